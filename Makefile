@@ -1,0 +1,42 @@
+# Everything runs in .venv, made on first use from constraints.txt.
+PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+VENV ?= .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.DEFAULT_GOAL := help
+.PHONY: help train evaluate test test-all lint format clean
+
+help: ## this list
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+
+$(READY): pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "jaxcal needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	@touch $@
+
+train: $(READY) ## set everything up and train the compact policy on this machine (about ten minutes)
+	$(BIN)/python train.py $(ARGS)
+
+evaluate: $(READY) ## compare every method with the proven optimum on 1,000 unseen candidate sets
+	$(BIN)/python evaluate.py $(ARGS)
+
+test: lint ## set everything up, lint, and run the quick tests (the ones CI runs)
+	$(BIN)/python -m pytest -m 'not slow' $(ARGS)
+
+test-all: lint ## every test, the slow ones too
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: $(READY) ## ruff (lint and format) and mypy
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(READY) ## let ruff rewrite what it can
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean: ## remove the virtual environment and caches
+	rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache

@@ -1,0 +1,57 @@
+"""jaxcal: which few postures to measure, and the calibration that follows.
+
+``select`` picks the D-optimal few of many candidate postures, ``identify`` fits
+``y = A u + b`` to what was measured there. Names load on first use, so importing
+jaxcal costs no more than numpy.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jaxcal.calibration import Calibration, identify
+    from jaxcal.regression import (
+        hat_matrix,
+        information_matrix,
+        leverages,
+        log_det_information,
+        regression_matrix,
+    )
+    from jaxcal.selection import Selection, score, select
+
+__all__ = [
+    "Calibration",
+    "Selection",
+    "hat_matrix",
+    "identify",
+    "information_matrix",
+    "leverages",
+    "log_det_information",
+    "regression_matrix",
+    "score",
+    "select",
+]
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Calibration": "jaxcal.calibration",
+    "identify": "jaxcal.calibration",
+    "Selection": "jaxcal.selection",
+    "score": "jaxcal.selection",
+    "select": "jaxcal.selection",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'jaxcal' has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOME.get(name, "jaxcal.regression")), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -1,0 +1,186 @@
+"""The calibration model ``y = A u + b`` as a linear regression.
+
+Every quantity jaxcal maximises, bounds or reports starts here. A posture is a command
+``u`` (n inputs); its regressor is ``z = [u, 1]``; the m outputs share that regressor, so
+the full regression matrix is a Kronecker product and everything reduces to the small
+matrix ``Z`` of stacked regressors:
+
+    S = A.T @ A  ~  I_m (x) (Z.T @ Z)      log det S = m log det(Z.T @ Z)
+
+Functions take and return numpy arrays in float64, in the unit of the caller's commands.
+Leading axes (``...``) are batches. Source: paper, Equations 2, 9 and the D-criterion.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = [
+    "hat_matrix",
+    "information_matrix",
+    "leverages",
+    "log_det_gram",
+    "log_det_information",
+    "regression_matrix",
+    "regressors",
+]
+
+Array = NDArray[np.float64]
+
+
+def _as_commands(commands: ArrayLike) -> Array:
+    """(..., N, n) finite float64, or a ValueError that says what is wrong."""
+    try:
+        array = np.asarray(commands, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"commands must be an array of numbers (N, n), got {type(commands).__name__}"
+        ) from error
+    if array.ndim < 2 or array.shape[-1] < 1 or array.shape[-2] < 1:
+        raise ValueError(
+            "commands must have shape (..., N, n) with N >= 1 and n >= 1, "
+            f"got {array.shape}"
+        )
+    if not np.isfinite(array).all():
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise ValueError(f"commands must be finite, got {array[where]} at {where}")
+    return array
+
+
+def regressors(commands: ArrayLike) -> Array:
+    """Regressors ``Z = [commands, 1]``.
+
+    Args:
+        commands: (..., N, n) in any unit.
+
+    Returns:
+        (..., N, n + 1).
+    """
+    commands = _as_commands(commands)
+    return np.concatenate([commands, np.ones((*commands.shape[:-1], 1))], axis=-1)
+
+
+def regression_matrix(commands: ArrayLike, num_outputs: int | None = None) -> Array:
+    """Regression matrix of the stacked measurements ``[y_1; y_2; ...; y_N]``.
+
+    Columns follow the paper's parameter vector: A row by row, then the biases,
+    ``[a11 a12 a13 a21 ... a33 | bx by bz]`` (Equation 9); rows are the outputs of
+    posture 1, then of posture 2, and so on (Equation 2).
+
+    Args:
+        commands: (..., N, n).
+        num_outputs: m; as many as inputs when not given.
+
+    Returns:
+        (..., m N, m (n + 1)).
+    """
+    commands = _as_commands(commands)
+    *batch, num_postures, num_inputs = commands.shape
+    m = num_inputs if num_outputs is None else num_outputs
+    if m < 1:
+        raise ValueError(f"num_outputs must be at least 1, got {m}")
+    eye = np.eye(m)
+    slopes = np.einsum("ab,...ni->...nabi", eye, commands)
+    slopes = slopes.reshape(*batch, num_postures, m, m * num_inputs)
+    biases = np.broadcast_to(eye, (*batch, num_postures, m, m))
+    rows = np.concatenate([slopes, biases], axis=-1)
+    return rows.reshape(*batch, num_postures * m, m * (num_inputs + 1))
+
+
+def information_matrix(commands: ArrayLike, num_outputs: int | None = None) -> Array:
+    """Information matrix ``S = A.T @ A`` for unit noise.
+
+    Args:
+        commands: (..., N, n).
+        num_outputs: m; as many as inputs when not given.
+
+    Returns:
+        (..., m (n + 1), m (n + 1)), 12 x 12 for three inputs and three outputs.
+    """
+    a = regression_matrix(commands, num_outputs)
+    return np.matrix_transpose(a) @ a
+
+
+def log_det_gram(commands: ArrayLike) -> Array:
+    """Log-determinant of ``Z.T @ Z``, computed about the centroid.
+
+    ``det(Z.T Z) = N det(C.T C)`` with C the commands less their mean, which keeps every
+    digit when the commands lie far from zero (encoder pulses, say).
+
+    Args:
+        commands: (..., N, n).
+
+    Returns:
+        (...,) natural log; ``-inf`` where the postures span fewer than n dimensions.
+    """
+    commands = _as_commands(commands)
+    num_postures, num_inputs = commands.shape[-2:]
+    if num_postures <= num_inputs:
+        return np.full(commands.shape[:-2], -np.inf)
+    centred = commands - commands.mean(axis=-2, keepdims=True)
+    norms = np.linalg.norm(centred, axis=-2, keepdims=True)
+    # Below a few ulp of the commands themselves a spread is rounding, not a posture.
+    floor = 4 * np.finfo(np.float64).eps * np.abs(commands).max(-2, keepdims=True)
+    flat = norms <= floor * np.sqrt(num_postures)
+    scaled = centred / np.where(flat, 1.0, norms)
+    singular = np.linalg.svd(scaled, compute_uv=False)
+    tolerance = 8 * num_postures * np.finfo(np.float64).eps
+    deficient = flat.any(axis=(-1, -2)) | (singular[..., -1] <= tolerance)
+    with np.errstate(divide="ignore"):
+        value = (
+            np.log(num_postures)
+            + 2.0 * np.log(singular).sum(axis=-1)
+            + 2.0 * np.log(norms).sum(axis=(-1, -2))
+        )
+    return np.where(deficient, -np.inf, value)
+
+
+def log_det_information(
+    commands: ArrayLike, num_outputs: int | None = None
+) -> float | Array:
+    """Log-determinant of the information matrix ``S``.
+
+    The outputs share one regressor, so the 12 x 12 determinant is the cube of a 4 x 4
+    one: ``log det S = m log det(Z.T @ Z)``.
+
+    Args:
+        commands: (..., N, n) in the unit the value is to be quoted in.
+        num_outputs: m; as many as inputs when not given.
+
+    Returns:
+        A float, or (...,) for batches; natural log, ``-inf`` where singular.
+    """
+    commands = _as_commands(commands)
+    m = commands.shape[-1] if num_outputs is None else num_outputs
+    value = m * log_det_gram(commands)
+    return float(value) if value.ndim == 0 else value
+
+
+def hat_matrix(commands: ArrayLike) -> Array:
+    """Hat matrix ``H = Z (Z.T Z)^-1 Z.T`` of a whole candidate set.
+
+    H does not change under any invertible affine map of the commands, and for a subset
+    s of n + 1 postures ``det(Z_s.T Z_s) = det(Z.T Z) det(H_ss)``: it holds all there is
+    to know for D-optimal selection.
+
+    Args:
+        commands: (..., M, n), not all in one plane.
+
+    Returns:
+        (..., M, M), symmetric, idempotent, trace n + 1.
+
+    Raises:
+        ValueError: the postures lie in one plane, so ``Z.T @ Z`` has no inverse.
+    """
+    commands = _as_commands(commands)
+    if np.any(np.isneginf(log_det_gram(commands))):
+        raise ValueError("commands must not all lie in one plane: Z.T @ Z is singular")
+    centred = commands - commands.mean(axis=-2, keepdims=True)
+    q = np.linalg.qr(regressors(centred / np.abs(centred).max(-2, keepdims=True)))[0]
+    return q @ np.matrix_transpose(q)
+
+
+def leverages(commands: ArrayLike) -> Array:
+    """(..., M) diagonal of the hat matrix; each in (0, 1], summing to n + 1."""
+    return np.diagonal(hat_matrix(commands), axis1=-2, axis2=-1)

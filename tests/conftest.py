@@ -1,0 +1,26 @@
+"""Shared fixtures. Silent broadcasting is the commonest bug here, so it is an error."""
+
+from __future__ import annotations
+
+import os
+import pathlib
+
+# One cache of compiled programs for every test process, so subprocess tests start fast.
+_CACHE = pathlib.Path(__file__).parent.parent / ".cache" / "jax"
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
+
+import jax
+import numpy as np
+import pytest
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.fixture
+def key() -> jax.Array:
+    return jax.random.key(0)
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
