@@ -1,9 +1,9 @@
 """The calibration model ``y = A u + b`` as a linear regression.
 
 Every quantity jaxcal maximises, bounds or reports starts here. A posture is a command
-``u`` (n inputs); its regressor is ``z = [u, 1]``; the m outputs share that regressor, so
-the full regression matrix is a Kronecker product and everything reduces to the small
-matrix ``Z`` of stacked regressors:
+``u`` (n inputs); its regressor is ``z = [u, 1]``; the m outputs share that regressor,
+so the full regression matrix is a Kronecker product and everything reduces to the
+small matrix ``Z`` of stacked regressors:
 
     S = A.T @ A  ~  I_m (x) (Z.T @ Z)      log det S = m log det(Z.T @ Z)
 
@@ -35,7 +35,8 @@ def _as_commands(commands: ArrayLike) -> Array:
         array = np.asarray(commands, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(
-            f"commands must be an array of numbers (N, n), got {type(commands).__name__}"
+            "commands must be an array of numbers (..., N, n), "
+            f"got {type(commands).__name__}"
         ) from error
     if array.ndim < 2 or array.shape[-1] < 1 or array.shape[-2] < 1:
         raise ValueError(
@@ -120,12 +121,15 @@ def log_det_gram(commands: ArrayLike) -> Array:
         return np.full(commands.shape[:-2], -np.inf)
     centred = commands - commands.mean(axis=-2, keepdims=True)
     norms = np.linalg.norm(centred, axis=-2, keepdims=True)
-    # Below a few ulp of the commands themselves a spread is rounding, not a posture.
-    floor = 4 * np.finfo(np.float64).eps * np.abs(commands).max(-2, keepdims=True)
-    flat = norms <= floor * np.sqrt(num_postures)
-    scaled = centred / np.where(flat, 1.0, norms)
+    scaled = centred / np.where(norms == 0.0, 1.0, norms)
     singular = np.linalg.svd(scaled, compute_uv=False)
-    tolerance = 8 * num_postures * np.finfo(np.float64).eps
+    # The commands are exact to half a unit in the last place of their size, not of
+    # their spread: a direction no wider than that is rounding, not a posture.
+    largest = np.abs(commands).max(axis=-2, keepdims=True)
+    resolution = np.finfo(np.float64).eps * num_postures
+    flat = norms <= resolution * largest
+    rounding = (largest / np.where(flat, np.inf, norms)).max(axis=(-1, -2))
+    tolerance = resolution * np.maximum(8.0, rounding)
     deficient = flat.any(axis=(-1, -2)) | (singular[..., -1] <= tolerance)
     with np.errstate(divide="ignore"):
         value = (
