@@ -1,0 +1,427 @@
+"""One run: opens everything, visits postures once each, closes everything stopped.
+
+A run is a fixed sequence of visits with names. A visit that the journal holds already
+is taken from there, so resuming is running the same sequence again.
+"""
+
+from __future__ import annotations
+
+import datetime
+import pathlib
+import platform
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rig.attitude import Array, Frame
+from rig.drives import Bus, BusError
+from rig.imu import Imu, ImuError
+from rig.journal import Journal, JournalError
+from rig.limits import LimitError
+from rig.motion import Measurement, Motion, MotionFault, Unreachable
+from rig.settings import RigConfig
+from rig.stop import PauseRequested, Signals, Stopper, StopRequested, UnitStop
+
+__all__ = [
+    "EXIT_BAD_INPUT",
+    "EXIT_FAULT",
+    "EXIT_OK",
+    "EXIT_PAUSED",
+    "EXIT_RECALIBRATE",
+    "Refused",
+    "Run",
+    "new_run_folder",
+    "run_safely",
+]
+
+EXIT_OK = 0
+EXIT_RECALIBRATE = 1  # done, but the errors say: calibrate (again)
+EXIT_BAD_INPUT = 2
+EXIT_FAULT = 3  # stopped by a fault; `resume` goes on
+EXIT_PAUSED = 4  # paused by Ctrl-C; `resume` goes on
+JOURNAL = "journal.jsonl"
+STREAM_WAIT_S = 15.0
+ZERO_FACTOR = 4  # readings of the zero posture, in those of a posture
+
+Say = Callable[[str], None]
+
+
+class Refused(ValueError):
+    """The request makes no sense for this run; nothing was moved."""
+
+
+def new_run_folder(output: pathlib.Path, mode: str) -> pathlib.Path:
+    """Make ``output/mode-date-time``, never an existing one."""
+    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    for number in range(100):
+        path = output / (f"{mode}-{stamp}" + (f"-{number}" if number else ""))
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise Refused(f"cannot make {path}: {error.strerror or error}") from None
+        return path
+    raise Refused(f"cannot make a new run under {output}")
+
+
+class Run:
+    """Journal, devices and visits of one run."""
+
+    def __init__(
+        self,
+        config: RigConfig,
+        folder: pathlib.Path,
+        mode: str,
+        say: Say = print,
+        *,
+        start: dict[str, Any] | None = None,
+        reset_alarms: bool = False,
+        on_imu_port: Callable[[int], None] | None = None,
+        zero_at: tuple[int, int, int] | None = None,
+    ) -> None:
+        self.config = config
+        self.folder = folder
+        self.mode = mode
+        self.say = say
+        self.phase_listeners: list[Callable[[str], None]] = []
+        self.confirm: Callable[[Run], None] = lambda run: None
+        self.motion: Motion | None = None
+        self.frame: Frame | None = None
+        self.zero_pulses: tuple[int, int, int] | None = None
+        self.zero_at = zero_at
+        self.signals = Signals(say)
+        self.planned = 0
+        self._visited = 0
+        self._visit_s: list[float] = []
+        self._reset_alarms = reset_alarms
+        self._on_imu_port = on_imu_port
+        self._bus: Bus | None = None
+        self._imu: Imu | None = None
+        self._phase_name = ""
+        self.journal = Journal(folder / JOURNAL)
+        try:
+            self._begin(start or {})
+        except BaseException:
+            self.journal.close()
+            raise
+
+    def _begin(self, extra: dict[str, Any]) -> None:
+        fingerprint = self.config.fingerprint()
+        starts = self.journal.events("start")
+        if starts:
+            if starts[0]["fingerprint"] != fingerprint:
+                raise Refused(
+                    f"{self.folder}: the configuration changed since this run began "
+                    "(what moves or measures may not); start a new run"
+                )
+            if starts[0]["mode"] != self.mode:
+                raise Refused(f"{self.folder} is a {starts[0]['mode']} run")
+            self.journal.write("resume", sync=True, **_provenance())
+            for record in self.journal.events("zero"):
+                self._set_zero(record)
+            return
+        self.journal.write(
+            "start",
+            sync=True,
+            schema=1,
+            mode=self.mode,
+            fingerprint=fingerprint,
+            config=self.config.described(),
+            **_provenance(),
+            **extra,
+        )
+
+    # Memory
+
+    def remember(
+        self, event: str, make: Callable[[], dict[str, Any]]
+    ) -> dict[str, Any]:
+        """The record of an event, made and journalled on first use only."""
+        known = self.journal.events(event)
+        return known[0] if known else self.journal.write(event, sync=True, **make())
+
+    def posture(self, name: str) -> dict[str, Any] | None:
+        """The record of a posture, or None where it has not been measured."""
+        for record in self.journal.records:
+            if record["event"] == "posture" and record["name"] == name:
+                return record
+        return None
+
+    def unreachable(self, name: str) -> bool:
+        """Whether a posture was found out of reach."""
+        return any(r["name"] == name for r in self.journal.events("unreachable"))
+
+    # Phases
+
+    def phase(self, name: str) -> None:
+        """Tell everybody which phase begins."""
+        if name != self._phase_name:
+            self._phase_name = name
+            self.journal.write("phase", phase=name)
+        for listener in self.phase_listeners:
+            listener(name)
+
+    # Devices
+
+    def ready(self) -> Motion:
+        """Open, arm and zero; on a resumed run check the zero posture instead.
+
+        Raises:
+            MotionFault, BusError, ImuError: not fit to move.
+        """
+        if self.motion is not None:
+            return self.motion
+        config = self.config
+        self.confirm(self)
+        silence = max(axis.map.inter_frame_s for axis in config.axes)
+        if config.bus.transport == "tcp":
+            silence = 0.0  # the gateway keeps the line's silence
+        self._imu = Imu(config.imu).open()
+        self.say(
+            f"IMU: waiting for the phone on port {self._imu.port} ({config.imu.format})"
+        )
+        if self._on_imu_port is not None:
+            self._on_imu_port(self._imu.port)
+        self._bus = Bus(config.bus, silence)
+        self._bus.on_frame = self._log_frame
+        self._bus.open()
+        self._imu.wait_for_stream(STREAM_WAIT_S)
+        stopper = Stopper([], self._report_stop)
+        self.signals.armed = True
+        self.motion = Motion(
+            config, self._bus, self._imu, self.signals, stopper, self._log, self.phase
+        )
+        self.motion.arm(self._reset_alarms)
+        self.say(f"armed: {len(self.motion.drives)} drives on {config.bus.where}")
+        if self.frame is None:
+            self._zero(self.motion)
+        else:
+            self.motion.frame = self.frame
+            self._check_reference(self.motion)
+        return self.motion
+
+    def _zero(self, motion: Motion) -> None:
+        self.phase("zeroing")
+        if self.zero_at is not None:
+            motion.move_to(self.zero_at, "zero")
+        elif self.config.session.zero == "drive":
+            motion.move_to((0, 0, 0), "zero")
+        target = self.zero_at or motion.positions()
+        # Every posture is measured against this one, so its noise must be the smaller.
+        measured = motion.measure(target, ZERO_FACTOR * self.config.settle.samples)
+        record = self.journal.write(
+            "zero",
+            sync=True,
+            pulses=list(measured.pulses),
+            attitude=_rounded(measured.attitude, 12),
+            std_deg=_rounded(measured.std, 6),
+            samples=measured.samples,
+        )
+        self._set_zero(record)
+        motion.frame = self.frame
+        self.say(f"zero taken at pulses {list(measured.pulses)}")
+
+    def _set_zero(self, record: dict[str, Any]) -> None:
+        a, b, c = (int(value) for value in record["pulses"])
+        self.zero_pulses = (a, b, c)
+        self.frame = Frame(
+            np.array(record["attitude"]),
+            self.config.imu.mounting,
+            self.config.mechanism_order,
+            self.config.letters,
+        )
+
+    def _check_reference(self, motion: Motion) -> None:
+        """Before a resumed run goes on: the zero posture must still read zero."""
+        assert self.zero_pulses is not None
+        motion.move_to(self.zero_pulses, "reference")
+        measured = motion.measure(self.zero_pulses)
+        worst = float(np.abs(measured.angles).max())
+        limit = self.config.session.reference_tolerance_deg
+        self.journal.write(
+            "reference", sync=True, angles=_rounded(measured.angles, 9), limit=limit
+        )
+        if worst > limit:
+            raise MotionFault(
+                f"the zero posture now reads {worst:.3f} deg away from zero (limit "
+                f"{limit:g}): the phone or the device was moved; start a new run"
+            )
+        self.say(f"reference posture reads {worst:.3f} deg from zero: going on")
+
+    # Visits
+
+    def visit(self, name: str, pulses: Any, **fields: Any) -> dict[str, Any] | None:
+        """Measure a posture, once in the life of the run.
+
+        Returns:
+            Its record; None where it is out of reach.
+
+        Raises:
+            PauseRequested: between postures, after Ctrl-C.
+        """
+        known = self.posture(name)
+        if known is not None:
+            self._visited += 1
+            return known
+        if self.unreachable(name):
+            return None
+        motion = self.ready()
+        self.signals.check_pause()
+        target = (int(pulses[0]), int(pulses[1]), int(pulses[2]))
+        begun = time.monotonic()
+        try:
+            motion.move_to(target, name)
+            measured = motion.measure(target)
+        except Unreachable as reason:
+            motion.stopper.stop(str(reason), latch=False)
+            if not all(result.standing for result in motion.stopper.results):
+                raise MotionFault(f"{reason}; and not all drives stand") from None
+            self.journal.write("unreachable", sync=True, name=name, reason=str(reason))
+            self.say(f"  {name} is out of reach: {reason}")
+            return None
+        record = self._record(name, measured, fields)
+        self._visited += 1
+        self._visit_s.append(time.monotonic() - begun)
+        self._progress(record)
+        self.signals.check_pause()
+        return record
+
+    def _record(
+        self, name: str, measured: Measurement, fields: dict[str, Any]
+    ) -> dict[str, Any]:
+        self.phase("saving")
+        return self.journal.write(
+            "posture",
+            sync=True,
+            name=name,
+            pulses=list(measured.pulses),
+            feedback=list(measured.feedback),
+            commanded_deg=_rounded(self.config.to_deg(measured.pulses), 9),
+            measured_deg=_rounded(measured.angles, 9),
+            std_deg=_rounded(measured.std, 6),
+            samples=measured.samples,
+            attitude=_rounded(measured.attitude, 12),
+            raw_deg=_rounded(measured.raw, 5),
+            **fields,
+        )
+
+    def _progress(self, record: dict[str, Any]) -> None:
+        left = max(0, self.planned - self._visited)
+        eta = left * float(np.mean(self._visit_s[-10:]))
+        commanded = " ".join(f"{v:8.3f}" for v in record["commanded_deg"])
+        measured = " ".join(f"{v:8.3f}" for v in record["measured_deg"])
+        self.say(
+            f"  [{self._visited:>3}/{self.planned}] {record['name']:<12} "
+            f"u [{commanded}]  y [{measured}]  {self._visit_s[-1]:5.2f} s, "
+            f"about {eta:.0f} s left"
+        )
+
+    # Log and stop
+
+    def _log(self, event: str, **fields: Any) -> None:
+        self.journal.write(event, **fields)
+
+    def _log_frame(self, event: str, fields: dict[str, Any]) -> None:
+        try:
+            self.journal.write(event, **fields)
+        except JournalError:
+            return  # a full disk must not keep a stop from the bus; "command" raises
+
+    def _report_stop(self, reason: str, results: list[UnitStop]) -> None:
+        self.say(f"stop: {reason or 'end of run'}")
+        for result in results:
+            self.say(f"  {result}")
+        self._log_frame(
+            "stop", {"reason": reason, "units": [vars(result) for result in results]}
+        )
+
+    def stop(self, reason: str, latch: bool = True) -> bool:
+        """Stop every unit; whether each acknowledged and stands."""
+        motion = self.motion
+        if motion is None:
+            return True
+        results = motion.stopper.stop(reason, latch)
+        return all(result.acknowledged and result.standing for result in results)
+
+    def disarm(self) -> None:
+        """Nothing more will move: close the bus and the IMU, free the signals."""
+        if self.motion is not None:
+            self.motion.heartbeat.close()
+            self.motion.armed = False
+        if self._bus is not None:
+            self._bus.close()
+        if self._imu is not None:
+            self.dropped = {
+                k: v for k, v in self._imu.counts.items() if k != "accepted"
+            }
+            self._imu.close()
+        self._bus = self._imu = None
+        self.motion = None
+        self.signals.armed = False
+
+    def close(self) -> None:
+        """Let go of everything."""
+        self.disarm()
+        self.journal.close()
+
+
+def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
+    """Run a procedure; whatever happens, the drives are told to stop and it is said.
+
+    Returns:
+        The exit code.
+    """
+    code, event, reason = EXIT_FAULT, "fault", ""
+    with run.signals:
+        try:
+            code = procedure(run)
+            event, reason = "end", ""
+        except PauseRequested as pause:
+            code, event, reason = EXIT_PAUSED, "paused", str(pause)
+        except StopRequested as stop:
+            code, event, reason = stop.exit_code, "stopped", str(stop)
+        except KeyboardInterrupt:
+            code, event, reason = 130, "stopped", "SIGINT"
+        except (Refused, LimitError) as error:
+            code, event, reason = EXIT_BAD_INPUT, "refused", str(error)
+        except (MotionFault, BusError, ImuError, JournalError) as error:
+            reason = str(error)
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}"
+        finally:
+            run.signals.armed = run.motion is not None
+            if event != "end":
+                run.stop(reason, latch=event != "paused")
+            elif run.motion is not None:
+                run.stop("", latch=False)
+            run.disarm()
+    try:
+        run.journal.write(event, sync=True, code=code, reason=reason)
+    except JournalError as error:
+        run.say(f"the journal could not be closed with a last line: {error}")
+    if event != "end":
+        run.say(f"{event}: {reason}")
+        if event != "refused":
+            run.say(f"to go on: python -m rig resume {run.folder}")
+    run.close()
+    return code
+
+
+def _provenance() -> dict[str, Any]:
+    import jaxcal
+
+    return {
+        "jaxcal": jaxcal.__version__,
+        "python": platform.python_version(),
+        "host": platform.node(),
+        "arguments": sys.argv[1:],
+        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+    }
+
+
+def _rounded(values: Array, digits: int) -> Any:
+    return np.round(np.asarray(values, dtype=np.float64), digits).tolist()

@@ -1,0 +1,220 @@
+"""A drive made from its register map: ramps, quick stop, alarms, comm timeout."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+from rig.registers import RegisterMap, Write, decode, encode
+
+__all__ = ["ILLEGAL_ADDRESS", "ILLEGAL_VALUE", "DriveException", "SimDrive"]
+
+ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 2, 3, 4
+STEP_S = 0.001
+COMM_ALARM = 0x85
+QUICK_STOP_FACTOR = 5.0
+
+
+class DriveException(Exception):
+    """The drive answers with a Modbus exception."""
+
+    def __init__(self, code: int) -> None:
+        self.code = code
+        super().__init__(f"exception {code}")
+
+
+class SimDrive:
+    """One unit. Positions in pulses, time from ``clock`` in seconds."""
+
+    def __init__(
+        self,
+        register_map: RegisterMap,
+        pulses_per_rev: int,
+        position: float = 0.0,
+        clock: Callable[[], float] = time.monotonic,
+        speedup: float = 1.0,
+        travel: tuple[int, int] | None = None,
+    ) -> None:
+        self.map = register_map
+        self.position = float(position)
+        self.velocity = 0.0
+        self.target = round(position)
+        self.moving = False
+        self.done = True
+        self.alarm = 0
+        self.enabled = True
+        self.stuck: Callable[[], bool] = lambda: False
+        self.executions: list[tuple[float, int]] = []  # (time, target) of each move run
+        self.stops: list[float] = []
+        self.comm_stops = 0
+        self._travel = travel  # targets outside are answered with exception 3
+        self._pulses_per_rev = pulses_per_rev
+        self._clock = clock
+        self._speedup = speedup
+        self._speed = self._accel = 1.0
+        self._stopping = False
+        self._comm_timeout = 0.0
+        self._last_frame = self._now = clock()
+        self._registers = self._known()
+
+    def _known(self) -> dict[int, int]:
+        m = self.map
+        known = {m.status.address + i: 0 for i in range(m.status.count)}
+        reads = [m.position, *(read for _, read in m.identity)]
+        if m.alarm:
+            reads.append(m.alarm)
+        for read in reads:
+            known |= {read.address + i: 0 for i in range(read.count)}
+        frames = m.move + m.stop + m.enable + m.alarm_reset + m.comm_timeout + m.limits
+        for frame in frames:
+            known |= {frame.address + i: 0 for i in range(frame.count)}
+        for _, read in m.identity[:1]:
+            known[read.address + read.count - 1] = self._pulses_per_rev & 0xFFFF
+        return known
+
+    def advance(self) -> None:
+        """Bring position and velocity up to the clock."""
+        now = self._clock()
+        if self.moving and self._comm_timeout:
+            lost = self._last_frame + self._comm_timeout
+            if now > lost and not self._stopping:
+                self._integrate(lost)
+                self.comm_stops += 1
+                self.alarm = COMM_ALARM
+                self._stopping = True
+        self._integrate(now)
+
+    def _integrate(self, now: float) -> None:
+        while self.moving and self._now < now:
+            dt = min(STEP_S, now - self._now)
+            self._now += dt
+            self._step(dt * self._speedup)
+        self._now = max(self._now, now)
+
+    def _step(self, dt: float) -> None:
+        if self._stopping:
+            drop = QUICK_STOP_FACTOR * self._accel * dt
+            if abs(self.velocity) <= drop or self.stuck():
+                self.velocity, self.moving, self._stopping = 0.0, False, False
+                self.position = float(round(self.position))
+                return
+            self.velocity -= math.copysign(drop, self.velocity)
+            self.position += self.velocity * dt
+            return
+        if self.stuck():
+            self.velocity = 0.0
+            return
+        error = self.target - self.position
+        wanted = math.copysign(
+            min(self._speed, math.sqrt(2.0 * self._accel * abs(error))), error
+        )
+        change = max(-self._accel * dt, min(self._accel * dt, wanted - self.velocity))
+        self.velocity += change
+        step = self.velocity * dt
+        near = abs(error) <= max(abs(step), 0.5)
+        if near and abs(self.velocity) <= 3 * self._accel * dt + 1.0:
+            self.position, self.velocity = float(self.target), 0.0
+            self.moving, self.done = False, True
+            return
+        self.position += step
+
+    def raise_alarm(self, code: int) -> None:
+        """Fault: the drive stops itself and refuses to move until reset."""
+        self.advance()
+        self.alarm = code
+        self.done = False
+        self._stopping = self.moving
+
+    def read(self, address: int, count: int) -> list[int]:
+        """Holding registers; raises DriveException where there are none."""
+        self.advance()
+        self._last_frame = self._clock()
+        m = self.map
+        self._put(m.status.address, self._status(), m.status.type)
+        self._put(m.position.address, round(self.position), m.position.type)
+        if m.alarm:
+            self._put(m.alarm.address, self.alarm, m.alarm.type)
+        try:
+            return [self._registers[address + i] for i in range(count)]
+        except KeyError:
+            raise DriveException(ILLEGAL_ADDRESS) from None
+
+    def _put(self, address: int, value: int, kind: str) -> None:
+        for i, word in enumerate(encode(value, kind, self.map.word_order)):
+            self._registers[address + i] = word
+
+    def _status(self) -> int:
+        m, word = self.map, 0
+        if self.enabled and m.enabled:
+            word |= sum(1 << bit for bit in m.enabled.set)
+        if self.moving:
+            word |= sum(1 << bit for bit in m.moving.set)
+        elif self.done and not self.alarm:
+            word |= sum(1 << bit for bit in m.done.set)
+        if self.alarm:
+            word |= sum(1 << bit for bit in m.fault.set)
+        return word
+
+    def write(self, address: int, words: list[int]) -> None:
+        """Write holding registers, and do what they mean."""
+        self.advance()
+        self._last_frame = self._clock()
+        if any(address + i not in self._registers for i in range(len(words))):
+            raise DriveException(ILLEGAL_ADDRESS)
+        m = self.map
+        at = {address + i: word for i, word in enumerate(words)}
+        moves = at.get(m.trigger[0]) == m.trigger[1]
+        before = dict(self._registers)
+        self._registers |= at
+        if moves:
+            try:
+                self._start()
+            except DriveException:
+                self._registers = before
+                raise
+        elif self._is(m.stop[:1], address, words):
+            self.stops.append(self._clock())
+            self._stopping = self.moving
+            self.target = round(self.position)
+        elif self._is(m.alarm_reset[:1], address, words):
+            self.alarm = 0
+        elif self._is(m.enable[:1], address, words):
+            self.enabled = True
+        elif any(frame.address == address for frame in m.comm_timeout):
+            value = self._value(m.comm_timeout, "timeout")
+            self._comm_timeout = (value or 0) / m.comm_timeout_per_s
+
+    def _is(self, frames: tuple[Write, ...], address: int, words: list[int]) -> bool:
+        return any(f.address == address and list(f.words) == words for f in frames)
+
+    def _value(self, frames: tuple[Write, ...], name: str) -> int | None:
+        for frame in frames:
+            found = frame.offset_of(name)
+            if found:
+                address, kind = found
+                count = 2 if kind.endswith("32") else 1
+                words = [self._registers[address + i] for i in range(count)]
+                return decode(words, kind, self.map.word_order)
+        return None
+
+    def _start(self) -> None:
+        m = self.map
+        if self.alarm or not self.enabled:
+            raise DriveException(DEVICE_FAILURE)
+        target = self._value(m.move, "position")
+        assert target is not None  # the schema demands it
+        if self._travel and not self._travel[0] <= target <= self._travel[1]:
+            raise DriveException(ILLEGAL_VALUE)
+        speed = (self._value(m.move, "speed") or 1) / m.speed_per_unit
+        accel = float(self._value(m.move, "accel") or 1)
+        if m.accel_unit == "s_per_rev_per_s":
+            accel = m.accel_per_unit / accel
+        else:
+            accel /= m.accel_per_unit
+        per_rev = float(self._pulses_per_rev)
+        self._speed = speed * (per_rev if m.speed_unit == "rev_per_s" else 1.0)
+        self._accel = accel * (1.0 if m.accel_unit == "pulse_per_s2" else per_rev)
+        self.executions.append((self._clock(), target))
+        self.target, self.moving, self.done = target, True, False
+        self._stopping = False

@@ -1,0 +1,201 @@
+"""The phone: its attitude in the published formats, at a steady rate."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import random
+import socket
+import threading
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from rig.attitude import Array, matrix_to_euler
+from rig.settings import ImuSettings
+from rig.simulator.faults import FaultInjector
+
+__all__ = ["Phone", "format_line", "matrix_to_quaternion"]
+
+
+def matrix_to_quaternion(matrix: Array) -> Array:
+    """(4,) x, y, z, w of a (3, 3) rotation, by the largest of the four."""
+    m = matrix
+    squares = np.array(
+        [
+            1 + m[0, 0] - m[1, 1] - m[2, 2],
+            1 - m[0, 0] + m[1, 1] - m[2, 2],
+            1 - m[0, 0] - m[1, 1] + m[2, 2],
+            1 + np.trace(m),
+        ]
+    )
+    rows = [
+        [squares[0], m[1, 0] + m[0, 1], m[0, 2] + m[2, 0], m[2, 1] - m[1, 2]],
+        [m[1, 0] + m[0, 1], squares[1], m[2, 1] + m[1, 2], m[0, 2] - m[2, 0]],
+        [m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], squares[2], m[1, 0] - m[0, 1]],
+        [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], squares[3]],
+    ]
+    q = np.array(rows[int(np.argmax(squares))])
+    return q / np.linalg.norm(q)
+
+
+def format_line(
+    settings: ImuSettings, matrix: Array, stamp_s: float, order: str
+) -> str:
+    """One line as the configured app would send it, without its end."""
+    width = settings.column_count or 1 + max(
+        *settings.columns, *(settings.quaternion or ()), settings.stamp_column or 0
+    )
+    fields = ["0.0"] * width
+    if settings.quaternion:
+        for column, value in zip(
+            settings.quaternion, matrix_to_quaternion(matrix), strict=True
+        ):
+            fields[column] = f"{value:.9f}"
+    else:
+        angles = matrix_to_euler(matrix, order) * np.array(settings.signs)
+        if settings.format == "hyperimu":
+            angles[0] %= 360.0  # the azimuth runs from 0 to 360
+        if settings.angle_unit == "rad":
+            angles = np.radians(angles)
+        for column, value in zip(settings.columns, angles, strict=True):
+            fields[column] = f"{value:.7f}"
+    if settings.stamp_column is not None:
+        fields[settings.stamp_column] = str(round(stamp_s * 1000))
+    return settings.separator.join(fields)
+
+
+class Phone:
+    """Sends ``attitude()`` at ``rate_hz`` until closed; connects again by itself."""
+
+    def __init__(
+        self,
+        settings: ImuSettings,
+        attitude: Callable[[], Array],
+        faults: FaultInjector,
+        rate_hz: float = 100.0,
+        seed: int = 0,
+    ) -> None:
+        self.settings = settings
+        self.lines = 0
+        self.port = settings.port
+        self._attitude = attitude
+        self._faults = faults
+        self._period = 1.0 / rate_hz
+        self._random = random.Random(seed)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._listener: socket.socket | None = None
+        self._frozen: Array | None = None
+
+    def start(self, port: int) -> None:
+        """Begin; ``port`` is where the rig listens, or where this phone shall."""
+        self.port = port
+        if self.settings.transport == "connect":
+            self._listener = socket.create_server(("127.0.0.1", port), backlog=1)
+            self._listener.settimeout(0.1)
+            self.port = int(self._listener.getsockname()[1])
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop sending."""
+        self._closing.set()
+        self._thread.join(2.0)
+        if self._listener:
+            self._listener.close()
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            with contextlib.suppress(OSError, http.client.HTTPException):
+                if self.settings.format == "sensorlogger":
+                    self._push()
+                elif self._listener is not None:
+                    connection, _ = self._listener.accept()
+                    self._stream(connection)
+                else:
+                    address = ("127.0.0.1", self.port)
+                    self._stream(socket.create_connection(address, timeout=1.0))
+            self._closing.wait(0.05)
+
+    def _stream(self, connection: socket.socket) -> None:
+        with contextlib.closing(connection):
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            connection.settimeout(1.0)
+            held: bytes | None = None
+            next_time = time.monotonic()
+            while not self._closing.is_set():
+                if self._faults.take("imu_disconnect"):
+                    return
+                if not self._faults.take("imu_gap"):
+                    data = self._line()
+                    if self._faults.take("imu_reorder") and held is None:
+                        held = data
+                    else:
+                        connection.sendall(data + (held or b""))
+                        held = None
+                    self.lines += 1
+                next_time += self._period
+                self._closing.wait(max(0.0, next_time - time.monotonic()))
+
+    def _line(self) -> bytes:
+        s, faults = self.settings, self._faults
+        order = s.order
+        if faults.take("imu_wrong_order"):
+            order = "XYZ" if s.order != "XYZ" else "ZYX"
+        matrix = self._attitude()
+        if faults.take("imu_frozen"):
+            self._frozen = matrix = matrix if self._frozen is None else self._frozen
+        else:
+            self._frozen = None
+        text = format_line(s, matrix, time.time(), order)
+        if faults.take("imu_nan"):
+            fields = text.split(s.separator)
+            fields[(s.quaternion or s.columns)[0]] = "NaN"
+            text = s.separator.join(fields)
+        if faults.take("imu_columns"):
+            text += f"{s.separator}1.0"
+        data = text.encode() + b"\r\n"
+        if faults.take("imu_garbage"):
+            cut = self._random.randrange(len(data))
+            noise = self._random.randbytes(self._random.randint(1, 40))
+            data = data[:cut] + noise + data[cut:]
+        return data
+
+    def _push(self) -> None:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=2.0)
+        number = 0
+        with contextlib.closing(connection):
+            while not self._closing.is_set():
+                payload = []
+                for _ in range(5):
+                    q = matrix_to_quaternion(self._attitude())
+                    if self._faults.take("imu_nan"):
+                        q = q * np.nan
+                    keys = ("qx", "qy", "qz", "qw")
+                    values = dict(zip(keys, q.tolist(), strict=True))
+                    payload.append(
+                        {
+                            "name": "orientation",
+                            "time": time.time_ns(),
+                            "values": values,
+                        }
+                    )
+                    self._closing.wait(self._period)
+                message = {
+                    "messageId": number,
+                    "sessionId": "simulated",
+                    "deviceId": "simulated",
+                    "payload": payload,
+                }
+                number += 1
+                if self._faults.take("imu_gap"):
+                    continue
+                body = json.dumps(message)
+                if self._faults.take("imu_garbage"):
+                    body = body[: self._random.randrange(len(body))]
+                headers = {"Content-Type": "application/json"}
+                connection.request("POST", "/", body, headers)
+                connection.getresponse().read()
+                self.lines += 1

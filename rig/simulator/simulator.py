@@ -1,0 +1,126 @@
+"""Drives, mechanism and phone put together behind one configuration."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+
+from rig.attitude import Array
+from rig.settings import RigConfig
+from rig.simulator.drive import SimDrive
+from rig.simulator.faults import FaultInjector, FaultSpec
+from rig.simulator.phone import Phone
+from rig.simulator.plant import Plant, Truth
+from rig.simulator.server import ModbusServer
+
+__all__ = ["Simulator"]
+
+
+class Simulator:
+    """A whole simulated rig. ``start`` returns the configuration that reaches it."""
+
+    def __init__(
+        self,
+        config: RigConfig,
+        truth: Truth | None = None,
+        faults: list[FaultSpec] | None = None,
+        *,
+        transport: str = "tcp",
+        rate_hz: float = 100.0,
+        speedup: float = 1.0,
+        travel_deg: tuple[float, float] | None = None,
+    ) -> None:
+        self.config = config
+        self.truth = truth or Truth(seed=config.session.seed)
+        self.faults = FaultInjector(faults)
+        self.transport = transport
+        self.rate_hz = rate_hz
+        jig = Plant.jig_posture(self.truth)
+        self.drives: list[SimDrive] = []
+        for axis, angle in zip(config.axes, jig, strict=True):
+            travel = None
+            if travel_deg is not None:
+                ends = sorted(axis.scale.to_pulses(end) for end in travel_deg)
+                travel = (ends[0], ends[1])
+            position = 0.0
+            if config.session.zero == "here":
+                position = float(axis.scale.to_pulses(float(angle)))
+            self.drives.append(
+                SimDrive(
+                    axis.map, axis.scale.pulses_per_rev, position,
+                    speedup=speedup, travel=travel,
+                )
+            )  # fmt: skip
+        for number, drive in enumerate(self.drives):
+            drive.stuck = lambda n=number: bool(self.faults.take("stuck_axis", n))  # type: ignore[misc] # a default argument binds the axis
+        self.plant = Plant(config, self.truth, self.drives)
+        self.plant.slipping = lambda axis: bool(self.faults.take("slipping_axis", axis))
+        units = [axis.unit for axis in config.axes]
+        self.server = ModbusServer(
+            dict(zip(units, self.drives, strict=True)), self.faults, self.truth.seed
+        )
+        self.phone: Phone | None = None
+        self._alarm_lock = threading.Lock()
+
+    def start(self, port: int = 0) -> RigConfig:
+        """Serve the drives; the phone starts with ``start_phone``."""
+        bus = self.config.bus
+        if self.transport == "rtu":
+            bus = dataclasses.replace(
+                bus, transport="rtu", device=self.server.serve_pty(), parity="N"
+            )
+        else:
+            port = self.server.serve_tcp(port, rtu=self.transport == "rtu_tcp")
+            bus = dataclasses.replace(
+                bus, transport=self.transport, host="127.0.0.1", port=port
+            )
+        imu = dataclasses.replace(self.config.imu, host="127.0.0.1")
+        if imu.transport == "listen":
+            imu = dataclasses.replace(imu, port=0)
+        else:
+            self.start_phone(0)
+            assert self.phone is not None
+            imu = dataclasses.replace(imu, port=self.phone.port)
+        return dataclasses.replace(self.config, bus=bus, imu=imu)
+
+    def start_phone(self, port: int) -> None:
+        """Begin to send to the port the rig listens on; once only."""
+        if self.phone is not None:
+            self.phone.port = port
+            return
+        self.phone = Phone(
+            self.config.imu, self._attitude, self.faults, self.rate_hz, self.truth.seed
+        )
+        self.phone.start(port)
+
+    def enter(self, phase: str) -> None:
+        """The session entered a phase: faults that wait for it begin."""
+        self.faults.enter(phase)
+        self._alarms()
+
+    def _alarms(self) -> None:
+        with self._alarm_lock, self.server.lock:
+            for axis, drive in enumerate(self.drives):
+                if not drive.alarm and self.faults.take("alarm", axis):
+                    drive.raise_alarm(0x30)
+
+    def _attitude(self) -> Array:
+        self._alarms()
+        with self.server.lock:
+            return self.plant.attitude()
+
+    def executions(self) -> list[list[int]]:
+        """Targets in pulses each drive really ran, pitch, yaw, roll."""
+        return [[target for _, target in drive.executions] for drive in self.drives]
+
+    def close(self) -> None:
+        """Stop serving and sending."""
+        if self.phone is not None:
+            self.phone.close()
+        self.server.close()
+
+    def __enter__(self) -> Simulator:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
