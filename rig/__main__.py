@@ -398,6 +398,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return commands.get(args.command, _session)(args)
     except KeyboardInterrupt:
         return 130
+    except BrokenPipeError:
+        return 141  # the reader of our output went away, as `| head` does
     except (ValueError, OSError, RuntimeError) as error:
         bad_input = isinstance(error, (ValueError, OSError))
         if type(error).__name__ == "JournalError" and args.command == "resume":

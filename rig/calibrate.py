@@ -81,8 +81,8 @@ def describe_plan(run: Run, candidates: Array, choice: Choice) -> float:
     total = seconds + extra * (seconds / session.k)
     say(
         f"  travel pitch {travel[0]:.1f}, yaw {travel[1]:.1f}, roll {travel[2]:.1f} "
-        f"deg; with {session.verify_postures} held-out postures, before and after, about "
-        f"{total:.0f} s"
+        f"deg; with {session.verify_postures} held-out postures, before and after, "
+        f"about {total:.0f} s"
     )
     return total
 
@@ -205,7 +205,7 @@ def _finish(
 ) -> int:
     """Identify, check, save, report. The drives are stopped and let go first."""
     assert run.frame is not None
-    run.phase("saving")
+    run.phase("finishing")
     if run.motion is not None:
         run.stop("", latch=False)
         run.disarm()

@@ -83,7 +83,13 @@ class Bus:
         """
         with self._lock:
             if self._client is None:
-                self._client = self._make_client()
+                try:
+                    self._client = self._make_client()
+                except RuntimeError as error:  # pymodbus without pyserial
+                    text = " ".join(str(error).split())
+                    raise BusError(
+                        f"cannot open {self.settings.where}: {text}"
+                    ) from None
             if not self._client.connect():
                 hint = (
                     "absent, or held by another program (a running session?)"
@@ -191,6 +197,8 @@ class Bus:
                 )
             except ModbusException as error:
                 text = " ".join(str(error).split())
+                if "No response" in text:
+                    text = f"silent for {self.settings.timeout_s:g} s"
                 raise BusError(f"unit {unit}: no valid reply ({text})") from None
             except Exception as error:
                 # pymodbus lets struct, index and socket errors of mangled frames out.

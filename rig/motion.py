@@ -23,8 +23,9 @@ from rig.stream import Reading
 
 __all__ = ["Measurement", "Motion", "MotionFault", "Unreachable"]
 
-FOLLOW_MIN_DEG = 8.0  # a commanded change this large must be seen by the IMU
+FOLLOW_MIN_DEG = 3.0  # a commanded change this large must be seen by the IMU
 FOLLOW_SHARE = 0.1  # at least this share of it
+FOLLOW_LEADING = 0.5  # of axes that move at least this share of the largest move
 
 
 class MotionFault(RuntimeError):
@@ -448,7 +449,8 @@ class Motion:
             asked = np.abs(commanded - self._seen[0])
             seen = np.abs(measurement.angles - self._seen[1])
             for name, a, s in zip(AXIS_NAMES, asked, seen, strict=True):
-                if a >= FOLLOW_MIN_DEG and s < FOLLOW_SHARE * a:
+                leading = max(FOLLOW_MIN_DEG, FOLLOW_LEADING * asked.max())
+                if a >= leading and s < FOLLOW_SHARE * a:
                     raise MotionFault(
                         f"the drive of {name} turned {a:.1f} deg, the IMU saw {s:.2f}: "
                         "a slipped coupling, a frozen stream, or axes mixed up"

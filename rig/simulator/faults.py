@@ -13,6 +13,7 @@ __all__ = ["BUS_KINDS", "KINDS", "PHASES", "FaultInjector", "FaultSpec", "parse_
 PHASES = ("zeroing", "moving", "settling", "measuring", "saving")
 BUS_KINDS = {
     "lost_reply": "the drive obeys, its reply is lost",
+    "lost_write_reply": "the drive obeys a write, its reply is lost",
     "lost_request": "the drive never sees the request",
     "delayed_reply": "the reply comes after `seconds` (0.5)",
     "noise_bytes": "random bytes before the reply",

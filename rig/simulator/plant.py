@@ -64,6 +64,10 @@ class Plant:
         """(3,) commands in degrees at which every joint stands at zero."""
         return np.linalg.solve(np.array(truth.matrix), -np.array(truth.bias))
 
+    def tighten(self) -> None:
+        """Put slipped joints back to where their drives say."""
+        self._slip[:] = 0.0
+
     def _commanded(self) -> Array:
         return self._config.to_deg([drive.position for drive in self._drives])
 

@@ -176,6 +176,8 @@ class ModbusServer:
             reply = self._execute(self.drives[unit], pdu)
         if faults.take("lost_reply", axis):
             return None, b""
+        if pdu[0] in (6, 16) and faults.take("lost_write_reply", axis):
+            return None, b""
         delayed = faults.take("delayed_reply", axis)
         if delayed:
             time.sleep(0.5 if delayed.seconds is None else delayed.seconds)

@@ -109,6 +109,11 @@ class Simulator:
         with self.server.lock:
             return self.plant.attitude()
 
+    def repair(self) -> None:
+        """Undo every fault, as a technician would before the run is resumed."""
+        self.faults.clear()
+        self.plant.tighten()
+
     def executions(self) -> list[list[int]]:
         """Targets in pulses each drive really ran, pitch, yaw, roll."""
         return [[target for _, target in drive.executions] for drive in self.drives]

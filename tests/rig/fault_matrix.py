@@ -1,0 +1,297 @@
+"""Every fault at every phase: run, spoil, repair, resume, compare.
+
+``python tests/rig/fault_matrix.py docs/fault_matrix.md`` runs all cells and writes the
+published table; the slow test runs the same cells, the quick one a few of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pathlib
+import re
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+
+import numpy as np
+from harness import (
+    HOST_FAULTS,
+    fast_config,
+    fast_text,
+    in_the_middle,
+    session,
+    simulator,
+)
+
+from rig.config import parse_config
+from rig.journal import read_journal
+from rig.session import Run
+from rig.simulator import Simulator, parse_fault
+
+PHASES = ("zeroing", "moving", "settling", "measuring", "saving")
+FAULTS = (
+    "lost_reply,count=1",
+    "lost_reply",
+    "lost_write_reply,count=1",
+    "lost_request,count=1",
+    "delayed_reply,count=1,seconds=0.3",
+    "delayed_reply,seconds=0.3",
+    "noise_bytes,count=1",
+    "noise_bytes",
+    "exception_reply,count=1",
+    "exception_reply",
+    "dead_drive,axis=yaw",
+    "alarm,axis=pitch",
+    "stuck_axis,axis=roll",
+    "slipping_axis,axis=roll",
+    "imu_gap,seconds=0.5",
+    "imu_gap",
+    "imu_disconnect,count=1",
+    "imu_garbage,count=20",
+    "imu_garbage",
+    "imu_nan,count=20",
+    "imu_nan",
+    "imu_frozen",
+    "imu_wrong_order",
+    "imu_columns",
+    "imu_reorder,count=20",
+)
+DEAF = ("dead_drive", "lost_request", "exception_reply")  # cannot take a stop
+MAX_RESUMES = 6
+HARNESS = pathlib.Path(__file__).with_name("harness.py")
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """What one cell came to."""
+
+    fault: str
+    phase: str
+    first_code: int
+    resumes: int
+    reason: str
+    worst: float  # largest difference of A and b from the uninterrupted run's
+
+    @property
+    def word(self) -> str:
+        if self.first_code == 0:
+            return "ridden out"
+        if self.first_code == 4:
+            return "paused"
+        return "killed" if self.first_code == -9 else "stopped"
+
+
+def calibration(folder: pathlib.Path) -> np.ndarray:
+    summary = json.loads((folder / "summary.json").read_text())
+    return np.column_stack([summary["A"], summary["b"]])
+
+
+def uninterrupted(folder: pathlib.Path) -> np.ndarray:
+    """A and b of a run without faults; fails where that does not end well."""
+    config = fast_config()
+    said: list[str] = []
+    with simulator(config) as sim:
+        code = session(sim.start(), folder, sim, said)
+    assert code == 0, said
+    return calibration(folder)
+
+
+def check_invariants(folder: pathlib.Path, sim: Simulator, alive: bool, deaf: bool):
+    """What must hold after every run, whatever was done to it."""
+    records = read_journal(folder / "journal.jsonl")
+    names = [r["name"] for r in records if r["event"] == "posture"]
+    assert len(names) == len(set(names)), f"a posture was counted twice: {names}"
+    for drive, axis in zip(sim.drives, ("pitch", "yaw", "roll"), strict=True):
+        asked = [
+            r["pulses"]
+            for r in records
+            if r["event"] == "command" and r["axis"] == axis
+        ]
+        ran = [target for _, target in drive.executions]
+        rest = iter(asked)
+        missing = [target for target in ran if target not in rest]
+        assert not missing, f"{axis} ran moves twice or unasked: {missing}"
+    if not alive:
+        return
+    assert any(r["event"] == "stop" for r in records) or not any(
+        r["event"] == "command" for r in records
+    )
+    for drive in sim.drives:
+        deadline = time.monotonic() + 2.0
+        while drive.moving and time.monotonic() < deadline:
+            with sim.server.lock:
+                drive.advance()
+            time.sleep(0.01)
+        assert deaf or (drive.stops and not drive.moving), "a drive was not stopped"
+
+
+def run_cell(
+    fault: str, phase: str, truth: np.ndarray, folder: pathlib.Path
+) -> Outcome:
+    """Run one cell of the matrix; raises AssertionError where a promise is broken."""
+    if fault in HOST_FAULTS:
+        return _host_cell(fault, phase, truth, folder)
+    config = fast_config()
+    said: list[str] = []
+    spec = parse_fault(fault)
+    done: list[bool] = []
+
+    with simulator(config) as sim:
+
+        def listen(run: Run, entered: str) -> None:
+            if entered == phase and not done and in_the_middle(run, entered):
+                done.append(True)
+                sim.faults.add(spec)
+                sim.enter(entered)
+
+        served = sim.start()
+        code = first = session(served, folder, sim, said, [listen])
+        assert done, f"the session never entered {phase}"
+        reason = next((s for s in reversed(said) if s.startswith("fault:")), "")
+        check_invariants(folder, sim, alive=True, deaf=spec.kind in DEAF)
+        sim.repair()
+        resumes = 0
+        while code != 0 and resumes < MAX_RESUMES:
+            resumes += 1
+            code = session(served, folder, sim, said)
+            check_invariants(folder, sim, alive=True, deaf=True)
+    assert code == 0, said[-12:]
+    worst = float(np.abs(calibration(folder) - truth).max())
+    assert worst < 1e-6, f"resumed to another calibration: {worst}"
+    return Outcome(fault, phase, first, resumes, reason, worst)
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+def _host_cell(
+    fault: str, phase: str, truth: np.ndarray, folder: pathlib.Path
+) -> Outcome:
+    folder.mkdir(parents=True, exist_ok=True)
+    with simulator(fast_config()) as sim:
+        served, phone_port = sim.start(), _free_port()
+        text = fast_text(
+            {
+                "port = 5020": f"port = {served.bus.port}",
+                "port = 2055": f"port = {phone_port}",
+            }
+        )
+        path = folder / "given.toml"
+        path.write_text(text)
+        sim.start_phone(phone_port)
+        child = subprocess.run(
+            [sys.executable, str(HARNESS), str(folder), str(path), fault,
+             phase],
+            capture_output=True, text=True, timeout=90, check=False,
+        )  # fmt: skip
+        first = child.returncode
+        expected = {
+            "sigint": (4, 0),  # 0: in the last phase there is nothing left to pause
+            "sigint_twice": (130, 0),
+            "sigterm": (143,),
+            "sigkill": (-9,),
+            "full_disk": (3,),
+        }[fault]
+        assert first in expected, (first, child.stdout, child.stderr)
+        check_invariants(folder, sim, alive=fault != "sigkill", deaf=False)
+        config = parse_config(text)
+        code, resumes, said = first, 0, []
+        while code != 0 and resumes < MAX_RESUMES:
+            resumes += 1
+            code = session(config, folder, sim, said, on_imu_port=lambda port: None)
+            check_invariants(folder, sim, alive=True, deaf=False)
+    assert code == 0, said[-12:]
+    worst = float(np.abs(calibration(folder) - truth).max())
+    assert worst < 1e-6, f"resumed to another calibration: {worst}"
+    found = re.findall(r"^(?:fault|stopped|paused): .*", child.stdout, re.M)
+    return Outcome(fault, phase, first, resumes, found[-1] if found else "", worst)
+
+
+def cells() -> list[tuple[str, str]]:
+    """Every fault with every phase."""
+    simulated = [(fault, phase) for fault in FAULTS for phase in PHASES]
+    host = [(fault, p) for fault in HOST_FAULTS for p in (*PHASES, "finishing")]
+    return simulated + host
+
+
+def table(outcomes: list[Outcome]) -> str:
+    """The published page."""
+    counts: dict[str, int] = {}
+    for outcome in outcomes:
+        counts[outcome.word] = counts.get(outcome.word, 0) + 1
+    worst = max(outcome.worst for outcome in outcomes)
+    counted = ", ".join(f"{count} {word}" for word, count in sorted(counts.items()))
+    lines = [
+        "# Fault matrix",
+        "",
+        "Written by `python tests/rig/fault_matrix.py docs/fault_matrix.md`; the slow "
+        "test `tests/rig/test_rig_faults.py` runs the same cells.",
+        "",
+        f"**{len(outcomes)} of {len(outcomes)} cells hold**: {counted}. Largest "
+        "difference of any element of A or b between a run that was spoilt and resumed "
+        f"and one that was not: {worst:.1e}.",
+        "",
+        "A cell begins a fault when the session enters the phase (after two recorded "
+        "postures, so that there is something to lose), lets it act until the session "
+        "ends, repairs it, and resumes. It holds when: the drives were commanded to "
+        "stop while the process lived, and stand; every line of the journal reads; the "
+        "drives ran no move twice and none that was not journalled (the simulator "
+        "counts); no posture is recorded twice or missing; the resumed calibration is "
+        "that of the uninterrupted run. *Ridden out* means the first session reached "
+        "the same calibration by itself. Faults without a count last until the session "
+        "ends.",
+        "",
+        "| fault | " + " | ".join((*PHASES, "finishing")) + " |",
+        "|---" * (len(PHASES) + 2) + "|",
+    ]
+    by_cell = {(o.fault, o.phase): o for o in outcomes}
+    for fault in (*FAULTS, *HOST_FAULTS):
+        row = []
+        for phase in (*PHASES, "finishing"):
+            found = by_cell.get((fault, phase))
+            row.append("" if found is None else f"{found.word} ({found.first_code})")
+        lines.append(f"| `{fault}` | " + " | ".join(row) + " |")
+    lines += ["", "In brackets the exit code of the first session.", "",
+              "## What stopped each", ""]  # fmt: skip
+    for fault in (*FAULTS, *HOST_FAULTS):
+        reasons = {
+            o.reason.partition(": ")[2] for o in outcomes if o.fault == fault
+        } - {""}
+        if reasons:
+            lines.append(f"- `{fault}`: {sorted(reasons, key=len)[0]}")
+    return "\n".join(lines) + "\n"
+
+
+def main(target: str, *only: str) -> int:
+    begun = time.monotonic()
+    outcomes, broken = [], 0
+    with tempfile.TemporaryDirectory() as scratch:
+        base = pathlib.Path(scratch)
+        truth = uninterrupted(base / "uninterrupted")
+        chosen = [c for c in cells() if not only or c[0].partition(",")[0] in only]
+        for number, (fault, phase) in enumerate(chosen):
+            try:
+                outcome = run_cell(fault, phase, truth, base / f"cell{number}")
+            except AssertionError as error:
+                broken += 1
+                print(f"BROKEN {fault} @ {phase}: {error}", flush=True)
+                continue
+            outcomes.append(outcome)
+            print(
+                f"{number + 1}/{len(chosen)} {fault} @ {phase}: {outcome.word} "
+                f"({outcome.first_code}), {outcome.resumes} resumes; {outcome.reason}",
+                flush=True,
+            )
+    print(f"{len(outcomes)} hold, {broken} broken, {time.monotonic() - begun:.0f} s")
+    if not broken and target != "-":
+        pathlib.Path(target).write_text(table(outcomes))
+    return 1 if broken else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

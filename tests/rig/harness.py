@@ -1,0 +1,117 @@
+"""A fast simulated rig and the means to run, spoil, kill and resume sessions on it.
+
+Also a program: ``python harness.py FOLDER CONFIG FAULT PHASE`` is one session that does
+something to itself when it enters a phase; the simulator lives in the parent.
+"""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import resource
+import signal
+import sys
+import time
+
+from rig.calibrate import calibrate
+from rig.config import EXAMPLES, parse_config
+from rig.session import Run, run_safely
+from rig.settings import RigConfig
+from rig.simulator import Simulator, Truth
+
+RATE_HZ = 250.0
+HOST_FAULTS = ("sigint", "sigint_twice", "sigterm", "sigkill", "full_disk")
+FAST = {
+    "speed_deg_s = 120": "speed_deg_s = 400",
+    "accel_deg_s2 = 1200": "accel_deg_s2 = 8000",
+    "timeout_s = 0.2": "timeout_s = 0.08",
+    "column_count = 4": "column_count = 4\nstale_s = 0.25",
+    "poll_s = 0.01": "poll_s = 0.005\nstall_s = 0.3\ndeadline_slack_s = 1.0",
+    "window_s = 0.2": "window_s = 0.04",
+    "min_samples = 10": "min_samples = 5",
+    "samples = 25": "samples = 5",
+    "timeout_s = 5": "timeout_s = 1.2",
+}
+SESSION = '\n[session]\nmethod = "exact"\nverify_postures = 1\n'
+
+
+def fast_text(changes: dict[str, str] | None = None, session: str = SESSION) -> str:
+    """The shipped example with quick axes and a short settle window."""
+    text = (EXAMPLES / "simulate.toml").read_text()
+    for old, new in (FAST | (changes or {})).items():
+        assert old in text, old
+        text = text.replace(old, new)
+    return text + session
+
+
+def fast_config(changes: dict[str, str] | None = None) -> RigConfig:
+    return parse_config(fast_text(changes))
+
+
+def simulator(config: RigConfig, **options) -> Simulator:
+    """Noise-free, so that an interrupted run must give the very same calibration."""
+    noise = options.pop("noise_deg", 0.0)
+    options.setdefault("rate_hz", RATE_HZ)
+    return Simulator(config, Truth(noise_deg=noise), **options)
+
+
+def session(
+    config: RigConfig,
+    folder: pathlib.Path,
+    sim: Simulator | None = None,
+    said: list[str] | None = None,
+    listeners=(),
+    on_imu_port=None,
+) -> int:
+    """One session in this process; the same call again resumes it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    run = Run(
+        config,
+        folder,
+        "calibrate",
+        (said if said is not None else []).append,
+        start={"simulated": {"noise": 0.0}, "inputs": {}, "maps_from": "."},
+        reset_alarms=True,
+        on_imu_port=on_imu_port or (sim.start_phone if sim else None),
+    )
+    for listener in listeners:
+        run.phase_listeners.append(lambda phase, f=listener: f(run, phase))
+    return run_safely(run, calibrate)
+
+
+def in_the_middle(run: Run, phase: str) -> bool:
+    """Two postures are recorded, so there is something to lose."""
+    return phase == "zeroing" or len(run.journal.events("posture")) >= 2
+
+
+def _spoil(fault: str, journal: pathlib.Path) -> None:
+    if fault == "full_disk":
+        size = journal.stat().st_size + 20
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+        return
+    number = {"sigkill": signal.SIGKILL, "sigterm": signal.SIGTERM}.get(
+        fault, signal.SIGINT
+    )
+    os.kill(os.getpid(), number)
+    if fault == "sigint_twice":
+        time.sleep(0.01)
+        os.kill(os.getpid(), number)
+
+
+def _main(folder: str, config_path: str, fault: str, phase: str) -> int:
+    config = parse_config(pathlib.Path(config_path).read_text())
+    done = []
+
+    def listen(run: Run, entered: str) -> None:
+        if entered == phase and not done and in_the_middle(run, entered):
+            done.append(True)
+            _spoil(fault, pathlib.Path(folder) / "journal.jsonl")
+
+    said: list[str] = []
+    code = session(config, pathlib.Path(folder), None, said, [listen])
+    print("\n".join(said[-6:]))
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(_main(*sys.argv[1:]))
