@@ -1,0 +1,100 @@
+"""Checks of what a caller hands over; each error names the argument and the value."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = [
+    "axis_letter",
+    "axis_names",
+    "in_words",
+    "noise_levels",
+    "numbers",
+    "relative_weights",
+    "table",
+    "text",
+]
+
+Array = NDArray[np.float64]
+
+
+def in_words(values: Array) -> str:
+    return "(" + ", ".join(f"{value:.6g}" for value in np.atleast_1d(values)) + ")"
+
+
+def axis_letter(index: int, count: int) -> str:
+    return "xyz"[index] if count == 3 else str(index + 1)
+
+
+def numbers(name: str, values: ArrayLike, *, finite: bool = True) -> Array:
+    try:
+        given = np.asarray(values)
+        if given.dtype.kind not in "iufb":
+            given = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{name} must be an array of numbers, got {type(values).__name__}"
+        ) from error
+    array = given.astype(np.float64)
+    if finite and not np.isfinite(array).all():
+        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        raise ValueError(f"{name} must be finite, got {array[where]} at {where}")
+    return array
+
+
+def table(name: str, values: ArrayLike) -> Array:
+    table = numbers(name, values)
+    if table.ndim != 2 or table.shape[1] < 1:
+        raise ValueError(
+            f"{name} must have shape (N, {'n' if name == 'commands' else 'm'}), "
+            f"got {table.shape}"
+        )
+    return table
+
+
+def relative_weights(weights: ArrayLike | None, count: int) -> Array:
+    if weights is None:
+        return np.ones(count)
+    weight = numbers("weights", weights)
+    if weight.shape != (count,):
+        raise ValueError(f"weights must have shape ({count},), got {weight.shape}")
+    if (weight < 0.0).any():
+        where = int(np.flatnonzero(weight < 0.0)[0])
+        raise ValueError(
+            f"weights must not be negative, got {weight[where]} at {where}"
+        )
+    return weight
+
+
+def noise_levels(noise_std: ArrayLike | None, num_outputs: int) -> Array | None:
+    if noise_std is None:
+        return None
+    noise = numbers("noise_std", noise_std)
+    if noise.shape not in ((), (num_outputs,)):
+        raise ValueError(
+            f"noise_std must be one number or ({num_outputs},), got {noise.shape}"
+        )
+    noise = np.broadcast_to(noise, (num_outputs,)).copy()
+    if (noise <= 0.0).any():
+        raise ValueError(f"noise_std must be positive, got {noise[noise <= 0.0][0]}")
+    return noise
+
+
+def axis_names(
+    argument: str, names: Sequence[str] | None, letter: str, count: int
+) -> tuple[str, ...]:
+    if names is None:
+        return tuple(f"{letter}_{axis_letter(i, count)}" for i in range(count))
+    given = tuple(names)
+    if len(given) != count or not all(isinstance(name, str) and name for name in given):
+        raise ValueError(f"{argument} must hold {count} names, got {names!r}")
+    return given
+
+
+def text(argument: str, value: str) -> str:
+    if not isinstance(value, str):
+        raise ValueError(f"{argument} must be text, got {value!r}")
+    return value

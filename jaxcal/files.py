@@ -1,0 +1,92 @@
+"""Files that are either the old one or the whole new one, whatever happens between."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pathlib
+import secrets
+from collections.abc import Iterator
+from typing import IO
+
+__all__ = ["atomic_write", "require_writable_folder", "write_text"]
+
+
+@contextlib.contextmanager
+def atomic_write(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
+    """A binary file to fill; it takes the place of ``path`` when the block succeeds.
+
+    The bytes go to a new file in the same folder, reach the disk (fsync) and are then
+    renamed over ``path``. If the block raises or the process dies, ``path`` is what it
+    was.
+
+    Args:
+        path: the file to make or replace; its folder must exist.
+
+    Raises:
+        OSError: the folder is missing, not writable or full.
+    """
+    target = pathlib.Path(path).resolve()
+    if target.is_dir():
+        raise IsADirectoryError(f"{path} is a folder, not a file")
+    partial = target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial")
+    try:
+        descriptor = os.open(partial, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+    except FileNotFoundError:
+        raise FileNotFoundError(f"there is no folder {target.parent}") from None
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(target)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+    _sync_folder(target.parent)
+
+
+def _sync_folder(folder: pathlib.Path) -> None:
+    """Make the rename itself durable, where the file system lets a folder be synced."""
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        with contextlib.suppress(OSError):
+            os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write UTF-8 text atomically.
+
+    Raises:
+        OSError: the folder is missing, not writable or full; the old file stays.
+    """
+    with atomic_write(path) as file:
+        file.write(text.encode("utf-8"))
+
+
+def require_writable_folder(folder: str | os.PathLike[str]) -> None:
+    """Make sure files can be written to ``folder`` before work is spent on them.
+
+    A folder that does not exist is not made: its nearest existing ancestor is tried.
+
+    Raises:
+        OSError: it is a file, or nothing can be written there.
+    """
+    place = pathlib.Path(folder).resolve()
+    while not os.path.lexists(place) and place != place.parent:
+        place = place.parent
+    if not place.is_dir():
+        raise NotADirectoryError(f"{place} is not a folder")
+    probe = place / f".jaxcal.{secrets.token_hex(4)}.probe"
+    try:
+        probe.touch(exist_ok=False)
+        probe.unlink()
+    except OSError as error:
+        raise PermissionError(
+            f"cannot write in {place}: {error.strerror or error}"
+        ) from None
