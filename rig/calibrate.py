@@ -213,7 +213,16 @@ def _finish(
     first = fit(chosen, _reading_noise(chosen))
     zero = run.journal.events("zero")[0]
     limits = uncertainty(first, chosen, before + after, zero)
-    calibration = fit(chosen, float(limits["noise_std_deg"][0]) or 1e-9)
+    notes = {
+        "zero_pulses": list(run.zero_pulses or ()),
+        "fingerprint": run.config.fingerprint(),
+        "mechanism_order": run.config.mechanism_order,
+        "postures": [r["name"] for r in chosen],
+        "noise_from": limits["basis"],
+        "run": run.folder.name,
+    }
+    noise = max(1e-9, float(np.mean(limits["noise_std_deg"])))
+    calibration = fit(chosen, noise, notes)
     summary: dict[str, Any] = {
         "schema": 1,
         "mode": "calibrate",

@@ -169,7 +169,8 @@ def _imu(table: Table) -> ImuSettings:
     transport = table.choice("transport", ("listen", "connect"), "listen")
     if kind == "sensorlogger" and transport != "listen":
         table.fault("transport", "Sensor Logger pushes: the computer must listen")
-    columns = table.integers("columns", 3, 0, 200, (1, 2, 3) if hyper else (0, 1, 2))
+    # HyperIMU sends azimuth, pitch, roll, which turn about Z, X, Y; the order is ZYX.
+    columns = table.integers("columns", 3, 0, 200, (1, 3, 2) if hyper else (0, 1, 2))
     quaternion = table.integers("quaternion_columns", 4, 0, 200, ())
     stamp = table.integer("stamp_column", -1, 200, 0 if hyper else -1)
     count = table.integer("column_count", 0, 200, 0)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from rig.attitude import ORDERS, Array, Frame
-from rig.settings import RigConfig
+from rig.settings import AXIS_NAMES, RigConfig
 
 __all__ = ["errors", "fit", "order_residuals", "pairs", "uncertainty"]
 
@@ -19,19 +19,31 @@ def pairs(records: list[dict[str, Any]]) -> tuple[Array, Array]:
     return commands.reshape(-1, 3), measured.reshape(-1, 3)
 
 
-def fit(records: list[dict[str, Any]], noise_std: Array | float | None = None) -> Any:
+def fit(
+    records: list[dict[str, Any]],
+    noise_std: float,
+    notes: dict[str, Any] | None = None,
+) -> Any:
     """``jaxcal.identify`` on posture records.
 
     Args:
         records: chosen postures.
-        noise_std: degrees, of one recorded mean; None where the residual tells.
+        noise_std: degrees, of one recorded mean.
+        notes: stored in the calibration's file.
     """
     import jaxcal
 
     commands, measured = pairs(records)
-    if noise_std is None or len(records) > 4:
-        return jaxcal.identify(commands, measured)
-    return jaxcal.identify(commands, measured, noise_std=noise_std)
+    return jaxcal.identify(
+        commands,
+        measured,
+        noise_std=noise_std,
+        input_names=AXIS_NAMES,
+        output_names=AXIS_NAMES,
+        command_unit="deg",
+        measured_unit="deg",
+        notes=notes,
+    )
 
 
 def uncertainty(

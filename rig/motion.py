@@ -175,7 +175,7 @@ class Motion:
         faults = outside(self.config, target)
         if faults:
             raise LimitError("; ".join(faults))
-        starts = [drive.status() for drive in self.drives]
+        starts = [self._status(drive) for drive in self.drives]
         begun = time.monotonic()
         deadline = begun + self._deadline_s([s.position for s in starts], target)
         self.heartbeat.feed(moving=True)
@@ -205,6 +205,7 @@ class Motion:
                 raise Unreachable(
                     f"{drive.axis.name} refused {pulses}: {error}"
                 ) from None
+            self._status(drive)  # an alarm says more than a refusal
             raise
 
     def _deadline_s(self, starts: list[int], target: tuple[int, int, int]) -> float:

@@ -82,12 +82,10 @@ def load_calibration(path: pathlib.Path, config: RigConfig) -> tuple[Any, Any]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise Refused(f"{path}: not a calibration: {error}") from None
     zero = None
-    try:
-        summary = json.loads((path.parent / "summary.json").read_text())
-        a, b, c = (int(value) for value in summary["zero_pulses"])
+    notes = calibration.provenance.get("notes", {})
+    if "zero_pulses" in notes:
+        a, b, c = (int(value) for value in notes["zero_pulses"])
         zero = (a, b, c)
-    except (OSError, ValueError, KeyError, TypeError):
-        pass  # a calibration from elsewhere: the zero is taken where the device stands
     return calibration, zero
 
 

@@ -172,7 +172,7 @@ def draw_held_out(
             break
         raw = config.to_pulses(rng.uniform(low, high))
         desired = config.to_deg(raw)
-        command = np.asarray(calibration.command_for(desired), dtype=np.float64)
+        command = calibration.command_for(desired)
         if (command >= low).all() and (command <= high).all():
             pairs.append((raw, config.to_pulses(command)))
     return pairs

@@ -1,0 +1,189 @@
+"""Configuration and maps: every fault at once, and all that ships is valid."""
+
+import dataclasses
+import tomllib
+
+import pytest
+
+from rig.config import EXAMPLES, ConfigError, load_config, parse_config
+from rig.registers import (
+    MAP_FOLDER,
+    MapError,
+    available_maps,
+    decode,
+    encode,
+    load_map,
+    parse_map,
+)
+from rig.units import Scale
+
+EXAMPLE_TEXT = (EXAMPLES / "simulate.toml").read_text()
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda p: p.stem)
+def test_every_example_is_valid(path):
+    assert load_config(path).fingerprint()
+
+
+@pytest.mark.parametrize("name", available_maps())
+def test_every_map_that_ships_keeps_the_schema(name):
+    loaded = load_map(name)
+    assert loaded.name == name
+    assert loaded.stop and loaded.move
+    written = {f.address + i for f in loaded.move for i in range(f.count)}
+    assert loaded.trigger[0] in written
+    names = {w[0] for f in loaded.move for w in f.words if not isinstance(w, int)}
+    assert {"position", "speed", "accel"} <= names
+
+
+def test_there_is_an_example_for_every_map():
+    assert set(available_maps()) <= {path.stem for path in EXAMPLES.glob("*.toml")}
+
+
+def test_every_fault_of_a_configuration_is_listed_at_once():
+    text = EXAMPLE_TEXT.replace("unit = 2", "unit = 1")
+    text = text.replace("reduction = 10\n", "reduction = -10\n", 1)
+    text = text.replace('order = "ZXY"', 'order = "ZXZ"')
+    text = text.replace("window_s = 0.2", "window_s = nan")
+    text = text.replace("port = 2055", "prot = 2055")
+    with pytest.raises(ConfigError) as caught:
+        parse_config(text)
+    faults = "\n".join(caught.value.faults)
+    for part in (
+        "axes.pitch.reduction",
+        "unit must differ",
+        "mechanism.order",
+        "settle.window_s",
+        "imu.port: missing",
+        "imu.prot: unknown key",
+    ):
+        assert part in faults
+    assert len(caught.value.faults) == 6
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "part"),
+    [
+        ("max_deg = 20", "max_deg = -30", "under max_deg"),
+        ('map = "leadshine_pr"', 'map = "nobody"', "no register map"),
+        ("pulses_per_rev = 10000", "pulses_per_rev = 10", "coarser than"),
+        ("min_deg = -20", "min_deg = -20\nmin_pulses = -100", "outside min_pulses"),
+        ("speed_deg_s = 120", "speed_deg_s = 0", "speed_deg_s"),
+        ("speed_deg_s = 120", "comm_timeout_s = 1\nspeed_deg_s = 120", "no register"),
+        ("direction = -1", "direction = 0", "must be 1 or -1"),
+        ("timeout_s = 5", "timeout_s = 0.1", "longer than window_s"),
+        ('transport = "tcp"', 'transport = "udp"', "one of tcp"),
+        ("column_count = 4", "column_count = 2", "too few"),
+        ("unit = 3", 'unit = "three"', "whole number"),
+        ("poll_s = 0.01", "approach_overshoot_deg = 19\nmax_step_deg = -1", "max_step"),
+        ("speed_deg_s = 120", "speed_deg_s = 4e3\naccel_deg_s2 = 1", "does not fit"),
+    ],
+)
+def test_a_wrong_value_is_named(old, new, part):
+    text = EXAMPLE_TEXT.replace(old, new, 1)
+    if "accel_deg_s2 = 1" in new:
+        text = text.replace("accel_deg_s2 = 1200\n", "", 1)
+        text = text.replace("reduction = 10\n", "reduction = 1e4\n", 1)
+        text = text.replace("pulses_per_rev = 10000", "pulses_per_rev = 1000", 1)
+    with pytest.raises(ConfigError, match=part):
+        parse_config(text)
+
+
+def test_a_session_range_outside_the_limits_is_refused():
+    text = EXAMPLE_TEXT + "\n[session]\npitch_range_deg = [-25, 10]\nk = 60\n"
+    with pytest.raises(ConfigError) as caught:
+        parse_config(text)
+    assert any("pitch_range_deg" in fault for fault in caught.value.faults)
+    assert any("session.k" in fault for fault in caught.value.faults)
+
+
+def test_an_overshoot_shrinks_the_default_ranges_and_binds_given_ones():
+    text = EXAMPLE_TEXT.replace("[motion]", "[motion]\napproach_overshoot_deg = 2")
+    assert parse_config(text).session.ranges[0] == (-18.0, 20.0)
+    with pytest.raises(ConfigError, match="overshoot"):
+        parse_config(text + "\n[session]\nyaw_range_deg = [-20, 20]\n")
+
+
+@pytest.mark.parametrize(
+    "text", ["[bus", "", "axes = 3", "bus = 1\nimu = 2\naxes = [1]"]
+)
+def test_nonsense_is_one_clear_error(text):
+    with pytest.raises(ConfigError):
+        parse_config(text)
+
+
+def test_fingerprint_changes_with_what_measures_and_not_with_where_it_is_plugged():
+    config = parse_config(EXAMPLE_TEXT)
+    moved = parse_config(EXAMPLE_TEXT.replace("port = 5020", "port = 5021"))
+    assert moved.fingerprint() == config.fingerprint()
+    for old, new in (
+        ("reduction = 10", "reduction = 11"),
+        ('order = "ZXY"', 'order = "ZYX"'),
+        ("samples = 25", "samples = 26"),
+        ('map = "leadshine_pr"', 'map = "generic"'),
+    ):
+        changed = parse_config(EXAMPLE_TEXT.replace(old, new, 1))
+        assert changed.fingerprint() != config.fingerprint()
+
+
+def test_pulses_are_rounded_first_and_the_angle_follows_from_them():
+    scale = Scale(pulses_per_rev=1000, reduction=7.5, direction=-1)
+    pulses = scale.to_pulses(10.01)
+    assert pulses == round(-1000 * 7.5 * 10.01 / 360)
+    assert scale.rounded_deg(10.01) == pytest.approx(360 * -pulses / (1000 * 7.5))
+    assert scale.to_pulses(scale.rounded_deg(10.01)) == pulses
+
+
+@pytest.mark.parametrize("order", ["big", "little"])
+@pytest.mark.parametrize("kind", ["u16", "i16", "u32", "i32"])
+def test_values_survive_registers(kind, order):
+    low = {"u16": 0, "u32": 0, "i16": -(2**15), "i32": -(2**31)}[kind]
+    high = {"u16": 2**16, "u32": 2**32, "i16": 2**15, "i32": 2**31}[kind] - 1
+    for value in (low, high, 0, 1, low + 1, high - 1, 12345):
+        assert decode(encode(value, kind, order), kind, order) == value
+    for value in (low - 1, high + 1):
+        with pytest.raises(ValueError, match="does not fit"):
+            encode(value, kind, order)
+
+
+def test_word_order_of_a_pair_is_the_makers():
+    assert encode(-70001, "i32", "big") == [0xFFFE, 0xEE8F]
+    assert encode(-70001, "i32", "little") == [0xEE8F, 0xFFFE]
+    assert encode(-1000, "i32", "big") == [0xFFFF, 0xFC18]  # Oriental Motor FAQ 0331
+
+
+def test_every_fault_of_a_map_is_listed_at_once():
+    data = tomllib.loads((MAP_FOLDER / "generic.toml").read_text())
+    data["word_order"] = "middle"
+    data["position"]["address"] = 70000
+    data["move"]["write"][0]["words"][0] = "positon:i32"
+    data["status"]["done"] = {"set": [99]}
+    data["colour"] = "red"
+    with pytest.raises(MapError) as caught:
+        parse_map(data, "broken.toml")
+    text = str(caught.value)
+    for part in ("word_order", "position.address", "positon", "status.done", "colour"):
+        assert part in text
+
+
+def test_the_trigger_must_be_written_last():
+    data = tomllib.loads((MAP_FOLDER / "generic.toml").read_text())
+    data["move"]["write"].reverse()
+    with pytest.raises(MapError, match="last word of the last frame"):
+        parse_map(data, "broken.toml")
+
+
+def test_a_map_beside_the_configuration_needs_no_code(tmp_path):
+    text = (MAP_FOLDER / "generic.toml").read_text().replace("0x0012", "0x0112")
+    (tmp_path / "mine.toml").write_text(text.replace('"generic"', '"mine"'))
+    (tmp_path / "rig.toml").write_text(
+        EXAMPLE_TEXT.replace('map = "leadshine_pr"', 'map = "mine.toml"')
+    )
+    config = load_config(tmp_path / "rig.toml")
+    assert {axis.map.position.address for axis in config.axes} == {0x112}
+
+
+def test_configuration_is_frozen():
+    config = parse_config(EXAMPLE_TEXT)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        config.mechanism_order = "XYZ"

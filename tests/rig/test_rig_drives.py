@@ -1,0 +1,361 @@
+"""Drives: the makers' published frames, three transports, retries, and other stacks."""
+
+import asyncio
+import dataclasses
+import itertools
+import pathlib
+import socket
+import struct
+import threading
+import time
+
+import pytest
+from harness import fast_config, simulator
+
+from rig.drives import Bus, BusError, Drive, Rejected, motion_counts
+from rig.registers import load_map
+from rig.settings import BusSettings
+from rig.simulator import parse_fault
+from rig.simulator.server import crc16
+from rig.stop import stop_all
+
+
+class Recorder:
+    """A TCP peer that keeps what it is sent and answers from a script."""
+
+    def __init__(self, answer):
+        self.received = b""
+        self._answer = answer
+        self._listener = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listener.getsockname()[1]
+        self._connections = []
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def _run(self):
+        while True:
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:
+                return
+            self._connections.append(connection)
+            threading.Thread(
+                target=self._serve, args=(connection,), daemon=True
+            ).start()
+
+    def _serve(self, connection):
+        try:
+            while data := connection.recv(4096):
+                self.received += data
+                reply = self._answer(data)
+                if reply:
+                    connection.sendall(reply)
+        except OSError:
+            return
+
+    def close(self):
+        self._listener.close()
+        for connection in self._connections:
+            connection.close()
+
+
+@pytest.fixture
+def recorder():
+    made = []
+
+    def make(answer):
+        made.append(Recorder(answer))
+        return made[-1]
+
+    yield make
+    for peer in made:
+        peer.close()
+
+
+def rtu_over_tcp(port, retries=2):
+    return BusSettings(
+        "rtu_tcp", "127.0.0.1", port, timeout_s=0.1, read_retries=retries
+    )
+
+
+def echo_write(frame):
+    """The RTU reply to a write of many registers."""
+    head = frame[:6]
+    return head + crc16(head)
+
+
+def axis_with(name, **changes):
+    axis = fast_config().axes[0]
+    return dataclasses.replace(axis, map=load_map(name), unit=7, **changes)
+
+
+def test_crc_is_the_standards():
+    assert crc16(bytes.fromhex("010300000001")) == bytes.fromhex("840a")
+
+
+def test_leadshine_move_is_the_frame_printed_in_the_makers_manual(recorder):
+    """CS2RS manual, page 43: absolute move to 10000, both ramps 10000 ms."""
+    manual = bytes.fromhex("07106200000810000100002710000027102710000000108D50")
+    assert crc16(manual[:-2]) == manual[-2:]
+    peer = recorder(echo_write)
+    with Bus(rtu_over_tcp(peer.port)) as bus:
+        words = list(struct.unpack(">8H", manual[7:23]))
+        bus.write(7, 0x6200, 16, words)
+        assert peer.received == manual
+        peer.received = b""
+        drive = Drive(bus, axis_with("leadshine_pr", max_pulses=20000))
+        drive.move(10000)
+    frame = peer.received
+    assert frame[:7] == manual[:7] and len(frame) == len(manual)
+    assert frame[7:13] == manual[7:13]  # absolute, 10000, high word first
+    assert frame[-4:-2] == bytes.fromhex("0010")  # run PR path 0 at once
+    assert crc16(frame[:-2]) == frame[-2:]
+    assert peer.received.count(frame) == 1
+
+
+def test_oriental_move_is_one_frame_of_sixteen_registers(recorder):
+    peer = recorder(echo_write)
+    with Bus(rtu_over_tcp(peer.port)) as bus:
+        Drive(bus, axis_with("oriental_az")).move(-1000)
+    frame = peer.received
+    assert frame[:7] == bytes([7, 16, 0x00, 0x58, 0, 16, 32])
+    words = struct.unpack(">16H", frame[7:39])
+    assert words[:4] == (0, 0, 0, 1)  # data 0, type 1: absolute
+    assert words[4:6] == (0xFFFF, 0xFC18)  # -1000, high word first
+    assert words[12:] == (0, 1000, 0, 1)  # full current; start
+
+
+def test_applied_motion_sends_its_parameters_then_the_opcode(recorder):
+    def answer(frame):
+        return echo_write(frame) if frame[1] == 16 else frame
+
+    peer = recorder(answer)
+    with Bus(rtu_over_tcp(peer.port)) as bus:
+        Drive(bus, axis_with("applied_motion")).move(4321)
+    first, second = peer.received[:-8], peer.received[-8:]
+    assert first[:7] == bytes([7, 16, 0, 27, 0, 5, 10])
+    assert first[13:17] == struct.pack(">i", 4321)
+    assert second[:6] == bytes([7, 6, 0, 124, 0, 0x67])
+
+
+def test_speed_and_ramp_arrive_in_the_makers_units():
+    axis = axis_with("leadshine_pr", speed_deg_s=36.0, accel_deg_s2=360.0)
+    # reduction 10: 36 deg/s is 1 rev/s = 60 rpm; 360 deg/s^2 is 10 rev/s^2, so
+    # 1000 rpm takes 1000 / 600 s = 1667 ms.
+    assert motion_counts(axis, 36.0) == {"speed": 60, "accel": 1667, "decel": 1667}
+    axis = dataclasses.replace(axis, map=load_map("applied_motion"))
+    assert motion_counts(axis, 36.0) == {"speed": 240, "accel": 60, "decel": 60}
+    axis = dataclasses.replace(axis, map=load_map("oriental_az"))
+    assert motion_counts(axis, 36.0)["speed"] == 10000
+
+
+@pytest.mark.parametrize("transport", ["tcp", "rtu_tcp", "rtu"])
+def test_three_drives_move_on_every_transport(transport):
+    if transport == "rtu":
+        pytest.importorskip("serial", reason="serial ports need pyserial")
+    config = fast_config()
+    with simulator(config, transport=transport) as sim:
+        with Bus(sim.start().bus) as bus:
+            drives = [Drive(bus, axis) for axis in config.axes]
+            for drive, target in zip(drives, (1000, -2000, 555), strict=True):
+                drive.move(target)
+            end = time.monotonic() + 10
+            while not all(drive.status().done for drive in drives):
+                assert time.monotonic() < end
+            assert [d.status().position for d in drives] == [1000, -2000, 555]
+        assert sim.executions() == [[1000], [-2000], [555]]
+
+
+def test_a_target_outside_the_limits_never_reaches_the_bus():
+    config = fast_config()
+    with simulator(config) as sim, Bus(sim.start().bus) as bus:
+        drive = Drive(bus, config.axes[0])
+        for pulses in (config.axes[0].max_pulses + 1, config.axes[0].min_pulses - 1):
+            with pytest.raises(ValueError, match="leave the limits"):
+                drive.move(pulses)
+        assert sim.server.requests == 0
+
+
+@pytest.mark.parametrize(
+    "fault", ["lost_reply", "lost_request", "noise_bytes", "exception_reply"]
+)
+def test_reads_are_retried(fault):
+    config = fast_config()
+    with simulator(config) as sim, Bus(sim.start().bus) as bus:
+        drive = Drive(bus, config.axes[0])
+        sim.faults.add(parse_fault(f"{fault},count=2"))
+        assert drive.status().position == round(sim.drives[0].position)
+        sim.faults.add(parse_fault(fault))
+        with pytest.raises(BusError):
+            drive.status()
+
+
+@pytest.mark.parametrize("transport", ["tcp", "rtu_tcp"])
+def test_a_move_whose_reply_is_lost_is_executed_once_and_reported(transport):
+    config = fast_config()
+    with (
+        simulator(config, transport=transport) as sim,
+        Bus(sim.start().bus) as bus,
+    ):
+        sim.faults.add(parse_fault("lost_write_reply,count=1"))
+        with pytest.raises(BusError):
+            Drive(bus, config.axes[0]).move(1234)
+        assert sim.executions()[0] == [1234]
+
+
+def test_exception_replies_are_errors_with_their_name():
+    config = fast_config()
+    with simulator(config, travel_deg=(-5, 5)) as sim, Bus(sim.start().bus) as bus:
+        with pytest.raises(Rejected, match="illegal value") as caught:
+            Drive(bus, config.axes[0]).move(5000)
+        assert caught.value.code == 3
+        with pytest.raises(Rejected, match="illegal address"):
+            bus.read_words(1, 0x7777, 1)
+
+
+def test_a_late_reply_is_never_taken_for_the_next_one(recorder):
+    """A peer that always answers one request late."""
+    pending = []
+
+    def answer(frame):
+        value = struct.unpack(">H", frame[2:4])[0]
+        body = frame[:2] + b"\x02" + struct.pack(">H", value)
+        pending.append(body + crc16(body))
+        if len(pending) == 1:
+            time.sleep(0.15)  # beyond the time-out
+        return pending[-1]
+
+    peer = recorder(answer)
+    with Bus(rtu_over_tcp(peer.port)) as bus:
+        for address in (11, 22, 33, 44):
+            assert bus.read_words(1, address, 1) == [address]
+
+
+def test_replies_of_another_unit_function_or_length_are_refused(recorder):
+    script = {
+        1: lambda f: bytes([9, 3, 2, 0, 1]),
+        2: lambda f: bytes([1, 4, 2, 0, 1]),
+        3: lambda f: bytes([1, 3, 4, 0, 1, 0, 2]),
+    }
+    for build in script.values():
+
+        def answer(frame, build=build):
+            body = build(frame)
+            return body + crc16(body)
+
+        peer = recorder(answer)
+        with Bus(rtu_over_tcp(peer.port, retries=0)) as bus:
+            with pytest.raises(BusError):
+                bus.read_words(1, 0, 1)
+
+
+def test_silence_between_frames_is_kept(recorder):
+    times = []
+
+    def answer(frame):
+        times.append(time.monotonic())
+        body = frame[:2] + b"\x02\x00\x01"
+        return body + crc16(body)
+
+    peer = recorder(answer)
+    with Bus(rtu_over_tcp(peer.port), silence_s=0.03) as bus:
+        for _ in range(4):
+            bus.read_words(1, 0, 1)
+    gaps = [b - a for a, b in itertools.pairwise(times)]
+    assert min(gaps) >= 0.03
+
+
+def test_a_closed_port_is_one_clear_error():
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    with pytest.raises(BusError, match="cannot open"):
+        Bus(rtu_over_tcp(port)).open()
+    with pytest.raises(BusError, match="cannot open"):
+        Bus(BusSettings("rtu", device="/dev/does-not-exist")).open()
+
+
+def test_a_serial_port_in_use_says_so():
+    pytest.importorskip("serial", reason="serial ports need pyserial")
+    with simulator(fast_config(), transport="rtu") as sim:
+        settings = sim.start().bus
+        with Bus(settings), pytest.raises(BusError, match="held by another"):
+            Bus(settings).open()
+
+
+def test_identify_only_reads():
+    config = fast_config()
+    with simulator(config) as sim, Bus(sim.start().bus) as bus:
+        frames = []
+        bus.on_frame = lambda event, fields: frames.append(event)
+        for axis in config.axes:
+            drive = Drive(bus, axis)
+            drive.status(), drive.alarm()
+            assert drive.identity()["pulses_per_rev"] == 10000
+        assert frames == []
+
+
+def test_stop_reaches_the_others_when_one_unit_is_dead():
+    config = fast_config()
+    with simulator(config) as sim, Bus(sim.start().bus) as bus:
+        drives = [Drive(bus, axis) for axis in config.axes]
+        for drive in drives:
+            drive.move(5000 if drive.axis.name != "yaw" else -5000)
+        sim.faults.add(parse_fault("dead_drive,axis=yaw"))
+        pitch, yaw, roll = stop_all(drives, verify_s=1.0)
+        assert pitch.acknowledged and pitch.standing
+        assert roll.acknowledged and roll.standing
+        assert not yaw.acknowledged and not yaw.standing and yaw.detail
+        assert not sim.drives[0].moving and sim.drives[0].position != 5000
+
+
+def test_against_pymodbus_own_server_on_tcp():
+    """A second stack at the other end: registers stored there read back the same."""
+    from pymodbus.server import ModbusTcpServer
+    from pymodbus.simulator import DataType, SimData, SimDevice
+
+    ready, ports = threading.Event(), []
+    stop = []
+
+    def serve():
+        async def run():
+            device = SimDevice(
+                1,
+                simdata=[SimData(0, count=200, values=0, datatype=DataType.REGISTERS)],
+            )
+            server = ModbusTcpServer([device], address=("127.0.0.1", 0))
+            await server.serve_forever(background=True)
+            ports.append(server.transport.sockets[0].getsockname()[1])
+            done = asyncio.Event()
+            stop.append((asyncio.get_running_loop(), done))
+            ready.set()
+            await done.wait()
+            await server.shutdown()
+
+        asyncio.run(run())
+
+    thread = threading.Thread(target=serve, daemon=True)
+    thread.start()
+    assert ready.wait(10)
+    try:
+        settings = BusSettings("tcp", "127.0.0.1", ports[0], timeout_s=1.0)
+        axis = dataclasses.replace(axis_with("generic"), unit=1)
+        with Bus(settings) as bus:
+            bus.write(1, 10, 16, [0xFFFE, 0xEE8F, 3])
+            assert bus.read_words(1, 10, 3) == [0xFFFE, 0xEE8F, 3]
+            bus.write(1, 20, 6, [77])
+            assert bus.read_words(1, 20, 1) == [77]
+            Drive(bus, axis).move(-321)
+            assert bus.read_words(1, 0x20, 2) == [0xFFFF, 0x10000 - 321]
+            assert bus.read_words(1, 0x28, 1) == [1]
+    finally:
+        loop, done = stop[0]
+        loop.call_soon_threadsafe(done.set)
+        thread.join(5)
+
+
+def test_only_one_file_opens_a_drive_port():
+    import rig.drives
+
+    folder = pathlib.Path(rig.drives.__file__).parent
+    for path in folder.glob("*.py"):
+        if path.name not in ("drives.py",):
+            assert "pymodbus" not in path.read_text(), path.name

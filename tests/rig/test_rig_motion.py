@@ -1,0 +1,291 @@
+"""Motion: arming, limits, splitting, settling, and what stops it."""
+
+import contextlib
+import dataclasses
+import signal
+import threading
+import time
+
+import numpy as np
+import pytest
+from harness import fast_config, fast_text, simulator
+
+from rig.config import parse_config
+from rig.drives import Bus
+from rig.imu import Imu
+from rig.limits import LimitError, approach_point, check_plan
+from rig.motion import Motion, MotionFault, Unreachable
+from rig.simulator import parse_fault
+from rig.stop import PauseRequested, Signals, Stopper, StopRequested
+
+
+@contextlib.contextmanager
+def bench(config=None, arm=True, **options):
+    """Motion on a simulated rig; ``events`` is what it logged."""
+    config = config or fast_config()
+    with simulator(config, **options) as sim:
+        served = sim.start()
+        events = []
+        with Imu(served.imu) as imu, Bus(served.bus) as bus:
+            sim.start_phone(imu.port)
+            imu.wait_for_stream(5)
+            motion = Motion(
+                served, bus, imu, Signals(), Stopper([]),
+                lambda event, **fields: events.append((event, fields)),
+                lambda phase: sim.enter(phase),
+            )  # fmt: skip
+            motion.sim, motion.events = sim, events
+            if arm:
+                motion.arm()
+            try:
+                yield motion
+            finally:
+                motion.heartbeat.close()
+
+
+def test_nothing_moves_before_arming():
+    with bench(arm=False) as motion:
+        with pytest.raises(MotionFault, match="not armed"):
+            motion.move_to((100, 100, 100), "x")
+        assert motion.sim.executions() == [[], [], []]
+
+
+def test_an_alarm_or_a_silent_phone_keeps_it_from_arming():
+    with bench(arm=False) as motion:
+        motion.sim.drives[1].raise_alarm(0x40)
+        with pytest.raises(MotionFault, match="yaw is in alarm: alarm 0x40"):
+            motion.arm()
+        motion.arm(reset_alarms=True)
+        assert motion.armed
+    with bench(arm=False) as motion:
+        motion.sim.faults.add(parse_fault("imu_gap"))
+        time.sleep(motion.config.imu.stale_s + 0.1)
+        with pytest.raises(MotionFault, match="reading is"):
+            motion.arm()
+
+
+def test_a_position_outside_the_limits_keeps_it_from_arming():
+    with bench(arm=False) as motion:
+        drive = motion.sim.drives[2]
+        drive.position = motion.config.axes[2].max_pulses + 500.0
+        with pytest.raises(MotionFault, match="outside its limits"):
+            motion.arm()
+
+
+def test_the_whole_plan_is_checked_before_the_first_move():
+    config = fast_config()
+    inside, outside = config.to_pulses([5, 5, 5]), config.to_pulses([5, 5, 20.1])
+    check_plan(config, [inside])
+    with pytest.raises(LimitError, match="roll"):
+        check_plan(config, [inside, outside])
+
+
+def test_the_point_of_approach_is_checked_too():
+    text = fast_text({"[motion]": "[motion]\napproach_overshoot_deg = 3"})
+    config = parse_config(text)
+    check_plan(config, [config.to_pulses([-16.9, -16.9, -16.9])])
+    with pytest.raises(LimitError):
+        check_plan(config, [config.to_pulses([-17.5, 0, 0])])
+
+
+def test_a_target_outside_sends_nothing():
+    with bench() as motion:
+        with pytest.raises(LimitError):
+            motion.move_to((0, 0, 99999), "x")
+        assert motion.sim.executions() == [[], [], []]
+
+
+def test_long_moves_are_split_and_short_ones_are_not():
+    with bench() as motion:
+        start = motion.config.to_deg(motion.positions())
+        target = motion.config.to_pulses([18.0, -18.0, 18.0])
+        motion.move_to(target, "far")
+        way = np.abs(motion.config.to_deg(target) - start).max()
+        steps = int(np.ceil(way / motion.config.motion.max_step_deg))
+        assert [len(ran) for ran in motion.sim.executions()] == [steps] * 3
+        near = motion.config.to_pulses([17.0, -17.0, 17.0])
+        motion.move_to(near, "near")
+        assert [len(ran) for ran in motion.sim.executions()] == [steps + 1] * 3
+        assert motion.positions() == near
+
+
+def test_every_posture_is_approached_from_one_side():
+    text = fast_text({"[motion]": "[motion]\napproach_overshoot_deg = 2"})
+    with bench(parse_config(text)) as motion:
+        for goal in ([10, 10, 10], [-10, -10, -10]):
+            target = motion.config.to_pulses(goal)
+            motion.move_to(target, "x")
+            via = approach_point(motion.config, target)
+            for ran, last, before in zip(
+                motion.sim.executions(), target, via, strict=True
+            ):
+                assert ran[-2:] == [before, last]
+
+
+def test_backlash_becomes_pure_bias_when_approached_from_one_side():
+    changes = {"[motion]": "[motion]\napproach_overshoot_deg = 2"}
+    spread = {}
+    for name, text in (("plain", fast_text()), ("one side", fast_text(changes))):
+        config = parse_config(text)
+        with bench(config) as motion:
+            plant = motion.sim.plant
+            plant.truth = dataclasses.replace(plant.truth, backlash_deg=1.0)
+            seen = []
+            for start in (-15, 15):
+                motion.move_to(motion.config.to_pulses([start] * 3), "start")
+                motion.move_to(motion.config.to_pulses([0, 0, 0]), "zero")
+                with motion.sim.server.lock:
+                    seen.append(plant.joints())
+            spread[name] = np.abs(seen[1] - seen[0]).max()
+    assert spread["plain"] > 0.5
+    assert spread["one side"] < 0.01
+
+
+def test_settled_means_drives_done_and_imu_quiet():
+    with bench(noise_deg=0.01) as motion:
+        target = motion.config.to_pulses([5, 5, 5])
+        motion.move_to(target, "x")
+        measured = motion.measure(target)
+        assert measured.samples == motion.config.settle.samples
+        assert (measured.std <= motion.config.settle.std_deg).all()
+        assert measured.feedback == target
+
+
+def test_a_shaking_device_never_settles():
+    with bench(noise_deg=1.0) as motion:
+        with pytest.raises(MotionFault, match=r"did not settle.*deviation"):
+            motion.measure(motion.positions())
+
+
+def test_a_creeping_device_never_settles():
+    text = fast_text({"slope_deg_s = 0.5": "slope_deg_s = 0.05"})
+    with bench(parse_config(text)) as motion:
+        plant = motion.sim.plant
+        plant.truth = dataclasses.replace(plant.truth, drift_deg_per_min=60.0)
+        with pytest.raises(MotionFault, match=r"did not settle.*slope"):
+            motion.measure(motion.positions())
+
+
+@pytest.mark.parametrize(
+    ("fault", "error"),
+    [
+        ("stuck_axis,axis=yaw@moving", "yaw does not follow"),
+        ("alarm,axis=roll", "roll: alarm 0x30"),
+        ("imu_gap", "s old"),
+        ("dead_drive,axis=pitch", "no valid reply"),
+    ],
+)
+def test_trouble_on_the_way_is_noticed(fault, error):
+    with bench() as motion:
+        motion.sim.faults.add(parse_fault(fault.partition("@")[0]))
+        if fault == "imu_gap":
+            time.sleep(motion.config.imu.stale_s)
+        motion.sim.enter("moving")
+        with pytest.raises(Exception, match=error):
+            motion.move_to(motion.config.to_pulses([10, 10, 10]), "x")
+        results = motion.stopper.stop("test")
+        assert sum(result.acknowledged for result in results) >= 2
+        with pytest.raises(StopRequested):
+            motion.move_to((0, 0, 0), "after a fault")
+
+
+def test_a_missed_deadline_stops():
+    text = fast_text({"deadline_slack_s = 1.0": "deadline_slack_s = 0.05"})
+    with bench(parse_config(text), speedup=0.05) as motion:
+        with pytest.raises(MotionFault, match="deadline"):
+            motion.move_to(motion.config.to_pulses([10, 10, 10]), "x")
+
+
+def test_a_refused_target_is_out_of_reach_and_latches_nothing():
+    with bench(travel_deg=(-15, 15)) as motion:
+        with pytest.raises(Unreachable, match="refused"):
+            motion.move_to(motion.config.to_pulses([0, 19, 0]), "x")
+        motion.stopper.stop("out of reach", latch=False)
+        motion.move_to(motion.config.to_pulses([0, 5, 0]), "y")
+
+
+def test_signals_pause_first_and_stop_second():
+    signals = Signals()
+    with signals:
+        signals.armed = True
+        signal.raise_signal(signal.SIGINT)
+        signals.check_stop()
+        with pytest.raises(PauseRequested):
+            signals.check_pause()
+        signal.raise_signal(signal.SIGINT)
+        with pytest.raises(StopRequested) as caught:
+            signals.check_stop()
+        assert caught.value.exit_code == 130
+
+
+def test_an_unarmed_program_ends_at_once():
+    with Signals(), pytest.raises(StopRequested) as caught:
+        signal.raise_signal(signal.SIGTERM)
+    assert caught.value.exit_code == 143
+
+
+def test_sigterm_stops_a_move_under_way():
+    with bench(speedup=0.1) as motion, motion.signals as signals:
+        signals.armed = True
+
+        main = threading.main_thread().ident
+        send = threading.Timer(0.15, signal.pthread_kill, (main, signal.SIGTERM))
+        send.start()
+        with pytest.raises(StopRequested):
+            motion.move_to(motion.config.to_pulses([15, 15, 15]), "x")
+        assert all(r.standing for r in motion.stopper.stop("SIGTERM"))
+
+
+def test_a_lost_heartbeat_stops_the_drives():
+    text = fast_text({"[motion]": "[motion]\nheartbeat_s = 0.3"})
+    with bench(parse_config(text), speedup=0.02) as motion:
+        for drive, pulses in zip(
+            motion.drives, motion.config.to_pulses([15, 15, 15]), strict=True
+        ):
+            drive.move(pulses)
+        motion.heartbeat.feed(moving=True)  # and then the loop falls silent
+        end = time.monotonic() + 5
+        while not motion.stopper.latched:
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        assert "heartbeat" in motion.stopper.reason
+        end = time.monotonic() + 5
+        while not motion.stopper.results:
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        assert all(drive.stops for drive in motion.sim.drives)
+
+
+def test_a_drives_own_watch_stops_it_when_the_host_is_gone():
+    text = fast_text({'map = "leadshine_pr"': 'map = "generic"\ncomm_timeout_s = 0.4'})
+    with bench(parse_config(text), speedup=0.05) as motion:
+        motion.heartbeat.close()
+        target = motion.config.to_pulses([15, 15, 15])
+        for drive, pulses in zip(motion.drives, target, strict=True):
+            drive.move(pulses)
+        time.sleep(0.8)  # nothing is said on the bus
+        for sim, pulses in zip(motion.sim.drives, target, strict=True):
+            with motion.sim.server.lock:
+                sim.advance()
+                assert sim.comm_stops == 1 and not sim.moving
+                assert sim.position != pulses
+
+
+def test_the_keep_alive_keeps_that_watch_quiet_while_the_plan_computes():
+    text = fast_text({'map = "leadshine_pr"': 'map = "generic"\ncomm_timeout_s = 0.4'})
+    with bench(parse_config(text)) as motion:
+        before = motion.sim.server.requests
+        time.sleep(0.6)
+        assert motion.sim.server.requests > before
+
+
+def test_the_motion_and_stop_modules_never_load_jax():
+    import subprocess
+    import sys
+
+    program = (
+        "import sys, rig.motion, rig.stop, rig.drives, rig.imu, rig.session\n"
+        "heavy = {'jax', 'matplotlib', 'numba', 'flax'} & set(sys.modules)\n"
+        "sys.exit(f'loaded {heavy}' if heavy else 0)\n"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)

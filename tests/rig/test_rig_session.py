@@ -1,0 +1,440 @@
+"""Whole sessions: calibrate, collect, verify, goto, resume, and the command line."""
+
+import csv
+import json
+import os
+import pathlib
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from harness import SESSION, fast_config, fast_text, session, simulator
+
+import jaxcal
+from rig.__main__ import main
+from rig.calibrate import calibrate
+from rig.config import parse_config
+from rig.identification import order_residuals, uncertainty
+from rig.journal import read_journal
+from rig.other_sessions import collect
+from rig.planning import choose, draw_candidates, travel_order
+from rig.session import Refused, Run, run_safely
+from rig.simulator import Truth, parse_fault
+
+TRUTH = np.column_stack([Truth().matrix, Truth().bias])
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A noisy calibration that ended well, with what it said."""
+    folder = tmp_path_factory.mktemp("runs") / "run"
+    config = parse_config(fast_text(session='\n[session]\nmethod = "exact"\n'))
+    said = []
+    with simulator(config, noise_deg=0.02) as sim:
+        code = session(sim.start(), folder, sim, said)
+    assert code == 0, said
+    return folder, said
+
+
+def test_the_truth_lies_in_the_stated_intervals(finished):
+    summary = json.loads((finished[0] / "summary.json").read_text())
+    found = np.column_stack([summary["A"], summary["b"]])
+    # Twelve intervals of 95 % each: one or two may miss, none by far.
+    ratio = np.abs(found - TRUTH) / np.array(summary["ci95"])
+    assert (ratio < 1.0).sum() >= 10
+    assert ratio.max() < 2.0
+    assert summary["after"]["rms"] < 0.1 < 1.0 < summary["before"]["rms"]
+
+
+def test_stated_intervals_hold_the_truth_as_often_as_they_say(rng):
+    """The arithmetic alone, many times: 95 % of the intervals cover."""
+    covered = []
+    for _ in range(300):
+        u = rng.uniform(-18, 18, size=(12, 3))
+        zero = rng.normal(0, 0.004, 3)
+        y = u @ TRUTH[:, :3].T + TRUTH[:, 3] + rng.normal(0, 0.02, (12, 3)) - zero
+        records = [
+            {"commanded_deg": a, "measured_deg": b, "std_deg": [0.1] * 3, "samples": 25}
+            for a, b in zip(u.tolist(), y.tolist(), strict=True)
+        ]
+        fitted = jaxcal.identify(u[:4], y[:4])
+        stated = uncertainty(
+            fitted, records[:4], records[4:], {"std_deg": [0.04] * 3, "samples": 100}
+        )
+        found = np.column_stack([fitted.matrix, fitted.bias])
+        covered.append(np.abs(found - TRUTH) <= np.array(stated["ci95"]))
+    assert 0.93 < np.mean(covered) < 0.97
+
+
+def test_everything_is_saved_and_loads(finished):
+    folder, _ = finished
+    loaded = jaxcal.Calibration.load(folder / "calibration.json")
+    np.testing.assert_allclose(loaded.matrix, TRUTH[:, :3], atol=0.01)
+    assert len(loaded.provenance["notes"]["zero_pulses"]) == 3
+    rows = list(csv.DictReader((folder / "pairs.csv").open()))
+    assert [row["role"] for row in rows].count("select") == 4
+    for row in rows:
+        pulses = [int(row[f"pulses_{axis}"]) for axis in ("pitch", "yaw", "roll")]
+        angle = float(row["u_deg_pitch"])
+        assert angle == pytest.approx(pulses[0] * 360 / (10000 * 10), abs=1e-6)
+    page = (folder / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 3
+    assert not re.findall(r'(?:src|href)="(?!data:)', page)
+    assert "no patient" in page
+
+
+def test_the_choice_is_shown_before_anything_moves(finished):
+    _, said = finished
+    shown = next(i for i, line in enumerate(said) if "log det" in line)
+    armed = next(i for i, line in enumerate(said) if line.startswith("armed"))
+    assert shown < armed
+    assert "D-efficiency" in said[shown] and "proven optimum" in said[shown]
+
+
+def test_progress_tells_the_time_left(finished):
+    assert any(re.search(r"\[ *3/13\].*about \d+ s left", line) for line in finished[1])
+
+
+def test_held_out_postures_are_not_the_chosen_ones(finished):
+    records = read_journal(finished[0] / "journal.jsonl")
+    postures = {r["name"]: tuple(r["pulses"]) for r in records if "samples" in r
+                and r["event"] == "posture"}  # fmt: skip
+    chosen = {p for name, p in postures.items() if name.startswith("select")}
+    held = {p for name, p in postures.items() if not name.startswith("select")}
+    assert len(chosen) == 4 and not chosen & held
+
+
+def test_a_finished_run_resumes_to_the_same_without_moving(finished, tmp_path):
+    folder, _ = finished
+    before = (folder / "summary.json").read_text()
+    code = session(parse_config(fast_text(session='\n[session]\nmethod = "exact"\n')),
+                   folder)  # fmt: skip
+    assert code == 0
+    assert json.loads((folder / "summary.json").read_text()) == json.loads(before)
+
+
+def test_resume_refuses_a_changed_configuration(finished):
+    changed = parse_config(fast_text({"samples = 25": "samples = 6"}))
+    with pytest.raises(Refused, match="configuration changed"):
+        Run(changed, finished[0], "calibrate", [].append)
+
+
+def test_resume_checks_the_reference_posture_first(tmp_path):
+    config = fast_config()
+    with simulator(config) as sim:
+        served, said, pressed = sim.start(), [], []
+
+        def press_once(run, phase):
+            if len(run.journal.events("posture")) == 2 and not pressed:
+                pressed.append(True)
+                signal.raise_signal(signal.SIGINT)
+
+        assert session(served, tmp_path / "run", sim, said, [press_once]) == 4
+        ran = sum(map(len, sim.executions()))
+        plant = sim.plant
+        plant.truth = Truth(noise_deg=0.0, heading_deg=plant.truth.heading_deg + 3.0)
+        assert session(served, tmp_path / "run", sim, said) == 3
+        assert "the phone or the device was moved" in said[-2]
+        postures = read_journal(tmp_path / "run/journal.jsonl")
+        assert sum(r["event"] == "posture" for r in postures) in (2, 3)
+        assert sum(map(len, sim.executions())) > ran
+
+
+def test_a_posture_out_of_reach_is_masked_and_the_rest_chosen_anew(tmp_path):
+    text = fast_text(session=SESSION + "max_unreachable = 40\nseed = 3\n")
+    config, said = parse_config(text), []
+    with simulator(config, travel_deg=(-20, 14)) as sim:
+        code = session(sim.start(), tmp_path / "run", sim, said)
+    records = read_journal(tmp_path / "run/journal.jsonl")
+    lost = {r["name"] for r in records if r["event"] == "unreachable"}
+    assert code == 0, said[-5:]
+    assert any(name.startswith("select") for name in lost)
+    replans = [r["choice"]["indices"] for r in records if r["event"] == "replan"]
+    for number, indices in enumerate(replans):
+        gone = sorted(lost, key=[r.get("name") for r in records].index)[: number + 1]
+        assert not {f"select:{i}" for i in indices} & set(gone)
+    measured = [r for r in records if r["event"] == "posture"]
+    assert sum(r["role"] == "select" for r in measured) == 4
+    found = json.loads((tmp_path / "run/summary.json").read_text())
+    np.testing.assert_allclose(
+        np.column_stack([found["A"], found["b"]]), TRUTH, atol=1e-3
+    )
+
+
+def test_too_many_out_of_reach_is_a_fault(tmp_path):
+    text = fast_text(session=SESSION + "max_unreachable = 1\nseed = 3\n")
+    config, said = parse_config(text), []
+    with simulator(config, travel_deg=(-14, 12)) as sim:
+        assert session(sim.start(), tmp_path / "run", sim, said) == 3
+    assert any("max_unreachable" in line for line in said)
+
+
+def test_collect_records_a_dataset_and_resumes(tmp_path):
+    config, said = fast_config(), []
+    folder = tmp_path / "collection"
+    folder.mkdir()
+    with simulator(config) as sim:
+        served, pressed = sim.start(), []
+
+        def once():
+            run = Run(served, folder, "collect", said.append,
+                      on_imu_port=sim.start_phone)  # fmt: skip
+
+            def press(phase):
+                if len(run.journal.events("posture")) == 3 and not pressed:
+                    pressed.append(True)
+                    signal.raise_signal(signal.SIGINT)
+
+            run.phase_listeners.append(press)
+            return run_safely(run, lambda r: collect(r, 8))
+
+        assert once() == 4
+        assert once() == 0
+    data = np.load(folder / "dataset.npz")
+    assert data["candidates"].shape == data["measured"].shape == (1, 8, 3)
+    predicted = data["candidates"] @ TRUTH[:, :3].T + TRUTH[:, 3]
+    np.testing.assert_allclose(data["measured"], predicted, atol=1e-3)
+    low, high = np.array(config.session.ranges).T
+    assert (data["candidates"] >= low - 0.01).all()
+    assert (data["candidates"] <= high + 0.01).all()
+
+
+def test_the_wrong_euler_order_is_named(finished):
+    records = [r for r in read_journal(finished[0] / "journal.jsonl")
+               if r["event"] == "posture"]  # fmt: skip
+    zero = next(r for r in read_journal(finished[0] / "journal.jsonl")
+                if r["event"] == "zero")  # fmt: skip
+    from rig.attitude import Frame
+
+    config = fast_config()
+    frame = Frame(np.array(zero["attitude"]), np.eye(3), "ZXY", config.letters)
+    right = order_residuals(config, frame, records)
+    assert right["best"] == "ZXY" and not right["warning"]
+    wrong_config = parse_config(fast_text({'order = "ZXY"': 'order = "XYZ"'}))
+    wrong = order_residuals(wrong_config, frame, records)
+    assert "the order ZXY leaves" in wrong["warning"]
+
+
+def test_the_policys_place_is_taken_by_exact_when_it_is_missing_or_poor(monkeypatch):
+    config = parse_config(fast_text(session=""))
+    candidates = np.array([config.to_deg(p) for p in draw_candidates(config)])
+    real = jaxcal.select
+
+    def poor(points, k, method="policy", **options):
+        if method != "policy":
+            return real(points, k, method=method, **options)
+        return real(points, k, method="random", **options)
+
+    def absent(points, k, method="policy", **options):
+        if method == "policy":
+            raise FileNotFoundError("no checkpoint\nanywhere")
+        return real(points, k, method=method, **options)
+
+    best = float(real(candidates, 4, method="exact").log_det)
+    for stand_in, part in ((poor, "D-efficiency of"), (absent, "no checkpoint")):
+        monkeypatch.setattr(jaxcal, "select", stand_in)
+        choice = choose(config, candidates)
+        assert choice.log_det == pytest.approx(best)
+        assert part in choice.note and "\n" not in choice.note
+
+
+def test_travel_order_beats_the_drawn_order(rng):
+    points = rng.uniform(-20, 20, size=(12, 3))
+    speeds = np.array([10.0, 20.0, 5.0])
+
+    def seconds(order):
+        path = np.vstack([[0, 0, 0], points[list(order)]])
+        return (np.abs(np.diff(path, axis=0)) / speeds).max(axis=1).sum()
+
+    order = travel_order(points, np.zeros(3), speeds)
+    assert sorted(order) == list(range(12))
+    assert seconds(order) < seconds(range(12))
+    import itertools
+
+    few = points[:6]
+    best = min(
+        itertools.permutations(range(6)),
+        key=lambda o: (
+            (np.abs(np.diff(np.vstack([[0, 0, 0], few[list(o)]]), axis=0)) / speeds)
+            .max(axis=1)
+            .sum()
+        ),
+    )
+    points = few
+    assert seconds(travel_order(few, np.zeros(3), speeds)) <= 1.15 * seconds(best)
+
+
+# The command line
+
+
+def test_calibrate_simulate_needs_no_configuration(tmp_path, capsys, monkeypatch):
+    """The shipped settings, policy or its stand-in, in well under a minute."""
+    begun = time.monotonic()
+    assert main(["calibrate", "--simulate", "--out", str(tmp_path)]) == 0
+    assert time.monotonic() - begun < 60
+    said = capsys.readouterr().out
+    assert "95 % confidence" in said and "after compensation" in said
+    (folder,) = tmp_path.iterdir()
+    before = jaxcal.Calibration.load(folder / "calibration.json")
+    assert main(["verify", str(folder), "--simulate", "--count", "2",
+                 "--out", str(tmp_path / "v")]) == 0  # fmt: skip
+    assert "still holds" in capsys.readouterr().out
+    assert main(["goto", str(folder), "--simulate", "--to", "2", "-3", "4",
+                 "--out", str(tmp_path / "g")]) == 0  # fmt: skip
+    reached = re.search(r"off by \[(.*)\]", capsys.readouterr().out)
+    assert max(abs(float(v)) for v in reached.group(1).split(",")) < 0.1
+    assert before.num_measurements == 4
+
+
+def test_goto_refuses_what_the_limits_do_not_reach(finished, tmp_path, capsys):
+    code = main(["goto", str(finished[0]), "--simulate", "--to", "40", "0", "0",
+                 "--out", str(tmp_path)])  # fmt: skip
+    assert code == 2
+    assert "outside [" in capsys.readouterr().out
+
+
+def test_dry_run_opens_no_port(tmp_path, capsys):
+    config = tmp_path / "rig.toml"
+    config.write_text(fast_text({"port = 5020": "port = 1", "port = 2055": "port = 1"}))
+    for command in (["calibrate"], ["collect", "--count", "3"]):
+        code = main([*command, "--config", str(config), "--dry-run", "--out",
+                     str(tmp_path / "runs")])  # fmt: skip
+        assert code == 0
+    said = capsys.readouterr().out
+    assert "nothing was sent to the bus" in said and "about" in said
+    for folder in (tmp_path / "runs").iterdir():
+        events = {r["event"] for r in read_journal(folder / "journal.jsonl")}
+        assert not events & {"write", "command", "stop"}
+
+
+def test_nothing_moves_without_confirmation(tmp_path, capsys):
+    config = fast_config()
+    with simulator(config) as sim:
+        served = sim.start()
+        text = fast_text({"port = 5020": f"port = {served.bus.port}"})
+        (tmp_path / "rig.toml").write_text(text)
+        code = main(["calibrate", "--config", str(tmp_path / "rig.toml"),
+                     "--out", str(tmp_path / "runs")])  # fmt: skip
+        assert code == 2
+        assert "confirm with --arm" in capsys.readouterr().out
+        assert sim.server.requests == 0
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["calibrate"],
+        ["calibrate", "--config", "/does/not/exist.toml"],
+        ["resume", "/does/not/exist"],
+        ["check", "/does/not/exist.toml"],
+        ["example", "nobody"],
+        ["verify", "/does/not/exist", "--simulate"],
+        ["calibrate", "--simulate", "--fault", "earthquake"],
+        ["collect", "--simulate", "--count", "0"],
+    ],
+)
+def test_bad_input_is_one_clear_line_and_exit_code_2(
+    arguments, capsys, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("rig: ") and "Traceback" not in error
+
+
+def test_stop_works_alone_and_says_when_it_cannot(tmp_path, capsys):
+    config = fast_config()
+    with simulator(config) as sim:
+        served = sim.start()
+        path = tmp_path / "rig.toml"
+        path.write_text(fast_text({"port = 5020": f"port = {served.bus.port}"}))
+        assert main(["stop", "--config", str(path)]) == 0
+        assert capsys.readouterr().out.count("acknowledged, standing") == 3
+        assert all(drive.stops for drive in sim.drives)
+        sim.faults.add(parse_fault("dead_drive,axis=yaw"))
+        assert main(["stop", "--config", str(path)]) == 3
+        assert "NOT acknowledged" in capsys.readouterr().out
+    assert main(["stop", "--config", str(path)]) == 3
+    assert "cannot open" in capsys.readouterr().err
+
+
+def test_identify_prints_every_drive(capsys):
+    assert main(["identify", "--simulate"]) == 0
+    said = capsys.readouterr().out
+    assert said.count("pulses_per_rev = 10000") == 3
+
+
+def test_help_and_stop_load_no_heavy_module(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(fast_text({"port = 5020": "port = 1"}))
+    program = (
+        "import sys\n"
+        "from rig.__main__ import main\n"
+        "try:\n"
+        "    main({})\n"
+        "except SystemExit:\n"
+        "    pass\n"
+        "heavy = set('jax matplotlib numba scipy flax'.split()) & set(sys.modules)\n"
+        "sys.exit(' '.join(heavy))\n"
+    )
+    for arguments in (["--help"], ["stop", "--config", str(path)]):
+        subprocess.run(
+            [sys.executable, "-c", program.format(arguments)], check=True,
+            capture_output=True, cwd=tmp_path,
+        )  # fmt: skip
+
+
+def test_simulate_serves_a_session_in_another_process(tmp_path):
+    """Two programs, as with real hardware: the simulator and the session."""
+    from fault_matrix import _free_port
+
+    bus, phone = _free_port(), _free_port()
+    path = tmp_path / "rig.toml"
+    path.write_text(fast_text({"port = 5020": f"port = {bus}",
+                               "port = 2055": f"port = {phone}"}))  # fmt: skip
+    served = subprocess.Popen(
+        [sys.executable, "-m", "rig", "simulate", "--config", str(path),
+         "--rate", "250"], stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        for line in served.stdout:
+            if "Ctrl-C" in line:
+                break
+        code = main(["calibrate", "--config", str(path), "--arm", "--zero",
+                     "--out", str(tmp_path / "runs")])  # fmt: skip
+        assert code == 0
+    finally:
+        os.kill(served.pid, signal.SIGINT)
+        assert served.wait(10) == 0
+        served.stdout.close()
+
+
+def test_run_folders_are_never_reused(tmp_path):
+    from rig.session import new_run_folder
+
+    folders = {new_run_folder(tmp_path, "calibrate") for _ in range(5)}
+    assert len(folders) == 5
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with pytest.raises(Refused, match="cannot make"):
+        new_run_folder(pathlib.Path(blocked), "calibrate")
+
+
+def test_a_plan_that_leaves_the_limits_is_refused_before_arming(tmp_path):
+    config = fast_config()
+    folder = tmp_path / "run"
+    folder.mkdir()
+    said = []
+    run = Run(config, folder, "calibrate", said.append)
+    wild = draw_candidates(config)
+    wild[:, 0] = 99999
+    choice = choose(
+        config, np.array([config.to_deg(p) for p in draw_candidates(config)])
+    )
+    run.journal.write("plan", candidates=wild.tolist(), choice=choice.described())
+    assert run_safely(run, calibrate) == 2
+    assert any("leaves the limits" in line for line in said)

@@ -1,0 +1,270 @@
+"""The phone's stream: published formats, and everything a Wi-Fi does to them."""
+
+import dataclasses
+import http.client
+import json
+import socket
+import time
+
+import numpy as np
+import pytest
+from harness import fast_config
+
+from rig.attitude import angle_between_deg, euler_to_matrix, matrix_to_euler
+from rig.imu import Imu, ImuError
+from rig.simulator.phone import matrix_to_quaternion
+from rig.stream import MAX_LINE, LineSplitter, Parser, StreamFault
+
+HYPER = dataclasses.replace(fast_config().imu, max_jump_deg=180.0, host="127.0.0.1")
+PLAIN = dataclasses.replace(
+    HYPER, format="lines", columns=(0, 1, 2), stamp_column=None, column_count=3,
+    order="ZXY", signs=(1, 1, 1),
+)  # fmt: skip
+
+
+def feed(settings, *lines, parser=None):
+    parser = parser or Parser(settings)
+    return parser.lines([line.encode() for line in lines], 100.0), parser
+
+
+def test_hyperimu_line_as_published_is_androids_orientation():
+    """Time stamp, then azimuth, pitch, roll of the Orientation sensor in degrees.
+
+    Pitch turns about the phone's X and roll about its Y, so in the order Z, Y, X the
+    roll comes before the pitch.
+    """
+    readings, _ = feed(HYPER, "1700000000000,350.5,-10.25,5.125")
+    expected = euler_to_matrix([-350.5, -5.125, 10.25], "ZYX")
+    np.testing.assert_allclose(readings[0].matrix, expected, atol=1e-12)
+    pitched, _ = feed(HYPER, "1700000000000,0,-110.0,0")  # pitch may pass 90, roll not
+    np.testing.assert_allclose(
+        pitched[0].matrix, euler_to_matrix([110.0, 0, 0], "XYZ"), atol=1e-12
+    )
+
+
+def test_lines_arrive_in_any_pieces():
+    stream = b"".join(b"%d,10.5,1.5,2.5\r\n" % stamp for stamp in range(1, 40))
+    for size in (1, 2, 3, 7, 64, len(stream)):
+        splitter, parser, count = LineSplitter(), Parser(HYPER), 0
+        for start in range(0, len(stream), size):
+            lines = splitter.feed(stream[start : start + size])
+            count += len(parser.lines(lines, 100.0))
+        assert count == 38  # the first line may be the end of an older one
+
+
+def test_hash_ends_a_line_too():
+    assert LineSplitter().feed(b"x#1,2,3#4,5,6#7") == [b"1,2,3", b"4,5,6"]
+
+
+def test_a_stream_without_line_ends_keeps_no_memory():
+    splitter = LineSplitter()
+    for _ in range(2000):
+        assert splitter.feed(b"1234567890" * 100) == []
+        assert len(splitter._tail) <= MAX_LINE
+    assert splitter.feed(b"\n1,2,3\n") == [b"1,2,3"]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "1,nan,2,3", "1,inf,2,3", "1,1e999,2,3", "1,0x10,2,3", "1,1_0,2,3", "1,,2,3",
+        "1,10,3,95", "1,361,2,3", "1,10.5,2", "x,1,2,3", "1,--1,2,3", "1,1.,2,3",
+        "1,٣,2,3", "1,10 5,2,3", "1,0.0,0,-0.0", "abc", ",,,", "1;2;3;4",
+    ],
+)  # fmt: skip
+def test_a_malformed_line_is_dropped_and_counted(line):
+    readings, parser = feed(HYPER, line)
+    assert readings == []
+    assert sum(parser.counts.values()) == 1
+
+
+def test_a_decimal_comma_is_a_wrong_number_of_columns_not_another_angle():
+    readings, parser = feed(HYPER, "17,10,5,1,5,2,5")
+    assert readings == []
+    assert parser.counts["wrong number of columns"] == 1
+
+
+def test_changed_columns_are_refused_for_good():
+    _, parser = feed(HYPER, "1,10,2,3")
+    with pytest.raises(StreamFault, match="6 columns where 4"):
+        feed(HYPER, *(f"{n},10,2,3,4,5" for n in range(2, 6)), parser=parser)
+
+
+def test_one_torn_line_is_no_change_of_columns():
+    _, parser = feed(HYPER, "1,10,2,3", "2,10,2,33,10,2,3", "4,10,2,3", "5,10,2")
+    readings, _ = feed(HYPER, "6,10,2,3", parser=parser)
+    assert len(readings) == 1
+
+
+def test_without_a_configured_width_the_first_good_line_sets_it():
+    settings = dataclasses.replace(HYPER, column_count=None)
+    readings, parser = feed(settings, "1,10,2,3,0.5", "2,10,2,3,0.5", "3,10,2,3")
+    assert len(readings) == 2
+    assert parser.counts["wrong number of columns"] == 1
+
+
+def test_older_stamps_are_dropped_until_the_clock_was_plainly_set_back():
+    _, parser = feed(HYPER, "5000,10,2,3")
+    readings, _ = feed(HYPER, "4000,50,2,3", parser=parser)
+    assert readings == []
+    later = [f"{1000 + n},50,2,3" for n in range(60)]
+    readings, _ = feed(HYPER, *later, parser=parser)
+    assert readings
+
+
+def test_a_single_wild_reading_is_dropped_and_a_real_turn_is_accepted():
+    settings = dataclasses.replace(PLAIN, max_jump_deg=20.0)
+    _, parser = feed(settings, "10,2,3")
+    readings, _ = feed(settings, "70,2,3", parser=parser)
+    assert readings == []
+    readings, _ = feed(settings, "10.1,2,3", parser=parser)
+    assert len(readings) == 1
+    readings, _ = feed(settings, *["70,2,3"] * 6, parser=parser)
+    assert len(readings) == 2
+
+
+def test_a_reading_that_waited_in_a_buffer_is_as_old_as_it_is():
+    parser = Parser(HYPER)
+    parser.lines([b"1000,10,2,3"], 50.0)
+    late = parser.lines([b"1100,10,2,3"], 53.0)
+    assert late[0].time == pytest.approx(50.1, abs=0.01)
+
+
+def test_radians_signs_and_quaternion_columns():
+    settings = dataclasses.replace(PLAIN, angle_unit="rad", signs=(1, -1, 1))
+    readings, _ = feed(settings, "0.1,0.2,0.3")
+    read = np.radians(matrix_to_euler(readings[0].matrix, "ZXY"))
+    np.testing.assert_allclose(read, [0.1, -0.2, 0.3], atol=1e-9)
+    settings = dataclasses.replace(PLAIN, quaternion=(0, 1, 2, 3), column_count=4)
+    readings, parser = feed(settings, "0,0,0.7071068,0.7071068", "0,0,0.5,0.5")
+    assert len(readings) == 1
+    assert parser.counts["a quaternion that is not of length one"] == 1
+    np.testing.assert_allclose(
+        readings[0].matrix, euler_to_matrix([90, 0, 0], "ZYX"), atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("nested", [True, False])
+def test_sensor_logger_message_as_published(nested):
+    q = dict(zip(("qx", "qy", "qz", "qw"), (0.0, 0.0, 0.6, 0.8), strict=True))
+    extra = {"roll": 0.1, "pitch": 0.2, "yaw": 0.3}
+    entry = {"name": "orientation", "time": 1_700_000_000_000_000_000}
+    entry |= {"values": q | extra} if nested else q | extra
+    other = {"name": "accelerometer", "time": 1, "values": {"x": 1}}
+    message = {"messageId": 1, "sessionId": "s", "deviceId": "d",
+               "payload": [other, entry]}  # fmt: skip
+    readings = Parser(HYPER).body(json.dumps(message).encode(), 5.0)
+    assert len(readings) == 1
+    turned = matrix_to_euler(readings[0].matrix, "ZYX")
+    np.testing.assert_allclose(
+        turned, [np.degrees(2 * np.arcsin(0.6)), 0, 0], atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    "body",
+    [b"", b"{}", b"[]", b"null", b'{"payload": 3}', b'{"payload": [1, null, []]}',
+     b'{"payload": [{"name": "orientation"}]}', b"\xff\xfe", b"[" * 50_000,
+     b'{"payload": [{"name": "orientation", "values": {"qx": "a", "qy": null}}]}',
+     b'{"payload": [{"name": "orientation", "time": {}, "values": {"qx": 1e400, '
+     b'"qy": NaN, "qz": 0, "qw": 1}}]}'],
+)  # fmt: skip
+def test_a_malformed_message_is_dropped(body):
+    assert Parser(HYPER).body(body, 1.0) == []
+
+
+def connect(imu):
+    return socket.create_connection(("127.0.0.1", imu.port), timeout=2)
+
+
+def wait_for(condition, seconds=5.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "did not happen"
+        time.sleep(0.005)
+
+
+def test_a_phone_that_comes_back_on_a_new_connection_is_heard():
+    with Imu(dataclasses.replace(PLAIN, port=0, stale_s=0.3)) as imu:
+        for angle in (10, 30):
+            with connect(imu) as phone:
+                phone.sendall(b"?\r\n" + f"{angle},2,3\r\n".encode() * 3)
+                wait_for(
+                    lambda a=angle: (
+                        imu.since(0)
+                        and abs(matrix_to_euler(imu.since(0)[-1].matrix, "ZXY")[0] - a)
+                        < 1e-6
+                    )
+                )
+        assert imu.connections == 2
+
+
+def test_a_half_open_connection_is_given_up_for_the_next():
+    with Imu(dataclasses.replace(PLAIN, port=0, stale_s=0.1)) as imu:
+        with connect(imu), connect(imu) as second:
+            second.sendall(b"?\r\n1,2,3\r\n")
+            wait_for(lambda: imu.since(0))
+
+
+def test_a_stale_stream_is_an_error_and_a_silent_one_names_the_port():
+    with Imu(dataclasses.replace(PLAIN, port=0, stale_s=0.1)) as imu:
+        with pytest.raises(ImuError, match="no reading yet"):
+            imu.latest()
+        with connect(imu) as phone:
+            phone.sendall(b"?\r\n1,2,3\r\n")
+            wait_for(lambda: imu.since(0))
+            time.sleep(0.15)
+            with pytest.raises(ImuError, match="old"):
+                imu.latest()
+            with pytest.raises(ImuError, match=f":{imu.port}"):
+                imu.wait_for_stream(0.05)
+
+
+def test_a_taken_port_is_one_clear_error():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        settings = dataclasses.replace(PLAIN, port=taken.getsockname()[1])
+        with pytest.raises(ImuError, match="cannot open the IMU port"):
+            Imu(settings).open()
+
+
+def test_client_mode_connects_and_connects_again():
+    with socket.create_server(("127.0.0.1", 0)) as sender:
+        settings = dataclasses.replace(
+            PLAIN, transport="connect", port=sender.getsockname()[1]
+        )
+        with Imu(settings) as imu:
+            for _ in range(2):
+                connection, _ = sender.accept()
+                connection.sendall(b"?\n4,5,6\n")
+                before = len(imu.since(0))
+                wait_for(lambda b=before: len(imu.since(0)) > 0)
+                connection.close()
+            assert imu.since(0)
+
+
+def test_http_push_is_received_and_an_oversized_one_refused():
+    settings = dataclasses.replace(HYPER, format="sensorlogger", port=0)
+    with Imu(settings) as imu:
+        turned = euler_to_matrix([20.0, 5.0, -3.0], "ZYX")
+        keys = ("qx", "qy", "qz", "qw")
+        q = dict(zip(keys, matrix_to_quaternion(turned).tolist(), strict=True))
+        payload = [{"name": "orientation", "time": 1, "values": q}]
+        web = http.client.HTTPConnection("127.0.0.1", imu.port, timeout=2)
+        web.request("POST", "/data", json.dumps({"payload": payload}))
+        assert web.getresponse().status == 200
+        assert angle_between_deg(imu.since(0)[-1].matrix, turned) < 1e-6
+        web.close()
+        web.putrequest("POST", "/data")
+        web.putheader("Content-Length", str(1 << 40))
+        web.endheaders()
+        assert web.getresponse().status == 413
+        web.close()
+
+
+def test_quaternions_round_trip(rng):
+    for angles in rng.uniform(-180, 180, size=(200, 3)):
+        turned = euler_to_matrix(angles, "XYZ")
+        q = matrix_to_quaternion(turned)
+        from rig.attitude import quaternion_to_matrix
+
+        np.testing.assert_allclose(quaternion_to_matrix(q), turned, atol=1e-9)
