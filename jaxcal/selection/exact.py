@@ -1,9 +1,10 @@
 """The proven optimum, by whichever proof is cheaper.
 
 k = n + 1: the absolute determinant is convex in each posture, so only vertices of the
-convex hull matter, and :mod:`jaxcal.selection.volume` enumerates them without numba. Everything else (more
-postures, hulls too large to enumerate, many inputs) goes to branch and bound, started
-from the exchange. The runner-up need not lie on the hull, so ``best`` > 1 does without.
+convex hull matter, and :mod:`jaxcal.selection.volume` enumerates them without numba.
+Everything else (more postures, hulls too large to enumerate, many inputs) goes to
+branch and bound, started from the exchange. The runner-up need not lie on the hull, so
+``best`` > 1 does without it.
 """
 
 from __future__ import annotations

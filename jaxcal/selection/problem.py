@@ -2,9 +2,9 @@
 
 Solvers work on whitened regressors: with Z = [candidates, 1] of the available
 candidates and Z = X R its QR factors, the rows x_i of X satisfy ``X.T @ X = I``, and
-``log det(Z_s.T Z_s) = log det(X_s.T X_s) + log det(Z.T Z)`` for all subsets s. An affine
-map of the candidates rotates X and nothing else, so a solver that looks only at X picks
-the same postures in pulses, degrees or [0, 1].
+``log det(Z_s.T Z_s) = log det(X_s.T X_s) + log det(Z.T Z)`` for all subsets s. An
+affine map of the candidates rotates X and nothing else, so a solver that looks only at
+X picks the same postures in pulses, degrees or [0, 1].
 """
 
 from __future__ import annotations
