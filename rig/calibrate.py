@@ -211,7 +211,7 @@ def _finish(
         run.disarm()
     everything = chosen + before + after
     first = fit(chosen, _reading_noise(chosen))
-    zero = run.journal.events("zero")[0]
+    zero = run.journal.events("zero")[-1]
     limits = uncertainty(first, chosen, before + after, zero)
     notes = {
         "zero_pulses": list(run.zero_pulses or ()),
@@ -251,7 +251,7 @@ def _finish(
     write_atomically(run.folder / "summary.json", json.dumps(summary, indent=1))
     from rig.report import write_report
 
-    write_report(run.folder, summary, run.journal.records)
+    write_report(run.folder, summary, run.journal.records[0], run.postures())
     _say_summary(run, summary, code)
     return code
 
@@ -262,7 +262,7 @@ def pairs_csv(run: Run) -> str:
     for what in ("pulses", "u_deg", "y_deg", "std_deg"):
         columns += [f"{what}_{axis}" for axis in AXIS_NAMES]
     lines = [",".join([*columns, "samples"])]
-    for r in run.journal.events("posture"):
+    for r in run.postures().values():
         values = r["pulses"] + r["commanded_deg"] + r["measured_deg"] + r["std_deg"]
         fields = [r["name"], r.get("role", ""), *(repr(v) for v in values)]
         lines.append(",".join([*fields, str(r["samples"])]))

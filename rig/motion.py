@@ -21,15 +21,27 @@ from rig.settings import AXIS_NAMES, RigConfig
 from rig.stop import Heartbeat, Signals, Stopper
 from rig.stream import Reading
 
-__all__ = ["Measurement", "Motion", "MotionFault", "Unreachable"]
+__all__ = ["Measurement", "Motion", "MotionFault", "NotFollowing", "Unreachable"]
 
 FOLLOW_MIN_DEG = 3.0  # a commanded change this large must be seen by the IMU
 FOLLOW_SHARE = 0.1  # at least this share of it
-FOLLOW_LEADING = 0.5  # of axes that move at least this share of the largest move
+FOLLOW_LEADING = 0.3  # of axes that move at least this share of the largest move
 
 
 class MotionFault(RuntimeError):
     """Something is wrong with the device: stop everything and latch."""
+
+
+class NotFollowing(MotionFault):
+    """A drive turned and the IMU did not see it.
+
+    ``suspects`` are the postures recorded since the axis was last seen to follow: the
+    coupling may have slipped before any of them.
+    """
+
+    def __init__(self, text: str, suspects: list[str]) -> None:
+        self.suspects = suspects
+        super().__init__(text)
 
 
 class Unreachable(RuntimeError):
@@ -75,6 +87,7 @@ class Motion:
         self._phase = phase
         self._moves = 0
         self._seen: tuple[Array, Array] | None = None  # (commanded, measured) last
+        self._unproven: list[list[str]] = [[], [], []]  # postures, an axis
         watched = [a.comm_timeout_s for a in config.axes if a.comm_timeout_s]
         self.heartbeat = Heartbeat(
             stopper, config.motion.heartbeat_s, min(watched) / 4 if watched else 0.0
@@ -127,6 +140,11 @@ class Motion:
             raise MotionFault(str(error)) from None
         self.armed = True
         self.heartbeat.start()
+
+    def zeroed(self, frame: Frame, pulses: tuple[int, int, int]) -> None:
+        """Measure against this zero posture from now on."""
+        self.frame = frame
+        self._seen = (self.config.to_deg(pulses), np.zeros(3))
 
     def positions(self) -> tuple[int, int, int]:
         """Where the drives stand, in pulses."""
@@ -307,12 +325,16 @@ class Motion:
     # Settling and measuring
 
     def measure(
-        self, target: tuple[int, int, int], samples: int | None = None
+        self,
+        target: tuple[int, int, int],
+        label: str = "",
+        samples: int | None = None,
     ) -> Measurement:
         """Wait until the device has settled, then average fresh readings.
 
         Args:
             target: pulses commanded.
+            label: name of the posture.
             samples: readings to average; as configured when not given.
 
         Raises:
@@ -352,7 +374,7 @@ class Motion:
             samples=len(readings),
             raw=raw,
         )
-        self._check_agreement(result)
+        self._check_agreement(result, label)
         return result
 
     def _frame_for(self, readings: list[Reading]) -> Frame:
@@ -428,7 +450,7 @@ class Motion:
         self.stopper.check()
         self.heartbeat.feed(moving=False)
 
-    def _check_agreement(self, measurement: Measurement) -> None:
+    def _check_agreement(self, measurement: Measurement, label: str) -> None:
         """The joints are where the drives say, roughly, and moved when they moved."""
         config = self.config
         commanded = config.to_deg(measurement.pulses)
@@ -449,13 +471,19 @@ class Motion:
         if self._seen is not None:
             asked = np.abs(commanded - self._seen[0])
             seen = np.abs(measurement.angles - self._seen[1])
-            for name, a, s in zip(AXIS_NAMES, asked, seen, strict=True):
-                leading = max(FOLLOW_MIN_DEG, FOLLOW_LEADING * asked.max())
-                if a >= leading and s < FOLLOW_SHARE * a:
-                    raise MotionFault(
-                        f"the drive of {name} turned {a:.1f} deg, the IMU saw {s:.2f}: "
-                        "a slipped coupling, a frozen stream, or axes mixed up"
+            leading = max(FOLLOW_MIN_DEG, FOLLOW_LEADING * float(asked.max()))
+            for index, name in enumerate(AXIS_NAMES):
+                if asked[index] < leading:
+                    self._unproven[index].append(label)
+                elif seen[index] < FOLLOW_SHARE * asked[index]:
+                    raise NotFollowing(
+                        f"the drive of {name} turned {asked[index]:.1f} deg, the IMU "
+                        f"saw {seen[index]:.2f}: a slipped coupling, a frozen stream, "
+                        "or axes mixed up",
+                        self._unproven[index],
                     )
+                else:
+                    self._unproven[index] = []
         self._seen = (commanded, measurement.angles)
 
 

@@ -45,7 +45,7 @@ def collect(run: Run, count: int, dry_run: bool = False) -> int:
     for number, target in enumerate(targets):
         run.visit(f"collect:{number}", target, role="collect")
     run.phase("saving")
-    records = run.journal.events("posture")
+    records = list(run.postures().values())
     size = config.session.candidates
     commands, measured = pairs(records)
     episodes = len(records) // size

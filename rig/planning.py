@@ -14,6 +14,10 @@ from rig.settings import RigConfig
 __all__ = ["Choice", "choose", "draw_candidates", "draw_held_out", "travel_order"]
 
 
+EXACT_LIMIT_S = 20.0  # for the proof that the choice is (or is not) the optimum
+REPLAN_LIMIT_S = 5.0  # the same while the drives stand armed
+
+
 @dataclasses.dataclass(frozen=True)
 class Choice:
     """The postures to measure, and how good they are."""
@@ -68,11 +72,14 @@ def choose(
 
     session = config.session
     extra: dict[str, Any] = {"seed": session.seed}
+    limit = EXACT_LIMIT_S if policy else REPLAN_LIMIT_S
     if available is not None:
         extra["available"] = available
     if required:
         extra["required"] = list(required)
-    exact = jaxcal.select(candidates_deg, session.k, method="exact", **extra)
+    exact = jaxcal.select(
+        candidates_deg, session.k, method="exact", time_limit=limit, **extra
+    )
     best = float(exact.log_det)
     if session.method == "exact" or not policy:
         return _choice(exact, best, bool(exact.proven), "")

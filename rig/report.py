@@ -69,13 +69,12 @@ def _errors_figure(summary: dict[str, Any]) -> str:
 
 def _postures_figure(records: list[dict[str, Any]]) -> str:
     def draw(figure: Any) -> None:
-        plan = [r for r in records if r["event"] == "posture"]
         axes = figure.subplots(1, 3)
         planes = ((0, 1), (0, 2), (1, 2))
         styles = {"select": "o", "before": "^", "after": "v", "reference": "s"}
         for axis, (a, b) in zip(axes, planes, strict=True):
             for role, marker in styles.items():
-                points = [r["commanded_deg"] for r in plan if r.get("role") == role]
+                points = [r["commanded_deg"] for r in records if r.get("role") == role]
                 if points:
                     u = np.array(points)
                     axis.plot(u[:, a], u[:, b], marker, label=role)
@@ -90,7 +89,7 @@ def _readings_figure(records: list[dict[str, Any]]) -> str:
     def draw(figure: Any) -> None:
         axes = figure.subplots(3, 1, sharex=True)
         begin = 0
-        for record in [r for r in records if r["event"] == "posture"]:
+        for record in records:
             raw = np.array(record["raw_deg"])
             raw = raw - np.array(record["measured_deg"])
             x = np.arange(begin, begin + len(raw))
@@ -105,10 +104,13 @@ def _readings_figure(records: list[dict[str, Any]]) -> str:
 
 
 def write_report(
-    folder: pathlib.Path, summary: dict[str, Any], records: list[dict[str, Any]]
+    folder: pathlib.Path,
+    summary: dict[str, Any],
+    start: dict[str, Any],
+    postures: dict[str, dict[str, Any]],
 ) -> pathlib.Path:
     """Write ``report.html`` of a calibration run; returns its path."""
-    start, choice = records[0], summary["choice"]
+    records, choice = list(postures.values()), summary["choice"]
     rank = "the proven optimum" if choice["proven"] else "the best known subset"
     efficiency = np.exp((choice["log_det"] - choice["best_log_det"]) / 12.0)
     parts = [

@@ -21,7 +21,13 @@ from rig.drives import Bus, BusError
 from rig.imu import Imu, ImuError
 from rig.journal import Journal, JournalError
 from rig.limits import LimitError
-from rig.motion import Measurement, Motion, MotionFault, Unreachable
+from rig.motion import (
+    Measurement,
+    Motion,
+    MotionFault,
+    NotFollowing,
+    Unreachable,
+)
 from rig.settings import RigConfig
 from rig.stop import PauseRequested, Signals, Stopper, StopRequested, UnitStop
 
@@ -121,8 +127,9 @@ class Run:
             if starts[0]["mode"] != self.mode:
                 raise Refused(f"{self.folder} is a {starts[0]['mode']} run")
             self.journal.write("resume", sync=True, **_provenance())
-            for record in self.journal.events("zero"):
-                self._set_zero(record)
+            zeros = self.journal.events("zero")
+            if zeros:
+                self._set_zero(zeros[-1])
             return
         self.journal.write(
             "start",
@@ -146,10 +153,18 @@ class Run:
 
     def posture(self, name: str) -> dict[str, Any] | None:
         """The record of a posture, or None where it has not been measured."""
+        return self.postures().get(name)
+
+    def postures(self) -> dict[str, dict[str, Any]]:
+        """Every posture measured and not made void since, by name, in order."""
+        found: dict[str, dict[str, Any]] = {}
         for record in self.journal.records:
-            if record["event"] == "posture" and record["name"] == name:
-                return record
-        return None
+            if record["event"] == "posture":
+                found[record["name"]] = record
+            elif record["event"] == "void":
+                for name in record["names"]:
+                    found.pop(name, None)
+        return found
 
     def unreachable(self, name: str) -> bool:
         """Whether a posture was found out of reach."""
@@ -197,22 +212,27 @@ class Run:
         )
         self.motion.arm(self._reset_alarms)
         self.say(f"armed: {len(self.motion.drives)} drives on {config.bus.where}")
-        if self.frame is None:
+        if self.frame is None or not self.postures():
             self._zero(self.motion)
         else:
-            self.motion.frame = self.frame
+            assert self.zero_pulses is not None
+            self.motion.zeroed(self.frame, self.zero_pulses)
             self._check_reference(self.motion)
         return self.motion
 
     def _zero(self, motion: Motion) -> None:
+        """Take the zero, or take it anew where nothing was measured against it yet."""
         self.phase("zeroing")
-        if self.zero_at is not None:
-            motion.move_to(self.zero_at, "zero")
-        elif self.config.session.zero == "drive":
-            motion.move_to((0, 0, 0), "zero")
-        target = self.zero_at or motion.positions()
+        target = self.zero_at or self.zero_pulses
+        if target is None and self.config.session.zero == "drive":
+            target = (0, 0, 0)
+        if target is not None:
+            motion.move_to(target, "zero")
+        else:
+            target = motion.positions()
         # Every posture is measured against this one, so its noise must be the smaller.
-        measured = motion.measure(target, ZERO_FACTOR * self.config.settle.samples)
+        samples = ZERO_FACTOR * self.config.settle.samples
+        measured = motion.measure(target, "zero", samples)
         record = self.journal.write(
             "zero",
             sync=True,
@@ -222,7 +242,8 @@ class Run:
             samples=measured.samples,
         )
         self._set_zero(record)
-        motion.frame = self.frame
+        assert self.frame is not None
+        motion.zeroed(self.frame, measured.pulses)
         self.say(f"zero taken at pulses {list(measured.pulses)}")
 
     def _set_zero(self, record: dict[str, Any]) -> None:
@@ -239,7 +260,7 @@ class Run:
         """Before a resumed run goes on: the zero posture must still read zero."""
         assert self.zero_pulses is not None
         motion.move_to(self.zero_pulses, "reference")
-        measured = motion.measure(self.zero_pulses)
+        measured = motion.measure(self.zero_pulses, "reference")
         worst = float(np.abs(measured.angles).max())
         limit = self.config.session.reference_tolerance_deg
         self.journal.write(
@@ -275,7 +296,12 @@ class Run:
         begun = time.monotonic()
         try:
             motion.move_to(target, name)
-            measured = motion.measure(target)
+            measured = motion.measure(target, name)
+        except NotFollowing as fault:
+            if fault.suspects:
+                self.journal.write("void", sync=True, names=fault.suspects)
+                self.say(f"  void, to be measured again: {', '.join(fault.suspects)}")
+            raise
         except Unreachable as reason:
             motion.stopper.stop(str(reason), latch=False)
             if not all(result.standing for result in motion.stopper.results):

@@ -30,7 +30,8 @@ NUMBER = re.compile(r"[+-]?[0-9]{1,15}(?:\.[0-9]{1,17})?(?:[eE][+-]?[0-9]{1,2})?
 TOKEN = re.compile(r"[-+.:0-9A-Za-z_]{0,64}")
 RECOUNT = 3  # lines of one new width in a row that mean the phone's settings changed
 REJOIN = 5  # readings in a row that agree with each other after a jump
-BACKWARDS = 50  # stamps in a row behind the last that mean the clock was set back
+ODD_STAMPS = 50  # stamps in a row out of line that mean the phone's clock was set
+AHEAD_S = 1.0  # a stamp so far ahead of the clock is torn, not early
 CLOCK_CREEP = 2e-4  # the phone's clock may run this much faster or slower
 
 
@@ -97,7 +98,7 @@ class Parser:
         self._width = settings.column_count
         self._widths: deque[int] = deque(maxlen=RECOUNT)
         self._stamp: float | None = None
-        self._behind = 0
+        self._odd = 0
         self._offset: float | None = None
         self._offset_at = 0.0
         self._last: Array | None = None
@@ -108,7 +109,7 @@ class Parser:
         """A new connection: the phone may have moved and its clock may have changed."""
         self._stamp = None
         self._offset = None
-        self._behind = 0
+        self._odd = 0
         self._last = None
         self._far.clear()
         self._widths.clear()
@@ -233,12 +234,17 @@ class Parser:
             return now
         if not math.isfinite(stamp):
             raise _Dropped("not a number")
+        odd = ""
         if self._stamp is not None and stamp < self._stamp:
-            self._behind += 1
-            if self._behind < BACKWARDS:
-                raise _Dropped("older than the reading before")
+            odd = "older than the reading before"
+        elif self._offset is not None and stamp + self._offset - now > AHEAD_S:
+            odd = "from the future"
+        if odd:
+            self._odd += 1
+            if self._odd < ODD_STAMPS:
+                raise _Dropped(odd)
             self._offset = None
-        self._behind = 0
+        self._odd = 0
         self._stamp = stamp
         delay = now - stamp
         if self._offset is None:

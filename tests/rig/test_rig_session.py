@@ -379,7 +379,7 @@ def test_help_and_stop_load_no_heavy_module(tmp_path):
         "except SystemExit:\n"
         "    pass\n"
         "heavy = set('jax matplotlib numba scipy flax'.split()) & set(sys.modules)\n"
-        "sys.exit(' '.join(heavy))\n"
+        "sys.exit(' '.join(heavy) or 0)\n"
     )
     for arguments in (["--help"], ["stop", "--config", str(path)]):
         subprocess.run(

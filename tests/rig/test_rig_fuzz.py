@@ -1,0 +1,218 @@
+"""Random and mutated bytes: no crash, no growth, nothing accepted that is not valid.
+
+The judges are written apart from what they judge: a line is right when scipy turns its
+numbers, read by another grammar, into the same rotation; a Modbus value is right when
+its bytes stand in the reply behind the header (and before the CRC) they must have.
+"""
+
+import dataclasses
+import json
+import random
+import re
+import resource
+
+import numpy as np
+import pytest
+from harness import fast_config
+from scipy.spatial.transform import Rotation
+
+from rig.drives import Bus, BusError
+from rig.settings import BusSettings
+from rig.simulator.server import crc16
+from rig.stream import MAX_LINE, LineSplitter, Parser, StreamFault
+
+IMU = dataclasses.replace(fast_config().imu, max_jump_deg=180.0)
+FIELD = re.compile(r"\s*[+-]?\d+(\.\d+)?([eE][+-]?\d+)?\s*", re.ASCII)
+SIZES = [
+    pytest.param(20_000, id="quick"),
+    pytest.param(500_000, id="full", marks=pytest.mark.slow),
+]
+
+
+def mutate(rng: random.Random, data: bytes) -> bytes:
+    """One to three of: flip, drop, insert, repeat, cut, swap, or all new."""
+    for _ in range(rng.randint(1, 3)):
+        kind, at = rng.randrange(7), rng.randrange(len(data) + 1)
+        if kind == 0 and data:
+            at = min(at, len(data) - 1)
+            data = (
+                data[:at] + bytes([data[at] ^ 1 << rng.randrange(8)]) + data[at + 1 :]
+            )
+        elif kind == 1:
+            data = data[:at] + data[at + 1 :]
+        elif kind == 2:
+            data = data[:at] + rng.randbytes(rng.randint(1, 4)) + data[at:]
+        elif kind == 3:
+            data = data[:at] + data[max(0, at - 5) : at] + data[at:]
+        elif kind == 4:
+            data = data[:at]
+        elif kind == 5:
+            data = data[at:] + data[:at]
+        elif rng.random() < 0.1:
+            data = rng.randbytes(rng.randint(0, 64))
+    return data
+
+
+def judged(line: bytes):
+    """Rotation a HyperIMU line means, or None where it means nothing."""
+    try:
+        fields = line.decode("ascii").strip(" \t\0").split(",")
+    except UnicodeDecodeError:
+        return None
+    if len(fields) == 5 and not fields[4].strip():
+        fields.pop()
+    if len(fields) != 4 or not all(FIELD.fullmatch(field) for field in fields):
+        return None
+    _, azimuth, pitch, roll = map(float, fields)
+    if abs(azimuth) > 361 or abs(pitch) > 361 or abs(roll) > 90.1:
+        return None
+    return Rotation.from_euler("ZYX", [-azimuth, -roll, -pitch], degrees=True)
+
+
+@pytest.mark.parametrize("count", SIZES)
+def test_mutated_imu_lines(count):
+    rng = random.Random(count)
+    parser, splitter = Parser(IMU), LineSplitter()
+    accepted = changed = 0
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    splitter.feed(b"\n")
+    for number in range(count):
+        azimuth, pitch, roll = (rng.uniform(-80, 80) for _ in range(3))
+        line = b"%d,%.4f,%.4f,%.4f" % (number * 10, azimuth % 360, pitch, roll)
+        if rng.random() < 0.8:
+            line = mutate(rng, line)
+        lines = []
+        data = line + rng.choice([b"\n", b"\r\n", b"#"])
+        while data:
+            size = rng.randint(1, 40)
+            lines += splitter.feed(data[:size])
+            data = data[size:]
+        assert len(splitter._tail) <= MAX_LINE
+        for piece in lines:
+            try:
+                readings = parser.lines([piece], number * 0.01)
+            except StreamFault:  # a legitimate answer to three lines of one new width
+                parser, changed = Parser(IMU), changed + 1
+                continue
+            for reading in readings:
+                right = judged(piece)
+                assert right is not None, piece
+                np.testing.assert_allclose(
+                    reading.matrix, right.as_matrix(), atol=1e-9, err_msg=str(piece)
+                )
+                accepted += 1
+    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert accepted > count * 0.1
+    assert after - before < 100_000  # kilobytes
+    assert sum(parser.counts.values()) > 0
+
+
+@pytest.mark.parametrize("count", [pytest.param(300, id="quick"),
+    pytest.param(20_000, id="full", marks=pytest.mark.slow)])  # fmt: skip
+def test_random_imu_streams_keep_no_memory(count):
+    rng = random.Random(1)
+    parser, splitter = Parser(IMU), LineSplitter()
+    for number in range(count):
+        data = rng.randbytes(rng.randint(0, 4096))
+        if rng.random() < 0.3:
+            data = bytes(rng.choice(b"0123456789.,-+eE\r\n#") for _ in range(400))
+        try:
+            for reading in parser.lines(splitter.feed(data), number * 0.1):
+                assert np.isfinite(reading.matrix).all()
+        except StreamFault:
+            parser = Parser(IMU)
+        assert len(splitter._tail) <= MAX_LINE
+    assert len(parser.counts) < 20
+
+
+@pytest.mark.parametrize("count", [pytest.param(5_000, id="quick"),
+    pytest.param(100_000, id="full", marks=pytest.mark.slow)])  # fmt: skip
+def test_mutated_sensor_logger_messages(count):
+    rng = random.Random(2)
+    parser = Parser(IMU)
+    for number in range(count):
+        q = np.array([rng.gauss(0, 1) for _ in range(4)])
+        q /= np.linalg.norm(q)
+        values = dict(zip(("qx", "qy", "qz", "qw"), q.tolist(), strict=True))
+        entry = {"name": "orientation", "time": number * 10_000_000, "values": values}
+        body = mutate(rng, json.dumps({"messageId": 1, "payload": [entry]}).encode())
+        for reading in parser.body(body, number * 0.01):
+            entry = json.loads(body)["payload"][0]
+            given = entry.get("values", entry)
+            numbers = [float(given[key]) for key in ("qx", "qy", "qz", "qw")]
+            right = Rotation.from_quat(numbers).as_matrix()
+            np.testing.assert_allclose(reading.matrix, right, atol=1e-9)
+
+
+class Replies:
+    """pymodbus' client with its socket taken out: one prepared reply, then silence."""
+
+    def __init__(self, framer_name: str):
+        from pymodbus import FramerType
+        from pymodbus.client import ModbusTcpClient
+
+        self.reply = b""
+        self.sent = b""
+        outer = self
+
+        class Client(ModbusTcpClient):
+            def connect(self):
+                return True
+
+            def close(self):
+                pass
+
+            def send(self, request, addr=None):
+                outer.sent = request
+                return len(request)
+
+            def recv(self, size):
+                data, outer.reply = outer.reply, b""
+                return data
+
+        self.client = Client("x", framer=FramerType(framer_name), timeout=0, retries=0)
+
+
+@pytest.mark.parametrize("count", SIZES)
+@pytest.mark.parametrize("framer", ["rtu", "socket"])
+def test_mutated_modbus_replies(framer, count):
+    rng = random.Random(count)
+    transport = "tcp" if framer == "socket" else "rtu_tcp"
+    bus = Bus(BusSettings(transport, "x", 1, timeout_s=0.01, read_retries=0))
+    replies = Replies(framer)
+    bus._client = replies.client
+    reads = writes = 0
+    for _ in range(count // 2):
+        words = [rng.randrange(65536) for _ in range(rng.randint(1, 3))]
+        unit, address = rng.randint(1, 20), rng.randrange(60000)
+        writing = rng.random() < 0.3
+        data = b"".join(word.to_bytes(2, "big") for word in words)
+        if writing:
+            body = bytes([unit, 16]) + address.to_bytes(2, "big")
+            body += len(words).to_bytes(2, "big")
+        else:
+            body = bytes([unit, 3, len(data)]) + data
+        if framer == "rtu":
+            raw = body + crc16(body)
+        else:
+            tid = replies.client.transaction.next_tid + 1
+            raw = tid.to_bytes(2, "big") + bytes([0, 0, 0, len(body)]) + body
+        if rng.random() < 0.9:
+            raw = mutate(rng, raw)
+        replies.reply = raw
+        try:
+            if writing:
+                bus.write(unit, address, 16, words)
+                expected = body
+                writes += 1
+            else:
+                got = bus.read_words(unit, address, len(words))
+                expected = bytes([unit, 3, len(data)])
+                expected += b"".join(word.to_bytes(2, "big") for word in got)
+                reads += 1
+        except BusError:
+            continue
+        if framer == "rtu":
+            expected += crc16(expected)
+        assert expected in raw, (raw.hex(), expected.hex())
+    assert reads > count * 0.02 and writes > count * 0.005
