@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from jaxcal.selection.problem import Problem
 
-__all__ = ["DEFAULT_RESTARTS", "exchange_indices"]
+__all__ = ["DEFAULT_RESTARTS", "exchange_from", "exchange_indices"]
 
 DEFAULT_RESTARTS = 200
 
@@ -41,3 +41,27 @@ def exchange_indices(
             "but every start was singular"
         )
     return usable[chosen]
+
+
+def exchange_from(problem: Problem, indices: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(k,) the local optimum that a given selection climbs to.
+
+    Args:
+        problem: what may be chosen; its required candidates stay.
+        indices: (k,) where to start, required candidates first.
+    """
+    from jaxcal.selection.exchange_kernel import climb
+
+    p = problem.num_regressors
+    chosen = np.array(indices, dtype=np.int64)
+    climb(
+        problem.rows,
+        np.ascontiguousarray(problem.rows.T),
+        problem.upper,
+        len(problem.required),
+        chosen,
+        np.bincount(chosen, minlength=len(problem.rows)),
+        np.empty((p, p)),
+        np.empty((p, p)),
+    )
+    return chosen
