@@ -158,7 +158,7 @@ class Parser:
             text = line.decode("ascii").strip(" \t\0")
         except UnicodeDecodeError:
             raise _Dropped("not text") from None
-        fields = [field.strip() for field in text.split(s.separator)]
+        fields = [field.strip(" \t") for field in text.split(s.separator)]
         if fields[-1] == "" and len(fields) > 1:
             fields.pop()
         used = set(s.quaternion or s.columns)

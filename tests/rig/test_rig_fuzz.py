@@ -22,7 +22,7 @@ from rig.simulator.server import crc16
 from rig.stream import MAX_LINE, LineSplitter, Parser, StreamFault
 
 IMU = dataclasses.replace(fast_config().imu, max_jump_deg=180.0)
-FIELD = re.compile(r"\s*[+-]?\d+(\.\d+)?([eE][+-]?\d+)?\s*", re.ASCII)
+FIELD = re.compile(r"[ \t]*[+-]?[0-9]+([.][0-9]+)?([eE][+-]?[0-9]+)?[ \t]*")
 SIZES = [
     pytest.param(20_000, id="quick"),
     pytest.param(500_000, id="full", marks=pytest.mark.slow),
@@ -59,7 +59,7 @@ def judged(line: bytes):
         fields = line.decode("ascii").strip(" \t\0").split(",")
     except UnicodeDecodeError:
         return None
-    if len(fields) == 5 and not fields[4].strip():
+    if len(fields) == 5 and not fields[4].strip(" \t"):
         fields.pop()
     if len(fields) != 4 or not all(FIELD.fullmatch(field) for field in fields):
         return None
