@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.regression import log_det_information
 from jaxcal.selection.exact import solve_exact
 from jaxcal.selection.exchange import DEFAULT_RESTARTS, exchange_indices
 from jaxcal.selection.greedy import greedy_indices
@@ -203,27 +202,20 @@ def _exact(
     start: float,
 ) -> Selection:
     found = solve_exact(problem, best, deadline, restarts, seed)
-    _judge(problem, found.subsets[0], "exact")
-    values = log_det_information(
-        problem.candidates[np.stack(found.subsets)], problem.num_outputs
-    )
-    subsets = [
-        Subset(indices, float(value))
-        for indices, value in zip(found.subsets, np.atleast_1d(values), strict=True)
-        if np.isfinite(value)
-    ]
-    top = subsets[0].log_det
     return Selection(
-        indices=subsets[0].indices,
-        log_det=top,
+        indices=found.subsets[0],
+        log_det=float(found.log_dets[0]),
         method="exact",
         proven=found.proven,
         seconds=time.perf_counter() - start,
         seed=seed,
         restarts=restarts,
         nodes=found.nodes,
-        alternatives=tuple(subsets),
-        known_bound=top if found.proven else max(found.bound, top),
+        alternatives=tuple(
+            Subset(indices, float(value))
+            for indices, value in zip(found.subsets, found.log_dets, strict=True)
+        ),
+        known_bound=found.bound,
         problem=problem,
     )
 
@@ -279,9 +271,7 @@ def _reference_bound(
         return None
     deadline = None if time_limit is None else time.perf_counter() + time_limit
     found = solve_exact(problem, deadline=deadline)
-    if found.proven:
-        return problem.log_det(found.subsets[0]), True
-    return found.bound, False
+    return found.bound, found.proven
 
 
 def _is_proven(log_det: float, bound: tuple[float, bool] | None) -> bool:

@@ -149,14 +149,11 @@ def exact_batch(
         problems, lambda problem: solve_exact(problem, deadline=deadline)
     )
     indices = np.stack([result.subsets[0] for result in found])
-    log_det = _log_dets(problems, indices, "exact")
-    proven = np.array([result.proven for result in found])
-    bound = np.maximum([result.bound for result in found], log_det)
     return BatchSelection(
         indices=indices,
-        log_det=log_det,
-        proven=proven,
-        bound=np.where(proven, log_det, bound),
+        log_det=np.array([result.log_dets[0] for result in found]),
+        proven=np.array([result.proven for result in found]),
+        bound=np.array([result.bound for result in found]),
         nodes=np.array([result.nodes for result in found]),
         method="exact",
         seconds=time.perf_counter() - start,

@@ -14,6 +14,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.regression import log_det_information
 from jaxcal.selection.branch_and_bound import branch_and_bound
 from jaxcal.selection.exchange import DEFAULT_RESTARTS, exchange_indices
 from jaxcal.selection.greedy import greedy_indices
@@ -35,8 +36,9 @@ _LARGEST_HULL_DIMENSION = 4  # qhull's facets grow as M^(n // 2)
 class ExactResult:
     """The best selections and the proof."""
 
-    subsets: list[Indices]  # (k,) each, sorted, best first
-    bound: float  # upper bound on log det S of every selection
+    subsets: Indices  # (found, k), each sorted, best first; none of them singular
+    log_dets: Array  # (found,) natural log det S
+    bound: float  # upper bound on log det S of every selection, log_dets[0] if proven
     nodes: int  # branch-and-bound nodes, or subsets enumerated
     proven: bool
 
@@ -72,12 +74,9 @@ def solve_exact(
         best,
         deadline,
     )
-    return ExactResult(
-        [_expand(problem, groups, counts) for counts in result.counts],
-        problem.num_outputs * (result.bound + problem.log_scale),
-        result.nodes,
-        result.proven,
-    )
+    subsets = [_expand(problem, groups, counts) for counts in result.counts]
+    bound = None if result.proven else result.bound
+    return _result(problem, subsets, best, bound, result.nodes)
 
 
 def upper_bound(problem: Problem) -> float:
@@ -138,11 +137,10 @@ def _enumerate(
     subsets = [
         np.sort(np.concatenate([problem.required, pool[s]])) for s in found.subsets
     ]
-    if found.complete and subsets:
-        return ExactResult(subsets, problem.log_det(subsets[0]), found.examined, True)
+    if found.complete:
+        return _result(problem, subsets, best, None, found.examined)
     # Out of time: whatever greedy has, if that is better, and the relaxation's bound.
     greedy = np.sort(greedy_indices(problem))
-    subsets = sorted([*subsets, greedy], key=problem.log_det, reverse=True)[:best]
     keep = np.flatnonzero(problem.available)
     relaxed = relaxed_bound(
         problem.rows[keep],
@@ -150,8 +148,36 @@ def _enumerate(
         problem.upper[keep],
         np.searchsorted(keep, greedy),
     )
-    bound = problem.num_outputs * (relaxed + problem.log_scale)
-    return ExactResult(subsets, bound, found.examined, False)
+    return _result(problem, [*subsets, greedy], best, relaxed, found.examined)
+
+
+def _result(
+    problem: Problem,
+    subsets: list[Indices],
+    best: int,
+    relaxed: float | None,
+    nodes: int,
+) -> ExactResult:
+    """Values in the caller's unit, singular subsets left out, best first.
+
+    ``relaxed`` is an upper bound on log det(X_s.T X_s), None where the first is proven.
+    """
+    chosen = np.stack(subsets)
+    values = np.atleast_1d(
+        log_det_information(problem.candidates[chosen], problem.num_outputs)
+    )
+    order = np.argsort(-values, kind="stable")[:best]
+    order = order[np.isfinite(values[order])]
+    if not order.size:
+        raise ValueError(
+            "candidates must allow an invertible selection, but the best of them, "
+            f"{chosen[0].tolist()}, lies in one plane"
+        )
+    top = float(values[order[0]])
+    bound = top
+    if relaxed is not None:
+        bound = max(top, problem.num_outputs * (relaxed + problem.log_scale))
+    return ExactResult(chosen[order], values[order], bound, nodes, relaxed is None)
 
 
 def _groups(problem: Problem, merge: bool) -> list[Indices]:

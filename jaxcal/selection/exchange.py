@@ -9,7 +9,7 @@ Nachtsheim 1980 for one posture at a time.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.selection.problem import Problem
 
@@ -43,18 +43,26 @@ def exchange_indices(
     return usable[chosen]
 
 
-def exchange_from(problem: Problem, indices: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(k,) the local optimum that a given selection climbs to.
+def exchange_from(problem: Problem, indices: ArrayLike) -> NDArray[np.int64]:
+    """The local optimum that a given selection climbs to; never worse than it was.
 
     Args:
         problem: what may be chosen; its required candidates stay.
-        indices: (k,) where to start, required candidates first.
+        indices: (k,) where to start, not singular.
+
+    Returns:
+        (k,) the required candidates first.
     """
     from jaxcal.selection.exchange_kernel import climb
 
+    rest = np.asarray(indices, dtype=np.int64).tolist()
+    for i in problem.required.tolist():
+        if i not in rest:
+            raise ValueError(f"indices must hold every required candidate, got no {i}")
+        rest.remove(i)
+    chosen = np.array([*problem.required, *rest], dtype=np.int64)
     p = problem.num_regressors
-    chosen = np.array(indices, dtype=np.int64)
-    climb(
+    log_det = climb(
         problem.rows,
         np.ascontiguousarray(problem.rows.T),
         problem.upper,
@@ -64,4 +72,9 @@ def exchange_from(problem: Problem, indices: NDArray[np.int64]) -> NDArray[np.in
         np.empty((p, p)),
         np.empty((p, p)),
     )
+    if not np.isfinite(log_det):
+        raise ValueError(
+            "indices must give an invertible information matrix, but the postures "
+            f"{chosen.tolist()} lie in one plane"
+        )
     return chosen

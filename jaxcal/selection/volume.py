@@ -13,6 +13,7 @@ import functools
 import itertools
 import math
 import time
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +23,10 @@ __all__ = ["Volumes", "enumeration_cost", "largest_volumes"]
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-_ONE_PRODUCT = 150_000  # entries up to which a single product beats the grouped ones
-_BLOCK = 1 << 18  # entries a block: a float32 block stays in the second-level cache
+_PRUNE = 200_000  # entries from which a known volume to prune by is worth its time
+_STARTS = 8  # climbs to such a volume
+_SCREEN = 500_000  # entries from which single precision first is faster
+_UNTHREADED = 240_000  # multiplications up to which BLAS starts no threads, which stall
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,13 +65,19 @@ def largest_volumes(
     left, right = _last_ordered(h, s), _first_ordered(h, q - s)
     left_minors = _minors(vectors, left)
     right_minors = _minors(vectors, right) @ _pairing(q, s)
-    if best == 1 and len(left) * len(right) <= _ONE_PRODUCT:
-        found = _single_product(left_minors, right_minors)
-        pair, examined, complete = [found], math.comb(h, q), True
-    else:
-        pair, examined, complete = _grouped(
-            left, right, left_minors, right_minors, best, deadline
-        )
+    if best == 1 and len(left) * len(right) > _PRUNE:
+        # |det| <= |left minors| |right minors|, which is nearly sharp in whitened
+        # coordinates: most halves are too short for any subset as good as one known.
+        reached = (1.0 - 1e-9) * _climbed_volume(vectors)
+        left_norm = np.linalg.norm(left_minors, axis=1)
+        right_norm = np.linalg.norm(right_minors, axis=1)
+        long_left = left_norm * right_norm.max() >= reached
+        long_right = right_norm * left_norm.max() >= reached
+        left, left_minors = left[long_left], left_minors[long_left]
+        right, right_minors = right[long_right], right_minors[long_right]
+    pair, examined, complete = _products(
+        left, right, left_minors, right_minors, best, deadline
+    )
     subsets = np.array([[*left[a], *right[b]] for a, b in pair], dtype=np.int64)
     return Volumes(
         np.sort(subsets.reshape(-1, q), axis=1),
@@ -78,14 +87,55 @@ def largest_volumes(
     )
 
 
-def _single_product(left: Array, right: Array) -> tuple[int, int]:
-    product = left @ right.T
-    flat = np.abs(product, out=product).argmax()
-    row, column = divmod(int(flat), product.shape[1])
-    return row, column
+def _climbed_volume(vectors: Array) -> float:
+    """A large volume, by swapping one vector at a time from a few starts.
+
+    Row i of ``vectors @ inverse(chosen)`` holds the factors by which the volume grows
+    when vector i replaces each of the chosen (Goreinov et al., How to find a good
+    submatrix, 2010).
+    """
+    h, q = vectors.shape
+    rng = np.random.default_rng(0)
+    largest = 0.0
+    for _ in range(_STARTS):
+        chosen = rng.permutation(h)[:q]
+        if abs(np.linalg.det(vectors[chosen])) < 1e-9:
+            continue
+        for _ in range(10 * q):
+            factors = np.abs(np.linalg.solve(vectors[chosen].T, vectors.T))
+            out, new = divmod(int(factors.argmax()), h)
+            if factors[out, new] <= 1.0 + 1e-9:
+                break
+            chosen[out] = new
+        largest = max(largest, float(abs(np.linalg.det(vectors[chosen]))))
+    return largest
 
 
-def _grouped(
+def _blocks(
+    left: Indices, right: Indices, components: int, once: bool
+) -> Iterator[tuple[int, int, int]]:
+    """Blocks (first left, end of left, first right) that cover every subset.
+
+    Lefts are sorted by their largest index and rights by their smallest, so the rights
+    that lie beyond a left are a tail. A block takes the tail of its first left: the
+    extra pairs are subsets met before or overlap, with volume zero. ``once`` ends each
+    block where that index changes, so that no subset is met twice.
+    """
+    h = int(right[-1, -1]) + 1
+    begin_of = np.searchsorted(left[:, -1], np.arange(h + 1)).tolist()
+    tail_of = np.searchsorted(right[:, 0], np.arange(h + 1)).tolist()
+    end = begin_of[int(right[-1, 0])]  # lefts from here on have no right beyond them
+    limit = _UNTHREADED // components
+    low = 0
+    while low < end:
+        b = int(left[low, -1])
+        width = len(right) - tail_of[b + 1]
+        high = min(low + max(1, limit // width), begin_of[b + 1] if once else end)
+        yield low, high, tail_of[b + 1]
+        low = high
+
+
+def _products(
     left: Indices,
     right: Indices,
     left_minors: Array,
@@ -94,42 +144,43 @@ def _grouped(
     deadline: float | None,
 ) -> tuple[list[tuple[int, int]], int, bool]:
     """Best (left, right) pairs; single precision screens, double precision decides."""
-    h = int(left[-1, -1]) + 1
-    left_small = left_minors.astype(np.float32)
-    right_small = np.ascontiguousarray(right_minors.T.astype(np.float32))
-    slack = 1e-5 * float(
-        np.linalg.norm(left_minors, axis=1).max()
-        * np.linalg.norm(right_minors, axis=1).max()
-    )
+    right_columns = np.ascontiguousarray(right_minors.T)
+    screen = len(left) * len(right) > _SCREEN
+    if screen:
+        left_small = left_minors.astype(np.float32)
+        right_small = right_columns.astype(np.float32)
+        slack = 1e-5 * float(
+            np.linalg.norm(left_minors, axis=1).max()
+            * np.linalg.norm(right_minors, axis=1).max()
+        )
     kept: list[tuple[float, int, int]] = []
     threshold = -np.inf
     examined = 0
-    start_of = np.searchsorted(left[:, -1], np.arange(h + 1))
-    first_right = np.searchsorted(right[:, 0], np.arange(h + 1), side="left")
-    for b in range(left.shape[1] - 1, h - right.shape[1]):
-        begin, end = int(start_of[b]), int(start_of[b + 1])
-        column = int(first_right[b + 1])
+    for low, high, column in _blocks(left, right, left_minors.shape[1], best > 1):
+        if deadline is not None and time.perf_counter() > deadline:
+            return [(i, j) for _, i, j in kept], examined, False
         width = len(right) - column
-        step = max(1, _BLOCK // width)
-        for low in range(begin, end, step):
-            if deadline is not None and time.perf_counter() > deadline:
-                return [(i, j) for _, i, j in kept], examined, False
-            high = min(low + step, end)
+        examined += (high - low) * width
+        if screen and kept:
             block = left_small[low:high] @ right_small[:, column:]
-            examined += block.size
             if max(block.max(), -block.min()) < threshold - slack:
                 continue
-            exact = np.abs(left_minors[low:high] @ right_minors[column:].T).ravel()
-            cut = np.flatnonzero(exact > threshold)
-            if len(cut) > best:
-                cut = cut[np.argpartition(-exact[cut], best - 1)[:best]]
-            kept.extend(
-                (float(exact[f]), low + int(f) // width, column + int(f) % width)
-                for f in cut
-            )
-            kept = sorted(kept, key=lambda item: -item[0])[:best]
-            if len(kept) == best:
-                threshold = kept[-1][0]
+        exact = left_minors[low:high] @ right_columns[:, column:]
+        flat = np.abs(exact, out=exact).ravel()
+        if best == 1:
+            cut = np.array([flat.argmax()])
+            cut = cut[flat[cut] > threshold]
+        else:
+            cut = np.flatnonzero(flat > threshold)
+        if len(cut) > best:
+            cut = cut[np.argpartition(-flat[cut], best - 1)[:best]]
+        kept.extend(
+            (float(flat[f]), low + int(f) // width, column + int(f) % width)
+            for f in cut
+        )
+        kept = sorted(kept, key=lambda item: -item[0])[:best]
+        if len(kept) == best:
+            threshold = kept[-1][0]
     return [(i, j) for _, i, j in kept], examined, True
 
 
@@ -154,11 +205,12 @@ def _minors(vectors: Array, subsets: Indices) -> Array:
     size, q = subsets.shape[1], vectors.shape[1]
     if size == 1:
         return vectors[subsets[:, 0]]
-    smaller = list(itertools.combinations(range(q), size - 1))
     if size == 2:
-        inner = vectors[subsets[:, 0]]
-    else:
-        inner = _minors(vectors, subsets[:, :-1])
+        first, second = vectors[subsets[:, 0]], vectors[subsets[:, 1]]
+        a, b = _first_ordered(q, 2).T
+        return first[:, a] * second[:, b] - first[:, b] * second[:, a]
+    smaller = list(itertools.combinations(range(q), size - 1))
+    inner = _minors(vectors, subsets[:, :-1])
     last = vectors[subsets[:, -1]]
     columns = []
     for chosen in itertools.combinations(range(q), size):
