@@ -30,6 +30,7 @@ from jaxcal.candidates import JointRanges, uniform_candidates
 
 __all__ = [
     "BIAS_DEG",
+    "EPISODES",
     "NAMES",
     "NOISE_STD_DEG",
     "NUM_CANDIDATES",
@@ -50,7 +51,7 @@ BIAS_DEG = np.array([3.1, -5.8, 2.41])
 NOISE_STD_DEG = 0.1
 RANGES = JointRanges([-20.0] * 3, [20.0] * 3, ("pitch", "yaw", "roll"))  # degrees
 
-_EPISODES = {"dataset1": 200_000, "dataset2": 1_000, "dataset3": 100}
+EPISODES = {"dataset1": 200_000, "dataset2": 1_000, "dataset3": 100}
 _BLOCK = 1_000  # episodes that share a stream
 
 
@@ -165,10 +166,10 @@ def chunks(name: str, seed: int = 0, episodes: int | None = None) -> Iterator[Da
         raise ValueError(f"name must be one of {', '.join(NAMES)}, got {name!r}")
     if seed < 0:
         raise ValueError(f"seed must not be negative, got {seed}")
-    total = _EPISODES[name] if episodes is None else episodes
-    if not 1 <= total <= _EPISODES[name]:
+    total = EPISODES[name] if episodes is None else episodes
+    if not 1 <= total <= EPISODES[name]:
         raise ValueError(
-            f"episodes must be in [1, {_EPISODES[name]}] for {name}, got {total}"
+            f"episodes must be in [1, {EPISODES[name]}] for {name}, got {total}"
         )
     return _blocks(name, seed, total)
 
