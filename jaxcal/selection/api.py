@@ -77,8 +77,7 @@ def select(
     best = whole_number("best", best, 1)
     if best > 1 and method != "exact":
         raise ValueError(f'best must be 1 unless method is "exact", got {best}')
-    if time_limit is not None and not float(time_limit) > 0.0:
-        raise ValueError(f"time_limit must be above 0 seconds, got {time_limit}")
+    _check_time_limit(time_limit)
     start = time.perf_counter()
     problem = make_problem(
         candidates,
@@ -90,7 +89,7 @@ def select(
     )
     starts = restarts or DEFAULT_RESTARTS
     if method == "exact":
-        deadline = None if time_limit is None else start + float(time_limit)
+        deadline = None if time_limit is None else start + time_limit
         return _exact(problem, best, deadline, starts, seed, start)
     used_seed: int | None = seed
     used_restarts: int | None = None
@@ -145,6 +144,7 @@ def score(
         ValueError: also where the subset is singular.
     """
     _check_reference(reference)
+    _check_time_limit(time_limit)
     start = time.perf_counter()
     subset = np.asarray(indices)
     if subset.ndim != 1 or not np.issubdtype(subset.dtype, np.integer):
@@ -260,6 +260,16 @@ def _check_reference(reference: str) -> None:
     if reference not in _REFERENCES:
         raise ValueError(
             f"reference must be one of {', '.join(_REFERENCES)}, got {reference!r}"
+        )
+
+
+def _check_time_limit(time_limit: Any) -> None:
+    if time_limit is None:
+        return
+    number = isinstance(time_limit, int | float | np.integer | np.floating)
+    if not number or not time_limit > 0.0:
+        raise ValueError(
+            f"time_limit must be a number above 0 in seconds, got {time_limit!r}"
         )
 
 

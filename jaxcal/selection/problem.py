@@ -283,7 +283,7 @@ def _whiten(candidates: Array, mask: Mask, single: bool) -> tuple[Array, Array]:
             raise ValueError(_flat_message(chosen, _in_set(b, single)))
     constant = weight / np.sqrt(count)[:, None, None]
     log_scale = np.log(count) + 2.0 * np.log(diagonal * scale[:, 0]).sum(axis=1)
-    return np.concatenate([q, constant], axis=2), log_scale
+    return np.concatenate([q * weight, constant], axis=2), log_scale
 
 
 def _flat_message(chosen: Array, where: str) -> str:
