@@ -319,11 +319,19 @@ def _default_simulation() -> dict[str, Any]:
 
 
 def _stop(args: argparse.Namespace) -> int:
-    from rig.drives import Bus, Drive
+    from rig.drives import Bus, BusError, Drive
     from rig.stop import stop_all
 
     config = _load(args)
-    with Bus(config.bus, max(axis.map.inter_frame_s for axis in config.axes)) as bus:
+    bus = Bus(config.bus, max(axis.map.inter_frame_s for axis in config.axes))
+    try:
+        bus.open()
+    except BusError as error:
+        raise BusError(
+            f"NOTHING WAS STOPPED: {error}. If a session holds the port, press Ctrl-C "
+            "twice there; otherwise use the emergency stop"
+        ) from None
+    with bus:
         results = stop_all([Drive(bus, axis) for axis in config.axes])
     for result in results:
         print(result)

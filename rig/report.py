@@ -26,7 +26,7 @@ img { max-width: 100%; } small { color: #5b6778; }
 """
 
 
-def _figure(draw: Any, size: tuple[float, float]) -> str:
+def _figure(draw: Any, size: tuple[float, float], text: str) -> str:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size, layout="constrained")
@@ -34,7 +34,7 @@ def _figure(draw: Any, size: tuple[float, float]) -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     data = base64.b64encode(buffer.getvalue()).decode()
-    return f'<img alt="" src="data:image/png;base64,{data}">'
+    return f'<img alt="{text}" src="data:image/png;base64,{data}">'
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:
@@ -64,7 +64,7 @@ def _errors_figure(summary: dict[str, Any]) -> str:
             axis.set_ylabel("measured - desired [deg]")
             axis.set_title(f"{title}: {summary[key]['rms']:.4f} deg rms")
 
-    return _figure(draw, (9, 3.4))
+    return _figure(draw, (9, 3.4), "held-out errors, raw and compensated")
 
 
 def _postures_figure(records: list[dict[str, Any]]) -> str:
@@ -82,7 +82,7 @@ def _postures_figure(records: list[dict[str, Any]]) -> str:
             axis.set_ylabel(f"{AXIS_NAMES[b]} [deg]")
         axes[0].legend(fontsize=8)
 
-    return _figure(draw, (10, 3.2))
+    return _figure(draw, (10, 3.2), "commanded postures in three planes")
 
 
 def _readings_figure(records: list[dict[str, Any]]) -> str:
@@ -100,7 +100,7 @@ def _readings_figure(records: list[dict[str, Any]]) -> str:
             axis.set_ylabel(f"{name} [deg]")
         axes[-1].set_xlabel("reading, posture by posture, less the posture's mean")
 
-    return _figure(draw, (9, 4))
+    return _figure(draw, (9, 4), "readings of every posture about their mean")
 
 
 def write_report(

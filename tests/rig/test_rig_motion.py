@@ -72,6 +72,16 @@ def test_a_position_outside_the_limits_keeps_it_from_arming():
             motion.arm()
 
 
+def test_soft_limits_are_mirrored_in_drives_that_have_them():
+    changes = {'map = "leadshine_pr"': 'map = "generic"',
+               "[motion]": "[motion]\nmirror_limits = true"}  # fmt: skip
+    with bench(parse_config(fast_text(changes))) as motion:
+        axis = motion.config.axes[0]
+        words = motion.bus.read_words(axis.unit, 0x2C, 4)
+        low, high = (a << 16 | b for a, b in (words[:2], words[2:]))
+        assert (low - 2**32, high) == (axis.min_pulses, axis.max_pulses)
+
+
 def test_the_whole_plan_is_checked_before_the_first_move():
     config = fast_config()
     inside, outside = config.to_pulses([5, 5, 5]), config.to_pulses([5, 5, 20.1])
