@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 __all__ = ["TOLERANCE", "BranchResult", "branch_and_bound"]
 
 TOLERANCE = 1e-10  # of log det(Z.T Z); times m in log det S
-_CHUNK = 256  # nodes between looks at the clock
+_CHUNK = 16  # nodes between looks at the clock, where there is a deadline
+_ALL = 1 << 40
 _MEMORY = 64 * 2**20  # bytes of open nodes up to which the best bound goes first
 
 Array = NDArray[np.float64]
@@ -120,7 +121,7 @@ def _search(
             bounds = _grown(bounds, room)
         size, done = search(
             rows, columns, k, TOLERANCE, lows, highs, points, bounds, size,
-            best_counts, best_values, widest, _CHUNK,
+            best_counts, best_values, widest, _ALL if deadline is None else _CHUNK,
         )  # fmt: skip
         nodes += done
     return nodes, True, float(best_values[0])

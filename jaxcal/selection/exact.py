@@ -16,16 +16,20 @@ from numpy.typing import NDArray
 
 from jaxcal.regression import log_det_information
 from jaxcal.selection.branch_and_bound import branch_and_bound
-from jaxcal.selection.exchange import DEFAULT_RESTARTS, exchange_indices
+from jaxcal.selection.exchange import exchange_indices
 from jaxcal.selection.greedy import greedy_indices
 from jaxcal.selection.problem import Problem
 from jaxcal.selection.relaxation import relaxed_bound
 from jaxcal.selection.volume import enumeration_cost, largest_volumes
 
-__all__ = ["ExactResult", "solve_exact", "upper_bound"]
+__all__ = ["STARTING_RESTARTS", "ExactResult", "solve_exact", "upper_bound"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+
+STARTING_RESTARTS = (
+    30  # of the exchange: enough to start from, the search does the rest
+)
 
 _CHEAP = 3e7  # multiplications of an enumeration: about 20 ms
 _CONVEX_POSITION = 3e10  # those of 500 points on a sphere, some seconds
@@ -47,7 +51,7 @@ def solve_exact(
     problem: Problem,
     best: int = 1,
     deadline: float | None = None,
-    restarts: int = DEFAULT_RESTARTS,
+    restarts: int = STARTING_RESTARTS,
     seed: int = 0,
 ) -> ExactResult:
     """The ``best`` selections, or the best found by ``deadline`` and an honest bound.
