@@ -44,6 +44,7 @@ __all__ = ["Calibration", "identify"]
 Array = NDArray[np.float64]
 
 _EPS = float(np.finfo(np.float64).eps)
+_ROUNDING = 1e-12  # a response below this share of the output is rounding
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -361,8 +362,10 @@ class Calibration:
             )
         effect = self.matrix * self.scale
         rows = np.linalg.norm(effect, axis=1)
-        if (rows == 0.0).any():
-            name = self.output_names[int(np.flatnonzero(rows == 0.0)[0])]
+        at_centre = self.matrix @ self.centre + self.bias
+        silent = np.flatnonzero(rows <= _ROUNDING * np.abs(at_centre))
+        if silent.size:
+            name = self.output_names[int(silent[0])]
             raise ValueError(
                 f"matrix A is singular: {name} does not respond to any input"
             )

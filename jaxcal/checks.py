@@ -32,13 +32,13 @@ def axis_letter(index: int, count: int) -> str:
 def numbers(name: str, values: ArrayLike, *, finite: bool = True) -> Array:
     try:
         given = np.asarray(values)
-        if given.dtype.kind not in "iufb":
-            given = np.asarray(values, dtype=np.float64)
+        if given.dtype.kind not in "biufO":
+            raise TypeError
+        array = given.astype(np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"{name} must be an array of numbers, got {type(values).__name__}"
         ) from error
-    array = given.astype(np.float64)
     if finite and not np.isfinite(array).all():
         where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise ValueError(f"{name} must be finite, got {array[where]} at {where}")
