@@ -209,6 +209,7 @@ def _finish(
     if run.motion is not None:
         run.stop("", latch=False)
         run.disarm()
+    run.signals.check_stop()
     everything = chosen + before + after
     first = fit(chosen, _reading_noise(chosen))
     zero = run.journal.events("zero")[-1]

@@ -92,14 +92,14 @@ class Run:
         self.config = config
         self.folder = folder
         self.mode = mode
-        self.say = say
+        self._say = say
         self.phase_listeners: list[Callable[[str], None]] = []
         self.confirm: Callable[[Run], None] = lambda run: None
         self.motion: Motion | None = None
         self.frame: Frame | None = None
         self.zero_pulses: tuple[int, int, int] | None = None
         self.zero_at = zero_at
-        self.signals = Signals(say)
+        self.signals = Signals(self.say)
         self.planned = 0
         self._visited = 0
         self._visit_s: list[float] = []
@@ -141,6 +141,13 @@ class Run:
             **_provenance(),
             **extra,
         )
+
+    def say(self, text: str) -> None:
+        """Print a line. A terminal that is gone ends the run, but never a stop."""
+        try:
+            self._say(text)
+        except OSError:
+            self.signals.request_stop("the terminal is gone", EXIT_FAULT)
 
     # Memory
 

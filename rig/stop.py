@@ -182,6 +182,10 @@ class Signals:
         if not self.armed:
             raise self._stop
 
+    def request_stop(self, reason: str, exit_code: int) -> None:
+        """Ask for a stop from inside the program, as a signal would."""
+        self._stop = self._stop or StopRequested(reason, exit_code)
+
     def check_stop(self) -> None:
         """Raise StopRequested where one has been asked for."""
         if self._stop is not None:

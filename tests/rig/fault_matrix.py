@@ -121,9 +121,8 @@ def check_invariants(folder: pathlib.Path, sim: Simulator, alive: bool, deaf: bo
         assert not missing, f"{axis} ran moves twice or unasked: {missing}"
     if not alive:
         return
-    assert any(r["event"] == "stop" for r in records) or not any(
-        r["event"] == "command" for r in records
-    )
+    if deaf:  # the drives cannot say that they were told: the journal does
+        assert any(r["event"] == "stop" for r in records), "no stop was sent"
     for drive in sim.drives:
         deadline = time.monotonic() + 2.0
         while drive.moving and time.monotonic() < deadline:
@@ -162,7 +161,7 @@ def run_cell(
         while code != 0 and resumes < MAX_RESUMES:
             resumes += 1
             code = session(served, folder, sim, said)
-            check_invariants(folder, sim, alive=True, deaf=True)
+            check_invariants(folder, sim, alive=True, deaf=False)
     assert code == 0, said[-12:]
     worst = float(np.abs(calibration(folder) - truth).max())
     assert worst < 1e-6, f"resumed to another calibration: {worst}"
@@ -197,7 +196,7 @@ def _host_cell(
         first = child.returncode
         expected = {
             "sigint": (4, 0),  # 0: in the last phase there is nothing left to pause
-            "sigint_twice": (130, 0),
+            "sigint_twice": (130,),
             "sigterm": (143,),
             "sigkill": (-9,),
             "full_disk": (3,),
@@ -251,7 +250,8 @@ def table(outcomes: list[Outcome]) -> str:
         "counts); no posture is recorded twice or missing; the resumed calibration is "
         "that of the uninterrupted run. *Ridden out* means the first session reached "
         "the same calibration by itself. Faults without a count last until the session "
-        "ends.",
+        "ends; a full disk is a limit on the size of the process's files, set by the "
+        "operating system.",
         "",
         "| fault | " + " | ".join((*PHASES, "finishing")) + " |",
         "|---" * (len(PHASES) + 2) + "|",
@@ -267,7 +267,9 @@ def table(outcomes: list[Outcome]) -> str:
               "## What stopped each", ""]  # fmt: skip
     for fault in (*FAULTS, *HOST_FAULTS):
         reasons = {
-            o.reason.partition(": ")[2] for o in outcomes if o.fault == fault
+            re.sub(r"/\S*/", "", o.reason.partition(": ")[2])
+            for o in outcomes
+            if o.fault == fault
         } - {""}
         if reasons:
             lines.append(f"- `{fault}`: {sorted(reasons, key=len)[0]}")

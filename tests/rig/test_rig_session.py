@@ -173,6 +173,24 @@ def test_too_many_out_of_reach_is_a_fault(tmp_path):
     assert any("max_unreachable" in line for line in said)
 
 
+def test_a_terminal_that_goes_away_stops_the_run_and_not_the_stop(tmp_path):
+    config = fast_config()
+    folder = tmp_path / "run"
+    folder.mkdir()
+    with simulator(config) as sim:
+        served = sim.start()
+
+        def broken(text):
+            if "1/7" in text or "stop" in text or "acknowledged" in text:
+                raise BrokenPipeError("Broken pipe")
+
+        run = Run(served, folder, "calibrate", broken, on_imu_port=sim.start_phone)
+        assert run_safely(run, calibrate) == 3
+        assert all(drive.stops for drive in sim.drives)
+        assert read_journal(folder / "journal.jsonl")[-1]["event"] == "stopped"
+        assert session(served, folder, sim) == 0
+
+
 def test_collect_records_a_dataset_and_resumes(tmp_path):
     config, said = fast_config(), []
     folder = tmp_path / "collection"
