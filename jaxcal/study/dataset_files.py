@@ -14,6 +14,7 @@ import hashlib
 import io
 import os
 import pathlib
+import struct
 import zipfile
 import zlib
 from typing import Any, NoReturn
@@ -29,6 +30,19 @@ from jaxcal.study.datasets import Dataset
 __all__ = ["load_dataset", "save_csv", "save_npz"]
 
 Array = NDArray[np.float64]
+
+# What zipfile and numpy raise on bytes that are not what they say.
+_DAMAGE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    EOFError,
+    KeyError,
+    MemoryError,
+    OSError,
+    OverflowError,
+    RuntimeError,
+)
 
 
 def load_dataset(path: str | os.PathLike[str]) -> Dataset:
@@ -110,7 +124,7 @@ _Fields = tuple[Array, Array | None, NDArray[np.bool_] | None, JointRanges | Non
 def _read_npz(data: bytes) -> _Fields:
     try:
         archive = np.load(io.BytesIO(data), allow_pickle=False)
-    except (zipfile.BadZipFile, ValueError, EOFError, OSError):
+    except (*_DAMAGE, ValueError):
         raise ValueError("not a .npz file, or a truncated one") from None
     if not isinstance(archive, np.lib.npyio.NpzFile):
         raise ValueError("not a .npz file but a single array")
@@ -141,7 +155,7 @@ def _read_npz(data: bytes) -> _Fields:
 def _member(archive: np.lib.npyio.NpzFile, key: str) -> NDArray[np.generic]:
     try:
         member: NDArray[np.generic] = archive[key]
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError):
+    except _DAMAGE:
         raise ValueError(f'key "{key}" is damaged') from None
     except ValueError as error:
         if "pickle" in str(error):
