@@ -8,9 +8,7 @@ QUICK = [
     ("lost_write_reply,count=1", "moving"),
     ("slipping_axis,axis=roll", "settling"),
     ("imu_wrong_order", "zeroing"),
-    ("dead_drive,axis=yaw", "measuring"),
     ("sigkill", "moving"),
-    ("sigint", "measuring"),
     ("full_disk", "saving"),
 ]
 
