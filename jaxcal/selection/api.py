@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.selection.exact import STARTING_RESTARTS, solve_exact
-from jaxcal.selection.exchange import DEFAULT_RESTARTS, exchange_indices
+from jaxcal.selection.exchange import default_restarts, exchange_indices
 from jaxcal.selection.greedy import greedy_indices
 from jaxcal.selection.problem import Problem, make_problem, whole_number
 from jaxcal.selection.random import random_indices
@@ -53,8 +53,8 @@ def select(
         num_outputs: m, as many as inputs when not given; log det S is m times that of
             the (n + 1) x (n + 1) matrix.
         seed: for random and exchange, and for the policy where it samples.
-        restarts: random starts of the exchange, 200 when not given; 30 where it only
-            starts the exact search.
+        restarts: random starts of the exchange; when not given 200, with replicates
+            400, and 30 where it only starts the exact search.
         time_limit: seconds after which exact returns the best found, not proven.
         best: how many best subsets exact proves, in ``alternatives``.
         reference: what ``bound`` and ``efficiency`` are measured against, "bound" (the
@@ -92,7 +92,7 @@ def select(
         deadline = None if time_limit is None else start + time_limit
         starts = restarts or STARTING_RESTARTS
         return _exact(problem, best, deadline, starts, seed, start)
-    starts = restarts or DEFAULT_RESTARTS
+    starts = restarts or default_restarts(problem.max_replicates)
     used_seed: int | None = seed
     used_restarts: int | None = None
     if method == "random":

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.regression import log_det_information
 from jaxcal.selection.exact import ExactResult, solve_exact
-from jaxcal.selection.exchange import DEFAULT_RESTARTS, exchange_indices
+from jaxcal.selection.exchange import exchange_indices
 from jaxcal.selection.greedy import greedy_rows
 from jaxcal.selection.problem import Problem, make_problems, whole_number
 from jaxcal.selection.random import random_indices
@@ -98,7 +98,7 @@ def exchange_batch(
     required: ArrayLike | None = None,
     max_replicates: int = 1,
     num_outputs: int | None = None,
-    restarts: int = DEFAULT_RESTARTS,
+    restarts: int | None = None,
     seed: int = 0,
 ) -> BatchSelection:
     """Fedorov exchange, the same seed in every set.
@@ -106,7 +106,8 @@ def exchange_batch(
     Args: those of :func:`random_batch`, and the random starts a set.
     """
     start = time.perf_counter()
-    restarts = whole_number("restarts", restarts, 1)
+    if restarts is not None:
+        restarts = whole_number("restarts", restarts, 1)
     seed = whole_number("seed", seed, 0)
     problems = make_problems(
         candidates,

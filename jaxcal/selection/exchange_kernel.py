@@ -114,7 +114,7 @@ def climb(rows, columns, upper, num_fixed, chosen, counts, gram, inverse):
         gram, inverse: (p, p) work space.
 
     Returns:
-        log det of the local optimum.
+        log det of the local optimum; -inf, and nothing changed, from a singular start.
     """
     num_rows, p = rows.shape
     k = len(chosen)
@@ -122,6 +122,8 @@ def climb(rows, columns, upper, num_fixed, chosen, counts, gram, inverse):
     for r in range(k):
         add_outer(gram, rows[chosen[r]], 1.0)
     log_det = factor(gram, inverse)
+    if not log_det > -np.inf:
+        return log_det
     leverage = np.empty(num_rows)
     cross = np.empty(num_rows)
     weight = np.empty(p)
