@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pathlib
 import re
+import signal
 import subprocess
 import sys
 
@@ -172,6 +173,27 @@ def test_a_missing_checkpoint_is_one_line_and_code_2(tmp_path: pathlib.Path) -> 
         *("--json", tmp_path / "o.json", "--report", tmp_path / "report"),
     )
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_writes_nothing(tmp_path: pathlib.Path) -> None:
+    child = subprocess.Popen(
+        [
+            *(sys.executable, str(ROOT / "evaluate.py"), "--dataset", "dataset3"),
+            *("dataset2", "--methods", "exact", "--k", "9"),
+            *("--json", str(tmp_path / "o.json")),
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
+    assert child.stdout is not None
+    assert child.stdout.readline().startswith("dataset3")
+    child.send_signal(signal.SIGINT)
+    _, errors = child.communicate(timeout=120)
+    assert child.returncode == 130, errors
+    assert errors.splitlines()[-1] == "evaluate.py: interrupted, nothing was written"
     assert list(tmp_path.iterdir()) == []
 
 

@@ -182,10 +182,14 @@ class _Run:
 
     def log_det(self, indices: Indices) -> Array:
         """(E, R) natural log det S of (E, R, k) indices."""
-        chosen = np.take_along_axis(
-            self.dataset.candidates[:, None], indices[..., None], axis=2
-        )
-        return self.dataset.num_outputs * log_det_gram(chosen)
+        gram = np.empty(indices.shape[:2])
+        for begin in range(0, len(indices), _CHUNK):
+            cut = slice(begin, begin + _CHUNK)
+            chosen = np.take_along_axis(
+                self.dataset.candidates[cut, None], indices[cut, :, :, None], axis=2
+            )
+            gram[cut] = log_det_gram(chosen)
+        return self.dataset.num_outputs * gram
 
     def pieces(self, label: str, size: int = _CHUNK) -> Any:
         """Slices of episodes, reporting progress between them."""
