@@ -1,0 +1,236 @@
+"""Checkpoints, by orbax: the policy, what it was trained with, and how to go on.
+
+A checkpoint folder holds one numbered folder a save. Each has ``policy`` (the averaged
+weights), ``meta`` (JSON: schema, configuration, seed, package versions, progress) and,
+in a training run, ``state`` (all an uninterrupted run would need). Orbax writes a step
+beside the others and renames it, so a kill during a save leaves the previous one.
+
+orbax calls this interface legacy and its successor is still experimental; it is used
+here alone, so that changing it touches one file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import importlib.metadata
+import pathlib
+import platform
+from typing import Any
+
+import jax
+import orbax.checkpoint as ocp
+
+from jaxcal.learning.networks import Network, NetworkConfig, build
+
+__all__ = ["CheckpointError", "Policy", "default_folder", "load", "restore", "save"]
+
+SCHEMA = "jaxcal-policy"
+VERSION = 1
+_PACKAGES = ("jaxcal", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that is missing, damaged, or made by another version."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Policy:
+    """A trained policy, ready to choose."""
+
+    network: Network
+    params: Any
+    meta: dict[str, Any]  # as saved
+    folder: pathlib.Path
+    step: int
+
+
+def default_folder() -> pathlib.Path:
+    """The checkpoint that ships: inside the installed package, or in the repository."""
+    package = pathlib.Path(__file__).resolve().parent.parent
+    inside = package / "checkpoints" / "default"
+    return inside if inside.is_dir() else package.parent / "checkpoints" / "default"
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of what a result depends on."""
+    versions = {"python": platform.python_version()}
+    for name in _PACKAGES:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return versions
+
+
+def _manager(folder: pathlib.Path, keep: int | None, create: bool) -> Any:
+    return ocp.CheckpointManager(
+        folder.absolute(),
+        options=ocp.CheckpointManagerOptions(
+            max_to_keep=keep,
+            create=create,
+            cleanup_tmp_directories=create,
+            enable_async_checkpointing=False,
+            read_only=not create,
+        ),
+    )
+
+
+def _plain_keys(tree: Any) -> Any:
+    """PRNG keys as the integers they are made of, which every orbax can store."""
+    return jax.tree.map(
+        lambda leaf: (
+            jax.random.key_data(leaf)
+            if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+            else leaf
+        ),
+        tree,
+    )
+
+
+def save(
+    folder: str | pathlib.Path,
+    step: int,
+    params: Any,
+    meta: dict[str, Any],
+    state: Any = None,
+    keep: int = 3,
+) -> None:
+    """Add a step to a checkpoint folder.
+
+    Args:
+        folder: made where missing.
+        step: number of the step; a step that exists is left as it is.
+        params: the policy's weights.
+        meta: JSON values; ``network`` is the fields of a ``NetworkConfig``.
+        state: what ``restore`` gives back, or None for a policy only.
+        keep: older steps beyond these are deleted.
+    """
+    meta = {
+        "schema": SCHEMA,
+        "version": VERSION,
+        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "versions": package_versions(),
+    } | meta
+    items = {"policy": ocp.args.StandardSave(params), "meta": ocp.args.JsonSave(meta)}
+    if state is not None:
+        items["state"] = ocp.args.StandardSave(_plain_keys(state))
+    with _manager(pathlib.Path(folder), keep, create=True) as manager:
+        if step not in manager.all_steps():
+            manager.save(step, args=ocp.args.Composite(**items))
+
+
+def _resolve(folder: str | pathlib.Path | None) -> pathlib.Path:
+    """The folder with the numbered steps: the one given, or its ``checkpoint``."""
+    path = default_folder() if folder is None else pathlib.Path(folder)
+    if not path.is_dir():
+        hint = " (train one with: python train.py)" if folder is None else ""
+        raise CheckpointError(f"checkpoint folder {path} does not exist{hint}")
+    return path / "checkpoint" if (path / "checkpoint").is_dir() else path
+
+
+def _latest(folder: pathlib.Path) -> tuple[pathlib.Path, int, dict[str, Any]]:
+    """The newest complete step of a folder and its meta, checked."""
+    steps = [int(p.name) for p in folder.iterdir() if p.name.isdigit() and p.is_dir()]
+    if not steps:
+        raise CheckpointError(f"checkpoint folder {folder} holds no checkpoint")
+    step = max(steps)
+    try:
+        with _manager(folder, None, create=False) as manager:
+            meta = manager.restore(
+                step, args=ocp.args.Composite(meta=ocp.args.JsonRestore())
+            )["meta"]
+    except Exception as error:  # orbax and tensorstore raise many kinds
+        raise CheckpointError(
+            f"checkpoint {folder / str(step)} cannot be read: its meta is damaged "
+            f"({_first_line(error)})"
+        ) from error
+    if not isinstance(meta, dict) or meta.get("schema") != SCHEMA:
+        raise CheckpointError(
+            f"checkpoint {folder / str(step)} is not a jaxcal policy: its schema is "
+            f"{meta.get('schema')!r}, not {SCHEMA!r}"
+        )
+    if meta.get("version") != VERSION:
+        raise CheckpointError(
+            f"checkpoint {folder / str(step)} has version {meta.get('version')!r}; "
+            f"this jaxcal reads version {VERSION}"
+        )
+    return folder / str(step), step, meta
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+
+
+def load(folder: str | pathlib.Path | None = None) -> Policy:
+    """The newest policy in a folder.
+
+    Args:
+        folder: a checkpoint folder or a training run's; the one that ships when None.
+
+    Raises:
+        CheckpointError: there is none, it is damaged, or another version made it.
+    """
+    root = _resolve(folder)
+    path, step, meta = _latest(root)
+    try:
+        config = NetworkConfig(**meta["network"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"checkpoint {path} names no network this jaxcal knows: {error}"
+        ) from error
+    try:
+        with _manager(root, None, create=False) as manager:
+            params = manager.restore(
+                step, args=ocp.args.Composite(policy=ocp.args.StandardRestore())
+            )["policy"]
+    except Exception as error:  # orbax and tensorstore raise many kinds
+        raise CheckpointError(
+            f"checkpoint {path} cannot be read: its weights are damaged "
+            f"({_first_line(error)})"
+        ) from error
+    if not all(
+        bool(jax.numpy.isfinite(leaf).all()) for leaf in jax.tree.leaves(params)
+    ):
+        raise CheckpointError(f"checkpoint {path} holds weights that are not finite")
+    return Policy(build(config), params, meta, root, step)
+
+
+def restore(folder: str | pathlib.Path, fresh: Any) -> tuple[Any, dict[str, Any]]:
+    """The training state of the newest step, and its meta.
+
+    Args:
+        folder: as for ``load``.
+        fresh: a state of the same structure, for shapes and types.
+
+    Raises:
+        CheckpointError: none, damaged, or one without a training state.
+    """
+    root = _resolve(folder)
+    path, step, meta = _latest(root)
+    if not (path / "state").exists():
+        raise CheckpointError(
+            f"checkpoint {path} holds a policy but no training state to resume from"
+        )
+    abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, _plain_keys(fresh))
+    try:
+        with _manager(root, None, create=False) as manager:
+            plain = manager.restore(
+                step,
+                args=ocp.args.Composite(state=ocp.args.StandardRestore(abstract)),
+            )["state"]
+    except Exception as error:  # orbax and tensorstore raise many kinds
+        raise CheckpointError(
+            f"checkpoint {path} cannot be resumed: its training state is damaged or of "
+            f"another configuration ({_first_line(error)})"
+        ) from error
+    state = jax.tree.map(
+        lambda new, old: (
+            jax.random.wrap_key_data(old)
+            if jax.dtypes.issubdtype(new.dtype, jax.dtypes.prng_key)
+            else old
+        ),
+        fresh,
+        plain,
+    )
+    return state, meta

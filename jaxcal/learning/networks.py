@@ -1,0 +1,377 @@
+"""Policy networks: ``compact`` (invariant, any M, K and n) and ``paper`` (Table 2).
+
+What needs no parameters is kept apart from what does, so that training computes the
+geometry of a decision once and not in every epoch:
+
+    view          = look(candidates, usable)            of a set, no parameters
+    glance        = look_at(view, chosen, available, count)   of a decision, likewise
+    memory        = encode(view)                        once a set
+    logits, value = decode(memory, glance)              once a decision
+
+Arrays are batched over leading axes (``...``). ``value`` is the expected final
+log det(Z.T Z), unscaled. Networks are flax modules; ``build`` makes one from a config.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from jaxcal.learning import geometry
+from jaxcal.learning.observation import context_features
+
+__all__ = [
+    "PAPER_HEADS",
+    "CompactNetwork",
+    "Network",
+    "NetworkConfig",
+    "PaperNetwork",
+    "build",
+    "mask_logits",
+]
+
+View = dict[str, jax.Array]
+
+_FLOOR = -8.0  # least log-volume, relative to the best, that a feature can show
+_RIDGE = 0.01  # of the mean square of a whitened coordinate, which is one
+_SHARP = 60.0  # inverse temperature of the choices that need no learning
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkConfig:
+    """Which network, and its size."""
+
+    kind: str = "compact"  # "compact" or "paper"
+    width: int = 32  # features a candidate (compact), hidden width (paper: 768)
+    encoder_rounds: int = 3  # message rounds over the whole set, once an episode
+    decoder_rounds: int = 1  # message rounds over what is left, once a decision
+    lookahead: int = 12  # most greedy choices ahead that a candidate's features show
+    messages: bool = True  # second-moment messages sum_j v_j x_j x_j.T
+    endgame: bool = True  # the last two choices by volume alone, which is optimal
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("compact", "paper"):
+            raise ValueError(f"kind must be 'compact' or 'paper', got {self.kind!r}")
+        for name in ("width", "lookahead"):
+            if getattr(self, name) < 1:
+                raise ValueError(
+                    f"{name} must be at least 1, got {getattr(self, name)}"
+                )
+        for name in ("encoder_rounds", "decoder_rounds"):
+            if getattr(self, name) < 0:
+                raise ValueError(
+                    f"{name} must not be negative, got {getattr(self, name)}"
+                )
+
+
+def mask_logits(logits: jax.Array, available: jax.Array) -> jax.Array:
+    """(..., M) logits, a large finite minimum where not available.
+
+    ``-inf`` would make the entropy, and with it every gradient, NaN.
+    """
+    return jnp.where(available, logits, jnp.asarray(-1e9, logits.dtype))
+
+
+def _second_moments(x: jax.Array) -> jax.Array:
+    """(..., M, p) -> (..., M, p (p + 1) / 2) with phi(x) . phi(y) = (x . y)^2."""
+    p = x.shape[-1]
+    return jnp.stack(
+        [
+            x[..., i] * x[..., j] * (1.0 if i == j else 2.0**0.5)
+            for i in range(p)
+            for j in range(i, p)
+        ],
+        axis=-1,
+    )
+
+
+def _glance(y: jax.Array, spanned: bool, active: jax.Array, depth: int) -> View:
+    """What the network reads of conditional vectors y (..., M, p).
+
+    Returns:
+        ``features`` (..., M, 13); ``moments`` (..., M, p (p + 1) / 2), scaled so that
+        messages keep their size; ``active`` (..., M) bool; ``ahead`` (..., M, 4)
+        log-volumes after 1, 2, 3 and ``depth`` greedy choices, relative to the best;
+        and ``best`` (..., 4).
+    """
+    y = y * active[..., None].astype(y.dtype)
+    number = jnp.maximum(active.sum(-1).astype(y.dtype), 1.0)
+    square = (y * y).sum(-1)
+    mean_square = jnp.maximum(square.sum(-1) / number, 1e-8)
+    unit = y * jax.lax.rsqrt(mean_square)[..., None, None]
+    moments = _second_moments(unit) * jax.lax.rsqrt(number)[..., None, None]
+    steps = geometry.lookahead(y, spanned, active, depth)
+    shown = [steps[min(d, depth) - 1] for d in (1, 2, 3, depth)]
+    ahead = jnp.stack(shown, axis=-1)
+    best = ahead.max(-2)
+    ahead = jnp.maximum(ahead - best[..., None, :], -30.0)
+    level = jnp.log(jnp.maximum(square, 1e-6) / mean_square[..., None])
+    short = jnp.maximum(ahead, _FLOOR)
+    features = jnp.concatenate(
+        [
+            short / 2.0,
+            jnp.exp(short),
+            jnp.exp(4.0 * short),
+            jnp.clip(level, _FLOOR, 4.0)[..., None] / 2.0,
+        ],
+        axis=-1,
+    )
+    return {
+        "features": jnp.where(active[..., None], features, 0.0),
+        "moments": moments,
+        "active": active,
+        "ahead": ahead,
+        "best": best,
+    }
+
+
+class _Round(nn.Module):
+    """One round of messages among the active candidates, then a residual MLP.
+
+    The message to candidate i is a linear attention with the kernel (x_i . x_j)^2:
+    ``sum_j (x_i . x_j)^2 v_j``, computed through the second moments of the whole set,
+    so that the cost grows with M and not with M squared.
+    """
+
+    config: NetworkConfig
+
+    @nn.compact
+    def __call__(self, h: jax.Array, glance: View) -> jax.Array:
+        width = self.config.width
+        active = glance["active"][..., None].astype(h.dtype)
+        u = nn.LayerNorm(name="norm")(h)
+        parts = [u]
+        if self.config.messages:
+            v = nn.Dense(width, use_bias=False, name="send")(u) * active
+            moments = glance["moments"]
+            total = jnp.einsum("...mf,...mw->...fw", moments, v)
+            parts.append(jnp.einsum("...mf,...fw->...mw", moments, total))
+        number = jnp.maximum(active.sum(-2, keepdims=True), 1.0)
+        mean = (u * active).sum(-2, keepdims=True) / number
+        inner = nn.Dense(2 * width, name="mix")(jnp.concatenate(parts, axis=-1))
+        pooled = nn.Dense(2 * width, use_bias=False, name="pool")(mean)
+        out = nn.Dense(width, name="out")(nn.relu(inner + pooled))
+        return h + out * active
+
+
+class CompactNetwork(nn.Module):
+    """Permutation-equivariant, affine-invariant, for any M, K and n.
+
+    It sees the candidates only through inner products of whitened regressors, so no
+    affine map of the commands and no order of the candidates can change the pick. With
+    one choice left the largest gain is optimal, and with two the largest pair volume:
+    those two are taken as they are (``endgame``), the network chooses before them.
+    """
+
+    config: NetworkConfig
+
+    def setup(self) -> None:
+        config = self.config
+        self.embed = nn.Dense(config.width)
+        self.encoder = [_Round(config) for _ in range(config.encoder_rounds)]
+        self.join = nn.Dense(config.width)
+        self.decoder = [_Round(config) for _ in range(config.decoder_rounds)]
+        self.final_norm = nn.LayerNorm()
+        self.actor = nn.Dense(
+            1, use_bias=False, kernel_init=nn.initializers.orthogonal(0.1)
+        )
+        self.critic_hidden = nn.Dense(config.width)
+        self.critic = nn.Dense(1, kernel_init=nn.initializers.orthogonal(0.1))
+
+    @property
+    def num_unlearned(self) -> int:
+        """Choices at the end of an episode that are made without the network."""
+        return min(self.config.lookahead, 2) if self.config.endgame else 0
+
+    def look(self, candidates: jax.Array, usable: jax.Array) -> View:
+        """The geometry of a set.
+
+        Args:
+            candidates: (..., M, n) commands in any unit.
+            usable: (..., M) bool, available or already chosen.
+        """
+        x, offset = geometry.whiten(candidates, usable)
+        depth = min(self.config.lookahead, x.shape[-1])
+        return _glance(x, False, usable, depth) | {"x": x, "offset": offset}
+
+    def look_at(
+        self, view: View, chosen: jax.Array, available: jax.Array, count: int
+    ) -> View:
+        """The geometry of a decision.
+
+        Args:
+            view: from ``look``.
+            chosen: (..., K) int, of which the first ``count`` are chosen, the rest -1.
+            available: (..., M) bool.
+            count: choices made, the same for the whole batch.
+        """
+        x = view["x"]
+        p, total = x.shape[-1], chosen.shape[-1]
+        left = total - count
+        which = jax.nn.one_hot(chosen[..., :count], x.shape[-2], dtype=x.dtype)
+        picked = jnp.einsum(
+            "...km,...mp->...kp", which, x, precision=jax.lax.Precision.HIGHEST
+        )
+        if total == p:
+            # Every choice is a new direction: exact projections.
+            y, spanned = geometry.projected(x, picked), False
+            so_far = geometry.log_det_lengths(picked)
+        else:
+            # The metric of the chosen; until they span the space, with a ridge small
+            # beside what a posture contributes.
+            ridge = _RIDGE if count < p else 0.0
+            y, so_far = geometry.normalised_by(x, picked, ridge)
+            spanned = True
+        glance = _glance(y, spanned, available, min(self.config.lookahead, left))
+        scalars = [
+            float(left == 1),
+            float(left == 2),
+            float(left == 3),
+            1.0 / left,
+            count / p,
+            min(left / p, 3.0),
+            float(total > p),
+        ]
+        return glance | {
+            "which": which.sum(-2) / max(count, 1),
+            "so_far": view["offset"] + so_far + glance["best"][..., 3],
+            "scalars": jnp.broadcast_to(
+                jnp.asarray(scalars, x.dtype), (*so_far.shape, len(scalars))
+            ),
+        }
+
+    def encode(self, view: View) -> jax.Array:
+        """Embed a set: (..., M, width)."""
+        features, active = view["features"], view["active"]
+        size = jnp.log(jnp.maximum(active.sum(-1).astype(features.dtype), 1.0) / 50.0)
+        dimension = jnp.full_like(size, view["x"].shape[-1] / 4.0 - 1.0)
+        scalars = jnp.stack([size / 3.0, dimension], axis=-1)[..., None, :]
+        scalars = jnp.broadcast_to(scalars, (*features.shape[:-1], 2))
+        h = self.embed(jnp.concatenate([features, scalars], axis=-1))
+        h = h * active[..., None]
+        for layer in self.encoder:
+            h = layer(h, view)
+        return h
+
+    def decode(self, memory: jax.Array, glance: View) -> tuple[jax.Array, jax.Array]:
+        """Score the next choice.
+
+        Returns:
+            (..., M) masked logits and (...,) value, in units of log det(Z.T Z).
+        """
+        h, features, active = memory, glance["features"], glance["active"]
+        lead = features.shape[:-1]
+        mean = jnp.einsum("...m,...mw->...w", glance["which"], h)
+        state = jnp.concatenate([mean, glance["scalars"]], axis=-1)[..., None, :]
+        state = jnp.broadcast_to(state, (*lead, state.shape[-1]))
+        h = jnp.broadcast_to(h, (*lead, h.shape[-1]))
+        g = self.join(jnp.concatenate([h, features, state], axis=-1))
+        g = g * active[..., None]
+        for layer in self.decoder:
+            g = layer(g, glance)
+        g = self.final_norm(g)
+        logits = mask_logits(self.actor(g)[..., 0], active)
+        weight = active[..., None].astype(g.dtype)
+        number = jnp.maximum(weight.sum(-2), 1.0)
+        pooled = jnp.concatenate(
+            [(g * weight).sum(-2) / number, (g - 1e3 * (1.0 - weight)).max(-2)], axis=-1
+        )
+        value = self.critic(nn.relu(self.critic_hidden(pooled)))[..., 0]
+        return logits, glance["so_far"] + value
+
+    def finish(self, glance: View) -> tuple[jax.Array, jax.Array]:
+        """Logits and value of a choice that needs no network (``num_unlearned``)."""
+        logits = mask_logits(_SHARP * glance["ahead"][..., 3], glance["active"])
+        return logits, glance["so_far"]
+
+    def __call__(
+        self,
+        candidates: jax.Array,
+        usable: jax.Array,
+        chosen: jax.Array,
+        available: jax.Array,
+    ) -> tuple[jax.Array, jax.Array]:
+        view = self.look(candidates, usable)
+        return self.decode(self.encode(view), self.look_at(view, chosen, available, 0))
+
+
+class PaperNetwork(nn.Module):
+    """The paper's attention policy: hidden 768, 3.5 M parameters, 71 % shared.
+
+    Candidates are encoded one by one, a context encoder reads the ten numbers of the
+    state that are not candidates, attention relates the two, and an actor and a critic
+    stand on that shared encoder. Any M runs; it is not invariant to affine maps.
+    """
+
+    config: NetworkConfig
+
+    num_unlearned = 0
+
+    def setup(self) -> None:
+        width = self.config.width
+        self.pose_1, self.pose_2 = nn.Dense(width), nn.Dense(width)
+        self.pose_norm = nn.LayerNorm()
+        self.key = nn.Dense(width)
+        self.context_1, self.context_2 = nn.Dense(width), nn.Dense(width)
+        self.context_norm = nn.LayerNorm()
+        self.query = nn.Dense(width)
+        self.squeeze = nn.Dense(max(width * 3 // 32, 1))
+        self.expand = nn.Dense(width)
+        self.actor = nn.Dense(width)
+        self.critic_1 = nn.Dense(max(width * 2 // 3, 1))
+        self.critic_2 = nn.Dense(1, kernel_init=nn.initializers.orthogonal(0.1))
+
+    def look(self, candidates: jax.Array, usable: jax.Array) -> View:
+        """The candidates as they are."""
+        return {"candidates": candidates}
+
+    def look_at(
+        self, view: View, chosen: jax.Array, available: jax.Array, count: int
+    ) -> View:
+        """The ten context numbers and the availability of the 210."""
+        context = context_features(view["candidates"], chosen)
+        return {"context": context, "active": available}
+
+    def encode(self, view: View) -> jax.Array:
+        """Keys (..., M, width) of the candidates, encoded one by one."""
+        poses = nn.relu(self.pose_1(2.0 * view["candidates"] - 1.0))
+        poses = self.pose_norm(nn.relu(self.pose_2(poses)))
+        return self.key(poses)
+
+    def decode(self, memory: jax.Array, glance: View) -> tuple[jax.Array, jax.Array]:
+        """Score the next choice; see ``CompactNetwork.decode``."""
+        keys = memory
+        context = nn.relu(self.context_1(glance["context"]))
+        context = self.context_norm(nn.relu(self.context_2(context)))
+        scale = self.config.width**-0.5
+        scores = jnp.einsum("...w,...mw->...m", self.query(context), keys) * scale
+        weights = nn.softmax(mask_logits(scores, glance["active"]))
+        glimpse = jnp.einsum("...m,...mw->...w", weights, keys)
+        shared = context + self.expand(nn.relu(self.squeeze(context + glimpse)))
+        query = self.actor(shared)
+        logits = jnp.einsum("...w,...mw->...m", query, keys) * scale
+        value = self.critic_2(nn.relu(self.critic_1(shared)))[..., 0]
+        return mask_logits(logits, glance["active"]), value
+
+    def __call__(
+        self,
+        candidates: jax.Array,
+        usable: jax.Array,
+        chosen: jax.Array,
+        available: jax.Array,
+    ) -> tuple[jax.Array, jax.Array]:
+        view = self.look(candidates, usable)
+        return self.decode(self.encode(view), self.look_at(view, chosen, available, 0))
+
+
+PAPER_HEADS = ("actor", "critic_1", "critic_2")  # everything else is shared
+
+Network = CompactNetwork | PaperNetwork
+
+
+def build(config: NetworkConfig) -> Network:
+    """The network a config names, as a flax module."""
+    return CompactNetwork(config) if config.kind == "compact" else PaperNetwork(config)

@@ -1,0 +1,211 @@
+"""Train a posture-selection policy: ``python train.py``; ``--help`` lists the rest."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import pathlib
+import signal
+import sys
+from typing import Any
+
+EXAMPLES = """\
+examples:
+  python train.py                                  the compact policy, about 10 minutes
+  python train.py --preset paper                   the paper's network and schedule
+  python train.py --resume --out runs/compact      go on where a run stopped
+  python train.py --episodes 20000 --seed 1 --out runs/short
+  python train.py --trainer brax --episodes 50000  the same task, brax's own PPO
+
+A run folder holds metrics.csv, TensorBoard events and checkpoint/; measure it with
+  python evaluate.py --checkpoint runs/compact
+Ctrl-C saves and stops; --resume then continues bit for bit (on the same CPU)."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Flags; those of a configuration are made from its fields."""
+    from jaxcal.learning import presets
+
+    out = argparse.ArgumentParser(
+        description=__doc__,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    out.add_argument("--preset", choices=sorted(presets.PRESETS), default="compact")
+    out.add_argument("--episodes", type=int, metavar="N", help="training budget")
+    out.add_argument("--seed", type=int, metavar="S", help="of everything random")
+    out.add_argument("--out", metavar="DIR", help="run folder (runs/PRESET)")
+    out.add_argument(
+        "--resume", action="store_true", help="go on from the run folder's checkpoint"
+    )
+    out.add_argument(
+        "--trainer",
+        choices=("jaxcal", "brax"),
+        default="jaxcal",
+        help="jaxcal's own PPO, or brax's on the same environment",
+    )
+    out.add_argument(
+        "--no-validation",
+        action="store_true",
+        help="do not measure the gap to the proven optimum while training",
+    )
+    for title, field, skip in (
+        ("optimisation", "ppo", {"num_episodes", "seed"}),
+        ("network", "network", set()),
+        ("environment", "environment", set()),
+    ):
+        group = out.add_argument_group(title, "the preset's value when not given")
+        for name, kind in presets.fields(field, skip):
+            flag = "--" + name.replace("_", "-")
+            if kind is bool:
+                group.add_argument(flag, action=argparse.BooleanOptionalAction)
+            else:
+                group.add_argument(flag, type=kind, metavar=kind.__name__.upper())
+    return out
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run; 0 when trained or stopped on request, 2 when something given was wrong."""
+    arguments = parser().parse_args(argv)
+    try:
+        return run(arguments)
+    except (ValueError, OSError) as error:
+        print(f"train.py: {error}", file=sys.stderr)
+        return 2
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Build the configuration, train, say how it went."""
+    import jax
+
+    from jaxcal.files import require_writable_folder
+    from jaxcal.learning import cache, checkpoint, networks, ppo, presets, training
+
+    cache.keep_compiled_programs()
+    given = {
+        name: value
+        for name, value in vars(arguments).items()
+        if value is not None and name in presets.field_names()
+    }
+    if arguments.episodes is not None:
+        given["num_episodes"] = arguments.episodes
+    out = pathlib.Path(arguments.out or f"runs/{arguments.preset}")
+    held = (out / "checkpoint").is_dir() and any((out / "checkpoint").iterdir())
+    if arguments.resume:
+        if given:
+            raise ValueError(
+                f"--resume takes its configuration from {out}; leave out "
+                + ", ".join("--" + name.replace("_", "-") for name in sorted(given))
+            )
+        config = training.TrainConfig.from_meta(checkpoint.load(out).meta)
+    else:
+        if held:
+            raise ValueError(
+                f"--out {out} already holds a run: go on with --resume, or name another"
+            )
+        config = presets.with_values(presets.PRESETS[arguments.preset], given)
+    require_writable_folder(out)
+    stop = Stop()
+    if arguments.trainer == "brax":
+        if arguments.resume:
+            raise ValueError("--resume works with --trainer jaxcal only")
+        from jaxcal.learning import brax_ppo
+
+        brax_ppo.train(config, out, print)
+        print(
+            f"saved {out}/checkpoint; measure it: python evaluate.py --checkpoint {out}"
+        )
+        return 0
+    network = networks.build(config.network)
+    shapes = jax.eval_shape(lambda: ppo.init(config.ppo, config.tasks[0], network))
+    size = sum(leaf.size for leaf in jax.tree.leaves(shapes.params))
+    env = config.tasks[0].environment
+    print(
+        f"preset {config.preset}: {config.network.kind} network, {size:,} parameters; "
+        f"choose {env.num_selected} of {env.num_candidates}; "
+        f"{config.ppo.num_episodes:,} episodes, seed {config.ppo.seed}, "
+        f"on {jax.devices()[0].device_kind}; run folder {out}"
+    )
+    print(f"configuration: {dataclasses.asdict(config)}")
+    validation = None if arguments.no_validation else fixed_validation(config)
+    print("compiling the training step (half a minute; seconds the next time) ...")
+    print(
+        "   update   episodes     /s   elapsed      left   reward"
+        "   ratio to exact   optima hit",
+        flush=True,
+    )
+    state = training.train(
+        config,
+        out,
+        resume=arguments.resume,
+        validation=validation,
+        report=show,
+        should_stop=stop.requested,
+    )
+    done = int(state.num_updates)
+    if done < config.ppo.num_updates:
+        print(
+            f"stopped at update {done} of {config.ppo.num_updates} and saved; go on: "
+            f"python train.py --resume --out {out}"
+        )
+    else:
+        print(
+            f"saved {out}/checkpoint; measure it: python evaluate.py --checkpoint {out}"
+        )
+    return 0
+
+
+class Stop:
+    """Ctrl-C or SIGTERM asks the loop to save and stop; a second Ctrl-C is at once."""
+
+    def __init__(self) -> None:
+        self._asked = False
+        for name in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(name, self._ask)
+
+    def _ask(self, number: int, frame: Any) -> None:
+        self._asked = True
+        print("\nstopping after this update and saving ...", flush=True)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def requested(self) -> bool:
+        """Whether to stop."""
+        return self._asked
+
+
+def fixed_validation(config: Any) -> Any:
+    """500 uniform sets of the first task's size, never trained on, and their optima."""
+    import numpy as np
+
+    from jaxcal.learning.training import Validation
+    from jaxcal.selection import exact_batch
+
+    env = config.tasks[0].environment
+    rng = np.random.default_rng([20261121, env.num_candidates, env.num_inputs])
+    sets = rng.uniform(size=(500, env.num_candidates, env.num_inputs))
+    best = exact_batch(sets, env.num_selected, num_outputs=1).log_det
+    return Validation(sets, np.asarray(best), env.num_outputs)
+
+
+def show(report: Any) -> None:
+    """One line of progress."""
+    metrics = report.metrics
+    ratio, hits = metrics.get("ratio_to_exact"), metrics.get("hit_rate")
+    print(
+        f"{report.update:9,d} {report.episodes:10,d} "
+        f"{report.episodes_per_second:6,.0f} "
+        f"{clock(report.seconds):>9} {clock(report.eta):>9} "
+        f"{metrics['reward_mean']:8.4f} "
+        + (f"{ratio:16.4f} {hits:12.3f}" if ratio is not None else ""),
+        flush=True,
+    )
+
+
+def clock(seconds: float) -> str:
+    """h:mm:ss."""
+    whole = round(seconds)
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
