@@ -77,7 +77,7 @@ def det_per_episode(evaluation: Evaluation) -> Figure:
             marker="o",
             markersize=3.5,
             color=COLOURS[0],
-            label=_label(main),
+            label=_label(evaluation, main),
         )
     total = evaluation.dataset.num_episodes
     part = "" if shown == total else f", first {shown} of {total}"
@@ -227,7 +227,7 @@ def parameter_variance(evaluation: Evaluation) -> Figure:
             marker=style["marker"],
             markersize=4.5,
             color=style["color"],
-            label=label or _label(result),
+            label=label or _label(evaluation, result),
         )
     for edge in np.arange(len(names) - 1) + 0.5:
         axes.axvline(edge, color="#DDDDDD", linewidth=0.6, zorder=0)
@@ -276,10 +276,13 @@ def _reference_name(evaluation: Evaluation) -> str:
     return "proven optimum" if evaluation.proven.all() else "optimum or its upper bound"
 
 
-def _label(result: MethodResult) -> str:
-    if result.checkpoint is None:
+def _label(evaluation: Evaluation, result: MethodResult) -> str:
+    """The method in words, with its checkpoint where there are several."""
+    policies = {r.checkpoint for r in evaluation.results if r.is_policy}
+    if not result.is_policy or len(policies) < 2:
         return result.label
-    return f"{result.label}, {pathlib.Path(result.checkpoint).name}"
+    name = "default" if result.checkpoint is None else result.checkpoint
+    return f"{result.label}, {pathlib.Path(name).name}"
 
 
 def _main(evaluation: Evaluation) -> MethodResult | None:
@@ -316,7 +319,7 @@ def _styles(
 def _with_random(evaluation: Evaluation) -> list[tuple[str, Array, dict[str, Any]]]:
     """Name, (E, R) log det S and style of every method; random also when not asked."""
     rows = [
-        (_label(result), result.log_det, style)
+        (_label(evaluation, result), result.log_det, style)
         for result, style in zip(
             evaluation.results,
             _styles(evaluation, evaluation.results),
