@@ -178,6 +178,7 @@ class CompactNetwork(nn.Module):
         self.actor = nn.Dense(
             1, use_bias=False, kernel_init=nn.initializers.orthogonal(0.1)
         )
+        self.trust = self.param("trust", nn.initializers.zeros, ())
         self.critic_hidden = nn.Dense(config.width)
         self.critic = nn.Dense(1, kernel_init=nn.initializers.orthogonal(0.1))
 
@@ -273,7 +274,9 @@ class CompactNetwork(nn.Module):
         for layer in self.decoder:
             g = layer(g, glance)
         g = self.final_norm(g)
-        logits = mask_logits(self.actor(g)[..., 0], active)
+        # How far to believe the greedy look ahead is learned, from nothing.
+        logits = self.actor(g)[..., 0] + 20.0 * self.trust * glance["ahead"][..., 3]
+        logits = mask_logits(logits, active)
         weight = active[..., None].astype(g.dtype)
         number = jnp.maximum(weight.sum(-2), 1.0)
         pooled = jnp.concatenate(

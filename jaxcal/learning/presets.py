@@ -9,7 +9,8 @@ from typing import Any
 
 from jaxcal.learning.environment import SelectionConfig
 from jaxcal.learning.networks import NetworkConfig
-from jaxcal.learning.ppo import PPOConfig
+from jaxcal.learning.ppo import PPOConfig, Task
+from jaxcal.learning.scenarios import SHAPES
 from jaxcal.learning.training import TrainConfig
 
 __all__ = ["PRESETS", "field_names", "fields", "with_values"]
@@ -17,7 +18,48 @@ __all__ = ["PRESETS", "field_names", "fields", "with_values"]
 _COMPACT = TrainConfig(
     preset="compact",
     network=NetworkConfig(),
-    ppo=PPOConfig(num_episodes=500_000),
+    ppo=PPOConfig(num_episodes=200_000),
+)
+
+
+def _task(
+    num_candidates: int = 50,
+    num_selected: int = 4,
+    num_inputs: int = 3,
+    shapes: tuple[str, ...] = ("uniform",),
+    masked: float = 0.0,
+    random_starts: float = 0.0,
+) -> Task:
+    environment = SelectionConfig(
+        num_candidates,
+        num_selected,
+        num_inputs,
+        num_inputs,
+        reward_gain=num_selected > num_inputs + 1,
+    )
+    return Task(environment, shapes, masked, random_starts)
+
+
+# What ships: the paper's task half of the time, and beside it other shapes of candidate
+# sets, masks, postures already measured, other numbers of postures and of inputs.
+_GENERAL = TrainConfig(
+    preset="general",
+    network=NetworkConfig(),
+    ppo=PPOConfig(num_episodes=800_000),
+    tasks=(
+        _task(),
+        _task(shapes=SHAPES, masked=0.4, random_starts=0.3),
+        _task(),
+        _task(num_selected=5, shapes=("uniform", *SHAPES)),
+        _task(),
+        _task(num_selected=6, masked=0.3, random_starts=0.2),
+        _task(num_candidates=20, shapes=("uniform", *SHAPES)),
+        _task(),
+        _task(num_selected=8, shapes=("uniform", *SHAPES)),
+        _task(num_selected=3, num_inputs=2),
+        _task(),
+        _task(num_selected=5, num_inputs=4),
+    ),
 )
 
 # Table 2: an update every 16 episodes, 10 epochs, 200,000 episodes, and no more. The
@@ -41,7 +83,7 @@ _PAPER = TrainConfig(
     ),
 )
 
-PRESETS = {config.preset: config for config in (_COMPACT, _PAPER)}
+PRESETS = {config.preset: config for config in (_COMPACT, _GENERAL, _PAPER)}
 
 _PARTS = {"ppo": PPOConfig, "network": NetworkConfig, "environment": SelectionConfig}
 
