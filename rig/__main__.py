@@ -9,111 +9,12 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from rig.arguments import make_parser
+
 if TYPE_CHECKING:
     from rig.session import Run
     from rig.settings import RigConfig
     from rig.simulator import Simulator
-
-EPILOG = """\
-exit codes: 0 done; 1 done, but the error says calibrate (again); 2 bad input, nothing
-moved; 3 stopped by a fault; 4 paused by Ctrl-C; 128 + signal stopped by a signal.
-After 3, 4 and signals `resume RUN` goes on.
-
-Research software, not a medical device. Calibrate with no patient attached; a hardware
-emergency stop is required.
-"""
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m rig",
-        description="Calibrate a three-axis device over Modbus and a phone's IMU.",
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-
-    def add(name: str, text: str) -> argparse.ArgumentParser:
-        return commands.add_parser(name, help=text, description=text)
-
-    for name, text in (
-        ("calibrate", "choose, visit, identify, verify and save"),
-        ("collect", "record random postures (Datasets 4 and 5)"),
-        ("verify", "compare a saved calibration with fresh measurements"),
-        ("goto", "move the end-effector to a posture through a calibration"),
-    ):
-        sub = add(name, text)
-        if name in ("verify", "goto"):
-            sub.add_argument(
-                "calibration", type=pathlib.Path, help="file, or run folder"
-            )
-        if name == "goto":
-            sub.add_argument(
-                "--to", type=float, nargs=3, required=True,
-                metavar=("PITCH", "YAW", "ROLL"), help="desired posture in degrees",
-            )  # fmt: skip
-        if name in ("collect", "verify"):
-            sub.add_argument(
-                "--count", type=int, default=50 if name == "collect" else 6
-            )
-        _config_options(sub)
-        sub.add_argument("--out", type=pathlib.Path, help="folder for the run's folder")
-        sub.add_argument("--dry-run", action="store_true", help="plan; open no port")
-        _motion_options(sub)
-        sub.add_argument(
-            "--zero", action="store_true",
-            help="confirm that the device stands in its zero posture",
-        )  # fmt: skip
-        _simulator_options(sub)
-    resume = add("resume", "go on with a run that was paused, stopped or killed")
-    resume.add_argument("run", type=pathlib.Path, help="the run's folder")
-    resume.add_argument("--config", type=pathlib.Path, help="for a changed port")
-    _motion_options(resume)
-    resume.add_argument("--zero", action="store_true", help=argparse.SUPPRESS)
-    _simulator_options(resume)
-    identify = add("identify", "ask every drive who and how it is; only reads")
-    _config_options(identify)
-    identify.add_argument("--simulate", action="store_true")
-    stop = add("stop", "quick-stop every drive now, and verify")
-    _config_options(stop)
-    check = add("check", "check a configuration and list every fault")
-    check.add_argument("config", type=pathlib.Path)
-    example = add("example", "print a commented example configuration")
-    example.add_argument("name", nargs="?", help="none: list them")
-    simulate = add("simulate", "serve simulated drives and a phone on loopback")
-    _config_options(simulate)
-    simulate.add_argument("--bus-port", type=int, default=None, help="0: any free one")
-    _simulator_options(simulate)
-    return parser
-
-
-def _config_options(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--config", type=pathlib.Path, help="rig.toml")
-
-
-def _motion_options(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--arm", action="store_true", help="let the device move, unasked")
-    sub.add_argument("--reset-alarms", action="store_true", help="before arming")
-
-
-def _simulator_options(sub: argparse.ArgumentParser) -> None:
-    group = sub.add_argument_group("simulator")
-    group.add_argument(
-        "--simulate", action="store_true", help="against a simulated rig"
-    )
-    group.add_argument(
-        "--transport", choices=("tcp", "rtu_tcp", "rtu"), default="tcp",
-        help="of the simulated bus; rtu is a pseudo-terminal",
-    )  # fmt: skip
-    group.add_argument(
-        "--fault", action="append", default=[], metavar="KIND[@PHASE|@Ns][,count=N]...",
-        help="inject a fault; --fault list names them",
-    )  # fmt: skip
-    group.add_argument("--noise", type=float, default=0.02, help="degrees")
-    group.add_argument("--backlash", type=float, default=0.0, help="degrees")
-    group.add_argument("--drift", type=float, default=0.0, help="degrees a minute")
-    group.add_argument("--speedup", type=float, default=1.0, help="of the axes")
-    group.add_argument("--rate", type=float, default=100.0, help="of the phone, Hz")
 
 
 def _simulation(args: argparse.Namespace) -> dict[str, Any]:
@@ -159,7 +60,7 @@ def _simulator(
 
 
 def _confirm(args: argparse.Namespace, simulated: bool) -> Any:
-    from rig.session import Refused
+    from rig.exits import Refused
 
     def ask(word: str, text: str) -> None:
         if not sys.stdin.isatty():
@@ -183,7 +84,9 @@ def _confirm(args: argparse.Namespace, simulated: bool) -> Any:
 def _session(args: argparse.Namespace) -> int:
     from rig import session
     from rig.config import load_config, parse_config
+    from rig.exits import Refused
     from rig.journal import read_journal
+    from rig.runner import run_safely
 
     resumed = args.command == "resume"
     faults: list[str] = list(args.fault)
@@ -191,7 +94,7 @@ def _session(args: argparse.Namespace) -> int:
         folder = args.run
         records = read_journal(folder / session.JOURNAL)
         if not records or records[0]["event"] != "start":
-            raise session.Refused(f"{folder} holds no run")
+            raise Refused(f"{folder} holds no run")
         start = records[0]
         mode, inputs, simulation = start["mode"], start["inputs"], start["simulated"]
         if args.config is not None:
@@ -203,7 +106,7 @@ def _session(args: argparse.Namespace) -> int:
         config = _load(args)
         mode = args.command
         if getattr(args, "count", 1) < 1:
-            raise session.Refused(f"--count must be at least 1, got {args.count}")
+            raise Refused(f"--count must be at least 1, got {args.count}")
         inputs = {
             "count": getattr(args, "count", None),
             "to": getattr(args, "to", None),
@@ -245,7 +148,7 @@ def _session(args: argparse.Namespace) -> int:
             run.phase_listeners.append(simulator.enter)
         run.confirm = _confirm(args, simulated=simulator is not None)
         dry = getattr(args, "dry_run", False)
-        return session.run_safely(run, _procedure(mode, inputs, calibration, dry))
+        return run_safely(run, _procedure(mode, inputs, calibration, dry))
     finally:
         if simulator is not None:
             simulator.close()
@@ -271,7 +174,8 @@ def _say(text: str) -> None:
 
 
 def _identify(args: argparse.Namespace) -> int:
-    from rig.drives import Bus, BusError, Drive
+    from rig.bus import Bus, BusError
+    from rig.drives import Drive
 
     config = _load(args)
     simulator = None
@@ -319,7 +223,8 @@ def _default_simulation() -> dict[str, Any]:
 
 
 def _stop(args: argparse.Namespace) -> int:
-    from rig.drives import Bus, BusError, Drive
+    from rig.bus import Bus, BusError
+    from rig.drives import Drive
     from rig.stop import stop_all
 
     config = _load(args)
@@ -391,7 +296,7 @@ def _check(args: argparse.Namespace) -> int:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
-    args = _parser().parse_args(argv)
+    args = make_parser().parse_args(argv)
     if "list" in getattr(args, "fault", []):
         from rig.simulator.faults import KINDS
 

@@ -9,20 +9,17 @@ from typing import Any
 import numpy as np
 
 from rig.attitude import Array
+from rig.exits import EXIT_OK, EXIT_RECALIBRATE
+from rig.faults import MotionFault
 from rig.identification import errors, fit, order_residuals, uncertainty
 from rig.journal import write_atomically
 from rig.limits import check_plan
-from rig.motion import MotionFault
 from rig.planning import Choice, choose, draw_candidates, draw_held_out, travel_order
-from rig.session import EXIT_OK, EXIT_RECALIBRATE, Run
-from rig.settings import AXIS_NAMES, RigConfig
+from rig.session import Run
+from rig.settings import AXIS_NAMES
+from rig.words import degrees_of, describe_plan, pairs_csv, say_summary, speeds
 
-__all__ = ["calibrate", "describe_plan", "pairs_csv", "speeds"]
-
-
-def speeds(config: RigConfig) -> Array:
-    """(3,) degrees a second."""
-    return np.array([axis.speed_deg_s for axis in config.axes])
+__all__ = ["calibrate"]
 
 
 def _plan(run: Run) -> tuple[Array, Choice]:
@@ -32,7 +29,7 @@ def _plan(run: Run) -> tuple[Array, Choice]:
     def make() -> dict[str, Any]:
         candidates = draw_candidates(config)
         begun = time.perf_counter()
-        choice = choose(config, _degrees(config, candidates))
+        choice = choose(config, degrees_of(config, candidates))
         return {
             "candidates": candidates.tolist(),
             "choice": choice.described(),
@@ -45,46 +42,6 @@ def _plan(run: Run) -> tuple[Array, Choice]:
 
 def _choice_of(data: dict[str, Any]) -> Choice:
     return Choice(**{**data, "indices": tuple(data["indices"])})
-
-
-def _degrees(config: RigConfig, pulses: Array) -> Array:
-    return np.array([config.to_deg(row) for row in pulses])
-
-
-def describe_plan(run: Run, candidates: Array, choice: Choice) -> float:
-    """Say what will be done; returns an estimate of its seconds."""
-    config, say = run.config, run.say
-    session, settle = config.session, config.settle
-    degrees = _degrees(config, candidates)
-    rank = "proven optimum" if choice.proven else "best known"
-    say(
-        f"{session.k} of {session.candidates} candidates by {choice.method}: log det "
-        f"{choice.log_det:.4f} (commands in degrees), {rank} "
-        f"{choice.best_log_det:.4f}, D-efficiency {choice.efficiency:.4f}"
-    )
-    if choice.note:
-        say(f"  note: {choice.note}")
-    start = config.to_deg(run.zero_pulses or (0, 0, 0))
-    chosen = np.array(choice.indices)
-    order = chosen[travel_order(degrees[chosen], start, speeds(config))]
-    say("  order   candidate   degrees (pitch yaw roll)        pulses")
-    here, travel, seconds = start, np.zeros(3), 0.0
-    per_posture = settle.window_s + 0.02 * settle.samples + 0.1
-    for number, index in enumerate(order, 1):
-        angle = " ".join(f"{v:9.4f}" for v in degrees[index])
-        say(f"  {number:>5}   {index:>9}   {angle}   {candidates[index].tolist()}")
-        travel += np.abs(degrees[index] - here)
-        seconds += float((np.abs(degrees[index] - here) / speeds(config)).max())
-        seconds += per_posture
-        here = degrees[index]
-    extra = 2 * session.verify_postures + 2
-    total = seconds + extra * (seconds / session.k)
-    say(
-        f"  travel pitch {travel[0]:.1f}, yaw {travel[1]:.1f}, roll {travel[2]:.1f} "
-        f"deg; with {session.verify_postures} held-out postures, before and after, "
-        f"about {total:.0f} s"
-    )
-    return total
 
 
 def calibrate(run: Run, dry_run: bool = False) -> int:
@@ -116,7 +73,7 @@ def calibrate(run: Run, dry_run: bool = False) -> int:
 def _visit_chosen(run: Run, candidates: Array, choice: Choice) -> list[dict[str, Any]]:
     """Measure K postures; one out of reach is masked and the rest chosen anew."""
     config = run.config
-    degrees = _degrees(config, candidates)
+    degrees = degrees_of(config, candidates)
     available = np.ones(len(candidates), dtype=bool)
     records: dict[int, dict[str, Any]] = {}
     assert run.zero_pulses is not None
@@ -253,52 +210,5 @@ def _finish(
     from rig.report import write_report
 
     write_report(run.folder, summary, run.journal.records[0], run.postures())
-    _say_summary(run, summary, code)
+    say_summary(run, summary, code)
     return code
-
-
-def pairs_csv(run: Run) -> str:
-    """Every posture measured: role, commands, measurements, scatter."""
-    columns = ["name", "role"]
-    for what in ("pulses", "u_deg", "y_deg", "std_deg"):
-        columns += [f"{what}_{axis}" for axis in AXIS_NAMES]
-    lines = [",".join([*columns, "samples"])]
-    for r in run.postures().values():
-        values = r["pulses"] + r["commanded_deg"] + r["measured_deg"] + r["std_deg"]
-        fields = [r["name"], r.get("role", ""), *(repr(v) for v in values)]
-        lines.append(",".join([*fields, str(r["samples"])]))
-    return "\n".join(lines) + "\n"
-
-
-def _say_summary(run: Run, summary: dict[str, Any], code: int) -> None:
-    say = run.say
-    say("y = A u + b in degrees, +- 95 % confidence:")
-    for row, name in enumerate(AXIS_NAMES):
-        values = "  ".join(
-            f"{summary['A'][row][column]:8.5f} +- {summary['ci95'][row][column]:.5f}"
-            for column in range(3)
-        )
-        say(
-            f"  {name:<5} [{values}]   "
-            f"{summary['b'][row]:8.4f} +- {summary['ci95'][row][3]:.4f}"
-        )
-    say(f"  noise of one posture {summary['noise_std_deg'][0]:.4f} deg, from "
-        f"{summary['basis']} ({summary['dof']} degrees of freedom)")  # fmt: skip
-    if "before" in summary:
-        before, after = summary["before"], summary["after"]
-        say(
-            f"held-out error before {before['rms']:.4f} deg rms (max "
-            f"{before['max']:.4f}), after compensation {after['rms']:.4f} (max "
-            f"{after['max']:.4f})"
-        )
-    if summary["drift_deg"] is not None:
-        say(f"zero posture at the end: {summary['drift_deg']:.4f} deg from zero")
-    if summary["orders"]["warning"]:
-        say(f"WARNING: {summary['orders']['warning']}")
-    if code == EXIT_RECALIBRATE:
-        say(
-            f"the error after compensation exceeds session.verify_limit_deg "
-            f"({run.config.session.verify_limit_deg:g}): do not use this calibration "
-            "before the cause is known"
-        )
-    say(f"saved: {run.folder}/calibration.json, pairs.csv, summary.json, report.html")

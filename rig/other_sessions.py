@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 
 from rig.attitude import Array
-from rig.calibrate import pairs_csv
+from rig.exits import EXIT_OK, EXIT_RECALIBRATE, Refused
 from rig.identification import errors, pairs
 from rig.journal import write_atomically
 from rig.limits import LimitError
 from rig.planning import draw_held_out
-from rig.session import EXIT_OK, EXIT_RECALIBRATE, Refused, Run
+from rig.session import Run
 from rig.settings import RigConfig
+from rig.words import pairs_csv
 
 __all__ = ["collect", "goto", "load_calibration", "verify"]
 

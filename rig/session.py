@@ -17,46 +17,26 @@ from typing import Any
 import numpy as np
 
 from rig.attitude import Array, Frame
-from rig.drives import Bus, BusError
-from rig.imu import Imu, ImuError
+from rig.bus import Bus
+from rig.exits import EXIT_FAULT, Refused
+from rig.faults import MotionFault, NotFollowing, Unreachable
+from rig.imu import Imu
 from rig.journal import Journal, JournalError
-from rig.limits import LimitError
-from rig.motion import (
-    Measurement,
-    Motion,
-    MotionFault,
-    NotFollowing,
-    Unreachable,
-)
+from rig.measuring import Measurement
+from rig.motion import Motion
 from rig.settings import RigConfig
-from rig.stop import PauseRequested, Signals, Stopper, StopRequested, UnitStop
+from rig.stop import Signals, Stopper, UnitStop
 
 __all__ = [
-    "EXIT_BAD_INPUT",
-    "EXIT_FAULT",
-    "EXIT_OK",
-    "EXIT_PAUSED",
-    "EXIT_RECALIBRATE",
-    "Refused",
     "Run",
     "new_run_folder",
-    "run_safely",
 ]
 
-EXIT_OK = 0
-EXIT_RECALIBRATE = 1  # done, but the errors say: calibrate (again)
-EXIT_BAD_INPUT = 2
-EXIT_FAULT = 3  # stopped by a fault; `resume` goes on
-EXIT_PAUSED = 4  # paused by Ctrl-C; `resume` goes on
 JOURNAL = "journal.jsonl"
 STREAM_WAIT_S = 15.0
 ZERO_FACTOR = 4  # readings of the zero posture, in those of a posture
 
 Say = Callable[[str], None]
-
-
-class Refused(ValueError):
-    """The request makes no sense for this run; nothing was moved."""
 
 
 def new_run_folder(output: pathlib.Path, mode: str) -> pathlib.Path:
@@ -223,7 +203,7 @@ class Run:
             self._zero(self.motion)
         else:
             assert self.zero_pulses is not None
-            self.motion.zeroed(self.frame, self.zero_pulses)
+            self.motion.observer.zeroed(self.frame, self.zero_pulses)
             self._check_reference(self.motion)
         return self.motion
 
@@ -239,7 +219,7 @@ class Run:
             target = motion.positions()
         # Every posture is measured against this one, so its noise must be the smaller.
         samples = ZERO_FACTOR * self.config.settle.samples
-        measured = motion.measure(target, "zero", samples)
+        measured = motion.observer.measure(target, "zero", samples)
         record = self.journal.write(
             "zero",
             sync=True,
@@ -250,7 +230,7 @@ class Run:
         )
         self._set_zero(record)
         assert self.frame is not None
-        motion.zeroed(self.frame, measured.pulses)
+        motion.observer.zeroed(self.frame, measured.pulses)
         self.say(f"zero taken at pulses {list(measured.pulses)}")
 
     def _set_zero(self, record: dict[str, Any]) -> None:
@@ -267,7 +247,7 @@ class Run:
         """Before a resumed run goes on: the zero posture must still read zero."""
         assert self.zero_pulses is not None
         motion.move_to(self.zero_pulses, "reference")
-        measured = motion.measure(self.zero_pulses, "reference")
+        measured = motion.observer.measure(self.zero_pulses, "reference")
         worst = float(np.abs(measured.angles).max())
         limit = self.config.session.reference_tolerance_deg
         self.journal.write(
@@ -303,7 +283,7 @@ class Run:
         begun = time.monotonic()
         try:
             motion.move_to(target, name)
-            measured = motion.measure(target, name)
+            measured = motion.observer.measure(target, name)
         except NotFollowing as fault:
             if fault.suspects:
                 self.journal.write("void", sync=True, names=fault.suspects)
@@ -400,48 +380,6 @@ class Run:
         """Let go of everything."""
         self.disarm()
         self.journal.close()
-
-
-def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
-    """Run a procedure; whatever happens, the drives are told to stop and it is said.
-
-    Returns:
-        The exit code.
-    """
-    code, event, reason = EXIT_FAULT, "fault", ""
-    with run.signals:
-        try:
-            code = procedure(run)
-            event, reason = "end", ""
-        except PauseRequested as pause:
-            code, event, reason = EXIT_PAUSED, "paused", str(pause)
-        except StopRequested as stop:
-            code, event, reason = stop.exit_code, "stopped", str(stop)
-        except KeyboardInterrupt:
-            code, event, reason = 130, "stopped", "SIGINT"
-        except (Refused, LimitError) as error:
-            code, event, reason = EXIT_BAD_INPUT, "refused", str(error)
-        except (MotionFault, BusError, ImuError, JournalError) as error:
-            reason = str(error)
-        except Exception as error:
-            reason = f"{type(error).__name__}: {error}"
-        finally:
-            run.signals.armed = run.motion is not None
-            if event != "end":
-                run.stop(reason, latch=event != "paused")
-            elif run.motion is not None:
-                run.stop("", latch=False)
-            run.disarm()
-    try:
-        run.journal.write(event, sync=True, code=code, reason=reason)
-    except JournalError as error:
-        run.say(f"the journal could not be closed with a last line: {error}")
-    if event != "end":
-        run.say(f"{event}: {reason}")
-        if event != "refused":
-            run.say(f"to go on: python -m rig resume {run.folder}")
-    run.close()
-    return code
 
 
 def _provenance() -> dict[str, Any]:

@@ -68,6 +68,10 @@ class Axis:
     accel_deg_s2: float
     comm_timeout_s: float | None  # written to the drive when its map has a register
 
+    def pulses_within(self, angle_deg: float) -> int:
+        """A tolerance in degrees as whole pulses, at least one."""
+        return max(1, round(angle_deg * abs(self.scale.pulses_per_deg)))
+
 
 @dataclasses.dataclass(frozen=True)
 class ImuSettings:

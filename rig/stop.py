@@ -16,7 +16,8 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
-from rig.drives import BusError, Drive
+from rig.bus import BusError
+from rig.drives import Drive
 
 __all__ = [
     "Heartbeat",

@@ -15,7 +15,8 @@ import time
 
 from rig.calibrate import calibrate
 from rig.config import EXAMPLES, parse_config
-from rig.session import Run, run_safely
+from rig.runner import run_safely
+from rig.session import Run
 from rig.settings import RigConfig
 from rig.simulator import Simulator, Truth
 

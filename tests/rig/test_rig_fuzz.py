@@ -16,7 +16,7 @@ import pytest
 from harness import fast_config
 from scipy.spatial.transform import Rotation
 
-from rig.drives import Bus, BusError
+from rig.bus import Bus, BusError
 from rig.settings import BusSettings
 from rig.simulator.server import crc16
 from rig.stream import MAX_LINE, LineSplitter, Parser, StreamFault

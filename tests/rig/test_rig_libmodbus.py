@@ -21,8 +21,9 @@ from harness import fast_text
 from scipy.spatial.transform import Rotation
 
 from rig.__main__ import main
+from rig.bus import Bus, BusError
 from rig.config import parse_config
-from rig.drives import Bus, BusError, Drive
+from rig.drives import Drive
 from rig.settings import BusSettings
 from rig.stop import stop_all
 

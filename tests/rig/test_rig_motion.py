@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from harness import fast_config, fast_text, simulator
 
+from rig.bus import Bus
 from rig.config import parse_config
-from rig.drives import Bus
+from rig.faults import MotionFault, Unreachable
 from rig.imu import Imu
 from rig.limits import LimitError, approach_point, check_plan
-from rig.motion import Motion, MotionFault, Unreachable
+from rig.motion import Motion
 from rig.simulator import parse_fault
 from rig.stop import PauseRequested, Signals, Stopper, StopRequested
 
@@ -155,7 +156,7 @@ def test_settled_means_drives_done_and_imu_quiet():
     with bench(noise_deg=0.01) as motion:
         target = motion.config.to_pulses([5, 5, 5])
         motion.move_to(target, "x")
-        measured = motion.measure(target)
+        measured = motion.observer.measure(target)
         assert measured.samples == motion.config.settle.samples
         assert (measured.std <= motion.config.settle.std_deg).all()
         assert measured.feedback == target
@@ -164,7 +165,7 @@ def test_settled_means_drives_done_and_imu_quiet():
 def test_a_shaking_device_never_settles():
     with bench(noise_deg=1.0) as motion:
         with pytest.raises(MotionFault, match=r"did not settle.*deviation"):
-            motion.measure(motion.positions())
+            motion.observer.measure(motion.positions())
 
 
 def test_a_creeping_device_never_settles():
@@ -173,7 +174,7 @@ def test_a_creeping_device_never_settles():
         plant = motion.sim.plant
         plant.truth = dataclasses.replace(plant.truth, drift_deg_per_min=60.0)
         with pytest.raises(MotionFault, match=r"did not settle.*slope"):
-            motion.measure(motion.positions())
+            motion.observer.measure(motion.positions())
 
 
 @pytest.mark.parametrize(
@@ -294,7 +295,7 @@ def test_the_motion_and_stop_modules_never_load_jax():
     import sys
 
     program = (
-        "import sys, rig.motion, rig.stop, rig.drives, rig.imu, rig.session\n"
+        "import sys, rig.motion, rig.measuring, rig.stop, rig.runner\n"
         "heavy = {'jax', 'matplotlib', 'numba', 'flax'} & set(sys.modules)\n"
         "sys.exit(f'loaded {heavy}' if heavy else 0)\n"
     )

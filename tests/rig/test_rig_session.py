@@ -17,11 +17,13 @@ import jaxcal
 from rig.__main__ import main
 from rig.calibrate import calibrate
 from rig.config import parse_config
+from rig.exits import Refused
 from rig.identification import order_residuals, uncertainty
 from rig.journal import read_journal
 from rig.other_sessions import collect
 from rig.planning import choose, draw_candidates, travel_order
-from rig.session import Refused, Run, run_safely
+from rig.runner import run_safely
+from rig.session import Run
 from rig.simulator import Truth, parse_fault
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])

@@ -1,0 +1,110 @@
+"""The arguments of ``python -m rig``; imports nothing that takes time."""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+
+__all__ = ["make_parser"]
+
+EPILOG = """\
+exit codes: 0 done; 1 done, but the error says calibrate (again); 2 bad input, nothing
+moved; 3 stopped by a fault; 4 paused by Ctrl-C; 128 + signal stopped by a signal.
+After 3, 4 and signals `resume RUN` goes on.
+
+Research software, not a medical device. Calibrate with no patient attached; a hardware
+emergency stop is required.
+"""
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of every command."""
+    parser = argparse.ArgumentParser(
+        prog="python -m rig",
+        description="Calibrate a three-axis device over Modbus and a phone's IMU.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def add(name: str, text: str) -> argparse.ArgumentParser:
+        return commands.add_parser(name, help=text, description=text)
+
+    for name, text in (
+        ("calibrate", "choose, visit, identify, verify and save"),
+        ("collect", "record random postures (Datasets 4 and 5)"),
+        ("verify", "compare a saved calibration with fresh measurements"),
+        ("goto", "move the end-effector to a posture through a calibration"),
+    ):
+        sub = add(name, text)
+        if name in ("verify", "goto"):
+            sub.add_argument(
+                "calibration", type=pathlib.Path, help="file, or run folder"
+            )
+        if name == "goto":
+            sub.add_argument(
+                "--to", type=float, nargs=3, required=True,
+                metavar=("PITCH", "YAW", "ROLL"), help="desired posture in degrees",
+            )  # fmt: skip
+        if name in ("collect", "verify"):
+            sub.add_argument(
+                "--count", type=int, default=50 if name == "collect" else 6
+            )
+        _config_options(sub)
+        sub.add_argument("--out", type=pathlib.Path, help="folder for the run's folder")
+        sub.add_argument("--dry-run", action="store_true", help="plan; open no port")
+        _motion_options(sub)
+        sub.add_argument(
+            "--zero", action="store_true",
+            help="confirm that the device stands in its zero posture",
+        )  # fmt: skip
+        _simulator_options(sub)
+    resume = add("resume", "go on with a run that was paused, stopped or killed")
+    resume.add_argument("run", type=pathlib.Path, help="the run's folder")
+    resume.add_argument("--config", type=pathlib.Path, help="for a changed port")
+    _motion_options(resume)
+    resume.add_argument("--zero", action="store_true", help=argparse.SUPPRESS)
+    _simulator_options(resume)
+    identify = add("identify", "ask every drive who and how it is; only reads")
+    _config_options(identify)
+    identify.add_argument("--simulate", action="store_true")
+    stop = add("stop", "quick-stop every drive now, and verify")
+    _config_options(stop)
+    check = add("check", "check a configuration and list every fault")
+    check.add_argument("config", type=pathlib.Path)
+    example = add("example", "print a commented example configuration")
+    example.add_argument("name", nargs="?", help="none: list them")
+    simulate = add("simulate", "serve simulated drives and a phone on loopback")
+    _config_options(simulate)
+    simulate.add_argument("--bus-port", type=int, default=None, help="0: any free one")
+    _simulator_options(simulate)
+    return parser
+
+
+def _config_options(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--config", type=pathlib.Path, help="rig.toml")
+
+
+def _motion_options(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--arm", action="store_true", help="let the device move, unasked")
+    sub.add_argument("--reset-alarms", action="store_true", help="before arming")
+
+
+def _simulator_options(sub: argparse.ArgumentParser) -> None:
+    group = sub.add_argument_group("simulator")
+    group.add_argument(
+        "--simulate", action="store_true", help="against a simulated rig"
+    )
+    group.add_argument(
+        "--transport", choices=("tcp", "rtu_tcp", "rtu"), default="tcp",
+        help="of the simulated bus; rtu is a pseudo-terminal",
+    )  # fmt: skip
+    group.add_argument(
+        "--fault", action="append", default=[], metavar="KIND[@PHASE|@Ns][,count=N]...",
+        help="inject a fault; --fault list names them",
+    )  # fmt: skip
+    group.add_argument("--noise", type=float, default=0.02, help="degrees")
+    group.add_argument("--backlash", type=float, default=0.0, help="degrees")
+    group.add_argument("--drift", type=float, default=0.0, help="degrees a minute")
+    group.add_argument("--speedup", type=float, default=1.0, help="of the axes")
+    group.add_argument("--rate", type=float, default=100.0, help="of the phone, Hz")

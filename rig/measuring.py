@@ -1,0 +1,228 @@
+"""Settling and measuring: when a posture is at rest, and what its attitude is.
+
+The loops read drives and IMU, look at the clock and the signals, and do nothing else.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from rig.attitude import Array, Frame, mean_rotation
+from rig.drives import Status
+from rig.faults import MotionFault, NotFollowing
+from rig.imu import Imu
+from rig.settings import AXIS_NAMES, RigConfig
+from rig.stream import Reading
+
+__all__ = ["Measurement", "Observer"]
+
+FOLLOW_MIN_DEG = 3.0  # a commanded change this large must be seen by the IMU
+FOLLOW_SHARE = 0.1  # at least this share of it
+FOLLOW_LEADING = 0.3  # of axes that move at least this share of the largest move
+
+
+@dataclasses.dataclass(frozen=True)
+class Measurement:
+    """One settled posture."""
+
+    pulses: tuple[int, int, int]  # commanded
+    feedback: tuple[int, int, int]  # the drives' own positions
+    attitude: Array  # (3, 3) mean attitude of the phone
+    angles: Array  # (3,) degrees: pitch, yaw, roll of the end-effector
+    std: Array  # (3,) degrees, of single readings
+    samples: int
+    raw: Array  # (samples, 3) degrees
+
+
+class Observer:
+    """What the IMU says about a device that stands."""
+
+    def __init__(
+        self,
+        config: RigConfig,
+        imu: Imu,
+        guard: Callable[[], None],
+        statuses: Callable[[], list[Status]],
+        phase: Callable[[str], None],
+    ) -> None:
+        self.config = config
+        self.imu = imu
+        self.frame: Frame | None = None
+        self._guard = guard  # raises where a stop was asked for
+        self._statuses = statuses  # of all drives; raises on a fault bit
+        self._phase = phase
+        self._seen: tuple[Array, Array] | None = None  # (commanded, measured) last
+        self._unproven: list[list[str]] = [[], [], []]  # postures, an axis
+
+    def zeroed(self, frame: Frame, pulses: tuple[int, int, int]) -> None:
+        """Measure against this zero posture from now on."""
+        self.frame = frame
+        self._seen = (self.config.to_deg(pulses), np.zeros(3))
+
+    def measure(
+        self,
+        target: tuple[int, int, int],
+        label: str = "",
+        samples: int | None = None,
+    ) -> Measurement:
+        """Wait until the device has settled, then average fresh readings.
+
+        Args:
+            target: pulses commanded.
+            label: name of the posture.
+            samples: readings to average; as configured when not given.
+
+        Raises:
+            MotionFault: it does not settle in time, or the IMU disagrees with the
+                drives. ImuError, BusError, StopRequested: stop everything.
+        """
+        settle = self.config.settle
+        begun = time.monotonic()
+        deadline = begun + settle.timeout_s
+        self._phase("settling")
+        since = begun
+        reason = "no reading"
+        while True:
+            statuses, since, reason = self._settled(since, deadline, reason)
+            self._phase("measuring")
+            readings = self._collect(deadline, samples or settle.samples)
+            if readings is None:
+                since, reason = time.monotonic(), "the stream paused while measuring"
+                self._phase("settling")
+                continue
+            frame = self._frame_for(readings)
+            raw = frame.angles(np.array([r.matrix for r in readings]))
+            std = raw.std(axis=0, ddof=1) if len(raw) > 1 else np.zeros(3)
+            if (std > settle.std_deg).any():
+                since, reason = time.monotonic(), _unquiet("deviation", std, "deg")
+                self._phase("settling")
+                continue
+            break
+        attitude = mean_rotation([r.matrix for r in readings])
+        feedback = tuple(status.position for status in statuses)
+        result = Measurement(
+            pulses=target,
+            feedback=(feedback[0], feedback[1], feedback[2]),
+            attitude=attitude,
+            angles=frame.angles(attitude),
+            std=std,
+            samples=len(readings),
+            raw=raw,
+        )
+        self._check_agreement(result, label)
+        return result
+
+    def _frame_for(self, readings: list[Reading]) -> Frame:
+        if self.frame is not None:
+            return self.frame
+        config = self.config
+        return Frame(
+            readings[0].matrix, config.imu.mounting, config.mechanism_order,
+            config.letters,
+        )  # fmt: skip
+
+    def _settled(
+        self, since: float, deadline: float, reason: str
+    ) -> tuple[list[Status], float, str]:
+        settle, poll = self.config.settle, self.config.motion.poll_s
+        while True:
+            self._guard()
+            statuses = self._statuses()
+            now = time.monotonic()
+            if any(status.moving for status in statuses):
+                since, reason = now, "a drive is moving"
+            self.imu.check_fault()
+            readings = self.imu.since(max(since, now - settle.window_s))
+            span = readings[-1].time - readings[0].time if readings else 0.0
+            if len(readings) < settle.min_samples or span < 0.8 * settle.window_s:
+                reason = f"{len(readings)} readings over {span:.2f} s of the window"
+            elif now - readings[-1].time > self.config.imu.stale_s:
+                reason = "the phone's readings are stale"
+            else:
+                quiet, reason = self._quiet(readings)
+                if quiet:
+                    return statuses, since, reason
+            if now > deadline:
+                raise MotionFault(f"did not settle in {settle.timeout_s:g} s: {reason}")
+            time.sleep(poll)
+
+    def _quiet(self, readings: list[Reading]) -> tuple[bool, str]:
+        settle = self.config.settle
+        frame = self._frame_for(readings)
+        angles = frame.angles(np.array([reading.matrix for reading in readings]))
+        times = np.array([reading.time for reading in readings])
+        std = angles.std(axis=0, ddof=1)
+        if (std > settle.std_deg).any():
+            return False, _unquiet("deviation", std, "deg")
+        times = times - times.mean()
+        slope = np.abs(times @ (angles - angles.mean(axis=0)) / (times @ times))
+        if (slope > settle.slope_deg_s).any():
+            return False, _unquiet("slope", slope, "deg/s")
+        return True, ""
+
+    def _collect(self, deadline: float, wanted: int) -> list[Reading] | None:
+        """Fresh readings as wanted, or None where the stream paused or time is up."""
+        start = time.monotonic()
+        polled = start
+        while True:
+            self._guard()
+            self.imu.check_fault()
+            readings = self.imu.since(start)
+            if len(readings) >= wanted:
+                return readings[:wanted]
+            now = time.monotonic()
+            newest = readings[-1].time if readings else start
+            if now - newest > self.config.imu.stale_s or now > deadline:
+                return None
+            if now - polled > self.config.motion.poll_s:
+                polled = now
+                if any(status.moving for status in self._statuses()):
+                    raise MotionFault("a drive moves while the posture is measured")
+            time.sleep(0.002)
+
+    def _check_agreement(self, measurement: Measurement, label: str) -> None:
+        """The joints are where the drives say, roughly, and moved when they moved."""
+        config = self.config
+        commanded = config.to_deg(measurement.pulses)
+        for axis, pulses, feedback in zip(
+            config.axes, measurement.pulses, measurement.feedback, strict=True
+        ):
+            if abs(pulses - feedback) > axis.pulses_within(
+                config.motion.position_tolerance_deg
+            ):
+                raise MotionFault(f"{axis.name} left its target while settling")
+        if self.frame is None:
+            return
+        apart = np.abs(measurement.angles - commanded)
+        if (apart > config.motion.max_disagreement_deg).any():
+            worst = int(np.argmax(apart))
+            raise MotionFault(
+                f"the IMU reads {AXIS_NAMES[worst]} {apart[worst]:.1f} deg away from "
+                "the command: wrong zero, axis order or signs?"
+            )
+        if self._seen is not None:
+            asked = np.abs(commanded - self._seen[0])
+            seen = np.abs(measurement.angles - self._seen[1])
+            leading = max(FOLLOW_MIN_DEG, FOLLOW_LEADING * float(asked.max()))
+            for index, name in enumerate(AXIS_NAMES):
+                if asked[index] < leading:
+                    self._unproven[index].append(label)
+                elif seen[index] < FOLLOW_SHARE * asked[index]:
+                    raise NotFollowing(
+                        f"the drive of {name} turned {asked[index]:.1f} deg, the IMU "
+                        f"saw {seen[index]:.2f}: a slipped coupling, a frozen stream, "
+                        "or axes mixed up",
+                        self._unproven[index],
+                    )
+                else:
+                    self._unproven[index] = []
+        self._seen = (commanded, measurement.angles)
+
+
+def _unquiet(what: str, values: Array, unit: str) -> str:
+    worst = int(np.argmax(values))
+    return f"{what} of {AXIS_NAMES[worst]} is {values[worst]:.3f} {unit}"
