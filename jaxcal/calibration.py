@@ -464,6 +464,11 @@ def identify(
     outputs = axis_names("output_names", output_names, "y", m)
     weight = relative_weights(weights, len(commands))
     noise = noise_levels(noise_std, m)
+    if noise is not None and common_noise:
+        raise ValueError(
+            "common_noise says how to estimate the noise and noise_std what it is: "
+            "give one of them"
+        )
     used = weight > 0.0
     u, y, w = commands[used], measured[used], weight[used]
     require_excited(u, inputs)

@@ -449,6 +449,7 @@ good = np.vstack([np.zeros(3), np.eye(3), np.ones(3)])
         ({"noise_std": 0.0}, "noise_std must be positive, got 0"),
         ({"noise_std": [1, 1]}, r"noise_std must be one number or \(3,\), got \(2,\)"),
         ({"noise_std": np.nan}, "noise_std must be finite"),
+        ({"noise_std": 1.0, "common_noise": True}, "give one of them"),
         ({"input_names": ["a", "b"]}, "input_names must hold 3 names"),
         ({"output_names": ["a", "b", 3]}, "output_names must hold 3 names"),
         ({"notes": {"x": np.eye(2)}}, "notes must be what JSON can hold"),
