@@ -61,7 +61,7 @@ def calibrate(run: Run, dry_run: bool = False) -> int:
     run.phase("saving")
     first = fit(chosen, _reading_noise(chosen))
     first.save(run.folder / "calibration.partial.json")
-    held = run.remember("held_out", lambda: _held_out(run, first))["pairs"]
+    held = _held_out(run, first)
     run.planned = session.k + 2 * len(held) + 1
     before, after, desired = _verify(run, held)
     end = run.visit("reference:end", run.zero_pulses, role="reference")
@@ -117,14 +117,31 @@ def _reading_noise(records: list[dict[str, Any]]) -> float:
     return float(max(1e-9, np.sqrt((std**2 / counts).mean())))
 
 
-def _held_out(run: Run, calibration: Any) -> dict[str, Any]:
+def _held_out(run: Run, calibration: Any) -> list[Any]:
+    """Pairs of pulses, raw and compensated; drawn once for one set of chosen postures.
+
+    Where chosen postures were made void since, the compensated commands came from a
+    wrong calibration: they are drawn anew, and what was measured there is void too.
+    """
+    known = run.journal.events("held_out")
+    voids = [
+        record["seq"]
+        for record in run.journal.events("void")
+        if any(name.startswith("select:") for name in record["names"])
+    ]
+    if known and not (voids and voids[-1] > known[-1]["seq"]):
+        return known[-1]["pairs"]
+    stale = [n for n in run.postures() if n.startswith(("before:", "after:"))]
+    if stale:
+        run.journal.write("void", sync=True, names=stale)
     found = draw_held_out(run.config, calibration, run.config.session.verify_postures)
     if len(found) < run.config.session.verify_postures:
         run.say(
             f"  note: only {len(found)} held-out targets can be reached compensated "
             "within the ranges"
         )
-    return {"pairs": [[list(raw), list(command)] for raw, command in found]}
+    drawn = [[list(raw), list(command)] for raw, command in found]
+    return run.journal.write("held_out", sync=True, pairs=drawn)["pairs"]
 
 
 def _verify(

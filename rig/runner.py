@@ -34,7 +34,9 @@ def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
         except KeyboardInterrupt:
             code, event, reason = 130, "stopped", "SIGINT"
         except (Refused, LimitError) as error:
-            code, event, reason = EXIT_BAD_INPUT, "refused", str(error)
+            moved = bool(run.journal.events("command"))
+            code = EXIT_FAULT if moved else EXIT_BAD_INPUT
+            event, reason = "fault" if moved else "refused", str(error)
         except (MotionFault, BusError, ImuError, JournalError) as error:
             reason = str(error)
         except Exception as error:

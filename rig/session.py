@@ -22,6 +22,7 @@ from rig.exits import EXIT_FAULT, Refused
 from rig.faults import MotionFault, NotFollowing, Unreachable
 from rig.imu import Imu
 from rig.journal import Journal, JournalError
+from rig.limits import check_plan
 from rig.measuring import Measurement
 from rig.motion import Motion
 from rig.settings import RigConfig
@@ -217,6 +218,7 @@ class Run:
             motion.move_to(target, "zero")
         else:
             target = motion.positions()
+        check_plan(self.config, [target])  # it is where a resumed run looks again
         # Every posture is measured against this one, so its noise must be the smaller.
         samples = ZERO_FACTOR * self.config.settle.samples
         measured = motion.observer.measure(target, "zero", samples)

@@ -240,8 +240,8 @@ def table(outcomes: list[Outcome]) -> str:
         "",
         f"**{len(outcomes)} of {len(outcomes)} cells hold**: {counted}. Largest "
         "difference of any element of A or b between a run that was spoilt and resumed "
-        f"and one that was not: {worst:.1e} (the simulated readings are noise-free here, "
-        "so that any lost, doubled or mixed-up posture would show).",
+        f"and one that was not: {worst:.1e} (the simulated readings are noise-free "
+        "here, so that any lost, doubled or mixed-up posture would show).",
         "",
         "A cell begins a fault when the session enters the phase (after two recorded "
         "postures, so that there is something to lose), lets it act until the session "

@@ -192,6 +192,29 @@ def test_a_terminal_that_goes_away_stops_the_run_and_not_the_stop(tmp_path):
         assert session(served, folder, sim) == 0
 
 
+def test_held_out_targets_are_drawn_anew_when_a_chosen_posture_is_void(tmp_path):
+    """A slip found during verification: the first calibration was wrong."""
+    config = fast_config()
+    with simulator(config) as sim:
+        served, folder, pressed = sim.start(), tmp_path / "run", []
+
+        def press(run, phase):
+            if run.posture("before:0") or run.posture("after:0"):
+                if not pressed:
+                    pressed.append(True)
+                    run.journal.write("void", names=[next(iter(run.postures()))])
+                    signal.raise_signal(signal.SIGINT)
+
+        assert session(served, folder, sim, listeners=[press]) == 4
+        assert session(served, folder, sim) == 0
+    records = read_journal(folder / "journal.jsonl")
+    assert sum(r["event"] == "held_out" for r in records) == 2
+    voided = [r["names"] for r in records if r["event"] == "void"]
+    assert any(name.startswith(("before", "after")) for name in voided[-1])
+    found = json.loads((folder / "summary.json").read_text())
+    assert found["after"]["max"] < 0.01
+
+
 def test_collect_records_a_dataset_and_resumes(tmp_path):
     config, said = fast_config(), []
     folder = tmp_path / "collection"
