@@ -9,11 +9,16 @@ import pathlib
 _CACHE = pathlib.Path(__file__).parent.parent / ".cache" / "jax"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
 
+import hypothesis
 import jax
 import numpy as np
 import pytest
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# A loaded machine is slow, not wrong: no example has a deadline.
+hypothesis.settings.register_profile("jaxcal", deadline=None)
+hypothesis.settings.load_profile("jaxcal")
 
 
 @pytest.fixture

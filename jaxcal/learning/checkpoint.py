@@ -14,11 +14,13 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import importlib.metadata
+import logging
 import pathlib
 import platform
 from typing import Any
 
 import jax
+import numpy as np
 import orbax.checkpoint as ocp
 
 from jaxcal.learning.networks import Network, NetworkConfig, build
@@ -61,6 +63,10 @@ def package_versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             versions[name] = "not installed"
     return versions
+
+
+# orbax warns of every default it takes, on every load.
+logging.getLogger("absl").setLevel(logging.ERROR)
 
 
 def _manager(folder: pathlib.Path, keep: int | None, create: bool) -> Any:

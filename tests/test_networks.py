@@ -1,0 +1,135 @@
+"""The networks: size, invariances, masks."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxcal.learning import networks
+from jaxcal.learning.networks import NetworkConfig
+
+SMALL = NetworkConfig(width=8, encoder_rounds=1)
+
+
+def made(config, m=12, n=3, k=4, seed=0):
+    network = networks.build(config)
+    params = network.init(
+        jax.random.key(seed),
+        jnp.zeros((1, m, n)),
+        jnp.ones((1, m), bool),
+        jnp.full((1, k), -1),
+        jnp.ones((1, m), bool),
+    )["params"]
+    # Every parameter away from its initial zero, so that nothing is hidden by one.
+    noisy = jax.tree.map(lambda leaf: leaf + 0.1 * jnp.cos(jnp.arange(leaf.size)
+                         .reshape(leaf.shape)), params)  # fmt: skip
+    return network, noisy
+
+
+def score(network, params, points, chosen, k=4):
+    points = jnp.asarray(points, jnp.float32)
+    batch, m, _ = points.shape
+    view = network.look(points, jnp.ones((batch, m), bool))
+    memory = network.apply({"params": params}, view, method="encode")
+    picks = jnp.full((batch, k), -1).at[:, : len(chosen)].set(jnp.asarray(chosen, int))
+    free = jnp.ones((batch, m), bool).at[:, jnp.asarray(chosen, int)].set(False)
+    glance = network.look_at(view, picks, free, len(chosen))
+    return network.apply({"params": params}, memory, glance, method="decode")
+
+
+def test_the_papers_network_has_its_size_and_its_share():
+    network = networks.build(NetworkConfig(kind="paper", width=768))
+    shapes = jax.eval_shape(
+        network.init,
+        jax.random.key(0),
+        jnp.zeros((1, 50, 3)),
+        jnp.ones((1, 50), bool),
+        jnp.full((1, 4), -1),
+        jnp.ones((1, 50), bool),
+    )["params"]
+    size = {name: sum(x.size for x in jax.tree.leaves(part)) for name, part in
+            shapes.items()}  # fmt: skip
+    total = sum(size.values())
+    heads = sum(size[name] for name in networks.PAPER_HEADS)
+    assert abs(total - 3.5e6) <= 0.03 * 3.5e6
+    assert abs((1 - heads / total) - 0.71) <= 0.01
+
+
+@pytest.mark.parametrize(
+    ("k", "chosen"), [(4, []), (4, [3]), (4, [3, 7]), (7, [1, 2]), (7, [1, 2, 5, 8, 9])]
+)
+def test_compact_is_blind_to_affine_maps(rng, k, chosen):
+    network, params = made(SMALL)
+    points = rng.uniform(size=(3, 12, 3))
+    shear = np.array([[3.0, 1.0, 0.0], [0.0, 0.5, 2.0], [1.0, 0.0, 1.0]])
+    logits, value = score(network, params, points, chosen, k)
+    mapped, other = score(network, params, points @ shear.T + 5.0, chosen, k)
+    np.testing.assert_allclose(logits, mapped, rtol=2e-3, atol=5e-3)
+    # The value moves by the log-determinant of the map, squared.
+    moved = 2.0 * np.log(abs(np.linalg.det(shear)))
+    np.testing.assert_allclose(other - value, moved, atol=5e-3)
+
+
+@pytest.mark.parametrize("config", [SMALL, NetworkConfig(kind="paper", width=32)])
+def test_permuting_the_candidates_permutes_the_logits(rng, config):
+    network, params = made(config)
+    points = rng.uniform(size=(1, 12, 3))
+    order = rng.permutation(12)
+    logits, value = score(network, params, points, [4, 6])
+    where = [int(np.flatnonzero(order == i)[0]) for i in (4, 6)]
+    mixed, other = score(network, params, points[:, order], where)
+    np.testing.assert_allclose(logits[:, order], mixed, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(value, other, atol=1e-3)
+
+
+@pytest.mark.parametrize("config", [SMALL, NetworkConfig(kind="paper", width=32)])
+def test_masked_candidates_are_never_likely_and_gradients_stay_finite(rng, config):
+    network, params = made(config)
+    points = jnp.asarray(rng.uniform(size=(2, 12, 3)), jnp.float32)
+
+    def loss(params):
+        logits, value = score(network, params, points, [0, 1])
+        log_probs = jax.nn.log_softmax(logits)
+        entropy = -(jnp.exp(log_probs) * log_probs).sum()
+        return entropy + value.sum(), jnp.exp(log_probs)
+
+    grads, probabilities = jax.grad(loss, has_aux=True)(params)
+    assert float(probabilities[:, :2].max()) == 0.0
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(grads))
+
+
+def test_one_set_of_weights_serves_any_m_k_and_n(rng):
+    network, params = made(SMALL)
+    for m, n, k in ((5, 1, 2), (9, 2, 3), (30, 4, 5), (40, 3, 11)):
+        logits, value = score(network, params, rng.uniform(size=(2, m, n)), [], k)
+        assert logits.shape == (2, m) and bool(jnp.isfinite(value).all())
+
+
+def test_a_masked_candidate_does_not_touch_the_others(rng):
+    network, params = made(SMALL)
+    points = jnp.asarray(rng.uniform(size=(1, 12, 3)), jnp.float32)
+    usable = jnp.ones((1, 12), bool).at[:, 9:].set(False)
+
+    def logits(points):
+        view = network.look(points, usable)
+        memory = network.apply({"params": params}, view, method="encode")
+        glance = network.look_at(view, jnp.full((1, 4), -1), usable, 0)
+        return network.apply({"params": params}, memory, glance, method="decode")[0]
+
+    moved = points.at[:, 9:].set(50.0)
+    np.testing.assert_allclose(logits(points)[:, :9], logits(moved)[:, :9], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("values", "named"),
+    [
+        ({"kind": "big"}, "kind"),
+        ({"width": 0}, "width"),
+        ({"lookahead": 0}, "lookahead"),
+    ],
+)
+def test_a_bad_configuration_is_named(values, named):
+    with pytest.raises(ValueError, match=named):
+        NetworkConfig(**values)
