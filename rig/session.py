@@ -34,7 +34,7 @@ __all__ = [
 ]
 
 JOURNAL = "journal.jsonl"
-STREAM_WAIT_S = 15.0
+STREAM_WAIT_S = 60.0  # time to start the app on the phone
 ZERO_FACTOR = 4  # readings of the zero posture, in those of a posture
 
 Say = Callable[[str], None]
