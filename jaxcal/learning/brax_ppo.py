@@ -85,10 +85,8 @@ def _make_networks(
         candidates = observation[..., : n * m].reshape(*lead, m, n)
         available = observation[..., n * m : (n + 1) * m] > 0.5
         glance = {"context": observation[..., (n + 1) * m :], "active": available}
-        memory = network.apply(
-            {"params": params}, network.look(candidates, available), method="encode"
-        )
-        return network.apply({"params": params}, memory, glance, method="decode")
+        memory = networks.encode(network, params, network.look(candidates, available))
+        return networks.decode(network, params, memory, glance)
 
     def init(key: jax.Array) -> Any:
         return network.init(

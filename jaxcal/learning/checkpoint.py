@@ -195,11 +195,48 @@ def load(folder: str | pathlib.Path | None = None) -> Policy:
             f"checkpoint {path} cannot be read: its weights are damaged "
             f"({_first_line(error)})"
         ) from error
-    if not all(
-        bool(jax.numpy.isfinite(leaf).all()) for leaf in jax.tree.leaves(params)
-    ):
-        raise CheckpointError(f"checkpoint {path} holds weights that are not finite")
-    return Policy(build(config), params, meta, root, step)
+    network = build(config)
+    _check_weights(path, params, network, meta)
+    return Policy(network, params, meta, root, step)
+
+
+def _check_weights(
+    path: pathlib.Path, params: Any, network: Network, meta: dict[str, Any]
+) -> None:
+    """Refuse weights that the network cannot use."""
+    try:
+        env = meta["tasks"][0]["environment"]
+        m, n, k = env["num_candidates"], env["num_inputs"], env["num_selected"]
+    except (KeyError, IndexError, TypeError) as error:
+        raise CheckpointError(
+            f"checkpoint {path} does not say what it was trained on: no {error}"
+        ) from error
+    expected = jax.eval_shape(
+        network.init,
+        jax.random.key(0),
+        jax.ShapeDtypeStruct((1, m, n), np.float32),
+        jax.ShapeDtypeStruct((1, m), bool),
+        jax.ShapeDtypeStruct((1, k), np.int32),
+        jax.ShapeDtypeStruct((1, m), bool),
+    )["params"]
+    wanted, held = _shapes(expected), _shapes(params)
+    if wanted != held:
+        name = sorted(set(wanted.items()) ^ set(held.items()))[0][0]
+        raise CheckpointError(
+            f"checkpoint {path} does not fit its network: {name} has shape "
+            f"{held.get(name)}, the network wants {wanted.get(name)}"
+        )
+    for keys, leaf in jax.tree_util.tree_leaves_with_path(params):
+        if not np.isfinite(np.asarray(leaf)).all():
+            raise CheckpointError(
+                f"checkpoint {path} holds weights that are not finite, in "
+                + jax.tree_util.keystr(keys)
+            )
+
+
+def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {jax.tree_util.keystr(keys): tuple(leaf.shape) for keys, leaf in leaves}
 
 
 def restore(folder: str | pathlib.Path, fresh: Any) -> tuple[Any, dict[str, Any]]:

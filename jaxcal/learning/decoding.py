@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcal.learning import geometry
+from jaxcal.learning import geometry, networks
 from jaxcal.learning.networks import Network
 
 __all__ = ["DECODINGS", "choose", "log_det_of", "logits_at"]
@@ -66,7 +66,7 @@ def logits_at(
     glance = network.look_at(view, chosen, available, count)
     if chosen.shape[-1] - count <= network.num_unlearned:
         return network.finish(glance)
-    return network.apply({"params": params}, memory, glance, method="decode")
+    return networks.decode(network, params, memory, glance)
 
 
 @functools.partial(
@@ -110,7 +110,7 @@ def choose(
     usable = available.at[rows, required].set(True)
     free = available.at[rows, required].set(False)
     view = network.look(candidates, usable)
-    memory = network.apply({"params": params}, view, method="encode")
+    memory = networks.encode(network, params, view)
     complete = functools.partial(_complete, network, params, view, memory)
     if decoding == "greedy" or num_required == k:
         return complete(chosen, free, num_required, None)

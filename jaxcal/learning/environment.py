@@ -20,6 +20,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from jaxcal.learning import geometry
@@ -96,21 +97,20 @@ def uniform(
     high: tuple[float, ...] | None = None,
 ) -> Candidates:
     """Candidates uniform between ``low`` and ``high``, per axis; [0, 1] by default."""
-    lower = jnp.asarray(low if low is not None else (0.0,) * config.num_inputs)
-    upper = jnp.asarray(high if high is not None else (1.0,) * config.num_inputs)
+    lower = np.asarray(low if low is not None else (0.0,) * config.num_inputs)
+    upper = np.asarray(high if high is not None else (1.0,) * config.num_inputs)
     if lower.shape != (config.num_inputs,) or upper.shape != (config.num_inputs,):
         raise ValueError(
             f"low and high must hold {config.num_inputs} numbers, "
             f"got {lower.shape} and {upper.shape}"
         )
-    if not bool((lower < upper).all()):
+    if not (lower < upper).all():
         raise ValueError(f"low must be below high on every axis, got {low} and {high}")
     shape = (config.num_candidates, config.num_inputs)
 
     def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         unit = jax.random.uniform(key, shape)
-        # lower and upper broadcast over the candidates on purpose.
-        points = lower[None, :] + unit * (upper - lower)[None, :]
+        points = jnp.float32(lower)[None, :] + unit * jnp.float32(upper - lower)[None]
         return points, jnp.ones(shape[0], bool)
 
     return draw

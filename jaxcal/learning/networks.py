@@ -15,6 +15,7 @@ log det(Z.T Z), unscaled. Networks are flax modules; ``build`` makes one from a 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any, cast
 
 import flax.linen as nn
 import jax
@@ -30,6 +31,8 @@ __all__ = [
     "NetworkConfig",
     "PaperNetwork",
     "build",
+    "decode",
+    "encode",
     "mask_logits",
 ]
 
@@ -373,6 +376,19 @@ class PaperNetwork(nn.Module):
 PAPER_HEADS = ("actor", "critic_1", "critic_2")  # everything else is shared
 
 Network = CompactNetwork | PaperNetwork
+
+
+def encode(network: Network, params: Any, view: View) -> jax.Array:
+    """Apply ``network.encode`` with given parameters."""
+    return cast(jax.Array, network.apply({"params": params}, view, method="encode"))
+
+
+def decode(
+    network: Network, params: Any, memory: jax.Array, glance: View
+) -> tuple[jax.Array, jax.Array]:
+    """Apply ``network.decode`` with given parameters: logits and value."""
+    out = network.apply({"params": params}, memory, glance, method="decode")
+    return cast(tuple[jax.Array, jax.Array], out)
 
 
 def build(config: NetworkConfig) -> Network:

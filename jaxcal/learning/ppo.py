@@ -201,16 +201,12 @@ def _play(
         jax.random.split(key_sets, num_sets)
     )
     view = network.look(sets.candidates, sets.available)
-    memory = network.apply({"params": params}, view, method="encode")
+    memory = networks.encode(network, params, view)
     # Every episode of a set shares its candidates, their geometry and their memory.
     states = jax.tree.map(
         lambda leaf: jnp.broadcast_to(leaf[None], (repeats, *leaf.shape)), sets
     )
-    decode = jax.vmap(
-        lambda glance: network.apply(
-            {"params": params}, memory, glance, method="decode"
-        )
-    )
+    decode = jax.vmap(lambda glance: networks.decode(network, params, memory, glance))
     advance = jax.vmap(
         jax.vmap(lambda state, action: environment.step(state, action, env))
     )
@@ -310,12 +306,10 @@ def _loss(
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Clipped surrogate, squared value error and entropy bonus of whole episodes."""
     env = task.environment
-    memory = network.apply({"params": params}, batch.view, method="encode")
+    memory = networks.encode(network, params, batch.view)
     decode = jax.vmap(
         jax.vmap(
-            lambda glance: network.apply(
-                {"params": params}, memory, glance, method="decode"
-            ),
+            lambda glance: networks.decode(network, params, memory, glance),
             in_axes=1,
             out_axes=1,
         ),

@@ -120,14 +120,14 @@ def select_batch(
     batch, m, _ = sets.shape
     policy = load_policy(checkpoint)
     scaled = _to_order_one(sets, usable, white=policy.network.config.kind == "compact")
-    scaled = np.where(usable[..., None], scaled, 0.0).astype(np.float32)
+    inputs = np.where(usable[..., None], scaled, 0.0).astype(np.float32)
     tries = num if decoding in ("samples", "first") else 1
     size = max(1, min(batch, _CELLS // (m * m * tries), _LARGEST_CHUNK))
     how = "greedy" if decoding == "exchange" else decoding
     indices = np.concatenate(
         [
             _choose(
-                policy, scaled[i:j], usable[i:j], kept[i:j], k, how, num, seed + i, size
+                policy, inputs[i:j], usable[i:j], kept[i:j], k, how, num, seed + i, size
             )
             for i in range(0, batch, size)
             for j in [min(i + size, batch)]
