@@ -207,7 +207,8 @@ def step(
 
     before = state.paid if config.reward_gain else jnp.zeros_like(value)
     reward = jnp.where(pays, config.reward_scale * (value - before), 0.0)
-    state = state.replace(
+    state = dataclasses.replace(
+        state,
         chosen=chosen,
         available=state.available & (jnp.arange(config.num_candidates) != action),
         count=count,
