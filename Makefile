@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help train evaluate test test-all lint format clean
+.PHONY: help train checkpoint evaluate test test-all lint format clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -17,8 +17,11 @@ $(READY): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
 	@touch $@
 
-train: $(READY) ## set everything up and train the compact policy on this machine (about ten minutes)
+train: $(READY) ## set everything up and train the compact policy on this machine (a few minutes)
 	$(BIN)/python train.py $(ARGS)
+
+checkpoint: $(READY) ## train the policy that ships and put it in checkpoints/default (about 15 minutes)
+	$(BIN)/python train.py --preset general --export checkpoints/default $(ARGS)
 
 evaluate: $(READY) ## compare every method with the proven optimum on 1,000 unseen candidate sets
 	$(BIN)/python evaluate.py $(ARGS)

@@ -11,10 +11,11 @@ from typing import Any
 
 EXAMPLES = """\
 examples:
-  python train.py                                  the compact policy, about 10 minutes
+  python train.py                                  the compact policy, a few minutes
   python train.py --preset paper                   the paper's network and schedule
   python train.py --resume --out runs/compact      go on where a run stopped
   python train.py --episodes 20000 --seed 1 --out runs/short
+  python train.py --preset general --export checkpoints/default   what ships
   python train.py --trainer brax --episodes 50000  the same task, brax's own PPO
 
 A run folder holds metrics.csv, TensorBoard events and checkpoint/; measure it with
@@ -43,6 +44,11 @@ def parser() -> argparse.ArgumentParser:
         choices=("jaxcal", "brax"),
         default="jaxcal",
         help="jaxcal's own PPO, or brax's on the same environment",
+    )
+    out.add_argument(
+        "--export",
+        metavar="DIR",
+        help="write the finished policy alone, without its training state, to DIR",
     )
     out.add_argument(
         "--no-validation",
@@ -148,10 +154,11 @@ def run(arguments: argparse.Namespace) -> int:
             f"stopped at update {done} of {config.ppo.num_updates} and saved; go on: "
             f"python train.py --resume --out {out}"
         )
-    else:
-        print(
-            f"saved {out}/checkpoint; measure it: python evaluate.py --checkpoint {out}"
-        )
+        return 0
+    print(f"saved {out}/checkpoint; measure it: python evaluate.py --checkpoint {out}")
+    if arguments.export:
+        checkpoint.export(out, arguments.export)
+        print(f"exported the policy alone to {arguments.export}")
     return 0
 
 

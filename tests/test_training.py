@@ -177,6 +177,19 @@ def test_a_missing_folder_and_a_policy_without_state_are_told(finished, tmp_path
         training.train(CONFIG, tmp_path, resume=True)
 
 
+def test_exporting_keeps_the_policy_and_leaves_the_state(finished, tmp_path):
+    for _ in range(2):  # the second replaces the first
+        checkpoint.export(finished[0], tmp_path / "policy")
+    assert [p.name for p in tmp_path.iterdir()] == ["policy"]
+    one, other = checkpoint.load(finished[0]), checkpoint.load(tmp_path / "policy")
+    for a, b in zip(
+        jax.tree.leaves(one.params), jax.tree.leaves(other.params), strict=True
+    ):
+        np.testing.assert_array_equal(a, b)
+    with pytest.raises(CheckpointError, match="no training state"):
+        checkpoint.restore(tmp_path / "policy", None)
+
+
 def test_a_state_of_another_configuration_is_refused(finished, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(finished[0], copy)

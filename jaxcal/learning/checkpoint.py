@@ -17,6 +17,7 @@ import importlib.metadata
 import logging
 import pathlib
 import platform
+import tempfile
 from typing import Any
 
 import jax
@@ -25,7 +26,15 @@ import orbax.checkpoint as ocp
 
 from jaxcal.learning.networks import Network, NetworkConfig, build
 
-__all__ = ["CheckpointError", "Policy", "default_folder", "load", "restore", "save"]
+__all__ = [
+    "CheckpointError",
+    "Policy",
+    "default_folder",
+    "export",
+    "load",
+    "restore",
+    "save",
+]
 
 SCHEMA = "jaxcal-policy"
 VERSION = 1
@@ -237,6 +246,28 @@ def _check_weights(
 def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {jax.tree_util.keystr(keys): tuple(leaf.shape) for keys, leaf in leaves}
+
+
+def export(run: str | pathlib.Path, folder: str | pathlib.Path) -> None:
+    """Write a run's policy alone, without its training state, to another folder.
+
+    Args:
+        run: a training run's folder.
+        folder: becomes a checkpoint folder with one step; one that is there is replaced
+            after the new one is complete.
+    """
+    policy = load(run)
+    target = pathlib.Path(folder)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    own = {"schema", "version", "created", "versions"}
+    meta = {name: value for name, value in policy.meta.items() if name not in own}
+    meta["trained_with"] = policy.meta["versions"]
+    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".export-") as fresh:
+        new, old = pathlib.Path(fresh) / "new", pathlib.Path(fresh) / "old"
+        save(new, policy.step, policy.params, meta)
+        if target.exists():
+            target.rename(old)
+        new.rename(target)
 
 
 def restore(folder: str | pathlib.Path, fresh: Any) -> tuple[Any, dict[str, Any]]:
