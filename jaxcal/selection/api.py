@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.selection.auto import check_least_efficiency, solve_auto
 from jaxcal.selection.exact import STARTING_RESTARTS, solve_exact
 from jaxcal.selection.exchange import default_restarts, exchange_indices
 from jaxcal.selection.greedy import greedy_indices
@@ -18,6 +19,7 @@ from jaxcal.selection.result import Selection, Subset
 __all__ = ["METHODS", "score", "select"]
 
 METHODS = ("random", "greedy", "exchange", "exact", "policy")
+_CHOICES = (*METHODS, "auto")  # auto is one of the last two, whichever suffices
 _REFERENCES = ("bound", "exact")
 _PROVEN = 1e-9  # log det S this near a proven optimum is that optimum
 
@@ -39,14 +41,16 @@ def select(
     checkpoint: Any = None,
     decoding: str = "greedy",
     num: int = 16,
+    least_efficiency: float = 0.999,
 ) -> Selection:
     """Choose the k postures whose information matrix has the largest determinant.
 
     Args:
         candidates: (M, n) commands that could be measured, in any unit.
         k: postures to choose, at least n + 1.
-        method: "random", "greedy", "exchange" (near-optimal), "exact" (proven) or
-            "policy" (the trained network).
+        method: "random", "greedy", "exchange" (near-optimal), "exact" (proven),
+            "policy" (the trained network) or "auto": the policy where it provably has
+            ``least_efficiency``, else exact; ``method`` of the answer says which.
         available: (M,) bool, True where a candidate may be chosen; all when not given.
         required: (r,) candidates that must be among the chosen.
         max_replicates: how often one candidate may be chosen; 1 keeps them distinct.
@@ -55,23 +59,27 @@ def select(
         seed: for random and exchange, and for the policy where it samples.
         restarts: random starts of the exchange; when not given 200, with replicates
             400, and 30 where it only starts the exact search.
-        time_limit: seconds after which exact returns the best found, not proven.
+        time_limit: seconds after which exact, also within auto, returns the best found,
+            not proven.
         best: how many best subsets exact proves, in ``alternatives``.
         reference: what ``bound`` and ``efficiency`` are measured against, "bound" (the
             cheapest upper bound, computed when read) or "exact" (the proven optimum).
         checkpoint: folder of a trained policy; the one that ships when not given.
         decoding: how the policy chooses, see ``jaxcal.selection.policy``.
         num: decodings the policy tries, where ``decoding`` tries several.
+        least_efficiency: of auto, the D-efficiency in (0, 1] against the optimum or an
+            upper bound on it from which the policy's answer is kept.
 
     Returns:
-        The selection; never a singular one.
+        The selection; never a singular one. That of auto also has a ``reason``.
 
     Raises:
         ValueError: naming the argument, the rule and the value.
     """
-    if method not in METHODS:
-        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    if method not in _CHOICES:
+        raise ValueError(f"method must be one of {', '.join(_CHOICES)}, got {method!r}")
     _check_reference(reference)
+    least_efficiency = check_least_efficiency(least_efficiency)
     seed = whole_number("seed", seed, 0)
     if restarts is not None:
         restarts = whole_number("restarts", restarts, 1)
@@ -92,6 +100,16 @@ def select(
         deadline = None if time_limit is None else start + time_limit
         starts = restarts or STARTING_RESTARTS
         return _exact(problem, best, deadline, starts, seed, start)
+    if method == "auto":
+        return solve_auto(
+            problem,
+            lambda: _policy(problem, checkpoint, decoding, num, seed),
+            least_efficiency,
+            reference,
+            time_limit,
+            restarts or STARTING_RESTARTS,
+            seed,
+        )
     starts = restarts or default_restarts(problem.max_replicates)
     used_seed: int | None = seed
     used_restarts: int | None = None
