@@ -7,7 +7,7 @@ import dataclasses
 import pathlib
 import signal
 import sys
-from typing import Any
+from typing import Any, NoReturn
 
 EXAMPLES = """\
 examples:
@@ -23,11 +23,18 @@ A run folder holds metrics.csv, TensorBoard events and checkpoint/; measure it w
 Ctrl-C saves and stops; --resume then continues bit for bit (on the same CPU)."""
 
 
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"train.py: {message}; see --help\n")
+
+
 def parser() -> argparse.ArgumentParser:
     """Flags; those of a configuration are made from its fields."""
     from jaxcal.learning import presets
 
-    out = argparse.ArgumentParser(
+    out = Parser(
         description=__doc__,
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,

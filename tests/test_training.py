@@ -297,6 +297,7 @@ def test_train_command_trains_saves_and_refuses_to_overwrite(tmp_path):
     [
         (["--episodes", "0"], "num_episodes must be at least 1"),
         (["--num-selected", "3"], "num_selected must be in"),
+        (["--seed", "one"], "argument --seed: invalid int value: 'one'"),
         (["--resume"], "does not exist"),
         (["--out", "/proc/nowhere/run"], "cannot write in /proc"),
     ],
