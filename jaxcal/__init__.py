@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration, identify
+    from jaxcal.planning import plan
     from jaxcal.regression import (
         hat_matrix,
         information_matrix,
@@ -29,6 +30,7 @@ __all__ = [
     "information_matrix",
     "leverages",
     "log_det_information",
+    "plan",
     "regression_matrix",
     "score",
     "select",
@@ -39,6 +41,7 @@ __version__ = "0.1.0"
 _HOME = {
     "Calibration": "jaxcal.calibration",
     "identify": "jaxcal.calibration",
+    "plan": "jaxcal.planning",
     "Selection": "jaxcal.selection",
     "score": "jaxcal.selection",
     "select": "jaxcal.selection",
