@@ -57,6 +57,7 @@ class PPOConfig:
     warmup_updates: int = 5  # linear rise of the learning rate
     clip_range: float = 0.2  # of the probability ratio
     value_coefficient: float = 0.5
+    value_error_limit: float = 3.0  # reward units; a singular pick is an outlier
     entropy_start: float = 0.02  # entropy bonus, linear to entropy_end
     entropy_end: float = 0.0
     discount: float = 1.0  # episodes are short: nothing is discounted
@@ -86,7 +87,12 @@ class PPOConfig:
                 f"num_minibatches = {self.episodes_per_set * self.num_minibatches}, "
                 f"got {self.episodes_per_update}"
             )
-        for name in ("learning_rate", "clip_range", "max_grad_norm"):
+        for name in (
+            "learning_rate",
+            "clip_range",
+            "max_grad_norm",
+            "value_error_limit",
+        ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
         for name in ("discount", "gae_lambda", "average_decay"):
@@ -330,7 +336,8 @@ def _loss(
 
     surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
     policy_loss = -mean(surrogate)
-    error = jnp.clip(value - batch.target, -3.0, 3.0)
+    limit = config.value_error_limit
+    error = jnp.clip(value - batch.target, -limit, limit)
     value_loss = mean(error**2)
     entropy = mean(-(jnp.exp(log_probs) * log_probs).sum(-1))
     loss = policy_loss + config.value_coefficient * value_loss - entropy_bonus * entropy

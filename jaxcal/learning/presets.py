@@ -79,6 +79,8 @@ _PAPER = TrainConfig(
         entropy_start=0.01,
         entropy_end=0.01,
         normalise_per_decision=False,
+        value_error_limit=1e9,
+        advantage_limit=1e9,
         average_decay=0.99,
     ),
 )

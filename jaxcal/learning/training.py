@@ -191,12 +191,12 @@ def train(
                 "seconds": before + now - begun,
                 "learning_rate": ppo.learning_rate(config.ppo, done),
             }
-            look = now - looked > config.validate_every or done == last
-            if (look or mark_update == done - 1 == 0) and validation is not None:
+            look = done in (1, last) or now - looked > config.validate_every
+            if look and validation is not None:
                 ratio, hits = validation.measure(network, state.average, k)
                 row |= {"ratio_to_exact": ratio, "hit_rate": hits}
             table.add(row)
-            if look or done == 1:
+            if look:
                 looked = now = time.perf_counter()
                 rate = (done - mark_update) / max(now - mark_time, 1e-9)
                 report(
