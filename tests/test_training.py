@@ -188,6 +188,12 @@ def test_exporting_keeps_the_policy_and_leaves_the_state(finished, tmp_path):
         np.testing.assert_array_equal(a, b)
     with pytest.raises(CheckpointError, match="no training state"):
         checkpoint.restore(tmp_path / "policy", None)
+    text = "".join(
+        path.read_text(errors="ignore")
+        for path in (tmp_path / "policy").rglob("*")
+        if path.is_file()
+    )
+    assert str(tmp_path) not in text
 
 
 def test_a_state_of_another_configuration_is_refused(finished, tmp_path):

@@ -265,6 +265,10 @@ def export(run: str | pathlib.Path, folder: str | pathlib.Path) -> None:
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".export-") as fresh:
         new, old = pathlib.Path(fresh) / "new", pathlib.Path(fresh) / "old"
         save(new, policy.step, policy.params, meta)
+        for marker in new.rglob("commit_success.txt"):
+            # orbax looks only whether the file is there, and writes this machine's
+            # folders into it.
+            marker.write_text("committed\n")
         if target.exists():
             target.rename(old)
         new.rename(target)
