@@ -21,19 +21,23 @@ if TYPE_CHECKING:
         regression_matrix,
     )
     from jaxcal.selection import Selection, score, select
+    from jaxcal.selection.cost import Motion, pareto_front, select_fastest
 
 __all__ = [
     "Calibration",
+    "Motion",
     "Selection",
     "hat_matrix",
     "identify",
     "information_matrix",
     "leverages",
     "log_det_information",
+    "pareto_front",
     "plan",
     "regression_matrix",
     "score",
     "select",
+    "select_fastest",
 ]
 
 __version__ = "0.1.0"
@@ -45,6 +49,9 @@ _HOME = {
     "Selection": "jaxcal.selection",
     "score": "jaxcal.selection",
     "select": "jaxcal.selection",
+    "Motion": "jaxcal.selection.cost",
+    "pareto_front": "jaxcal.selection.cost",
+    "select_fastest": "jaxcal.selection.cost",
 }
 
 

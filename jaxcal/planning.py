@@ -270,6 +270,7 @@ _WORDS = {"G": "largest", "I": "average"}
 def plan_figure(result: Plan) -> Figure:
     """Accuracy against K: the designs, what no design beats, and the target."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import MaxNLocator
 
     from jaxcal.study.figure_style import BLACK, COLOURS, GREY, MARKERS, plain_axes
 
@@ -294,7 +295,7 @@ def plan_figure(result: Plan) -> Figure:
     axes.set_ylabel(
         f"{_WORDS[result.criterion]} standard error of a prediction (measured unit)"
     )
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_ylim(bottom=0.0)
     axes.legend(frameon=False)
     plain_axes(axes)

@@ -1,0 +1,584 @@
+"""Which postures to measure, and in which order, so that the run takes least time.
+
+A move is a trapezoid profile on every axis (accelerate, cruise, brake), all axes start
+together and the slowest sets the time; after it the device settles. The fastest run is
+the subset **and** order of least total time among those with at least a given
+D-efficiency. Each axis' time is a concave function of its distance that is zero at
+zero, so the travel time is a metric, which the exact search uses to cut branches.
+
+``exact`` proves the answer, for few postures (K up to about 6 of 50; it stops at a time
+limit and says so). ``heuristic`` is local search from near-optimal subsets, for any K,
+and proves nothing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import numbers
+from jaxcal.criteria import d_efficiency
+from jaxcal.selection.auto import check_least_efficiency
+from jaxcal.selection.exact import solve_exact
+from jaxcal.selection.exchange import exchange_indices
+from jaxcal.selection.problem import Problem, make_problem, whole_number
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = [
+    "FastSelection",
+    "Motion",
+    "ParetoFront",
+    "fastest_tour",
+    "pareto_figure",
+    "pareto_front",
+    "select_fastest",
+    "travel_times",
+]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+METHODS = ("exact", "heuristic")
+
+MOST_EXACT = 12  # postures whose order Held and Karp find in a moment
+_EXACT_INSIDE = 7  # postures up to which the heuristic orders every trial exactly
+_CHUNK = 20_000  # nodes between looks at the clock
+_ROUNDING = 1e-12  # of log det(Z.T Z), so that the optimum itself meets its own value
+_SAME_TIME = 1e-9  # seconds: two runs this close take as long
+_STARTS = 12  # of the heuristic
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion:
+    """How the device moves; in the unit of the candidates and seconds."""
+
+    speed: tuple[float, ...]  # (n,) or one for all axes, unit/s
+    acceleration: tuple[float, ...]  # likewise, unit/s^2; also the deceleration
+    settle: float = 0.0  # s at every posture, before and while measuring
+
+    def __post_init__(self) -> None:
+        for name in ("speed", "acceleration"):
+            given = numbers(name, getattr(self, name))
+            if given.ndim > 1 or not given.size or (given <= 0.0).any():
+                raise ValueError(
+                    f"{name} must be positive numbers, one or one an axis, "
+                    f"got {getattr(self, name)!r}"
+                )
+            object.__setattr__(self, name, tuple(np.atleast_1d(given).tolist()))
+        settle = numbers("settle", self.settle)
+        if settle.ndim or settle < 0.0:
+            raise ValueError(f"settle must be at least 0 seconds, got {self.settle!r}")
+
+
+def travel_times(points: ArrayLike, others: ArrayLike, motion: Motion) -> Array:
+    """Seconds from each of some postures to each of others, without settling.
+
+    An axis that moves d at speed v and acceleration a takes ``d / v + v / a``, or
+    ``2 sqrt(d / a)`` where it never reaches v (d < v^2 / a); the slowest axis counts.
+
+    Args:
+        points: (A, n).
+        others: (B, n) in the same unit.
+        motion: limits of the axes.
+
+    Returns:
+        (A, B).
+    """
+    a, b = numbers("points", points), numbers("others", others)
+    if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1]:
+        raise ValueError(
+            f"points and others must be (A, n) and (B, n), got {a.shape} and {b.shape}"
+        )
+    n = a.shape[1]
+    limits = []
+    for name in ("speed", "acceleration"):
+        value = np.asarray(getattr(motion, name))
+        if len(value) not in (1, n):
+            raise ValueError(f"motion.{name} must hold 1 or {n}, got {len(value)}")
+        limits.append(np.broadcast_to(value, (n,)))
+    speed, ramp = limits
+    way = np.abs(a[:, None] - b[None])
+    cruise = way >= speed**2 / ramp
+    seconds = np.where(cruise, way / speed + speed / ramp, 2.0 * np.sqrt(way / ramp))
+    return seconds.max(axis=2)
+
+
+def fastest_tour(times: ArrayLike, start: ArrayLike | None = None) -> tuple[Any, float]:
+    """The order of least time through all postures, ending anywhere.
+
+    Exact up to 12 postures (Held and Karp 1962); beyond that 2-opt and moving single
+    postures from each nearest-neighbour tour, which proves nothing.
+
+    Args:
+        times: (K, K) symmetric travel times.
+        start: (K,) times from where the device stands; it begins anywhere when None.
+
+    Returns:
+        (K,) order, and the seconds of travel.
+    """
+    t = numbers("times", times)
+    k = len(t)
+    if t.shape != (k, k) or not k:
+        raise ValueError(f"times must have shape (K, K), got {t.shape}")
+    begin = np.zeros(k) if start is None else numbers("start", start)
+    if begin.shape != (k,):
+        raise ValueError(f"start must have shape ({k},), got {begin.shape}")
+    if k <= MOST_EXACT:
+        return _held_karp(t, begin)
+    tours = [_improved(_nearest(t, begin, first), t, begin) for first in range(k)]
+    seconds = [_length(order, t, begin) for order in tours]
+    best = int(np.argmin(seconds))
+    return tours[best], seconds[best]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FastSelection:
+    """The postures in the order to visit, what the run takes, and what is proven."""
+
+    indices: Indices  # (k,) in the order to visit
+    seconds: float  # of travel and settling
+    travel_seconds: float
+    log_det: float  # natural log det S, in the candidates' unit
+    efficiency: float  # D-efficiency against ``bound``
+    least_efficiency: float  # that was asked for
+    proven: bool  # no subset and order with that efficiency takes less time
+    method: str  # "exact" or "heuristic"
+    bound: float  # log det S of the D-optimum, an upper bound on it where not proven
+    bound_proven: bool  # ``bound`` is the optimum
+    nodes: int  # of the search; 0 for the heuristic
+    search_seconds: float  # that finding it took
+
+
+def select_fastest(
+    candidates: ArrayLike,
+    k: int = 4,
+    *,
+    motion: Motion,
+    least_efficiency: float = 0.95,
+    start: ArrayLike | None = None,
+    available: ArrayLike | None = None,
+    required: ArrayLike | None = None,
+    num_outputs: int | None = None,
+    method: str | None = None,
+    time_limit: float = 60.0,
+    seed: int = 0,
+) -> FastSelection:
+    """Subset and order of least time with a D-efficiency of ``least_efficiency``.
+
+    Args:
+        candidates: (M, n) commands that could be measured, in any unit.
+        k: postures to choose, distinct.
+        motion: speeds and accelerations in the candidates' unit, settle time.
+        least_efficiency: in (0, 1], against the proven D-optimum.
+        start: (n,) where the device stands; it begins at any posture when not given.
+        available: (M,) bool, True where a candidate may be chosen.
+        required: (r,) candidates that must be among the chosen.
+        num_outputs: m; changes log det S, not the answer.
+        method: "exact" (k up to 12, with a proof unless the time runs out) or
+            "heuristic"; exact up to k = 6 when not given.
+        time_limit: seconds of the exact search and of the D-optimum behind it.
+        seed: of the starts of the heuristic, which also starts exact.
+
+    Returns:
+        The selection; among runs of equal time the one with the largest determinant.
+
+    Raises:
+        ValueError: naming the argument, the rule and the value.
+    """
+    least_efficiency = check_least_efficiency(least_efficiency)
+    problem = make_problem(
+        candidates,
+        k,
+        available=available,
+        required=required,
+        num_outputs=num_outputs,
+    )
+    task = _task(problem, motion, start, _method(method, problem.k), time_limit, seed)
+    return _fastest(task, least_efficiency, None)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ParetoFront:
+    """Runs none of which is both faster and more efficient than another."""
+
+    points: tuple[FastSelection, ...]  # ascending in time and in efficiency
+    least_efficiency: float  # where the front was cut off
+    proven: bool  # every point is, and none is missing
+
+
+def pareto_front(
+    candidates: ArrayLike,
+    k: int = 4,
+    *,
+    motion: Motion,
+    least_efficiency: float = 0.7,
+    start: ArrayLike | None = None,
+    available: ArrayLike | None = None,
+    required: ArrayLike | None = None,
+    num_outputs: int | None = None,
+    method: str | None = None,
+    time_limit: float = 60.0,
+    max_points: int = 200,
+    seed: int = 0,
+) -> ParetoFront:
+    """Time against D-efficiency, from ``least_efficiency`` up to the D-optimum.
+
+    Each point is the fastest run more efficient than the point before it.
+
+    Args:
+        candidates, k, motion, start, available, required, num_outputs, method, seed:
+            as in :func:`select_fastest`.
+        least_efficiency: where to cut the front off, in (0, 1].
+        time_limit: seconds for each point.
+        max_points: points after which to stop; the front is then not proven.
+    """
+    least_efficiency = check_least_efficiency(least_efficiency)
+    max_points = whole_number("max_points", max_points, 1)
+    problem = make_problem(
+        candidates,
+        k,
+        available=available,
+        required=required,
+        num_outputs=num_outputs,
+    )
+    task = _task(problem, motion, start, _method(method, problem.k), time_limit, seed)
+    points: list[FastSelection] = []
+    share, above = least_efficiency, None
+    complete = False
+    while len(points) < max_points:
+        try:
+            point = _fastest(task, share, above)
+        except _NothingLeftError:
+            complete = True
+            break
+        points.append(point)
+        above = point.log_det
+    kept = [
+        p
+        for p in points
+        if not any(
+            q.seconds <= p.seconds + _SAME_TIME and q.log_det > p.log_det
+            for q in points
+        )
+    ]
+    proven = complete and all(point.proven for point in points)
+    return ParetoFront(tuple(kept), least_efficiency, proven)
+
+
+def pareto_figure(fronts: dict[str, ParetoFront]) -> Figure:
+    """Time against efficiency; filled markers are proven, hollow ones are not."""
+    from matplotlib.figure import Figure
+
+    from jaxcal.study.figure_style import COLOURS, MARKERS, plain_axes
+
+    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
+    axes = figure.add_subplot()
+    for i, (name, front) in enumerate(fronts.items()):
+        colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
+        efficiency = [point.efficiency for point in front.points]
+        seconds = [point.seconds for point in front.points]
+        axes.plot(
+            efficiency,
+            seconds,
+            drawstyle="steps-pre",
+            color=colour,
+            linewidth=1.0,
+            marker=marker,
+            markersize=5,
+            markerfacecolor=colour if front.proven else "white",
+            label=name + ("" if front.proven else " (not proven)"),
+        )
+    axes.set_xlabel("D-efficiency against the optimum")
+    axes.set_ylabel("time of the run (s): travel and settling")
+    axes.legend(frameon=False)
+    plain_axes(axes)
+    return figure
+
+
+# -- inside ----------------------------------------------------------------------------
+
+
+class _NothingLeftError(ValueError):
+    """No subset has the determinant asked for."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Task:
+    problem: Problem
+    pool: Indices  # (P,) available candidates, the required first
+    times: Array  # (P, P)
+    start: Array  # (P,)
+    settle: float
+    method: str
+    time_limit: float
+    seed: int
+    optimum: Indices  # (k,) the D-optimal subset, into the pool
+    bound: float  # log det S
+    bound_proven: bool
+
+    @property
+    def rows(self) -> Array:
+        return self.problem.rows[self.pool]
+
+
+def _method(method: str | None, k: int) -> str:
+    if method is None:
+        return "exact" if k <= 6 else "heuristic"
+    if method not in METHODS:
+        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    if method == "exact" and k > MOST_EXACT:
+        raise ValueError(f"k must be at most {MOST_EXACT} with exact, got {k}")
+    return method
+
+
+def _task(
+    problem: Problem,
+    motion: Motion,
+    start: ArrayLike | None,
+    method: str,
+    time_limit: float,
+    seed: int,
+) -> _Task:
+    limit = numbers("time_limit", time_limit, finite=False)
+    if limit.ndim or not limit > 0.0:
+        raise ValueError(f"time_limit must be above 0 seconds, got {time_limit!r}")
+    n = problem.num_regressors - 1
+    free = np.setdiff1d(np.flatnonzero(problem.available), problem.required)
+    leverage = (problem.rows[free] ** 2).sum(axis=1)
+    pool = np.concatenate([problem.required, free[np.argsort(-leverage)]])
+    points = problem.candidates[pool]
+    begin = np.zeros(len(pool))
+    if start is not None:
+        where = numbers("start", start)
+        if where.shape != (n,):
+            raise ValueError(f"start must have shape ({n},), got {where.shape}")
+        begin = travel_times(where[None], points, motion)[0]
+    found = solve_exact(problem, deadline=time.perf_counter() + time_limit)
+    position = np.full(len(problem.rows), -1)
+    position[pool] = np.arange(len(pool))
+    return _Task(
+        problem=problem,
+        pool=pool,
+        times=travel_times(points, points, motion),
+        start=begin,
+        settle=float(motion.settle) * problem.k,
+        method=method,
+        time_limit=float(time_limit),
+        seed=whole_number("seed", seed, 0),
+        optimum=position[found.subsets[0]],
+        bound=found.bound,
+        bound_proven=found.proven,
+    )
+
+
+def _log_det(rows: Array, chosen: Indices) -> float:
+    x = rows[chosen]
+    sign, value = np.linalg.slogdet(x.T @ x)
+    return float(value) if sign > 0 else -np.inf
+
+
+def _fastest(task: _Task, least: float, above: float | None) -> FastSelection:
+    """The fastest run with efficiency ``least``, and log det S over ``above``."""
+    begun = time.perf_counter()
+    problem, rows = task.problem, task.rows
+    m, p = problem.num_outputs, problem.num_regressors
+    scale = problem.log_scale
+    # log det(X.T X) wanted; a bound that is not the optimum asks too much of a subset,
+    # never too little.
+    wanted = task.bound / m - scale + p * np.log(least) - _ROUNDING
+    if above is not None:
+        wanted = max(wanted, above / m - scale + 1e-9)
+    chosen, seconds = _local_search(task, wanted)
+    nodes, proven = 0, False
+    if task.method == "exact":
+        value = -np.inf if chosen is None else _log_det(rows, chosen)
+        chosen, nodes, proven = _exact_search(task, wanted, chosen, seconds, value)
+    if chosen is None:
+        if above is not None:
+            raise _NothingLeftError
+        raise ValueError(
+            f"least_efficiency must be reachable, got {least:g}; the optimum is only "
+            "bounded within the time limit: give more time, or ask for less"
+        )
+    order, travel = fastest_tour(task.times[np.ix_(chosen, chosen)], task.start[chosen])
+    indices = task.pool[chosen[order]]
+    log_det = problem.log_det(indices)
+    return FastSelection(
+        indices=indices,
+        seconds=travel + task.settle,
+        travel_seconds=travel,
+        log_det=log_det,
+        efficiency=d_efficiency(log_det, max(task.bound, log_det), m * p),
+        least_efficiency=least,
+        proven=proven and task.bound_proven,
+        method=task.method,
+        bound=max(task.bound, log_det),
+        bound_proven=task.bound_proven,
+        nodes=nodes,
+        search_seconds=time.perf_counter() - begun,
+    )
+
+
+def _exact_search(
+    task: _Task, wanted: float, chosen: Indices | None, seconds: float, value: float
+) -> tuple[Indices | None, int, bool]:
+    """Drive the compiled search, watching the clock."""
+    from jaxcal.selection.cost_kernel import search
+
+    k = task.problem.k
+    best = np.array([seconds, value])
+    best_chosen = np.zeros(k, dtype=np.int64) if chosen is None else np.sort(chosen)
+    state, stack = np.zeros(3, dtype=np.int64), np.zeros(k + 1, dtype=np.int64)
+    relaxed = task.rows[task.optimum].T @ task.rows[task.optimum]
+    deadline = time.perf_counter() + task.time_limit
+    complete = False
+    tours = np.full((1 << k, k), np.inf)
+    while not complete and time.perf_counter() < deadline:
+        complete = search(
+            np.ascontiguousarray(task.rows), task.times, task.start,
+            len(task.problem.required), k, relaxed, wanted, _SAME_TIME, tours,
+            stack, state, best, best_chosen, _CHUNK,
+        )  # fmt: skip
+    found = best_chosen if np.isfinite(best[0]) else None
+    return found, int(state[2]), bool(complete)
+
+
+def _local_search(task: _Task, wanted: float) -> tuple[Indices | None, float]:
+    """Swaps that keep the determinant and shorten the tour, from several subsets."""
+    rng = np.random.default_rng(task.seed)
+    starts = [task.optimum]
+    position = np.full(len(task.problem.rows), -1)
+    position[task.pool] = np.arange(len(task.pool))
+    for _ in range(_STARTS - 1):
+        indices = exchange_indices(task.problem, 1, int(rng.integers(2**31)))
+        starts.append(position[indices])
+    best: Indices | None = None
+    least = np.inf
+    for start in starts:
+        if _log_det(task.rows, start) < wanted:
+            continue
+        chosen, seconds = _shortened(task, start, wanted)
+        if seconds < least - _SAME_TIME:
+            best, least = chosen, seconds
+    return best, least
+
+
+def _shortened(task: _Task, start: Indices, wanted: float) -> tuple[Indices, float]:
+    rows, times, begin = task.rows, task.times, task.start
+    fixed = len(task.problem.required)
+    order, seconds = fastest_tour(times[np.ix_(start, start)], begin[start])
+    tour = start[order]
+    for _ in range(10 * len(tour)):
+        gram = rows[tour].T @ rows[tour]
+        value = np.linalg.slogdet(gram)[1]
+        inverse = np.linalg.inv(gram)
+        leverage = np.einsum("mp,pq,mq->m", rows, inverse, rows)
+        others = np.setdiff1d(np.arange(len(rows)), tour)
+        moves: list[tuple[float, int, int]] = []
+        for i in np.flatnonzero(tour >= fixed):
+            cross = rows[others] @ inverse @ rows[tour[i]]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                after = value + np.log(
+                    (1 + leverage[others]) * (1 - leverage[tour[i]]) + cross**2
+                )
+            enough = others[after >= wanted]
+            if not len(enough):
+                continue
+            rest = np.delete(tour, i)
+            base = _length(np.arange(len(rest)), times[np.ix_(rest, rest)], begin[rest])
+            estimate = base + _insertions(rest, enough, times, begin)
+            moves += [
+                (float(t), int(i), int(j))
+                for t, j in zip(estimate, enough, strict=True)
+            ]
+        improved = False
+        for _, out, new in sorted(moves)[:8]:
+            tried = tour.copy()
+            tried[out] = new
+            if _log_det(rows, tried) < wanted:
+                continue
+            if len(tried) <= _EXACT_INSIDE:
+                order, length = fastest_tour(times[np.ix_(tried, tried)], begin[tried])
+            else:
+                order = _improved(
+                    np.arange(len(tried)), times[np.ix_(tried, tried)], begin[tried]
+                )
+                length = _length(order, times[np.ix_(tried, tried)], begin[tried])
+            if length < seconds - _SAME_TIME:
+                tour, seconds, improved = tried[order], length, True
+                break
+        if not improved:
+            break
+    return tour, seconds
+
+
+def _insertions(tour: Indices, new: Indices, times: Array, begin: Array) -> Array:
+    """(new,) least time that putting each of ``new`` anywhere in the tour adds."""
+    first = begin[new] + times[new, tour[0]] - begin[tour[0]]
+    last = times[tour[-1], new]
+    between = (
+        times[np.ix_(tour[:-1], new)]
+        + times[np.ix_(tour[1:], new)]
+        - times[tour[:-1], tour[1:]][:, None]
+    )
+    return np.vstack([first, last, between]).min(axis=0)
+
+
+def _length(order: Any, times: Array, start: Array) -> float:
+    return float(start[order[0]] + times[order[:-1], order[1:]].sum())
+
+
+def _held_karp(times: Array, start: Array) -> tuple[Indices, float]:
+    """Best open tour by dynamic programming over subsets."""
+    k = len(times)
+    best = np.full((1 << k, k), np.inf)
+    before = np.full((1 << k, k), -1)
+    best[1 << np.arange(k), np.arange(k)] = start
+    for mask in range(1, 1 << k):
+        inside = [i for i in range(k) if mask >> i & 1]
+        if len(inside) < 2:
+            continue
+        for last in inside:
+            rest = mask & ~(1 << last)
+            reached = best[rest] + times[:, last]
+            before[mask, last] = reached.argmin()
+            best[mask, last] = reached.min()
+    mask, order = (1 << k) - 1, []
+    last = int(best[mask].argmin())
+    seconds = float(best[mask, last])
+    while last >= 0:
+        order.append(last)
+        mask, last = mask & ~(1 << last), int(before[mask, last])
+    return np.array(order[::-1]), seconds
+
+
+def _nearest(times: Array, start: Array, first: int) -> Indices:
+    order, left = [first], set(range(len(times))) - {first}
+    while left:
+        order.append(min(left, key=lambda j: times[order[-1], j]))
+        left.remove(order[-1])
+    return np.array(order)
+
+
+def _improved(order: Indices, times: Array, start: Array) -> Indices:
+    """2-opt and moves of one posture until neither shortens the tour."""
+    k = len(order)
+    length = _length(order, times, start)
+    again = True
+    while again:
+        again = False
+        for i in range(k - 1):
+            for j in range(i + 1, k):
+                flipped = np.r_[order[:i], order[i : j + 1][::-1], order[j + 1 :]]
+                moved = np.insert(np.delete(order, i), j, order[i])
+                for tried in (flipped, moved):
+                    reached = _length(tried, times, start)
+                    if reached < length - 1e-12:
+                        order, length, again = tried, reached, True
+    return order
