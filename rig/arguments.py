@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import pathlib
+from collections.abc import Callable
 
 __all__ = ["make_parser"]
 
@@ -43,7 +44,7 @@ def make_parser() -> argparse.ArgumentParser:
             )
         if name == "goto":
             sub.add_argument(
-                "--to", type=float, nargs=3, required=True,
+                "--to", type=_number_within(-360, 360), nargs=3, required=True,
                 metavar=("PITCH", "YAW", "ROLL"), help="desired posture in degrees",
             )  # fmt: skip
         if name in ("collect", "verify"):
@@ -81,6 +82,16 @@ def make_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _number_within(low: float, high: float) -> Callable[[str], float]:
+    def number(text: str) -> float:
+        value = float(text)
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"must be in [{low:g}, {high:g}]: {text}")
+        return value
+
+    return number
+
+
 def _config_options(sub: argparse.ArgumentParser) -> None:
     sub.add_argument("--config", type=pathlib.Path, help="rig.toml")
 
@@ -103,8 +114,13 @@ def _simulator_options(sub: argparse.ArgumentParser) -> None:
         "--fault", action="append", default=[], metavar="KIND[@PHASE|@Ns][,count=N]...",
         help="inject a fault; --fault list names them",
     )  # fmt: skip
-    group.add_argument("--noise", type=float, default=0.02, help="degrees")
-    group.add_argument("--backlash", type=float, default=0.0, help="degrees")
-    group.add_argument("--drift", type=float, default=0.0, help="degrees a minute")
-    group.add_argument("--speedup", type=float, default=1.0, help="of the axes")
-    group.add_argument("--rate", type=float, default=100.0, help="of the phone, Hz")
+    for name, low, high, default, text in (
+        ("--noise", 0.0, 90.0, 0.02, "degrees"),
+        ("--backlash", 0.0, 90.0, 0.0, "degrees"),
+        ("--drift", -90.0, 90.0, 0.0, "degrees a minute"),
+        ("--speedup", 0.01, 100.0, 1.0, "of the axes"),
+        ("--rate", 0.1, 1000.0, 100.0, "of the phone, Hz"),
+    ):
+        group.add_argument(
+            name, type=_number_within(low, high), default=default, help=text
+        )

@@ -10,6 +10,7 @@ never be taken for the answer to a later request.
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -77,11 +78,7 @@ class Bus:
                         f"cannot open {self.settings.where}: {text}"
                     ) from None
             if not self._client.connect():
-                hint = (
-                    "absent, or held by another program (a running session?)"
-                    if self.settings.transport == "rtu"
-                    else "nothing answers there, or its connections are all taken"
-                )
+                hint = _why_closed(self.settings)
                 raise BusError(f"cannot open {self.settings.where}: {hint}")
         return self
 
@@ -230,6 +227,16 @@ class Bus:
                     port.reset_input_buffer()
             except OSError:
                 self._client.close()
+
+
+def _why_closed(settings: BusSettings) -> str:
+    if settings.transport != "rtu":
+        return "nothing answers there, or its connections are all taken"
+    if not os.path.exists(settings.device):
+        return "there is no such port (adapter not plugged in?)"
+    if not os.access(settings.device, os.R_OK | os.W_OK):
+        return "this user may not open it (join its group, often dialout)"
+    return "held by another program (a running session?)"
 
 
 def _exception_name(code: int) -> str:

@@ -8,11 +8,17 @@ from typing import Any
 
 import numpy as np
 
+from jaxcal.files import write_text
 from rig.attitude import Array
 from rig.exits import EXIT_OK, EXIT_RECALIBRATE
 from rig.faults import MotionFault
-from rig.identification import errors, fit, order_residuals, uncertainty
-from rig.journal import write_atomically
+from rig.identification import (
+    errors,
+    fit,
+    order_residuals,
+    uncertainty,
+    zero_variance,
+)
 from rig.limits import check_plan
 from rig.planning import Choice, choose, draw_candidates, draw_held_out, travel_order
 from rig.session import Run
@@ -197,7 +203,8 @@ def _finish(
         "run": run.folder.name,
     }
     noise = max(1e-9, float(np.mean(limits["noise_std_deg"])))
-    calibration = fit(chosen, noise, notes)
+    zero_std = float(np.sqrt(zero_variance(zero).mean()))
+    calibration = fit(chosen, noise, notes, zero_std)
     summary: dict[str, Any] = {
         "schema": 1,
         "mode": "calibrate",
@@ -222,8 +229,8 @@ def _finish(
             code = EXIT_RECALIBRATE
     calibration.save(run.folder / "calibration.json")
     (run.folder / "calibration.partial.json").unlink(missing_ok=True)
-    write_atomically(run.folder / "pairs.csv", pairs_csv(run))
-    write_atomically(run.folder / "summary.json", json.dumps(summary, indent=1))
+    write_text(run.folder / "pairs.csv", pairs_csv(run))
+    write_text(run.folder / "summary.json", json.dumps(summary, indent=1))
     from rig.report import write_report
 
     write_report(run.folder, summary, run.journal.records[0], run.postures())

@@ -15,7 +15,7 @@ import threading
 import time
 from typing import Any
 
-__all__ = ["Journal", "JournalError", "read_journal", "write_atomically"]
+__all__ = ["Journal", "JournalError", "read_journal"]
 
 
 class JournalError(RuntimeError):
@@ -125,21 +125,3 @@ class Journal:
     def close(self) -> None:
         """Let go of the file."""
         os.close(self._fd)
-
-
-def write_atomically(path: pathlib.Path, text: str) -> None:
-    """Write a file that is either the old one or the whole new one.
-
-    Raises:
-        JournalError: the disk is full or gone; the old file stays.
-    """
-    partial = path.with_name(path.name + ".partial")
-    try:
-        with partial.open("w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise JournalError(f"cannot write {path}: {error.strerror or error}") from None

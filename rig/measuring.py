@@ -89,7 +89,7 @@ class Observer:
         while True:
             statuses, since, reason = self._settled(since, deadline, reason)
             self._phase("measuring")
-            readings = self._collect(deadline, samples or settle.samples)
+            readings = self._collect(samples or settle.samples)
             if readings is None:
                 since, reason = time.monotonic(), "the stream paused while measuring"
                 self._phase("settling")
@@ -136,7 +136,7 @@ class Observer:
             if any(status.moving for status in statuses):
                 since, reason = now, "a drive is moving"
             self.imu.check_fault()
-            readings = self.imu.since(max(since, now - settle.window_s))
+            readings = self._window(since, now)
             span = readings[-1].time - readings[0].time if readings else 0.0
             if len(readings) < settle.min_samples or span < 0.8 * settle.window_s:
                 reason = f"{len(readings)} readings over {span:.2f} s of the window"
@@ -149,6 +149,13 @@ class Observer:
             if now > deadline:
                 raise MotionFault(f"did not settle in {settle.timeout_s:g} s: {reason}")
             time.sleep(poll)
+
+    def _window(self, since: float, now: float) -> list[Reading]:
+        """The last window_s, or the last min_samples of a slow phone."""
+        settle = self.config.settle
+        readings = self.imu.since(since)
+        recent = sum(reading.time >= now - settle.window_s for reading in readings)
+        return readings[-max(recent, settle.min_samples) :]
 
     def _quiet(self, readings: list[Reading]) -> tuple[bool, str]:
         settle = self.config.settle
@@ -164,9 +171,11 @@ class Observer:
             return False, _unquiet("slope", slope, "deg/s")
         return True, ""
 
-    def _collect(self, deadline: float, wanted: int) -> list[Reading] | None:
+    def _collect(self, wanted: int) -> list[Reading] | None:
         """Fresh readings as wanted, or None where the stream paused or time is up."""
+        settle = self.config.settle
         start = time.monotonic()
+        deadline = start + settle.timeout_s * max(1.0, wanted / settle.samples)
         polled = start
         while True:
             self._guard()

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxcal.files import atomic_write, write_text
 from rig.attitude import Array
 from rig.exits import EXIT_OK, EXIT_RECALIBRATE, Refused
 from rig.identification import errors, pairs
-from rig.journal import write_atomically
 from rig.limits import LimitError
 from rig.planning import draw_held_out
 from rig.session import Run
@@ -52,15 +52,14 @@ def collect(run: Run, count: int, dry_run: bool = False) -> int:
     episodes = len(records) // size
     if episodes == 0:
         episodes, size = 1, len(records)
-    write_atomically(run.folder / "pairs.csv", pairs_csv(run))
+    write_text(run.folder / "pairs.csv", pairs_csv(run))
     shape = (episodes, size, 3)
-    partial = run.folder / "dataset.partial.npz"
-    np.savez(
-        partial,
-        candidates=commands[: episodes * size].reshape(shape),
-        measured=measured[: episodes * size].reshape(shape),
-    )
-    partial.replace(run.folder / "dataset.npz")
+    with atomic_write(run.folder / "dataset.npz") as file:
+        np.savez(
+            file,
+            candidates=commands[: episodes * size].reshape(shape),
+            measured=measured[: episodes * size].reshape(shape),
+        )
     run.say(
         f"saved: {run.folder}/pairs.csv ({len(records)} postures), dataset.npz "
         f"({episodes} x {size})"
@@ -133,8 +132,8 @@ def verify(run: Run, calibration: Any, count: int, dry_run: bool = False) -> int
         "recalibrate": again,
     }
     run.phase("saving")
-    write_atomically(run.folder / "pairs.csv", pairs_csv(run))
-    write_atomically(run.folder / "summary.json", json.dumps(summary, indent=1))
+    write_text(run.folder / "pairs.csv", pairs_csv(run))
+    write_text(run.folder / "summary.json", json.dumps(summary, indent=1))
     run.say(
         f"error raw {found['before']['rms']:.4f} deg rms (max "
         f"{found['before']['max']:.4f}), compensated {found['after']['rms']:.4f} (max "

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rig.journal import write_atomically
+from jaxcal.files import write_text
 from rig.settings import AXIS_NAMES
 
 __all__ = ["write_report"]
@@ -134,7 +134,7 @@ def write_report(
         for i, name in enumerate(AXIS_NAMES)
     ]
     parts += [
-        "<h2>y = A u + b, degrees, ± 95 %</h2>",
+        "<h2>y = A u + b, degrees, ± 95 % for all twelve at once</h2>",
         _table(["", *(f"u {name}" for name in AXIS_NAMES), "b"], rows),
         f"<p>Noise of one posture {summary['noise_std_deg'][0]:.4f} deg, from "
         f"{html.escape(summary['basis'])} ({summary['dof']} degrees of freedom). "
@@ -191,5 +191,5 @@ def write_report(
         + "</html>\n"
     )
     path = folder / "report.html"
-    write_atomically(path, page)
+    write_text(path, page)
     return path

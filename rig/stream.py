@@ -31,7 +31,9 @@ TOKEN = re.compile(r"[-+.:0-9A-Za-z_]{0,64}")
 RECOUNT = 3  # lines of one new width in a row that mean the phone's settings changed
 REJOIN = 5  # readings in a row that agree with each other after a jump
 ODD_STAMPS = 50  # stamps in a row out of line that mean the phone's clock was set
+ZEROS_S = 1.0  # all-zero records a new connection may begin with
 AHEAD_S = 1.0  # a stamp so far ahead of the clock is torn, not early
+ROUNDED = 1 + 1e-5  # full turns in radians are written a little too large
 CLOCK_CREEP = 2e-4  # the phone's clock may run this much faster or slower
 
 
@@ -103,6 +105,7 @@ class Parser:
         self._offset_at = 0.0
         self._last: Array | None = None
         self._far: deque[Array] = deque(maxlen=REJOIN)
+        self._zeros_from: float | None = None
         self.counts: Counter[str] = Counter()
 
     def reconnected(self) -> None:
@@ -111,6 +114,7 @@ class Parser:
         self._offset = None
         self._odd = 0
         self._last = None
+        self._zeros_from = None
         self._far.clear()
         self._widths.clear()
 
@@ -142,7 +146,7 @@ class Parser:
         readings = []
         for record in records:
             try:
-                attitude = parse(record)
+                attitude = parse(record, now)
                 time = self._time(attitude.stamp, now)
                 self._gate(attitude.matrix)
             except _Dropped as reason:
@@ -152,7 +156,7 @@ class Parser:
             readings.append(Reading(time, attitude.matrix))
         return readings
 
-    def _line(self, line: bytes) -> Attitude:
+    def _line(self, line: bytes, now: float) -> Attitude:
         s = self._settings
         try:
             text = line.decode("ascii").strip(" \t\0")
@@ -173,7 +177,10 @@ class Parser:
             stamp = values[s.stamp_column] / 1000.0
         if s.quaternion:
             return Attitude(stamp, _quaternion([values[c] for c in s.quaternion]))
-        return Attitude(stamp, self._euler([values[c] for c in s.columns]))
+        angles = [values[c] for c in s.columns]
+        if not any(angles):
+            self._check_zeros(now)
+        return Attitude(stamp, self._euler(angles))
 
     def _check_width(self, fields: list[str], used: set[int]) -> None:
         width = len(fields)
@@ -194,21 +201,27 @@ class Parser:
             )
         raise _Dropped("wrong number of columns")
 
+    def _check_zeros(self, now: float) -> None:
+        """A sensor without a reading sends zeros; one that lies level goes on to."""
+        if self._zeros_from is None:
+            self._zeros_from = now
+        if self._last is None and now - self._zeros_from < ZEROS_S:
+            raise _Dropped("all zero, as sensors send before their first reading")
+
     def _euler(self, values: list[float]) -> Array:
         s = self._settings
-        if values[0] == values[1] == values[2] == 0.0:
-            raise _Dropped("all zero, as sensors send before their first reading")
         degrees = values
         if s.angle_unit == "rad":
             degrees = [math.degrees(value) for value in values]
-        limits = (360.0, 90.0, 360.0)  # the middle angle is an arc sine
-        for value, limit in zip(degrees, limits, strict=True):
-            if not abs(value) <= limit * (1 + 1e-5):
-                raise _Dropped("an angle no rotation has")
+        middle = degrees[1]  # an arc sine
+        if s.format == "lines":
+            middle = math.remainder(middle, 360.0)  # some write -10 as 350
+        if max(map(abs, degrees)) > 360.0 * ROUNDED or abs(middle) > 90.0 * ROUNDED:
+            raise _Dropped("an angle no rotation has")
         signed = [v * sign for v, sign in zip(degrees, s.signs, strict=True)]
         return euler_to_matrix(signed, s.order)
 
-    def _entry(self, entry: dict[str, Any]) -> Attitude:
+    def _entry(self, entry: dict[str, Any], now: float) -> Attitude:
         values = entry.get("values")
         if not isinstance(values, dict):
             values = entry

@@ -34,7 +34,8 @@ def describe_plan(run: Run, candidates: Array, choice: Choice) -> float:
     say(
         f"{session.k} of {session.candidates} candidates by {choice.method}: log det "
         f"{choice.log_det:.4f} (commands in degrees), {rank} "
-        f"{choice.best_log_det:.4f}, D-efficiency {choice.efficiency:.4f}"
+        f"{choice.best_log_det:.4f}, gap {choice.best_log_det - choice.log_det:.4f}, "
+        f"D-efficiency {choice.efficiency:.4f}"
     )
     if choice.note:
         say(f"  note: {choice.note}")
@@ -77,7 +78,7 @@ def pairs_csv(run: Run) -> str:
 def say_summary(run: Run, summary: dict[str, Any], code: int) -> None:
     """Print A and b with their intervals, the errors and any warning."""
     say = run.say
-    say("y = A u + b in degrees, +- 95 % confidence:")
+    say("y = A u + b in degrees, +- 95 % confidence for all twelve at once:")
     for row, name in enumerate(AXIS_NAMES):
         values = "  ".join(
             f"{summary['A'][row][column]:8.5f} +- {summary['ci95'][row][column]:.5f}"

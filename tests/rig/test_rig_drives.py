@@ -270,7 +270,7 @@ def test_a_closed_port_is_one_clear_error():
         port = probe.getsockname()[1]
     with pytest.raises(BusError, match="cannot open"):
         Bus(rtu_over_tcp(port)).open()
-    with pytest.raises(BusError, match="cannot open"):
+    with pytest.raises(BusError, match="no such port"):
         Bus(BusSettings("rtu", device="/dev/does-not-exist")).open()
 
 

@@ -1,14 +1,12 @@
 """The journal: whole lines, numbered, one writer, and torn ends repaired."""
 
-import json
 import os
-import pathlib
 import subprocess
 import sys
 
 import pytest
 
-from rig.journal import Journal, JournalError, read_journal, write_atomically
+from rig.journal import Journal, JournalError, read_journal
 
 
 def test_records_survive_and_are_numbered(tmp_path):
@@ -112,17 +110,3 @@ def test_not_a_number_never_enters_the_journal(tmp_path):
     with pytest.raises(ValueError, match="JSON"):
         journal.write("posture", value=float("nan"))
     journal.close()
-
-
-def test_a_file_is_old_or_new_never_half(tmp_path, monkeypatch):
-    path = tmp_path / "calibration.json"
-    write_atomically(path, json.dumps({"a": 1}))
-
-    def full(fd):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(JournalError, match="No space left"):
-        write_atomically(path, json.dumps({"a": 2}))
-    assert json.loads(path.read_text()) == {"a": 1}
-    assert [p.name for p in pathlib.Path(tmp_path).iterdir()] == ["calibration.json"]

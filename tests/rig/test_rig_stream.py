@@ -78,6 +78,22 @@ def test_a_malformed_line_is_dropped_and_counted(line):
     assert sum(parser.counts.values()) == 1
 
 
+def test_zeros_are_believed_once_they_last_or_follow_a_reading():
+    parser = Parser(PLAIN)
+    assert parser.lines([b"0,0,0"], 10.0) == []
+    assert parser.lines([b"0.0,0,-0"], 10.9) == []
+    assert len(parser.lines([b"0,0,0"], 11.1)) == 1
+    parser.reconnected()
+    assert parser.lines([b"0,0,0"], 12.0) == []
+    assert len(parser.lines([b"0.1,0,0", b"0,0,0"], 12.1)) == 2
+
+
+def test_a_line_may_write_every_angle_in_0_to_360():
+    readings, _ = feed(PLAIN, "350,355,359.5", "-10,-5,-0.5", "350,180,0", "0,361,0")
+    assert len(readings) == 2
+    assert angle_between_deg(readings[0].matrix, readings[1].matrix) < 1e-9
+
+
 def test_a_decimal_comma_is_a_wrong_number_of_columns_not_another_angle():
     readings, parser = feed(HYPER, "17,10,5,1,5,2,5")
     assert readings == []

@@ -1,0 +1,252 @@
+"""Against the least a stranger would build: a bare Modbus TCP slave, a bare phone.
+
+The slave is a socket and a dictionary: functions 3, 6 and 16, one connection at a time,
+an exception for every register it lacks, and a move that is over at once. The phone
+has no noise, few readings a second, and angles as its app writes them.
+"""
+
+import contextlib
+import json
+import socket
+import struct
+import threading
+import time
+
+import numpy as np
+import pytest
+from fault_matrix import _free_port
+
+from rig.__main__ import main
+from rig.attitude import angle_between_deg, euler_to_matrix
+from rig.simulator.phone import matrix_to_quaternion
+
+MATRIX = np.array([[0.95, 0.03, -0.02], [0.01, 1.04, 0.02], [-0.015, 0.01, 0.9]])
+PULSES_PER_DEG = 1000
+CONFIG = """
+[bus]
+transport = "tcp"
+host = "127.0.0.1"
+port = {bus}
+{axes}
+[imu]
+host = "127.0.0.1"
+port = {imu}
+{phone}
+[session]
+verify_postures = 2
+{session}
+"""
+AXIS = """
+[[axes]]
+name = "{name}"
+unit = {unit}
+map = "generic"
+pulses_per_rev = 36000
+reduction = 10
+min_deg = -20
+max_deg = 20
+speed_deg_s = 20
+accel_deg_s2 = 100
+"""
+LINES = """
+format = "lines"
+order = "ZXY"
+columns = [0, 1, 2]
+"""
+HYPERIMU = """
+format = "hyperimu"
+"""
+SENSOR_LOGGER = """
+format = "sensorlogger"
+stale_s = 1.5
+"""
+QUICK = """
+[settle]
+window_s = 0.2
+min_samples = 5
+samples = 10
+"""
+
+
+class Slave:
+    """Three units of the ``generic`` map (rig/maps/generic.toml, read by a person)."""
+
+    def __init__(self):
+        self.socket = socket.create_server(("127.0.0.1", 0))
+        self.port = self.socket.getsockname()[1]
+        mapped = [0x10, 0x12, 0x13, 0x14, *range(0x20, 0x29), 0x29, 0x2A, 0x2B]
+        self.registers = {u: dict.fromkeys(mapped, 0) for u in (1, 2, 3)}
+        for registers in self.registers.values():
+            registers[0x10] = 0b1001  # enabled, done
+        self.functions, self.moves, self.stops = set(), [], []
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def position(self, unit):
+        words = struct.pack(">HH", *(self.registers[unit][a] for a in (0x12, 0x13)))
+        return struct.unpack(">i", words)[0] / PULSES_PER_DEG
+
+    def _serve(self):
+        while True:
+            try:
+                connection, _ = self.socket.accept()
+            except OSError:
+                return
+            with contextlib.suppress(OSError, EOFError), connection:
+                while True:
+                    head = self._take(connection, 7)
+                    transaction, _, length, unit = struct.unpack(">HHHB", head)
+                    pdu = self._answer(unit, self._take(connection, length - 1))
+                    size = len(pdu) + 1
+                    connection.sendall(
+                        struct.pack(">HHHB", transaction, 0, size, unit) + pdu
+                    )
+
+    def _take(self, connection, count):
+        data = b""
+        while len(data) < count:
+            more = connection.recv(count - len(data))
+            if not more:
+                raise EOFError
+            data += more
+        return data
+
+    def _answer(self, unit, pdu):
+        function, address = struct.unpack(">BH", pdu[:3])
+        self.functions.add(function)
+        registers = self.registers[unit]
+        if function == 3:
+            (count,) = struct.unpack(">H", pdu[3:5])
+            wanted = range(address, address + count)
+            if not all(a in registers for a in wanted):
+                return bytes([0x83, 2])
+            words = [registers[a] for a in wanted]
+            return struct.pack(f">BB{count}H", 3, 2 * count, *words)
+        if function == 6:
+            words = struct.unpack(">H", pdu[3:5])
+        elif function == 16:
+            words = struct.unpack(f">{(len(pdu) - 6) // 2}H", pdu[6:])
+        else:
+            return bytes([0x80 | function, 1])
+        for offset, word in enumerate(words):
+            registers[address + offset] = word
+        if address == 0x28 and words[-1] == 1:  # go: there at once
+            registers[0x12], registers[0x13] = registers[0x20], registers[0x21]
+            self.moves.append((unit, self.position(unit)))
+        if address == 0x28 and words[-1] == 2:
+            self.stops.append(unit)
+        return pdu[:5]
+
+
+def attitude(slave):
+    """A plant without bias, so that its zero reads exactly zero."""
+    pitch, yaw, roll = MATRIX @ [slave.position(unit) for unit in (1, 2, 3)]
+    return euler_to_matrix([yaw, pitch, roll], "ZXY"), (pitch, yaw, roll)
+
+
+def line_phone(slave, port, closing, rate, wrap=False):
+    """``yaw,pitch,roll`` and a line feed; ``wrap``: every angle in 0..360."""
+    with contextlib.suppress(OSError):
+        phone = connected(port, closing)
+        while not closing.is_set():
+            pitch, yaw, roll = attitude(slave)[1]
+            angles = [yaw, pitch, roll]
+            if wrap:
+                angles = [angle % 360.0 for angle in angles]
+            phone.sendall((",".join(f"{a:.4f}" for a in angles) + "\n").encode())
+            time.sleep(1 / rate)
+
+
+def wrapping_phone(slave, port, closing, rate):
+    line_phone(slave, port, closing, rate, wrap=True)
+
+
+def hyper_phone(slave, port, closing, rate):
+    """HyperIMU: stamp, azimuth, pitch, roll of Android's legacy orientation, CR LF."""
+    with contextlib.suppress(OSError):
+        phone = connected(port, closing)
+        while not closing.is_set():
+            r = attitude(slave)[0]
+            azimuth = np.degrees(np.arctan2(-r[1, 0], r[0, 0])) % 360.0
+            pitch = np.degrees(np.arctan2(-r[2, 1], r[2, 2]))
+            roll = np.degrees(np.arcsin(r[2, 0]))
+            stamp = int(time.time() * 1000)
+            phone.sendall(f"{stamp},{azimuth},{pitch},{roll}\r\n".encode())
+            time.sleep(1 / rate)
+
+
+def logger_phone(slave, port, closing, rate):
+    """Sensor Logger: half a second of readings in every message."""
+    import urllib.request
+
+    while not closing.is_set():
+        payload = []
+        for _ in range(max(1, round(rate / 2))):
+            q = matrix_to_quaternion(attitude(slave)[0])
+            values = dict(zip(("qx", "qy", "qz", "qw"), q.tolist(), strict=True))
+            payload.append(
+                {"name": "orientation", "time": time.time_ns(), "values": values}
+            )
+            time.sleep(1 / rate)
+        message = {"messageId": 1, "sessionId": "s", "deviceId": "d"}
+        request = urllib.request.Request(
+            f"http://127.0.0.1:{port}/data",
+            json.dumps(message | {"payload": payload}).encode(),
+            {"Content-Type": "application/json"},
+        )
+        with contextlib.suppress(OSError):
+            urllib.request.urlopen(request, timeout=2).close()
+
+
+def connected(port, closing):
+    while not closing.is_set():
+        try:
+            return socket.create_connection(("127.0.0.1", port), timeout=2)
+        except OSError:
+            time.sleep(0.05)
+    raise OSError
+
+
+@pytest.mark.parametrize(
+    ("phone", "settings", "rate"),
+    [
+        pytest.param(line_phone, LINES + QUICK, 50, id="lines"),
+        pytest.param(hyper_phone, HYPERIMU + QUICK, 50, id="hyperimu"),
+        pytest.param(wrapping_phone, LINES, 50, id="wraps", marks=pytest.mark.slow),
+        pytest.param(line_phone, LINES, 10, id="10 Hz", marks=pytest.mark.slow),
+        pytest.param(
+            logger_phone, SENSOR_LOGGER, 50, id="sensorlogger", marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_a_whole_calibration_with_a_strangers_slave_and_phone(
+    phone, settings, rate, tmp_path, capsys
+):
+    slave, imu, closing = Slave(), _free_port(), threading.Event()
+    axes = "".join(
+        AXIS.format(name=name, unit=unit)
+        for unit, name in enumerate(("pitch", "yaw", "roll"), 1)
+    )
+    (tmp_path / "rig.toml").write_text(
+        CONFIG.format(bus=slave.port, imu=imu, axes=axes, phone=settings,
+                      session='method = "exact"')
+    )  # fmt: skip
+    thread = threading.Thread(
+        target=phone, args=(slave, imu, closing, rate), daemon=True
+    )
+    thread.start()
+    try:
+        code = main(["calibrate", "--config", str(tmp_path / "rig.toml"), "--arm",
+                     "--zero", "--out", str(tmp_path / "runs")])  # fmt: skip
+    finally:
+        closing.set()
+        thread.join(5)
+        slave.socket.close()
+    said = capsys.readouterr().out
+    assert code == 0, said
+    (folder,) = (tmp_path / "runs").iterdir()
+    saved = json.loads((folder / "summary.json").read_text())
+    np.testing.assert_allclose(saved["A"], MATRIX, atol=2e-4)
+    np.testing.assert_allclose(saved["b"], 0.0, atol=2e-3)
+    assert slave.functions <= {3, 6, 16}
+    assert set(slave.stops) == {1, 2, 3}
+    assert angle_between_deg(attitude(slave)[0], np.eye(3)) < 20
