@@ -4,10 +4,9 @@ The best subset does not change under an affine map of the commands, so the poli
 works on whitened regressors ``x_i`` (mean over the candidates of ``x x.T`` is the
 identity; ``x_i . x_j / M`` is the hat matrix). What a choice does to the remaining
 candidates is a projection: the chosen direction leaves every ``x_i``, and the squared
-length of what is left is the gain. All functions broadcast over leading axes and use no
-library
-factorisation: for matrices of 3 to 5 rows unrolled arithmetic is faster on a batch,
-the same on every backend, and has a gradient.
+length of what is left is the gain. All functions broadcast over leading axes and use
+no library factorisation: for matrices of 3 to 5 rows unrolled arithmetic is faster on a
+batch, the same on every backend, and has a gradient.
 """
 
 from __future__ import annotations

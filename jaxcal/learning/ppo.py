@@ -237,6 +237,8 @@ def _play(
             action = jnp.where(
                 step < length, jax.random.categorical(key_random, blind), action
             )
+        # What was paid already is not to come: the value is of the rest.
+        paid = env.reward_scale * states.paid * float(env.reward_gain)
         states, reward, _ = advance(states, action)
         final = final + reward
         log_probs = jax.nn.log_softmax(logits)
@@ -244,20 +246,26 @@ def _play(
         record = {
             "action": action.astype(jnp.int32),
             "log_prob": log_prob,
-            "value": value * (env.reward_scale * env.num_outputs),
+            "value": value * (env.reward_scale * env.num_outputs) - paid,
+            "paid": paid,
             "reward": reward,
             "counted": (step >= length).astype(logits.dtype),
             "entropy": -(jnp.exp(log_probs) * log_probs).sum(-1),
         }
         out.append(record | ({"glance": glance} if step < learned else {}))
-    value, reward = (jnp.stack([r[name] for r in out]) for name in ("value", "reward"))
+    value, reward, paid = (
+        jnp.stack([r[name] for r in out]) for name in ("value", "reward", "paid")
+    )
     advantage = advantages(reward, value, config.discount, config.gae_lambda)
-    target = advantage + value
+    target = advantage + value + paid
+    own = (length == 0).astype(final.dtype)
     if repeats > 1:
-        # On the first decision the other episodes of the set are the better baseline.
-        total = target[0].sum(0, keepdims=True)
-        others = (total - target[0]) / (repeats - 1)
-        advantage = advantage.at[0].set(target[0] - others)
+        # On the first decision the set's other episodes are the better baseline: those
+        # that the policy began itself.
+        counts = own.sum(0, keepdims=True) - own
+        others = (target[0] * own).sum(0, keepdims=True) - target[0] * own
+        baseline = jnp.where(counts > 0, others / jnp.maximum(counts, 1.0), value[0])
+        advantage = advantage.at[0].set(target[0] - baseline)
     # What is not learned is dropped here: the last choices made by volume alone.
     out, advantage, target = out[:learned], advantage[:learned], target[:learned]
     counted = jnp.stack([r["counted"] for r in out])
@@ -290,8 +298,7 @@ def _play(
         target=by_set(target),
         counted=by_set(counted),
     )
-    own = (length == 0).astype(final.dtype)
-    log_det = (final * own).sum() / jnp.maximum(own.sum(), 1.0) / env.reward_scale
+    log_det = (states.paid * own).sum() / jnp.maximum(own.sum(), 1.0)
     metrics = {
         "rewards": final.reshape(-1),
         "reward_mean": final.mean(),
