@@ -6,7 +6,7 @@ the subset **and** order of least total time among those with at least a given
 D-efficiency. Each axis' time is a concave function of its distance that is zero at
 zero, so the travel time is a metric, which the exact search uses to cut branches.
 
-``exact`` proves the answer, for few postures (K up to about 6 of 50; it stops at a time
+``exact`` proves the answer, for few postures (K up to about 8 of 50; it stops at a time
 limit and says so). ``heuristic`` is local search from near-optimal subsets, for any K,
 and proves nothing.
 """
@@ -181,7 +181,7 @@ def select_fastest(
         required: (r,) candidates that must be among the chosen.
         num_outputs: m; changes log det S, not the answer.
         method: "exact" (k up to 12, with a proof unless the time runs out) or
-            "heuristic"; exact up to k = 6 when not given.
+            "heuristic"; exact up to k = 8 when not given.
         time_limit: seconds of the exact search and of the D-optimum behind it.
         seed: of the starts of the heuristic, which also starts exact.
 
@@ -329,7 +329,7 @@ class _Task:
 
 def _method(method: str | None, k: int) -> str:
     if method is None:
-        return "exact" if k <= 6 else "heuristic"
+        return "exact" if k <= 8 else "heuristic"
     if method not in METHODS:
         raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
     if method == "exact" and k > MOST_EXACT:
