@@ -81,41 +81,49 @@ def _confirm(args: argparse.Namespace, simulated: bool) -> Any:
     return confirm
 
 
-def _session(args: argparse.Namespace) -> int:
-    from rig import session
+def _new(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
+    """The configuration of a run that begins, and what its journal says of it first."""
+    from rig.exits import Refused
+
+    if getattr(args, "count", 1) < 1:
+        raise Refused(f"--count must be at least 1, got {args.count}")
+    calibration = getattr(args, "calibration", None)
+    return _load(args), {
+        "mode": args.command,
+        "inputs": {
+            "count": getattr(args, "count", None),
+            "to": getattr(args, "to", None),
+            "calibration": None if calibration is None else str(calibration.resolve()),
+        },
+        "simulated": _simulation(args) if args.simulate else None,
+        "maps_from": str((args.config or pathlib.Path()).resolve().parent),
+    }
+
+
+def _recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
+    """The same of a run that is resumed, from its folder."""
     from rig.config import load_config, parse_config
     from rig.exits import Refused
     from rig.journal import read_journal
+    from rig.session import JOURNAL
+
+    records = read_journal(args.run / JOURNAL)
+    if not records or records[0]["event"] != "start":
+        raise Refused(f"{args.run} holds no run")
+    start = records[0]
+    if args.config is not None:
+        return load_config(args.config), start
+    text = (args.run / "rig.toml").read_text(encoding="utf-8")
+    return parse_config(text, pathlib.Path(start["maps_from"]), str(args.run)), start
+
+
+def _session(args: argparse.Namespace) -> int:
+    from rig import session
     from rig.runner import run_safely
 
     resumed = args.command == "resume"
-    faults: list[str] = list(args.fault)
-    if resumed:
-        folder = args.run
-        records = read_journal(folder / session.JOURNAL)
-        if not records or records[0]["event"] != "start":
-            raise Refused(f"{folder} holds no run")
-        start = records[0]
-        mode, inputs, simulation = start["mode"], start["inputs"], start["simulated"]
-        if args.config is not None:
-            config = load_config(args.config)
-        else:
-            text = (folder / "rig.toml").read_text(encoding="utf-8")
-            config = parse_config(text, pathlib.Path(start["maps_from"]), str(folder))
-    else:
-        config = _load(args)
-        mode = args.command
-        if getattr(args, "count", 1) < 1:
-            raise Refused(f"--count must be at least 1, got {args.count}")
-        inputs = {
-            "count": getattr(args, "count", None),
-            "to": getattr(args, "to", None),
-            "calibration": str(args.calibration.resolve())
-            if mode in ("verify", "goto")
-            else None,
-        }
-        simulation = _simulation(args) if args.simulate else None
-        folder = None
+    config, start = _recorded(args) if resumed else _new(args)
+    mode, inputs, simulation = start["mode"], start["inputs"], start["simulated"]
     calibration, zero_at = None, None
     if mode in ("verify", "goto"):
         from rig.other_sessions import load_calibration
@@ -123,15 +131,16 @@ def _session(args: argparse.Namespace) -> int:
         calibration, zero_at = load_calibration(
             pathlib.Path(inputs["calibration"]), config
         )
-        if getattr(args, "zero", False):
+        if args.zero:
             zero_at = None  # the operator put the device into its zero posture
-    if folder is None:
+    if resumed:
+        folder = args.run
+    else:
         folder = session.new_run_folder(args.out or config.output, mode)
         (folder / "rig.toml").write_text(config.text, encoding="utf-8")
-    maps_from = str((args.config or pathlib.Path()).resolve().parent)
     simulator = None
     if simulation is not None:
-        simulator = _simulator(config, simulation, faults)
+        simulator = _simulator(config, simulation, args.fault)
         config = simulator.start()
     try:
         run = session.Run(
@@ -139,7 +148,7 @@ def _session(args: argparse.Namespace) -> int:
             folder,
             mode,
             _say,
-            start={"simulated": simulation, "inputs": inputs, "maps_from": maps_from},
+            start={key: start[key] for key in ("simulated", "inputs", "maps_from")},
             reset_alarms=args.reset_alarms,
             on_imu_port=simulator.start_phone if simulator else None,
             zero_at=zero_at,

@@ -36,6 +36,7 @@ class Imu:
         self._threads: list[threading.Thread] = []
         self._listener: socket.socket | None = None
         self._web: http.server.HTTPServer | None = None
+        self._arrived = 0.0
         self._fault = ""
 
     def open(self) -> Imu:
@@ -98,9 +99,12 @@ class Imu:
             raise ImuError("the phone has sent no reading yet")
         age = time.monotonic() - reading.time
         if age > self.settings.stale_s:
+            late = ""
+            if time.monotonic() - self._arrived < self.settings.stale_s:
+                late = "; it arrives late, or its stamps are not those configured"
             raise ImuError(
                 f"the phone's last reading is {age:.2f} s old "
-                f"(limit {self.settings.stale_s:g} s)"
+                f"(limit {self.settings.stale_s:g} s){late}"
             )
         return reading
 
@@ -152,6 +156,8 @@ class Imu:
         thread.start()
 
     def _store(self, readings: list[Reading]) -> None:
+        if readings:
+            self._arrived = time.monotonic()
         for reading in readings:
             if not self._ring or reading.time >= self._ring[-1].time:
                 self._ring.append(reading)

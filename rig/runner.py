@@ -39,6 +39,8 @@ def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
             event, reason = "fault" if moved else "refused", str(error)
         except (MotionFault, BusError, ImuError, JournalError) as error:
             reason = str(error)
+        except OSError as error:
+            reason = f"cannot write to {run.folder}: {error.strerror or error}"
         except Exception as error:
             reason = f"{type(error).__name__}: {error}"
         finally:

@@ -172,6 +172,26 @@ def test_a_posture_out_of_reach_is_masked_and_the_rest_chosen_anew(tmp_path):
     )
 
 
+def test_a_disk_that_fills_while_saving_loses_nothing(tmp_path, monkeypatch):
+    import rig.report
+
+    def full(path, text):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(rig.report, "write_text", full)
+    said = []
+    with simulator(fast_config()) as sim:
+        config = sim.start()
+        assert session(config, tmp_path, sim, said) == 3
+        assert f"fault: cannot write to {tmp_path}: No space left on device" in said
+        assert all(drive.stops for drive in sim.drives)
+        moves = [list(drive.executed) for drive in sim.drives]
+        monkeypatch.undo()
+        assert session(config, tmp_path) == 0
+        assert [list(drive.executed) for drive in sim.drives] == moves
+    assert (tmp_path / "report.html").is_file()
+
+
 def test_too_many_out_of_reach_is_a_fault(tmp_path):
     text = fast_text(session=SESSION + "max_unreachable = 1\nseed = 3\n")
     config, said = parse_config(text), []

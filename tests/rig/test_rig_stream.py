@@ -236,6 +236,23 @@ def test_a_stale_stream_is_an_error_and_a_silent_one_names_the_port():
                 imu.wait_for_stream(0.05)
 
 
+def test_stamps_of_another_unit_are_named_as_the_cause():
+    settings = dataclasses.replace(
+        PLAIN, port=0, stale_s=0.1, stamp_column=0, columns=(1, 2, 3), column_count=4
+    )
+    with Imu(settings) as imu, connect(imu) as phone:
+        begun, said = time.monotonic(), ""
+        while "stamps are not" not in said and time.monotonic() - begun < 3.0:
+            stamp = time.monotonic() - begun  # seconds, where ms are agreed
+            phone.sendall(f"{stamp:.3f},1,2,3\n".encode())
+            time.sleep(0.01)
+            try:
+                imu.latest()
+            except ImuError as error:
+                said = str(error)
+        assert "stamps are not those configured" in said
+
+
 def test_a_taken_port_is_one_clear_error():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         settings = dataclasses.replace(PLAIN, port=taken.getsockname()[1])
