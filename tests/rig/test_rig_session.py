@@ -185,10 +185,10 @@ def test_a_disk_that_fills_while_saving_loses_nothing(tmp_path, monkeypatch):
         assert session(config, tmp_path, sim, said) == 3
         assert f"fault: cannot write to {tmp_path}: No space left on device" in said
         assert all(drive.stops for drive in sim.drives)
-        moves = [list(drive.executed) for drive in sim.drives]
+        moves = [list(drive.executions) for drive in sim.drives]
         monkeypatch.undo()
         assert session(config, tmp_path) == 0
-        assert [list(drive.executed) for drive in sim.drives] == moves
+        assert [list(drive.executions) for drive in sim.drives] == moves
     assert (tmp_path / "report.html").is_file()
 
 
