@@ -179,9 +179,9 @@ class CompactNetwork(nn.Module):
         self.decoder = [_Round(config) for _ in range(config.decoder_rounds)]
         self.final_norm = nn.LayerNorm()
         self.actor = nn.Dense(
-            1, use_bias=False, kernel_init=nn.initializers.orthogonal(0.02)
+            1, use_bias=False, kernel_init=nn.initializers.orthogonal(0.1)
         )
-        self.trust = self.param("trust", nn.initializers.constant(0.5), ())
+        self.trust = self.param("trust", nn.initializers.zeros, ())
         self.critic_hidden = nn.Dense(config.width)
         self.critic = nn.Dense(1, kernel_init=nn.initializers.orthogonal(0.1))
 
@@ -277,7 +277,7 @@ class CompactNetwork(nn.Module):
         for layer in self.decoder:
             g = layer(g, glance)
         g = self.final_norm(g)
-        # How far to believe the greedy look ahead is learned, and so is what to add.
+        # How far to believe the greedy look ahead is learned, from nothing.
         logits = self.actor(g)[..., 0] + 20.0 * self.trust * glance["ahead"][..., 3]
         logits = mask_logits(logits, active)
         weight = active[..., None].astype(g.dtype)
