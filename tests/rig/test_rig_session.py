@@ -545,7 +545,7 @@ def test_simulate_serves_a_session_in_another_process(tmp_path):
         assert code == 0
     finally:
         os.kill(served.pid, signal.SIGINT)
-        assert served.wait(10) == 0
+        assert served.wait(60) == 0
         served.stdout.close()
 
 
