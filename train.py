@@ -93,6 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from jaxcal.files import require_writable_folder
     from jaxcal.learning import cache, checkpoint, networks, ppo, presets, training
+    from jaxcal.study.validation import fixed_validation
 
     cache.keep_compiled_programs()
     given = {
@@ -185,20 +186,6 @@ class Stop:
     def requested(self) -> bool:
         """Whether to stop."""
         return self._asked
-
-
-def fixed_validation(config: Any) -> Any:
-    """500 uniform sets of the first task's size, never trained on, and their optima."""
-    import numpy as np
-
-    from jaxcal.learning.training import Validation
-    from jaxcal.selection import exact_batch
-
-    env = config.tasks[0].environment
-    rng = np.random.default_rng([20261121, env.num_candidates, env.num_inputs])
-    sets = rng.uniform(size=(500, env.num_candidates, env.num_inputs))
-    best = exact_batch(sets, env.num_selected, num_outputs=1).log_det
-    return Validation(sets, np.asarray(best), env.num_outputs)
 
 
 def show(report: Any) -> None:

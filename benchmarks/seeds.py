@@ -19,28 +19,14 @@ import time
 
 import numpy as np
 
-from jaxcal.files import require_writable_folder
-from jaxcal.learning import cache, presets, training
+from jaxcal.learning import cache, presets
 from jaxcal.regression import log_det_information
 from jaxcal.selection import exact_batch
 from jaxcal.selection.policy import select_batch
+from jaxcal.study.training_runs import train_seed
 
 HIT = 1e-8
 NAMES = ("ratio", "hit_rate", "ratio of 8", "hits of 8")
-
-
-def train(seed: int, episodes: int | None, folder: pathlib.Path) -> float:
-    """Train one run where there is none yet; seconds it took."""
-    if (folder / "checkpoint").is_dir():
-        return 0.0
-    values: dict[str, int] = {"seed": seed}
-    if episodes is not None:
-        values["num_episodes"] = episodes
-    config = presets.with_values(presets.PRESETS["compact"], values)
-    require_writable_folder(folder)
-    begun = time.perf_counter()
-    training.train(config, folder)
-    return time.perf_counter() - begun
 
 
 def measure(folder: pathlib.Path, sets: np.ndarray, best: np.ndarray) -> list[float]:
@@ -74,7 +60,11 @@ def main() -> None:
         rows = []
         for seed in seeds:
             folder = root / f"seed{seed}"
-            seconds = train(seed, arguments.episodes, folder)
+            values = {"seed": seed, "num_episodes": budget}
+            config = presets.with_values(presets.PRESETS["compact"], values)
+            begun = time.perf_counter()
+            train_seed(config, folder, validate=False)
+            seconds = time.perf_counter() - begun
             rows.append(measure(folder, sets, optimum.log_det))
             print(f"{seed:8d}" + line(rows[-1]) + f"{seconds:14.0f}", flush=True)
     table = np.array(rows)

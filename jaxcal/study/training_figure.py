@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jaxcal.study.figure_style import COLOURS, plain_axes
 
-__all__ = ["training_curves"]
+__all__ = ["read_metrics", "training_curves"]
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ def training_curves(folder: pathlib.Path | str) -> Figure:
         ValueError: it cannot be understood, naming the line or column.
     """
     folder = pathlib.Path(folder)
-    metrics = _read_metrics(folder / "metrics.csv")
+    metrics = read_metrics(folder / "metrics.csv")
     episodes, reward = metrics["episodes"], metrics["reward_mean"]
     thousands = episodes / 1000.0
     window = max(1, min(len(reward) // 10, 50))
@@ -106,7 +106,13 @@ def training_curves(folder: pathlib.Path | str) -> Figure:
     return figure
 
 
-def _read_metrics(path: pathlib.Path) -> dict[str, Array]:
+def read_metrics(path: pathlib.Path) -> dict[str, Array]:
+    """Columns of a ``metrics.csv``; NaN where a cell is empty.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it cannot be understood, naming the line or column.
+    """
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.reader(file))
     if len(rows) < 2:
