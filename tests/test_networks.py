@@ -133,3 +133,41 @@ def test_a_masked_candidate_does_not_touch_the_others(rng):
 def test_a_bad_configuration_is_named(values, named):
     with pytest.raises(ValueError, match=named):
         NetworkConfig(**values)
+
+
+def test_the_papers_scores_are_those_of_keys_that_are_written_out(rng):
+    # Attention as the paper has it: a key for every candidate, a query for the context.
+    network, params = made(NetworkConfig(kind="paper", width=32), m=20)
+    candidates = jnp.asarray(rng.uniform(size=(1, 20, 3)), jnp.float32)
+    free = jnp.arange(20)[None] != 7
+    chosen = jnp.array([[7, -1, -1, -1]])
+    view = network.look(candidates, free)
+    glance = network.look_at(view, chosen, free, 1)
+    poses = networks.encode(network, params, view)
+    logits, _ = networks.decode(network, params, poses, glance)
+    params, poses, context = jax.tree.map(
+        np.asarray, (params, poses, glance["context"])
+    )
+
+    def dense(name, rows):
+        return rows @ params[name]["kernel"] + params[name]["bias"]
+
+    def relu(rows):
+        return np.maximum(rows, 0.0)
+
+    def norm(name, rows):
+        centred = rows - rows.mean(-1, keepdims=True)
+        unit = centred / np.sqrt((centred**2).mean(-1, keepdims=True) + 1e-6)
+        return unit * params[name]["scale"] + params[name]["bias"]
+
+    keys = dense("key", poses)[0]
+    context = relu(dense("context_1", context))
+    context = norm("context_norm", relu(dense("context_2", context)))
+    scores = keys @ dense("query", context)[0] / 32**0.5
+    weights = np.asarray(jax.nn.softmax(np.where(free[0], scores, -np.inf)))
+    squeezed = relu(dense("squeeze", context + weights @ keys))
+    shared = context + dense("expand", squeezed)
+    expected = np.where(free[0], keys @ dense("actor", shared)[0] / 32**0.5, -np.inf)
+    np.testing.assert_allclose(
+        jax.nn.softmax(logits[0]), jax.nn.softmax(expected), rtol=1e-4, atol=1e-6
+    )

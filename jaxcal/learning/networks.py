@@ -304,6 +304,31 @@ class CompactNetwork(nn.Module):
         return self.decode(self.encode(view), self.look_at(view, chosen, available, 0))
 
 
+class _Keys(nn.Module):
+    """A linear map of candidates that is never applied to them.
+
+    A score ``q . (K.T p + b)`` is ``(K q) . p`` and a number that is the same for every
+    candidate, which no softmax sees; a weighted mean of keys is the key of the weighted
+    mean. So the map is applied to a few queries and not to every candidate.
+    """
+
+    width: int
+
+    def setup(self) -> None:
+        shape = (self.width, self.width)
+        self.kernel = self.param("kernel", nn.initializers.lecun_normal(), shape)
+        self.bias = self.param("bias", nn.initializers.zeros, (self.width,))
+
+    def __call__(self, poses: jax.Array) -> jax.Array:
+        """Keys (..., width) of encoded poses (..., width)."""
+        keys = poses @ self.kernel
+        return keys + jnp.broadcast_to(self.bias, keys.shape)
+
+    def scores(self, query: jax.Array, poses: jax.Array) -> jax.Array:
+        """(..., M) inner products with the keys, less what all of them share."""
+        return jnp.einsum("...w,...mw->...m", query @ self.kernel.T, poses)
+
+
 class PaperNetwork(nn.Module):
     """The paper's attention policy: hidden 768, 3.5 M parameters, 71 % shared.
 
@@ -320,7 +345,7 @@ class PaperNetwork(nn.Module):
         width = self.config.width
         self.pose_1, self.pose_2 = nn.Dense(width), nn.Dense(width)
         self.pose_norm = nn.LayerNorm()
-        self.key = nn.Dense(width)
+        self.key = _Keys(width)
         self.context_1, self.context_2 = nn.Dense(width), nn.Dense(width)
         self.context_norm = nn.LayerNorm()
         self.query = nn.Dense(width)
@@ -342,23 +367,21 @@ class PaperNetwork(nn.Module):
         return {"context": context, "active": available}
 
     def encode(self, view: View) -> jax.Array:
-        """Keys (..., M, width) of the candidates, encoded one by one."""
+        """The candidates (..., M, width), encoded one by one."""
         poses = nn.relu(self.pose_1(2.0 * view["candidates"] - 1.0))
-        poses = self.pose_norm(nn.relu(self.pose_2(poses)))
-        return self.key(poses)
+        return self.pose_norm(nn.relu(self.pose_2(poses)))
 
     def decode(self, memory: jax.Array, glance: View) -> tuple[jax.Array, jax.Array]:
         """Score the next choice; see ``CompactNetwork.decode``."""
-        keys = memory
+        poses = memory
         context = nn.relu(self.context_1(glance["context"]))
         context = self.context_norm(nn.relu(self.context_2(context)))
         scale = self.config.width**-0.5
-        scores = jnp.einsum("...w,...mw->...m", self.query(context), keys) * scale
+        scores = self.key.scores(self.query(context), poses) * scale
         weights = nn.softmax(mask_logits(scores, glance["active"]))
-        glimpse = jnp.einsum("...m,...mw->...w", weights, keys)
+        glimpse = self.key(jnp.einsum("...m,...mw->...w", weights, poses))
         shared = context + self.expand(nn.relu(self.squeeze(context + glimpse)))
-        query = self.actor(shared)
-        logits = jnp.einsum("...w,...mw->...m", query, keys) * scale
+        logits = self.key.scores(self.actor(shared), poses) * scale
         value = self.critic_2(nn.relu(self.critic_1(shared)))[..., 0]
         return mask_logits(logits, glance["active"]), value
 
