@@ -43,7 +43,8 @@ methods:
   exact               the proven optimum
 
 datasets:
-  dataset1, 2, 3      the paper's, made from --seed (200,000, 1,000 and 100 episodes)
+  dataset0 to 5       the paper's, made from --seed (200, 200,000, 1,000, 100, 100 and
+                      1 episodes); 4 and 5 from --recordings, or those that ship
   FILE.npz            candidates (episodes, M, n); optional measured, available
   FILE.csv            episode,candidate,u_x,u_y,u_z[,y_x,y_y,y_z]
 
@@ -97,7 +98,9 @@ def _evaluate(options: argparse.Namespace, progress: Progress) -> int:
         )
     _check_outputs(options)
     checkpoints: list[str | None] = list(dict.fromkeys(options.checkpoint)) or [None]
-    datasets = [_dataset(name, options) for name in dict.fromkeys(options.dataset)]
+    datasets = [
+        _dataset(name, options, progress) for name in dict.fromkeys(options.dataset)
+    ]
     evaluations = []
     for dataset in datasets:
         evaluations.append(
@@ -130,14 +133,22 @@ def _evaluate(options: argparse.Namespace, progress: Progress) -> int:
     return EXIT_OK
 
 
-def _dataset(name: str, options: argparse.Namespace) -> Dataset:
+def _dataset(name: str, options: argparse.Namespace, progress: Progress) -> Dataset:
     from jaxcal.study import datasets
     from jaxcal.study.dataset_files import load_dataset
 
     if name in datasets.NAMES:
         limit = datasets.EPISODES[name]
         episodes = limit if options.episodes is None else min(options.episodes, limit)
-        return datasets.make_dataset(name, options.seed, episodes)
+        dataset = datasets.make_dataset(
+            name,
+            options.seed,
+            episodes,
+            recordings=options.recordings,
+            progress=progress,
+        )
+        progress.clear()
+        return dataset
     if pathlib.Path(name).suffix.lower() not in (".npz", ".csv"):
         raise ValueError(
             f"--dataset must be one of {', '.join(datasets.NAMES)} or a .npz or .csv "
@@ -265,6 +276,12 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
         **several,
     )
     add("--dataset", metavar="NAME|FILE", help="datasets; dataset2", **several)
+    add(
+        "--recordings",
+        type=pathlib.Path,
+        metavar="DIR",
+        help="folder of dataset4.csv and dataset5.csv, recorded by the rig",
+    )
     add("--methods", help="comma separated; all", metavar="LIST")
     add("--k", type=_at_least(1), default=4, help="postures to choose; 4")
     add(

@@ -1,7 +1,10 @@
-"""The paper's datasets by seed, and dataset files good and bad."""
+"""The paper's datasets by seed, recordings, and dataset files good and bad."""
 
 from __future__ import annotations
 
+import csv
+import hashlib
+import json
 import os
 import pathlib
 
@@ -10,19 +13,24 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import jaxcal
 from jaxcal.candidates import JointRanges
-from jaxcal.study.dataset_files import load_dataset, save_csv, save_npz
+from jaxcal.study import record
+from jaxcal.study.dataset_command import main
+from jaxcal.study.dataset_files import load_dataset, save_csv, save_csv_parts, save_npz
 from jaxcal.study.datasets import (
     BIAS_DEG,
     EPISODES,
     NAMES,
     NOISE_STD_DEG,
     RANGES,
+    RECORDED,
     SCALE,
     Dataset,
     chunks,
     make_dataset,
 )
+from jaxcal.study.recordings import SHIPPED, read_pool
 
 # A loaded machine is no failure.
 settings.register_profile("patient", deadline=None)
@@ -34,10 +42,18 @@ settings.load_profile("patient")
 
 def test_sizes_are_those_of_table_3() -> None:
     two, three = make_dataset("dataset2"), make_dataset("dataset3")
-    assert EPISODES == {"dataset1": 200_000, "dataset2": 1_000, "dataset3": 100}
+    assert list(EPISODES.values()) == [200, 200_000, 1_000, 100, 100, 1]
     assert two.candidates.shape == (1000, 50, 3) and two.measured is None
     assert three.candidates.shape == (100, 50, 3)
     assert three.measured is not None and three.measured.shape == (100, 50, 3)
+    for name in RECORDED:
+        data = make_dataset(name)
+        assert data.candidates.shape == (EPISODES[name], 50, 3)
+        assert data.measured is not None and data.measured.shape == (
+            EPISODES[name],
+            50,
+            3,
+        )
     first = next(chunks("dataset1"))
     assert first.candidates.shape == (1000, 50, 3) and first.measured is None
 
@@ -52,22 +68,26 @@ def test_the_whole_of_dataset_1_comes_in_chunks() -> None:
     np.testing.assert_allclose(mean / total / 50, 0.5, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [n for n in NAMES if n != "dataset5"])
 def test_candidates_are_uniform_in_the_unit_cube(name: str) -> None:
-    points = make_dataset(name, episodes=100).candidates.reshape(-1, 3)
+    points = make_dataset(
+        name, episodes=40 if name == "dataset0" else 100
+    ).candidates.reshape(-1, 3)
     assert points.min() >= 0.0 and points.max() < 1.0
-    np.testing.assert_allclose(points.mean(axis=0), 0.5, atol=0.02)
-    np.testing.assert_allclose(points.var(axis=0), 1 / 12, atol=0.005)
+    # The pool of dataset4 has 500 postures only, however often they are drawn.
+    drawn = 500 if name == "dataset4" else len(points)
+    np.testing.assert_allclose(points.mean(axis=0), 0.5, atol=4 * 0.2887 / drawn**0.5)
+    np.testing.assert_allclose(points.var(axis=0), 1 / 12, atol=4 * 0.0745 / drawn**0.5)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [n for n in NAMES if n != "dataset5"])
 def test_the_seed_decides_and_fewer_are_the_first_of_more(name: str) -> None:
-    whole = make_dataset(name, 5, 60)
-    part = make_dataset(name, 5, 20)
-    np.testing.assert_array_equal(part.candidates, whole.candidates[:20])
-    assert not np.array_equal(make_dataset(name, 6, 20).candidates, part.candidates)
+    whole = make_dataset(name, 5, 12)
+    part = make_dataset(name, 5, 4)
+    np.testing.assert_array_equal(part.candidates, whole.candidates[:4])
+    assert not np.array_equal(make_dataset(name, 6, 4).candidates, part.candidates)
     if whole.measured is not None and part.measured is not None:
-        np.testing.assert_array_equal(part.measured, whole.measured[:20])
+        np.testing.assert_array_equal(part.measured, whole.measured[:4])
 
 
 def test_chunks_are_the_dataset() -> None:
@@ -85,6 +105,7 @@ def test_no_dataset_shares_a_candidate_with_another_or_with_itself() -> None:
         make_dataset("dataset1", seed=1, episodes=1000).candidates,
         make_dataset("dataset2").candidates,
         make_dataset("dataset3").candidates,
+        make_dataset("dataset0", episodes=4).candidates,
     ]
     axis = np.concatenate([part[..., 0].ravel() for part in parts])
     assert len(np.unique(axis)) == len(axis)
@@ -105,7 +126,8 @@ def test_dataset_3_is_table_1_plus_noise() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("dataset9",), "name must be one of dataset1, dataset2, dataset3"),
+        (("dataset9",), "name must be one of dataset0, dataset1, dataset2, dataset3"),
+        (("dataset5", 0, 2), r"episodes must be in \[1, 1\] for dataset5, got 2"),
         (("dataset2", -1), "seed must not be negative, got -1"),
         (("dataset2", 0, 0), r"episodes must be in \[1, 1000\] for dataset2, got 0"),
         (("dataset3", 0, 101), r"episodes must be in \[1, 100\] for dataset3, got 101"),
@@ -126,6 +148,251 @@ def test_bad_arrays_are_named() -> None:
         Dataset("x", good, available=np.ones((2, 4), bool))
     with pytest.raises(ValueError, match=r"episodes must be in \[1, 2\] for x, got 3"):
         Dataset("x", good).first(3)
+
+
+# -- dataset0: the robot, driven ------------------------------------------------------
+
+
+def identified(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
+    """Estimates (12,) and standard errors of y = A u + b by normal equations alone."""
+    with path.open(newline="") as file:
+        rows = [
+            {name: float(cell) for name, cell in row.items()}
+            for row in csv.DictReader(file)
+        ]
+    ranges = json.loads(path.with_suffix(".json").read_text())["ranges_deg"]
+    commands = np.array(
+        [
+            [
+                low + row[f"u_{axis}"] * (high - low)
+                for axis, (low, high) in zip("xyz", ranges.values(), strict=True)
+            ]
+            for row in rows
+        ]
+    )
+    read = np.array([[row[f"y_{axis}"] for axis in "xyz"] for row in rows])
+    z = np.column_stack([commands, np.ones(len(rows))])
+    inverse = np.linalg.inv(z.T @ z)
+    found = inverse @ z.T @ read  # (4, 3)
+    noise = ((read - z @ found) ** 2).sum(axis=0) / (len(rows) - 4)
+    errors = np.sqrt(np.outer(np.diag(inverse), noise))
+    return found.T.ravel(), errors.T.ravel()
+
+
+TRUTH = np.column_stack([np.diag(SCALE), BIAS_DEG]).ravel()
+
+
+def test_dataset_0_gives_table_1_back(tmp_path: pathlib.Path) -> None:
+    assert main(["dataset0", "--out", str(tmp_path), "--episodes", "40"]) == 0
+    found, errors = identified(tmp_path / "dataset0.csv")
+    assert ((found - TRUTH) ** 2 / errors**2).sum() < 32.9  # chi2(12), 99.9 %
+    assert errors.max() < 0.005
+
+
+@pytest.mark.slow
+def test_the_whole_of_dataset_0_holds_table_1_in_every_interval(
+    tmp_path: pathlib.Path,
+) -> None:
+    assert main(["dataset0", "--out", str(tmp_path)]) == 0
+    found, errors = identified(tmp_path / "dataset0.csv")
+    assert (np.abs(found - TRUTH) < 1.96 * errors).all()  # with the default seed
+    data = load_dataset(tmp_path / "dataset0.npz")
+    assert data.measured is not None and data.candidates.shape == (200, 50, 3)
+    inside = []
+    for commands, read in zip(data.candidates, data.measured, strict=True):
+        fit = jaxcal.identify(RANGES.denormalise(commands), read)
+        low, high = fit.confidence_intervals().T
+        truth = np.concatenate([np.diag(SCALE).ravel(), BIAS_DEG])
+        inside.append((low < truth) & (truth < high))
+    assert abs(np.mean(inside) - 0.95) < 0.02  # of 2,400 intervals
+
+
+# -- recordings ------------------------------------------------------------------------
+
+POOL = "name,u_deg_pitch,u_deg_yaw,u_deg_roll,y_deg_pitch,y_deg_yaw,y_deg_roll,samples"
+
+
+def pool(folder: pathlib.Path, count: int, name: str = "dataset4") -> np.ndarray:
+    """Write a recording whose numbers tell the posture; its (N, 6)."""
+    rng = np.random.default_rng(count)
+    values = rng.uniform(-20, 20, (count, 6)).round(4)
+    lines = [
+        f"p{i}," + ",".join(map(repr, row)) + ",25"
+        for i, row in enumerate(values.tolist())
+    ]
+    (folder / f"{name}.csv").write_text("\n".join([POOL, *lines]) + "\n")
+    return values
+
+
+def rows_of(data: Dataset) -> np.ndarray:
+    assert data.measured is not None and data.ranges is not None
+    commands = data.ranges.denormalise(data.candidates)
+    return np.concatenate([commands, data.measured], axis=-1)
+
+
+def test_dataset_4_is_fifty_different_postures_of_the_pool(
+    tmp_path: pathlib.Path,
+) -> None:
+    values = pool(tmp_path, 500)
+    data = make_dataset("dataset4", seed=3, recordings=tmp_path)
+    seen = np.zeros(500, int)
+    for episode in rows_of(data):
+        apart = np.abs(episode[:, None] - values[None]).max(axis=-1)
+        numbers = apart.argmin(axis=1)
+        assert apart.min(axis=1).max() < 1e-12
+        assert len(set(numbers.tolist())) == 50
+        seen[numbers] += 1
+    assert seen.sum() == 5000
+    assert seen.min() >= 1 and seen.max() <= 25  # 10 each on average, s.d. 3
+
+
+def test_a_full_recording_is_taken_as_it_stands(tmp_path: pathlib.Path) -> None:
+    values = pool(tmp_path, 5003)
+    for seed in (0, 1):
+        data = make_dataset("dataset4", seed=seed, recordings=tmp_path)
+        np.testing.assert_allclose(
+            rows_of(data).reshape(-1, 6), values[:5000], atol=1e-12
+        )
+
+
+def test_dataset_5_is_the_first_fifty_of_its_session(tmp_path: pathlib.Path) -> None:
+    values = pool(tmp_path, 60, "dataset5")
+    data = make_dataset("dataset5", seed=9, recordings=tmp_path)
+    np.testing.assert_allclose(rows_of(data)[0], values[:50], atol=1e-12)
+
+
+def test_a_data_card_can_name_other_ranges(tmp_path: pathlib.Path) -> None:
+    values = pool(tmp_path, 50, "dataset5")
+    card = {"ranges_deg": {"pitch": [-25, 25], "yaw": [-20, 30], "roll": [-40, 40]}}
+    (tmp_path / "dataset5.json").write_text(json.dumps(card))
+    data = make_dataset("dataset5", recordings=tmp_path)
+    assert data.ranges is not None and data.ranges.high.tolist() == [25, 30, 40]
+    np.testing.assert_allclose(rows_of(data)[0], values, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", RECORDED)
+def test_what_ships_is_what_its_card_says(name: str) -> None:
+    commands, measured, ranges, digest = read_pool(SHIPPED / f"{name}.csv")
+    card = json.loads((SHIPPED / f"{name}.json").read_text())
+    assert digest == card["sha256"]
+    assert len(commands) == card["postures"] == {"dataset4": 500, "dataset5": 50}[name]
+    assert "SIMULATED" in card["what"]
+    assert ranges.contains(commands).all()
+    fit = jaxcal.identify(commands, measured)
+    assert np.abs(np.diag(fit.matrix) - SCALE).max() < 0.02
+    assert fit.residual_std.max() < 0.3
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "the file is empty"),
+        (POOL, "no postures below the header"),
+        (POOL.replace("u_deg_yaw", "u_yaw"), 'line 1: column "u_deg_yaw" is missing'),
+        (
+            POOL.replace("samples", "u_deg_yaw"),
+            'line 1: column "u_deg_yaw" is there tw',
+        ),
+        (f"{POOL}\np,1,2,3,4,5,6", "line 2: 7 cells, 8 in the header"),
+        (f"{POOL}\np,1,2,x,4,5,6,7", "line 2: \"u_deg_roll\" must be .* got 'x'"),
+        (f"{POOL}\np,1,2,3,4,5,nan,7", 'line 2: "y_deg_roll" must be a finite number'),
+        (f"{POOL}\np,1,2,3,4,5,6,7", "takes 50 postures, the recording has 1"),
+        (f"{POOL}\np,1,25,3,4,5,6,7", r"posture 1 is commanded \[1.0, 25.0, 3.0\] deg"),
+    ],
+)
+def test_a_bad_recording_is_refused_by_line(
+    tmp_path: pathlib.Path, text: str, message: str
+) -> None:
+    (tmp_path / "dataset4.csv").write_text(text)
+    with pytest.raises(ValueError, match=message) as caught:
+        make_dataset("dataset4", recordings=tmp_path)
+    assert str(tmp_path / "dataset4.csv") in str(caught.value)
+
+
+def test_a_missing_recording_or_a_bad_card_is_named(tmp_path: pathlib.Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"dataset4\.csv"):
+        make_dataset("dataset4", recordings=tmp_path)
+    pool(tmp_path, 50)
+    for text in ("{", "[]", '{"ranges_deg": {"pitch": [0, 1]}}', '{"ranges_deg": 3}'):
+        (tmp_path / "dataset4.json").write_text(text)
+        with pytest.raises(ValueError, match=r'dataset4\.json: "ranges_deg" must give'):
+            make_dataset("dataset4", recordings=tmp_path)
+
+
+@pytest.mark.slow
+def test_a_recording_is_made_through_the_rig(tmp_path: pathlib.Path) -> None:
+    path = record.record("dataset5", tmp_path, count=6)
+    commands, _, _, digest = read_pool(path)
+    card = json.loads(path.with_suffix(".json").read_text())
+    assert len(commands) == card["postures"] == 6 and digest == card["sha256"]
+    shipped = read_pool(SHIPPED / "dataset5.csv")[0]
+    np.testing.assert_array_equal(commands, shipped[:6])
+
+
+# -- the command -----------------------------------------------------------------------
+
+
+def test_one_command_writes_all_six(tmp_path: pathlib.Path) -> None:
+    assert main(["--out", str(tmp_path / "d"), "--seed", "2", "--episodes", "3"]) == 0
+    expected = {f"{name}.{kind}" for name in NAMES for kind in ("npz", "csv", "json")}
+    assert {path.name for path in (tmp_path / "d").iterdir()} == expected | {
+        "README.md"
+    }
+    page = (tmp_path / "d" / "README.md").read_text()
+    for name in NAMES:
+        binary = load_dataset(tmp_path / "d" / f"{name}.npz")
+        text = load_dataset(tmp_path / "d" / f"{name}.csv")
+        again = make_dataset(name, 2, min(3, EPISODES[name]))
+        np.testing.assert_array_equal(binary.candidates, again.candidates)
+        np.testing.assert_array_equal(text.candidates, again.candidates)
+        card = json.loads((tmp_path / "d" / f"{name}.json").read_text())
+        for kind in ("npz", "csv"):
+            data = (tmp_path / "d" / f"{name}.{kind}").read_bytes()
+            assert card["files"][f"{name}.{kind}"] == hashlib.sha256(data).hexdigest()
+        assert card["seed"] == 2 and name in page
+        assert card["arrays"]["candidates"]["shape"] == list(again.candidates.shape)
+        assert ("measured" in card["arrays"]) == (again.measured is not None)
+        if again.measured is not None:
+            assert binary.measured is not None and text.measured is not None
+            np.testing.assert_array_equal(binary.measured, again.measured)
+            np.testing.assert_array_equal(text.measured, again.measured)
+            assert card["arrays"]["measured"]["unit"] == "degrees"
+        assert list(card["ranges_deg"]) == ["pitch", "yaw", "roll"]
+        assert all(ends == [-20, 20] for ends in card["ranges_deg"].values())
+    noise = json.loads((tmp_path / "d" / "dataset3.json").read_text())["noise"]
+    assert noise["std_deg"] == NOISE_STD_DEG
+
+
+def test_a_csv_in_parts_is_the_csv_of_the_whole(tmp_path: pathlib.Path) -> None:
+    data = make_dataset("dataset3", episodes=5)
+    save_csv(data, tmp_path / "whole.csv")
+    save_csv_parts([data.part(0, 2), data.part(2, 5)], tmp_path / "parts.csv")
+    whole = (tmp_path / "whole.csv").read_bytes()
+    assert (tmp_path / "parts.csv").read_bytes() == whole
+
+
+def test_the_command_refuses_by_one_line(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = str(tmp_path / "d")
+    for arguments, message in (
+        ([folder, "dataset7"], "NAME must be one of dataset0"),
+        ([folder, "--formats", "npz,xls"], "--formats must be npz, csv or both"),
+        ([folder, "--episodes", "0"], "--episodes must be at least 1, got 0"),
+    ):
+        with pytest.raises(SystemExit) as caught:
+            main(["--out", *arguments])
+        assert caught.value.code == 2
+        assert message in capsys.readouterr().err
+    for arguments, message in (
+        ([folder, "--seed", "-1", "dataset2"], "seed must not be negative, got -1"),
+        ([folder, "--recordings", folder, "dataset4"], "dataset4.csv: No such file"),
+    ):
+        assert main(["--out", *arguments]) == 2
+        assert message in capsys.readouterr().err
+    (tmp_path / "file").touch()
+    assert main(["--out", str(tmp_path / "file"), "dataset2"]) == 2
+    assert "is not a folder" in capsys.readouterr().err
 
 
 # -- files -----------------------------------------------------------------------------

@@ -149,7 +149,7 @@ def test_vmap_and_jit_change_nothing() -> None:
 # -- compliance ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("order", ["XYZ", "YXZ", "ZYX"])
+@pytest.mark.parametrize("order", ["XYZ", "YXZ"])
 def test_bent_joints_are_where_the_energy_is_least(order: str) -> None:
     """Springs and weight; the oracle is scipy's minimiser of their energy."""
     config = RobotConfig(

@@ -17,6 +17,7 @@ import pathlib
 import struct
 import zipfile
 import zlib
+from collections.abc import Iterable
 from typing import Any, NoReturn
 
 import numpy as np
@@ -24,10 +25,10 @@ from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges
 from jaxcal.checks import axis_letter
-from jaxcal.files import atomic_write, write_text
+from jaxcal.files import atomic_write
 from jaxcal.study.datasets import Dataset
 
-__all__ = ["load_dataset", "save_csv", "save_npz"]
+__all__ = ["load_dataset", "save_csv", "save_csv_parts", "save_npz"]
 
 Array = NDArray[np.float64]
 
@@ -99,23 +100,43 @@ def save_csv(dataset: Dataset, path: str | os.PathLike[str]) -> None:
     Raises:
         OSError: the folder is missing, not writable or full.
     """
-    n = dataset.num_inputs
+    save_csv_parts([dataset], path)
+
+
+def save_csv_parts(parts: Iterable[Dataset], path: str | os.PathLike[str]) -> None:
+    """Write one .csv of a dataset that comes in parts, each with as many columns.
+
+    Raises:
+        OSError: the folder is missing, not writable or full.
+    """
+    with atomic_write(path) as file:
+        episode = 0
+        for dataset in parts:
+            text = io.StringIO()
+            writer = csv.writer(text, lineterminator="\n")
+            if episode == 0:
+                writer.writerow(_header(dataset))
+            _write_rows(writer, dataset, episode)
+            file.write(text.getvalue().encode("utf-8"))
+            episode += dataset.num_episodes
+
+
+def _header(dataset: Dataset) -> list[str]:
+    n, m = dataset.num_inputs, dataset.num_outputs
     header = ["episode", "candidate", *(f"u_{axis_letter(i, n)}" for i in range(n))]
+    if dataset.measured is not None:
+        header += [f"y_{axis_letter(i, m)}" for i in range(m)]
+    return header if dataset.available is None else [*header, "available"]
+
+
+def _write_rows(writer: Any, dataset: Dataset, first_episode: int) -> None:
     columns = [dataset.candidates]
     if dataset.measured is not None:
-        m = dataset.num_outputs
-        header += [f"y_{axis_letter(i, m)}" for i in range(m)]
         columns.append(dataset.measured)
-    if dataset.available is not None:
-        header.append("available")
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(header)
     for e, episode in enumerate(np.concatenate(columns, axis=2).tolist()):
         for i, row in enumerate(episode):
             mask = [] if dataset.available is None else [int(dataset.available[e, i])]
-            writer.writerow([e, i, *row, *mask])
-    write_text(path, text.getvalue())
+            writer.writerow([first_episode + e, i, *row, *mask])
 
 
 _Fields = tuple[Array, Array | None, NDArray[np.bool_] | None, JointRanges | None]

@@ -1,32 +1,46 @@
-"""The paper's simulated Datasets 1, 2 and 3 (Table 3), each by seed.
+"""The paper's Datasets 0 to 5 (Table 3), each by seed.
 
 ==========  ========  ==  ===  ========================================================
 name        episodes   M  dim  for
 ==========  ========  ==  ===  ========================================================
+dataset0         200  50    6  identification, driven open loop in MuJoCo
 dataset1     200,000  50    3  training; read it in chunks
 dataset2       1,000  50    3  evaluation
 dataset3         100  50    6  independent evaluation, with measured outputs
+dataset4         100  50    6  recorded on the rig: 50-of-500 draws from a pool
+dataset5           1  50    6  recorded on the rig, in a session of its own
 ==========  ========  ==  ===  ========================================================
 
 Commands are uniform within ``RANGES`` and stored normalised to [0, 1], as in the paper.
 The outputs of dataset3 are ``y = diag(scale) u + bias`` (Table 1) of the commands in
-degrees, with white Gaussian noise of ``NOISE_STD_DEG`` on every output.
+degrees, with white Gaussian noise of ``NOISE_STD_DEG`` on every output; those of
+dataset0 are what the robot of ``jaxcal.study.robot_model`` reads after a second at each
+posture, with the same noise. ``jaxcal.study.recordings`` reads what dataset4 and
+dataset5 are made from.
 
-Every block of 1,000 episodes of every dataset has a random stream of its own, spawned
-from the seed, the dataset's number and the block's. So no dataset shares candidates
-with another, and asking for fewer episodes gives the first of them. Training draws from
-JAX's generator, which is a different one altogether.
+Every block of 1,000 episodes of every simulated dataset (every group of dataset0) has a
+random stream of its own, spawned from the seed, the dataset's number and the block's.
+So no dataset shares candidates with another, and asking for fewer episodes gives the
+first of them. Training draws from JAX's generator, which is a different one altogether.
+
+``python -m jaxcal.study.datasets --out DIR`` writes them all, with a data card.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+import pathlib
+import sys
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges, uniform_candidates
+
+if TYPE_CHECKING:
+    from jaxcal.study.robot import RobotConfig
 
 __all__ = [
     "BIAS_DEG",
@@ -35,23 +49,34 @@ __all__ = [
     "NOISE_STD_DEG",
     "NUM_CANDIDATES",
     "RANGES",
+    "RECORDED",
     "SCALE",
     "Dataset",
     "chunks",
+    "dataset0_robot",
     "make_dataset",
 ]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+Progress = Callable[[str, int, int], None]
 
-NAMES = ("dataset1", "dataset2", "dataset3")
+NAMES = tuple(f"dataset{number}" for number in range(6))
+RECORDED = ("dataset4", "dataset5")
 NUM_CANDIDATES = 50
 SCALE = np.array([0.43, 0.71, 0.87])  # pitch, yaw, roll; Table 1 lists roll before yaw
 BIAS_DEG = np.array([3.1, -5.8, 2.41])
 NOISE_STD_DEG = 0.1
 RANGES = JointRanges([-20.0] * 3, [20.0] * 3, ("pitch", "yaw", "roll"))  # degrees
 
-EPISODES = {"dataset1": 200_000, "dataset2": 1_000, "dataset3": 100}
+EPISODES = {
+    "dataset0": 200,
+    "dataset1": 200_000,
+    "dataset2": 1_000,
+    "dataset3": 100,
+    "dataset4": 100,
+    "dataset5": 1,
+}
 _BLOCK = 1_000  # episodes that share a stream
 
 
@@ -121,7 +146,11 @@ class Dataset:
                 f"episodes must be in [1, {self.num_episodes}] for {self.name}, "
                 f"got {episodes}"
             )
-        cut = slice(episodes)
+        return self.part(0, episodes)
+
+    def part(self, begin: int, end: int) -> Dataset:
+        """Episodes ``begin`` to ``end``, the last one not included."""
+        cut = slice(begin, end)
         return dataclasses.replace(
             self,
             candidates=self.candidates[cut],
@@ -130,37 +159,59 @@ class Dataset:
         )
 
 
-def make_dataset(name: str, seed: int = 0, episodes: int | None = None) -> Dataset:
+def make_dataset(
+    name: str,
+    seed: int = 0,
+    episodes: int | None = None,
+    *,
+    recordings: pathlib.Path | str | None = None,
+    progress: Progress | None = None,
+) -> Dataset:
     """One of the paper's datasets, whole.
 
-    The whole of dataset1 takes 240 MB; ``chunks`` gives it in pieces.
+    The whole of dataset1 takes 240 MB; ``chunks`` gives it in pieces. The whole of
+    dataset0 takes some seconds of simulation.
 
     Args:
-        name: dataset1, dataset2 or dataset3.
-        seed: of the streams.
+        name: dataset0 to dataset5.
+        seed: of the streams; of the draws from the pool (dataset4); none (dataset5).
         episodes: the first so many; all when not given.
+        recordings: folder of dataset4.csv and dataset5.csv; the shipped one when not
+            given.
+        progress: told how far a simulation is.
     """
-    blocks = list(chunks(name, seed, episodes))
+    blocks = list(
+        chunks(name, seed, episodes, recordings=recordings, progress=progress)
+    )
     measured = [block.measured for block in blocks if block.measured is not None]
-    return Dataset(
-        name=name,
+    return dataclasses.replace(
+        blocks[0],
         candidates=np.concatenate([block.candidates for block in blocks]),
         measured=np.concatenate(measured) if measured else None,
-        ranges=RANGES,
-        seed=seed,
     )
 
 
-def chunks(name: str, seed: int = 0, episodes: int | None = None) -> Iterator[Dataset]:
+def chunks(
+    name: str,
+    seed: int = 0,
+    episodes: int | None = None,
+    *,
+    recordings: pathlib.Path | str | None = None,
+    progress: Progress | None = None,
+) -> Iterator[Dataset]:
     """The same episodes as ``make_dataset``, at most 1,000 at a time.
 
     Args:
-        name: dataset1, dataset2 or dataset3.
+        name: dataset0 to dataset5.
         seed: of the streams, 0 or greater.
         episodes: the first so many; all when not given.
+        recordings: folder of recordings; the shipped one when not given.
+        progress: told how far a simulation is.
 
     Raises:
-        ValueError: naming the argument; raised before the first chunk is drawn.
+        OSError: a recording cannot be read.
+        ValueError: naming the argument, or the line of a recording; an argument is
+            refused before the first chunk is drawn.
     """
     if name not in NAMES:
         raise ValueError(f"name must be one of {', '.join(NAMES)}, got {name!r}")
@@ -171,18 +222,64 @@ def chunks(name: str, seed: int = 0, episodes: int | None = None) -> Iterator[Da
         raise ValueError(
             f"episodes must be in [1, {EPISODES[name]}] for {name}, got {total}"
         )
+    if name in RECORDED:
+        from jaxcal.study.recordings import recorded_dataset
+
+        whole = recorded_dataset(
+            name, EPISODES[name], NUM_CANDIDATES, seed, folder=recordings
+        )
+        return iter([whole.first(total)])
+    if name == "dataset0":
+        return _groups(seed, total, progress)
     return _blocks(name, seed, total)
 
 
 def _blocks(name: str, seed: int, total: int) -> Iterator[Dataset]:
-    number = NAMES.index(name) + 1
     for block, begin in enumerate(range(0, total, _BLOCK)):
         count = min(_BLOCK, total - begin)
-        stream = np.random.SeedSequence(seed, spawn_key=(number, block))
-        draw, noise = (np.random.default_rng(child) for child in stream.spawn(2))
+        draw, noise = _streams(name, seed, block)
         candidates = uniform_candidates(draw, count, NUM_CANDIDATES, 3)
         measured = None
         if name == "dataset3":
             measured = RANGES.denormalise(candidates) * SCALE + BIAS_DEG
             measured += noise.normal(0.0, NOISE_STD_DEG, measured.shape)
         yield Dataset(name, candidates, measured, ranges=RANGES, seed=seed)
+
+
+def _streams(
+    name: str, seed: int, block: int
+) -> tuple[np.random.Generator, np.random.Generator]:
+    """Commands and noise."""
+    key = (NAMES.index(name), block)
+    draw, noise = np.random.SeedSequence(seed, spawn_key=key).spawn(2)
+    return np.random.default_rng(draw), np.random.default_rng(noise)
+
+
+def _groups(seed: int, total: int, progress: Progress | None) -> Iterator[Dataset]:
+    """Dataset0: groups of postures driven in MuJoCo, each with a stream of its own."""
+    from jaxcal.study.robot_model import simulate
+
+    candidates, noises = [], []
+    for group in range(total):
+        draw, noise = _streams("dataset0", seed, group)
+        candidates.append(uniform_candidates(draw, 1, NUM_CANDIDATES, 3)[0])
+        noises.append(noise.normal(0.0, NOISE_STD_DEG, candidates[-1].shape))
+    unit = np.stack(candidates)
+    read = simulate(dataset0_robot(), RANGES.denormalise(unit), progress=progress)
+    yield Dataset("dataset0", unit, read + noises, ranges=RANGES, seed=seed)
+
+
+def dataset0_robot() -> RobotConfig:
+    """The ideal robot of Table 1."""
+    from jaxcal.study.robot import RobotConfig
+
+    return RobotConfig(
+        scale=(SCALE[0], SCALE[1], SCALE[2]),
+        bias_deg=(BIAS_DEG[0], BIAS_DEG[1], BIAS_DEG[2]),
+    )
+
+
+if __name__ == "__main__":
+    from jaxcal.study.dataset_command import main
+
+    sys.exit(main())
