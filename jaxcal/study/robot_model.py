@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers
 from jaxcal.study.robot import GRAVITY, RobotConfig
-from jaxcal.study.robot_parts import Part, parts_of
+from jaxcal.study.robot_parts import EYE_M, FIELD_DEG, Part, parts_of, view_axes
 
 __all__ = [
     "HOLD_S",
@@ -75,11 +75,12 @@ def model_xml(config: RobotConfig, timestep_s: float | None = None) -> str:
 <option timestep="{timestep_s}" integrator="implicitfast"
  gravity="0 {-GRAVITY if config.per_axis("compliance_deg_per_nm").any() else 0.0} 0"/>
 <visual><headlight ambient="0.45 0.45 0.45" diffuse="0.5 0.5 0.5"/>
-<global offwidth="1280" offheight="960"/><quality offsamples="8"/></visual>
-<asset>
-<texture type="skybox" builtin="flat" rgb1="1 1 1" width="32" height="32"/></asset>
+<global offwidth="1280" offheight="960"/>
+<quality offsamples="4" shadowsize="1024"/></visual>
+<asset><texture type="skybox" builtin="flat" rgb1="1 1 1" rgb2="1 1 1"
+ width="32" height="32"/></asset>
 <default><geom contype="0" conaffinity="0" mass="0"/></default>
-<worldbody><light pos="0.6 1.5 0.9" dir="-0.4 -1 -0.6"/>{_geometry(parts, 0)}
+<worldbody>{_camera()}<light pos="0.6 1.5 0.9" dir="-0.4 -1 -0.6"/>{_geometry(parts, 0)}
 {bodies}<site name="phone" quat="{phone}"/>{closing}</worldbody>
 <tendon>{_drags(gaps)}</tendon>
 <actuator>{_servos(config)}</actuator>
@@ -257,6 +258,13 @@ def _drags(gaps: Array) -> str:
         for letter, gap in zip("XYZ", gaps, strict=True)
         if gap > 0.0
     )
+
+
+def _camera() -> str:
+    right, up, _ = view_axes()
+    place = " ".join(f"{value:g}" for value in EYE_M)
+    axes = " ".join(f"{value:.9g}" for value in (*right, *up))
+    return f'<camera name="view" pos="{place}" xyaxes="{axes}" fovy="{FIELD_DEG:g}"/>'
 
 
 def _geometry(parts: list[Part], link: int) -> str:

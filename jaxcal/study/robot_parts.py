@@ -12,19 +12,22 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Part", "parts_of"]
+__all__ = ["AXIS_COLOURS", "EYE_M", "FIELD_DEG", "Part", "parts_of", "view_axes"]
 
 Array = NDArray[np.float64]
 Colour = tuple[float, float, float]
 
-RING_RADII_M = (0.21, 0.175, 0.14)  # from the base inwards
+_RING_RADII_M = (0.21, 0.175, 0.14)  # from the base inwards
 _RING_RODS = 36
 _FLOOR_M = -0.30
-_AXIS_COLOURS: dict[str, Colour] = {
+AXIS_COLOURS: dict[str, Colour] = {
     "X": (0.84, 0.37, 0.0),  # pitch
     "Y": (0.0, 0.45, 0.70),  # yaw
     "Z": (0.0, 0.62, 0.45),  # roll
 }
+EYE_M = np.array([0.68, 0.46, 0.88])  # of whoever looks at it
+FIELD_DEG = 36.0  # from the upper edge of the picture to the lower
+_TARGET_M = np.array([0.0, -0.075, 0.0])
 _STEEL: Colour = (0.45, 0.47, 0.50)
 _PLATE: Colour = (0.75, 0.77, 0.80)
 _PHONE: Colour = (0.10, 0.10, 0.12)
@@ -46,12 +49,12 @@ class Part:
 def parts_of(mechanism_order: str) -> list[Part]:
     """Every part of a robot whose axes stand in this order from the base outwards."""
     axes = [np.eye(3)["XYZ".index(letter)] for letter in mechanism_order]
-    colours = [_AXIS_COLOURS[letter] for letter in mechanism_order]
+    colours = [AXIS_COLOURS[letter] for letter in mechanism_order]
     parts = _stand(axes[0])
     for link in (1, 2):
         parts += _ring(link, axes[link - 1], axes[link])
     for link in (1, 2, 3):
-        inner, outer = RING_RADII_M[link - 1], RING_RADII_M[link - 1] + 0.045
+        inner, outer = _RING_RADII_M[link - 1], _RING_RADII_M[link - 1] + 0.045
         for side in (-1.0, 1.0):
             reach = outer if side > 0 else inner + 0.012
             parts.append(
@@ -75,6 +78,14 @@ def parts_of(mechanism_order: str) -> list[Part]:
     return parts + _foot(axes[2])
 
 
+def view_axes() -> tuple[Array, Array, Array]:
+    """Right, up and backwards of the camera, each (3,), in the world (y is up)."""
+    back = (EYE_M - _TARGET_M) / np.linalg.norm(EYE_M - _TARGET_M)
+    right = np.cross([0.0, 1.0, 0.0], back)
+    right /= np.linalg.norm(right)
+    return right, np.cross(back, right), back
+
+
 def _rod(link: int, start: Array, end: Array, radius: float, colour: Colour) -> Part:
     return Part(link, "rod", _triple(start), _triple(end), radius, colour)
 
@@ -90,7 +101,7 @@ def _triple(values: ArrayLike) -> tuple[float, float, float]:
 
 def _ring(link: int, first: Array, second: Array) -> list[Part]:
     """Round the bearing of its own axis outside and that of the next one inside."""
-    wide, narrow = RING_RADII_M[link - 1], RING_RADII_M[link]
+    wide, narrow = _RING_RADII_M[link - 1], _RING_RADII_M[link]
     turns = np.linspace(0.0, 2.0 * np.pi, _RING_RODS + 1)
     way = [
         (wide - 0.017) * np.cos(t) * first + (narrow + 0.017) * np.sin(t) * second
@@ -102,8 +113,8 @@ def _ring(link: int, first: Array, second: Array) -> list[Part]:
 def _stand(axis: Array) -> list[Part]:
     """A floor plate, and a post under each bearing of the first axis."""
     floor = np.array([0.0, _FLOOR_M, 0.0])
-    parts = [_box(0, (-0.27, _FLOOR_M - 0.02, -0.27), (0.27, _FLOOR_M, 0.27), _PLATE)]
-    reach = RING_RADII_M[0] + 0.03
+    parts = [_box(0, (-0.24, _FLOOR_M - 0.02, -0.24), (0.24, _FLOOR_M, 0.24), _PLATE)]
+    reach = _RING_RADII_M[0] + 0.03
     if abs(axis[1]) > 0.5:  # upright: one column from below, the motor hangs there
         return [*parts, _rod(0, floor, -reach * axis + [0, 0.01, 0], 0.02, _STEEL)]
     for side in (-1.0, 1.0):
@@ -115,7 +126,7 @@ def _stand(axis: Array) -> list[Part]:
 
 def _foot(axis: Array) -> list[Part]:
     """The plate with its heel cup, hung from the innermost axis, and the phone."""
-    reach = RING_RADII_M[2] - 0.035
+    reach = _RING_RADII_M[2] - 0.035
     parts = [
         _box(3, (-0.05, -0.06, -0.09), (0.05, -0.05, 0.13), _PLATE),
         _box(3, (-0.05, -0.05, -0.09), (0.05, 0.0, -0.08), _PLATE),
