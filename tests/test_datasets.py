@@ -329,6 +329,21 @@ def test_a_recording_is_made_through_the_rig(tmp_path: pathlib.Path) -> None:
     np.testing.assert_array_equal(commands, shipped[:6])
 
 
+def test_a_failed_recording_says_so_and_writes_nothing(
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(record, "_FLAGS", ("--nois",) * 5)  # the rig refuses it
+    assert record.main(["--out", str(tmp_path), "dataset5"]) == 3
+    assert "python -m rig collect ended with exit code 2" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(SystemExit) as caught:
+        record.main(["--out", str(tmp_path), "dataset3"])
+    assert caught.value.code == 2
+    assert "NAME must be one of dataset4, dataset5" in capsys.readouterr().err
+
+
 # -- the command -----------------------------------------------------------------------
 
 
