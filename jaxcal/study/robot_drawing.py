@@ -20,7 +20,8 @@ __all__ = ["Drawing"]
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-_PATCH_M = 0.06  # large faces are cut up, so that sorting by depth works
+_PATCH_M = 0.04  # large faces are cut up, so that sorting by depth works
+_LAYER_M = 0.015
 
 
 class Drawing:
@@ -43,13 +44,21 @@ class Drawing:
 
         faces, colours, depths = [], [], []
         turns = _link_rotations(self._order, joints_deg)
+        layer = 0.0  # phone and screen lie flat on what comes before them
         for part in self._parts:
+            flat = part.link == 3 and part.kind == "box"
+            layer = layer + _LAYER_M if flat else 0.0
+            middle = (
+                (np.array(part.start) + np.array(part.end)) / 2.0 @ turns[part.link].T
+            )
             for corners, colour in _faces(part):
                 placed = corners @ turns[part.link].T
-                flat, depth = self._project(placed)
-                faces.append(flat)
+                if not _faces_us(placed, middle):
+                    continue
+                points, depth = self._project(placed)
+                faces.append(points)
                 colours.append(_lit(placed, colour))
-                depths.append(depth.mean())
+                depths.append(depth.mean() - layer)
         far_first = np.argsort(depths)[::-1]
         axes = self._axes
         axes.clear()
@@ -128,6 +137,13 @@ def _faces(part: Part) -> Iterator[tuple[Array, tuple[float, float, float]]]:
 
 def _cuts(low: float, high: float) -> Array:
     return np.linspace(low, high, 1 + max(1, round((high - low) / _PATCH_M)))
+
+
+def _faces_us(corners: Array, middle: Array) -> bool:
+    """Whether the outside of a face is seen; the parts are convex."""
+    normal = np.cross(corners[1] - corners[0], corners[2] - corners[1])
+    outward = normal if normal @ (corners[0] - middle) > 0.0 else -normal
+    return bool(outward @ (EYE_M - corners[0]) > 0.0)
 
 
 def _lit(corners: Array, colour: Sequence[float]) -> tuple[float, float, float]:
