@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help train checkpoint evaluate test test-all lint format clean
+.PHONY: help train checkpoint evaluate reproduce test test-all lint format clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -25,6 +25,9 @@ checkpoint: $(READY) ## train the policy that ships and put it in checkpoints/de
 
 evaluate: $(READY) ## compare every method with the proven optimum on 1,000 unseen candidate sets
 	$(BIN)/python evaluate.py $(ARGS)
+
+reproduce: $(READY) ## the paper's figures, tables and claims from our own runs, in report/index.html
+	$(BIN)/python -m jaxcal.study.reproduce $(ARGS)
 
 test: lint ## set everything up, lint, and run the quick tests (the ones CI runs)
 	$(BIN)/python -m pytest -m 'not slow' $(ARGS)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 from typing import Any
 
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 __all__ = ["BLACK", "COLOURS", "GREY", "MARKERS", "STYLES", "as_bytes", "plain_axes"]
@@ -21,10 +22,11 @@ BLACK = "#000000"
 
 
 def as_bytes(figure: Figure, suffix: str) -> bytes:
-    """The figure as a file of the given kind, "png" or "svg"."""
+    """The figure as a file of the given kind, "png" or "svg"; the same every time."""
     buffer = io.BytesIO()
     metadata: dict[str, Any] = {"Date": None} if suffix == "svg" else {}
-    figure.savefig(buffer, format=suffix, dpi=150, metadata=metadata)
+    with rc_context({"svg.hashsalt": "jaxcal"}):
+        figure.savefig(buffer, format=suffix, dpi=150, metadata=metadata)
     return buffer.getvalue()
 
 

@@ -25,6 +25,7 @@ __all__ = [
     "evaluation_figures",
     "gap_to_optimum",
     "parameter_variance",
+    "variances",
 ]
 
 Array = NDArray[np.float64]
@@ -169,36 +170,44 @@ def gap_to_optimum(evaluation: Evaluation) -> Figure:
             np.append(1.0, share[keep]),
             where="pre",
             label=f"{name} (mean {ratio.mean():.3g})",
-            color=style["color"],
-            linestyle=style["linestyle"],
+            **_line(style),
         )
     axes.set_xlabel(f"det S / det S* ({_reference_name(evaluation)})")
     axes.set_ylabel("share of selections at least this good")
     axes.set_xlim(0.0, 1.005)
     axes.set_ylim(0.0, 1.02)
-    _legend(axes, outside=True)
+    _legend(axes)
     _title(axes, evaluation, "Gap to the optimum")
     return figure
 
 
 def best_so_far(evaluation: Evaluation) -> Figure:
-    """Largest det S found up to each episode (paper, Figure 4)."""
+    """Largest det S found up to each episode (paper, Figure 4).
+
+    Of several draws an episode the median curve, with a band from 5 to 95 % of them.
+    """
     figure, axes = _figure(8.0, 3.8)
     episodes = np.arange(1, evaluation.dataset.num_episodes + 1)
     for name, log_det, style in _with_random(evaluation):
-        label = f"{name}, one draw" if name == "random" else name
+        best = _log10(np.maximum.accumulate(log_det, axis=0))
+        label = name
+        if best.shape[1] > 1:
+            low, high = np.quantile(best, [0.05, 0.95], axis=1)
+            axes.fill_between(
+                episodes, low, high, step="post", color=style["color"], alpha=0.2, lw=0
+            )
+            label = f"{name}, median and\n5 to 95 % of {best.shape[1]} draws"
         axes.step(
             episodes,
-            _log10(np.maximum.accumulate(log_det[:, 0])),
+            np.median(best, axis=1),
             where="post",
             label=label,
-            color=style["color"],
-            linestyle=style["linestyle"],
+            **_line(style),
         )
     axes.set_xlabel("episode")
     axes.set_ylabel(f"best {_det_label(evaluation)} so far")
     _powers_of_ten(axes.yaxis)
-    _legend(axes, outside=True)
+    _legend(axes)
     _title(axes, evaluation, "Best det S so far")
     return figure
 
@@ -212,34 +221,64 @@ def parameter_variance(evaluation: Evaluation) -> Figure:
     dataset = evaluation.dataset
     if dataset.measured is None:
         raise ValueError(f"{dataset.name} holds no measured outputs")
-    names = parameter_names(dataset.num_inputs, dataset.num_outputs)
-    figure, axes = _figure(8.0, 4.0)
     results = [r for r in evaluation.results if r.parameters is not None]
-    offsets = np.linspace(-0.3, 0.3, len(results)) if len(results) > 1 else [0.0]
-    for result, offset, style in zip(
-        results, offsets, _styles(evaluation, results), strict=True
-    ):
+    rows = []
+    for result, style in zip(results, _styles(evaluation, results), strict=True):
         label = "random, median over draws" if result.method == "random" else None
-        axes.plot(
+        variance = evaluation.parameter_variance(result)
+        rows.append((label or _label(evaluation, result), variance, None, style))
+    figure = variances(
+        rows,
+        parameter_names(dataset.num_inputs, dataset.num_outputs),
+        "unit of measured and commands, squared"
+        if dataset.ranges is None
+        else "A: no unit, b: deg²",
+    )
+    _title(
+        figure.axes[0],
+        evaluation,
+        "Cross-episode variance of the identified parameters",
+    )
+    return figure
+
+
+def variances(
+    rows: Sequence[tuple[str, Array, tuple[Array, Array] | None, dict[str, Any]]],
+    names: Sequence[str],
+    unit: str,
+) -> Figure:
+    """Variance of each parameter, a marker for each way of choosing.
+
+    Args:
+        rows: label, (P,) variances, lower and upper ends of their intervals, style.
+        names: of the P parameters.
+        unit: in words.
+    """
+    figure, axes = _figure(8.0, 4.0)
+    offsets = np.linspace(-0.3, 0.3, len(rows)) if len(rows) > 1 else [0.0]
+    for (label, variance, ends, style), offset in zip(rows, offsets, strict=True):
+        error = None
+        if ends is not None:
+            # A percentile interval need not hold the estimate.
+            error = np.maximum([variance - ends[0], ends[1] - variance], 0.0)
+        axes.errorbar(
             np.arange(len(names)) + offset,
-            evaluation.parameter_variance(result),
+            variance,
+            yerr=error,
             linestyle="none",
             marker=style["marker"],
             markersize=4.5,
+            elinewidth=0.9,
             color=style["color"],
-            label=label or _label(evaluation, result),
+            label=label,
         )
     for edge in np.arange(len(names) - 1) + 0.5:
         axes.axvline(edge, color="#DDDDDD", linewidth=0.6, zorder=0)
     axes.set_yscale("log")
     axes.set_xticks(range(len(names)), names)
-    unit = "unit of measured and commands, squared"
-    if dataset.ranges is not None:
-        unit = "A: no unit, b: deg²"
     axes.set_xlabel("parameter")
     axes.set_ylabel(f"variance over episodes ({unit})")
-    _legend(axes, outside=True)
-    _title(axes, evaluation, "Cross-episode variance of the identified parameters")
+    _legend(axes)
     return figure
 
 
@@ -250,13 +289,8 @@ def _figure(width: float, height: float) -> tuple[Figure, Any]:
     return figure, axes
 
 
-def _legend(axes: Any, *, outside: bool = False) -> None:
-    if outside:
-        axes.legend(
-            fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5)
-        )
-    else:
-        axes.legend(fontsize=8, frameon=True, framealpha=0.9, loc="best")
+def _legend(axes: Any) -> None:
+    axes.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 def _title(axes: Any, evaluation: Evaluation, what: str) -> None:
@@ -314,6 +348,14 @@ def _styles(
                 }
             )
     return styles
+
+
+def _line(style: dict[str, Any]) -> dict[str, Any]:
+    """A curve; the optimum broad and pale, for others may lie on it."""
+    line = {key: style[key] for key in ("color", "linestyle")}
+    if style["color"] == BLACK:
+        line |= {"linewidth": 4.0, "alpha": 0.3, "zorder": 1}
+    return line
 
 
 def _with_random(evaluation: Evaluation) -> list[tuple[str, Array, dict[str, Any]]]:

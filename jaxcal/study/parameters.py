@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from jaxcal.checks import axis_letter
 from jaxcal.study.datasets import Dataset
 
-__all__ = ["estimate_parameters", "parameter_names"]
+__all__ = ["estimate_parameters", "least_squares", "parameter_names", "predict"]
 
 Array = NDArray[np.float64]
 
@@ -39,9 +39,39 @@ def estimate_parameters(dataset: Dataset, indices: NDArray[np.int64]) -> Array |
     gather = indices[..., None]
     u = np.take_along_axis(commands[:, None], gather, axis=2)
     y = np.take_along_axis(dataset.measured[:, None], gather, axis=2)
-    mean_u, mean_y = u.mean(axis=2, keepdims=True), y.mean(axis=2, keepdims=True)
-    q, r = np.linalg.qr(u - mean_u)
-    slopes = np.linalg.solve(r, np.matrix_transpose(q) @ (y - mean_y))  # (E, R, n, m)
+    return least_squares(u, y)
+
+
+def least_squares(commands: Array, measured: Array) -> Array:
+    """Parameters of many sets of postures at once, without uncertainty.
+
+    Args:
+        commands: (..., N, n) with N > n, each set of full rank.
+        measured: (..., N, m).
+
+    Returns:
+        (..., m (n + 1)) A row by row, then b.
+    """
+    mean_u = commands.mean(axis=-2, keepdims=True)
+    mean_y = measured.mean(axis=-2, keepdims=True)
+    q, r = np.linalg.qr(commands - mean_u)
+    slopes = np.linalg.solve(r, np.matrix_transpose(q) @ (measured - mean_y))
     biases = (mean_y - mean_u @ slopes)[..., 0, :]
     matrix = np.matrix_transpose(slopes)
-    return np.concatenate([matrix.reshape(*biases.shape[:2], -1), biases], axis=-1)
+    return np.concatenate([matrix.reshape(*biases.shape[:-1], -1), biases], axis=-1)
+
+
+def predict(parameters: Array, commands: Array) -> Array:
+    """Outputs of many calibrations, the batched ``Calibration.predict``.
+
+    Args:
+        parameters: (..., m (n + 1)) A row by row, then b.
+        commands: (..., N, n).
+
+    Returns:
+        (..., N, m).
+    """
+    n = commands.shape[-1]
+    m = parameters.shape[-1] // (n + 1)
+    matrix = parameters[..., : m * n].reshape(*parameters.shape[:-1], m, n)
+    return commands @ np.matrix_transpose(matrix) + parameters[..., None, m * n :]

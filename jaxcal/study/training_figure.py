@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from jaxcal.study.figure_style import COLOURS, plain_axes
 
-__all__ = ["read_metrics", "training_curves"]
+__all__ = ["last_rewards", "read_metrics", "training_curves"]
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ def training_curves(folder: pathlib.Path | str) -> Figure:
     left.set_ylabel("reward (log det S, scaled)")
     left.legend(fontsize=8, frameon=False)
 
-    last, what = _last_rewards(folder, metrics)
+    last, what = last_rewards(folder, metrics)
     middle.hist(
         last, bins=min(_BINS, max(5, len(last) // 10)), color=COLOURS[0], alpha=0.8
     )
@@ -135,7 +135,7 @@ def read_metrics(path: pathlib.Path) -> dict[str, Array]:
     return {name: table[:, i] for i, name in enumerate(header)}
 
 
-def _last_rewards(folder: pathlib.Path, metrics: dict[str, Array]) -> tuple[Array, str]:
+def last_rewards(folder: pathlib.Path, metrics: dict[str, Array]) -> tuple[Array, str]:
     """Rewards to draw as a histogram, and what they are."""
     path = folder / "last_rewards.npy"
     if path.exists():

@@ -1,0 +1,104 @@
+"""What the report is made of: exhibits, with their data, and claims with a verdict."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import pathlib
+from collections.abc import Mapping, Sequence
+from dataclasses import field
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.figure import Figure
+
+__all__ = ["Claim", "Columns", "Exhibit", "Settings", "Verdict", "as_csv"]
+
+Columns = Mapping[str, Sequence[Any] | np.ndarray]
+Verdict = Literal["agrees", "agrees in part", "disagrees", "not comparable"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """How much to compute; everything random hangs on ``seed``."""
+
+    seed: int = 0
+    quick: bool = False
+    data: pathlib.Path | None = None  # real recordings in place of Datasets 4 and 5
+    studies: pathlib.Path = pathlib.Path("studies")  # kept training runs
+
+    @property
+    def episodes(self) -> int:
+        """Of dataset2."""
+        return 200 if self.quick else 1_000
+
+    @property
+    def groups(self) -> int:
+        """Of dataset0."""
+        return 40 if self.quick else 200
+
+    @property
+    def random_draws(self) -> int:
+        """Random selections an episode."""
+        return 30 if self.quick else 100
+
+    @property
+    def resamples(self) -> int:
+        """Of a bootstrap."""
+        return 400 if self.quick else 2_000
+
+    @property
+    def repeats(self) -> int:
+        """Simulated devices, or histories of one, in the accuracy studies."""
+        return 100 if self.quick else 500
+
+    def rng(self, *stream: int) -> np.random.Generator:
+        """A stream of its own for each use."""
+        return np.random.default_rng(
+            np.random.SeedSequence(self.seed, spawn_key=stream)
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Exhibit:
+    """One figure or table: what it shows, what the paper says of it, what came out."""
+
+    key: str  # of its files: "figure_1"
+    title: str
+    caption: str  # what is drawn, sample sizes, what the intervals are
+    paper: str = ""  # what the paper states, in our words
+    ours: str = ""
+    verdict: Verdict | None = None
+    figures: Mapping[str, Figure] = field(default_factory=dict)
+    data: Mapping[str, Columns] = field(default_factory=dict)
+    numbers: Mapping[str, Any] = field(default_factory=dict)
+    rows: Sequence[Sequence[str]] = ()  # a table, its header first
+
+
+@dataclasses.dataclass(frozen=True)
+class Claim:
+    """One statement of the paper and what became of it."""
+
+    key: str
+    claim: str
+    paper: str  # its figure
+    ours: str
+    verdict: Verdict
+    where: str  # key of the exhibit with the evidence, "" where it is a proof
+
+
+def as_csv(columns: Columns) -> str:
+    """Columns of equal length as text, numbers with twelve digits."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    for row in zip(*columns.values(), strict=True):
+        writer.writerow([_cell(value) for value in row])
+    return text.getvalue()
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, (float, np.floating)):
+        return "" if np.isnan(value) else f"{value:.12g}"
+    return str(value)
