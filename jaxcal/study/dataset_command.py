@@ -22,7 +22,7 @@ __all__ = ["main", "write_datasets"]
 _DESCRIPTION = """\
 Write the paper's Datasets 0 to 5 to a folder: NAME.npz, NAME.csv and the data card
 NAME.json of each, and README.md, the cards as a page. dataset0 is simulated in MuJoCo
-(some seconds), dataset1 takes 240 MB as .npz and 700 MB as .csv, dataset4 and dataset5
+(some seconds), dataset1 takes 240 MB as .npz and 670 MB as .csv, dataset4 and dataset5
 are made from recordings.
 """
 
