@@ -121,6 +121,26 @@ def test_csv_keeps_twelve_digits_and_refuses_ragged_columns() -> None:
         as_csv({"a": [1.0], "b": [1.0, 2.0]})
 
 
+def test_recordings_can_be_given(tmp_path: pathlib.Path) -> None:
+    rng = np.random.default_rng(5)
+    for name, count in (("dataset4", 5_000), ("dataset5", 60)):
+        u = rng.uniform(-20.0, 20.0, (count, 3))
+        y = u @ np.diag([0.5, 0.6, 0.7]) + [1.0, 2.0, 3.0]
+        header = ",".join(
+            f"{w}_deg_{a}" for w in "uy" for a in ("pitch", "yaw", "roll")
+        )
+        rows = [",".join(map(repr, row)) for row in np.hstack([u, y]).tolist()]
+        (tmp_path / f"{name}.csv").write_text("\n".join([header, *rows]) + "\n")
+    given = Material(Settings(data=tmp_path))
+    found = given.all_parameters("dataset4")
+    assert found.shape == (100, 12)
+    expected = [0.5, 0, 0, 0, 0.6, 0, 0, 0, 0.7, 1, 2, 3]
+    np.testing.assert_allclose(found, np.tile(expected, (100, 1)), atol=1e-9)
+    assert given.about_overlap("dataset4") == ""  # 5,000 are used as they stand
+    assert str(tmp_path) in given.about_recordings()
+    assert "500 postures" in Material(Settings()).about_overlap("dataset4")
+
+
 # -- training --------------------------------------------------------------------------
 
 

@@ -122,7 +122,15 @@ def _exhibits(settings: Settings, progress: Progress) -> list[Exhibit]:
     for name in ("dataset5", "dataset4"):
         material.dataset(name)
     parts = (training, calibration, selection, tables, accuracy, recalibration)
-    found = {e.key: e for part in parts for e in part.exhibits(material)}
+    found: dict[str, Exhibit] = {}
+    for number, part in enumerate(parts):
+        stage = f"part {number + 1} of {len(parts)}"
+
+        def report(task: str, done: int, total: int, stage: str = stage) -> None:
+            progress(f"{stage}, {task}", done, total)
+
+        material.progress = report
+        found |= {exhibit.key: exhibit for exhibit in part.exhibits(material)}
     first = [key for key in _ORDER if key in found]
     return [found[key] for key in (*first, *(k for k in found if k not in first))]
 

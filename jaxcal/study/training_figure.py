@@ -37,12 +37,11 @@ def training_curves(folder: pathlib.Path | str) -> Figure:
     episodes, reward = metrics["episodes"], metrics["reward_mean"]
     thousands = episodes / 1000.0
     window = max(1, min(len(reward) // 10, 50))
+    span = window * (episodes[-1] - episodes[0]) / max(len(episodes) - 1, 1)
     figure = Figure(figsize=(12.0, 3.6), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
 
-    left.plot(
-        thousands, reward, color=COLOURS[5], linewidth=0.8, label="mean of an update"
-    )
+    left.plot(thousands, reward, color=COLOURS[5], linewidth=0.8, label="mean reward")
     if "reward_std" in metrics:
         spread = metrics["reward_std"]
         left.fill_between(
@@ -58,7 +57,7 @@ def training_curves(folder: pathlib.Path | str) -> Figure:
         thousands,
         _moving_average(reward, window),
         color=COLOURS[0],
-        label=f"moving average, {window} updates",
+        label=f"moving average, {span:,.0f} episodes",
     )
     left.set_title("(a) reward", fontsize=10)
     left.set_ylabel("reward (log det S, scaled)")

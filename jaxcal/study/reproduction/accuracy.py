@@ -119,7 +119,8 @@ def _four_or_fifty(material: Material) -> Exhibit:
             "dataset2: the policy's four measured alone, or all fifty, and the error "
             "of prediction right afterwards over the 50 candidates. Noise 0.1° where "
             "it is not the axis; gross errors of 3° s.d. Bands: 95 % of the mean; both "
-            "sides of a comparison on the same devices and candidates."
+            "sides of a comparison on the same devices and candidates. On recordings "
+            "the error is against the measured, whose own noise is in both."
         ),
         paper=(
             "Four D-optimal postures predict other episodes better than all fifty of "

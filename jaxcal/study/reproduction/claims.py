@@ -68,6 +68,23 @@ def _information(found: dict[str, Exhibit]) -> list[Claim]:
             )
         )
     best = found["figure_4"].numbers
+    seen = found["figure_3"].numbers["policy"]["ratio_to_exact"]
+    unseen = best["comparison"]["policy"]
+    out.append(
+        Claim(
+            "generalises",
+            "Does as well on the independent simulation (dataset3)",
+            "far above random again",
+            f"{unseen['times_random']:,.0f} times random; det S / det S* "
+            f"{unseen['ratio_to_exact']:.4f}, on dataset2 {seen:.4f}",
+            _verdict(
+                unseen["times_random"].low > 100
+                and unseen["ratio_to_exact"].high >= seen.low,
+                unseen["times_random"].low > 100,
+            ),
+            "figure_4",
+        )
+    )
     never = best["random_draws_that_never_reach_policys_first"]
     episode = best["policy_first_episode_within_half_of_best"]
     out.append(

@@ -6,6 +6,7 @@ import base64
 import dataclasses
 import html
 import json
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -93,7 +94,7 @@ def page(
         "<h2 id='claims'>Claim by claim</h2>",
         _claims_table(claims, {exhibit.key: exhibit.title for exhibit in exhibits}),
         "<nav>",
-        *(f"<a href='#{e.key}'>{_safe(e.title)}</a>" for e in exhibits),
+        *(f"<a href='#{e.key}'>{_typeset(e.title)}</a>" for e in exhibits),
         "</nav>",
     ]
     for exhibit in exhibits:
@@ -108,12 +109,12 @@ def _claims_table(claims: Sequence[Claim], titles: Mapping[str, str]) -> str:
         "<th>verdict</th></tr></thead><tbody>"
     ]
     for claim in claims:
-        name = _safe(claim.claim)
+        name = _typeset(claim.claim)
         if claim.where in titles:
             name = f"<a href='#{claim.where}'>{name}</a>"
         rows.append(
-            f"<tr><td>{name}</td><td>{_safe(claim.paper)}</td>"
-            f"<td>{_safe(claim.ours)}</td><td>{_badge(claim.verdict)}</td></tr>"
+            f"<tr><td>{name}</td><td>{_typeset(claim.paper)}</td>"
+            f"<td>{_typeset(claim.ours)}</td><td>{_badge(claim.verdict)}</td></tr>"
         )
     return "\n".join([*rows, "</tbody></table></div>"])
 
@@ -122,9 +123,9 @@ def _section(exhibit: Exhibit, images: Mapping[str, bytes]) -> list[str]:
     badge = "" if exhibit.verdict is None else _badge(exhibit.verdict)
     parts = [
         f"<section id='{exhibit.key}'><div class='head'>",
-        f"<h2>{_safe(exhibit.title)} {badge}</h2>",
-        f"<div class='sides'><div><b>The paper</b>{_safe(exhibit.paper)}</div>",
-        f"<div><b>Ours</b>{_safe(exhibit.ours)}</div></div></div>",
+        f"<h2>{_typeset(exhibit.title)} {badge}</h2>",
+        f"<div class='sides'><div><b>The paper</b>{_typeset(exhibit.paper)}</div>",
+        f"<div><b>Ours</b>{_typeset(exhibit.ours)}</div></div></div>",
     ]
     if exhibit.rows:
         parts.append("<div class='wide'>" + _table(exhibit.rows) + "</div>")
@@ -136,7 +137,7 @@ def _section(exhibit: Exhibit, images: Mapping[str, bytes]) -> list[str]:
             f"src='data:image/svg+xml;base64,{encoded}'></figure>"
         )
     if exhibit.caption:
-        parts.append(f"<p class='note'>{_safe(exhibit.caption)}</p>")
+        parts.append(f"<p class='note'>{_typeset(exhibit.caption)}</p>")
     if exhibit.data:
         files = ", ".join(
             f"<a href='data/{exhibit.key}_{name}.csv'>{exhibit.key}_{name}.csv</a>"
@@ -161,6 +162,11 @@ def _table(rows: Sequence[Sequence[str]]) -> str:
 
 def _safe(text: str) -> str:
     return html.escape(text)
+
+
+def _typeset(text: str) -> str:
+    """Escaped, with the paper's X_0 and X_* as they are printed."""
+    return re.sub(r"X_(0|\*)", r"X<sub>\1</sub>", _safe(text))
 
 
 def json_document(

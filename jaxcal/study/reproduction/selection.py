@@ -202,11 +202,12 @@ def _best(material: Material, name: str, key: str, title: str) -> Exhibit:
     reached = int(np.argmax(best["policy"][:, 0] >= best["exact"][-1, 0] - np.log(2.0)))
     first = np.exp(best["policy"][0, 0] - np.median(random[-1]))
     every = float((random[-1] < best["policy"][0, 0]).mean())
-    numbers = {
+    numbers: dict[str, Any] = {
         "policy_first_episode_within_half_of_best": reached + 1,
         "policy_first_over_random_best": float(first),
         "random_draws_that_never_reach_policys_first": every,
         "final_log_det_s": {m: float(v[-1, 0]) for m, v in best.items()},
+        "comparison": comparison(evaluation, material.settings),
     }
     verdict: Verdict = "agrees" if every > 0.95 else "agrees in part"
     return Exhibit(
@@ -224,7 +225,9 @@ def _best(material: Material, name: str, key: str, title: str) -> Exhibit:
             f"The policy is within a factor of two of the best of all episodes from "
             f"episode {reached + 1} on. Its very first episode is {first:.3g} times "
             f"what the median random run has found after {len(random)} episodes; "
-            f"{every:.0%} of the random runs never get there."
+            f"{every:.0%} of the random runs never get there. Mean det S is "
+            f"{numbers['comparison']['policy']['times_random']:,.0f} times random's, "
+            f"det S / det S* {numbers['comparison']['policy']['ratio_to_exact']:.4f}."
         ),
         verdict=verdict,
         figures={f"{key}_best_so_far": figures.best_so_far(evaluation)},
