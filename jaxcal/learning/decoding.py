@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxcal.learning import geometry, networks
 from jaxcal.learning.networks import Network
 
-__all__ = ["DECODINGS", "choose", "log_det_of", "logits_at"]
+__all__ = ["DECODINGS", "choose", "complete", "log_det_of", "logits_at"]
 
 DECODINGS = ("greedy", "samples", "first")
 
@@ -27,11 +27,11 @@ def log_det_of(candidates: jax.Array, indices: jax.Array) -> jax.Array:
     )
 
 
-def _complete(
+def complete(
     network: Network,
     params: Any,
     view: Any,
-    memory: jax.Array,
+    memory: Any,
     chosen: jax.Array,
     available: jax.Array,
     first: int,
@@ -57,14 +57,17 @@ def logits_at(
     network: Network,
     params: Any,
     view: Any,
-    memory: jax.Array,
+    memory: Any,
     chosen: jax.Array,
     available: jax.Array,
     count: int,
 ) -> tuple[jax.Array, jax.Array]:
-    """(B, M) logits and (B,) value of the decision after ``count`` choices."""
+    """(B, M) logits and (B,) value of the decision after ``count`` choices.
+
+    Without ``params`` every choice is the look-ahead's.
+    """
     glance = network.look_at(view, chosen, available, count)
-    if chosen.shape[-1] - count <= network.num_unlearned:
+    if params is None or chosen.shape[-1] - count <= network.num_unlearned:
         return network.finish(glance)
     return networks.decode(network, params, memory, glance)
 
@@ -111,12 +114,12 @@ def choose(
     free = available.at[rows, required].set(False)
     view = network.look(candidates, usable)
     memory = networks.encode(network, params, view)
-    complete = functools.partial(_complete, network, params, view, memory)
+    finish = functools.partial(complete, network, params, view, memory)
     if decoding == "greedy" or num_required == k:
-        return complete(chosen, free, num_required, None)
+        return finish(chosen, free, num_required, None)
     if decoding == "samples":
         keys = jax.random.split(key, num)
-        tries = jax.vmap(lambda key: complete(chosen, free, num_required, key))(keys)
+        tries = jax.vmap(lambda key: finish(chosen, free, num_required, key))(keys)
     else:
         logits, _ = logits_at(network, params, view, memory, chosen, free, num_required)
         _, firsts = jax.lax.top_k(logits, min(num, m))
@@ -128,7 +131,7 @@ def choose(
         def with_first(first: jax.Array) -> jax.Array:
             begun = chosen.at[:, num_required].set(first)
             rest = free & ~jax.nn.one_hot(first, m, dtype=bool)
-            return complete(begun, rest, num_required + 1, None)
+            return finish(begun, rest, num_required + 1, None)
 
         tries = jax.vmap(with_first)(firsts.T)
     values = jax.vmap(lambda tried: log_det_of(candidates, tried))(tries)

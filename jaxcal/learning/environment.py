@@ -24,6 +24,7 @@ import numpy as np
 from flax import struct
 
 from jaxcal.learning import geometry
+from jaxcal.learning.networks import Network, View
 from jaxcal.learning.observation import context_features
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     "SelectionConfig",
     "SelectionState",
     "from_pool",
+    "look",
     "observe",
     "reset",
     "reset_from",
@@ -215,6 +217,11 @@ def step(
         paid=jnp.where(pays, value, state.paid),
     )
     return state, reward, done
+
+
+def look(network: Network, state: SelectionState) -> View:
+    """The network's view of a batch of sets."""
+    return network.look(state.candidates, state.available)
 
 
 def observe(state: SelectionState, config: SelectionConfig) -> jax.Array:

@@ -170,7 +170,11 @@ def normalised_by(
 
 
 def lookahead(
-    y: jax.Array, spanned: bool, active: jax.Array, depth: int
+    y: jax.Array,
+    spanned: bool,
+    active: jax.Array,
+    depth: int,
+    tolls: jax.Array | None = None,
 ) -> list[jax.Array]:
     """How far each candidate leads when the choices after it are greedy.
 
@@ -181,6 +185,8 @@ def lookahead(
             False where by ``|y_i|^2``.
         active: (..., M) bool.
         depth: choices to look at, that candidate included; at least 1.
+        tolls: (..., M, M) what choosing j right after i costs, in logarithms; greedy
+            is then by the gain less the toll, and the values are less the tolls.
 
     Returns:
         ``depth`` arrays (..., M): the log of the factor by which the determinant grows
@@ -202,6 +208,8 @@ def lookahead(
     rest = rest & ~jnp.broadcast_to(jnp.eye(m, dtype=bool), shape)
     picked = y  # (..., M, p) the newest choice of each start, as it was when chosen
     along: list[tuple[jax.Array, jax.Array]] = []  # directions, and how far they shrink
+    every = None if tolls is None else jnp.broadcast_to(tolls, shape)
+    leave = every  # tolls from the newest choice of each start
     for _ in range(1, depth):
         size = jnp.maximum((picked * picked).sum(-1), _LEAST_GAIN)
         unit = picked * jax.lax.rsqrt(size)[..., None]
@@ -216,12 +224,19 @@ def lookahead(
             "...ip,...jp->...ij", back, y, precision=jax.lax.Precision.HIGHEST
         )
         gains = gains - inner * inner * (1.0 - keep * keep)[..., None]
-        ranked = jnp.where(rest, gains, -1.0)
-        best = jnp.argmax(ranked, axis=-1)
+        if every is None or leave is None:
+            ranked = jnp.where(rest, gains, -1.0)
+            best = jnp.argmax(ranked, axis=-1)
+            gain = jnp.maximum(ranked.max(-1), 0.0)
+            step = jnp.log(jnp.maximum(base + gain, _LEAST_GAIN))
+        else:
+            grown = jnp.log(jnp.maximum(base + gains, _LEAST_GAIN))
+            ranked = jnp.where(rest, grown - leave, -1e9)
+            best = jnp.argmax(ranked, axis=-1)
+            step = jnp.maximum(ranked.max(-1), -30.0)
+            leave = jnp.take_along_axis(every, best[..., None], axis=-2)
         which = jax.nn.one_hot(best, m, dtype=bool)
         rest = rest & ~which
-        gain = jnp.maximum(ranked.max(-1), 0.0)
-        step = jnp.log(jnp.maximum(base + gain, _LEAST_GAIN))
         values.append(jnp.where(active, values[-1] + step, -30.0))
         picked = jnp.einsum(
             "...ij,...jp->...ip",

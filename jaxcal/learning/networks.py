@@ -38,6 +38,8 @@ __all__ = [
 
 View = dict[str, jax.Array]
 
+KINDS = ("compact", "paper", "travel")
+
 _FLOOR = -8.0  # least log-volume, relative to the best, that a feature can show
 _RIDGE = 0.01  # of the mean square of a whitened coordinate, which is one
 _SHARP = 60.0  # inverse temperature of the choices that need no learning
@@ -47,7 +49,7 @@ _SHARP = 60.0  # inverse temperature of the choices that need no learning
 class NetworkConfig:
     """Which network, and its size."""
 
-    kind: str = "compact"  # "compact" or "paper"
+    kind: str = "compact"  # or "paper" or "travel"
     width: int = 32  # features a candidate (compact), hidden width (paper: 768)
     encoder_rounds: int = 3  # message rounds over the whole set, once an episode
     decoder_rounds: int = 1  # message rounds over what is left, once a decision
@@ -56,8 +58,10 @@ class NetworkConfig:
     endgame: bool = True  # the last two choices by volume alone, which is optimal
 
     def __post_init__(self) -> None:
-        if self.kind not in ("compact", "paper"):
-            raise ValueError(f"kind must be 'compact' or 'paper', got {self.kind!r}")
+        if self.kind not in KINDS:
+            raise ValueError(
+                f"kind must be one of {', '.join(KINDS)}, got {self.kind!r}"
+            )
         for name in ("width", "lookahead"):
             if getattr(self, name) < 1:
                 raise ValueError(
@@ -91,8 +95,18 @@ def _second_moments(x: jax.Array) -> jax.Array:
     )
 
 
-def _glance(y: jax.Array, spanned: bool, active: jax.Array, depth: int) -> View:
+def glance_at(
+    y: jax.Array,
+    spanned: bool,
+    active: jax.Array,
+    depth: int,
+    tolls: jax.Array | None = None,
+    entry: jax.Array | None = None,
+) -> View:
     """What the network reads of conditional vectors y (..., M, p).
+
+    ``tolls`` (..., M, M), as of ``geometry.lookahead``, and ``entry`` (..., M), the
+    toll of the first choice, are subtracted from the log-volumes where given.
 
     Returns:
         ``features`` (..., M, 13); ``moments`` (..., M, p (p + 1) / 2), scaled so that
@@ -106,7 +120,9 @@ def _glance(y: jax.Array, spanned: bool, active: jax.Array, depth: int) -> View:
     mean_square = jnp.maximum(square.sum(-1) / number, 1e-8)
     unit = y * jax.lax.rsqrt(mean_square)[..., None, None]
     moments = _second_moments(unit) * jax.lax.rsqrt(number)[..., None, None]
-    steps = geometry.lookahead(y, spanned, active, depth)
+    steps = geometry.lookahead(y, spanned, active, depth, tolls)
+    if entry is not None:
+        steps = [jnp.where(active, step - entry, -30.0) for step in steps]
     shown = [steps[min(d, depth) - 1] for d in (1, 2, 3, depth)]
     ahead = jnp.stack(shown, axis=-1)
     best = ahead.max(-2)
@@ -152,6 +168,8 @@ class _Round(nn.Module):
             moments = glance["moments"]
             total = jnp.einsum("...mf,...mw->...fw", moments, v)
             parts.append(jnp.einsum("...mf,...fw->...mw", moments, total))
+            if "near" in glance:
+                parts.append(jnp.einsum("...ij,...jw->...iw", glance["near"], v))
         number = jnp.maximum(active.sum(-2, keepdims=True), 1.0)
         mean = (u * active).sum(-2, keepdims=True) / number
         inner = nn.Dense(2 * width, name="mix")(jnp.concatenate(parts, axis=-1))
@@ -171,6 +189,8 @@ class CompactNetwork(nn.Module):
 
     config: NetworkConfig
 
+    first_trust = 0.0  # in the look-ahead, before training
+
     def setup(self) -> None:
         config = self.config
         self.embed = nn.Dense(config.width)
@@ -181,7 +201,7 @@ class CompactNetwork(nn.Module):
         self.actor = nn.Dense(
             1, use_bias=False, kernel_init=nn.initializers.orthogonal(0.1)
         )
-        self.trust = self.param("trust", nn.initializers.zeros, ())
+        self.trust = self.param("trust", nn.initializers.constant(self.first_trust), ())
         self.critic_hidden = nn.Dense(config.width)
         self.critic = nn.Dense(1, kernel_init=nn.initializers.orthogonal(0.1))
 
@@ -199,7 +219,7 @@ class CompactNetwork(nn.Module):
         """
         x, offset = geometry.whiten(candidates, usable)
         depth = min(self.config.lookahead, x.shape[-1])
-        return _glance(x, False, usable, depth) | {"x": x, "offset": offset}
+        return glance_at(x, False, usable, depth) | {"x": x, "offset": offset}
 
     def look_at(
         self, view: View, chosen: jax.Array, available: jax.Array, count: int
@@ -211,6 +231,25 @@ class CompactNetwork(nn.Module):
             chosen: (..., K) int, of which the first ``count`` are chosen, the rest -1.
             available: (..., M) bool.
             count: choices made, the same for the whole batch.
+        """
+        y, spanned, so_far, scalars, which = self.after(view, chosen, count)
+        left = chosen.shape[-1] - count
+        glance = glance_at(y, spanned, available, min(self.config.lookahead, left))
+        return glance | {
+            "which": which.sum(-2) / max(count, 1),
+            "so_far": so_far + glance["best"][..., 3],
+            "scalars": scalars,
+        }
+
+    def after(
+        self, view: View, chosen: jax.Array, count: int
+    ) -> tuple[jax.Array, bool, jax.Array, jax.Array, jax.Array]:
+        """What is left of a set after ``count`` choices.
+
+        Returns:
+            (..., M, p) conditional vectors, and whether they are those of
+            ``normalised_by``; (...,) log det(Z.T Z) so far; (..., 7) scalars of the
+            progress; (..., count, M) one-hot choices.
         """
         x = view["x"]
         p, total = x.shape[-1], chosen.shape[-1]
@@ -229,7 +268,6 @@ class CompactNetwork(nn.Module):
             ridge = _RIDGE if count < p else 0.0
             y, so_far = geometry.normalised_by(x, picked, ridge)
             spanned = True
-        glance = _glance(y, spanned, available, min(self.config.lookahead, left))
         scalars = [
             float(left == 1),
             float(left == 2),
@@ -239,13 +277,10 @@ class CompactNetwork(nn.Module):
             min(left / p, 3.0),
             float(total > p),
         ]
-        return glance | {
-            "which": which.sum(-2) / max(count, 1),
-            "so_far": view["offset"] + so_far + glance["best"][..., 3],
-            "scalars": jnp.broadcast_to(
-                jnp.asarray(scalars, x.dtype), (*so_far.shape, len(scalars))
-            ),
-        }
+        shown = jnp.broadcast_to(
+            jnp.asarray(scalars, x.dtype), (*so_far.shape, len(scalars))
+        )
+        return y, spanned, view["offset"] + so_far, shown, which
 
     def encode(self, view: View) -> jax.Array:
         """Embed a set: (..., M, width)."""
@@ -416,4 +451,8 @@ def decode(
 
 def build(config: NetworkConfig) -> Network:
     """The network a config names, as a flax module."""
+    if config.kind == "travel":
+        from jaxcal.learning.travel_network import TravelNetwork
+
+        return TravelNetwork(config)
     return CompactNetwork(config) if config.kind == "compact" else PaperNetwork(config)

@@ -12,6 +12,7 @@ from jaxcal.learning.networks import NetworkConfig
 from jaxcal.learning.ppo import PPOConfig, Task
 from jaxcal.learning.scenarios import SHAPES
 from jaxcal.learning.training import TrainConfig
+from jaxcal.learning.travel import TravelConfig
 
 __all__ = ["PRESETS", "field_names", "fields", "with_values"]
 
@@ -85,7 +86,28 @@ _PAPER = TrainConfig(
     ),
 )
 
-PRESETS = {config.preset: config for config in (_COMPACT, _GENERAL, _PAPER)}
+
+def _travel_task(num_selected: int = 4, num_candidates: int = 50, **task: Any) -> Task:
+    return Task(TravelConfig(num_candidates, num_selected), **task)
+
+
+# What ships for ``select_fastest(method="policy")``: every set has its own weight of
+# time, speeds, accelerations and start.
+_TRAVEL = TrainConfig(
+    preset="travel",
+    network=NetworkConfig(kind="travel"),
+    ppo=PPOConfig(num_episodes=300_000),
+    tasks=(
+        _travel_task(),
+        _travel_task(5, shapes=("uniform", *SHAPES)),
+        _travel_task(),
+        _travel_task(6, masked=0.3, random_starts=0.2),
+        _travel_task(shapes=SHAPES, masked=0.4, random_starts=0.2),
+        _travel_task(4, 20, shapes=("uniform", *SHAPES)),
+    ),
+)
+
+PRESETS = {config.preset: config for config in (_COMPACT, _GENERAL, _PAPER, _TRAVEL)}
 
 _PARTS = {"ppo": PPOConfig, "network": NetworkConfig, "environment": SelectionConfig}
 

@@ -22,7 +22,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.files import atomic_write
-from jaxcal.learning import checkpoint, decoding, environment, networks, ppo
+from jaxcal.learning import (
+    checkpoint,
+    decoding,
+    environment,
+    networks,
+    ppo,
+    travel,
+)
 from jaxcal.learning.networks import Network, NetworkConfig
 from jaxcal.learning.ppo import PPOConfig, Task
 
@@ -69,9 +76,11 @@ class TrainConfig:
     @staticmethod
     def from_meta(meta: dict[str, Any]) -> TrainConfig:
         """The configuration a checkpoint was trained with."""
+        timed = meta["network"]["kind"] == "travel"
+        rules = travel.TravelConfig if timed else environment.SelectionConfig
         tasks = tuple(
             Task(
-                environment=environment.SelectionConfig(**task["environment"]),
+                environment=rules(**task["environment"]),
                 shapes=tuple(task["shapes"]),
                 masked=task["masked"],
                 random_starts=task["random_starts"],

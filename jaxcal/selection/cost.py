@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +26,14 @@ from jaxcal.selection.auto import check_least_efficiency
 from jaxcal.selection.exact import solve_exact
 from jaxcal.selection.exchange import exchange_indices
 from jaxcal.selection.problem import Problem, make_problem, whole_number
+from jaxcal.travel import (
+    MOST_EXACT,
+    Motion,
+    fastest_tour,
+    improved_tour,
+    tour_seconds,
+    travel_times,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -46,7 +54,6 @@ Indices = NDArray[np.int64]
 
 METHODS = ("exact", "heuristic")
 
-MOST_EXACT = 12  # postures whose order Held and Karp find in a moment
 _EXACT_INSIDE = 7  # postures up to which the heuristic orders every trial exactly
 _CHUNK = 20_000  # nodes between looks at the clock
 _ROUNDING = 1e-12  # of log det(Z.T Z), so that the optimum itself meets its own value
@@ -54,89 +61,6 @@ _SAME_TIME = 1e-9  # seconds: two runs this close take as long
 _STARTS = 12  # of the heuristic, and then random changes of the best it found:
 _KICKS = 20
 _KICK_TRIES = 50  # swaps drawn until one keeps the determinant
-
-
-@dataclasses.dataclass(frozen=True)
-class Motion:
-    """How the device moves; in the unit of the candidates and seconds."""
-
-    speed: tuple[float, ...]  # (n,) or one for all axes, unit/s
-    acceleration: tuple[float, ...]  # likewise, unit/s^2; also the deceleration
-    settle: float = 0.0  # s at every posture, before and while measuring
-
-    def __post_init__(self) -> None:
-        for name in ("speed", "acceleration"):
-            given = numbers(name, getattr(self, name))
-            if given.ndim > 1 or not given.size or (given <= 0.0).any():
-                raise ValueError(
-                    f"{name} must be positive numbers, one or one an axis, "
-                    f"got {getattr(self, name)!r}"
-                )
-            object.__setattr__(self, name, tuple(np.atleast_1d(given).tolist()))
-        settle = numbers("settle", self.settle)
-        if settle.ndim or settle < 0.0:
-            raise ValueError(f"settle must be at least 0 seconds, got {self.settle!r}")
-
-
-def travel_times(points: ArrayLike, others: ArrayLike, motion: Motion) -> Array:
-    """Seconds from each of some postures to each of others, without settling.
-
-    An axis that moves d at speed v and acceleration a takes ``d / v + v / a``, or
-    ``2 sqrt(d / a)`` where it never reaches v (d < v^2 / a); the slowest axis counts.
-
-    Args:
-        points: (A, n).
-        others: (B, n) in the same unit.
-        motion: limits of the axes.
-
-    Returns:
-        (A, B).
-    """
-    a, b = numbers("points", points), numbers("others", others)
-    if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1]:
-        raise ValueError(
-            f"points and others must be (A, n) and (B, n), got {a.shape} and {b.shape}"
-        )
-    n = a.shape[1]
-    limits = []
-    for name in ("speed", "acceleration"):
-        value = np.asarray(getattr(motion, name))
-        if len(value) not in (1, n):
-            raise ValueError(f"motion.{name} must hold 1 or {n}, got {len(value)}")
-        limits.append(np.broadcast_to(value, (n,)))
-    speed, ramp = limits
-    way = np.abs(a[:, None] - b[None])
-    cruise = way >= speed**2 / ramp
-    seconds = np.where(cruise, way / speed + speed / ramp, 2.0 * np.sqrt(way / ramp))
-    return seconds.max(axis=2)
-
-
-def fastest_tour(times: ArrayLike, start: ArrayLike | None = None) -> tuple[Any, float]:
-    """The order of least time through all postures, ending anywhere.
-
-    Exact up to 12 postures (Held and Karp 1962); beyond that 2-opt and moving single
-    postures from each nearest-neighbour tour, which proves nothing.
-
-    Args:
-        times: (K, K) symmetric travel times.
-        start: (K,) times from where the device stands; it begins anywhere when None.
-
-    Returns:
-        (K,) order, and the seconds of travel.
-    """
-    t = numbers("times", times)
-    k = len(t)
-    if t.shape != (k, k) or not k:
-        raise ValueError(f"times must have shape (K, K), got {t.shape}")
-    begin = np.zeros(k) if start is None else numbers("start", start)
-    if begin.shape != (k,):
-        raise ValueError(f"start must have shape ({k},), got {begin.shape}")
-    if k <= MOST_EXACT:
-        return _held_karp(t, begin)
-    tours = [_improved(_nearest(t, begin, first), t, begin) for first in range(k)]
-    seconds = [_length(order, t, begin) for order in tours]
-    best = int(np.argmin(seconds))
-    return tours[best], seconds[best]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -519,7 +443,9 @@ def _shortened(task: _Task, start: Indices, wanted: float) -> tuple[Indices, flo
             if not len(enough):
                 continue
             rest = np.delete(tour, i)
-            base = _length(np.arange(len(rest)), times[np.ix_(rest, rest)], begin[rest])
+            base = tour_seconds(
+                np.arange(len(rest)), times[np.ix_(rest, rest)], begin[rest]
+            )
             estimate = base + _insertions(rest, enough, times, begin)
             moves += [
                 (float(t), int(i), int(j))
@@ -534,10 +460,10 @@ def _shortened(task: _Task, start: Indices, wanted: float) -> tuple[Indices, flo
             if len(tried) <= _EXACT_INSIDE:
                 order, length = fastest_tour(times[np.ix_(tried, tried)], begin[tried])
             else:
-                order = _improved(
+                order = improved_tour(
                     np.arange(len(tried)), times[np.ix_(tried, tried)], begin[tried]
                 )
-                length = _length(order, times[np.ix_(tried, tried)], begin[tried])
+                length = tour_seconds(order, times[np.ix_(tried, tried)], begin[tried])
             if length < seconds - _SAME_TIME:
                 tour, seconds, improved = tried[order], length, True
                 break
@@ -556,57 +482,3 @@ def _insertions(tour: Indices, new: Indices, times: Array, begin: Array) -> Arra
         - times[tour[:-1], tour[1:]][:, None]
     )
     return np.vstack([first, last, between]).min(axis=0)
-
-
-def _length(order: Any, times: Array, start: Array) -> float:
-    return float(start[order[0]] + times[order[:-1], order[1:]].sum())
-
-
-def _held_karp(times: Array, start: Array) -> tuple[Indices, float]:
-    """Best open tour by dynamic programming over subsets."""
-    k = len(times)
-    best = np.full((1 << k, k), np.inf)
-    before = np.full((1 << k, k), -1)
-    best[1 << np.arange(k), np.arange(k)] = start
-    for mask in range(1, 1 << k):
-        inside = [i for i in range(k) if mask >> i & 1]
-        if len(inside) < 2:
-            continue
-        for last in inside:
-            rest = mask & ~(1 << last)
-            reached = best[rest] + times[:, last]
-            before[mask, last] = reached.argmin()
-            best[mask, last] = reached.min()
-    mask, order = (1 << k) - 1, []
-    last = int(best[mask].argmin())
-    seconds = float(best[mask, last])
-    while last >= 0:
-        order.append(last)
-        mask, last = mask & ~(1 << last), int(before[mask, last])
-    return np.array(order[::-1]), seconds
-
-
-def _nearest(times: Array, start: Array, first: int) -> Indices:
-    order, left = [first], set(range(len(times))) - {first}
-    while left:
-        order.append(min(left, key=lambda j: times[order[-1], j]))
-        left.remove(order[-1])
-    return np.array(order)
-
-
-def _improved(order: Indices, times: Array, start: Array) -> Indices:
-    """2-opt and moves of one posture until neither shortens the tour."""
-    k = len(order)
-    length = _length(order, times, start)
-    again = True
-    while again:
-        again = False
-        for i in range(k - 1):
-            for j in range(i + 1, k):
-                flipped = np.r_[order[:i], order[i : j + 1][::-1], order[j + 1 :]]
-                moved = np.insert(np.delete(order, i), j, order[i])
-                for tried in (flipped, moved):
-                    reached = _length(tried, times, start)
-                    if reached < length - 1e-12:
-                        order, length, again = tried, reached, True
-    return order
