@@ -241,7 +241,10 @@ def test_the_figure_holds_every_point(rng):
     ("change", "message"),
     [
         ({"least_efficiency": 0.0}, r"least_efficiency must be in \(0, 1\], got 0"),
-        ({"method": "policy"}, "method must be one of exact, heuristic, got 'policy'"),
+        (
+            {"method": "magic"},
+            "method must be one of exact, heuristic, policy, lookahead, got 'magic'",
+        ),
         ({"k": 13, "method": "exact"}, "k must be at most 12 with exact, got 13"),
         ({"motion": 20.0}, "motion must be a Motion, got 20.0"),
         ({"k": 3}, "k must be at least 4"),

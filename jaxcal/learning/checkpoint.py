@@ -56,11 +56,15 @@ class Policy:
     step: int
 
 
-def default_folder() -> pathlib.Path:
-    """The checkpoint that ships: inside the installed package, or in the repository."""
+def default_folder(name: str = "default") -> pathlib.Path:
+    """A checkpoint that ships: inside the installed package, or in the repository.
+
+    Args:
+        name: "default", or "travel" for the policy that knows what time is worth.
+    """
     package = pathlib.Path(__file__).resolve().parent.parent
-    inside = package / "checkpoints" / "default"
-    return inside if inside.is_dir() else package.parent / "checkpoints" / "default"
+    inside = package / "checkpoints" / name
+    return inside if inside.is_dir() else package.parent / "checkpoints" / name
 
 
 def package_versions() -> dict[str, str]:

@@ -96,7 +96,7 @@ def _travel_task(num_selected: int = 4, num_candidates: int = 50, **task: Any) -
 _TRAVEL = TrainConfig(
     preset="travel",
     network=NetworkConfig(kind="travel"),
-    ppo=PPOConfig(num_episodes=300_000),
+    ppo=PPOConfig(num_episodes=100_000),
     tasks=(
         _travel_task(),
         _travel_task(5, shapes=("uniform", *SHAPES)),

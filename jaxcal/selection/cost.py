@@ -8,12 +8,15 @@ zero, so the travel time is a metric, which the exact search uses to cut branche
 
 ``exact`` proves the answer, for few postures (K up to about 8 of 50; it stops at a time
 limit and says so). ``heuristic`` is local search from near-optimal subsets, for any K,
-and proves nothing.
+and proves nothing. ``policy`` is a network that was trained on every weight of time
+against log det S, asked for 32 of them at once; ``lookahead`` is the rule that it
+started from, without learning.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import pathlib
 import time
 from typing import TYPE_CHECKING
 
@@ -22,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers
 from jaxcal.criteria import d_efficiency
+from jaxcal.selection import travel_policy
 from jaxcal.selection.auto import check_least_efficiency
 from jaxcal.selection.exact import solve_exact
 from jaxcal.selection.exchange import exchange_indices
@@ -52,7 +56,7 @@ __all__ = [
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-METHODS = ("exact", "heuristic")
+METHODS = ("exact", "heuristic", *travel_policy.METHODS)
 
 _EXACT_INSIDE = 7  # postures up to which the heuristic orders every trial exactly
 _CHUNK = 20_000  # nodes between looks at the clock
@@ -72,12 +76,12 @@ class FastSelection:
     travel_seconds: float
     log_det: float  # natural log det S, in the candidates' unit
     efficiency: float  # D-efficiency against ``bound``
-    least_efficiency: float  # that was asked for
+    least_efficiency: float  # that was asked for; 0 where a weight was
     proven: bool  # no subset and order with that efficiency takes less time
-    method: str  # "exact" or "heuristic"
+    method: str  # as asked for; "exact" where only the D-optimum was efficient enough
     bound: float  # log det S of the D-optimum, an upper bound on it where not proven
     bound_proven: bool  # ``bound`` is the optimum
-    nodes: int  # of the search; 0 for the heuristic
+    nodes: int  # of the exact search
     search_seconds: float  # that finding it took
 
 
@@ -86,13 +90,16 @@ def select_fastest(
     k: int = 4,
     *,
     motion: Motion,
-    least_efficiency: float = 0.95,
+    least_efficiency: float | None = None,
+    weight: float | None = None,
     start: ArrayLike | None = None,
     available: ArrayLike | None = None,
     required: ArrayLike | None = None,
     num_outputs: int | None = None,
     method: str | None = None,
     time_limit: float = 60.0,
+    num: int = 8,
+    checkpoint: str | pathlib.Path | None = None,
     seed: int = 0,
 ) -> FastSelection:
     """Subset and order of least time with a D-efficiency of ``least_efficiency``.
@@ -101,14 +108,21 @@ def select_fastest(
         candidates: (M, n) commands that could be measured, in any unit.
         k: postures to choose, distinct.
         motion: speeds and accelerations in the candidates' unit, settle time.
-        least_efficiency: in (0, 1], against the proven D-optimum.
+        least_efficiency: in (0, 1], against the proven D-optimum; 0.95 when neither
+            this nor a weight is given.
+        weight: instead of it, what a second is worth: the run with the largest
+            ``log(efficiency) - weight * seconds`` among those found ("policy" and
+            "lookahead" only).
         start: (n,) where the device stands; it begins at any posture when not given.
         available: (M,) bool, True where a candidate may be chosen.
         required: (r,) candidates that must be among the chosen.
         num_outputs: m; changes log det S, not the answer.
-        method: "exact" (k up to 12, with a proof unless the time runs out) or
-            "heuristic"; exact up to k = 8 when not given.
+        method: "exact" (k up to 12, with a proof unless the time runs out),
+            "heuristic", "policy" or "lookahead"; exact up to k = 8 when not given, the
+            heuristic above, the policy where a weight is given.
         time_limit: seconds of the exact search and of the D-optimum behind it.
+        num: first postures that policy and lookahead try for each of 32 weights.
+        checkpoint: folder of the travel policy; the one that ships when not given.
         seed: of the starts of the heuristic, which also starts exact.
 
     Returns:
@@ -117,7 +131,22 @@ def select_fastest(
     Raises:
         ValueError: naming the argument, the rule and the value.
     """
-    least_efficiency = check_least_efficiency(least_efficiency)
+    if weight is not None:
+        if least_efficiency is not None:
+            raise ValueError(
+                "weight and least_efficiency must not both be given, got "
+                f"{weight!r} and {least_efficiency!r}"
+            )
+        weight = _check_weight(weight)
+        method = "policy" if method is None else method
+        if method not in travel_policy.METHODS:
+            raise ValueError(
+                "method must be one of "
+                f"{', '.join(travel_policy.METHODS)} with a weight, got {method!r}"
+            )
+    least = check_least_efficiency(
+        0.95 if least_efficiency is None else least_efficiency
+    )
     problem = make_problem(
         candidates,
         k,
@@ -125,8 +154,11 @@ def select_fastest(
         required=required,
         num_outputs=num_outputs,
     )
-    task = _task(problem, motion, start, _method(method, problem.k), time_limit, seed)
-    return _fastest(task, least_efficiency, None)
+    method = _method(method, problem.k)
+    task = _task(
+        problem, motion, start, method, time_limit, seed, num, checkpoint, weight
+    )
+    return _fastest(task, least, None) if weight is None else _weighted(task, weight)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -151,6 +183,8 @@ def pareto_front(
     method: str | None = None,
     time_limit: float = 60.0,
     max_points: int = 200,
+    num: int = 8,
+    checkpoint: str | pathlib.Path | None = None,
     seed: int = 0,
 ) -> ParetoFront:
     """Time against D-efficiency, from ``least_efficiency`` up to the D-optimum.
@@ -158,8 +192,8 @@ def pareto_front(
     Each point is the fastest run more efficient than the point before it.
 
     Args:
-        candidates, k, motion, start, available, required, num_outputs, method, seed:
-            as in :func:`select_fastest`.
+        candidates, k, motion, start, available, required, num_outputs, method, num,
+            checkpoint, seed: as in :func:`select_fastest`.
         least_efficiency: where to cut the front off, in (0, 1].
         time_limit: seconds for each point.
         max_points: points after which to stop; the front is then not proven.
@@ -173,7 +207,8 @@ def pareto_front(
         required=required,
         num_outputs=num_outputs,
     )
-    task = _task(problem, motion, start, _method(method, problem.k), time_limit, seed)
+    method = _method(method, problem.k)
+    task = _task(problem, motion, start, method, time_limit, seed, num, checkpoint)
     points: list[FastSelection] = []
     share, above = least_efficiency, None
     complete = False
@@ -247,6 +282,7 @@ class _Task:
     optimum: Indices  # (k,) the D-optimal subset, into the pool
     bound: float  # log det S
     bound_proven: bool
+    runs: Indices | None  # (R, k) of the policy or the look-ahead, into the pool
 
     @property
     def rows(self) -> Array:
@@ -270,7 +306,11 @@ def _task(
     method: str,
     time_limit: float,
     seed: int,
+    num: int,
+    checkpoint: str | pathlib.Path | None,
+    weight: float | None = None,
 ) -> _Task:
+    num = whole_number("num", num, 1)
     if not isinstance(motion, Motion):
         raise ValueError(f"motion must be a Motion, got {motion!r}")
     limit = numbers("time_limit", time_limit, finite=False)
@@ -290,10 +330,25 @@ def _task(
     found = solve_exact(problem, deadline=time.perf_counter() + time_limit)
     position = np.full(len(problem.rows), -1)
     position[pool] = np.arange(len(pool))
+    times = travel_times(points, points, motion)
+    runs = None
+    if method in travel_policy.METHODS:
+        m = len(problem.rows)
+        between, first = np.zeros((m, m)), np.zeros(m)
+        between[np.ix_(pool, pool)], first[pool] = times, begin
+        weights = travel_policy.WEIGHTS
+        if weight is not None:
+            asked = weight * problem.num_regressors * times.mean()
+            weights = np.append(weights[1:], asked)
+        runs = position[
+            travel_policy.runs(
+                problem, between, first, method, num, checkpoint, weights
+            )
+        ]
     return _Task(
         problem=problem,
         pool=pool,
-        times=travel_times(points, points, motion),
+        times=times,
         start=begin,
         settle=float(motion.settle) * problem.k,
         method=method,
@@ -302,7 +357,15 @@ def _task(
         optimum=position[found.subsets[0]],
         bound=found.bound,
         bound_proven=found.proven,
+        runs=runs,
     )
+
+
+def _check_weight(weight: float) -> float:
+    value = numbers("weight", weight)
+    if value.ndim or value < 0.0:
+        raise ValueError(f"weight must be a number of at least 0, got {weight!r}")
+    return float(value)
 
 
 def _log_det(rows: Array, chosen: Indices) -> float:
@@ -322,11 +385,19 @@ def _fastest(task: _Task, least: float, above: float | None) -> FastSelection:
     wanted = task.bound / m - scale + p * np.log(least) - _ROUNDING
     if above is not None:
         wanted = max(wanted, above / m - scale + 1e-9)
-    chosen, seconds = _local_search(task, wanted)
-    nodes, proven = 0, False
-    if task.method == "exact":
-        value = -np.inf if chosen is None else _log_det(rows, chosen)
-        chosen, nodes, proven = _exact_search(task, wanted, chosen, seconds, value)
+    nodes, proven, method = 0, False, task.method
+    if task.runs is not None:
+        fixed = len(problem.required)
+        chosen, _ = travel_policy.completed(
+            task.runs, rows, task.times, task.start, wanted, fixed
+        )
+        if chosen is None and _log_det(rows, task.optimum) >= wanted:
+            chosen, method = task.optimum, "exact"
+    else:
+        chosen, seconds = _local_search(task, wanted)
+        if method == "exact":
+            value = -np.inf if chosen is None else _log_det(rows, chosen)
+            chosen, nodes, proven = _exact_search(task, wanted, chosen, seconds, value)
     if chosen is None:
         if above is not None:
             raise _NothingLeftError
@@ -334,18 +405,47 @@ def _fastest(task: _Task, least: float, above: float | None) -> FastSelection:
             f"least_efficiency must be reachable, got {least:g}; the optimum is only "
             "bounded within the time limit: give more time, or ask for less"
         )
+    return _selection(task, chosen, least, method, proven, nodes, begun)
+
+
+def _weighted(task: _Task, weight: float) -> FastSelection:
+    """The run of largest log efficiency less ``weight`` a second."""
+    begun = time.perf_counter()
+    p = task.problem.num_regressors
+    assert task.runs is not None
+    subsets = np.unique(np.sort(task.runs, axis=1), axis=0)
+    worth = []
+    for chosen in subsets:
+        _, travel = fastest_tour(task.times[np.ix_(chosen, chosen)], task.start[chosen])
+        worth.append(_log_det(task.rows, chosen) / p - weight * travel)
+    chosen = subsets[int(np.argmax(worth))]
+    return _selection(task, chosen, 0.0, task.method, False, 0, begun)
+
+
+def _selection(
+    task: _Task,
+    chosen: Indices,
+    least: float,
+    method: str,
+    proven: bool,
+    nodes: int,
+    begun: float,
+) -> FastSelection:
+    """A subset of the pool, in its best order and with everything to be said of it."""
+    problem = task.problem
     order, travel = fastest_tour(task.times[np.ix_(chosen, chosen)], task.start[chosen])
     indices = task.pool[chosen[order]]
     log_det = problem.log_det(indices)
+    weight = problem.num_outputs * problem.num_regressors
     return FastSelection(
         indices=indices,
         seconds=travel + task.settle,
         travel_seconds=travel,
         log_det=log_det,
-        efficiency=d_efficiency(log_det, max(task.bound, log_det), m * p),
+        efficiency=d_efficiency(log_det, max(task.bound, log_det), weight),
         least_efficiency=least,
         proven=proven and task.bound_proven,
-        method=task.method,
+        method=method,
         bound=max(task.bound, log_det),
         bound_proven=task.bound_proven,
         nodes=nodes,

@@ -19,7 +19,7 @@ from jaxcal.selection.problem import make_problems
 if TYPE_CHECKING:
     from jaxcal.learning.checkpoint import Policy
 
-__all__ = ["DECODINGS", "load_policy", "select_batch"]
+__all__ = ["DECODINGS", "load_policy", "select_batch", "to_order_one"]
 
 DECODINGS = ("greedy", "samples", "first", "exchange")
 
@@ -49,7 +49,7 @@ def load_policy(checkpoint: str | pathlib.Path | None = None) -> Policy:
     return _cached(None if checkpoint is None else str(checkpoint))
 
 
-def _to_order_one(candidates: Array, usable: NDArray[np.bool_], white: bool) -> Array:
+def to_order_one(candidates: Array, usable: NDArray[np.bool_], white: bool) -> Array:
     """Candidates about 0 with identity covariance, or per axis in [0, 1].
 
     The compact network sees only what no affine map changes: whitening in float64 first
@@ -119,7 +119,7 @@ def select_batch(
     kept = np.stack([problem.required for problem in problems])
     batch, m, _ = sets.shape
     policy = load_policy(checkpoint)
-    scaled = _to_order_one(sets, usable, white=policy.network.config.kind == "compact")
+    scaled = to_order_one(sets, usable, white=policy.network.config.kind == "compact")
     inputs = np.where(usable[..., None], scaled, 0.0).astype(np.float32)
     tries = num if decoding in ("samples", "first") else 1
     size = max(1, min(batch, _CELLS // (m * m * tries), _LARGEST_CHUNK))
