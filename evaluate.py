@@ -41,6 +41,8 @@ methods:
   greedy              the posture that adds most, K times
   exchange            Fedorov exchange with random restarts
   exact               the proven optimum
+  auto                the policy where it proves a D-efficiency of 0.999, else exact;
+                      not among the methods run by default
 
 datasets:
   dataset0 to 5       the paper's, made from --seed (200, 200,000, 1,000, 100, 100 and
@@ -91,7 +93,9 @@ def _evaluate(options: argparse.Namespace, progress: Progress) -> int:
     from jaxcal.study.report import json_document, text_table
 
     methods = check_methods([name for name in options.methods.split(",") if name])
-    if options.checkpoint and not any(method in POLICIES for method in methods):
+    if options.checkpoint and not any(
+        method in (*POLICIES, "auto") for method in methods
+    ):
         raise ValueError(
             "--checkpoint is given, but no policy is among --methods "
             f"{','.join(methods)}"

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxcal.travel import MOST_EXACT, fastest_tour
 from rig.attitude import Array
 from rig.settings import RigConfig
 
@@ -83,18 +84,21 @@ def choose(
     best = float(exact.log_det)
     if session.method == "exact" or not policy:
         return _choice(exact, best, bool(exact.proven), "")
+    if session.method == "auto":
+        extra |= {"least_efficiency": session.min_efficiency, "time_limit": limit}
     try:
         chosen = jaxcal.select(
             candidates_deg, session.k, method=session.method, **extra
         )
     except Exception as error:
-        if session.method != "policy":
+        if session.method not in ("policy", "auto"):
             raise
         # A missing or foreign checkpoint must not keep a rig from being calibrated.
         reason = " ".join(str(error).split())
         note = f"no policy could be used ({reason[:200]}); exact takes its place"
         return _choice(exact, best, bool(exact.proven), note)
-    result = _choice(chosen, best, bool(exact.proven), "")
+    reason = getattr(chosen, "reason", "")  # auto says why its answer is whose it is
+    result = _choice(chosen, best, bool(exact.proven), reason)
     if result.efficiency < session.min_efficiency:
         note = (
             f"{session.method} reached a D-efficiency of {result.efficiency:.3f}, "
@@ -116,10 +120,10 @@ def _choice(selection: Any, best: float, proven: bool, note: str) -> Choice:
 
 
 def travel_order(points_deg: Array, start_deg: Array, speeds: Array) -> list[int]:
-    """Order of least travel time: nearest neighbour, then 2-opt on the open path.
+    """Order of least travel time on an open path.
 
     The axes move at the same time, so the time between two postures is that of the
-    slowest axis.
+    slowest axis. Optimal up to 12 postures; beyond, nearest neighbour and 2-opt.
 
     Args:
         points_deg: (N, 3).
@@ -134,6 +138,9 @@ def travel_order(points_deg: Array, start_deg: Array, speeds: Array) -> list[int
         return []
     points = np.vstack([start_deg, points_deg])
     times = (np.abs(points[:, None] - points[None, :]) / speeds).max(axis=-1)
+    if count <= MOST_EXACT:
+        order, _ = fastest_tour(times[1:, 1:], times[0, 1:])
+        return [int(i) for i in order]
     path, left = [0], set(range(1, count + 1))
     while left:
         here = path[-1]

@@ -27,7 +27,7 @@ __all__ = [
     "read_settle",
 ]
 
-METHODS = ("policy", "exact", "exchange", "greedy", "random")
+METHODS = ("policy", "auto", "exact", "exchange", "greedy", "random")
 
 
 def read_bus(table: Table) -> BusSettings:

@@ -37,8 +37,10 @@ BASELINES = ("random", "greedy", "exchange", "exact")
 DECODINGS = ("greedy", "samples", "first", "exchange")
 POLICIES = ("policy", "policy:samples", "policy:first", "policy:exchange")
 DEFAULT_METHODS = (*POLICIES, *BASELINES)
+METHODS = (*DEFAULT_METHODS, "auto")
 DEFAULT_RANDOM_DRAWS = 100
 
+_LEARNED = (*POLICIES, "auto")  # what a checkpoint matters to
 _CHUNK = 250  # episodes between two reports of progress
 _CHUNK_EXACT = 50  # the slow one for k above n + 1
 _REDRAWS = 20
@@ -67,10 +69,10 @@ def check_methods(methods: Sequence[str]) -> tuple[str, ...]:
             chosen += POLICIES
         elif name == "policy:greedy":
             chosen.append("policy")
-        elif name in DEFAULT_METHODS:
+        elif name in METHODS:
             chosen.append(name)
         else:
-            known = ", ".join((*DEFAULT_METHODS, "policy:all"))
+            known = ", ".join((*METHODS, "policy:all"))
             raise ValueError(f"method must be one of {known}, got {name!r}")
     if not chosen:
         raise ValueError("methods must name at least one method, got none")
@@ -94,7 +96,7 @@ def evaluate(
     Args:
         dataset: candidate sets.
         k: postures to choose in each episode.
-        methods: names from ``DEFAULT_METHODS``.
+        methods: names from ``DEFAULT_METHODS``, or "auto".
         checkpoints: of the policy; None is the one that ships.
         num: decodings tried by ``policy:samples`` and ``policy:first``.
         random_draws: random selections an episode.
@@ -115,8 +117,10 @@ def evaluate(
     run = _Run(dataset, k, num, seed, progress or (lambda *_: None))
     found: dict[tuple[str, str | None], MethodResult] = {}
     for method in methods:
-        if method in POLICIES:
-            for checkpoint in checkpoints:
+        for checkpoint in checkpoints if method in _LEARNED else ():
+            if method == "auto":
+                found[method, checkpoint] = run.auto(checkpoint)
+            else:
                 found[method, checkpoint] = run.policy(method, checkpoint)
     random = run.random(random_draws)
     exact, reference, proven = run.exact(time_limit)
@@ -128,7 +132,7 @@ def evaluate(
     results = [
         found[method, checkpoint]
         for method in methods
-        for checkpoint in (checkpoints if method in POLICIES else (None,))
+        for checkpoint in (checkpoints if method in _LEARNED else (None,))
     ]
     return Evaluation(
         dataset=dataset,
@@ -245,6 +249,30 @@ class _Run:
         indices = np.concatenate(chosen)
         self.require_valid(label, indices)
         return self.result(method, indices[:, None], seconds / len(indices), checkpoint)
+
+    def auto(self, checkpoint: str | None) -> MethodResult:
+        """The policy where it proves good enough, else the optimum, one by one."""
+        from jaxcal.selection import select
+
+        label = "auto" if checkpoint is None else f"auto ({checkpoint})"
+        part = self.part(slice(None))
+        masks = part["available"]
+        chosen, seconds = [], 0.0
+        for cut in (slice(0, 1), *self.pieces(label)):  # the first compiles
+            for i in range(cut.start, cut.stop):
+                found = select(
+                    part["candidates"][i],
+                    self.k,
+                    "auto",
+                    available=None if masks is None else masks[i],
+                    num_outputs=self.dataset.num_outputs,
+                    seed=self.seed,
+                    checkpoint=checkpoint,
+                )
+                chosen.append(found.indices)
+                seconds += found.seconds if len(chosen) > 1 else 0.0
+        indices = np.array(chosen[1:])
+        return self.result("auto", indices[:, None], seconds / len(indices), checkpoint)
 
     def require_valid(self, label: str, indices: Indices) -> None:
         """A policy is trained, not proven: look at what it returned."""

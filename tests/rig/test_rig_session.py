@@ -337,6 +337,29 @@ def test_the_policys_place_is_taken_by_exact_when_it_is_missing_or_poor(monkeypa
         assert part in choice.note and "\n" not in choice.note
 
 
+@pytest.mark.parametrize(("least", "answers"), [(0.5, "policy"), (1.0, "exact")])
+def test_auto_lets_the_policy_answer_where_it_is_good_enough(
+    monkeypatch, least, answers
+):
+    from jaxcal.selection import policy
+
+    text = f'\n[session]\nmethod = "auto"\nmin_efficiency = {least}\n'
+    config = parse_config(fast_text(session=text))
+    candidates = draw_candidates(config)
+    degrees = np.array([config.to_deg(row) for row in candidates])
+    best = jaxcal.select(degrees, 4, method="exact")
+    # A pick that is fair, and not the optimum.
+    second = jaxcal.select(degrees, 4, method="exact", best=40).alternatives[-1]
+    monkeypatch.setattr(
+        policy, "select_batch", lambda *_, **__: np.array([second.indices])
+    )
+    choice = choose(config, degrees)
+    assert choice.method == answers
+    expected = second.log_det if answers == "policy" else best.log_det
+    assert choice.log_det == pytest.approx(expected)
+    assert "was asked for" in choice.note
+
+
 def test_travel_order_beats_the_drawn_order(rng):
     points = rng.uniform(-20, 20, size=(12, 3))
     speeds = np.array([10.0, 20.0, 5.0])
@@ -360,7 +383,11 @@ def test_travel_order_beats_the_drawn_order(rng):
         ),
     )
     points = few
-    assert seconds(travel_order(few, np.zeros(3), speeds)) <= 1.15 * seconds(best)
+    assert seconds(travel_order(few, np.zeros(3), speeds)) == pytest.approx(
+        seconds(best)
+    )
+    many = travel_order(rng.uniform(-20, 20, size=(30, 3)), np.zeros(3), speeds)
+    assert sorted(many) == list(range(30))
 
 
 # The command line
