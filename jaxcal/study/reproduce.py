@@ -80,14 +80,14 @@ def _run(options: argparse.Namespace, progress: Progress) -> int:
 
     from jaxcal.learning import cache
     from jaxcal.study.reproduction.claims import claims
-    from jaxcal.study.reproduction.exhibit import Settings
+    from jaxcal.study.reproduction.exhibit import STUDIES, Settings
 
     cache.keep_compiled_programs()
     settings = Settings(
         seed=options.seed,
         quick=options.quick,
         data=options.data,
-        studies=options.studies,
+        studies=options.studies or STUDIES,
     )
     exhibits = _exhibits(settings, progress)
     judged = claims(exhibits)
@@ -234,12 +234,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--quick", action="store_true", help="fewer episodes, draws and devices")
     add("--seed", type=_seed, default=0, metavar="S", help="of everything random; 0")
     add("--data", help="real recordings for Datasets 4 and 5", **folder)
-    add(
-        "--studies",
-        default=pathlib.Path("studies"),
-        help="kept runs; studies",
-        **folder,
-    )
+    add("--studies", help="kept runs; the repository's studies", **folder)
     add("--out", default=pathlib.Path("report"), help="of the report; report", **folder)
     add("--quiet", action="store_true", help="no progress")
     return parser.parse_args(arguments)

@@ -13,7 +13,18 @@ from typing import Any, Literal
 import numpy as np
 from matplotlib.figure import Figure
 
-__all__ = ["Claim", "Columns", "Exhibit", "Settings", "Verdict", "as_csv"]
+__all__ = [
+    "STUDIES",
+    "Claim",
+    "Columns",
+    "Exhibit",
+    "Settings",
+    "Verdict",
+    "as_csv",
+]
+
+STUDIES = pathlib.Path(__file__).resolve().parents[3] / "studies"
+"""Where the repository keeps training runs"""
 
 Columns = Mapping[str, Sequence[Any] | np.ndarray]
 Verdict = Literal["agrees", "agrees in part", "disagrees", "not comparable"]
@@ -26,7 +37,7 @@ class Settings:
     seed: int = 0
     quick: bool = False
     data: pathlib.Path | None = None  # real recordings in place of Datasets 4 and 5
-    studies: pathlib.Path = pathlib.Path("studies")  # kept training runs
+    studies: pathlib.Path = STUDIES  # kept training runs
 
     @property
     def episodes(self) -> int:
