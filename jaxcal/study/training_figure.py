@@ -97,7 +97,14 @@ def training_curves(folder: pathlib.Path | str) -> Figure:
         )
         twin.set_ylabel("mean det S / det S*")
         twin.set_ylim(0.0, 1.02)
-    right.legend(lines, [line.get_label() for line in lines], fontsize=8, frameon=False)
+    right.legend(
+        lines,
+        [line.get_label() for line in lines],
+        fontsize=8,
+        frameon=False,
+        loc="lower center",
+        bbox_to_anchor=(0.5, -0.42),  # below: two curves leave no corner free
+    )
     for axes in (left, right):
         axes.set_xlabel("training episodes (thousands)")
     for axes in (left, middle, right):
