@@ -17,10 +17,13 @@ examples:
   python train.py --episodes 20000 --seed 1 --out runs/short
   python train.py --preset general --export checkpoints/default   what ships
   python train.py --trainer brax --episodes 50000  the same task, brax's own PPO
+  srun python train.py                             all tasks of a SLURM job step
+  python train.py --coordinator host0:4711 --num-processes 2 --process-id 0   and 1
 
 A run folder holds metrics.csv, TensorBoard events and checkpoint/; measure it with
   python evaluate.py --checkpoint runs/compact
-Ctrl-C saves and stops; --resume then continues bit for bit (on the same CPU)."""
+Ctrl-C saves and stops; --resume then continues bit for bit (on the same CPU).
+All devices of all processes share each update: docs/scaling.md."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -32,7 +35,7 @@ class Parser(argparse.ArgumentParser):
 
 def parser() -> argparse.ArgumentParser:
     """Flags; those of a configuration are made from its fields."""
-    from jaxcal.learning import presets
+    from jaxcal.learning import presets, processes
 
     out = Parser(
         description=__doc__,
@@ -62,6 +65,10 @@ def parser() -> argparse.ArgumentParser:
         action="store_true",
         help="do not measure the gap to the proven optimum while training",
     )
+    out.add_argument(
+        "--devices", type=int, metavar="N", help="use so many a process; all"
+    )
+    processes.add_arguments(out)
     for title, field, skip in (
         ("optimisation", "ppo", {"num_episodes", "seed"}),
         ("network", "network", set()),
@@ -78,7 +85,18 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run; 0 when trained or stopped on request, 2 when something given was wrong."""
+    """Run; 0 when trained or stopped on request, 2 when something given was wrong.
+
+    3 where another process of the job was lost.
+    """
+    from jaxcal.learning import processes
+
+    advice = "what is saved stays: start every process again with --resume"
+    return processes.run_job("train.py", argv, lambda: alone(argv), advice)
+
+
+def alone(argv: list[str] | None) -> int:
+    """The command in this process, which may be one of several."""
     arguments = parser().parse_args(argv)
     try:
         return run(arguments)
@@ -87,15 +105,11 @@ def main(argv: list[str] | None = None) -> int:
         return 2
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Build the configuration, train, say how it went."""
-    import jax
-
+def configuration(arguments: argparse.Namespace, out: pathlib.Path) -> Any:
+    """What to train, from the flags or from the run to go on with."""
     from jaxcal.files import require_writable_folder
-    from jaxcal.learning import cache, checkpoint, networks, ppo, presets, training
-    from jaxcal.study.validation import fixed_validation
+    from jaxcal.learning import checkpoint, presets, training
 
-    cache.keep_compiled_programs()
     given = {
         name: value
         for name, value in vars(arguments).items()
@@ -103,7 +117,6 @@ def run(arguments: argparse.Namespace) -> int:
     }
     if arguments.episodes is not None:
         given["num_episodes"] = arguments.episodes
-    out = pathlib.Path(arguments.out or f"runs/{arguments.preset}")
     held = (out / "checkpoint").is_dir() and any((out / "checkpoint").iterdir())
     if arguments.resume:
         if given:
@@ -119,10 +132,37 @@ def run(arguments: argparse.Namespace) -> int:
             )
         config = presets.with_values(presets.PRESETS[arguments.preset], given)
     require_writable_folder(out)
-    stop = Stop()
+    return config
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Train, say how it went; of several processes the first speaks for all."""
+    import jax
+
+    from jaxcal.learning import cache, checkpoint, devices, networks, ppo, training
+    from jaxcal.study.validation import fixed_validation
+
+    cache.keep_compiled_programs()
     if arguments.trainer == "brax":
         if arguments.resume:
             raise ValueError("--resume works with --trainer jaxcal only")
+        if jax.process_count() > 1:
+            raise ValueError("--trainer brax works in a single process only")
+    out = pathlib.Path(arguments.out or f"runs/{arguments.preset}")
+    config = devices.on_first(lambda: configuration(arguments, out))
+    mesh = devices.make_mesh(arguments.devices)
+    devices.require_divisible(config.ppo.sets_per_minibatch, mesh)
+    if not devices.is_first():
+        training.train(
+            config,
+            out,
+            resume=arguments.resume,
+            should_stop=Stop().requested,
+            num_devices=arguments.devices,
+        )
+        return 0
+    stop = Stop()
+    if arguments.trainer == "brax":
         from jaxcal.learning import brax_ppo
 
         brax_ppo.train(config, out, print)
@@ -138,7 +178,7 @@ def run(arguments: argparse.Namespace) -> int:
         f"preset {config.preset}: {config.network.kind} network, {size:,} parameters; "
         f"choose {env.num_selected} of {env.num_candidates}; "
         f"{config.ppo.num_episodes:,} episodes, seed {config.ppo.seed}, "
-        f"on {jax.devices()[0].device_kind}; run folder {out}"
+        f"on {devices.describe(mesh)}; run folder {out}"
     )
     print(f"configuration: {dataclasses.asdict(config)}")
     validation = None if arguments.no_validation else fixed_validation(config)
@@ -155,6 +195,7 @@ def run(arguments: argparse.Namespace) -> int:
         validation=validation,
         report=show,
         should_stop=stop.requested,
+        num_devices=arguments.devices,
     )
     done = int(state.num_updates)
     if done < config.ppo.num_updates:

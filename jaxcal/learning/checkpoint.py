@@ -82,29 +82,48 @@ def package_versions() -> dict[str, str]:
 logging.getLogger("absl").setLevel(logging.ERROR)
 
 
+def _alone() -> Any:
+    """In a job of several processes, the one that asks works without the others."""
+    own = jax.process_index()
+    return ocp.options.MultiprocessingOptions(
+        primary_host=own, active_processes={own}, barrier_sync_key_prefix=str(own)
+    )
+
+
 def _manager(folder: pathlib.Path, keep: int | None, create: bool) -> Any:
+    if create:
+        folder.mkdir(parents=True, exist_ok=True)
     return ocp.CheckpointManager(
         folder.absolute(),
         options=ocp.CheckpointManagerOptions(
             max_to_keep=keep,
-            create=create,
+            create=False,
             cleanup_tmp_directories=create,
             enable_async_checkpointing=False,
             read_only=not create,
+            multiprocessing_options=_alone(),
         ),
     )
 
 
 def _plain_keys(tree: Any) -> Any:
-    """PRNG keys as the integers they are made of, which every orbax can store."""
+    """Arrays of the host, which know no device; PRNG keys as what they are made of."""
     return jax.tree.map(
-        lambda leaf: (
+        lambda leaf: np.asarray(
             jax.random.key_data(leaf)
             if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
             else leaf
         ),
         tree,
     )
+
+
+def _plain_policy(folder: pathlib.Path) -> Any:
+    """Weights as arrays of the host, whatever devices they were saved from."""
+    with ocp.StandardCheckpointer(multiprocessing_options=_alone()) as reader:
+        saved = reader.metadata(folder.absolute()).item_metadata
+        like = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), saved.tree)
+        return reader.restore(folder.absolute(), like)
 
 
 def save(
@@ -131,7 +150,10 @@ def save(
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "versions": package_versions(),
     } | meta
-    items = {"policy": ocp.args.StandardSave(params), "meta": ocp.args.JsonSave(meta)}
+    items = {
+        "policy": ocp.args.StandardSave(_plain_keys(params)),
+        "meta": ocp.args.JsonSave(meta),
+    }
     if state is not None:
         items["state"] = ocp.args.StandardSave(_plain_keys(state))
     with _manager(pathlib.Path(folder), keep, create=True) as manager:
@@ -199,10 +221,7 @@ def load(folder: str | pathlib.Path | None = None) -> Policy:
             f"checkpoint {path} names no network this jaxcal knows: {error}"
         ) from error
     try:
-        with _manager(root, None, create=False) as manager:
-            params = manager.restore(
-                step, args=ocp.args.Composite(policy=ocp.args.StandardRestore())
-            )["policy"]
+        params = jax.tree.map(jax.numpy.asarray, _plain_policy(path / "policy"))
     except Exception as error:  # orbax and tensorstore raise many kinds
         raise CheckpointError(
             f"checkpoint {path} cannot be read: its weights are damaged "
@@ -294,12 +313,13 @@ def restore(folder: str | pathlib.Path, fresh: Any) -> tuple[Any, dict[str, Any]
         raise CheckpointError(
             f"checkpoint {path} holds a policy but no training state to resume from"
         )
-    abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, _plain_keys(fresh))
     try:
         with _manager(root, None, create=False) as manager:
             plain = manager.restore(
                 step,
-                args=ocp.args.Composite(state=ocp.args.StandardRestore(abstract)),
+                args=ocp.args.Composite(
+                    state=ocp.args.StandardRestore(_plain_keys(fresh))
+                ),
             )["state"]
     except Exception as error:  # orbax and tensorstore raise many kinds
         raise CheckpointError(
@@ -308,9 +328,9 @@ def restore(folder: str | pathlib.Path, fresh: Any) -> tuple[Any, dict[str, Any]
         ) from error
     state = jax.tree.map(
         lambda new, old: (
-            jax.random.wrap_key_data(old)
+            jax.random.wrap_key_data(jax.numpy.asarray(old))
             if jax.dtypes.issubdtype(new.dtype, jax.dtypes.prng_key)
-            else old
+            else jax.numpy.asarray(old)
         ),
         fresh,
         plain,

@@ -17,8 +17,9 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from jax.sharding import Mesh
 
-from jaxcal.learning import environment, networks, scenarios, travel
+from jaxcal.learning import devices, environment, networks, scenarios, travel
 from jaxcal.learning.environment import SelectionConfig
 from jaxcal.learning.networks import Network
 
@@ -105,6 +106,11 @@ class PPOConfig:
     def num_updates(self) -> int:
         """Updates that cover the budget, rounded up."""
         return -(-self.num_episodes // self.episodes_per_update)
+
+    @property
+    def sets_per_minibatch(self) -> int:
+        """Candidate sets in a minibatch: what devices share among them."""
+        return self.episodes_per_update // self.episodes_per_set // self.num_minibatches
 
 
 @struct.dataclass
@@ -195,7 +201,12 @@ def advantages(
 
 
 def _play(
-    config: PPOConfig, task: Task, network: Network, params: Any, key: jax.Array
+    config: PPOConfig,
+    task: Task,
+    network: Network,
+    params: Any,
+    key: jax.Array,
+    mesh: Mesh | None = None,
 ) -> tuple[Rollout, dict[str, jax.Array]]:
     """Draw fresh sets and play every episode of one update."""
     env = task.environment
@@ -207,6 +218,7 @@ def _play(
     sets = jax.vmap(lambda key: rules.reset(key, env, draw))(
         jax.random.split(key_sets, num_sets)
     )
+    sets = devices.by_set(sets, mesh)
     view = rules.look(network, sets)
     memory = networks.encode(network, params, view)
     # Every episode of a set shares its candidates, their geometry and their memory.
@@ -357,19 +369,33 @@ def _loss(
 
 @functools.partial(
     jax.jit,
-    static_argnames=("config", "task", "network"),
+    static_argnames=("config", "task", "network", "mesh"),
     donate_argnames=("state",),
 )
 def update(
-    state: TrainState, config: PPOConfig, task: Task, network: Network
+    state: TrainState,
+    config: PPOConfig,
+    task: Task,
+    network: Network,
+    mesh: Mesh | None = None,
 ) -> tuple[TrainState, dict[str, jax.Array]]:
     """One update: play, then epochs of minibatches.
+
+    Over a mesh every device plays and learns from its share of the candidate sets. What
+    was played is gathered once, so that a minibatch is any of the sets, as on a single
+    device, and is cut without further communication.
+
+    Args:
+        state: from ``init``; given up.
+        config, task, network: what is trained, and how.
+        mesh: from ``devices.make_mesh``; None for one device.
 
     Returns:
         The next state, and metrics: scalars, and ``rewards`` (episodes_per_update,).
     """
     key, key_play, key_epochs = jax.random.split(state.key, 3)
-    rollout, metrics = _play(config, task, network, state.params, key_play)
+    rollout, metrics = _play(config, task, network, state.params, key_play, mesh)
+    rollout = devices.everywhere(rollout, mesh)
     progress = jnp.minimum(state.num_updates / config.num_updates, 1.0)
     bonus = config.entropy_start + progress * (
         config.entropy_end - config.entropy_start
@@ -380,7 +406,7 @@ def update(
 
     def minibatch(carry: Any, index: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
         params, average, opt_state = carry
-        batch = jax.tree.map(lambda leaf: leaf[index], rollout)
+        batch = devices.by_set(jax.tree.map(lambda leaf: leaf[index], rollout), mesh)
         grads, metrics = jax.grad(_loss, has_aux=True)(
             params, batch, bonus, config, task, network
         )
@@ -410,4 +436,4 @@ def update(
         key=key,
         num_updates=state.num_updates + 1,
     )
-    return state, metrics
+    return devices.everywhere((state, metrics), mesh)

@@ -25,6 +25,7 @@ from jaxcal.files import atomic_write
 from jaxcal.learning import (
     checkpoint,
     decoding,
+    devices,
     environment,
     networks,
     ppo,
@@ -32,6 +33,7 @@ from jaxcal.learning import (
 )
 from jaxcal.learning.networks import Network, NetworkConfig
 from jaxcal.learning.ppo import PPOConfig, Task
+from jaxcal.learning.processes import losing_a_process
 
 __all__ = ["COLUMNS", "Report", "TrainConfig", "Validation", "train"]
 
@@ -148,8 +150,12 @@ def train(
     report: Callable[[Report], None] = lambda report: None,
     should_stop: Callable[[], bool] = lambda: False,
     num_updates: int | None = None,
+    num_devices: int | None = None,
 ) -> Any:
     """Train until the budget is spent or ``should_stop`` says so, and save.
+
+    All devices take part. In a job of several processes each calls this with the same
+    configuration; the first alone touches ``folder``, validates and reports.
 
     Args:
         config: the run.
@@ -159,40 +165,45 @@ def train(
         report: called after every look at the validation set.
         should_stop: asked between updates.
         num_updates: stop after this update instead of at the end of the budget.
+        num_devices: use so many of each process; all when None.
 
     Returns:
         The ``TrainState`` after the last update.
 
     Raises:
         CheckpointError: nothing to resume from, or damaged.
+        ValueError: the devices cannot share a minibatch evenly.
         OSError: the folder cannot be written.
+        LostProcessError: another process of the job is gone.
     """
     root = pathlib.Path(folder)
-    root.mkdir(parents=True, exist_ok=True)
+    mesh = devices.make_mesh(num_devices)
+    devices.require_divisible(config.ppo.sets_per_minibatch, mesh)
+    first = devices.is_first()
     network = networks.build(config.network)
-    state = ppo.init(config.ppo, config.tasks[0], network)
-    done, before = 0, 0.0
-    recent = np.zeros(0, np.float32)
-    if resume:
-        state, meta = checkpoint.restore(root, state)
-        done, before = int(state.num_updates), float(meta["progress"]["seconds"])
-        if (root / "last_rewards.npy").exists():
-            recent = np.load(root / "last_rewards.npy")
-    table = _Table(root, done)
+    state, before, recent = devices.on_first(
+        lambda: _begin(root, config, network, resume)
+    )
+    state = devices.replicate(state, mesh)
+    done = int(state.num_updates)
+    table = _Table(root, done) if first else None
     last = config.ppo.num_updates if num_updates is None else num_updates
     begun = time.perf_counter()
     looked = saved = begun
     mark_time, mark_update = begun, done
     k = config.tasks[0].environment.num_selected
     try:
-        while done < last and not should_stop():
+        while done < last and not devices.any_process(should_stop()):
             task = config.tasks[done % len(config.tasks)]
-            state, metrics = ppo.update(state, config.ppo, task, network)
-            rewards = np.asarray(metrics.pop("rewards"))
+            with losing_a_process():
+                state, metrics = ppo.update(state, config.ppo, task, network, mesh)
+                rewards = np.asarray(metrics.pop("rewards"))
+                row = {name: float(value) for name, value in metrics.items()}
             done += 1
+            if table is None:
+                continue
             if task == config.tasks[0]:
                 recent = np.concatenate([recent, rewards])[-_LAST:]
-            row = {name: float(value) for name, value in metrics.items()}
             now = time.perf_counter()
             row |= {
                 "update": done,
@@ -202,7 +213,8 @@ def train(
             }
             look = done in (1, last) or now - looked > config.validate_every
             if look and validation is not None:
-                ratio, hits = validation.measure(network, state.average, k)
+                average = devices.local(state.average)
+                ratio, hits = validation.measure(network, average, k)
                 row |= {"ratio_to_exact": ratio, "hit_rate": hits}
             table.add(row)
             if look:
@@ -224,9 +236,26 @@ def train(
                 saved = now
                 _save(root, config, state, done, before + now - begun, recent)
     finally:
-        table.close()
-    _save(root, config, state, done, before + time.perf_counter() - begun, recent)
+        if table is not None:
+            table.close()
+    if first:
+        _save(root, config, state, done, before + time.perf_counter() - begun, recent)
     return state
+
+
+def _begin(
+    root: pathlib.Path, config: TrainConfig, network: Network, resume: bool
+) -> tuple[Any, float, np.ndarray]:
+    """The state to start from, seconds already trained, the last rewards."""
+    root.mkdir(parents=True, exist_ok=True)
+    state = ppo.init(config.ppo, config.tasks[0], network)
+    recent = np.zeros(0, np.float32)
+    if not resume:
+        return state, 0.0, recent
+    state, meta = checkpoint.restore(root, state)
+    if (root / "last_rewards.npy").exists():
+        recent = np.load(root / "last_rewards.npy")
+    return state, float(meta["progress"]["seconds"]), recent
 
 
 def _save(
@@ -246,6 +275,7 @@ def _save(
         "device": jax.devices()[0].device_kind,
     }
     meta = config.as_meta() | {"seed": config.ppo.seed, "progress": progress}
+    state = devices.local(state)
     checkpoint.save(root / "checkpoint", done, state.average, meta, state)
 
 
