@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import pathlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
@@ -59,6 +59,9 @@ examples:
       figures and report/index.html; dataset3 holds outputs, so parameters too
   python evaluate.py --methods random,greedy,exact --k 8 --episodes 100
       eight of fifty postures; loads no JAX
+  python evaluate.py --stream runs/ten_million --episodes 10000000
+      any number of episodes in constant memory; the same command goes on where it
+      stopped; under srun, or with --coordinator, many processes share the work
 """
 
 
@@ -72,6 +75,16 @@ class _Parser(argparse.ArgumentParser):
 
 def main(arguments: list[str] | None = None) -> int:
     """Evaluate, print, write; the exit code."""
+    from jaxcal.learning import processes
+
+    advice = "finished parts stay: start every process again"
+    return processes.run_job(
+        "evaluate.py", arguments, lambda: _alone(arguments), advice
+    )
+
+
+def _alone(arguments: list[str] | None) -> int:
+    """The command in this process, which may be one of several."""
     from jaxcal.study.progress import Progress
 
     options = _parse(arguments)
@@ -80,7 +93,10 @@ def main(arguments: list[str] | None = None) -> int:
         return _evaluate(options, progress)
     except KeyboardInterrupt:
         progress.clear()
-        print("evaluate.py: interrupted, nothing was written", file=sys.stderr)
+        kept = "nothing was written"
+        if options.stream is not None:
+            kept = "finished parts are kept; the same command goes on"
+        print(f"evaluate.py: interrupted, {kept}", file=sys.stderr)
         return EXIT_INTERRUPTED
     except (ValueError, OSError) as error:
         progress.clear()
@@ -90,7 +106,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _evaluate(options: argparse.Namespace, progress: Progress) -> int:
     from jaxcal.study.evaluation import POLICIES, check_methods, evaluate
-    from jaxcal.study.report import json_document, text_table
+    from jaxcal.study.report import text_table
 
     methods = check_methods([name for name in options.methods.split(",") if name])
     if options.checkpoint and not any(
@@ -101,6 +117,10 @@ def _evaluate(options: argparse.Namespace, progress: Progress) -> int:
             f"{','.join(methods)}"
         )
     _check_outputs(options)
+    if options.stream is not None:
+        return _evaluate_stream(options, methods, progress)
+    if _process()[1] > 1:
+        raise ValueError("several processes can share an evaluation with --stream only")
     checkpoints: list[str | None] = list(dict.fromkeys(options.checkpoint)) or [None]
     datasets = [
         _dataset(name, options, progress) for name in dict.fromkeys(options.dataset)
@@ -124,17 +144,95 @@ def _evaluate(options: argparse.Namespace, progress: Progress) -> int:
         if len(evaluations) > 1:
             print()
         print(text_table(evaluations[-1], many=len(checkpoints) > 1), flush=True)
-    command = ["python", "evaluate.py", *(options.arguments or [])]
     if options.report is not None:
+        command = ["python", "evaluate.py", *(options.arguments or [])]
         _write_report(options, evaluations, checkpoints, command)
-    if options.json is not None:
-        from jaxcal.files import write_text
-
-        text = json_document(evaluations, command=command, indices=options.indices)
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        write_text(options.json, text)
-        print(f"saved: {options.json}")
+    _write_json(options, evaluations)
     return EXIT_OK
+
+
+def _write_json(options: argparse.Namespace, evaluations: Sequence[Any]) -> None:
+    from jaxcal.files import write_text
+    from jaxcal.study.report import json_document
+
+    if options.json is None:
+        return
+    command = ["python", "evaluate.py", *(options.arguments or [])]
+    text = json_document(evaluations, command=command, indices=options.indices)
+    options.json.parent.mkdir(parents=True, exist_ok=True)
+    write_text(options.json, text)
+    print(f"saved: {options.json}")
+
+
+def _evaluate_stream(
+    options: argparse.Namespace, methods: tuple[str, ...], progress: Progress
+) -> int:
+    """Any number of episodes, in parts; of several processes the first prints."""
+    from jaxcal.study.report import text_table
+    from jaxcal.study.streaming import Plan, evaluate_stream, open_folder
+
+    refused = {
+        "--report": options.report is not None,
+        "--indices": options.indices,
+        "--time-limit": options.time_limit is not None,
+    }
+    for flag in [flag for flag, given in refused.items() if given]:
+        raise ValueError(f"{flag} needs every episode at once and --stream keeps none")
+    names = list(dict.fromkeys(options.dataset))
+    if len(names) > 1:
+        raise ValueError(f"--stream takes one dataset, got {', '.join(names)}")
+    if options.episodes is None:
+        raise ValueError("--stream needs --episodes")
+    checkpoints: list[str | None] = list(dict.fromkeys(options.checkpoint)) or [None]
+    plan = Plan(
+        dataset=names[0],
+        seed=options.seed,
+        k=options.k,
+        methods=methods,
+        checkpoints=tuple(checkpoints),
+        num=options.num,
+        draws=options.draws,
+    )
+    process = _process()
+    _on_first(lambda: open_folder(plan, options.stream))
+    if not (options.stream / "stream.json").exists():
+        raise ValueError(
+            f"--stream {options.stream} must be a folder that all processes see; "
+            f"process {process[0]} does not"
+        )
+    found = evaluate_stream(
+        plan,
+        options.episodes,
+        options.stream,
+        workers=options.workers,
+        process=process,
+        progress=progress,
+    )
+    progress.clear()
+    if process[0] == 0:
+        print(text_table(found, many=len(checkpoints) > 1), flush=True)
+        _write_json(options, [found])
+    return EXIT_OK
+
+
+def _process() -> tuple[int, int]:
+    """Which process this is, and of how many; one that holds no JAX is alone."""
+    if "jax" not in sys.modules:
+        return 0, 1
+    import jax
+
+    if not jax.distributed.is_initialized():
+        return 0, 1
+    return jax.process_index(), jax.process_count()
+
+
+def _on_first(function: Callable[[], None]) -> None:
+    if _process()[1] == 1:
+        function()
+        return
+    from jaxcal.learning import devices
+
+    devices.on_first(function)
 
 
 def _dataset(name: str, options: argparse.Namespace, progress: Progress) -> Dataset:
@@ -174,6 +272,10 @@ def _check_outputs(options: argparse.Namespace) -> None:
         require_writable_folder(options.json.parent)
     if options.report is not None:
         require_writable_folder(options.report)
+    if options.stream is not None:
+        require_writable_folder(options.stream)
+    elif options.workers is not None:
+        raise ValueError("--workers needs --stream")
     for folder in options.run:
         if not (folder / "metrics.csv").is_file():
             raise ValueError(f"--run {folder} holds no metrics.csv")
@@ -264,6 +366,8 @@ def _seconds(text: str) -> float:
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
+    from jaxcal.learning import processes
+
     parser = _Parser(
         prog="evaluate.py",
         description=_DESCRIPTION,
@@ -331,7 +435,20 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
         help="training runs to draw curves of; those of --checkpoint are found",
         **several,
     )
+    add(
+        "--stream",
+        type=pathlib.Path,
+        metavar="DIR",
+        help="evaluate in parts kept in DIR: any number of --episodes, resumable",
+    )
+    add(
+        "--workers",
+        type=_at_least(1),
+        metavar="N",
+        help="processes of --stream for the baselines; one a core",
+    )
     add("--quiet", action="store_true", help="no progress")
+    processes.add_arguments(parser)
     given = sys.argv[1:] if arguments is None else arguments
     options = parser.parse_args(given)
     options.arguments = given

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import hashlib
 import importlib.metadata
 import logging
 import pathlib
@@ -31,6 +32,7 @@ __all__ = [
     "Policy",
     "default_folder",
     "export",
+    "fingerprint",
     "load",
     "restore",
     "save",
@@ -230,6 +232,20 @@ def load(folder: str | pathlib.Path | None = None) -> Policy:
     network = build(config)
     _check_weights(path, params, network, meta)
     return Policy(network, params, meta, root, step)
+
+
+def fingerprint(folder: str | pathlib.Path | None = None) -> str:
+    """SHA-256 of a policy's network and weights, the same wherever it lies.
+
+    Raises:
+        CheckpointError: see ``load``.
+    """
+    policy = load(folder)
+    digest = hashlib.sha256(repr(policy.network.config).encode())
+    for keys, leaf in jax.tree_util.tree_leaves_with_path(policy.params):
+        digest.update(jax.tree_util.keystr(keys).encode())
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()
 
 
 def _check_weights(

@@ -40,6 +40,7 @@ __all__ = [
 EXIT_LOST = 3  # another process of the job is gone
 HEARTBEAT_SECONDS = 20  # silence after which a process counts as lost
 _CONNECT_SECONDS = 300  # for all processes to come together
+_LEAVE_SECONDS = 3600  # for the first to write, when the others are done
 _SAYS = "jaxcal: "  # begins the line in the log that the parent repeats
 _PARENT_SECONDS = 0.5  # between looks whether the parent lives
 
@@ -160,7 +161,10 @@ def run_job(
     def joined() -> int:
         try:
             connect(arguments)
-            return work()
+            code = work()
+            if code == 0:
+                _leave()
+            return code
         except LostProcessError as error:
             _note(f"{_SAYS}{error}")
             if _identity_pipe is None:
@@ -171,6 +175,15 @@ def run_job(
             return 2
 
     return supervise(program, joined, advice)
+
+
+def _leave() -> None:
+    """Wait for the others: whoever goes silently counts as lost."""
+    import jax
+
+    if jax.distributed.is_initialized():
+        sys.stdout.flush()
+        jax.distributed.shutdown()
 
 
 def _note(text: str) -> None:
@@ -197,6 +210,7 @@ def connect(arguments: argparse.Namespace) -> None:
             local_device_ids=local_device_ids(),
             initialization_timeout=_CONNECT_SECONDS,
             heartbeat_timeout_seconds=HEARTBEAT_SECONDS,
+            shutdown_timeout_seconds=_LEAVE_SECONDS,
         )
     except ValueError:
         if arguments.num_processes is None:

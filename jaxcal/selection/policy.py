@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import pathlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -84,8 +84,12 @@ def select_batch(
     num: int = 16,
     seed: int = 0,
     checkpoint: str | pathlib.Path | None = None,
+    chunk: int | None = None,
 ) -> NDArray[np.int64]:
     """Choose k postures for every candidate set of a batch.
+
+    The sets are cut into chunks of one size, and every device of this process takes one
+    at a time: what is chosen does not depend on how many there are.
 
     Args:
         candidates: (B, M, n) commands, none of the sets in one plane.
@@ -99,6 +103,7 @@ def select_batch(
         num: passes of "samples" and "first".
         seed: of "samples".
         checkpoint: see ``load_policy``.
+        chunk: cut after every so many sets, at least; the whole batch when None.
 
     Returns:
         (B, k) distinct indices, required ones first, then in the order of choice.
@@ -113,6 +118,8 @@ def select_batch(
         )
     if num < 1:
         raise ValueError(f"num must be at least 1, got {num}")
+    import jax
+
     problems = make_problems(candidates, k, available=available, required=required)
     sets = np.stack([problem.candidates for problem in problems])
     usable = np.stack([problem.available for problem in problems])
@@ -122,17 +129,23 @@ def select_batch(
     scaled = to_order_one(sets, usable, white=policy.network.config.kind == "compact")
     inputs = np.where(usable[..., None], scaled, 0.0).astype(np.float32)
     tries = num if decoding in ("samples", "first") else 1
-    size = max(1, min(batch, _CELLS // (m * m * tries), _LARGEST_CHUNK))
+    chunk = batch if chunk is None else chunk
+    size = max(1, min(batch, chunk, _CELLS // (m * m * tries), _LARGEST_CHUNK))
     how = "greedy" if decoding == "exchange" else decoding
-    indices = np.concatenate(
-        [
-            _choose(
-                policy, inputs[i:j], usable[i:j], kept[i:j], k, how, num, seed + i, size
-            )
-            for i in range(0, batch, size)
-            for j in [min(i + size, batch)]
+    cuts = [
+        slice(begin, min(begin + size, first + chunk, batch))
+        for first in range(0, batch, chunk)
+        for begin in range(first, min(first + chunk, batch), size)
+    ]
+    number = min(len(cuts), jax.local_device_count())
+    chosen = []
+    for begin in range(0, len(cuts), number):
+        parts = [
+            (inputs[cut], usable[cut], kept[cut], seed + cut.start)
+            for cut in cuts[begin : begin + number]
         ]
-    )
+        chosen += _choose(policy, parts, k, how, num, size, number)
+    indices = np.concatenate(chosen)
     if decoding == "exchange":
         found = zip(problems, indices, strict=True)
         indices = np.stack([exchange_from(problem, start) for problem, start in found])
@@ -141,32 +154,42 @@ def select_batch(
 
 def _choose(
     policy: Policy,
-    candidates: NDArray[np.float32],
-    free: NDArray[np.bool_],
-    kept: NDArray[np.int64],
+    parts: list[tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.int64], int]],
     k: int,
     decoding: str,
     num: int,
-    seed: int,
     size: int,
-) -> NDArray[np.int64]:
-    """One compiled call; a short last chunk is padded by repeating its first set."""
+    number: int,
+) -> list[NDArray[np.int64]]:
+    """One compiled call on so many devices, a part (candidates, free, kept, seed) each.
+
+    A short part is filled up by repeating its first set, a missing one by the first.
+    """
     import jax
 
     from jaxcal.learning import decoding as decoders
 
-    count = len(candidates)
-    fill = np.concatenate([np.arange(count), np.zeros(size - count, np.int64)])
-    indices = decoders.choose(
+    given = [parts[min(i, len(parts) - 1)] for i in range(number)]
+    fills = [np.arange(size) * (np.arange(size) < len(part[0])) for part in given]
+    candidates, free, kept = (
+        np.concatenate(
+            [part[n][fill] for part, fill in zip(given, fills, strict=True)]  # type: ignore[index]  # the first three of a part
+        )
+        for n in range(3)
+    )
+    keys = jax.numpy.stack([jax.random.key(part[3]) for part in given])
+    choose: Any = decoders.choose if number == 1 else decoders.choose_on_devices
+    indices = choose(
         policy.network,
         policy.params,
-        candidates[fill],
-        free[fill],
-        kept[fill].astype(np.int32),
-        jax.random.key(seed),
+        candidates,
+        free,
+        kept.astype(np.int32),
+        keys[0] if number == 1 else keys,
         k=k,
         num_required=kept.shape[1],
         decoding=decoding,
         num=num,
     )
-    return np.asarray(indices)[:count].astype(np.int64)
+    rows = np.asarray(indices).reshape(number, size, k).astype(np.int64)
+    return [row[: len(part[0])] for row, part in zip(rows, parts, strict=False)]

@@ -44,6 +44,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BIAS_DEG",
+    "BLOCK",
+    "DRAWN",
     "EPISODES",
     "NAMES",
     "NOISE_STD_DEG",
@@ -54,6 +56,7 @@ __all__ = [
     "Dataset",
     "chunks",
     "dataset0_robot",
+    "drawn",
     "make_dataset",
 ]
 
@@ -62,6 +65,7 @@ Mask = NDArray[np.bool_]
 Progress = Callable[[str, int, int], None]
 
 NAMES = tuple(f"dataset{number}" for number in range(6))
+DRAWN = ("dataset1", "dataset2", "dataset3")
 RECORDED = ("dataset4", "dataset5")
 NUM_CANDIDATES = 50
 SCALE = np.array([0.43, 0.71, 0.87])  # pitch, yaw, roll; Table 1 lists roll before yaw
@@ -77,7 +81,7 @@ EPISODES = {
     "dataset4": 100,
     "dataset5": 1,
 }
-_BLOCK = 1_000  # episodes that share a stream
+BLOCK = 1_000  # episodes that share a stream
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -235,15 +239,37 @@ def chunks(
 
 
 def _blocks(name: str, seed: int, total: int) -> Iterator[Dataset]:
-    for block, begin in enumerate(range(0, total, _BLOCK)):
-        count = min(_BLOCK, total - begin)
-        draw, noise = _streams(name, seed, block)
+    for begin in range(0, total, BLOCK):
+        yield drawn(name, seed, begin, min(begin + BLOCK, total))
+
+
+def drawn(name: str, seed: int, begin: int, end: int) -> Dataset:
+    """Episodes of a drawn dataset, which goes on beyond its size in the paper.
+
+    Args:
+        name: one of ``DRAWN``.
+        seed: of the streams, 0 or greater.
+        begin: the first episode, a multiple of ``BLOCK``.
+        end: one after the last.
+    """
+    parts = []
+    for first in range(begin, end, BLOCK):
+        draw, noise = _streams(name, seed, first // BLOCK)
+        count = min(BLOCK, end - first)
         candidates = uniform_candidates(draw, count, NUM_CANDIDATES, 3)
         measured = None
         if name == "dataset3":
             measured = RANGES.denormalise(candidates) * SCALE + BIAS_DEG
             measured += noise.normal(0.0, NOISE_STD_DEG, measured.shape)
-        yield Dataset(name, candidates, measured, ranges=RANGES, seed=seed)
+        parts.append((candidates, measured))
+    outputs = [measured for _, measured in parts if measured is not None]
+    return Dataset(
+        name,
+        np.concatenate([candidates for candidates, _ in parts]),
+        np.concatenate(outputs) if outputs else None,
+        ranges=RANGES,
+        seed=seed,
+    )
 
 
 def _streams(

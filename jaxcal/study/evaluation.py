@@ -25,6 +25,7 @@ __all__ = [
     "DEFAULT_RANDOM_DRAWS",
     "check_methods",
     "evaluate",
+    "evaluate_policies",
     "label_of",
 ]
 
@@ -145,6 +146,27 @@ def evaluate(
     )
 
 
+def evaluate_policies(
+    dataset: Dataset,
+    k: int,
+    policies: Sequence[tuple[str, str | None]],
+    *,
+    num: int = 16,
+    seed: int = 0,
+) -> dict[tuple[str, str | None], MethodResult]:
+    """The (method, checkpoint) rows that policies have in ``evaluate``, alone.
+
+    Args:
+        dataset, k, num, seed: see ``evaluate``.
+        policies: methods from ``POLICIES`` with their checkpoints.
+    """
+    run = _Run(dataset, k, num, seed, lambda *_: None)
+    return {
+        (method, checkpoint): run.policy(method, checkpoint)
+        for method, checkpoint in policies
+    }
+
+
 def _check(dataset: Dataset, k: int) -> None:
     from jaxcal.selection import make_problems
 
@@ -213,18 +235,22 @@ class _Run:
 
     def policy(self, method: str, checkpoint: str | None) -> MethodResult:
         """One decoding of one checkpoint."""
+        import jax
+
         from jaxcal.selection.policy import select_batch
 
         label = label_of(method, self.num)
         if checkpoint is not None:
             label = f"{label} ({checkpoint})"
-        size = min(_CHUNK, self.dataset.num_episodes)
+        count = self.dataset.num_episodes
+        chunk = min(_CHUNK, count)
+        size = min(chunk * jax.local_device_count(), -(-count // chunk) * chunk)
 
         def choose(cut: slice) -> Indices:
             part = self.part(cut)
-            count = len(part["candidates"])
+            number = len(part["candidates"])
             # A short last piece is filled up: another shape would compile again.
-            fill = np.minimum(np.arange(size), count - 1)
+            fill = np.minimum(np.arange(size), number - 1)
             part = {
                 key: None if value is None else value[fill]
                 for key, value in part.items()
@@ -235,11 +261,12 @@ class _Run:
                 num=self.num,
                 seed=self.seed + cut.start,
                 checkpoint=checkpoint,
+                chunk=chunk,
                 **part,
             )
-            return np.asarray(chosen, dtype=np.int64)[:count]
+            return np.asarray(chosen, dtype=np.int64)[:number]
 
-        self.progress(label, 0, self.dataset.num_episodes)
+        self.progress(label, 0, count)
         choose(slice(0, size))  # compiles
         chosen, seconds = [], 0.0
         for cut in self.pieces(label, size):

@@ -12,9 +12,17 @@ from importlib import metadata
 from typing import Any
 
 from jaxcal.study.parameters import parameter_names
-from jaxcal.study.results import Evaluation, MethodResult
+from jaxcal.study.results import (
+    Evaluation,
+    MethodResult,
+    StreamedEvaluation,
+    StreamedResult,
+)
+from jaxcal.study.tally import BINS_PER_UNIT
 
 __all__ = ["html_page", "json_document", "notes", "text_table", "versions"]
+
+AnyEvaluation = Evaluation | StreamedEvaluation
 
 FORMAT = "jaxcal-evaluation"
 VERSION = 1
@@ -51,7 +59,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def text_table(evaluation: Evaluation, *, many: bool = False) -> str:
+def text_table(evaluation: AnyEvaluation, *, many: bool = False) -> str:
     """One dataset as a table for the terminal.
 
     Args:
@@ -72,11 +80,11 @@ def text_table(evaluation: Evaluation, *, many: bool = False) -> str:
     return "\n".join([*lines, *(f"  {note}" for note in notes(evaluation))])
 
 
-def notes(evaluation: Evaluation) -> list[str]:
+def notes(evaluation: AnyEvaluation) -> list[str]:
     """What a reader must know beside the numbers."""
     found = []
     dataset = evaluation.dataset
-    unproven = int((~evaluation.proven).sum())
+    unproven = dataset.num_episodes - evaluation.num_proven
     if unproven:
         found.append(
             f"{unproven} of {dataset.num_episodes} optima are not proven: there det S* "
@@ -89,11 +97,19 @@ def notes(evaluation: Evaluation) -> list[str]:
             "many equations: no residual, so no estimate of the noise; a larger k "
             "leaves one"
         )
+    if isinstance(evaluation, StreamedEvaluation):
+        found.append(
+            "means and hit rates are of exact sums over all episodes; medians are read "
+            f"off a histogram of log det S with bins of 1/{BINS_PER_UNIT}"
+        )
     return found
 
 
 def json_document(
-    evaluations: Sequence[Evaluation], *, command: Sequence[str], indices: bool = False
+    evaluations: Sequence[AnyEvaluation],
+    *,
+    command: Sequence[str],
+    indices: bool = False,
 ) -> str:
     """The numbers of several evaluations; the layout is in docs/evaluation.md.
 
@@ -176,7 +192,7 @@ def file_prefix(evaluations: Sequence[Evaluation], number: int) -> str:
     return name if names.count(name) == 1 else f"{name}-{number + 1}"
 
 
-def _heading(evaluation: Evaluation) -> str:
+def _heading(evaluation: AnyEvaluation) -> str:
     dataset = evaluation.dataset
     seed = "" if dataset.seed is None else f", seed {dataset.seed}"
     return (
@@ -186,10 +202,11 @@ def _heading(evaluation: Evaluation) -> str:
     )
 
 
-def _rows(evaluation: Evaluation, many: bool) -> list[tuple[str, ...]]:
+def _rows(evaluation: AnyEvaluation, many: bool) -> list[tuple[str, ...]]:
     rows: list[tuple[str, ...]] = []
+    summary: Any = evaluation.summary
     for result in evaluation.results:
-        row = evaluation.summary(result)
+        row = summary(result)
         name = result.label
         if many and result.is_policy:
             name += f" ({_where(result)})"
@@ -210,19 +227,20 @@ def _rows(evaluation: Evaluation, many: bool) -> list[tuple[str, ...]]:
     return rows
 
 
-def _entries(evaluation: Evaluation, indices: bool) -> list[dict[str, Any]]:
+def _entries(evaluation: AnyEvaluation, indices: bool) -> list[dict[str, Any]]:
     """One entry a checkpoint, each with every baseline; one without where no policy."""
     dataset = evaluation.dataset
     policies = [result for result in evaluation.results if result.is_policy]
     checkpoints = list(dict.fromkeys(result.checkpoint for result in policies))
     entries = []
+    summary: Any = evaluation.summary
     for checkpoint in checkpoints or [None]:
         methods = {}
         for result in evaluation.results:
             if result.is_policy and result.checkpoint != checkpoint:
                 continue
-            methods[result.method] = evaluation.summary(result)
-            if indices:
+            methods[result.method] = summary(result)
+            if indices and isinstance(result, MethodResult):
                 methods[result.method]["indices"] = result.indices[:, 0].tolist()
         entry: dict[str, Any] = {
             "dataset": {
@@ -237,7 +255,7 @@ def _entries(evaluation: Evaluation, indices: bool) -> list[dict[str, Any]]:
             "k": evaluation.k,
             "seed": evaluation.seed,
             "checkpoint": (checkpoint or "default") if policies else None,
-            "proven": float(evaluation.proven.mean()),
+            "proven": evaluation.num_proven / dataset.num_episodes,
             "notes": notes(evaluation),
             "methods": methods,
         }
@@ -249,7 +267,7 @@ def _entries(evaluation: Evaluation, indices: bool) -> list[dict[str, Any]]:
     return entries
 
 
-def _where(result: MethodResult) -> str:
+def _where(result: MethodResult | StreamedResult) -> str:
     return "default" if result.checkpoint is None else result.checkpoint
 
 

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 
 from jaxcal.study.datasets import Dataset
 
-__all__ = ["Evaluation", "MethodResult"]
+__all__ = [
+    "Evaluation",
+    "MethodResult",
+    "StreamedData",
+    "StreamedEvaluation",
+    "StreamedResult",
+]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -47,6 +53,11 @@ class Evaluation:
     reference: Array  # (E,) log det S* where proven, else an upper bound on it
     proven: NDArray[np.bool_]  # (E,)
     random_log_det: Array  # (E, R) the baseline behind ratio_to_random
+
+    @property
+    def num_proven(self) -> int:
+        """Episodes whose optimum is proven."""
+        return int(self.proven.sum())
 
     @property
     def num_parameters(self) -> int:
@@ -90,6 +101,55 @@ class Evaluation:
         if result.parameters is None:
             raise ValueError(f"{self.dataset.name} holds no measured outputs")
         return np.median(result.parameters.var(axis=0), axis=0)
+
+
+@dataclasses.dataclass(frozen=True)
+class StreamedData:
+    """What is known of episodes that were never held all at once."""
+
+    name: str
+    num_episodes: int
+    num_candidates: int
+    num_inputs: int
+    num_outputs: int
+    seed: int
+    sha256: None = None
+    measured: None = None
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class StreamedResult:
+    """One method on a stream: its numbers, and no episode by itself."""
+
+    method: str
+    label: str
+    checkpoint: str | None
+    numbers: dict[str, Any]  # as in ``Evaluation.summary``
+
+    @property
+    def is_policy(self) -> bool:
+        """True where a checkpoint chose."""
+        return self.method.startswith("policy")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class StreamedEvaluation:
+    """All methods on a stream of episodes, as ``jaxcal.study.report`` shows them."""
+
+    dataset: StreamedData
+    k: int
+    seed: int
+    results: tuple[StreamedResult, ...]
+    num_proven: int
+
+    @property
+    def num_parameters(self) -> int:
+        """m (n + 1)."""
+        return self.dataset.num_outputs * (self.dataset.num_inputs + 1)
+
+    def summary(self, result: StreamedResult) -> dict[str, Any]:
+        """The numbers of one method."""
+        return {"label": result.label, **result.numbers}
 
 
 def _moments(values: Array) -> dict[str, float | None]:
