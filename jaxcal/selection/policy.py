@@ -118,14 +118,14 @@ def select_batch(
         )
     if num < 1:
         raise ValueError(f"num must be at least 1, got {num}")
-    import jax
-
     problems = make_problems(candidates, k, available=available, required=required)
     sets = np.stack([problem.candidates for problem in problems])
     usable = np.stack([problem.available for problem in problems])
     kept = np.stack([problem.required for problem in problems])
     batch, m, _ = sets.shape
     policy = load_policy(checkpoint)
+    import jax
+
     scaled = to_order_one(sets, usable, white=policy.network.config.kind == "compact")
     inputs = np.where(usable[..., None], scaled, 0.0).astype(np.float32)
     tries = num if decoding in ("samples", "first") else 1
@@ -177,7 +177,7 @@ def _choose(
         )
         for n in range(3)
     )
-    keys = jax.numpy.stack([jax.random.key(part[3]) for part in given])
+    keys = [jax.random.key(part[3]) for part in given]
     choose: Any = decoders.choose if number == 1 else decoders.choose_on_devices
     indices = choose(
         policy.network,
@@ -185,7 +185,7 @@ def _choose(
         candidates,
         free,
         kept.astype(np.int32),
-        keys[0] if number == 1 else keys,
+        keys[0] if number == 1 else jax.numpy.stack(keys),
         k=k,
         num_required=kept.shape[1],
         decoding=decoding,

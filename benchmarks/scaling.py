@@ -1,0 +1,63 @@
+"""Cost of sharing an update among devices and processes of this machine.
+
+    XLA_FLAGS=--xla_force_host_platform_device_count=8 python benchmarks/scaling.py
+
+prints, for 1, 2, 4 ... devices, seconds of wall and processor time an update. Forced
+devices share the same cores, so this measures what sharding adds, not what it gains.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import time
+
+import jax
+
+from jaxcal.learning import cache, devices, networks, ppo, presets
+
+
+def measure(preset: str, number: int, num_updates: int) -> dict[str, float]:
+    """Seconds an update on so many devices, compilation left out."""
+    config = presets.PRESETS[preset]
+    settings = dataclasses.replace(config.ppo, num_episodes=10**8)
+    network = networks.build(config.network)
+    mesh = devices.make_mesh(number)
+    devices.require_divisible(settings.sets_per_minibatch, mesh)
+    state = devices.replicate(ppo.init(settings, config.tasks[0], network), mesh)
+    for warm in (True, False):
+        wall, used = time.perf_counter(), time.process_time()
+        for _ in range(1 if warm else num_updates):
+            state, _ = ppo.update(state, settings, config.tasks[0], network, mesh)
+        jax.block_until_ready(state.num_updates)
+        wall, used = time.perf_counter() - wall, time.process_time() - used
+        if warm:
+            compiling = used
+    return {
+        "devices": number,
+        "compile_cpu_s": compiling,
+        "wall_s": wall / num_updates,
+        "cpu_s": used / num_updates,
+        "episodes_per_s": settings.episodes_per_update * num_updates / wall,
+    }
+
+
+def main() -> None:
+    """A JSON line for each number of devices."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--preset", choices=sorted(presets.PRESETS), default="compact")
+    parser.add_argument("--devices", default="1,2,4,8", help="comma separated")
+    parser.add_argument("--updates", type=int, default=10)
+    arguments = parser.parse_args()
+    cache.keep_compiled_programs()
+    for number in map(int, arguments.devices.split(",")):
+        if number <= jax.device_count():
+            print(
+                json.dumps(measure(arguments.preset, number, arguments.updates)),
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
