@@ -247,6 +247,7 @@ def test_damage_is_named(tmp_path: pathlib.Path) -> None:
     ("values", "says"),
     [
         ({"dataset": "dataset4"}, "streamed dataset must be one of .* got 'dataset4'"),
+        ({"methods": ("auto",)}, "streamed method must be one of .* got 'auto'"),
         ({"k": 3}, r"k must be in \[4, 50\), got 3"),
     ],
 )

@@ -61,6 +61,12 @@ class Plan:
                 f"a streamed dataset must be one of {', '.join(datasets.DRAWN)}, which "
                 f"are drawn from a seed without end, got {self.dataset!r}"
             )
+        for method in self.methods:
+            if method not in evaluation.DEFAULT_METHODS:
+                raise ValueError(
+                    "a streamed method must be one of "
+                    f"{', '.join(evaluation.DEFAULT_METHODS)}, got {method!r}"
+                )
         if not _NUM_AXES + 1 <= self.k < datasets.NUM_CANDIDATES:
             raise ValueError(
                 f"k must be in [{_NUM_AXES + 1}, {datasets.NUM_CANDIDATES}), "
