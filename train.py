@@ -140,7 +140,7 @@ def run(arguments: argparse.Namespace) -> int:
     import jax
 
     from jaxcal.learning import cache, checkpoint, devices, networks, ppo, training
-    from jaxcal.study.validation import fixed_validation
+    from jaxcal.study.validation import fixed_validation, teacher
 
     cache.keep_compiled_programs()
     if arguments.trainer == "brax":
@@ -159,6 +159,7 @@ def run(arguments: argparse.Namespace) -> int:
             resume=arguments.resume,
             should_stop=Stop().requested,
             num_devices=arguments.devices,
+            teacher=teacher,
         )
         return 0
     stop = Stop()
@@ -196,6 +197,7 @@ def run(arguments: argparse.Namespace) -> int:
         report=show,
         should_stop=stop.requested,
         num_devices=arguments.devices,
+        teacher=teacher,
     )
     done = int(state.num_updates)
     if done < config.ppo.num_updates:
@@ -233,11 +235,12 @@ def show(report: Any) -> None:
     """One line of progress."""
     metrics = report.metrics
     ratio, hits = metrics.get("ratio_to_exact"), metrics.get("hit_rate")
+    reward = metrics.get("reward_mean")
     print(
         f"{report.update:9,d} {report.episodes:10,d} "
         f"{report.episodes_per_second:6,.0f} "
         f"{clock(report.seconds):>9} {clock(report.eta):>9} "
-        f"{metrics['reward_mean']:8.4f} "
+        + (f"{reward:8.4f} " if reward is not None else " imitate ")
         + (f"{ratio:16.4f} {hits:12.3f}" if ratio is not None else ""),
         flush=True,
     )

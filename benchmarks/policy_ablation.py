@@ -14,8 +14,8 @@ tasks      the shipped policy on other sizes, shapes, masks, numbers of inputs a
            sets, and the better of policy and look-ahead, set by set; milliseconds a
            set, in batches, compiled code warm.
 time       milliseconds of a whole jaxcal.select call for one set, compiled code warm.
-trained    short trainings from scratch at an equal budget, one feature left out or one
-           size changed at a time (--train 0 skips them).
+trained    short trainings from scratch at an equal budget: the ways to train, and one
+           feature left out or one size changed at a time (--train 0 skips them).
 
 ratio is the mean of det S / det S*, a hit a selection whose log det(Z.T Z) is within
 1e-9 of the optimum's. The share behind counts the sets where the trained policy is
@@ -45,6 +45,7 @@ from jaxcal.learning.networks import CompactNetwork, NetworkConfig, View
 from jaxcal.regression import log_det_information
 from jaxcal.selection import exact_batch, greedy_batch, select
 from jaxcal.selection.policy import select_batch
+from jaxcal.study.validation import teacher
 
 HIT = 1e-9
 PARTS = ("unlearned", "shipped", "tasks", "time", "trained")
@@ -214,8 +215,13 @@ def all_tasks(num: int, seed: int) -> list[tuple[str, Sets]]:
     return out
 
 
+FROM_RULE = {"initial_trust": 4.0, "initial_actor": 0.05, "entropy_start": 0.002}
 TRAININGS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("full (width 32, look-ahead to the end)", {}),
+    ("imitation, then PPO, from nothing", {"imitation": 0.5}),
+    ("PPO alone, from the look-ahead", FROM_RULE),
+    ("imitation alone, from the look-ahead", FROM_RULE | {"imitation": 1.0}),
+    ("imitation, then PPO, from the look-ahead", FROM_RULE | {"imitation": 0.5}),
     ("look-ahead 3", {"lookahead": 3}),
     ("look-ahead 2", {"lookahead": 2}),
     ("look-ahead 1", {"lookahead": 1}),
@@ -242,7 +248,7 @@ def trained(
     with tempfile.TemporaryDirectory() as folder:
         run = pathlib.Path(folder) / "run"
         begun = time.perf_counter()
-        state = training.train(config, run)
+        state = training.train(config, run, teacher=teacher)
         seconds = time.perf_counter() - begun
         picked = select_batch(sets.candidates, sets.k, checkpoint=run)
     leaves = jax.tree.leaves(state.params)

@@ -56,6 +56,8 @@ class NetworkConfig:
     lookahead: int = 12  # most greedy choices ahead that a candidate's features show
     messages: bool = True  # second-moment messages sum_j v_j x_j x_j.T
     endgame: bool = True  # the last two choices by volume alone, which is optimal
+    initial_trust: float = 0.0  # in the look-ahead before learning; 1 begins with it
+    initial_actor: float = 0.1  # scale of the learned score before learning
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -189,8 +191,6 @@ class CompactNetwork(nn.Module):
 
     config: NetworkConfig
 
-    first_trust = 0.0  # in the look-ahead, before training
-
     def setup(self) -> None:
         config = self.config
         self.embed = nn.Dense(config.width)
@@ -199,9 +199,12 @@ class CompactNetwork(nn.Module):
         self.decoder = [_Round(config) for _ in range(config.decoder_rounds)]
         self.final_norm = nn.LayerNorm()
         self.actor = nn.Dense(
-            1, use_bias=False, kernel_init=nn.initializers.orthogonal(0.1)
+            1,
+            use_bias=False,
+            kernel_init=nn.initializers.orthogonal(config.initial_actor),
         )
-        self.trust = self.param("trust", nn.initializers.constant(self.first_trust), ())
+        trust = nn.initializers.constant(config.initial_trust)
+        self.trust = self.param("trust", trust, ())
         self.critic_hidden = nn.Dense(config.width)
         self.critic = nn.Dense(1, kernel_init=nn.initializers.orthogonal(0.1))
 
@@ -312,7 +315,7 @@ class CompactNetwork(nn.Module):
         for layer in self.decoder:
             g = layer(g, glance)
         g = self.final_norm(g)
-        # How far to believe the greedy look ahead is learned, from nothing.
+        # How far to believe the greedy look ahead is learned.
         logits = self.actor(g)[..., 0] + 20.0 * self.trust * glance["ahead"][..., 3]
         logits = mask_logits(logits, active)
         weight = active[..., None].astype(g.dtype)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from dataclasses import field
 from typing import Any
 
@@ -29,6 +30,7 @@ __all__ = [
     "TrainState",
     "advantages",
     "init",
+    "learn",
     "learning_rate",
     "update",
 ]
@@ -67,6 +69,7 @@ class PPOConfig:
     advantage_limit: float = 6.0  # standard deviations; a singular pick is an outlier
     max_grad_norm: float = 0.5  # global norm
     average_decay: float = 0.99  # of the averaged weights that are evaluated and kept
+    imitation: float = 0.0  # share of the updates, the first, that imitate a teacher
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -96,7 +99,7 @@ class PPOConfig:
         ):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
-        for name in ("discount", "gae_lambda", "average_decay"):
+        for name in ("discount", "gae_lambda", "average_decay", "imitation"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be in [0, 1], got {getattr(self, name)}")
         if self.seed < 0:
@@ -106,6 +109,11 @@ class PPOConfig:
     def num_updates(self) -> int:
         """Updates that cover the budget, rounded up."""
         return -(-self.num_episodes // self.episodes_per_update)
+
+    @property
+    def num_imitated(self) -> int:
+        """Updates that imitate, before the others."""
+        return round(self.imitation * self.num_updates)
 
     @property
     def sets_per_minibatch(self) -> int:
@@ -400,16 +408,44 @@ def update(
     bonus = config.entropy_start + progress * (
         config.entropy_end - config.entropy_start
     )
+
+    def loss(params: Any, batch: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
+        return _loss(params, batch, bonus, config, task, network)
+
+    state, losses = learn(state, config, rollout, loss, key_epochs, mesh)
+    state = dataclasses.replace(state, key=key)
+    return devices.everywhere((state, metrics | losses), mesh)
+
+
+def learn(
+    state: TrainState,
+    config: PPOConfig,
+    data: Any,
+    loss: Callable[[Any, Any], tuple[jax.Array, dict[str, jax.Array]]],
+    key: jax.Array,
+    mesh: Mesh | None = None,
+) -> tuple[TrainState, dict[str, jax.Array]]:
+    """Epochs of minibatches over what an update has gathered.
+
+    Args:
+        state: before the update.
+        config: the optimisation.
+        data: arrays with one leading row a candidate set.
+        loss: (parameters, rows of data) -> loss and metrics.
+        key: orders the minibatches.
+        mesh: shares each minibatch among devices.
+
+    Returns:
+        The state after the update, its key as it was; the mean of each metric.
+    """
     optimise = optimiser(config)
-    num_sets = rollout.action.shape[0]
+    num_sets = len(jax.tree.leaves(data)[0])
     size = num_sets // config.num_minibatches
 
     def minibatch(carry: Any, index: jax.Array) -> tuple[Any, dict[str, jax.Array]]:
         params, average, opt_state = carry
-        batch = devices.by_set(jax.tree.map(lambda leaf: leaf[index], rollout), mesh)
-        grads, metrics = jax.grad(_loss, has_aux=True)(
-            params, batch, bonus, config, task, network
-        )
+        batch = devices.by_set(jax.tree.map(lambda leaf: leaf[index], data), mesh)
+        grads, metrics = jax.grad(loss, has_aux=True)(params, batch)
         changes, opt_state = optimise.update(grads, opt_state, params)
         params = optax.apply_updates(params, changes)
         decay = config.average_decay
@@ -425,15 +461,15 @@ def update(
         )
 
     carry = (state.params, state.average, state.opt_state)
-    carry, losses = jax.lax.scan(
-        epoch, carry, jax.random.split(key_epochs, config.num_epochs)
+    carry, metrics = jax.lax.scan(
+        epoch, carry, jax.random.split(key, config.num_epochs)
     )
-    metrics |= {name: value.mean() for name, value in losses.items()}
-    state = TrainState(
-        params=carry[0],
-        average=carry[1],
-        opt_state=carry[2],
-        key=key,
+    params, average, opt_state = carry
+    state = dataclasses.replace(
+        state,
+        params=params,
+        average=average,
+        opt_state=opt_state,
         num_updates=state.num_updates + 1,
     )
-    return devices.everywhere((state, metrics), mesh)
+    return state, {name: value.mean() for name, value in metrics.items()}

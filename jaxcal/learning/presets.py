@@ -95,7 +95,7 @@ def _travel_task(num_selected: int = 4, num_candidates: int = 50, **task: Any) -
 # time, speeds, accelerations and start.
 _TRAVEL = TrainConfig(
     preset="travel",
-    network=NetworkConfig(kind="travel"),
+    network=NetworkConfig(kind="travel", initial_trust=0.25),
     ppo=PPOConfig(num_episodes=100_000),
     tasks=(
         _travel_task(),

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import functools
 import os
 import pathlib
 import time
@@ -27,6 +28,7 @@ from jaxcal.learning import (
     decoding,
     devices,
     environment,
+    imitation,
     networks,
     ppo,
     travel,
@@ -65,6 +67,10 @@ class TrainConfig:
     tasks: tuple[Task, ...] = field(default=(Task(),))  # update u: tasks[u % len]
     validate_every: float = 15.0  # seconds between looks at the validation set
     save_every: float = 60.0  # seconds between checkpoints
+
+    def task_of(self, update: int) -> Task:
+        """What update number ``update``, from 0, trains on."""
+        return self.tasks[update % len(self.tasks)]
 
     def as_meta(self) -> dict[str, Any]:
         """Plain JSON values; ``from_meta`` reads them back."""
@@ -151,6 +157,7 @@ def train(
     should_stop: Callable[[], bool] = lambda: False,
     num_updates: int | None = None,
     num_devices: int | None = None,
+    teacher: imitation.Teacher | None = None,
 ) -> Any:
     """Train until the budget is spent or ``should_stop`` says so, and save.
 
@@ -166,16 +173,23 @@ def train(
         should_stop: asked between updates.
         num_updates: stop after this update instead of at the end of the budget.
         num_devices: use so many of each process; all when None.
+        teacher: whom the first ``config.ppo.num_imitated`` updates imitate.
 
     Returns:
         The ``TrainState`` after the last update.
 
     Raises:
         CheckpointError: nothing to resume from, or damaged.
-        ValueError: the devices cannot share a minibatch evenly.
+        ValueError: the devices cannot share a minibatch evenly, or no teacher is given
+            where one is imitated.
         OSError: the folder cannot be written.
         LostProcessError: another process of the job is gone.
     """
+    if teacher is None and config.ppo.num_imitated:
+        raise ValueError(
+            f"teacher must be given for the {config.ppo.num_imitated} updates that "
+            "imitate, got None"
+        )
     root = pathlib.Path(folder)
     mesh = devices.make_mesh(num_devices)
     devices.require_divisible(config.ppo.sets_per_minibatch, mesh)
@@ -192,12 +206,23 @@ def train(
     looked = saved = begun
     mark_time, mark_update = begun, done
     k = config.tasks[0].environment.num_selected
+    imitated = min(config.ppo.num_imitated, last)
+    lessons = imitation.Lessons(
+        functools.partial(_lesson, config, network, teacher), imitated
+    )
     try:
         while done < last and not devices.any_process(should_stop()):
-            task = config.tasks[done % len(config.tasks)]
+            task = config.task_of(done)
             with losing_a_process():
-                state, metrics = ppo.update(state, config.ppo, task, network, mesh)
-                rewards = np.asarray(metrics.pop("rewards"))
+                if done < imitated:
+                    lesson = devices.replicate(lessons.at(done), mesh)
+                    state, metrics = imitation.update(
+                        state, lesson, config.ppo, task, network, mesh
+                    )
+                    rewards = np.zeros(0, np.float32)
+                else:
+                    state, metrics = ppo.update(state, config.ppo, task, network, mesh)
+                    rewards = np.asarray(metrics.pop("rewards"))
                 row = {name: float(value) for name, value in metrics.items()}
             done += 1
             if table is None:
@@ -236,11 +261,18 @@ def train(
                 saved = now
                 _save(root, config, state, done, before + now - begun, recent)
     finally:
+        lessons.close()
         if table is not None:
             table.close()
     if first:
         _save(root, config, state, done, before + time.perf_counter() - begun, recent)
     return state
+
+
+def _lesson(
+    config: TrainConfig, network: Network, teacher: Any, index: int
+) -> imitation.Lesson:
+    return imitation.draw(config.ppo, config.task_of(index), network, teacher, index)
 
 
 def _begin(

@@ -23,8 +23,6 @@ _MOST = 8.0  # largest toll that a feature shows
 class TravelNetwork(CompactNetwork):
     """Scores the next posture by what it adds to log det(Z.T Z) less the tolls."""
 
-    first_trust = 0.25
-
     def look(
         self,
         candidates: jax.Array,
