@@ -4,6 +4,11 @@ from __future__ import annotations
 
 import os
 import pathlib
+import signal
+
+# A shell that runs the tests in the background has SIGINT ignored, and every program
+# that a test starts and interrupts would inherit that.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # One cache of compiled programs for every test process, so subprocess tests start fast.
 _CACHE = pathlib.Path(__file__).parent.parent / ".cache" / "jax"

@@ -163,8 +163,10 @@ def test_settled_means_drives_done_and_imu_quiet():
 
 
 def test_a_shaking_device_never_settles():
+    # On a machine so busy that the phone is not heard, that is what it is told instead.
+    reason = r"did not settle.*(deviation|readings over)"
     with bench(noise_deg=1.0) as motion:
-        with pytest.raises(MotionFault, match=r"did not settle.*deviation"):
+        with pytest.raises(MotionFault, match=reason):
             motion.observer.measure(motion.positions())
 
 
