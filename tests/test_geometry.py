@@ -147,3 +147,41 @@ def test_log_det_gram_is_that_of_the_regressors(rng):
     )
     flat = jnp.asarray(points).at[..., 2].set(0.5)
     assert np.isfinite(np.asarray(geometry.log_det_gram(flat))).all()
+
+
+@pytest.mark.parametrize("spanned", [False, True])
+def test_looking_ahead_from_the_largest_gains_keeps_the_pick(rng, monkeypatch, spanned):
+    m = 120
+    points = jnp.asarray(rng.uniform(size=(2, m, 3)), jnp.float32)
+    active = jnp.ones((2, m), bool).at[:, :10].set(False)
+    x, _ = geometry.whiten(points, active)
+    full = geometry.lookahead(x, spanned, active, 4)
+    monkeypatch.setattr(geometry, "_ALL_START", 100)
+    monkeypatch.setattr(geometry, "_STARTS", 40)
+    few = geometry.lookahead(x, spanned, active, 4)
+    assert geometry.num_starts(m) == 40
+    for some, every in zip(few[1:], full[1:], strict=True):
+        looked = np.asarray(some) > -30.0
+        assert (looked.sum(-1) == 40).all()
+        assert not looked[:, :10].any()
+        np.testing.assert_allclose(some[looked], every[looked], atol=1e-5)
+    assert (few[0] == full[0]).all()
+    assert (few[-1].argmax(-1) == full[-1].argmax(-1)).all()
+
+
+def test_up_to_a_thousand_candidates_every_one_is_looked_ahead_from():
+    assert geometry.num_starts(500) == 500
+    assert geometry.num_starts(1024) == 1024
+    assert geometry.num_starts(5000) == 512
+
+
+@pytest.mark.parametrize("k", [5, 20])
+def test_log_det_gram_counts_only_the_rows_present(rng, k):
+    postures = rng.uniform(size=(3, k, 3))
+    present = np.ones((3, k), bool)
+    present[0, 4:] = False
+    found = geometry.log_det_gram(jnp.asarray(postures, jnp.float32), present)
+    for number in range(3):
+        z = np.c_[postures[number][present[number]], np.ones(present[number].sum())]
+        wanted = np.linalg.slogdet(z.T @ z)[1]
+        np.testing.assert_allclose(found[number], wanted, rtol=2e-5, atol=2e-5)

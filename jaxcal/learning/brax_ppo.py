@@ -135,6 +135,7 @@ def train(
     folder: str | pathlib.Path,
     say: Callable[[str], None],
     num_evals: int = 10,
+    watch: Callable[[int, Any], None] = lambda step, params: None,
 ) -> Any:
     """Train with ``brax.training.agents.ppo.train`` and save a checkpoint.
 
@@ -144,6 +145,7 @@ def train(
         folder: of the run.
         say: takes a line of progress.
         num_evals: how often brax reports.
+        watch: called with the step and the policy's parameters at every report.
 
     Returns:
         The policy's parameters.
@@ -185,6 +187,7 @@ def train(
             seed=config.ppo.seed,
             num_evals=num_evals,
             progress_fn=progress,
+            policy_params_fn=lambda step, _, params: watch(step, params[1]),
         )
     policy = params[1]
     meta = config.as_meta() | {

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxcal.learning import geometry
+from jaxcal.learning import geometry, randomness
 from jaxcal.learning.networks import Network, View
 from jaxcal.learning.observation import context_features
 
@@ -111,7 +111,7 @@ def uniform(
     shape = (config.num_candidates, config.num_inputs)
 
     def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        unit = jax.random.uniform(key, shape)
+        unit = randomness.uniform(key, shape)
         points = jnp.float32(lower)[None, :] + unit * jnp.float32(upper - lower)[None]
         return points, jnp.ones(shape[0], bool)
 
@@ -196,16 +196,8 @@ def step(
     done = count >= config.num_selected
     pays = (count % p == 0) | done
 
-    # Rows not chosen yet repeat the centroid of those chosen: a zero row of the centred
-    # regressor, so one shape serves every count.
-    present = chosen >= 0
-    weight = present.astype(state.candidates.dtype)[:, None]
     postures = state.candidates[jnp.maximum(chosen, 0)]
-    centroid = (postures * weight).sum(0, keepdims=True) / weight.sum()
-    filled = jnp.where(present[:, None], postures, centroid)
-    number = count.astype(filled.dtype)
-    gram = geometry.log_det_gram(filled) + jnp.log(number / config.num_selected)
-    value = config.num_outputs * gram
+    value = config.num_outputs * geometry.log_det_gram(postures, chosen >= 0)
 
     before = state.paid if config.reward_gain else jnp.zeros_like(value)
     reward = jnp.where(pays, config.reward_scale * (value - before), 0.0)

@@ -16,17 +16,25 @@ import jax.numpy as jnp
 
 __all__ = [
     "cholesky",
+    "cholesky_pivots",
     "log_det_gram",
     "log_det_lengths",
     "lookahead",
     "normalised_by",
+    "num_starts",
     "plus_ridge",
     "projected",
+    "row_dot",
+    "row_parts",
+    "row_sum",
     "solve_lower",
     "whiten",
 ]
 
 _TINY = 1e-12  # below any squared length that float32 commands in [0, 1] can show
+_ALL_START = 1024  # candidates up to which every one is looked ahead from
+_STARTS = 512  # of more candidates, those of largest gain that are
+_UNROLLED_ROWS = 16  # rows up to which sums over them are written out
 _LEAST_GAIN = 1e-5  # of a whitened vector: below it float32 shows the rounding of zero
 
 
@@ -40,18 +48,34 @@ def cholesky(matrix: jax.Array) -> jax.Array:
         (..., p, p) lower triangular.
     """
     p = matrix.shape[-1]
+    rows = [[matrix[..., i, j] for j in range(i + 1)] for i in range(p)]
+    lower = _factored(rows)
     zero = jnp.zeros_like(matrix[..., 0, 0])
-    lower = [[zero] * p for _ in range(p)]
-    for j in range(p):
-        for i in range(j, p):
-            value = matrix[..., i, j]
+    return jnp.stack(
+        [jnp.stack(row + [zero] * (p - len(row)), axis=-1) for row in lower], axis=-2
+    )
+
+
+def cholesky_pivots(rows: list[list[jax.Array]]) -> list[jax.Array]:
+    """Diagonal of the lower factor of a matrix held as rows of its lower triangle."""
+    return [row[-1] for row in _factored(rows)]
+
+
+def _factored(rows: list[list[jax.Array]]) -> list[list[jax.Array]]:
+    """Lower Cholesky factor, entry by entry; pivots are kept positive."""
+    lower: list[list[jax.Array]] = []
+    for i, row in enumerate(rows):
+        done: list[jax.Array] = []
+        for j, value in enumerate(row):
+            above = done if i == j else lower[j]
             for k in range(j):
-                value = value - lower[i][k] * lower[j][k]
+                value = value - done[k] * above[k]
             if i == j:
-                lower[i][j] = jnp.sqrt(jnp.maximum(value, _TINY))
+                done.append(jnp.sqrt(jnp.maximum(value, _TINY)))
             else:
-                lower[i][j] = value / lower[j][j]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in lower], axis=-2)
+                done.append(value / lower[j][j])
+        lower.append(done)
+    return lower
 
 
 def plus_ridge(matrix: jax.Array, ridge: float) -> jax.Array:
@@ -192,7 +216,9 @@ def lookahead(
         ``depth`` arrays (..., M): the log of the factor by which the determinant grows
         over the first 1, 2, ... choices; -30 where not active. The first is the gain.
         The second is the gain of the best pair, exactly; later ones are what greedy
-        choices reach. Cost: ``depth - 1`` products of (M, p) with (p, M).
+        choices reach. Cost: ``depth - 1`` products of (S, p) with (p, M), where
+        S = ``num_starts(M)``. Of more than 1,024 candidates only the 512 of largest
+        gain are looked ahead from; the others have -30 after the first choice.
     """
     m = y.shape[-2]
     base = 1.0 if spanned else 0.0
@@ -202,14 +228,26 @@ def lookahead(
     if depth == 1:
         return values
     # For every start i (axis -2): the gains of all j (axis -1) after its choices.
-    shape = (*square.shape[:-1], m, m)
+    number = num_starts(m)
+    shape = (*square.shape[:-1], number, m)
+    if number < m:
+        starts = jax.lax.top_k(values[0], number)[1]
+        itself = jax.nn.one_hot(starts, m, dtype=bool)
+        picked = jnp.take_along_axis(y, starts[..., None], axis=-2)
+        start_active = jnp.take_along_axis(active, starts, axis=-1)
+        reached = jnp.take_along_axis(values[0], starts, axis=-1)
+    else:
+        itself = jnp.broadcast_to(jnp.eye(m, dtype=bool), shape)
+        picked, start_active, reached = y, active, values[0]
+    # ``picked`` (..., S, p): the newest choice of each start, as it was when chosen.
     gains = jnp.broadcast_to(square[..., None, :], shape)
-    rest = jnp.broadcast_to(active[..., None, :], shape)
-    rest = rest & ~jnp.broadcast_to(jnp.eye(m, dtype=bool), shape)
-    picked = y  # (..., M, p) the newest choice of each start, as it was when chosen
+    rest = jnp.broadcast_to(active[..., None, :], shape) & ~itself
     along: list[tuple[jax.Array, jax.Array]] = []  # directions, and how far they shrink
-    every = None if tolls is None else jnp.broadcast_to(tolls, shape)
-    leave = every  # tolls from the newest choice of each start
+    every = leave = None  # leave: tolls from the newest choice of each start
+    if tolls is not None:
+        every = leave = jnp.broadcast_to(tolls, (*square.shape, m))
+        if number < m:
+            leave = jnp.take_along_axis(every, starts[..., None], axis=-2)
     for _ in range(1, depth):
         size = jnp.maximum((picked * picked).sum(-1), _LEAST_GAIN)
         unit = picked * jax.lax.rsqrt(size)[..., None]
@@ -237,7 +275,14 @@ def lookahead(
             leave = jnp.take_along_axis(every, best[..., None], axis=-2)
         which = jax.nn.one_hot(best, m, dtype=bool)
         rest = rest & ~which
-        values.append(jnp.where(active, values[-1] + step, -30.0))
+        reached = jnp.where(start_active, reached + step, -30.0)
+        if number < m:
+            nothing = jnp.full_like(values[0], -30.0)
+            values.append(
+                jnp.put_along_axis(nothing, starts, reached, axis=-1, inplace=False)
+            )
+        else:
+            values.append(reached)
         picked = jnp.einsum(
             "...ij,...jp->...ip",
             which.astype(y.dtype),
@@ -248,6 +293,16 @@ def lookahead(
             overlap = (picked * before).sum(-1) * shrink
             picked = picked - overlap[..., None] * before
     return values
+
+
+def num_starts(num_candidates: int) -> int:
+    """Candidates that ``lookahead`` looks ahead from: all of up to 1,024, else 512.
+
+    A member of the best set has a large gain of its own, so a set is found from one of
+    its members as long as that one is a start; memory and time then grow with M and not
+    with its square.
+    """
+    return num_candidates if num_candidates <= _ALL_START else _STARTS
 
 
 def log_det_lengths(chosen: jax.Array) -> jax.Array:
@@ -272,26 +327,61 @@ def log_det_lengths(chosen: jax.Array) -> jax.Array:
     return total
 
 
-def log_det_gram(postures: jax.Array, floor: float = 1e-18) -> jax.Array:
+def log_det_gram(
+    postures: jax.Array, present: jax.Array | None = None, floor: float = 1e-18
+) -> jax.Array:
     """Log-determinant of ``Z.T @ Z`` by Gram-Schmidt about the centroid.
 
     Args:
         postures: (..., K, n) commands, K > n.
+        present: (..., K) bool, the rows that count; all of them by default. At least
+            one must.
         floor: least squared column length, relative to its share before projection;
             it keeps the value finite where the postures lie in one plane.
 
     Returns:
         (...,) natural log.
     """
-    count = postures.shape[-2]
-    centred = postures - postures.mean(axis=-2, keepdims=True)
-    value = jnp.full(postures.shape[:-2], jnp.log(float(count)), postures.dtype)
-    basis: list[jax.Array] = []
+    if present is None:
+        present = jnp.ones(postures.shape[:-1], bool)
+    weight = row_parts(present.astype(postures.dtype))
+    number = row_sum(weight)
+    value = jnp.log(number)
+    basis: list[list[jax.Array]] = []
     for j in range(postures.shape[-1]):
-        v = centred[..., j]
+        column = row_parts(postures[..., j])
+        kept = [x * w for x, w in zip(column, weight, strict=True)]
+        mean = row_sum(kept) / number
+        v = [(x - mean) * w for x, w in zip(column, weight, strict=True)]
         for e in basis:
-            v = v - (v * e).sum(-1, keepdims=True) * e
-        square = (v * v).sum(-1, keepdims=True)
-        basis.append(v * jax.lax.rsqrt(jnp.maximum(square, floor)))
-        value = value + jnp.log(jnp.maximum(square[..., 0], floor))
-    return value
+            along = row_dot(v, e)
+            v = [x - along * y for x, y in zip(v, e, strict=True)]
+        square = row_dot(v, v)
+        factor = jax.lax.rsqrt(jnp.maximum(square, floor))
+        basis.append([x * factor for x in v])
+        value = value + jnp.log(jnp.maximum(square, floor))
+    return value[..., 0]
+
+
+def row_parts(column: jax.Array) -> list[jax.Array]:
+    """A column (..., K) as K arrays (..., 1) where K is small, else as it is.
+
+    A compiled loop runs over the last axis that is long: one over the batch is several
+    times faster than one over four rows, and long columns would be long programs.
+    """
+    k = column.shape[-1]
+    size = 1 if k <= _UNROLLED_ROWS else k
+    return [column[..., i : i + size] for i in range(0, k, size)]
+
+
+def row_sum(parts: list[jax.Array]) -> jax.Array:
+    """(..., 1) sum of a column held as ``row_parts``."""
+    total = parts[0]
+    for part in parts[1:]:
+        total = total + part
+    return total if total.shape[-1] == 1 else total.sum(-1, keepdims=True)
+
+
+def row_dot(a: list[jax.Array], b: list[jax.Array]) -> jax.Array:
+    """(..., 1) inner product of two columns held as ``row_parts``."""
+    return row_sum([x * y for x, y in zip(a, b, strict=True)])

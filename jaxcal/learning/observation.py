@@ -23,28 +23,39 @@ def context_features(candidates: jax.Array, chosen: jax.Array) -> jax.Array:
         regressors with a ridge of 0.01: log-determinant, trace, and the log ratio of
         the least to the largest Cholesky pivot, each scaled to order one.
     """
-    present = (chosen >= 0).astype(candidates.dtype)[..., None]
-    index = jnp.maximum(chosen, 0)[..., None]
-    postures = jnp.take_along_axis(candidates, index, axis=-2) * present
-    number = jnp.maximum(present.sum(-2), 1.0)
-    mean = postures.sum(-2) / number
-    spread = (postures - mean[..., None, :]) * present
-    variance = (spread * spread).sum(-2) / number
-    std = jnp.sqrt(jnp.where(variance > 0, variance, 1.0)) * (variance > 0)
-    z = jnp.concatenate([postures, present], axis=-1)
-    p, total = z.shape[-1], chosen.shape[-1]
-    gram = jnp.einsum("...ki,...kj->...ij", z, z)
-    gram = geometry.plus_ridge(gram, 0.01)
-    pivots = geometry.cholesky(gram)
-    pivots = jnp.log(jnp.diagonal(pivots, axis1=-2, axis2=-1))
-    trace = jnp.trace(gram, axis1=-2, axis2=-1)
-    scalars = jnp.stack(
-        [
-            present[..., 0].sum(-1) / total,
-            pivots.sum(-1) / (1.25 * p),
-            trace / (total * p),
-            (pivots.min(-1) - pivots.max(-1)) / 4.0,
-        ],
-        axis=-1,
+    row_parts, row_sum, row_dot = (
+        geometry.row_parts,
+        geometry.row_sum,
+        geometry.row_dot,
     )
-    return jnp.concatenate([mean, std, scalars], axis=-1)
+    n, total = candidates.shape[-1], chosen.shape[-1]
+    index = jnp.maximum(chosen, 0)[..., None]
+    postures = jnp.take_along_axis(candidates, index, axis=-2)
+    present = row_parts((chosen >= 0).astype(candidates.dtype))
+    rows = [row_parts(postures[..., j]) for j in range(n)]
+    rows = [[x * w for x, w in zip(row, present, strict=True)] for row in rows]
+    count = row_sum(present)
+    number = jnp.maximum(count, 1.0)
+    mean = [row_sum(row) / number for row in rows]
+    std = []
+    for row, middle in zip(rows, mean, strict=True):
+        spread = [(x - middle) * w for x, w in zip(row, present, strict=True)]
+        variance = row_dot(spread, spread) / number
+        std.append(jnp.sqrt(jnp.where(variance > 0, variance, 1.0)) * (variance > 0))
+    z = [*rows, present]
+    p = n + 1
+    gram = [[row_dot(z[i], z[j]) for j in range(i + 1)] for i in range(p)]
+    for i in range(p):
+        gram[i][i] = gram[i][i] + 0.01
+    pivots = [jnp.log(pivot) for pivot in geometry.cholesky_pivots(gram)]
+    trace = sum(gram[i][i] for i in range(p))
+    least, largest = pivots[0], pivots[0]
+    for pivot in pivots[1:]:
+        least, largest = jnp.minimum(least, pivot), jnp.maximum(largest, pivot)
+    scalars = [
+        count / total,
+        sum(pivots) / (1.25 * p),
+        trace / (total * p),
+        (least - largest) / 4.0,
+    ]
+    return jnp.concatenate([*mean, *std, *scalars], axis=-1)

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
+from jaxcal.learning import randomness
 from jaxcal.learning.environment import Candidates, SelectionConfig
 
 __all__ = ["SHAPES", "mixture"]
@@ -22,7 +23,7 @@ def _shape(name: str, key: jax.Array, m: int, n: int) -> jax.Array:
     """(M, n) candidates of one shape, about the size of the unit cube."""
     key_a, key_b, key_c = jax.random.split(key, 3)
     if name == "uniform":
-        return jax.random.uniform(key_a, (m, n))
+        return randomness.uniform(key_a, (m, n))
     if name == "gaussian":
         return jax.random.normal(key_a, (m, n))
     if name == "sphere":
@@ -78,6 +79,8 @@ def mixture(
         key_which, key_points, key_share, key_mask = jax.random.split(key, 4)
         points = jnp.stack([_shape(name, key_points, m, n) for name in unique])
         which = table[jax.random.randint(key_which, (), 0, len(shapes))]
+        if masked == 0.0:
+            return points[which].astype(jnp.float32), jnp.ones(m, bool)
         share = masked * jax.random.uniform(key_share)
         rank = jax.random.permutation(key_mask, m)
         keep = jnp.maximum((m * (1.0 - share)).astype(int), config.num_selected + 4)

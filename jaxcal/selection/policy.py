@@ -123,6 +123,8 @@ def select_batch(
     usable = np.stack([problem.available for problem in problems])
     kept = np.stack([problem.required for problem in problems])
     batch, m, _ = sets.shape
+    from jaxcal.learning.geometry import num_starts
+
     policy = load_policy(checkpoint)
     import jax
 
@@ -130,7 +132,8 @@ def select_batch(
     inputs = np.where(usable[..., None], scaled, 0.0).astype(np.float32)
     tries = num if decoding in ("samples", "first") else 1
     chunk = batch if chunk is None else chunk
-    size = max(1, min(batch, chunk, _CELLS // (m * m * tries), _LARGEST_CHUNK))
+    pairs = m * num_starts(m) * tries
+    size = max(1, min(batch, chunk, _CELLS // pairs, _LARGEST_CHUNK))
     how = "greedy" if decoding == "exchange" else decoding
     cuts = [
         slice(begin, min(begin + size, first + chunk, batch))
