@@ -2,11 +2,12 @@
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 VENV ?= .venv
+BENCH ?= .venv-bench
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help train checkpoint evaluate reproduce test test-all lint format clean
+.PHONY: help train checkpoint evaluate reproduce test test-all lint format benchmark clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -44,5 +45,15 @@ format: $(READY) ## let ruff rewrite what it can
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
+# The peers live in an environment of their own, so that they constrain nobody else.
+$(BENCH)/.ready: pyproject.toml constraints.txt constraints-bench.txt
+	@test -n "$(PYTHON)" || { echo "jaxcal needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 2; }
+	$(PYTHON) -m venv $(BENCH)
+	$(BENCH)/bin/python -m pip install --quiet -c constraints.txt -c constraints-bench.txt -e '.[dev,bench]'
+	@touch $@
+
+benchmark: $(BENCH)/.ready ## every benchmark with its peers: table, JSON, figures (about an hour; ARGS="--only steps", "--quick")
+	$(BENCH)/bin/python -m benchmarks $(ARGS)
+
 clean: ## remove the virtual environment and caches
-	rm -rf $(VENV) .cache .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(BENCH) .cache .mypy_cache .ruff_cache .pytest_cache

@@ -1,0 +1,137 @@
+"""The table, the JSON and the figures of a run of ``python -m benchmarks``."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pathlib
+from typing import Any
+
+from benchmarks.harness import Row
+from jaxcal.files import atomic_write, write_text
+
+
+def as_json(row: Row) -> dict[str, Any]:
+    """A row as plain JSON values."""
+    out = dataclasses.asdict(row)
+    for verdict, kept in zip(row.verdicts, out["verdicts"], strict=True):
+        kept["met"] = verdict.met
+    return out
+
+
+def number(value: float | None) -> str:
+    """Three figures, thousands separated."""
+    if value is None:
+        return "never"
+    if abs(value) >= 100:
+        return f"{value:,.0f}"
+    return f"{value:.3g}"
+
+
+def text(row: dict[str, Any]) -> str:
+    """A row for the terminal."""
+    out = []
+    for line in row["lines"]:
+        note = f"  ({line['note']})" if line["note"] else ""
+        out.append(
+            f"  {line['case']:<28} {line['who']:<34} "
+            f"{number(line['value']):>12} {line['unit']}{note}"
+        )
+    for verdict in row["verdicts"]:
+        out.append("  " + judged(verdict))
+    out += [f"  note: {note}" for note in row["notes"]]
+    return "\n".join(out)
+
+
+def judged(verdict: dict[str, Any]) -> str:
+    """What was wanted and what came out."""
+    sign = "at least" if verdict["larger"] else "at most"
+    met = "met" if verdict["met"] else "MISSED"
+    note = f", {verdict['note']}" if verdict["note"] else ""
+    return (
+        f"{verdict['case']}: {number(verdict['value'])} {verdict['unit']}, wanted "
+        f"{sign} {number(verdict['target'])} {verdict['unit']}: {met}{note}"
+    )
+
+
+def table(results: dict[str, dict[str, Any]]) -> str:
+    """Markdown: a part a row."""
+    out = ["# Benchmarks", "", "Written by `python -m benchmarks`."]
+    for row in results.values():
+        where = row["machine"]
+        out += ["", f"## {row['title']}", ""]
+        quick = ", QUICK: sizes too small to quote" if row["quick"] else ""
+        out += [
+            f"`python -m benchmarks --only {row['name']}`, {row['date'][:10]}, "
+            f"{where['cores']} cores ({where['processor']}), load average before "
+            f"{where['load_before']}, {row['seconds']:.0f} s{quick}.",
+            "",
+            "| case | who | figure | unit | |",
+            "|---|---|---|---|---|",
+        ]
+        for line in row["lines"]:
+            out.append(
+                f"| {line['case']} | {line['who']} | {number(line['value'])} | "
+                f"{line['unit']} | {line['note']} |"
+            )
+        if row["verdicts"]:
+            out.append("")
+        out += [f"- {judged(verdict)}" for verdict in row["verdicts"]]
+        out += [f"- {note}" for note in row["notes"]]
+    return "\n".join(out) + "\n"
+
+
+def write(folder: pathlib.Path, results: dict[str, dict[str, Any]]) -> None:
+    """Everything, each file whole or not at all."""
+    write_text(folder / "results.json", json.dumps(results, indent=1) + "\n")
+    write_text(folder / "table.md", table(results))
+    figures = {"benchmark.png": overview(results)}
+    if "scaling" in results:
+        figures["scaling.png"] = scaling(results["scaling"]["series"])
+    for name, figure in figures.items():
+        with atomic_write(folder / name) as file:
+            figure.savefig(file, format="png", dpi=130)
+
+
+def overview(results: dict[str, dict[str, Any]]) -> Any:
+    """How far every promise is kept: achieved over wanted, logarithmic."""
+    from matplotlib.figure import Figure
+
+    bars = []
+    for row in results.values():
+        for verdict in row["verdicts"]:
+            value, target = verdict["value"], verdict["target"]
+            if value is None or value <= 0:
+                continue
+            share = value / target if verdict["larger"] else target / value
+            bars.append((f"{row['name']}: {verdict['case']}", share, number(value)))
+    figure = Figure(figsize=(10, 1.2 + 0.3 * len(bars)), layout="constrained")
+    axes = figure.add_subplot()
+    for place, (_, share, shown) in enumerate(reversed(bars)):
+        colour = "tab:blue" if share >= 1.0 else "tab:red"
+        axes.barh(place, share, color=colour, height=0.6)
+        axes.text(max(share, 1.0) * 1.1, place, shown, va="center", fontsize=8)
+    axes.set_yticks(range(len(bars)), [name for name, _, _ in reversed(bars)])
+    axes.tick_params(axis="y", labelsize=8)
+    axes.axvline(1.0, color="black", linewidth=1)
+    axes.set_xscale("log")
+    axes.set_xlabel("achieved / wanted (right of the line: kept)")
+    axes.margins(x=0.15)
+    return figure
+
+
+def scaling(series: dict[str, Any]) -> Any:
+    """Seconds against size, one panel a size, the exponent in the legend."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 8), layout="constrained")
+    for place, (axis, curves) in enumerate(series.items()):
+        axes = figure.add_subplot(2, 2, place + 1)
+        for who, curve in curves.items():
+            label = f"{who}: {curve['exponent']:.2f}"
+            axes.loglog(curve["size"], curve["seconds"], marker="o", label=label)
+        axes.set_xlabel(axis)
+        axes.set_ylabel("seconds a call")
+        axes.legend(fontsize=8, title="exponent, upper half")
+        axes.grid(alpha=0.3)
+    return figure

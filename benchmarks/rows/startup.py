@@ -1,0 +1,77 @@
+"""From the command to the first result: with nothing compiled yet, and the second time.
+
+``train.py`` to its first update and ``evaluate.py`` to its first result, each as a new
+process, with empty caches and with those the first run left.
+"""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+
+from benchmarks.harness import ROOT, Budget, Line, Row, Verdict
+
+NAME = "startup"
+TITLE = "Start-up: the second run in a new process against the first"
+TARGET = 3.0
+_COMMANDS = {
+    "train.py to the first update": ["train.py", "--episodes", "2048", "--out", "OUT"],
+    "evaluate.py to the first result": [
+        "evaluate.py",
+        "--episodes",
+        "64",
+        "--methods",
+        "policy,exact",
+        "--quiet",
+    ],
+    "select, method policy": [
+        "-c",
+        "import numpy as np, jaxcal;"
+        "jaxcal.select(np.random.default_rng(0).random((50, 3)), 4)",
+    ],
+}
+
+
+def seconds_of(command: list[str], caches: str) -> float:
+    """Wall time of a command with its caches in one folder."""
+    environment = {
+        **os.environ,
+        "JAX_COMPILATION_CACHE_DIR": f"{caches}/jax",
+        "XDG_CACHE_HOME": caches,
+        "NUMBA_CACHE_DIR": f"{caches}/numba",
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        out = str(pathlib.Path(folder) / "run")
+        begun = time.perf_counter()
+        subprocess.run(
+            [sys.executable] + [out if part == "OUT" else part for part in command],
+            cwd=ROOT,
+            env=environment,
+            check=True,
+            capture_output=True,
+        )
+        return time.perf_counter() - begun
+
+
+def run(budget: Budget) -> Row:
+    row = Row(NAME, TITLE)
+    rounds = budget.pick(3, 1)
+    for name, command in _COMMANDS.items():
+        first, second = [], []
+        for _ in range(rounds):
+            with tempfile.TemporaryDirectory() as caches:
+                first.append(seconds_of(command, caches))
+                second.append(seconds_of(command, caches))
+        row.lines += [
+            Line(name, "first run, nothing compiled", statistics.median(first), "s"),
+            Line(name, "second run", statistics.median(second), "s"),
+        ]
+        ratio = statistics.median(a / b for a, b in zip(first, second, strict=True))
+        row.verdicts.append(Verdict(name, ratio, TARGET))
+    row.notes.append("a whole command with one update, the final save included")
+    return row

@@ -1,0 +1,228 @@
+"""Environment steps a second, uniformly random policy, on every core there is.
+
+A step returns the observation (210 numbers), reward and end, and an episode that ended
+begins anew with fresh candidates, everywhere. In JAX the observation is kept from being
+optimised away: each is written out and its sum is read.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from benchmarks.harness import (
+    Budget,
+    Line,
+    Row,
+    Verdict,
+    available,
+    interleaved,
+    median_ratio,
+)
+from jaxcal.learning import environment, randomness
+from jaxcal.learning.brax_env import SelectionEnv, wrap_fresh
+from jaxcal.learning.environment import SelectionConfig, SelectionState
+
+NAME = "steps"
+TITLE = "Environment steps per second, random policy"
+BATCHES = (64, 256, 1024, 4096)  # episodes in lockstep; each keeps its best
+M, K = 50, 4
+
+Run = tuple[Callable[[], Any], int]  # a call, and how many steps it makes
+
+
+def random_action(chosen: jax.Array, count: jax.Array, unit: jax.Array) -> jax.Array:
+    """Uniform among the candidates not chosen: a rank that steps over those that are.
+
+    Args:
+        chosen: (B, 4) int, -1 where nothing is chosen yet.
+        count: choices made.
+        unit: (B,) uniform in [0, 1).
+    """
+    taken = [jnp.where(chosen[:, i] < 0, M, chosen[:, i]) for i in range(K)]
+    for i, j in ((0, 1), (2, 3), (0, 2), (1, 3), (1, 2)):  # sorts four numbers
+        low, high = jnp.minimum(taken[i], taken[j]), jnp.maximum(taken[i], taken[j])
+        taken[i], taken[j] = low, high
+    action = jnp.floor(unit * (M - count)).astype(jnp.int32)
+    for index in taken:
+        action = action + (action >= index)
+    return action
+
+
+def read(observation: jax.Array) -> jax.Array:
+    """The sum of an observation that has really been written out."""
+    return jax.lax.optimization_barrier(observation).sum()
+
+
+def ours(batch: int, episodes: int) -> Run:
+    """jaxcal's functions, vmapped: an episode is a reset and four steps."""
+    config = SelectionConfig()
+    see = jax.vmap(lambda state: environment.observe(state, config))
+    move = jax.vmap(lambda state, action: environment.step(state, action, config))
+
+    def episode(carry: Any, _: None) -> tuple[Any, None]:
+        keys, total = carry
+        states: SelectionState = jax.vmap(lambda k: environment.reset(k, config))(keys)
+        units = jax.vmap(lambda k: randomness.uniform(k, (K,)))(states.key)
+        for step in range(K):
+            action = random_action(states.chosen, step, units[:, step])
+            states, reward, _ = move(states, action)
+            total = total + reward.sum() + read(see(states))
+        keys = jax.vmap(lambda k: jax.random.fold_in(k, 1))(states.key)
+        return (keys, total), None
+
+    @jax.jit
+    def run(keys: jax.Array) -> jax.Array:
+        return jax.lax.scan(episode, (keys, jnp.zeros(())), None, episodes)[0][1]
+
+    keys = jax.random.split(jax.random.key(0), batch)
+    return lambda: run(keys).block_until_ready(), batch * K * episodes
+
+
+def through_brax(batch: int, episodes: int) -> Run:
+    """The same environment behind brax's wrappers, as brax's trainers step it."""
+    config = SelectionConfig()
+    env = wrap_fresh(SelectionEnv(config), episode_length=K)
+
+    def step(carry: Any, units: jax.Array) -> tuple[Any, None]:
+        state, total = carry
+        inner = state.pipeline_state
+        action = random_action(inner.chosen, inner.count, units)
+        state = env.step(state, action)
+        return (state, total + state.reward.sum() + read(state.obs)), None
+
+    @jax.jit
+    def run(key: jax.Array) -> jax.Array:
+        key_reset, key_act = jax.random.split(key)
+        state = env.reset(jax.random.split(key_reset, batch))
+        units = randomness.uniform(key_act, (episodes * K, batch))
+        return jax.lax.scan(step, (state, jnp.zeros(())), units)[0][1]
+
+    key = jax.random.PRNGKey(0)
+    return lambda: run(key).block_until_ready(), batch * K * episodes
+
+
+def by_numpy(batch: int, episodes: int) -> Run:
+    from benchmarks.peers.environments import SelectionNumpy
+
+    env = SelectionNumpy(batch)
+
+    def run() -> None:
+        for _ in range(episodes):
+            env.reset()
+            done = False
+            while not done:
+                _, _, done = env.step(env.random_action())
+
+    return run, batch * K * episodes
+
+
+def by_gymnasium(batch: int, episodes: int) -> Run:
+    """SyncVectorEnv, which resets what ended by itself (one more call an episode)."""
+    import gymnasium
+
+    from benchmarks.peers.environments import SelectionGym
+
+    env = gymnasium.vector.SyncVectorEnv(
+        [SelectionGym] * batch,
+        autoreset_mode=gymnasium.vector.AutoresetMode.SAME_STEP,
+    )
+    rng = np.random.default_rng(0)
+
+    def run() -> None:
+        observation, _ = env.reset(seed=0)
+        for _ in range(episodes * K):
+            free = observation[:, 150:200] > 0
+            rank = np.floor(rng.random(batch) * free.sum(1)).astype(int)
+            action = np.argmax(np.cumsum(free, 1) > rank[:, None], axis=1)
+            observation, *_ = env.step(action)
+
+    return run, batch * K * episodes
+
+
+def add_floor(row: Row, rate: float) -> None:
+    """What no implementation avoids, and which share of it is reached.
+
+    Bytes: an observation written and read, a fourth of the candidates written. Numbers:
+    a fourth of 150 of Threefry's, 114 integer operations each, against the same hash
+    alone in one long pass.
+    """
+    count = 3_000_000
+    source = np.zeros(count * 4, np.float32)
+    target = np.empty_like(source)
+    numbers = jax.jit(lambda key: randomness.uniform(key, (count,)).sum())
+    key = jax.random.key(0)
+    seconds = interleaved(
+        {
+            "copy": lambda: np.copyto(target, source),
+            "hash": lambda: numbers(key).block_until_ready(),
+        },
+        5,
+    )
+    bandwidth = 2 * source.nbytes / min(seconds["copy"])
+    bytes_a_step = 2 * 4 * 210 + 600 / K
+    by_memory = bytes_a_step / bandwidth
+    by_hash = 150 / K * min(seconds["hash"]) / count
+    floor = by_memory + by_hash
+    row.lines += [
+        Line("floor", "bytes a step", bytes_a_step, "B"),
+        Line("floor", "copying here, one core", bandwidth / 1e9, "GB/s"),
+        Line("floor", "those bytes", 1e9 * by_memory, "ns/step"),
+        Line("floor", "random numbers of a step", 1e9 * by_hash, "ns/step"),
+        Line("floor", "share reached by jaxcal", floor * rate, "of the floor's speed"),
+    ]
+
+
+def run(budget: Budget) -> Row:
+    row = Row(NAME, TITLE)
+    makers: dict[str, tuple[Callable[[int, int], Run], int, tuple[int, ...]]] = {
+        "jaxcal": (ours, 400_000, BATCHES),
+        "jaxcal through brax's wrappers": (through_brax, 200_000, BATCHES),
+        "NumPy, vectorised by hand": (by_numpy, 200_000, BATCHES),
+    }
+    if available("gymnasium"):
+        makers["Gymnasium SyncVectorEnv"] = (by_gymnasium, 4_000, (16, 64))
+    if budget.quick:
+        makers = {k: (f, n // 20, (256,)) for k, (f, n, _) in makers.items()}
+    rounds = budget.pick(5, 2)
+    best: dict[str, tuple[float, int, list[float], int]] = {}
+    runs = {
+        (name, batch): maker(batch, max(1, steps // (K * batch)))
+        for name, (maker, steps, batches) in makers.items()
+        for batch in batches
+    }
+    times = interleaved(
+        {f"{n}|{b}": call for (n, b), (call, _) in runs.items()}, rounds
+    )
+    for (name, batch), (_, steps) in runs.items():
+        seconds = times[f"{name}|{batch}"]
+        rate = steps / statistics.median(seconds)
+        if name not in best or rate > best[name][0]:
+            best[name] = (rate, batch, seconds, steps)
+    for name, (rate, batch, _, _) in best.items():
+        row.lines.append(
+            Line(
+                "M = 50, K = 4", name, rate, "steps/s", f"{batch} episodes in lockstep"
+            )
+        )
+    add_floor(row, best["jaxcal"][0])
+    _, _, seconds, steps = best["jaxcal"]
+    own = [s / steps for s in seconds]
+    targets = {
+        "Gymnasium SyncVectorEnv": 50.0,
+        "NumPy, vectorised by hand": 2.0,
+        "jaxcal through brax's wrappers": 1.0,
+    }
+    for name, target in targets.items():
+        if name not in best:
+            row.notes.append(f"{name} is not installed: not measured")
+            continue
+        _, _, seconds, steps = best[name]
+        peer = [s / steps for s in seconds]
+        row.verdicts.append(Verdict(f"against {name}", median_ratio(peer, own), target))
+    return row

@@ -1,0 +1,122 @@
+"""The benchmarks' peers compute the same thing as jaxcal. No timing is asserted."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxcal.learning import environment, networks
+from jaxcal.learning.environment import SelectionConfig
+from jaxcal.learning.networks import NetworkConfig
+
+CONFIG = SelectionConfig()
+ACTIONS = np.array([[3, 17, 49, 8], [0, 1, 2, 40]])
+
+
+def played_by_jaxcal(sets):
+    """Observations (B, 5, 210) and rewards (B, 4) of the fixed actions."""
+
+    def play(candidates, actions):
+        state = environment.start(
+            candidates, jnp.ones(50, bool), CONFIG, jax.random.key(0)
+        )
+        seen, paid = [environment.observe(state, CONFIG)], []
+        for step in range(4):
+            state, reward, _ = environment.step(state, actions[step], CONFIG)
+            seen.append(environment.observe(state, CONFIG))
+            paid.append(reward)
+        return jnp.stack(seen), jnp.stack(paid)
+
+    return jax.jit(jax.vmap(play))(jnp.asarray(sets), jnp.asarray(ACTIONS))
+
+
+def peers_environments():
+    pytest.importorskip("gymnasium", reason="the extra bench is not installed")
+    from benchmarks.peers import environments
+
+    return environments
+
+
+def test_the_gymnasium_peer_sees_and_pays_the_same(rng):
+    peers = peers_environments()
+    sets = rng.random((2, 50, 3)).astype(np.float32)
+    seen, paid = played_by_jaxcal(sets)
+    for number, candidates in enumerate(sets):
+        env = peers.SelectionGym()
+        observation, _ = env.reset(seed=0, options={"candidates": candidates})
+        np.testing.assert_allclose(observation, seen[number, 0], atol=1e-5)
+        for step, action in enumerate(ACTIONS[number]):
+            observation, reward, done, cut, _ = env.step(action)
+            np.testing.assert_allclose(observation, seen[number, step + 1], atol=1e-5)
+            np.testing.assert_allclose(reward, paid[number, step], atol=1e-4)
+            assert done == (step == 3)
+            assert not cut
+            assert not env.action_masks()[action]
+
+
+def test_the_numpy_peer_sees_and_pays_the_same(rng):
+    peers = peers_environments()
+    sets = rng.random((2, 50, 3)).astype(np.float32)
+    seen, paid = played_by_jaxcal(sets)
+    env = peers.SelectionNumpy(2)
+    np.testing.assert_allclose(env.reset(sets), seen[:, 0], atol=1e-5)
+    for step in range(4):
+        observation, reward, done = env.step(ACTIONS[:, step])
+        np.testing.assert_allclose(observation, seen[:, step + 1], atol=1e-5)
+        np.testing.assert_allclose(reward, paid[:, step], atol=1e-4)
+        assert done == (step == 3)
+
+
+@pytest.mark.parametrize("folded", [False, True])
+def test_the_pytorch_peer_has_the_same_network(rng, folded):
+    torch = pytest.importorskip("torch", reason="the extra bench is not installed")
+    from benchmarks.peers.torch_ppo import PaperTorch, context_of
+
+    sets = jnp.asarray(rng.random((3, 50, 3)), jnp.float32)
+    everything = jnp.ones((3, 50), bool)
+    chosen = jnp.asarray([[3, 9, -1, -1]] * 3)
+    free = everything.at[:, chosen[0, :2]].set(False)
+    network = networks.build(NetworkConfig(kind="paper", width=48))
+
+    @jax.jit
+    def scored(key):
+        params = network.init(key, sets, everything, chosen, everything)["params"]
+        params = jax.tree.map(
+            lambda leaf: leaf + 0.05 * jax.random.normal(key, leaf.shape), params
+        )
+        view = network.look(sets, everything)
+        memory = networks.encode(network, params, view)
+        glance = network.look_at(view, chosen, free, 2)
+        return params, networks.decode(network, params, memory, glance)
+
+    params, (logits, value) = scored(jax.random.key(1))
+    peer = PaperTorch(48, folded=folded)
+    peer.load_flax(params)
+    context = context_of(torch.tensor(np.asarray(sets[:, jnp.asarray([3, 9])])), 2)
+    with torch.no_grad():
+        other, worth = peer.decode(
+            peer.encode(torch.tensor(np.asarray(sets))),
+            context[:, None],
+            torch.tensor(np.asarray(free))[:, None],
+        )
+
+    # A number that all candidates share changes no choice: compare log probabilities.
+    def log_softmax(x):
+        return np.asarray(jax.nn.log_softmax(jnp.asarray(x)))[np.asarray(free)]
+
+    mine, theirs = log_softmax(logits), log_softmax(other[:, 0].numpy())
+    np.testing.assert_allclose(mine, theirs, atol=2e-4)
+    np.testing.assert_allclose(value, worth[:, 0].numpy(), atol=2e-4)
+
+
+def test_random_actions_are_uniform_over_what_is_left():
+    peers_environments()
+    pytest.importorskip("brax", reason="the row steps loads brax")
+    from benchmarks.rows.steps import random_action
+
+    chosen = jnp.asarray([[7, 0, 49, -1]])
+    units = (jnp.arange(47) + 0.5) / 47
+    actions = random_action(jnp.tile(chosen, (47, 1)), 3, units)
+    assert sorted(np.asarray(actions).tolist()) == sorted(set(range(50)) - {7, 0, 49})
