@@ -118,6 +118,7 @@ def test_eight_devices_do_what_one_does() -> None:
     check_equal(out)
 
 
+@pytest.mark.slow
 def test_the_policy_chooses_the_same_on_every_number_of_devices() -> None:
     script = """
     from jaxcal.selection.policy import select_batch

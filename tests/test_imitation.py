@@ -86,6 +86,7 @@ def measured(params, lesson):
     return imitation.loss(params, attempt, PPO, TASK, NETWORK)
 
 
+@pytest.mark.slow
 def test_the_loss_is_that_of_the_definition(lesson):
     state = ppo.init(PPO, TASK, NETWORK)
     total, metrics = measured(state.params, lesson)
@@ -116,6 +117,7 @@ def test_the_loss_is_that_of_the_definition(lesson):
     )
 
 
+@pytest.mark.slow
 def test_the_order_of_the_candidates_does_not_matter(lesson, rng):
     state = ppo.init(PPO, TASK, NETWORK)
     order = rng.permutation(11)

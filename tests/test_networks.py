@@ -85,6 +85,7 @@ def test_permuting_the_candidates_permutes_the_logits(rng, config):
 
 
 @pytest.mark.parametrize("config", [SMALL, NetworkConfig(kind="paper", width=32)])
+@pytest.mark.slow
 def test_masked_candidates_are_never_likely_and_gradients_stay_finite(rng, config):
     network, params = made(config)
     points = jnp.asarray(rng.uniform(size=(2, 12, 3)), jnp.float32)
@@ -100,6 +101,7 @@ def test_masked_candidates_are_never_likely_and_gradients_stay_finite(rng, confi
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(grads))
 
 
+@pytest.mark.slow
 def test_one_set_of_weights_serves_any_m_k_and_n(rng):
     network, params = made(SMALL)
     for m, n, k in ((5, 1, 2), (9, 2, 3), (30, 4, 5), (40, 3, 11)):

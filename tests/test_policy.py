@@ -98,6 +98,7 @@ def test_going_on_from_a_partial_selection_is_near_the_conditional_optimum(rng):
     assert np.exp(3 * gap).mean() >= 0.97
 
 
+@pytest.mark.slow
 def test_trying_more_is_never_worse(rng):
     sets = rng.uniform(size=(40, 50, 3))
     plain = values(sets, select_batch(sets, 6))
