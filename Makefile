@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help train checkpoint evaluate reproduce test test-all lint format benchmark clean
+.PHONY: help train checkpoint evaluate reproduce test test-first test-second test-all lint format benchmark clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -31,7 +31,14 @@ reproduce: $(READY) ## the paper's figures, tables and claims from our own runs,
 	$(BIN)/python -m jaxcal.study.reproduce $(ARGS)
 
 test: lint ## set everything up, lint, and run the quick tests (the ones CI runs)
-	$(BIN)/python -m pytest -m 'not slow' $(ARGS)
+	$(MAKE) --jobs=2 --output-sync=target test-first test-second
+
+# Two halves of about equal length, side by side.
+test-first: $(READY)
+	$(BIN)/python -m pytest -m 'not slow' $(ARGS) $(sort $(wildcard tests/test_[a-q]*.py))
+
+test-second: $(READY)
+	$(BIN)/python -m pytest -m 'not slow' $(ARGS) tests/rig $(sort $(wildcard tests/test_[r-z]*.py))
 
 test-all: lint ## every test, the slow ones too
 	$(BIN)/python -m pytest $(ARGS)
