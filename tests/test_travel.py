@@ -20,7 +20,7 @@ from jaxcal.learning.training import TrainConfig
 from jaxcal.learning.travel import TravelConfig
 from jaxcal.regression import log_det_gram
 
-SMALL = NetworkConfig(kind="travel", width=8, encoder_rounds=1)
+SMALL = NetworkConfig(kind="travel", width=8, encoder_rounds=1, initial_trust=0.25)
 CONFIG = TravelConfig(num_candidates=9)
 
 
