@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import jax
@@ -23,12 +24,16 @@ from jaxcal.regression import log_det_gram
 SMALL = NetworkConfig(kind="travel", width=8, encoder_rounds=1, initial_trust=0.25)
 CONFIG = TravelConfig(num_candidates=9)
 
+# Compiled: op by op, JAX takes seconds for each episode.
+reset = jax.jit(travel.reset, static_argnames="config")
+step = jax.jit(travel.step, static_argnames="config")
+
 
 @pytest.fixture(scope="module")
 def made():
     """A network and parameters away from their initial zeros."""
     network = networks.build(SMALL)
-    params = network.init(
+    params = jax.jit(network.init)(
         jax.random.key(0),
         jnp.zeros((1, 9, 3)),
         jnp.ones((1, 9), bool),
@@ -87,12 +92,12 @@ def test_the_seconds_of_training_are_those_of_the_profile(rng):
 @pytest.mark.parametrize("k", [4, 6])
 def test_an_episode_pays_log_det_less_the_tolls_of_its_order(key, k):
     config = TravelConfig(num_candidates=9, num_selected=k)
-    state = travel.reset(key, config)
+    state = reset(key, config)
     tolls, entry = np.asarray(state.tolls), np.asarray(state.entry)
     points, paid = np.asarray(state.candidates), 0.0
     order = [5, 0, 7, 2, 8, 1][:k]
     for action in order:
-        state, reward, done = travel.step(state, jnp.asarray(action), config)
+        state, reward, done = step(state, jnp.asarray(action), config)
         paid += float(reward)
     tolls_of_it = entry[order[0]] + sum(
         tolls[i, j] for i, j in itertools.pairwise(order)
@@ -109,11 +114,11 @@ def test_an_episode_pays_log_det_less_the_tolls_of_its_order(key, k):
 def test_weightless_episodes_pay_what_the_plain_problem_pays(key):
     config = TravelConfig(num_candidates=9, weightless=1.0)
     plain = SelectionConfig(num_candidates=9)
-    state = travel.reset(key, config)
+    state = reset(key, config)
     assert not np.asarray(state.tolls).any() and not np.asarray(state.entry).any()
     other = environment.start(state.candidates, state.available, plain, key)
     for action in (3, 1, 4, 8):
-        state, reward, _ = travel.step(state, jnp.asarray(action), config)
+        state, reward, _ = step(state, jnp.asarray(action), config)
         other, expected, _ = environment.step(other, jnp.asarray(action), plain)
         assert float(reward) == pytest.approx(float(expected), abs=1e-6)
 
@@ -277,8 +282,9 @@ def test_the_preset_survives_its_own_meta():
 def test_the_network_starts_from_the_rule_without_learning(rng):
     # The trust in the look-ahead is there from the start: untrained, it agrees with the
     # rule in far more sets than a blind network could.
-    network = networks.build(SMALL)
-    params = ppo.init(PPOConfig(), Task(CONFIG), network).params
+    trust = PRESETS["travel"].network.initial_trust
+    network = networks.build(dataclasses.replace(SMALL, initial_trust=trust))
+    params = jax.jit(lambda: ppo.init(PPOConfig(), Task(CONFIG), network).params)()
     same = 0
     for _ in range(20):
         points, tolls, entry = drawn(rng)
