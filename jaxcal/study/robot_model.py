@@ -74,13 +74,14 @@ def model_xml(config: RobotConfig, timestep_s: float | None = None) -> str:
 <compiler angle="radian" autolimits="false"/>
 <option timestep="{timestep_s}" integrator="implicitfast"
  gravity="0 {-GRAVITY if config.per_axis("compliance_deg_per_nm").any() else 0.0} 0"/>
-<visual><headlight ambient="0.45 0.45 0.45" diffuse="0.5 0.5 0.5"/>
+<visual><headlight ambient="0.4 0.4 0.4" diffuse="0.3 0.3 0.3"/>
 <global offwidth="1280" offheight="960"/>
-<quality offsamples="4" shadowsize="1024"/></visual>
+<quality offsamples="4" shadowsize="2048"/></visual>
 <asset><texture type="skybox" builtin="flat" rgb1="1 1 1" rgb2="1 1 1"
  width="32" height="32"/></asset>
 <default><geom contype="0" conaffinity="0" mass="0"/></default>
-<worldbody>{_camera()}<light pos="0.6 1.5 0.9" dir="-0.4 -1 -0.6"/>{_geometry(parts, 0)}
+<worldbody>{_camera()}<light pos="0.6 1.5 0.9" dir="-0.4 -1 -0.6"
+ diffuse="0.5 0.5 0.5"/>{_geometry(parts, 0)}
 {bodies}<site name="phone" quat="{phone}"/>{closing}</worldbody>
 <tendon>{_drags(gaps)}</tendon>
 <actuator>{_servos(config)}</actuator>

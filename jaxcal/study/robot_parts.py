@@ -20,14 +20,15 @@ Colour = tuple[float, float, float]
 _RING_RADII_M = (0.21, 0.175, 0.14)  # from the base inwards
 _RING_RODS = 36
 _FLOOR_M = -0.30
+_FLOOR_HALF_M = (0.27, 0.24)  # along x and z; the posts stand within it
 AXIS_COLOURS: dict[str, Colour] = {
     "X": (0.84, 0.37, 0.0),  # pitch
     "Y": (0.0, 0.45, 0.70),  # yaw
     "Z": (0.0, 0.62, 0.45),  # roll
 }
 EYE_M = np.array([0.68, 0.46, 0.88])  # of whoever looks at it
-FIELD_DEG = 36.0  # from the upper edge of the picture to the lower
-_TARGET_M = np.array([0.0, -0.075, 0.0])
+FIELD_DEG = 38.0  # from the upper edge of the picture to the lower
+_TARGET_M = np.array([0.0, -0.11, 0.0])
 _STEEL: Colour = (0.45, 0.47, 0.50)
 _PLATE: Colour = (0.75, 0.77, 0.80)
 _PHONE: Colour = (0.10, 0.10, 0.12)
@@ -56,7 +57,7 @@ def parts_of(mechanism_order: str) -> list[Part]:
     for link in (1, 2, 3):
         inner, outer = _RING_RADII_M[link - 1], _RING_RADII_M[link - 1] + 0.045
         for side in (-1.0, 1.0):
-            reach = outer if side > 0 else inner + 0.012
+            reach = inner + 0.012
             parts.append(
                 _rod(
                     link,
@@ -66,14 +67,10 @@ def parts_of(mechanism_order: str) -> list[Part]:
                     colours[link - 1],
                 )
             )
-        parts.append(  # the motor, carried by the link before
-            _rod(
-                link - 1,
-                (inner + 0.012) * axes[link - 1],
-                outer * axes[link - 1],
-                0.022,
-                colours[link - 1],
-            )
+        # The motor, carried by the link before; of an upright first axis on its column.
+        end = -axes[0] if link == 1 and abs(axes[0][1]) > 0.5 else axes[link - 1]
+        parts.append(
+            _rod(link - 1, (inner + 0.012) * end, outer * end, 0.022, colours[link - 1])
         )
     return parts + _foot(axes[2])
 
@@ -113,7 +110,8 @@ def _ring(link: int, first: Array, second: Array) -> list[Part]:
 def _stand(axis: Array) -> list[Part]:
     """A floor plate, and a post under each bearing of the first axis."""
     floor = np.array([0.0, _FLOOR_M, 0.0])
-    parts = [_box(0, (-0.24, _FLOOR_M - 0.02, -0.24), (0.24, _FLOOR_M, 0.24), _PLATE)]
+    x, z = _FLOOR_HALF_M
+    parts = [_box(0, (-x, _FLOOR_M - 0.02, -z), (x, _FLOOR_M, z), _PLATE)]
     reach = _RING_RADII_M[0] + 0.03
     if abs(axis[1]) > 0.5:  # upright: one column from below, the motor hangs there
         return [*parts, _rod(0, floor, -reach * axis + [0, 0.01, 0], 0.02, _STEEL)]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import ctypes
 import io
 import itertools
 import os
@@ -48,6 +49,7 @@ TOUR_DEG = (  # what the film goes through: each axis alone, then all of them
 )
 _FRAMES_PER_S = 10.0
 _MOVE_S, _REST_S = 0.7, 0.3  # of the film, a posture
+_PALETTE, _PALETTE_FRAMES = 96, 8  # colours of a GIF, frames they are taken from
 
 
 def render(
@@ -141,7 +143,7 @@ def draw(
             scene = _MujocoScene(config, width, height)
         except Exception as error:  # drivers fail in every way there is
             if backend == "mujoco":
-                raise RuntimeError(f"MuJoCo cannot draw here: {error}") from None
+                raise RuntimeError(f"MuJoCo cannot draw here: {_why(error)}") from None
         if scene is not None:
             try:
                 yield "mujoco", scene.picture
@@ -155,6 +157,15 @@ def draw(
         yield "matplotlib", drawing.picture
     finally:
         drawing.close()
+
+
+def _why(error: Exception) -> str:
+    """What is missing, in words; of a broken driver, its own."""
+    try:
+        ctypes.CDLL("libEGL.so.1")
+    except OSError:
+        return "there is no EGL library (Debian: libegl1 and libgl1-mesa-dri)"
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 # -- MuJoCo ----------------------------------------------------------------------------
@@ -256,8 +267,7 @@ def _save(path: str | os.PathLike[str], frames: list[Any], frame_ms: int) -> Non
     if frame_ms == 0:
         frames[0].save(buffer, "PNG", optimize=True)
     else:
-        palette = frames[len(frames) // 2].quantize(96)
-        few = [frame.quantize(palette=palette, dither=0) for frame in frames]
+        few = _in_one_palette(frames)
         few[0].save(
             buffer,
             "GIF",
@@ -269,6 +279,19 @@ def _save(path: str | os.PathLike[str], frames: list[Any], frame_ms: int) -> Non
         )
     with atomic_write(path) as file:
         file.write(buffer.getvalue())
+
+
+def _in_one_palette(frames: list[Any]) -> list[Any]:
+    """The same colours in every frame, so that what stands still does not flicker."""
+    from PIL import Image as Pillow
+
+    shown = frames[:: max(1, len(frames) // _PALETTE_FRAMES)][:_PALETTE_FRAMES]
+    width, height = frames[0].size
+    sheet = Pillow.new("RGB", (width, height * len(shown)))
+    for number, frame in enumerate(shown):
+        sheet.paste(frame, (0, number * height))
+    palette = sheet.quantize(_PALETTE, Pillow.Quantize.MAXCOVERAGE)
+    return [frame.quantize(palette=palette, dither=0) for frame in frames]
 
 
 def _smooth(postures_deg: Array) -> Array:
