@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import itertools
 import json
@@ -14,9 +15,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from jaxcal.study.dataset_command import write_datasets
 from jaxcal.study.datasets import BIAS_DEG, SCALE, make_dataset
 from jaxcal.study.reproduce import main
 
@@ -49,7 +52,11 @@ def document(report: pathlib.Path) -> dict[str, Any]:
 
 
 def table(report: pathlib.Path, name: str) -> dict[str, np.ndarray]:
-    with (report / "data" / f"{name}.csv").open(newline="") as file:
+    return columns_of(report / "data" / f"{name}.csv")
+
+
+def columns_of(path: pathlib.Path) -> dict[str, np.ndarray]:
+    with path.open(newline="") as file:
         header, *rows = csv.reader(file)
     columns: dict[str, np.ndarray] = {}
     for name_of, cells in zip(header, zip(*rows, strict=True), strict=True):
@@ -74,7 +81,8 @@ def test_every_figure_of_the_paper_is_there(
     figures = [f for e in document["exhibits"].values() for f in e["figures"]]
     assert len(figures) == len(set(figures)) >= 20
     on_disk = {path.name for path in (report / "figures").iterdir()}
-    assert on_disk == {f"{f}.{kind}" for f in figures for kind in ("png", "svg")}
+    expected = {f"{f}.{kind}" for f in figures for kind in ("png", "svg")}
+    assert on_disk == expected | {"robot.png", "robot.gif"}
     tables = {name for e in document["exhibits"].values() for name in e["data"]}
     assert tables == {path.name for path in (report / "data").iterdir()}
 
@@ -85,7 +93,12 @@ def test_the_page_is_one_file_that_opens_offline(
     page = (report / "index.html").read_text()
     figures = [f for e in document["exhibits"].values() for f in e["figures"]]
     assert page.count("src='data:image/svg+xml;base64,") == len(figures)
-    assert page.count("src=") == len(figures) and "<script" not in page
+    pictures = document["exhibits"]["robot"]["pictures"]
+    assert pictures == ["robot.png", "robot.gif"]
+    for name in pictures:
+        held = base64.b64encode((report / "figures" / name).read_bytes()).decode()
+        assert f"src='data:image/{name[-3:]};base64,{held}'" in page
+    assert page.count("src=") == len(figures) + 2 and "<script" not in page
     assert not re.search(r"(href|src)=['\"](https?:)?//", page)
     assert "@media print" in page
     for claim in document["claims"]:
@@ -94,8 +107,21 @@ def test_the_page_is_one_file_that_opens_offline(
         assert f"id='{key}'" in page
     for link in re.findall(r"href='#([^']+)'", page):
         assert f"id='{link}'" in page
-    for link in re.findall(r"href='(data/[^']+)'", page):
+    for link in re.findall(r"href='((?:data|figures)/[^']+)'", page):
         assert (report / link).is_file()
+
+
+def test_the_robot_is_shown_still_and_moving(
+    report: pathlib.Path, document: dict[str, Any]
+) -> None:
+    with Image.open(report / "figures" / "robot.png") as still:
+        assert still.size == (960, 720)
+        assert len(np.unique(np.asarray(still).reshape(-1, 3), axis=0)) > 1_000
+    with Image.open(report / "figures" / "robot.gif") as film:
+        assert 30 < film.n_frames <= 50  # five seconds; frames that repeat are merged
+    said = document["exhibits"]["robot"]["caption"]
+    assert "Drawn by MuJoCo" in said or "MuJoCo cannot draw here: " in said
+    assert numbers(document, "robot")["largest_difference_deg"] < 1e-6
 
 
 def test_the_ratios_of_figure_3_are_those_of_its_data(
@@ -213,21 +239,60 @@ def test_white_noise_agrees_with_theory_at_every_number_of_postures(
     np.testing.assert_allclose(at_50, 0.1 * np.sqrt(4 / 50), rtol=1e-9)
 
 
-def test_table_1_is_what_lstsq_makes_of_dataset0(
-    report: pathlib.Path, document: dict[str, Any]
+@pytest.fixture(scope="module")
+def groups(tmp_path_factory: pytest.TempPathFactory) -> tuple[np.ndarray, np.ndarray]:
+    """Commands and measured angles of dataset0, (40, 50, 3) degrees, from its CSV."""
+    folder = tmp_path_factory.mktemp("datasets")
+    write_datasets(folder, ["dataset0"], episodes=40, formats=("csv",))
+    held = columns_of(folder / "dataset0.csv")
+    u, y = (
+        np.stack([held[f"{what}_{axis}"] for axis in "xyz"], axis=1).reshape(40, 50, 3)
+        for what in "uy"
+    )
+    return u * 40.0 - 20.0, y
+
+
+def test_table_1_and_its_intervals_are_those_of_lstsq(
+    report: pathlib.Path,
+    document: dict[str, Any],
+    groups: tuple[np.ndarray, np.ndarray],
 ) -> None:
     kept = table(report, "table_1_table_1")
-    data = make_dataset("dataset0", 0, 40)
-    assert data.measured is not None
-    u = data.candidates.reshape(-1, 3) * 40.0 - 20.0
+    u, y = (values.reshape(-1, 3) for values in groups)
     z = np.concatenate([u, np.ones((len(u), 1))], axis=1)
-    fit = np.linalg.lstsq(z, data.measured.reshape(-1, 3), rcond=None)[0]
+    fit, square, _, _ = np.linalg.lstsq(z, y, rcond=None)
     expected = np.concatenate([fit[:3].T.ravel(), fit[3]])
     np.testing.assert_allclose(kept["identified"], expected, atol=1e-9)
     truth = np.concatenate([np.diag(SCALE).ravel(), BIAS_DEG])
     np.testing.assert_array_equal(kept["set"], truth)
+    free = len(u) - 4
+    error = np.sqrt(np.outer(square / free, np.diag(np.linalg.inv(z.T @ z))))
+    half = stats.t.ppf(1.0 - 0.05 / 24, free) * np.append(error[:, :3], error[:, 3])
+    np.testing.assert_allclose(kept["low"], expected - half, atol=1e-9)
+    np.testing.assert_allclose(kept["high"], expected + half, atol=1e-9)
     inside = (kept["low"] <= truth) & (truth <= kept["high"])
     assert numbers(document, "table_1")["inside"] == inside.sum() == 12
+
+
+def test_the_errors_of_figure_1_are_those_of_dataset0(
+    report: pathlib.Path,
+    document: dict[str, Any],
+    groups: tuple[np.ndarray, np.ndarray],
+) -> None:
+    kept, found = table(report, "figure_1_errors"), numbers(document, "figure_1")
+    u, y = groups
+    z = np.concatenate([u, np.ones((40, 50, 1))], axis=2)
+    fits = [np.linalg.lstsq(a, b, rcond=None)[0] for a, b in zip(z, y, strict=True)]
+    after = np.stack([y[g] - z[g] @ fits[g - 1] for g in range(40)])
+    for axis, label in enumerate(("pitch", "yaw", "roll")):
+        for when, errors in (("before", y - u), ("after", after)):
+            expected = errors[..., axis].ravel()
+            held = kept[f"{label}_{when}_deg"]
+            np.testing.assert_allclose(held, expected, atol=1e-9)
+            box = found[f"{label}_{when}"]
+            assert box["median_deg"] == pytest.approx(np.median(expected), abs=1e-9)
+            spread = stats.iqr(expected)
+            assert box["interquartile_range_deg"] == pytest.approx(spread)
 
 
 def test_errors_shrink_as_their_quartiles_say(

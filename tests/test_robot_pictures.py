@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import pathlib
 from typing import Any
@@ -29,6 +30,20 @@ def no_egl(monkeypatch: pytest.MonkeyPatch) -> None:
         raise ImportError("no EGL here")
 
     monkeypatch.setattr(robot_pictures, "_MujocoScene", fail)
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: None)  # a library, but it fails
+
+
+def test_a_machine_without_the_library_is_told_which(
+    tmp_path: pathlib.Path, no_egl: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def absent(_: str) -> None:
+        raise OSError("cannot open shared object file")
+
+    monkeypatch.setattr(ctypes, "CDLL", absent)
+    with pytest.raises(
+        RuntimeError, match=r"there is no EGL library \(Debian: libegl1"
+    ):
+        render(CONFIG, tmp_path / "a.png", backend="mujoco")
 
 
 def test_without_egl_our_own_drawing_takes_its_place(

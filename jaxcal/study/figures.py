@@ -81,7 +81,7 @@ def det_per_episode(evaluation: Evaluation) -> Figure:
             label=_label(evaluation, main),
         )
     total = evaluation.dataset.num_episodes
-    part = "" if shown == total else f", first {shown} of {total}"
+    part = "" if shown == total else f", first {shown} of {total:,}"
     axes.set_xlabel(f"episode{part}")
     axes.set_ylabel(_det_label(evaluation))
     _powers_of_ten(axes.yaxis)
@@ -276,7 +276,8 @@ def variances(
         axes.axvline(edge, color="#DDDDDD", linewidth=0.6, zorder=0)
     axes.set_yscale("log")
     axes.set_xticks(range(len(names)), names)
-    axes.set_xlabel("parameter")
+    bars = any(ends is not None for _, _, ends, _ in rows)
+    axes.set_xlabel("parameter" + (" (bars: 95 % intervals)" if bars else ""))
     axes.set_ylabel(f"variance over episodes ({unit})")
     _legend(axes)
     return figure

@@ -19,7 +19,7 @@ states, and judge its claims one by one. Writes into --out:
 
   index.html            the report: one file, opens offline, prints
   reproduction.json     every number in it
-  figures/*.png, *.svg  each figure
+  figures/*.png, *.svg  each figure; robot.png and robot.gif, the robot moving
   data/*.csv            what each figure is drawn from
 
 The policy is the one that ships (checkpoints/default). Training curves are read from
@@ -90,15 +90,18 @@ def _run(options: argparse.Namespace, progress: Progress) -> int:
         studies=options.studies or STUDIES,
     )
     exhibits = _exhibits(settings, progress)
-    judged = claims(exhibits)
+    judged = claims(exhibits, settings.recorded)
     files = _files(settings, exhibits, judged, progress)
     _write(options.out, files)
     progress.clear()
     for claim in judged:
         print(f"{claim.verdict:>15}  {claim.claim}: {claim.ours}")
+    for notice in filter(None, (e.notice for e in exhibits)):
+        print(f"note: {notice}")
     print(
         f"saved: {options.out}/index.html, reproduction.json, "
-        f"{sum(len(e.figures) for e in exhibits)} figures and "
+        f"{sum(len(e.figures) for e in exhibits)} figures, "
+        f"{sum(len(e.pictures) for e in exhibits)} pictures and "
         f"{sum(len(e.data) for e in exhibits)} tables in "
         f"{time.perf_counter() - begun:.0f} s"
     )
@@ -110,6 +113,7 @@ def _exhibits(settings: Settings, progress: Progress) -> list[Exhibit]:
     from jaxcal.study.reproduction import (
         accuracy,
         calibration,
+        pictures,
         recalibration,
         selection,
         tables,
@@ -121,7 +125,10 @@ def _exhibits(settings: Settings, progress: Progress) -> list[Exhibit]:
     # Small inputs that may be wrong come first: a bad file is refused at once.
     for name in ("dataset5", "dataset4"):
         material.dataset(name)
-    parts = (training, calibration, selection, tables, accuracy, recalibration)
+    parts = (
+        *(training, calibration, selection, pictures),
+        *(tables, accuracy, recalibration),
+    )
     found: dict[str, Exhibit] = {}
     for number, part in enumerate(parts):
         stage = f"part {number + 1} of {len(parts)}"
@@ -136,7 +143,7 @@ def _exhibits(settings: Settings, progress: Progress) -> list[Exhibit]:
 
 
 _ORDER = (
-    *("table_1", "figure_1", "table_2", "table_3", "rank", "reward_range"),
+    *("robot", "table_1", "figure_1", "table_2", "table_3", "rank", "reward_range"),
     *("figure_2_paper", "figure_2", "figure_3", "gap_to_optimum", "figure_4"),
     *("figure_5", "ellipsoids", "figure_6", "figure_7", "figure_8", "figure_9"),
     *("four_or_fifty", "number_of_postures", "figure_10", "figure_10_recorded"),
@@ -164,6 +171,8 @@ def _files(
         files[f"figures/{name}.png"] = as_bytes(figure, "png")
         progress("drawing", number + 1, len(figures))
     for exhibit in exhibits:
+        for name, data in exhibit.pictures.items():
+            files[f"figures/{name}"] = data
         for name, columns in exhibit.data.items():
             files[f"data/{exhibit.key}_{name}.csv"] = as_csv(columns).encode()
     values = {
@@ -203,7 +212,7 @@ def _write(out: pathlib.Path, files: dict[str, bytes]) -> None:
     for name, data in files.items():
         with atomic_write(out / name) as file:
             file.write(data)
-    for folder, kinds in (("figures", (".png", ".svg")), ("data", (".csv",))):
+    for folder, kinds in (("figures", (".png", ".svg", ".gif")), ("data", (".csv",))):
         for path in (out / folder).iterdir():
             if path.suffix in kinds and f"{folder}/{path.name}" not in files:
                 path.unlink()

@@ -165,7 +165,7 @@ def _why(error: Exception) -> str:
         ctypes.CDLL("libEGL.so.1")
     except OSError:
         return "there is no EGL library (Debian: libegl1 and libgl1-mesa-dri)"
-    return " ".join(str(error).split()) or type(error).__name__
+    return " ".join(str(error).split()).rstrip(".") or type(error).__name__
 
 
 # -- MuJoCo ----------------------------------------------------------------------------

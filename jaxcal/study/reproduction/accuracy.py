@@ -134,7 +134,7 @@ def _four_or_fifty(material: Material) -> Exhibit:
             f"{drift['four_better'].value:.0%}. {OUTLIER_SHARE:.0%} gross errors: four "
             f"are better on {gross['four_better'].value:.0%} of the devices, yet their "
             f"mean error is {gross['ratio_of_means']:.3g} times that of fifty. Among "
-            f"rig recordings (dataset4, prediction of other episodes) four have "
+            f"the recordings (dataset4, prediction of other episodes) four have "
             f"{recorded['ratio_of_means']:.3g} times the error of fifty."
         ),
         verdict=verdict,
@@ -253,7 +253,9 @@ def _postures(material: Material) -> Exhibit:
             f"square under white noise is {agreement.min():.3f} to "
             f"{agreement.max():.3f} times what theory gives."
         ),
-        figures={"number_of_postures": number_of_postures(table)},
+        figures={
+            "number_of_postures": number_of_postures(table, NOISE_STD_DEG, DRIFT_DEG)
+        },
         data={"number_of_postures": table},
         numbers={
             "white_noise_d_optimal_deg": dict(

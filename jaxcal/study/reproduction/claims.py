@@ -12,16 +12,21 @@ __all__ = ["claims"]
 Numbers = Mapping[str, Any]
 
 
-def claims(exhibits: list[Exhibit]) -> list[Claim]:
-    """Judge every claim by the numbers of the exhibits."""
+def claims(exhibits: list[Exhibit], recorded: str) -> list[Claim]:
+    """Judge every claim by the numbers of the exhibits.
+
+    Args:
+        exhibits: all of them.
+        recorded: what Datasets 4 and 5 are, in words.
+    """
     found = {exhibit.key: exhibit for exhibit in exhibits}
     return [
-        *_information(found),
-        *_parameters(found),
+        *_information(found, recorded),
+        *_parameters(found, recorded),
         *_four_and_fifty(found),
         *_recalibration(found),
         *_training(found),
-        *_calibration(found),
+        *_calibration(found, recorded),
         _pairs(),
     ]
 
@@ -32,9 +37,9 @@ def _verdict(true: bool, partly: bool = False) -> Verdict:
     return "agrees in part" if partly else "disagrees"
 
 
-def _information(found: dict[str, Exhibit]) -> list[Claim]:
+def _information(found: dict[str, Exhibit], recorded: str) -> list[Claim]:
     out = []
-    for key, where in (("figure_3", "simulation"), ("figure_7", "rig recordings")):
+    for key, where in (("figure_3", "simulation"), ("figure_7", recorded)):
         numbers = found[key].numbers
         times = numbers["policy"]["times_random"]
         log, raw, relative = (
@@ -101,9 +106,9 @@ def _information(found: dict[str, Exhibit]) -> list[Claim]:
     return out
 
 
-def _parameters(found: dict[str, Exhibit]) -> list[Claim]:
+def _parameters(found: dict[str, Exhibit], recorded: str) -> list[Claim]:
     out = []
-    for key, where in (("figure_5", "dataset3"), ("figure_9", "rig recordings")):
+    for key, where in (("figure_5", "dataset3"), ("figure_9", recorded)):
         random = found[key].numbers["random/policy"]
         fifty = found[key].numbers["all 50/policy"]
         lower = int((random["low"] > 1.0).sum())
@@ -247,6 +252,8 @@ def _convergence(exhibit: Exhibit) -> str:
     if numbers.get("seeds", 2) < 2 or numbers.get("present") is False:
         return "no kept run in studies/"
     if "seeds" in numbers:
+        if exhibit.verdict == "not comparable":
+            return f"{min(numbers['episodes']):,} episodes run, not finished or too few"
         text = (
             f"within 5 % of its final level from episode "
             f"{numbers['plateau_episode']:,.0f}, {numbers['seeds']} seeds"
@@ -257,6 +264,8 @@ def _convergence(exhibit: Exhibit) -> str:
     text = f"{numbers['episodes']:,} episodes run"
     if not numbers["finished"]:
         return f"{text}, not finished"
+    if exhibit.verdict == "not comparable":
+        return f"{text}, too few"
     text += (
         f"; within 5 % of its final level from {numbers['episode']:,.0f}; the last "
         f"tenth brings {numbers['last_tenth']:.1%} of the rise"
@@ -267,9 +276,9 @@ def _convergence(exhibit: Exhibit) -> str:
     return text
 
 
-def _calibration(found: dict[str, Exhibit]) -> list[Claim]:
+def _calibration(found: dict[str, Exhibit], recorded: str) -> list[Claim]:
     out = []
-    for key, where in (("figure_1", "simulation"), ("figure_6", "rig recordings")):
+    for key, where in (("figure_1", "simulation"), ("figure_6", recorded)):
         numbers = found[key].numbers
         shrink = numbers["interquartile_range_shrinks_by"]
         spread = {

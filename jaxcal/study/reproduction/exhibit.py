@@ -40,6 +40,11 @@ class Settings:
     studies: pathlib.Path = STUDIES  # kept training runs
 
     @property
+    def recorded(self) -> str:
+        """What Datasets 4 and 5 are, for titles."""
+        return "rig's simulator" if self.data is None else "rig recordings"
+
+    @property
     def episodes(self) -> int:
         """Of dataset2."""
         return 200 if self.quick else 1_000
@@ -85,6 +90,8 @@ class Exhibit:
     data: Mapping[str, Columns] = field(default_factory=dict)
     numbers: Mapping[str, Any] = field(default_factory=dict)
     rows: Sequence[Sequence[str]] = ()  # a table, its header first
+    pictures: Mapping[str, bytes] = field(default_factory=dict)  # PNG, GIF, by file
+    notice: str = ""  # for the terminal: what had to be done otherwise
 
 
 @dataclasses.dataclass(frozen=True)

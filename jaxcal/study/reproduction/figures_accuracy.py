@@ -64,7 +64,9 @@ def four_against_fifty(curves: Mapping[str, Any]) -> Figure:
         for axes in (upper, lower):
             plain_axes(axes)
             axes.set_xticks(x, [f"{entry['strength']:g}" for entry in curve])
-    panels[0, 0].set_ylabel("error of prediction (° rms, mean)")
+    panels[0, 0].set_ylabel(
+        "error of prediction (° rms,\nmean; band: its 95 % interval)"
+    )
     panels[1, 0].set_ylabel("share of devices\non which four win")
     panels[0, 0].legend(fontsize=8, frameon=False)
     figure.suptitle("Four postures against fifty, on the same devices", fontsize=10)
@@ -98,8 +100,20 @@ def _plain_log(axis: Any) -> None:
     axis.set_minor_locator(NullLocator())
 
 
-def number_of_postures(table: Mapping[str, Array]) -> Figure:
-    """Median error of prediction over K, white noise and drift side by side."""
+def number_of_postures(
+    table: Mapping[str, Array], noise_std_deg: float, drift_deg: float
+) -> Figure:
+    """Median error of prediction over K, white noise and drift side by side.
+
+    Args:
+        table: ``scenario``, ``choice``, ``K``, ``median_rms_deg``, ``low``, ``high``.
+        noise_std_deg: of a reading, in both.
+        drift_deg: step of the bias from a posture to the next.
+    """
+    titles = {
+        "white noise": f"white noise, {noise_std_deg}°",
+        "drift": f"white noise, {noise_std_deg}°, and drift, {drift_deg}° a posture",
+    }
     figure = Figure(figsize=(9.0, 3.9), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
     for axes, scenario in zip(panels, ("white noise", "drift"), strict=True):
@@ -131,9 +145,11 @@ def number_of_postures(table: Mapping[str, Array]) -> Figure:
         axes.xaxis.set_major_formatter(ScalarFormatter())
         _plain_log(axes.yaxis)
         axes.set_xlabel("postures measured, K")
-        axes.set_title(scenario, fontsize=10)
+        axes.set_title(titles[scenario], fontsize=10)
         axes.legend(fontsize=8, frameon=False)
-    panels[0].set_ylabel("error of prediction (° rms, median)")
+    panels[0].set_ylabel(
+        "error of prediction\n(° rms, median; band: its 95 % interval)"
+    )
     figure.suptitle("Number of postures against accuracy", fontsize=10)
     return figure
 
@@ -185,5 +201,7 @@ def ellipses(
     figure.legend(
         handles, labels, loc="outside lower center", ncols=4, fontsize=8, frameon=False
     )
-    figure.suptitle("95 % error ellipses of the pitch row (+: set values)", fontsize=10)
+    figure.suptitle(
+        "95 % error ellipses of the pitch row of A and b (+: set values)", fontsize=10
+    )
     return figure

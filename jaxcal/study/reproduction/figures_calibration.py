@@ -42,6 +42,7 @@ def error_boxes(before: Array, after: Array, title: str) -> Figure:
         plain_axes(axes)
         axes.axhline(0.0, color=BLACK, linewidth=0.6)
         axes.set_ylabel("input-output error (°)")
+    left.set_xlabel("box: quartiles and median, whiskers: 1 to 99 % of the postures")
     figure.suptitle(f"Input-output error by axis: {title}", fontsize=10)
     return figure
 
@@ -79,7 +80,11 @@ def order_bars(columns: dict[str, Any], noise_std_deg: float) -> Figure:
             edgecolor="white",
         )
     axes.axhline(
-        noise_std_deg, color=BLACK, linestyle="--", linewidth=0.9, label="noise"
+        noise_std_deg,
+        color=BLACK,
+        linestyle="--",
+        linewidth=0.9,
+        label=f"noise of one\nreading, {noise_std_deg}°",
     )
     for place in places:
         if sum(columns[f"rms_{label}_deg"][place] for label in _AXES) < 1e-9:

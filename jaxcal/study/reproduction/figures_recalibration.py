@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from jaxcal.study.figure_style import BLACK, COLOURS, GREY, MARKERS, plain_axes
 
@@ -108,9 +107,9 @@ def by_age(columns: Mapping[str, Any], later: int, drift_deg: float) -> Figure:
                 label=f"{name} of session {calibrated}, {choice}",
             )
     axes.set_xlabel("session predicted")
-    axes.set_ylabel("error of prediction (° rms, median)")
+    axes.set_ylabel("error of prediction\n(° rms, median; band: its 95 % interval)")
     axes.set_ylim(bottom=0.0)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xticks(np.unique(columns["session"])[:: (later - 1) // 2])
     axes.set_title(
         f"Old and recent calibration, bias drifting {drift_deg}° a session", fontsize=10
     )

@@ -41,13 +41,15 @@ border-radius:1em;padding:.05em .6em}
 .sides{display:grid;grid-template-columns:1fr 2fr;gap:1rem;margin:.6em 0}
 .sides>div{background:#f7f7f7;padding:.6em .9em;border-radius:.4em}
 .sides b{display:block;font-size:.8rem;color:#555}
+.pair{display:grid;grid-template-columns:1fr 1fr;gap:1rem}
 figure{margin:1em 0;text-align:center}img{max-width:100%;height:auto}
 .note{color:#555;font-size:.88rem}nav{columns:2;font-size:.92rem}
 nav a{display:block;padding:.1em 0}a{color:#0b5394}
 .wide{overflow-x:auto}
-@media(max-width:40rem){.sides{grid-template-columns:1fr}nav{columns:1}}
+@media(max-width:40rem){.sides,.pair{grid-template-columns:1fr}nav{columns:1}}
 @media print{body{max-width:none;margin:0;font-size:9.5pt}nav{display:none}
 h1{font-size:18pt}h2{font-size:13pt}table{font-size:8.5pt}
+.film{display:none}.pair{display:block}
 figure,.sides,.head,tr{break-inside:avoid}h2,.head{break-after:avoid}
 figure+.note{break-before:avoid}.sides{grid-template-columns:1fr 2fr}a{color:inherit;
 text-decoration:none}.sides>div{background:none;border:1px solid #bbb}
@@ -88,8 +90,8 @@ def page(
         f"<p class='note'>Made by <code>{_safe(command)}</code> (seed {seed}). "
         f"{_safe(note)} Intervals in brackets are 95 % confidence intervals. The data "
         "behind each figure is in <code>data/</code>, every number in "
-        "<code>reproduction.json</code>, each figure as PNG and SVG in "
-        "<code>figures/</code>. "
+        "<code>reproduction.json</code>, each figure as PNG and SVG and the robot's "
+        "picture and film in <code>figures/</code>. "
         f"{_safe(', '.join(f'{k} {v}' for k, v in versions().items()))}.</p>",
         "<h2 id='claims'>Claim by claim</h2>",
         _claims_table(claims, {exhibit.key: exhibit.title for exhibit in exhibits}),
@@ -136,6 +138,17 @@ def _section(exhibit: Exhibit, images: Mapping[str, bytes]) -> list[str]:
             f"{_safe(name.replace('_', ' '))}' "
             f"src='data:image/svg+xml;base64,{encoded}'></figure>"
         )
+    parts += ["<div class='pair'>"] if exhibit.pictures else []
+    for name, data in exhibit.pictures.items():
+        kind = name.rpartition(".")[2]
+        encoded = base64.b64encode(data).decode("ascii")
+        what = "film" if kind == "gif" else "picture"
+        parts.append(
+            f"<figure class='{what}'><img alt='{_safe(exhibit.title)}: {what}' "
+            f"src='data:image/{kind};base64,{encoded}'><figcaption class='note'>"
+            f"<a href='figures/{name}'>{name}</a></figcaption></figure>"
+        )
+    parts += ["</div>"] if exhibit.pictures else []
     if exhibit.caption:
         parts.append(f"<p class='note'>{_typeset(exhibit.caption)}</p>")
     if exhibit.data:
@@ -193,6 +206,7 @@ def json_document(
                 "ours": exhibit.ours,
                 "verdict": exhibit.verdict,
                 "figures": list(exhibit.figures),
+                "pictures": list(exhibit.pictures),
                 "data": [f"{exhibit.key}_{name}.csv" for name in exhibit.data],
                 "numbers": _plain(exhibit.numbers),
             }

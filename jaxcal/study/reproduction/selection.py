@@ -29,7 +29,6 @@ _STREAM = {"dataset2": 2, "dataset3": 3, "dataset4": 4}
 _WHERE = {
     "dataset2": "simulation",
     "dataset3": "independent simulation",
-    "dataset4": "rig recordings",
 }
 
 
@@ -44,6 +43,10 @@ def exhibits(material: Material) -> list[Exhibit]:
         _best(material, "dataset4", "figure_8", "Figure 8"),
         _variance(material, "dataset4", "figure_9", "Figure 9"),
     ]
+
+
+def _where(material: Material, name: str) -> str:
+    return _WHERE.get(name, material.settings.recorded)
 
 
 # -- Figures 3 and 7 -------------------------------------------------------------------
@@ -122,7 +125,7 @@ def _determinants(material: Material, name: str, key: str, title: str) -> Exhibi
     count, draws = evaluation.random_log_det.shape
     return Exhibit(
         key=key,
-        title=f"{title}: det S against random selection, {_WHERE[name]}",
+        title=f"{title}: det S against random selection, {_where(material, name)}",
         caption=(
             f"{name}, {count:,} episodes, 4 of 50 postures; random: {draws} draws an "
             "episode (one of them in the first panel). Intervals: 95 %, over episodes. "
@@ -175,7 +178,7 @@ def _gap(material: Material, name: str) -> Exhibit:
             f"{numbers['greedy']['mean']:.4f} for plain greedy."
         ),
         figures={
-            "gap_per_episode": gap_per_episode(columns),
+            "gap_per_episode": gap_per_episode(columns, name),
             "gap_distribution": figures.gap_to_optimum(evaluation),
         },
         data={"gap": columns},
@@ -212,7 +215,7 @@ def _best(material: Material, name: str, key: str, title: str) -> Exhibit:
     verdict: Verdict = "agrees" if every > 0.95 else "agrees in part"
     return Exhibit(
         key=key,
-        title=f"{title}: best det S so far, {_WHERE[name]}",
+        title=f"{title}: best det S so far, {_where(material, name)}",
         caption=(
             f"{name}, {len(random)} episodes in their order; random: median and 5 to "
             f"95 % of {random.shape[1]} draws."
@@ -324,7 +327,7 @@ def _variance(material: Material, name: str, key: str, title: str) -> Exhibit:
     count, draws = evaluation.random_log_det.shape
     return Exhibit(
         key=key,
-        title=f"{title}: variance of the twelve parameters, {_WHERE[name]}",
+        title=f"{title}: variance of the twelve parameters, {_where(material, name)}",
         caption=(
             f"{name}, {count} episodes; bars: 95 % bootstrap intervals over episodes; "
             f"random: median and 5 to 95 % of {draws} draws an episode."
