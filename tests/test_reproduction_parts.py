@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import pathlib
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy import stats
 
 from jaxcal.calibration import identify
+from jaxcal.study import robot_pictures
+from jaxcal.study.datasets import make_dataset
 from jaxcal.study.parameters import least_squares, predict
+from jaxcal.study.reproduction import pictures
 from jaxcal.study.reproduction.devices import Device
 from jaxcal.study.reproduction.exhibit import Settings, as_csv
 from jaxcal.study.reproduction.intervals import (
@@ -23,7 +30,10 @@ from jaxcal.study.reproduction.intervals import (
 from jaxcal.study.reproduction.material import Material
 from jaxcal.study.reproduction.selection import variance_table
 from jaxcal.study.reproduction.training import exhibits, kept_runs, plateau
+from jaxcal.study.robot import RobotConfig
 from jaxcal.study.training_runs import FORMAT
+
+Array = NDArray[np.float64]
 
 
 def test_mean_interval_is_students(rng: np.random.Generator) -> None:
@@ -141,14 +151,54 @@ def test_recordings_can_be_given(tmp_path: pathlib.Path) -> None:
     assert "500 postures" in Material(Settings()).about_overlap("dataset4")
 
 
+def test_the_robot_is_drawn_where_mujoco_cannot(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(*_: object) -> None:
+        raise ImportError("no EGL here")
+
+    monkeypatch.setattr(robot_pictures, "_MujocoScene", fail)
+    render = functools.partial(robot_pictures.render, size=(120, 90))
+    monkeypatch.setattr(pictures, "render", render)
+
+    def animate(
+        config: RobotConfig, path: pathlib.Path, way: Array, **rest: Any
+    ) -> str:
+        return robot_pictures.animate(config, path, way[:1], size=(120, 90), **rest)
+
+    monkeypatch.setattr(pictures, "animate", animate)
+    chosen = SimpleNamespace(indices=np.arange(4).reshape(1, 1, 4))
+    material = SimpleNamespace(
+        settings=Settings(quick=True),
+        dataset=functools.partial(make_dataset, seed=0, episodes=1),
+        result=lambda *_: chosen,
+        progress=lambda *_: None,
+    )
+    (found,) = pictures.exhibits(material)
+    assert found.notice.startswith("MuJoCo cannot draw here: ")
+    assert found.notice.endswith("drawn by matplotlib from the same parts and angles.")
+    assert "\n" not in found.notice and found.notice in found.caption
+    assert found.pictures["robot.png"].startswith(b"\x89PNG")
+    assert found.pictures["robot.gif"].startswith(b"GIF89a")
+
+
 # -- training --------------------------------------------------------------------------
 
 
-def _keep(folder: pathlib.Path, seed: int, level: float, finished: bool = True) -> None:
-    """A run that rises from -0.6 to ``level`` with a time constant of 10,000."""
+def _keep(
+    folder: pathlib.Path,
+    seed: int,
+    level: float,
+    finished: bool = True,
+    *,
+    slowness: float = 10_000.0,
+    every: int = 2_000,
+) -> None:
+    """A run of 100 updates that rises from -0.6 to ``level``, exponentially."""
     folder.mkdir(parents=True)
-    episodes = np.arange(1, 101) * 2_000
-    reward = level - (level + 0.6) * np.exp(-episodes / 10_000)
+    episodes = np.arange(1, 101) * every
+    total = int(episodes[-1])
+    reward = level - (level + 0.6) * np.exp(-episodes / slowness)
     lines = ["episodes,seconds,reward_mean,reward_std,ratio_to_exact"]
     for count, value in zip(episodes, reward, strict=True):
         lines.append(f"{count},{count / 1000},{value},0.1,0.9")
@@ -157,8 +207,8 @@ def _keep(folder: pathlib.Path, seed: int, level: float, finished: bool = True) 
     summary = {
         "format": FORMAT,
         "seed": seed,
-        "episodes": 200_000,
-        "planned_episodes": 200_000 if finished else 400_000,
+        "episodes": total,
+        "planned_episodes": total if finished else 2 * total,
         "finished": finished,
         "seconds": 200.0,
         "parameters": 7,
@@ -205,6 +255,33 @@ def test_the_paper_run_says_how_far_it_went(tmp_path: pathlib.Path) -> None:
     _keep(tmp_path / "part" / "paper", 0, -0.1, finished=False)
     found = _shown(tmp_path / "part")["figure_2_paper"]
     assert found.verdict == "not comparable" and "not finished" in found.ours
+
+
+@pytest.mark.parametrize(
+    ("run", "verdict"),
+    [
+        ({}, "agrees"),
+        ({"finished": False}, "not comparable"),
+        ({"every": 100, "slowness": 1_000.0}, "not comparable"),  # 10,000 episodes
+        ({"every": 8_000, "slowness": 90_000.0}, "disagrees"),  # flat, but later
+        ({"slowness": 80_000.0}, "agrees in part"),  # still rising at 200,000
+        ({"level": -0.9}, "disagrees"),  # falls
+    ],
+)
+def test_a_run_converges_within_the_paper_s_episodes_or_not(
+    tmp_path: pathlib.Path, run: dict[str, float], verdict: str
+) -> None:
+    values = {"level": -0.1} | run
+    for place in ("paper", "compact_seeds/seed_0", "compact_seeds/seed_1"):
+        _keep(tmp_path / place, int(place[-1] == "1"), **values)
+    found = _shown(tmp_path)
+    assert [found[key].verdict for key in ("figure_2", "figure_2_paper")] == [
+        verdict,
+        verdict,
+    ]
+    seeds = found["figure_2"].ours
+    assert ("not finished" in seeds) == (not values.get("finished", True))
+    assert ("shorter than 200,000" in seeds) == (values.get("every") == 100)
 
 
 def test_a_torn_summary_is_named(tmp_path: pathlib.Path) -> None:

@@ -73,7 +73,7 @@ def curves_over_seeds(
             for name in rewards
         ],
     )
-    middle.set_xlabel("seed")
+    middle.set_xlabel("seed; box: quartiles, whiskers: 5 to 95 %")
     middle.set_ylabel("reward (log det S / 10)")
     middle.set_title("(b) reward, last 1,000 episodes", fontsize=10)
 
@@ -89,6 +89,7 @@ def curves_over_seeds(
         axes.legend(fontsize=8, frameon=False, loc="lower right")
     for axes in (left, middle, right):
         plain_axes(axes)
+    figure.suptitle("Training of the compact preset", fontsize=10)
     return figure
 
 
