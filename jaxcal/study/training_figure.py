@@ -77,7 +77,7 @@ def training_curves(folder: pathlib.Path | str) -> Figure:
     middle.set_xlabel("reward (log det S, scaled)")
     middle.set_ylabel("count")
     middle.margins(y=0.2)  # room for the legend
-    middle.legend(fontsize=8, frameon=False)
+    middle.legend(fontsize=8, framealpha=1.0, edgecolor="none")  # over the line
 
     lines = right.plot(
         thousands, _exponential(reward), color=COLOURS[0], label="reward, smoothed"
@@ -102,8 +102,8 @@ def training_curves(folder: pathlib.Path | str) -> Figure:
         [line.get_label() for line in lines],
         fontsize=8,
         frameon=False,
-        loc="lower center",
-        bbox_to_anchor=(0.5, -0.42),  # below: two curves leave no corner free
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.2),  # below: two curves leave no corner free
     )
     for axes in (left, right):
         axes.set_xlabel("training episodes (thousands)")
