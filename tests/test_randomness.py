@@ -29,3 +29,27 @@ def test_another_generators_key_is_left_to_jax():
     key = jax.random.key(0, impl="rbg")
     drawn = randomness.uniform(key, (4,))
     assert (np.asarray(drawn) == np.asarray(jax.random.uniform(key, (4,)))).all()
+
+
+@pytest.mark.parametrize("kind", ["typed", "legacy", "rbg"])
+def test_split_is_jaxs_bit_for_bit(kind):
+    keys = {
+        "typed": jax.random.key(5),
+        "legacy": jax.random.PRNGKey(5),
+        "rbg": jax.random.key(5, impl="rbg"),
+    }
+    wanted = jax.random.split(keys[kind])
+    for drawn, own in zip(randomness.split(keys[kind]), wanted, strict=True):
+        assert drawn.dtype == own.dtype
+        if kind != "legacy":
+            drawn, own = jax.random.key_data(drawn), jax.random.key_data(own)
+        assert (np.asarray(drawn) == np.asarray(own)).all()
+
+
+def test_split_is_jaxs_for_many_keys(key):
+    keys = jax.random.split(key, 5)
+    drawn = jax.vmap(randomness.split)(keys)
+    wanted = jax.vmap(jax.random.split)(keys)
+    for i, halves in enumerate(drawn):
+        own = jax.random.key_data(wanted[:, i])
+        assert (np.asarray(jax.random.key_data(halves)) == np.asarray(own)).all()

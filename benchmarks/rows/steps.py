@@ -1,12 +1,16 @@
 """Environment steps a second, uniformly random policy, on every core there is.
 
 A step returns the observation (210 numbers), reward and end, and an episode that ended
-begins anew with fresh candidates, everywhere. In JAX the observation is kept from being
-optimised away: each is written out and its sum is read.
+begins anew with fresh candidates, everywhere. An observation stays as it was when the
+next step is taken, as a learner that keeps it needs: JAX's arrays never change,
+SyncVectorEnv copies by default, NumPy by hand copies; without the copy is a line of its
+own. In JAX every step is a turn of a loop that carries its observation, so each is
+written out.
 """
 
 from __future__ import annotations
 
+import functools
 import statistics
 from collections.abc import Callable
 from typing import Any
@@ -26,11 +30,12 @@ from benchmarks.harness import (
 )
 from jaxcal.learning import environment, randomness
 from jaxcal.learning.brax_env import SelectionEnv, wrap_fresh
-from jaxcal.learning.environment import SelectionConfig, SelectionState
+from jaxcal.learning.environment import SelectionConfig
 
 NAME = "steps"
 TITLE = "Environment steps per second, random policy"
-BATCHES = (64, 256, 1024, 4096)  # episodes in lockstep; each keeps its best
+BATCHES = (256, 1024, 4096, 16384)  # episodes in lockstep; each keeps its best
+IN_PLACE = "NumPy, each observation overwritten by the next"
 M, K = 50, 4
 
 Run = tuple[Callable[[], Any], int]  # a call, and how many steps it makes
@@ -54,34 +59,36 @@ def random_action(chosen: jax.Array, count: jax.Array, unit: jax.Array) -> jax.A
     return action
 
 
-def read(observation: jax.Array) -> jax.Array:
-    """The sum of an observation that has really been written out."""
-    return jax.lax.optimization_barrier(observation).sum()
-
-
 def ours(batch: int, episodes: int) -> Run:
     """jaxcal's functions, vmapped: an episode is a reset and four steps."""
     config = SelectionConfig()
     see = jax.vmap(lambda state: environment.observe(state, config))
     move = jax.vmap(lambda state, action: environment.step(state, action, config))
+    again = jax.vmap(lambda state: environment.reset_from(state, config))
+    begin = jax.vmap(lambda key: environment.reset(key, config))
 
-    def episode(carry: Any, _: None) -> tuple[Any, None]:
-        keys, total = carry
-        states: SelectionState = jax.vmap(lambda k: environment.reset(k, config))(keys)
-        units = jax.vmap(lambda k: randomness.uniform(k, (K,)))(states.key)
-        for step in range(K):
-            action = random_action(states.chosen, step, units[:, step])
-            states, reward, _ = move(states, action)
-            total = total + reward.sum() + read(see(states))
-        keys = jax.vmap(lambda k: jax.random.fold_in(k, 1))(states.key)
-        return (keys, total), None
+    def step(carry: Any, units: jax.Array) -> tuple[Any, None]:
+        states, _, total = carry
+        action = random_action(states.chosen, states.count[0], units)
+        states, reward, _ = move(states, action)
+        return (states, see(states), total + reward), None
+
+    def episode(carry: Any, key: jax.Array) -> tuple[Any, None]:
+        states, seen, total = carry
+        units = randomness.uniform(key, (K, batch))
+        return jax.lax.scan(step, (again(states), seen, total), units)[0], None
 
     @jax.jit
-    def run(keys: jax.Array) -> jax.Array:
-        return jax.lax.scan(episode, (keys, jnp.zeros(())), None, episodes)[0][1]
+    def run(key: jax.Array) -> jax.Array:
+        keys = jax.random.split(key, batch)
+        carry = (begin(keys), see(begin(keys)), jnp.zeros(batch))
+        _, seen, total = jax.lax.scan(episode, carry, jax.random.split(key, episodes))[
+            0
+        ]
+        return seen.sum() + total.sum()
 
-    keys = jax.random.split(jax.random.key(0), batch)
-    return lambda: run(keys).block_until_ready(), batch * K * episodes
+    key = jax.random.key(0)
+    return lambda: run(key).block_until_ready(), batch * K * episodes
 
 
 def through_brax(batch: int, episodes: int) -> Run:
@@ -94,30 +101,33 @@ def through_brax(batch: int, episodes: int) -> Run:
         inner = state.pipeline_state
         action = random_action(inner.chosen, inner.count, units)
         state = env.step(state, action)
-        return (state, total + state.reward.sum() + read(state.obs)), None
+        return (state, total + state.reward), None
 
     @jax.jit
     def run(key: jax.Array) -> jax.Array:
         key_reset, key_act = jax.random.split(key)
         state = env.reset(jax.random.split(key_reset, batch))
         units = randomness.uniform(key_act, (episodes * K, batch))
-        return jax.lax.scan(step, (state, jnp.zeros(())), units)[0][1]
+        state, total = jax.lax.scan(step, (state, jnp.zeros(batch)), units)[0]
+        return state.obs.sum() + total.sum()
 
     key = jax.random.PRNGKey(0)
     return lambda: run(key).block_until_ready(), batch * K * episodes
 
 
-def by_numpy(batch: int, episodes: int) -> Run:
+def by_numpy(batch: int, episodes: int, copy: bool = True) -> Run:
     from benchmarks.peers.environments import SelectionNumpy
 
     env = SelectionNumpy(batch)
 
-    def run() -> None:
+    def run() -> np.ndarray:
         for _ in range(episodes):
             env.reset()
             done = False
             while not done:
-                _, _, done = env.step(env.random_action())
+                seen, _, done = env.step(env.random_action())
+                kept = seen.copy() if copy else seen
+        return kept
 
     return run, batch * K * episodes
 
@@ -184,6 +194,7 @@ def run(budget: Budget) -> Row:
         "jaxcal": (ours, 400_000, BATCHES),
         "jaxcal through brax's wrappers": (through_brax, 200_000, BATCHES),
         "NumPy, vectorised by hand": (by_numpy, 200_000, BATCHES),
+        IN_PLACE: (functools.partial(by_numpy, copy=False), 200_000, BATCHES),
     }
     if available("gymnasium"):
         makers["Gymnasium SyncVectorEnv"] = (by_gymnasium, 4_000, (16, 64))

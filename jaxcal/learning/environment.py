@@ -162,7 +162,7 @@ def reset(
         config: sizes and reward.
         draw: where candidates come from: ``uniform``, ``from_pool`` or your own.
     """
-    key_draw, key_next = jax.random.split(key)
+    key_draw, key_next = randomness.split(key)
     candidates, available = (draw or uniform(config))(key_draw)
     return start(candidates, available, config, key_next)
 
@@ -196,7 +196,7 @@ def step(
     done = count >= config.num_selected
     pays = (count % p == 0) | done
 
-    postures = state.candidates[jnp.maximum(chosen, 0)]
+    postures = geometry.picked(state.candidates, chosen)
     value = config.num_outputs * geometry.log_det_gram(postures, chosen >= 0)
 
     before = state.paid if config.reward_gain else jnp.zeros_like(value)

@@ -22,6 +22,7 @@ __all__ = [
     "lookahead",
     "normalised_by",
     "num_starts",
+    "picked",
     "plus_ridge",
     "projected",
     "row_dot",
@@ -303,6 +304,18 @@ def num_starts(num_candidates: int) -> int:
     with its square.
     """
     return num_candidates if num_candidates <= _ALL_START else _STARTS
+
+
+def picked(candidates: jax.Array, chosen: jax.Array) -> jax.Array:
+    """(..., K, n) postures that were chosen; the first one where nothing is yet.
+
+    Args:
+        candidates: (..., M, n).
+        chosen: (..., K) int, -1 where nothing is chosen.
+    """
+    # Everybody gathers alike, so that a program that needs them twice gathers once.
+    index = jnp.maximum(chosen, 0)[..., None]
+    return jnp.take_along_axis(candidates, index, axis=-2, mode="clip")
 
 
 def log_det_lengths(chosen: jax.Array) -> jax.Array:

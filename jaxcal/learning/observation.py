@@ -29,8 +29,7 @@ def context_features(candidates: jax.Array, chosen: jax.Array) -> jax.Array:
         geometry.row_dot,
     )
     n, total = candidates.shape[-1], chosen.shape[-1]
-    index = jnp.maximum(chosen, 0)[..., None]
-    postures = jnp.take_along_axis(candidates, index, axis=-2)
+    postures = geometry.picked(candidates, chosen)
     present = row_parts((chosen >= 0).astype(candidates.dtype))
     rows = [row_parts(postures[..., j]) for j in range(n)]
     rows = [[x * w for x, w in zip(row, present, strict=True)] for row in rows]
