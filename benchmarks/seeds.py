@@ -59,7 +59,7 @@ def main() -> None:
         root = arguments.out or pathlib.Path(scratch)
         rows = []
         for seed in seeds:
-            folder = root / f"seed{seed}"
+            folder = root / f"seed_{seed}"
             values = {"seed": seed, "num_episodes": budget}
             config = presets.with_values(presets.PRESETS["compact"], values)
             begun = time.perf_counter()
