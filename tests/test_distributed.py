@@ -205,7 +205,7 @@ def test_several_processes_have_the_loss_curve_of_one(
     several = finish(start([*command, "--out", tmp_path / "some"], number, flags))
     assert [code for code, _, _ in several] == [0] * number, several[0][2]
     one, some = curve(tmp_path / "one"), curve(tmp_path / "some")
-    assert one.shape == (8, 4)
+    assert one.shape == (8, 4) and np.isfinite(one).all()
     np.testing.assert_allclose(some, one, atol=5e-5, rtol=1e-4)
     assert "saved" in several[0][1] and f"in {number} processes" in several[0][1]
     assert [output for _, output, _ in several[1:]] == [""] * (number - 1)
@@ -256,7 +256,7 @@ def test_a_run_goes_on_with_another_number_of_processes(tmp_path: pathlib.Path) 
     results = finish(start([script, tmp_path / "whole", 8], 1))
     assert results[0][0] == 0, results[0][2]
     one, some = curve(tmp_path / "whole"), curve(tmp_path / "run")
-    assert one.shape == (8, 4)
+    assert one.shape == (8, 4) and np.isfinite(one).all()
     np.testing.assert_allclose(some, one, atol=5e-5, rtol=1e-4)
 
 
