@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxcal.learning import networks
+from jaxcal.learning import decoding, networks
 from jaxcal.learning.networks import NetworkConfig
 
 SMALL = NetworkConfig(width=8, encoder_rounds=1)
+CLOSE = NetworkConfig(width=8, encoder_rounds=1, close_up=True)
 
 
 def made(config, m=12, n=3, k=4, seed=0):
@@ -72,7 +75,9 @@ def test_compact_is_blind_to_affine_maps(rng, k, chosen):
     np.testing.assert_allclose(other - value, moved, atol=5e-3)
 
 
-@pytest.mark.parametrize("config", [SMALL, NetworkConfig(kind="paper", width=32)])
+@pytest.mark.parametrize(
+    "config", [SMALL, CLOSE, NetworkConfig(kind="paper", width=32)]
+)
 def test_permuting_the_candidates_permutes_the_logits(rng, config):
     network, params = made(config)
     points = rng.uniform(size=(1, 12, 3))
@@ -82,6 +87,48 @@ def test_permuting_the_candidates_permutes_the_logits(rng, config):
     mixed, other = score(network, params, points[:, order], where)
     np.testing.assert_allclose(logits[:, order], mixed, rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(value, other, atol=1e-3)
+
+
+@pytest.mark.parametrize("k", [4, 7])
+def test_a_network_can_begin_as_the_look_ahead_rule(rng, k):
+    start = dataclasses.replace(CLOSE, initial_trust=4.0, initial_actor=0.0)
+    network = networks.build(start)
+    params = made(start)[0].init(
+        jax.random.key(0),
+        jnp.zeros((1, 12, 3)),
+        jnp.ones((1, 12), bool),
+        jnp.full((1, k), -1),
+        jnp.ones((1, 12), bool),
+    )["params"]
+    points = jnp.asarray(rng.uniform(size=(50, 12, 3)), jnp.float32)
+    free = jnp.ones((50, 12), bool)
+    nothing = jnp.zeros((50, 0), jnp.int32)
+    key = jax.random.key(0)
+    own = decoding.choose(network, params, points, free, nothing, key, k=k)
+    chosen = jnp.full((50, k), -1, jnp.int32)
+    rule = jax.jit(  # without parameters every choice is the look-ahead's
+        lambda: decoding.complete(
+            network, None, network.look(points, free), None, chosen, free, 0, None
+        )
+    )()
+    # The members of one set tie; which of them comes first is rounding.
+    reached = [decoding.log_det_of(points, picked) for picked in (own, rule)]
+    np.testing.assert_allclose(*reached, atol=1e-4)
+    assert (np.sort(own) == np.sort(rule)).all(axis=1).mean() > 0.9
+
+
+def test_a_close_up_tells_near_equal_look_aheads_apart(rng):
+    network = networks.build(CLOSE)
+    points = jnp.asarray(rng.uniform(size=(1, 12, 3)), jnp.float32)
+    view = network.look(points, jnp.ones((1, 12), bool))
+    plain = networks.build(SMALL).look(points, jnp.ones((1, 12), bool))
+    assert (np.asarray(view["features"])[..., :13] == plain["features"]).all()
+    shown, behind = np.asarray(view["features"])[0, :, 13:], view["ahead"][0, :, 3]
+    best = int(np.argmax(behind))
+    assert (shown[best] == 1.0).all() and shown.shape == (12, 3)
+    for scale, column in zip((32.0, 256.0, 2048.0), shown.T, strict=True):
+        wanted = np.exp(scale * np.maximum(np.asarray(behind, np.float64), -8.0))
+        np.testing.assert_allclose(column, wanted, atol=1e-5)
 
 
 @pytest.mark.parametrize("config", [SMALL, NetworkConfig(kind="paper", width=32)])

@@ -42,6 +42,7 @@ KINDS = ("compact", "paper", "travel")
 
 _FLOOR = -8.0  # least log-volume, relative to the best, that a feature can show
 _RIDGE = 0.01  # of the mean square of a whitened coordinate, which is one
+_CLOSE = (32.0, 256.0, 2048.0)  # scales at which near-equal look-aheads differ
 _SHARP = 60.0  # inverse temperature of the choices that need no learning
 
 
@@ -56,6 +57,7 @@ class NetworkConfig:
     lookahead: int = 12  # most greedy choices ahead that a candidate's features show
     messages: bool = True  # second-moment messages sum_j v_j x_j x_j.T
     endgame: bool = True  # the last two choices by volume alone, which is optimal
+    close_up: bool = False  # features that tell near-equal look-aheads apart
     initial_trust: float = 0.0  # in the look-ahead before learning; 1 begins with it
     initial_actor: float = 0.1  # scale of the learned score before learning
 
@@ -104,6 +106,7 @@ def glance_at(
     depth: int,
     tolls: jax.Array | None = None,
     entry: jax.Array | None = None,
+    close_up: bool = False,
 ) -> View:
     """What the network reads of conditional vectors y (..., M, p).
 
@@ -131,15 +134,15 @@ def glance_at(
     ahead = jnp.maximum(ahead - best[..., None, :], -30.0)
     level = jnp.log(jnp.maximum(square, 1e-6) / mean_square[..., None])
     short = jnp.maximum(ahead, _FLOOR)
-    features = jnp.concatenate(
-        [
-            short / 2.0,
-            jnp.exp(short),
-            jnp.exp(4.0 * short),
-            jnp.clip(level, _FLOOR, 4.0)[..., None] / 2.0,
-        ],
-        axis=-1,
-    )
+    shown = [
+        short / 2.0,
+        jnp.exp(short),
+        jnp.exp(4.0 * short),
+        jnp.clip(level, _FLOOR, 4.0)[..., None] / 2.0,
+    ]
+    if close_up:
+        shown.append(_close_up(short[..., 3]))
+    features = jnp.concatenate(shown, axis=-1)
     return {
         "features": jnp.where(active[..., None], features, 0.0),
         "moments": moments,
@@ -147,6 +150,11 @@ def glance_at(
         "ahead": ahead,
         "best": best,
     }
+
+
+def _close_up(ahead: jax.Array) -> jax.Array:
+    """(..., 3) of (...,) log-volumes behind the best: 1 for the best, each sharper."""
+    return jnp.stack([jnp.exp(scale * ahead) for scale in _CLOSE], axis=-1)
 
 
 class _Round(nn.Module):
@@ -222,7 +230,9 @@ class CompactNetwork(nn.Module):
         """
         x, offset = geometry.whiten(candidates, usable)
         depth = min(self.config.lookahead, x.shape[-1])
-        return glance_at(x, False, usable, depth) | {"x": x, "offset": offset}
+        close_up = self.config.close_up
+        glance = glance_at(x, False, usable, depth, close_up=close_up)
+        return glance | {"x": x, "offset": offset}
 
     def look_at(
         self, view: View, chosen: jax.Array, available: jax.Array, count: int
@@ -237,7 +247,8 @@ class CompactNetwork(nn.Module):
         """
         y, spanned, so_far, scalars, which = self.after(view, chosen, count)
         left = chosen.shape[-1] - count
-        glance = glance_at(y, spanned, available, min(self.config.lookahead, left))
+        depth = min(self.config.lookahead, left)
+        glance = glance_at(y, spanned, available, depth, close_up=self.config.close_up)
         return glance | {
             "which": which.sum(-2) / max(count, 1),
             "so_far": so_far + glance["best"][..., 3],
@@ -316,7 +327,10 @@ class CompactNetwork(nn.Module):
             g = layer(g, glance)
         g = self.final_norm(g)
         # How far to believe the greedy look ahead is learned.
-        logits = self.actor(g)[..., 0] + 20.0 * self.trust * glance["ahead"][..., 3]
+        rule = 20.0 * glance["ahead"][..., 3]
+        if self.config.close_up:
+            rule = rule + _close_up(glance["ahead"][..., 3]).sum(-1)
+        logits = self.actor(g)[..., 0] + self.trust * rule
         logits = mask_logits(logits, active)
         weight = active[..., None].astype(g.dtype)
         number = jnp.maximum(weight.sum(-2), 1.0)

@@ -23,6 +23,9 @@ _COMPACT = TrainConfig(
 )
 
 
+_ALL = ("uniform", *SHAPES)  # uniform twice as often as any other
+
+
 def _task(
     num_candidates: int = 50,
     num_selected: int = 4,
@@ -41,24 +44,30 @@ def _task(
     return Task(environment, shapes, masked, random_starts)
 
 
-# What ships: the paper's task half of the time, and beside it other shapes of candidate
-# sets, masks, postures already measured, other numbers of postures and of inputs.
+# What ships. It begins as the look-ahead rule, imitates the solvers for two fifths of
+# the updates and goes on by PPO: the paper's task, other shapes of candidates, masks,
+# postures already measured, other numbers of postures and of inputs.
 _GENERAL = TrainConfig(
     preset="general",
-    network=NetworkConfig(),
-    ppo=PPOConfig(num_episodes=800_000),
+    network=NetworkConfig(close_up=True, initial_trust=4.0, initial_actor=0.05),
+    ppo=PPOConfig(
+        num_episodes=300_000,
+        learning_rate=5e-4,
+        entropy_start=0.002,
+        imitation=0.4,
+    ),
     tasks=(
         _task(),
+        _task(num_selected=6),
         _task(shapes=SHAPES, masked=0.4, random_starts=0.3),
-        _task(),
-        _task(num_selected=5, shapes=("uniform", *SHAPES)),
+        _task(num_selected=5, shapes=_ALL),
         _task(),
         _task(num_selected=6, masked=0.3, random_starts=0.2),
-        _task(num_candidates=20, shapes=("uniform", *SHAPES)),
-        _task(),
-        _task(num_selected=8, shapes=("uniform", *SHAPES)),
+        _task(num_candidates=20, shapes=_ALL),
+        _task(num_selected=8, shapes=_ALL),
+        _task(shapes=_ALL),
+        _task(num_selected=5),
         _task(num_selected=3, num_inputs=2),
-        _task(),
         _task(num_selected=5, num_inputs=4),
     ),
 )

@@ -45,7 +45,7 @@ class TravelNetwork(CompactNetwork):
             entry = jnp.zeros(candidates.shape[:-1], candidates.dtype)
         x, offset = geometry.whiten(candidates, usable)
         depth = min(self.config.lookahead, x.shape[-1])
-        glance = glance_at(x, False, usable, depth, tolls, entry)
+        glance = glance_at(x, False, usable, depth, tolls, entry, self.config.close_up)
         number = jnp.maximum(usable.sum(-1).astype(x.dtype), 1.0)
         near = jnp.exp(-2.0 * tolls) * usable[..., None, :]
         return glance | {
@@ -73,7 +73,9 @@ class TravelNetwork(CompactNetwork):
                 precision=jax.lax.Precision.HIGHEST,
             )
         depth = min(self.config.lookahead, chosen.shape[-1] - count)
-        glance = glance_at(y, spanned, available, depth, tolls, entry)
+        glance = glance_at(
+            y, spanned, available, depth, tolls, entry, self.config.close_up
+        )
         return glance | {
             "features": _with_tolls(glance["features"], y, available, tolls, entry),
             "which": which.sum(-2) / max(count, 1),
