@@ -215,13 +215,22 @@ def all_tasks(num: int, seed: int) -> list[tuple[str, Sets]]:
     return out
 
 
-FROM_RULE = {"initial_trust": 4.0, "initial_actor": 0.05, "entropy_start": 0.002}
+FROM_RULE = {
+    "close_up": True,
+    "initial_trust": 4.0,
+    "initial_actor": 0.05,
+    "entropy_start": 0.002,
+}
 TRAININGS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("full (width 32, look-ahead to the end)", {}),
     ("imitation, then PPO, from nothing", {"imitation": 0.5}),
     ("PPO alone, from the look-ahead", FROM_RULE),
     ("imitation alone, from the look-ahead", FROM_RULE | {"imitation": 1.0}),
     ("imitation, then PPO, from the look-ahead", FROM_RULE | {"imitation": 0.5}),
+    (
+        "the same, no close-up",
+        FROM_RULE | {"imitation": 0.5, "close_up": False},
+    ),
     ("look-ahead 3", {"lookahead": 3}),
     ("look-ahead 2", {"lookahead": 2}),
     ("look-ahead 1", {"lookahead": 1}),
