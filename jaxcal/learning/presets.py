@@ -44,17 +44,16 @@ def _task(
     return Task(environment, shapes, masked, random_starts)
 
 
-# What ships. It begins as the look-ahead rule, imitates the solvers for two fifths of
-# the updates and goes on by PPO: the paper's task, other shapes of candidates, masks,
-# postures already measured, other numbers of postures and of inputs.
+# What ships. It begins as the look-ahead rule and imitates the solvers, which is what
+# adds most to the rule in a given time (docs/policy.md): the paper's task, other shapes of
+# candidates, masks, postures already measured, other numbers of postures and of inputs.
 _GENERAL = TrainConfig(
     preset="general",
     network=NetworkConfig(close_up=True, initial_trust=4.0, initial_actor=0.05),
     ppo=PPOConfig(
         num_episodes=300_000,
-        learning_rate=5e-4,
         entropy_start=0.002,
-        imitation=0.4,
+        imitation=1.0,
     ),
     tasks=(
         _task(),
