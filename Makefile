@@ -21,7 +21,7 @@ $(READY): pyproject.toml constraints.txt
 train: $(READY) ## set everything up and train the compact policy on this machine (a few minutes)
 	$(BIN)/python train.py $(ARGS)
 
-checkpoint: $(READY) ## train the policy that ships and put it in checkpoints/default (about 15 minutes)
+checkpoint: $(READY) ## train the policy that ships and put it in checkpoints/default (about 10 minutes)
 	$(BIN)/python train.py --preset general --export checkpoints/default $(ARGS)
 
 evaluate: $(READY) ## compare every method with the proven optimum on 1,000 unseen candidate sets

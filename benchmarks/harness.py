@@ -72,7 +72,8 @@ class Verdict:
     def met(self) -> bool:
         if self.value is None:
             return False
-        return self.value >= self.target if self.larger else self.value <= self.target
+        wanted, value = self.target, self.value
+        return bool(value >= wanted if self.larger else value <= wanted)
 
 
 @dataclasses.dataclass

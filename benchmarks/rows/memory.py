@@ -86,7 +86,9 @@ print(json.dumps({"updates": list(seen), "resident": list(seen.values()),
 def measured(code: str, **sizes: int) -> dict[str, float]:
     for name, size in sizes.items():
         code = code.replace(name.upper(), str(size))
-    return dict(json.loads(fresh_process(code, timeout=3000.0)))
+    # brax says what it could not import before the result.
+    printed = fresh_process(code, timeout=3000.0)
+    return dict(json.loads(printed.splitlines()[-1]))
 
 
 def run(budget: Budget) -> Row:

@@ -171,6 +171,12 @@ def optimiser(config: PPOConfig) -> optax.GradientTransformation:
 
 def init(config: PPOConfig, task: Task, network: Network) -> TrainState:
     """The state before the first update, from the seed alone."""
+    return _init(config, task, network)
+
+
+# One program: op by op it would be two hundred small ones, seconds to compile.
+@functools.partial(jax.jit, static_argnames=("config", "task", "network"))
+def _init(config: PPOConfig, task: Task, network: Network) -> TrainState:
     key_params, key_train = jax.random.split(jax.random.key(config.seed))
     env = task.environment
     params = network.init(

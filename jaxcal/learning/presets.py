@@ -45,8 +45,8 @@ def _task(
 
 
 # What ships. It begins as the look-ahead rule and imitates the solvers, which is what
-# adds most to the rule in a given time (docs/policy.md): the paper's task, other shapes of
-# candidates, masks, postures already measured, other numbers of postures and of inputs.
+# adds most to the rule in a given time (docs/policy.md): the paper's task, other shapes
+# of candidates, masks, given postures, other numbers of postures and of inputs.
 _GENERAL = TrainConfig(
     preset="general",
     network=NetworkConfig(close_up=True, initial_trust=4.0, initial_actor=0.05),
