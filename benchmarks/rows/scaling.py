@@ -55,7 +55,9 @@ def curve(
     taken: list[float] = []
     for size in sizes:
         once = call(size)
+        begun = time.perf_counter()
         once()
+        compiling = time.perf_counter() - begun
         times = []
         for _ in range(rounds):
             begun = time.perf_counter()
@@ -65,7 +67,7 @@ def curve(
                 break
         done.append(size)
         taken.append(statistics.median(times))
-        if taken[-1] > LIMIT / 4:
+        if taken[-1] > LIMIT / 4 or compiling > LIMIT / 2:
             break
     return {"size": done, "seconds": taken, "exponent": exponent(done, taken)}
 
