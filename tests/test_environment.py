@@ -95,22 +95,6 @@ def test_the_observation_is_the_papers_210_numbers(key):
     assert after[208] == pytest.approx(np.trace(gram) / 16, abs=1e-5)
 
 
-def test_an_observation_written_over_an_earlier_one_is_the_same(key):
-    config = SelectionConfig()
-    keys = jax.random.split(key, 3)
-    state = jax.vmap(lambda key: environment.reset(key, config))(keys)
-    plain = jax.jit(jax.vmap(lambda state: environment.observe(state, config)))
-    over = jax.jit(
-        jax.vmap(lambda state, seen: environment.observe(state, config, seen))
-    )
-    move = jax.vmap(lambda state, action: environment.step(state, action, config))
-    seen = plain(state)
-    for actions in ([4, 7, 0], [11, 3, 49], [1, 30, 8], [0, 1, 2]):
-        state, _, _ = move(state, jnp.asarray(actions))
-        seen = over(state, seen)
-        assert (np.asarray(seen) == np.asarray(plain(state))).all()
-
-
 def test_thousands_of_episodes_step_at_once_and_compile_once(key):
     config = SelectionConfig()
     traces = 0

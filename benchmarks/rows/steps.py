@@ -63,22 +63,20 @@ def ours(batch: int, episodes: int) -> Run:
     """jaxcal's functions, vmapped: an episode is a reset and four steps."""
     config = SelectionConfig()
     see = jax.vmap(lambda state: environment.observe(state, config))
-    see_next = jax.vmap(lambda state, seen: environment.observe(state, config, seen))
     move = jax.vmap(lambda state, action: environment.step(state, action, config))
     again = jax.vmap(lambda state: environment.reset_from(state, config))
     begin = jax.vmap(lambda key: environment.reset(key, config))
 
     def step(carry: Any, units: jax.Array) -> tuple[Any, None]:
-        states, seen, total = carry
+        states, _, total = carry
         action = random_action(states.chosen, states.count[0], units)
         states, reward, _ = move(states, action)
-        return (states, see_next(states, seen), total + reward), None
+        return (states, see(states), total + reward), None
 
     def episode(carry: Any, key: jax.Array) -> tuple[Any, None]:
-        states, _, total = carry
-        states = again(states)
+        states, seen, total = carry
         units = randomness.uniform(key, (K, batch))
-        return jax.lax.scan(step, (states, see(states), total), units)[0], None
+        return jax.lax.scan(step, (again(states), seen, total), units)[0], None
 
     @jax.jit
     def run(key: jax.Array) -> jax.Array:

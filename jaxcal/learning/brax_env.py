@@ -56,7 +56,7 @@ class SelectionEnv(Env):
         metrics["log_det"] = reward / self.config.reward_scale
         return state.replace(
             pipeline_state=after,
-            obs=environment.observe(after, self.config, state.obs),
+            obs=environment.observe(after, self.config),
             reward=reward,
             done=done.astype(jnp.float32),
             metrics=metrics,

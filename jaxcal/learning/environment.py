@@ -216,25 +216,16 @@ def look(network: Network, state: SelectionState) -> View:
     return network.look(state.candidates, state.available)
 
 
-def observe(
-    state: SelectionState, config: SelectionConfig, before: jax.Array | None = None
-) -> jax.Array:
+def observe(state: SelectionState, config: SelectionConfig) -> jax.Array:
     """The paper's observation, 210 numbers for M = 50 and n = 3 (Table 2).
-
-    Args:
-        state: the episode.
-        config: its sizes.
-        before: an earlier observation of the same episode. Its candidates are kept and
-            the rest is written over: the same numbers, less to write.
 
     Returns:
         (n M + M + 2 n + 4,): poses; availability, 1 or 0; ``context_features``.
     """
-    changing = [
-        state.available.astype(state.candidates.dtype),
-        context_features(state.candidates, state.chosen),
-    ]
-    if before is None:
-        return jnp.concatenate([state.candidates.ravel(), *changing])
-    rest = jnp.concatenate(changing)
-    return jax.lax.dynamic_update_slice(before, rest, (state.candidates.size,))
+    return jnp.concatenate(
+        [
+            state.candidates.ravel(),
+            state.available.astype(state.candidates.dtype),
+            context_features(state.candidates, state.chosen),
+        ]
+    )
