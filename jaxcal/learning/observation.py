@@ -60,7 +60,7 @@ def context_features(candidates: jax.Array, chosen: jax.Array) -> jax.Array:
     # Written in one pass: joined, each number would be a copy of its own.
     parts = [*mean, *std, *scalars]
     column = jnp.arange(len(parts))
-    out = parts[0]
+    out = jnp.asarray(parts[0])
     for i, part in enumerate(parts[1:], start=1):
         out = jnp.where(column < i, out, part)
     return out
