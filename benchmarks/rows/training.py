@@ -61,10 +61,9 @@ def contend(who: str, file: pathlib.Path, budget: float) -> Curve:
             except subprocess.TimeoutExpired:
                 process.kill()
                 output, problem = process.communicate()
-    curve = [
-        (float(seconds), float(ratio))
-        for seconds, ratio in (line.split() for line in output.splitlines())
-    ]
+    # A library may print something of its own between the pairs.
+    pairs = [line.split() for line in output.splitlines() if line[:1].isdigit()]
+    curve = [(float(seconds), float(ratio)) for seconds, ratio in pairs]
     if process.returncode > 0 and not curve:
         raise RuntimeError(f"{who}: " + "\n".join(problem.strip().splitlines()[-5:]))
     return curve
