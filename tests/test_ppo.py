@@ -7,6 +7,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from jaxcal.learning import networks, ppo
@@ -38,6 +39,18 @@ def test_undiscounted_advantages_are_return_less_value(rng):
     got = ppo.advantages(jnp.asarray(rewards), jnp.asarray(values), 1.0, 1.0)
     returns = np.cumsum(rewards[::-1], axis=0)[::-1]
     np.testing.assert_allclose(got, returns - values, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [1e-3, 0.2, 30.0])
+def test_clipping_is_that_of_optax(rng, size):
+    grads = {"a": size * rng.normal(size=(7, 3)), "b": size * rng.normal(size=4)}
+    grads = jax.tree.map(jnp.asarray, grads)
+    ours = ppo._clip_by_global_norm(0.5)
+    theirs = optax.clip_by_global_norm(0.5)
+    got, _ = ours.update(grads, ours.init(grads))
+    expected, _ = theirs.update(grads, theirs.init(grads))
+    for name in grads:
+        np.testing.assert_allclose(got[name], expected[name], rtol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["compact", "paper"])

@@ -164,9 +164,23 @@ def learning_rate(config: PPOConfig, update: int) -> float:
 def optimiser(config: PPOConfig) -> optax.GradientTransformation:
     """Adam under a warmed-up cosine schedule, gradients clipped by global norm."""
     return optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm),
+        _clip_by_global_norm(config.max_grad_norm),
         optax.adam(_schedule(config), eps=1e-5),
     )
+
+
+def _clip_by_global_norm(limit: float) -> optax.GradientTransformation:
+    """``optax.clip_by_global_norm``, but as one factor for every gradient.
+
+    optax divides each gradient by the norm; XLA fuses a division into neither of Adam's
+    moments and writes the clipped gradients to memory first.
+    """
+
+    def clip(grads: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
+        factor = jnp.minimum(1.0, limit / jnp.maximum(optax.global_norm(grads), 1e-30))
+        return jax.tree.map(lambda grad: grad * factor, grads), state
+
+    return optax.GradientTransformation(lambda params: optax.EmptyState(), clip)
 
 
 def init(config: PPOConfig, task: Task, network: Network) -> TrainState:
