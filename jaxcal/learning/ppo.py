@@ -177,7 +177,8 @@ def _clip_by_global_norm(limit: float) -> optax.GradientTransformation:
     """
 
     def clip(grads: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
-        factor = jnp.minimum(1.0, limit / jnp.maximum(optax.global_norm(grads), 1e-30))
+        norm = jnp.sqrt(sum(jnp.vdot(grad, grad) for grad in jax.tree.leaves(grads)))
+        factor = jnp.minimum(1.0, limit / jnp.maximum(norm, 1e-30))
         return jax.tree.map(lambda grad: grad * factor, grads), state
 
     return optax.GradientTransformation(lambda params: optax.EmptyState(), clip)
