@@ -117,6 +117,40 @@ def test_a_network_can_begin_as_the_look_ahead_rule(rng, k):
     assert (np.sort(own) == np.sort(rule)).all(axis=1).mean() > 0.9
 
 
+@pytest.mark.parametrize("lookahead", [1, 3])
+def test_a_loop_over_like_choices_chooses_as_if_written_out(rng, lookahead):
+    config = NetworkConfig(width=8, encoder_rounds=1, lookahead=lookahead)
+    network, params = made(config)
+    points = jnp.asarray(rng.normal(size=(50, 15, 2)), jnp.float32)
+    free = jnp.asarray(rng.uniform(size=(50, 15)) < 0.8)
+    free = free.at[:, :10].set(True)
+    k = 9
+    view = network.look(points, free)
+    memory = networks.encode(network, params, view)
+    assert len(network.alike(view, k)) >= 4
+    nothing = jnp.zeros((50, 0), jnp.int32)
+    found = decoding.choose(
+        network, params, points, free, nothing, jax.random.key(0), k=k
+    )
+    chosen, left = jnp.full((50, k), -1, jnp.int32), free
+    for count in range(k):
+        if count in network.alike(view, k):
+            known = network.after(view, chosen, count)
+            traced = network.after(view, chosen, jnp.asarray(count))
+            for part in (0, 2, 3):
+                np.testing.assert_allclose(known[part], traced[part], atol=2e-5)
+        logits, _ = decoding.logits_at(
+            network, params, view, memory, chosen, left, count
+        )
+        taken = logits.argmax(-1)
+        chosen = chosen.at[:, count].set(taken)
+        left = left & ~jax.nn.one_hot(taken, 15, dtype=bool)
+    # Look-aheads that end in the same set tie; which comes first is rounding.
+    assert (np.sort(found) == np.sort(chosen)).all(axis=1).mean() >= 0.9
+    assert jnp.take_along_axis(free, found, axis=1).all()
+    assert (np.diff(np.sort(found)) > 0).all()
+
+
 def test_a_close_up_tells_near_equal_look_aheads_apart(rng):
     network = networks.build(CLOSE)
     points = jnp.asarray(rng.uniform(size=(1, 12, 3)), jnp.float32)

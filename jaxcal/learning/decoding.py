@@ -48,18 +48,33 @@ def complete(
 ) -> jax.Array:
     """Choose from position ``first`` to the end; by sampling where a key is given."""
     k, m = chosen.shape[-1], available.shape[-1]
-    for position in range(first, k):
-        logits = logits_at(network, params, view, memory, chosen, available, position)[
-            0
-        ]
+
+    def next_one(position: Any, carry: Any) -> Any:
+        chosen, available, key = carry
+        logits, _ = logits_at(
+            network, params, view, memory, chosen, available, position
+        )
         if key is None:
             action = jnp.argmax(logits, axis=-1)
         else:
             key, key_action = jax.random.split(key)
             action = jax.random.categorical(key_action, logits)
         chosen = chosen.at[:, position].set(action.astype(chosen.dtype))
-        available = available & ~jax.nn.one_hot(action, m, dtype=bool)
-    return chosen
+        return chosen, available & ~jax.nn.one_hot(action, m, dtype=bool), key
+
+    # Written out, except where many choices are the same program: K = 50 would
+    # otherwise take minutes to compile.
+    alike = network.alike(view, k)
+    carry = (chosen, available, key)
+    position = first
+    while position < k:
+        end = max(alike.stop, position + 1) if position in alike else position + 1
+        if end == position + 1:
+            carry = next_one(position, carry)
+        else:
+            carry = jax.lax.fori_loop(position, end, next_one, carry)
+        position = end
+    return carry[0]
 
 
 def logits_at(
@@ -69,14 +84,18 @@ def logits_at(
     memory: Any,
     chosen: jax.Array,
     available: jax.Array,
-    count: int,
+    count: int | jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """(B, M) logits and (B,) value of the decision after ``count`` choices.
 
-    Without ``params`` every choice is the look-ahead's.
+    Without ``params`` every choice is the look-ahead's. ``count`` may be traced where
+    it is one of ``network.alike``.
     """
     glance = network.look_at(view, chosen, available, count)
-    if params is None or chosen.shape[-1] - count <= network.num_unlearned:
+    last = isinstance(count, int) and (
+        chosen.shape[-1] - count <= network.num_unlearned
+    )
+    if params is None or last:
         return network.finish(glance)
     return networks.decode(network, params, memory, glance)
 

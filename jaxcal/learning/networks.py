@@ -234,8 +234,19 @@ class CompactNetwork(nn.Module):
         glance = glance_at(x, False, usable, depth, close_up=close_up)
         return glance | {"x": x, "offset": offset}
 
+    def alike(self, view: View, k: int) -> range:
+        """Numbers of choices made, out of K, after which the next is the same program:
+        the chosen span the space, and the look ahead is not cut short by the end."""
+        p = view["x"].shape[-1]
+        ahead = max(self.config.lookahead, self.num_unlearned + 1)
+        return range(p, k - ahead + 1) if k > p else range(0)
+
     def look_at(
-        self, view: View, chosen: jax.Array, available: jax.Array, count: int
+        self,
+        view: View,
+        chosen: jax.Array,
+        available: jax.Array,
+        count: int | jax.Array,
     ) -> View:
         """The geometry of a decision.
 
@@ -243,32 +254,37 @@ class CompactNetwork(nn.Module):
             view: from ``look``.
             chosen: (..., K) int, of which the first ``count`` are chosen, the rest -1.
             available: (..., M) bool.
-            count: choices made, the same for the whole batch.
+            count: choices made, the same for the whole batch; traced only if one of
+                ``alike``.
         """
         y, spanned, so_far, scalars, which = self.after(view, chosen, count)
-        left = chosen.shape[-1] - count
-        depth = min(self.config.lookahead, left)
+        depth = self.config.lookahead
+        if isinstance(count, int):
+            depth = min(depth, chosen.shape[-1] - count)
         glance = glance_at(y, spanned, available, depth, close_up=self.config.close_up)
         return glance | {
-            "which": which.sum(-2) / max(count, 1),
+            "which": which.sum(-2) / jnp.maximum(count, 1),
             "so_far": so_far + glance["best"][..., 3],
             "scalars": scalars,
         }
 
     def after(
-        self, view: View, chosen: jax.Array, count: int
+        self, view: View, chosen: jax.Array, count: int | jax.Array
     ) -> tuple[jax.Array, bool, jax.Array, jax.Array, jax.Array]:
         """What is left of a set after ``count`` choices.
 
         Returns:
             (..., M, p) conditional vectors, and whether they are those of
             ``normalised_by``; (...,) log det(Z.T Z) so far; (..., 7) scalars of the
-            progress; (..., count, M) one-hot choices.
+            progress; (..., c, M) one-hot choices, c = ``count`` or, where that is
+            traced, K with zeros after it.
         """
         x = view["x"]
         p, total = x.shape[-1], chosen.shape[-1]
         left = total - count
-        which = jax.nn.one_hot(chosen[..., :count], x.shape[-2], dtype=x.dtype)
+        known = isinstance(count, int)
+        shown = chosen[..., :count] if isinstance(count, int) else chosen
+        which = jax.nn.one_hot(shown, x.shape[-2], dtype=x.dtype)
         picked = jnp.einsum(
             "...km,...mp->...kp", which, x, precision=jax.lax.Precision.HIGHEST
         )
@@ -279,22 +295,23 @@ class CompactNetwork(nn.Module):
         else:
             # The metric of the chosen; until they span the space, with a ridge small
             # beside what a posture contributes.
-            ridge = _RIDGE if count < p else 0.0
+            ridge = _RIDGE if known and count < p else 0.0
             y, so_far = geometry.normalised_by(x, picked, ridge)
             spanned = True
         scalars = [
-            float(left == 1),
-            float(left == 2),
-            float(left == 3),
-            1.0 / left,
-            count / p,
-            min(left / p, 3.0),
-            float(total > p),
+            jnp.asarray(scalar, x.dtype)
+            for scalar in (
+                left == 1,
+                left == 2,
+                left == 3,
+                1.0 / left,
+                count / p,
+                jnp.minimum(left / p, 3.0),
+                total > p,
+            )
         ]
-        shown = jnp.broadcast_to(
-            jnp.asarray(scalars, x.dtype), (*so_far.shape, len(scalars))
-        )
-        return y, spanned, view["offset"] + so_far, shown, which
+        progress = jnp.broadcast_to(jnp.stack(scalars), (*so_far.shape, len(scalars)))
+        return y, spanned, view["offset"] + so_far, progress, which
 
     def encode(self, view: View) -> jax.Array:
         """Embed a set: (..., M, width)."""
@@ -411,8 +428,16 @@ class PaperNetwork(nn.Module):
         """The candidates as they are."""
         return {"candidates": candidates}
 
+    def alike(self, view: View, k: int) -> range:
+        """None: every choice is written out, they are few."""
+        return range(0)
+
     def look_at(
-        self, view: View, chosen: jax.Array, available: jax.Array, count: int
+        self,
+        view: View,
+        chosen: jax.Array,
+        available: jax.Array,
+        count: int | jax.Array,
     ) -> View:
         """The ten context numbers and the availability of the 210."""
         context = context_features(view["candidates"], chosen)
