@@ -8,6 +8,7 @@ ratios within a round.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import importlib.metadata
 import os
 import pathlib
@@ -16,9 +17,13 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import numpy as np
+
+CORES = len(os.sched_getaffinity(0))
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 _PACKAGES = (
     "jax",
@@ -115,6 +120,25 @@ def median_ratio(slower: list[float], faster: list[float]) -> float:
     return statistics.median(a / b for a, b in zip(slower, faster, strict=True))
 
 
+def side_by_side(calls: Sequence[Callable[[], Any]]) -> Callable[[], Any]:
+    """A call that makes all of them at once, each in a thread."""
+    if len(calls) == 1:
+        return calls[0]
+    pool = ThreadPoolExecutor(len(calls))
+    return lambda: list(pool.map(lambda call: call(), calls))
+
+
+def copy_bandwidth() -> float:
+    """Bytes a second that a plain copy reads and writes, one thread a core."""
+    arrays = [np.zeros(2**24, np.float32) for _ in range(2 * CORES)]
+    copies = [
+        functools.partial(np.copyto, target, source)
+        for target, source in zip(arrays[:CORES], arrays[CORES:], strict=True)
+    ]
+    seconds = interleaved({"copy": side_by_side(copies)}, 5)["copy"]
+    return sum(array.nbytes for array in arrays) / min(seconds)
+
+
 def fresh_process(
     code: str, environment: Mapping[str, str] | None = None, timeout: float = 900.0
 ) -> str:
@@ -153,7 +177,7 @@ def machine() -> dict[str, Any]:
         except importlib.metadata.PackageNotFoundError:
             versions[name] = "not installed"
     return {
-        "cores": len(os.sched_getaffinity(0)),
+        "cores": CORES,
         "processor": _processor(),
         "load_before": round(os.getloadavg()[0], 2),
         "threads": "every library's default, at most one a core",

@@ -12,10 +12,8 @@ with episodes of its own, and keeps the better.
 from __future__ import annotations
 
 import functools
-import os
 import statistics
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -23,13 +21,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.harness import (
+    CORES,
     Budget,
     Line,
     Row,
     Verdict,
     available,
+    copy_bandwidth,
     interleaved,
     median_ratio,
+    side_by_side,
 )
 from jaxcal.learning import environment, randomness
 from jaxcal.learning.brax_env import SelectionEnv, wrap_fresh
@@ -42,17 +43,6 @@ IN_PLACE = "NumPy, each observation overwritten by the next"
 M, K = 50, 4
 
 Run = tuple[Callable[[], Any], int]  # a call, and how many steps it makes
-
-
-CORES = len(os.sched_getaffinity(0))
-
-
-def side_by_side(calls: Sequence[Callable[[], Any]]) -> Callable[[], Any]:
-    """A call that makes all of them at once, each in a thread."""
-    if len(calls) == 1:
-        return calls[0]
-    pool = ThreadPoolExecutor(len(calls))
-    return lambda: list(pool.map(lambda call: call(), calls))
 
 
 def random_action(chosen: jax.Array, count: jax.Array, unit: jax.Array) -> jax.Array:
@@ -177,22 +167,14 @@ def add_floor(row: Row, rate: float) -> None:
     alone in one long pass.
     """
     count = 3_000_000
-    sources = [np.zeros(count * 4, np.float32) for _ in range(CORES)]
-    targets = [np.empty_like(source) for source in sources]
     numbers = jax.jit(lambda key: randomness.uniform(key, (count,)).sum())
     keys = jax.random.split(jax.random.key(0), CORES)
-    copies = [
-        functools.partial(np.copyto, target, source)
-        for target, source in zip(targets, sources, strict=True)
-    ]
     hashes = [lambda key=key: numbers(key).block_until_ready() for key in keys]
-    seconds = interleaved(
-        {"copy": side_by_side(copies), "hash": side_by_side(hashes)}, 5
-    )
-    bandwidth = 2 * sources[0].nbytes * CORES / min(seconds["copy"])
+    seconds = interleaved({"hash": side_by_side(hashes)}, 5)["hash"]
+    bandwidth = copy_bandwidth()
     bytes_a_step = 2 * 4 * 210 + 600 / K
     by_memory = bytes_a_step / bandwidth
-    by_hash = 150 / K * min(seconds["hash"]) / count / CORES
+    by_hash = 150 / K * min(seconds) / count / CORES
     floor = by_memory + by_hash
     row.lines += [
         Line("floor", "bytes a step", bytes_a_step, "B"),
