@@ -11,7 +11,7 @@ import sys
 
 import numpy as np
 import pytest
-from harness import SESSION, fast_config, fast_text, session, simulator
+from harness import PATIENT, SESSION, fast_config, fast_text, session, simulator
 
 import jaxcal
 from rig.__main__ import main
@@ -33,7 +33,8 @@ TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 def finished(tmp_path_factory):
     """A noisy calibration that ended well, with what it said."""
     folder = tmp_path_factory.mktemp("runs") / "run"
-    config = parse_config(fast_text(session='\n[session]\nmethod = "exact"\n'))
+    text = fast_text(PATIENT, session='\n[session]\nmethod = "exact"\n')
+    config = parse_config(text)
     said = []
     with simulator(config, noise_deg=0.02) as sim:
         code = session(sim.start(), folder, sim, said)
@@ -409,7 +410,7 @@ def test_calibrate_simulate_needs_no_configuration(tmp_path, capsys):
 
 def test_verify_and_goto_use_a_saved_calibration(finished, tmp_path, capsys):
     path = tmp_path / "rig.toml"
-    path.write_text(fast_text())
+    path.write_text(fast_text(PATIENT))
     given = [str(finished[0]), "--config", str(path), "--simulate", "--rate", "250"]
     assert main(["verify", *given, "--count", "2", "--out", str(tmp_path / "v")]) == 0
     assert "still holds" in capsys.readouterr().out
@@ -428,7 +429,7 @@ def test_verify_says_when_it_is_time_to_recalibrate(finished, tmp_path, capsys):
     )
     stale.save(tmp_path / "calibration.json")
     path = tmp_path / "rig.toml"
-    path.write_text(fast_text())
+    path.write_text(fast_text(PATIENT))
     given = [str(tmp_path), "--config", str(path), "--simulate", "--rate", "250"]
     code = main(["verify", *given, "--count", "2", "--out", str(tmp_path / "v")])
     assert code == 1
