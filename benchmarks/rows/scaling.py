@@ -67,7 +67,7 @@ def curve(
                 break
         done.append(size)
         taken.append(statistics.median(times))
-        if taken[-1] > LIMIT / 4 or compiling > LIMIT / 2:
+        if taken[-1] > LIMIT / 4 or compiling > LIMIT:
             break
     return {"size": done, "seconds": taken, "exponent": exponent(done, taken)}
 
