@@ -13,6 +13,7 @@ import dataclasses
 import functools
 import os
 import pathlib
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import field
@@ -311,12 +312,27 @@ def _save(
     checkpoint.save(root / "checkpoint", done, state.average, meta, state)
 
 
+def _summary_writer() -> Any:
+    """tensorboardX's writer, without PyTorch.
+
+    It loads PyTorch where that is installed, more than a second that scalars do not
+    need.
+    """
+    unloaded = "torch" not in sys.modules
+    if unloaded:
+        sys.modules["torch"] = None  # type: ignore[assignment]  # reads as not installed
+    try:
+        from tensorboardX import SummaryWriter
+    finally:
+        if unloaded:
+            del sys.modules["torch"]
+    return SummaryWriter
+
+
 class _Table:
     """metrics.csv and TensorBoard events, a row an update, flushed as they come."""
 
     def __init__(self, root: pathlib.Path, done: int) -> None:
-        from tensorboardX import SummaryWriter
-
         path = root / "metrics.csv"
         kept = _rows_until(path, done) if done else []
         with atomic_write(path) as file:
@@ -324,7 +340,7 @@ class _Table:
             file.write(("\n".join(lines) + "\n").encode())
         self._file = path.open("a", newline="")
         self._writer = csv.DictWriter(self._file, COLUMNS, extrasaction="ignore")
-        self._events = SummaryWriter(str(root), flush_secs=30)
+        self._events = _summary_writer()(str(root), flush_secs=30)
 
     def add(self, row: dict[str, float]) -> None:
         self._writer.writerow(row)
