@@ -116,7 +116,7 @@ def overview(results: dict[str, dict[str, Any]]) -> Any:
     axes.axvline(1.0, color="black", linewidth=1)
     axes.set_xscale("log")
     axes.set_xlabel("achieved / wanted (right of the line: kept)")
-    axes.margins(x=0.15)
+    axes.margins(x=0.15, y=0.01)
     return figure
 
 
@@ -125,11 +125,16 @@ def scaling(series: dict[str, Any]) -> Any:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(11, 8), layout="constrained")
+    markers = "osD^"
     for place, (axis, curves) in enumerate(series.items()):
         axes = figure.add_subplot(2, 2, place + 1)
-        for who, curve in curves.items():
+        for who, marker in zip(curves, markers, strict=False):
+            curve = curves[who]
             label = f"{who}: {curve['exponent']:.2f}"
-            axes.loglog(curve["size"], curve["seconds"], marker="o", label=label)
+            axes.loglog(curve["size"], curve["seconds"], marker=marker, label=label)
+        sizes = sorted({size for curve in curves.values() for size in curve["size"]})
+        axes.set_xticks(sizes, [f"{size:,}" for size in sizes])
+        axes.set_xticks([], minor=True)
         axes.set_xlabel(axis)
         axes.set_ylabel("seconds a call")
         axes.legend(fontsize=8, title="exponent, upper half")
