@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import pathlib
+import subprocess
+import sys
+import time
 import tracemalloc
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 
@@ -186,6 +191,56 @@ def test_workers_do_not_change_a_digit(tmp_path: pathlib.Path) -> None:
     here = run(tmp_path / "here", 2_200, plan, part=2_000)
     there = run(tmp_path / "there", 2_200, plan, part=1_000, workers=2)
     assert exact_numbers(here) == exact_numbers(there)
+
+
+@pytest.mark.skipif(not pathlib.Path("/proc/self/task").exists(), reason="no /proc")
+def test_a_killed_stream_leaves_no_worker_and_loses_no_part(
+    tmp_path: pathlib.Path,
+) -> None:
+    root = pathlib.Path(__file__).resolve().parent.parent
+    code = (
+        "import pathlib, sys; from jaxcal.study import streaming as s\n"
+        "if __name__ == '__main__':\n"
+        f"    plan = s.Plan(methods={PLAN.methods!r}, draws=3)\n"
+        "    folder = pathlib.Path(sys.argv[1]); s.open_folder(plan, folder)\n"
+        "    s.evaluate_stream(plan, 10**7, folder, workers=2, part=1_000)\n"
+    )
+    script = tmp_path / "stream.py"
+    script.write_text(code)
+    folder = tmp_path / "parts"
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    with subprocess.Popen(
+        [sys.executable, str(script), str(folder)], env=environment
+    ) as process:
+        wait_for(lambda: len(list(folder.glob("part-*"))) >= 2)
+        children = children_of(process.pid)
+        process.kill()
+    assert len(children) >= 2
+    wait_for(lambda: not any(running(pid) for pid in children))
+    assert not [path for path in folder.iterdir() if path.suffix != ".json"]
+    done = run(folder, 2_000, PLAN, part=1_000)
+    whole = run(tmp_path / "whole", 2_000, PLAN, part=2_000)
+    assert exact_numbers(done) == exact_numbers(whole)
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.05)
+
+
+def children_of(pid: int) -> list[int]:
+    found = pathlib.Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    return [int(child) for child in found.split()]
+
+
+def running(pid: int) -> bool:
+    """Neither gone nor a corpse that nobody has fetched."""
+    try:
+        return "\nState:\tZ" not in pathlib.Path(f"/proc/{pid}/status").read_text()
+    except FileNotFoundError:
+        return False
 
 
 def test_a_stream_goes_on_where_the_dataset_ends() -> None:
