@@ -317,9 +317,11 @@ def test_batches_name_the_set_that_is_wrong():
 def test_inputs_are_not_written_to():
     candidates = uniform(0)
     available = np.ones(20, dtype=bool)
-    candidates.flags.writeable = available.flags.writeable = False
+    before = candidates.copy()
+    candidates.flags.writeable = available.flags.writeable = False  # writing raises
     for method in SOLVERS:
         select(candidates, 5, method, available=available, required=(3,))
+    assert (candidates == before).all() and available.all()
 
 
 def test_whitened_rows_are_orthonormal_over_the_available():

@@ -212,9 +212,11 @@ def test_a_killed_stream_leaves_no_worker_and_loses_no_part(
     with subprocess.Popen(
         [sys.executable, str(script), str(folder)], env=environment
     ) as process:
-        wait_for(lambda: len(list(folder.glob("part-*"))) >= 2)
-        children = children_of(process.pid)
-        process.kill()
+        try:
+            wait_for(lambda: len(list(folder.glob("part-*"))) >= 2)
+            children = children_of(process.pid)
+        finally:
+            process.kill()
     assert len(children) >= 2
     wait_for(lambda: not any(running(pid) for pid in children))
     assert not [path for path in folder.iterdir() if path.suffix != ".json"]

@@ -68,7 +68,7 @@ def complete(
     carry = (chosen, available, key)
     position = first
     while position < k:
-        end = max(alike.stop, position + 1) if position in alike else position + 1
+        end = alike.stop if position in alike else position + 1
         if end == position + 1:
             carry = next_one(position, carry)
         else:

@@ -22,7 +22,7 @@ def truth(tmp_path_factory) -> np.ndarray:
 def test_a_spoilt_run_ends_stopped_and_resumes_to_the_same(
     fault, phase, truth, tmp_path
 ):
-    run_cell(fault, phase, truth, tmp_path / "run")
+    run_cell(fault, phase, truth, tmp_path / "run")  # asserts what the cell promises
 
 
 @pytest.mark.slow
@@ -30,7 +30,7 @@ def test_a_spoilt_run_ends_stopped_and_resumes_to_the_same(
     ("fault", "phase"), [cell for cell in cells() if cell not in QUICK]
 )
 def test_every_other_cell_of_the_matrix(fault, phase, truth, tmp_path):
-    run_cell(fault, phase, truth, tmp_path / "run")
+    run_cell(fault, phase, truth, tmp_path / "run")  # asserts what the cell promises
 
 
 def test_the_quick_cells_are_cells_of_the_matrix():
