@@ -194,14 +194,15 @@ class _Run:
         indices: Indices,
         seconds: float,
         checkpoint: str | None = None,
+        log_det: Array | None = None,
     ) -> MethodResult:
-        """Judge (E, R, k) indices."""
+        """Judge (E, R, k) indices, unless their (E, R) ``log_det`` is known."""
         return MethodResult(
             method=method,
             label=label_of(method, self.num),
             checkpoint=checkpoint,
             indices=indices,
-            log_det=self.log_det(indices),
+            log_det=self.log_det(indices) if log_det is None else log_det,
             seconds=seconds,
             parameters=estimate_parameters(self.dataset, indices),
         )
@@ -211,10 +212,7 @@ class _Run:
         gram = np.empty(indices.shape[:2])
         for begin in range(0, len(indices), _CHUNK):
             cut = slice(begin, begin + _CHUNK)
-            chosen = np.take_along_axis(
-                self.dataset.candidates[cut, None], indices[cut, :, :, None], axis=2
-            )
-            gram[cut] = log_det_gram(chosen)
+            gram[cut] = _log_det_gram(self.dataset.candidates[cut], indices[cut])
         return self.dataset.num_outputs * gram
 
     def pieces(self, label: str, size: int = _CHUNK) -> Any:
@@ -371,13 +369,19 @@ class _Run:
         count, size = self.dataset.num_episodes, self.dataset.num_candidates
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(0,)))
         available = self.dataset.available
-        chosen = []
+        chosen, grams = [], []
         for cut in self.pieces("random"):
             mask = None if available is None else available[cut]
             shape = (min(cut.stop, count) - cut.start, draws, size)
             picks = _draw(rng, shape, self.k, mask)
-            chosen.append(self._without_singular(rng, cut, picks, mask))
-        return self.result("random", np.concatenate(chosen), timed.seconds / count)
+            grams.append(self._without_singular(rng, cut, picks, mask))
+            chosen.append(picks)
+        return self.result(
+            "random",
+            np.concatenate(chosen),
+            timed.seconds / count,
+            log_det=self.dataset.num_outputs * np.concatenate(grams),
+        )
 
     def _without_singular(
         self,
@@ -385,26 +389,43 @@ class _Run:
         cut: slice,
         picks: Indices,
         mask: NDArray[np.bool_] | None,
-    ) -> Indices:
-        """Draw the singular ones again; the few that stay so are left to the solver."""
+    ) -> Array:
+        """Draw the singular ones again; the few that stay so are left to the solver.
+
+        Args:
+            rng: source of the draws.
+            cut: the episodes.
+            picks: (E, R, k), mended in place.
+            mask: (E, M) available candidates.
+
+        Returns:
+            (E, R) log det of the Gram matrices of what is then in ``picks``.
+        """
         from jaxcal.selection import random_batch
 
         candidates = self.dataset.candidates[cut]
+        gram = _log_det_gram(candidates, picks)
         for attempt in range(_REDRAWS + 1):
-            postures = np.take_along_axis(candidates[:, None], picks[..., None], axis=2)
-            episode, draw = np.nonzero(np.isneginf(log_det_gram(postures)))
+            episode, draw = np.nonzero(np.isneginf(gram))
             if not episode.size:
                 break
+            sets = candidates[episode]
             again = None if mask is None else mask[episode]
             if attempt < _REDRAWS:
                 shape = (len(episode), 1, candidates.shape[1])
-                picks[episode, draw] = _draw(rng, shape, self.k, again)[:, 0]
+                fresh = _draw(rng, shape, self.k, again)
             else:
-                batch = random_batch(
-                    candidates[episode], self.k, available=again, seed=self.seed
-                )
-                picks[episode, draw] = batch.indices
-        return picks
+                batch = random_batch(sets, self.k, available=again, seed=self.seed)
+                fresh = batch.indices[:, None]
+            picks[episode, draw] = fresh[:, 0]
+            gram[episode, draw] = _log_det_gram(sets, fresh)[:, 0]
+        return gram
+
+
+def _log_det_gram(candidates: Array, indices: Indices) -> Array:
+    """(E, R) log det of Z.T Z for (E, R, k) indices into (E, M, n) candidates."""
+    chosen = np.take_along_axis(candidates[:, None], indices[..., None], axis=2)
+    return log_det_gram(chosen)
 
 
 def _draw(
