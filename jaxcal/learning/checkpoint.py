@@ -25,6 +25,12 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+from jaxcal.learning.checkpoint_folder import (
+    CheckpointError,
+    default_folder,
+    newest_step,
+    resolve,
+)
 from jaxcal.learning.networks import Network, NetworkConfig, build
 
 __all__ = [
@@ -43,10 +49,6 @@ VERSION = 1
 _PACKAGES = ("jaxcal", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
 
 
-class CheckpointError(ValueError):
-    """A checkpoint that is missing, damaged, or made by another version."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Policy:
     """A trained policy, ready to choose."""
@@ -56,17 +58,6 @@ class Policy:
     meta: dict[str, Any]  # as saved
     folder: pathlib.Path
     step: int
-
-
-def default_folder(name: str = "default") -> pathlib.Path:
-    """A checkpoint that ships: inside the installed package, or in the repository.
-
-    Args:
-        name: "default", or "travel" for the policy that knows what time is worth.
-    """
-    package = pathlib.Path(__file__).resolve().parent.parent
-    inside = package / "checkpoints" / name
-    return inside if inside.is_dir() else package.parent / "checkpoints" / name
 
 
 def package_versions() -> dict[str, str]:
@@ -163,21 +154,9 @@ def save(
             manager.save(step, args=ocp.args.Composite(**items))
 
 
-def _resolve(folder: str | pathlib.Path | None) -> pathlib.Path:
-    """The folder with the numbered steps: the one given, or its ``checkpoint``."""
-    path = default_folder() if folder is None else pathlib.Path(folder)
-    if not path.is_dir():
-        hint = " (train one with: python train.py)" if folder is None else ""
-        raise CheckpointError(f"checkpoint folder {path} does not exist{hint}")
-    return path / "checkpoint" if (path / "checkpoint").is_dir() else path
-
-
 def _latest(folder: pathlib.Path) -> tuple[pathlib.Path, int, dict[str, Any]]:
     """The newest complete step of a folder and its meta, checked."""
-    steps = [int(p.name) for p in folder.iterdir() if p.name.isdigit() and p.is_dir()]
-    if not steps:
-        raise CheckpointError(f"checkpoint folder {folder} holds no checkpoint")
-    step = max(steps)
+    step = int(newest_step(folder).name)
     try:
         with _manager(folder, None, create=False) as manager:
             meta = manager.restore(
@@ -214,7 +193,7 @@ def load(folder: str | pathlib.Path | None = None) -> Policy:
     Raises:
         CheckpointError: there is none, it is damaged, or another version made it.
     """
-    root = _resolve(folder)
+    root = resolve(folder)
     path, step, meta = _latest(root)
     try:
         config = NetworkConfig(**meta["network"])
@@ -323,7 +302,7 @@ def restore(folder: str | pathlib.Path, fresh: Any) -> tuple[Any, dict[str, Any]
     Raises:
         CheckpointError: none, damaged, or one without a training state.
     """
-    root = _resolve(folder)
+    root = resolve(folder)
     path, step, meta = _latest(root)
     if not (path / "state").exists():
         raise CheckpointError(

@@ -1,13 +1,17 @@
 """Selection by a trained policy: one pass over the candidates, or a few.
 
-JAX is loaded by the first call. Candidates are brought to order one in float64 before
-the network, in float32, sees them, so pulses and degrees give the same pick.
+JAX is loaded by the first call, and the network only where nobody has decided alike on
+this machine before: programs are kept whole (``jaxcal.learning.programs``). Candidates
+are brought to order one in float64 before the network, in float32, sees them, so pulses
+and degrees give the same pick.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import pathlib
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,6 +22,7 @@ from jaxcal.selection.problem import make_problems
 
 if TYPE_CHECKING:
     from jaxcal.learning.checkpoint import Policy
+    from jaxcal.learning.programs import Program
 
 __all__ = ["DECODINGS", "load_policy", "select_batch", "to_order_one"]
 
@@ -29,12 +34,103 @@ _LARGEST_CHUNK = 512  # sets a compiled call
 Array = NDArray[np.float64]
 
 
-@functools.lru_cache(maxsize=8)
-def _cached(folder: str | None) -> Policy:
-    from jaxcal.learning import cache, checkpoint
+@dataclasses.dataclass(frozen=True)
+class _Call:
+    """What a program is compiled for."""
 
-    cache.keep_compiled_programs()
-    return checkpoint.load(folder)
+    size: int  # sets
+    num_candidates: int
+    num_inputs: int
+    num_required: int
+    k: int
+    decoding: str  # greedy, samples or first
+    num: int  # tries of the last two, else 1
+
+
+class _Source:
+    """A checkpoint folder, of which a process reads what it needs, once."""
+
+    def __init__(self, folder: str | None) -> None:
+        self.folder = folder
+        self._programs: dict[_Call, Program] = {}
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """Of its files when they were first asked for."""
+        from jaxcal.learning import checkpoint_folder
+
+        return checkpoint_folder.digest(self.folder)
+
+    @functools.cached_property
+    def policy(self) -> Policy:
+        """Network and weights."""
+        from jaxcal.learning import cache, checkpoint
+
+        cache.keep_compiled_programs()
+        return checkpoint.load(self.folder)
+
+    def program(self, call: _Call) -> Program:
+        """The policy, compiled for a call."""
+        if call not in self._programs:
+            from jaxcal.learning import programs
+
+            name = programs.name_of(self.digest, call)
+            self._programs[call] = programs.load(name) or self._compiled(call, name)
+        return self._programs[call]
+
+    def _compiled(self, call: _Call, name: str) -> Program:
+        policy = self.policy
+        import jax
+
+        from jaxcal.learning import checkpoint_folder, decoding, programs
+
+        if checkpoint_folder.digest(self.folder) != self.digest:
+            where = checkpoint_folder.resolve(self.folder)
+            raise checkpoint_folder.CheckpointError(
+                f"checkpoint folder {where} has changed since this process began to "
+                "use it; run again"
+            )
+
+        def decode(
+            params: Any, candidates: Any, free: Any, kept: Any, *key_data: Any
+        ) -> jax.Array:
+            key = jax.random.key(0)  # spent by samples only
+            if key_data:
+                key = jax.random.wrap_key_data(key_data[0])
+            chosen: jax.Array = decoding.choose(
+                policy.network,
+                params,
+                candidates,
+                free,
+                kept,
+                key,
+                k=call.k,
+                num_required=call.num_required,
+                decoding=call.decoding,
+                num=call.num,
+            )
+            return chosen
+
+        shape = (call.size, call.num_candidates)
+        arguments = [
+            jax.ShapeDtypeStruct((*shape, call.num_inputs), np.float32),
+            jax.ShapeDtypeStruct(shape, np.bool_),
+            jax.ShapeDtypeStruct((call.size, call.num_required), np.int32),
+        ]
+        if call.decoding == "samples":
+            key = jax.random.key_data(jax.random.key(0))
+            arguments.append(jax.ShapeDtypeStruct(key.shape, key.dtype))
+        facts = {"kind": policy.network.config.kind}
+        return programs.make(name, decode, policy.params, tuple(arguments), facts)
+
+
+@functools.lru_cache(maxsize=8)
+def _source(folder: str | None) -> _Source:
+    return _Source(folder)
+
+
+def _source_of(checkpoint: str | pathlib.Path | None) -> _Source:
+    return _source(None if checkpoint is None else str(checkpoint))
 
 
 def load_policy(checkpoint: str | pathlib.Path | None = None) -> Policy:
@@ -46,7 +142,7 @@ def load_policy(checkpoint: str | pathlib.Path | None = None) -> Policy:
     Raises:
         ValueError: it is missing, damaged, or made by another version.
     """
-    return _cached(None if checkpoint is None else str(checkpoint))
+    return _source_of(checkpoint).policy
 
 
 def to_order_one(candidates: Array, usable: NDArray[np.bool_], white: bool) -> Array:
@@ -123,31 +219,32 @@ def select_batch(
     usable = np.stack([problem.available for problem in problems])
     kept = np.stack([problem.required for problem in problems])
     batch, m, _ = sets.shape
-    from jaxcal.learning.geometry import num_starts
-
-    policy = load_policy(checkpoint)
     import jax
 
-    scaled = to_order_one(sets, usable, white=policy.network.config.kind == "compact")
-    inputs = np.where(usable[..., None], scaled, 0.0).astype(np.float32)
+    from jaxcal.learning.geometry import num_starts
+
     tries = num if decoding in ("samples", "first") else 1
     chunk = batch if chunk is None else chunk
     pairs = m * num_starts(m) * tries
     size = max(1, min(batch, chunk, _CELLS // pairs, _LARGEST_CHUNK))
-    how = "greedy" if decoding == "exchange" else decoding
     cuts = [
         slice(begin, min(begin + size, first + chunk, batch))
         for first in range(0, batch, chunk)
         for begin in range(first, min(first + chunk, batch), size)
     ]
     number = min(len(cuts), jax.local_device_count())
+    how = "greedy" if decoding == "exchange" else decoding
+    call = _Call(size, m, sets.shape[-1], kept.shape[1], k, how, tries)
+    chooser = _chooser(_source_of(checkpoint), call, number)
+    scaled = to_order_one(sets, usable, white=chooser.kind == "compact")
+    inputs = np.where(usable[..., None], scaled, 0.0).astype(np.float32)
     chosen = []
     for begin in range(0, len(cuts), number):
         parts = [
-            (inputs[cut], usable[cut], kept[cut], seed + cut.start)
+            (inputs[cut], usable[cut], kept[cut].astype(np.int32), seed + cut.start)
             for cut in cuts[begin : begin + number]
         ]
-        chosen += _choose(policy, parts, k, how, num, size, number)
+        chosen += _choose(chooser.run, parts, size, number)
     indices = np.concatenate(chosen)
     if decoding == "exchange":
         found = zip(problems, indices, strict=True)
@@ -155,12 +252,51 @@ def select_batch(
     return indices
 
 
+@dataclasses.dataclass(frozen=True)
+class _Chooser:
+    """The policy of a folder, for a call on each of so many devices."""
+
+    kind: str  # of the network
+    run: Callable[..., Any]  # (candidates, free, kept, a seed a device) -> indices
+
+
+def _chooser(source: _Source, call: _Call, number: int) -> _Chooser:
+    import jax
+
+    if number == 1:
+        program = source.program(call)
+
+        def alone(candidates: Any, free: Any, kept: Any, seeds: list[int]) -> Any:
+            if call.decoding != "samples":
+                return program(candidates, free, kept)
+            key_data = jax.random.key_data(jax.random.key(seeds[0]))
+            return program(candidates, free, kept, key_data)
+
+        return _Chooser(program.facts["kind"], alone)
+    from jaxcal.learning import decoding
+
+    policy = source.policy
+
+    def together(candidates: Any, free: Any, kept: Any, seeds: list[int]) -> Any:
+        return decoding.choose_on_devices(
+            policy.network,
+            policy.params,
+            candidates,
+            free,
+            kept,
+            jax.numpy.stack([jax.random.key(seed) for seed in seeds]),
+            k=call.k,
+            num_required=call.num_required,
+            decoding=call.decoding,
+            num=call.num,
+        )
+
+    return _Chooser(policy.network.config.kind, together)
+
+
 def _choose(
-    policy: Policy,
-    parts: list[tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.int64], int]],
-    k: int,
-    decoding: str,
-    num: int,
+    run: Callable[..., Any],
+    parts: list[tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.int32], int]],
     size: int,
     number: int,
 ) -> list[NDArray[np.int64]]:
@@ -168,10 +304,6 @@ def _choose(
 
     A short part is filled up by repeating its first set, a missing one by the first.
     """
-    import jax
-
-    from jaxcal.learning import decoding as decoders
-
     given = [parts[min(i, len(parts) - 1)] for i in range(number)]
     fills = [np.arange(size) * (np.arange(size) < len(part[0])) for part in given]
     candidates, free, kept = (
@@ -180,19 +312,6 @@ def _choose(
         )
         for n in range(3)
     )
-    keys = [jax.random.key(part[3]) for part in given]
-    choose: Any = decoders.choose if number == 1 else decoders.choose_on_devices
-    indices = choose(
-        policy.network,
-        policy.params,
-        candidates,
-        free,
-        kept.astype(np.int32),
-        keys[0] if number == 1 else jax.numpy.stack(keys),
-        k=k,
-        num_required=kept.shape[1],
-        decoding=decoding,
-        num=num,
-    )
-    rows = np.asarray(indices).reshape(number, size, k).astype(np.int64)
+    indices = np.asarray(run(candidates, free, kept, [part[3] for part in given]))
+    rows = indices.reshape(number, size, -1).astype(np.int64)
     return [row[: len(part[0])] for row, part in zip(rows, parts, strict=False)]

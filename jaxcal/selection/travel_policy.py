@@ -39,7 +39,7 @@ _RIDGE = 1e-8  # of the whitened Gram matrix of fewer postures than parameters
 def _network(method: str, checkpoint: str | pathlib.Path | None) -> tuple[Any, Any]:
     """The network and its parameters; none for the look-ahead."""
     from jaxcal.learning import cache, networks
-    from jaxcal.learning.checkpoint import default_folder
+    from jaxcal.learning.checkpoint_folder import default_folder
 
     if method == "lookahead":
         cache.keep_compiled_programs()
