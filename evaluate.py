@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import pathlib
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
@@ -16,6 +19,7 @@ if TYPE_CHECKING:
 EXIT_OK = 0
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 143
 
 _DESCRIPTION = """\
 Let every method choose K postures in every episode of a dataset, and compare the
@@ -90,18 +94,40 @@ def _alone(arguments: list[str] | None) -> int:
     options = _parse(arguments)
     progress = Progress(quiet=options.quiet)
     try:
-        return _evaluate(options, progress)
-    except KeyboardInterrupt:
+        with _stopped_by_sigterm():
+            return _evaluate(options, progress)
+    except KeyboardInterrupt as stop:
         progress.clear()
+        terminated = isinstance(stop, _Terminated)
         kept = "nothing was written"
         if options.stream is not None:
             kept = "finished parts are kept; the same command goes on"
-        print(f"evaluate.py: interrupted, {kept}", file=sys.stderr)
-        return EXIT_INTERRUPTED
+        how = "terminated" if terminated else "interrupted"
+        print(f"evaluate.py: {how}, {kept}", file=sys.stderr)
+        return EXIT_TERMINATED if terminated else EXIT_INTERRUPTED
     except (ValueError, OSError) as error:
         progress.clear()
         print(f"evaluate.py: error: {_one_line(error)}", file=sys.stderr)
         return EXIT_ERROR
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM, which ends the command as Ctrl-C does."""
+
+
+@contextlib.contextmanager
+def _stopped_by_sigterm() -> Iterator[None]:
+    def stop(number: int, frame: object) -> NoReturn:
+        raise _Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _evaluate(options: argparse.Namespace, progress: Progress) -> int:

@@ -8,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -176,7 +177,13 @@ def test_a_missing_checkpoint_is_one_line_and_code_2(tmp_path: pathlib.Path) -> 
     assert list(tmp_path.iterdir()) == []
 
 
-def test_ctrl_c_writes_nothing(tmp_path: pathlib.Path) -> None:
+@pytest.mark.parametrize(
+    ("number", "code", "says"),
+    [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")],
+)
+def test_a_stopped_command_writes_nothing(
+    tmp_path: pathlib.Path, number: int, code: int, says: str
+) -> None:
     child = subprocess.Popen(
         [
             *(sys.executable, str(ROOT / "evaluate.py"), "--dataset", "dataset3"),
@@ -191,11 +198,37 @@ def test_ctrl_c_writes_nothing(tmp_path: pathlib.Path) -> None:
     )
     assert child.stdout is not None
     assert child.stdout.readline().startswith("dataset3")
-    child.send_signal(signal.SIGINT)
+    child.send_signal(number)
     _, errors = child.communicate(timeout=120)
-    assert child.returncode == 130, errors
-    assert errors.splitlines()[-1] == "evaluate.py: interrupted, nothing was written"
+    assert child.returncode == code, errors
+    assert errors.splitlines()[-1] == f"evaluate.py: {says}, nothing was written"
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_stream_stopped_by_sigterm_says_so_and_keeps_its_parts(
+    tmp_path: pathlib.Path,
+) -> None:
+    folder = tmp_path / "parts"
+    child = subprocess.Popen(
+        [
+            *(sys.executable, str(ROOT / "evaluate.py"), "--stream", str(folder)),
+            *("--episodes", "10000000", "--methods", "greedy", "--draws", "2"),
+        ],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
+    assert child.stderr is not None
+    while not list(folder.glob("part-*")):
+        assert child.poll() is None
+        time.sleep(0.1)
+    child.send_signal(signal.SIGTERM)
+    _, errors = child.communicate(timeout=120)
+    assert child.returncode == 143, errors
+    says = "evaluate.py: terminated, finished parts are kept; the same command goes on"
+    assert errors.splitlines()[-1] == says
+    assert not [path for path in folder.iterdir() if path.suffix != ".json"]
 
 
 @pytest.mark.slow
