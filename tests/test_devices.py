@@ -131,15 +131,19 @@ def test_the_policy_chooses_the_same_on_every_number_of_devices() -> None:
             select_batch(sets, 4, available=free, chunk=chunk, decoding=how, num=2)
             for how, chunk in (("greedy", 3), ("samples", 2))
         ]
+    def last_two_sorted(number):
+        indices = np.array(chosen[number])
+        return np.concatenate([indices[..., :2], np.sort(indices[..., 2:])], -1)
     out["same"] = all(
-        (np.array(chosen[8]) == np.array(chosen[other])).all() for other in (1, 3)
+        (last_two_sorted(8) == last_two_sorted(other)).all() for other in (1, 3)
     )
     out["valid"] = bool(np.take_along_axis(free, chosen[8][1], 1).all())
     mixed = select_batch(sets, 4, available=free, chunk=27, decoding="samples", num=2)
     out["cut matters"] = bool((mixed != chosen[8][1]).any())
     """
     out = python(BEGIN, script, flags=f"{EIGHT} {QUICK}")
-    # Samples depend on where a chunk begins, so that the devices could have shown.
+    # Either of the best last pair may come first: both have its volume, and rounding
+    # decides. Samples depend on where a chunk begins: the devices could have shown.
     assert out == {"same": True, "valid": True, "cut matters": True}
 
 

@@ -183,7 +183,8 @@ def choose_on_devices(
     """``choose`` on the first devices of this process at once, an equal share on each.
 
     Every device runs the program that a single one would run on its share, so what is
-    chosen does not depend on their number.
+    chosen does not depend on their number; the order of the last two postures, equal in
+    all but rounding, may.
 
     Args:
         network, params: see ``choose``.

@@ -185,7 +185,8 @@ def select_batch(
     """Choose k postures for every candidate set of a batch.
 
     The sets are cut into chunks of one size, and every device of this process takes one
-    at a time: what is chosen does not depend on how many there are.
+    at a time: what is chosen does not depend on how many there are. (The last two
+    postures are the best pair; which of them is named first, rounding may decide.)
 
     Args:
         candidates: (B, M, n) commands, none of the sets in one plane.
