@@ -30,7 +30,7 @@ import jaxcal
 from jaxcal.files import atomic_write
 from jaxcal.learning import cache
 
-__all__ = ["Program", "load", "make", "name_of"]
+__all__ = ["Program", "are_kept", "load", "make", "name_of"]
 
 _MOST = 128  # programs kept; the one used longest ago goes first
 _DIGEST = 32  # bytes of SHA-256 in front of a file
@@ -68,6 +68,11 @@ def name_of(*what: Any) -> str:
     return hashlib.sha256(repr(whole).encode()).hexdigest()
 
 
+def are_kept() -> bool:
+    """Whether programs are kept here at all."""
+    return _path("any") is not None
+
+
 def load(name: str) -> Program | None:
     """The program of a name; None where it is not kept, or is not whole."""
     path = _path(name)
@@ -96,6 +101,8 @@ def make(
     weights: Any,
     arguments: tuple[jax.ShapeDtypeStruct, ...],
     facts: Mapping[str, Any],
+    *,
+    donate: bool = False,
 ) -> Program:
     """Compile a program and keep it.
 
@@ -105,10 +112,13 @@ def make(
         weights: a tree of arrays.
         arguments: their shapes and types.
         facts: what else its user needs to know, plain values.
+        donate: whether the arguments are given up to the results.
     """
+    given_up = tuple(range(1, 1 + len(arguments))) if donate else ()
     path = _path(name)
     if path is None:
-        compiled = jax.jit(function).lower(weights, *arguments).compile()
+        lowered = jax.jit(function, donate_argnums=given_up).lower(weights, *arguments)
+        compiled = lowered.compile()
         return Program(compiled, weights, facts)
 
     def anew(*given: Any) -> Any:
@@ -117,7 +127,7 @@ def make(
     # Under a name never used before, so that JAX's cache does not have it: code loaded
     # from one file cannot be written to another (jaxlib 0.10 leaves parts of it out).
     anew.__name__ = f"program_{secrets.token_hex(8)}"
-    lowered = jax.jit(anew).lower(weights, *arguments)
+    lowered = jax.jit(anew, donate_argnums=given_up).lower(weights, *arguments)
     with _not_in_jax_cache():
         compiled = lowered.compile()
     program = Program(compiled, weights, facts)

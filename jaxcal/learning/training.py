@@ -33,6 +33,7 @@ from jaxcal.learning import (
     networks,
     ppo,
     travel,
+    updates,
 )
 from jaxcal.learning.networks import Network, NetworkConfig
 from jaxcal.learning.ppo import PPOConfig, Task
@@ -207,6 +208,7 @@ def train(
     looked = saved = begun
     mark_time, mark_update = begun, done
     k = config.tasks[0].environment.num_selected
+    update_of: dict[Task, updates.Update] = {}
     imitated = min(config.ppo.num_imitated, last)
     lessons = imitation.Lessons(
         functools.partial(_lesson, config, network, teacher), imitated
@@ -222,7 +224,11 @@ def train(
                     )
                     rewards = np.zeros(0, np.float32)
                 else:
-                    state, metrics = ppo.update(state, config.ppo, task, network, mesh)
+                    if task not in update_of:
+                        update_of[task] = updates.updater(
+                            config.ppo, task, network, mesh, state
+                        )
+                    state, metrics = update_of[task](state)
                     rewards = np.asarray(metrics.pop("rewards"))
                 row = {name: float(value) for name, value in metrics.items()}
             done += 1

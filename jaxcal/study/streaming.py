@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from jaxcal.files import write_text
 from jaxcal.study import datasets, evaluation
 from jaxcal.study.results import StreamedData, StreamedEvaluation, StreamedResult
-from jaxcal.study.tally import Tally, tally_of
+from jaxcal.study.tally import RunningTally, Tally, tally_of
 
 __all__ = ["PART", "Plan", "evaluate_stream", "num_cores", "open_folder"]
 
@@ -176,7 +176,7 @@ def evaluate_stream(
             report("episodes", done, todo)
     while not all(_path(folder, cut).exists() for cut in cuts):
         time.sleep(_POLL_SECONDS)
-    return _total(plan, episodes, folder, cuts)
+    return _total(plan, episodes, folder, cuts, report)
 
 
 def _description(plan: Plan) -> dict[str, Any]:
@@ -366,12 +366,17 @@ def _write(folder: pathlib.Path, cut: tuple[int, int], part: dict[str, Any]) -> 
 
 
 def _total(
-    plan: Plan, episodes: int, folder: pathlib.Path, cuts: list[tuple[int, int]]
+    plan: Plan,
+    episodes: int,
+    folder: pathlib.Path,
+    cuts: list[tuple[int, int]],
+    report: Progress,
 ) -> StreamedEvaluation:
     """All parts of a folder added up."""
     proven = 0
-    totals: dict[str, Tally] = {}
-    for cut in cuts:
+    running: dict[str, RunningTally] = {}
+    for number, cut in enumerate(cuts):
+        report("parts added up", number, len(cuts))
         path = _path(folder, cut)
         try:
             part = json.loads(path.read_text(encoding="utf-8"))
@@ -379,12 +384,12 @@ def _total(
                 raise ValueError(f"it says episodes {part['episodes']}")
             proven += int(part["proven"])
             for name, row in part["methods"].items():
-                tally = Tally.from_json(row)
-                totals[name] = totals[name] + tally if name in totals else tally
+                running.setdefault(name, RunningTally()).add(Tally.from_json(row))
         except (ValueError, KeyError, TypeError) as error:
             raise ValueError(
                 f"{path} is damaged ({error}); delete it, and it is computed again"
             ) from None
+    totals = {name: tallies.total() for name, tallies in running.items()}
     random = totals["random"]
     return StreamedEvaluation(
         dataset=StreamedData(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from jaxcal.study.exact_sums import ExactSum, exact_sum
 from jaxcal.study.results import HIT_TOLERANCE
 
-__all__ = ["BINS_PER_UNIT", "Tally", "tally_of"]
+__all__ = ["BINS_PER_UNIT", "RunningTally", "Tally", "tally_of"]
 
 Array = NDArray[np.float64]
 
@@ -129,6 +129,25 @@ class Tally:
                 return float((number + inside) / BINS_PER_UNIT)
             below += count
         raise ValueError("a tally of nothing has no median")
+
+
+class RunningTally:
+    """Tallies added one after another; their histograms are merged in place."""
+
+    def __init__(self) -> None:
+        self._sums = Tally()
+        self._bins: Counter[int] = Counter()
+
+    def add(self, tally: Tally) -> None:
+        """One more."""
+        self._sums += dataclasses.replace(tally, histogram=())
+        self._bins.update(dict(tally.histogram))
+
+    def total(self) -> Tally:
+        """All of them together."""
+        return dataclasses.replace(
+            self._sums, histogram=tuple(sorted(self._bins.items()))
+        )
 
 
 def tally_of(
