@@ -71,6 +71,16 @@ def peak_gigaflops() -> float:
     return 2.0 * n**3 / min(seconds) / 1e9
 
 
+def torch_peak_gigaflops() -> float:
+    """The same through PyTorch."""
+    import torch
+
+    n = 1600
+    a = torch.randn(n, n)
+    seconds = interleaved({"gemm": lambda: a @ a}, 7)["gemm"]
+    return 2.0 * n**3 / min(seconds) / 1e9
+
+
 def run(budget: Budget) -> Row:
     row = Row(NAME, TITLE)
     calls: dict[str, Callable[[], object]] = {"jaxcal": ours()}
@@ -113,4 +123,7 @@ def run(budget: Budget) -> Row:
         Line("floor", "episodes at that speed", EPISODES / floor, "episodes/s"),
         Line("floor", "share reached by jaxcal", reached, "of that speed"),
     ]
+    if available("torch"):
+        own = torch_peak_gigaflops()
+        row.lines.append(Line("floor", "that product, PyTorch", own, "Gflop/s"))
     return row
