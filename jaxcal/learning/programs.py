@@ -32,7 +32,7 @@ from jaxcal.learning import cache
 
 __all__ = ["Program", "are_kept", "load", "make", "name_of"]
 
-_MOST = 128  # programs kept; the one used longest ago goes first
+_MOST = 64  # programs kept; the one used longest ago goes first
 _DIGEST = 32  # bytes of SHA-256 in front of a file
 
 
