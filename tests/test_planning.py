@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import jaxcal
@@ -64,20 +64,26 @@ def test_the_smallest_k_and_the_bounds_hold_against_brute_force(criterion, repea
 
 
 @settings(max_examples=15)
+@example(1398425, "G", 1, True)  # not even all fourteen are enough
 @given(st.integers(0, 2**31), st.sampled_from("GI"), st.integers(1, 3), st.booleans())
 def test_laws_of_a_plan(seed, criterion, cap, with_region):
     rng = np.random.default_rng(seed)
     candidates = rng.random((14, 3)) * 50 - 20
     region = rng.random((7, 3)) * 50 - 20 if with_region else None
-    found = plan(
-        candidates,
-        target_accuracy=1.2,
-        noise_std=1.0,
-        criterion=criterion,
-        region=region,
-        max_replicates=cap,
-        design="exchange",
-    )
+    wanted = {
+        "target_accuracy": 1.2,
+        "noise_std": 1.0,
+        "criterion": criterion,
+        "region": region,
+        "max_replicates": cap,
+        "design": "exchange",
+    }
+    everything = np.repeat(np.arange(14), cap)
+    if np.sqrt(value_of(candidates, everything, criterion, region)) > 1.2:
+        with pytest.raises(ValueError, match="must be reachable"):
+            plan(candidates, **wanted)
+        return
+    found = plan(candidates, **wanted)
     assert len(found.indices) == found.k
     assert np.bincount(found.indices).max() <= cap
     assert (found.standard_error <= 1.2 * (1 + 1e-9)).all()
