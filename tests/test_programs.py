@@ -28,15 +28,6 @@ def affine(weights, x):
 
 
 @pytest.fixture
-def kept(tmp_path):
-    """The folder of programs, empty."""
-    before = jax.config.values["jax_compilation_cache_dir"]
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    yield tmp_path / "programs"
-    jax.config.update("jax_compilation_cache_dir", before)
-
-
-@pytest.fixture
 def fresh():
     """As if nothing had been chosen in this process yet."""
     policy._source.cache_clear()
@@ -78,8 +69,22 @@ def test_a_damaged_program_is_no_program(kept, damage):
 def test_a_program_of_somebody_else_is_not_run(kept, monkeypatch):
     made("a")
     assert programs.load("a") is not None
+    (kept / "a.program").chmod(0o620)  # another could have written it
+    assert programs.load("a") is None
+    (kept / "a.program").chmod(0o600)
+    assert programs.load("a") is not None
     monkeypatch.setattr(os, "getuid", lambda: os.geteuid() + 1)
     assert programs.load("a") is None
+
+
+def test_a_loose_umask_does_not_open_a_program_to_others(kept):
+    before = os.umask(0)
+    try:
+        made("a")
+    finally:
+        os.umask(before)
+    assert (kept / "a.program").stat().st_mode & 0o077 == 0
+    assert programs.load("a") is not None
 
 
 def test_the_programs_used_longest_ago_go_first(kept, monkeypatch):

@@ -6,7 +6,6 @@ import dataclasses
 
 import jax
 import numpy as np
-import pytest
 
 from jaxcal.learning import networks, ppo, presets, updates
 
@@ -22,15 +21,6 @@ CONFIG = presets.with_values(
 )
 NETWORK = networks.build(CONFIG.network)
 TASK = CONFIG.tasks[0]
-
-
-@pytest.fixture
-def kept(tmp_path):
-    """The folder of programs, empty."""
-    before = jax.config.values["jax_compilation_cache_dir"]
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    yield tmp_path / "programs"
-    jax.config.update("jax_compilation_cache_dir", before)
 
 
 def leaves_of(state):

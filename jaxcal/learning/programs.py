@@ -79,8 +79,12 @@ def load(name: str) -> Program | None:
     if path is None:
         return None
     try:
-        if hasattr(os, "getuid") and path.stat().st_uid != os.getuid():
-            return None  # it holds code: only our own is run
+        # It holds code: only what nobody else could have written is run.
+        state = path.stat()
+        if hasattr(os, "getuid") and (
+            state.st_uid != os.getuid() or state.st_mode & 0o022
+        ):
+            return None
         data = path.read_bytes()
         body = memoryview(data)[_DIGEST:]
         if hashlib.sha256(body).digest() != data[:_DIGEST]:
@@ -182,6 +186,8 @@ def _agree(
 def _write(path: pathlib.Path, body: bytes) -> None:
     path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
     with atomic_write(path) as file:
+        if hasattr(os, "fchmod"):
+            os.fchmod(file.fileno(), 0o600)  # whatever the umask allows
         file.write(hashlib.sha256(body).digest() + body)
     kept = sorted(path.parent.glob("*.program"), key=lambda p: p.stat().st_mtime)
     for old in kept[:-_MOST]:
