@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help train checkpoint evaluate reproduce test test-first test-second test-all lint format benchmark clean
+.PHONY: help train checkpoint evaluate reproduce test  test-all lint format benchmark clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -15,7 +15,7 @@ help: ## this list
 $(READY): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "jaxcal needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 2; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[all,dev]'
 	@touch $@
 
 train: $(READY) ## set everything up and train the compact policy on this machine (a few minutes)
@@ -28,17 +28,10 @@ evaluate: $(READY) ## compare every method with the proven optimum on 1,000 unse
 	$(BIN)/python evaluate.py $(ARGS)
 
 reproduce: $(READY) ## the paper's figures, tables and claims from our own runs, in report/index.html
-	$(BIN)/python -m jaxcal.study.reproduce $(ARGS)
+	$(BIN)/python -m jaxcal.paper.reproduce $(ARGS)
 
 test: lint ## set everything up, lint, and run the quick tests (the ones CI runs)
-	$(MAKE) --jobs=2 --output-sync=target test-first test-second
-
-# Two halves of about equal length, side by side.
-test-first: $(READY)
-	$(BIN)/python -m pytest -m 'not slow' $(ARGS) $(sort $(wildcard tests/test_[a-q]*.py))
-
-test-second: $(READY)
-	$(BIN)/python -m pytest -m 'not slow' $(ARGS) tests/rig $(sort $(wildcard tests/test_[r-z]*.py))
+	$(BIN)/python -m pytest -n 2 --dist loadgroup -m 'not slow' $(ARGS)
 
 test-all: lint ## every test, the slow ones too
 	$(BIN)/python -m pytest $(ARGS)
@@ -56,7 +49,7 @@ format: $(READY) ## let ruff rewrite what it can
 $(BENCH)/.ready: pyproject.toml constraints.txt constraints-bench.txt
 	@test -n "$(PYTHON)" || { echo "jaxcal needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 2; }
 	$(PYTHON) -m venv $(BENCH)
-	$(BENCH)/bin/python -m pip install --quiet -c constraints.txt -c constraints-bench.txt -e '.[dev,bench]'
+	$(BENCH)/bin/python -m pip install --quiet -c constraints.txt -c constraints-bench.txt -e '.[all,dev,bench]'
 	@touch $@
 
 benchmark: $(BENCH)/.ready ## every benchmark with its peers: table, JSON, figures (26 to 40 minutes; ARGS="--only steps", "--quick")

@@ -12,9 +12,9 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
-    from jaxcal.study.datasets import Dataset
-    from jaxcal.study.progress import Progress
-    from jaxcal.study.results import Evaluation
+    from jaxcal.evaluation.progress import Progress
+    from jaxcal.evaluation.results import Evaluation
+    from jaxcal.paper.datasets.datasets import Dataset
 
 EXIT_OK = 0
 EXIT_ERROR = 2
@@ -79,7 +79,7 @@ class _Parser(argparse.ArgumentParser):
 
 def main(arguments: list[str] | None = None) -> int:
     """Evaluate, print, write; the exit code."""
-    from jaxcal.learning import processes
+    from jaxcal.learning.runtime import processes
 
     advice = "finished parts stay: start every process again"
     return processes.run_job(
@@ -89,7 +89,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _alone(arguments: list[str] | None) -> int:
     """The command in this process, which may be one of several."""
-    from jaxcal.study.progress import Progress
+    from jaxcal.evaluation.progress import Progress
 
     options = _parse(arguments)
     progress = Progress(quiet=options.quiet)
@@ -131,8 +131,8 @@ def _stopped_by_sigterm() -> Iterator[None]:
 
 
 def _evaluate(options: argparse.Namespace, progress: Progress) -> int:
-    from jaxcal.study.evaluation import POLICIES, check_methods, evaluate
-    from jaxcal.study.report import text_table
+    from jaxcal.evaluation.methods import POLICIES, check_methods, evaluate
+    from jaxcal.evaluation.report import text_table
 
     methods = check_methods([name for name in options.methods.split(",") if name])
     if options.checkpoint and not any(
@@ -178,8 +178,8 @@ def _evaluate(options: argparse.Namespace, progress: Progress) -> int:
 
 
 def _write_json(options: argparse.Namespace, evaluations: Sequence[Any]) -> None:
+    from jaxcal.evaluation.report import json_document
     from jaxcal.files import write_text
-    from jaxcal.study.report import json_document
 
     if options.json is None:
         return
@@ -194,8 +194,8 @@ def _evaluate_stream(
     options: argparse.Namespace, methods: tuple[str, ...], progress: Progress
 ) -> int:
     """Any number of episodes, in parts; of several processes the first prints."""
-    from jaxcal.study.report import text_table
-    from jaxcal.study.streaming import Plan, evaluate_stream, open_folder
+    from jaxcal.evaluation.report import text_table
+    from jaxcal.evaluation.streaming import Plan, evaluate_stream, open_folder
 
     refused = {
         "--report": options.report is not None,
@@ -256,14 +256,14 @@ def _on_first(function: Callable[[], None]) -> None:
     if _process()[1] == 1:
         function()
         return
-    from jaxcal.learning import devices
+    from jaxcal.learning.runtime import devices
 
     devices.on_first(function)
 
 
 def _dataset(name: str, options: argparse.Namespace, progress: Progress) -> Dataset:
-    from jaxcal.study import datasets
-    from jaxcal.study.dataset_files import load_dataset
+    from jaxcal.evaluation.dataset_files import load_dataset
+    from jaxcal.paper.datasets import datasets
 
     if name in datasets.NAMES:
         limit = datasets.EPISODES[name]
@@ -316,11 +316,11 @@ def _write_report(
     command: list[str],
 ) -> None:
     """Draw everything, then write everything, the page last."""
+    from jaxcal.evaluation.figures import evaluation_figures
+    from jaxcal.evaluation.report import file_prefix, html_page
+    from jaxcal.evaluation.training_figure import training_curves
     from jaxcal.files import atomic_write
-    from jaxcal.study.figure_style import as_bytes
-    from jaxcal.study.figures import evaluation_figures
-    from jaxcal.study.report import file_prefix, html_page
-    from jaxcal.study.training_figure import training_curves
+    from jaxcal.plots import as_bytes
 
     figures = {}
     for number, evaluation in enumerate(evaluations):
@@ -392,7 +392,7 @@ def _seconds(text: str) -> float:
 
 
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    from jaxcal.learning import processes
+    from jaxcal.learning.runtime import processes
 
     parser = _Parser(
         prog="evaluate.py",
@@ -480,7 +480,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     options.arguments = given
     options.dataset = options.dataset or ["dataset2"]
     if options.methods is None:
-        from jaxcal.study.evaluation import DEFAULT_METHODS
+        from jaxcal.evaluation.methods import DEFAULT_METHODS
 
         options.methods = ",".join(DEFAULT_METHODS)
     return options

@@ -35,7 +35,8 @@ class Parser(argparse.ArgumentParser):
 
 def parser() -> argparse.ArgumentParser:
     """Flags; those of a configuration are made from its fields."""
-    from jaxcal.learning import presets, processes
+    from jaxcal.learning.runtime import processes
+    from jaxcal.learning.training import presets
 
     out = Parser(
         description=__doc__,
@@ -89,7 +90,7 @@ def main(argv: list[str] | None = None) -> int:
 
     3 where another process of the job was lost.
     """
-    from jaxcal.learning import processes
+    from jaxcal.learning.runtime import processes
 
     advice = "what is saved stays: start every process again with --resume"
     return processes.run_job("train.py", argv, lambda: alone(argv), advice)
@@ -108,7 +109,8 @@ def alone(argv: list[str] | None) -> int:
 def configuration(arguments: argparse.Namespace, out: pathlib.Path) -> Any:
     """What to train, from the flags or from the run to go on with."""
     from jaxcal.files import require_writable_folder
-    from jaxcal.learning import checkpoint, presets, training
+    from jaxcal.learning.training import checkpoint, presets
+    from jaxcal.learning.training import run as training
 
     given = {
         name: value
@@ -139,8 +141,11 @@ def run(arguments: argparse.Namespace) -> int:
     """Train, say how it went; of several processes the first speaks for all."""
     import jax
 
-    from jaxcal.learning import cache, checkpoint, devices, networks, ppo, training
-    from jaxcal.study.validation import fixed_validation, teacher
+    from jaxcal.evaluation.validation import fixed_validation, teacher
+    from jaxcal.learning.policies import networks
+    from jaxcal.learning.runtime import cache, devices
+    from jaxcal.learning.training import checkpoint, ppo
+    from jaxcal.learning.training import run as training
 
     cache.keep_compiled_programs()
     if arguments.trainer == "brax":
@@ -164,7 +169,7 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     stop = Stop()
     if arguments.trainer == "brax":
-        from jaxcal.learning import brax_ppo
+        from jaxcal.learning.training import brax_ppo
 
         brax_ppo.train(config, out, print)
         print(

@@ -16,7 +16,7 @@ import time
 import numpy as np
 
 import jaxcal
-from jaxcal.learning import cache
+from jaxcal.learning.runtime import cache
 
 CASES = ((4, 0.999), (6, 0.99), (6, 0.999), (8, 0.99), (8, 0.999))
 

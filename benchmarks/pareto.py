@@ -19,7 +19,7 @@ import pathlib
 import numpy as np
 
 from jaxcal.selection import select
-from jaxcal.selection.cost import (
+from jaxcal.selection.fastest.fastest import (
     Motion,
     ParetoFront,
     fastest_tour,

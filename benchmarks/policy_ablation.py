@@ -37,15 +37,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcal.evaluation.validation import teacher
 from jaxcal.files import require_writable_folder, write_text
-from jaxcal.learning import cache, decoding, presets, scenarios, training
-from jaxcal.learning.checkpoint import package_versions
-from jaxcal.learning.environment import SelectionConfig
-from jaxcal.learning.networks import CompactNetwork, NetworkConfig, View
-from jaxcal.regression import log_det_information
+from jaxcal.information.regression import log_det_information
+from jaxcal.learning.environments import scenarios
+from jaxcal.learning.environments.selection import SelectionConfig
+from jaxcal.learning.policies import decoding
+from jaxcal.learning.policies.networks import CompactNetwork, NetworkConfig, View
+from jaxcal.learning.runtime import cache
+from jaxcal.learning.training import presets
+from jaxcal.learning.training import run as training
+from jaxcal.learning.training.checkpoint import package_versions
 from jaxcal.selection import exact_batch, greedy_batch, select
 from jaxcal.selection.policy import select_batch
-from jaxcal.study.validation import teacher
 
 HIT = 1e-9
 PARTS = ("unlearned", "shipped", "tasks", "time", "trained")
@@ -154,7 +158,7 @@ def uniform_sets(num: int, m: int, k: int, n: int, seed: int) -> np.ndarray:
 
 
 def shaped_sets(num: int, name: str, seed: int) -> np.ndarray:
-    """(num, 50, 3) candidates of one shape of ``jaxcal.learning.scenarios``."""
+    """(num, 50, 3) candidates of one shape of ``jaxcal.learning.environments.scenarios``."""
     draw = scenarios.mixture(SelectionConfig(), (name,))
     keys = jax.random.split(jax.random.key(seed), num)
     return np.asarray(jax.jit(jax.vmap(draw))(keys)[0], np.float64)

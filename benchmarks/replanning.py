@@ -21,7 +21,7 @@ import argparse
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.regression import log_det_information
+from jaxcal.information.regression import log_det_information
 from jaxcal.selection import exact_batch, greedy_batch
 from jaxcal.selection.policy import select_batch
 

@@ -16,9 +16,9 @@ import jax
 import numpy as np
 
 import jaxcal
-from jaxcal.study.datasets import BIAS_DEG, SCALE, make_dataset
-from jaxcal.study.robot import ORDERS, RobotConfig, measure, read_out
-from jaxcal.study.robot_model import simulate
+from jaxcal.paper.datasets.datasets import BIAS_DEG, SCALE, make_dataset
+from jaxcal.paper.twin.robot import ORDERS, RobotConfig, measure, read_out
+from jaxcal.paper.twin.robot_model import simulate
 
 GROUPS, LENGTH = 20, 50
 

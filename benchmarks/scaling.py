@@ -15,7 +15,9 @@ import time
 
 import jax
 
-from jaxcal.learning import cache, devices, networks, ppo, presets
+from jaxcal.learning.policies import networks
+from jaxcal.learning.runtime import cache, devices
+from jaxcal.learning.training import ppo, presets
 
 
 def measure(preset: str, number: int, num_updates: int) -> dict[str, float]:

@@ -16,8 +16,8 @@ import time
 import numpy as np
 
 from jaxcal.selection import Problem, exact_batch, make_problem, select
-from jaxcal.selection.branch_and_bound import branch_and_bound
-from jaxcal.selection.exchange import exchange_indices
+from jaxcal.selection.exact.branch_and_bound import branch_and_bound
+from jaxcal.selection.exchange.exchange import exchange_indices
 
 HIT = 1e-8
 

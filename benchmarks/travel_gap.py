@@ -19,10 +19,11 @@ import time
 import numpy as np
 from pareto import HOME, MOTION
 
-from jaxcal.selection import cost, make_problem
-from jaxcal.selection.cost import fastest_tour, travel_times
-from jaxcal.selection.exact import solve_exact
-from jaxcal.selection.travel_policy import WEIGHTS, completed
+from jaxcal.selection import make_problem
+from jaxcal.selection.exact.exact import solve_exact
+from jaxcal.selection.fastest import fastest as cost
+from jaxcal.selection.fastest.fastest import fastest_tour, travel_times
+from jaxcal.selection.fastest.travel_policy import WEIGHTS, completed
 
 SHARES = (0.8, 0.9, 0.95, 0.99)
 

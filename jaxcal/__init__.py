@@ -11,9 +11,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration, identify
-    from jaxcal.planning import plan
-    from jaxcal.regression import (
+    from jaxcal.calibration.identify import Calibration, identify
+    from jaxcal.information.regression import (
         hat_matrix,
         information_matrix,
         leverages,
@@ -21,7 +20,8 @@ if TYPE_CHECKING:
         regression_matrix,
     )
     from jaxcal.selection import Selection, score, select
-    from jaxcal.selection.cost import Motion, pareto_front, select_fastest
+    from jaxcal.selection.fastest.fastest import Motion, pareto_front, select_fastest
+    from jaxcal.selection.plan import plan
 
 __all__ = [
     "Calibration",
@@ -43,22 +43,24 @@ __all__ = [
 __version__ = "0.1.0"
 
 _HOME = {
-    "Calibration": "jaxcal.calibration",
-    "identify": "jaxcal.calibration",
-    "plan": "jaxcal.planning",
+    "Calibration": "jaxcal.calibration.identify",
+    "identify": "jaxcal.calibration.identify",
+    "plan": "jaxcal.selection.plan",
     "Selection": "jaxcal.selection",
     "score": "jaxcal.selection",
     "select": "jaxcal.selection",
-    "Motion": "jaxcal.selection.cost",
-    "pareto_front": "jaxcal.selection.cost",
-    "select_fastest": "jaxcal.selection.cost",
+    "Motion": "jaxcal.selection.fastest.fastest",
+    "pareto_front": "jaxcal.selection.fastest.fastest",
+    "select_fastest": "jaxcal.selection.fastest.fastest",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module 'jaxcal' has no attribute {name!r}")
-    value = getattr(importlib.import_module(_HOME.get(name, "jaxcal.regression")), name)
+    value = getattr(
+        importlib.import_module(_HOME.get(name, "jaxcal.information.regression")), name
+    )
     globals()[name] = value
     return value
 

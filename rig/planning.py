@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.travel import MOST_EXACT, fastest_tour
+from jaxcal.selection.fastest.travel import MOST_EXACT, fastest_tour
 from rig.attitude import Array
 from rig.settings import RigConfig
 

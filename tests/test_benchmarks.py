@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxcal.learning import environment, networks
-from jaxcal.learning.environment import SelectionConfig
-from jaxcal.learning.networks import NetworkConfig
+from jaxcal.learning.environments import selection as environment
+from jaxcal.learning.environments.selection import SelectionConfig
+from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.networks import NetworkConfig
 
 CONFIG = SelectionConfig()
 ACTIONS = np.array([[3, 17, 49, 8], [0, 1, 2, 40]])

@@ -13,7 +13,7 @@ from jaxcal.candidates import (
     random_availability,
     uniform_candidates,
 )
-from jaxcal.regression import log_det_information
+from jaxcal.information.regression import log_det_information
 
 # A loaded machine is no failure.
 settings.register_profile("patient", deadline=None)

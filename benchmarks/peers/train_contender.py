@@ -57,7 +57,9 @@ def jaxcal_paper(sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
 def ours(which: str, sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
     import dataclasses
 
-    from jaxcal.learning import cache, presets, training
+    from jaxcal.learning.runtime import cache
+    from jaxcal.learning.training import presets
+    from jaxcal.learning.training import run as training
 
     cache.keep_compiled_programs()
     config = presets.PRESETS["compact"]
@@ -83,8 +85,11 @@ def ours(which: str, sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
 
 def brax(sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
     """``python train.py --trainer brax``: brax's own PPO, the network 64 wide."""
-    from jaxcal.learning import brax_ppo, cache, networks, presets, training
-    from jaxcal.learning.networks import NetworkConfig
+    from jaxcal.learning.policies import networks
+    from jaxcal.learning.policies.networks import NetworkConfig
+    from jaxcal.learning.runtime import cache
+    from jaxcal.learning.training import brax_ppo, presets
+    from jaxcal.learning.training import run as training
 
     cache.keep_compiled_programs()
     config = presets.with_values(

@@ -41,7 +41,9 @@ _UPDATE = (
     _RESIDENT
     + """
 import dataclasses, jax
-from jaxcal.learning import cache, networks, ppo, presets
+from jaxcal.learning.runtime import cache
+from jaxcal.learning.policies import networks
+from jaxcal.learning.training import ppo, presets
 cache.keep_compiled_programs()
 config = presets.with_values(presets.PRESETS["compact"], {
     "episodes_per_update": EPISODES, "num_minibatches": EPISODES // 512})
@@ -60,7 +62,8 @@ _MANY = (
     _RESIDENT
     + """
 import dataclasses, tempfile
-from jaxcal.learning import cache, presets, training
+from jaxcal.learning.runtime import cache
+from jaxcal.learning.training import presets, run as training
 cache.keep_compiled_programs()
 config = presets.with_values(presets.PRESETS["compact"], {
     "episodes_per_update": 16, "episodes_per_set": 4, "num_minibatches": 1,

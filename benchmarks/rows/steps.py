@@ -32,9 +32,10 @@ from benchmarks.harness import (
     median_ratio,
     side_by_side,
 )
-from jaxcal.learning import environment, randomness
-from jaxcal.learning.brax_env import SelectionEnv, wrap_fresh
-from jaxcal.learning.environment import SelectionConfig
+from jaxcal.learning.environments import randomness
+from jaxcal.learning.environments import selection as environment
+from jaxcal.learning.environments.brax_env import SelectionEnv, wrap_fresh
+from jaxcal.learning.environments.selection import SelectionConfig
 
 NAME = "steps"
 TITLE = "Environment steps per second, random policy"

@@ -17,7 +17,8 @@ from benchmarks.harness import (
     interleaved,
     median_ratio,
 )
-from jaxcal.learning import networks, ppo, presets
+from jaxcal.learning.policies import networks
+from jaxcal.learning.training import ppo, presets
 
 NAME = "throughput"
 TITLE = "Training throughput, paper preset (3.5 M parameters)"

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.selection.auto import check_least_efficiency, solve_auto
-from jaxcal.selection.exact import STARTING_RESTARTS, solve_exact
-from jaxcal.selection.exchange import default_restarts, exchange_indices
+from jaxcal.selection.exact.exact import STARTING_RESTARTS, solve_exact
+from jaxcal.selection.exchange.exchange import default_restarts, exchange_indices
 from jaxcal.selection.greedy import greedy_indices
 from jaxcal.selection.problem import Problem, make_problem, whole_number
 from jaxcal.selection.random import random_indices

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.criteria import d_efficiency
-from jaxcal.selection.exact import (
+from jaxcal.information.criteria import d_efficiency
+from jaxcal.selection.exact.exact import (
     STARTING_RESTARTS,
     ExactResult,
     solve_exact,

@@ -11,9 +11,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.regression import log_det_information
-from jaxcal.selection.exact import ExactResult, solve_exact
-from jaxcal.selection.exchange import exchange_indices
+from jaxcal.information.regression import log_det_information
+from jaxcal.selection.exact.exact import ExactResult, solve_exact
+from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.greedy import greedy_rows
 from jaxcal.selection.problem import Problem, make_problems, whole_number
 from jaxcal.selection.random import random_indices

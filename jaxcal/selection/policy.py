@@ -1,7 +1,7 @@
 """Selection by a trained policy: one pass over the candidates, or a few.
 
 JAX is loaded by the first call, and the network only where nobody has decided alike on
-this machine before: programs are kept whole (``jaxcal.learning.programs``). Candidates
+this machine before: programs are kept whole (``jaxcal.learning.runtime.programs``). Candidates
 are brought to order one in float64 before the network, in float32, sees them, so pulses
 and degrees give the same pick.
 """
@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.selection.exchange import exchange_from
+from jaxcal.selection.exchange.exchange import exchange_from
 from jaxcal.selection.problem import make_problems
 
 if TYPE_CHECKING:
-    from jaxcal.learning.checkpoint import Policy
-    from jaxcal.learning.programs import Program
+    from jaxcal.learning.runtime.programs import Program
+    from jaxcal.learning.training.checkpoint import Policy
 
 __all__ = ["DECODINGS", "load_policy", "select_batch", "to_order_one"]
 
@@ -57,14 +57,15 @@ class _Source:
     @functools.cached_property
     def digest(self) -> str:
         """Of its files when they were first asked for."""
-        from jaxcal.learning import checkpoint_folder
+        from jaxcal.learning.runtime import checkpoint_folder
 
         return checkpoint_folder.digest(self.folder)
 
     @functools.cached_property
     def policy(self) -> Policy:
         """Network and weights."""
-        from jaxcal.learning import cache, checkpoint
+        from jaxcal.learning.runtime import cache
+        from jaxcal.learning.training import checkpoint
 
         cache.keep_compiled_programs()
         return checkpoint.load(self.folder)
@@ -72,7 +73,7 @@ class _Source:
     def program(self, call: _Call) -> Program:
         """The policy, compiled for a call."""
         if call not in self._programs:
-            from jaxcal.learning import programs
+            from jaxcal.learning.runtime import programs
 
             name = programs.name_of(self.digest, call)
             self._programs[call] = programs.load(name) or self._compiled(call, name)
@@ -82,7 +83,8 @@ class _Source:
         policy = self.policy
         import jax
 
-        from jaxcal.learning import checkpoint_folder, decoding, programs
+        from jaxcal.learning.policies import decoding
+        from jaxcal.learning.runtime import checkpoint_folder, programs
 
         if checkpoint_folder.digest(self.folder) != self.digest:
             where = checkpoint_folder.resolve(self.folder)
@@ -222,7 +224,7 @@ def select_batch(
     batch, m, _ = sets.shape
     import jax
 
-    from jaxcal.learning.geometry import num_starts
+    from jaxcal.learning.policies.geometry import num_starts
 
     tries = num if decoding in ("samples", "first") else 1
     chunk = batch if chunk is None else chunk
@@ -274,7 +276,7 @@ def _chooser(source: _Source, call: _Call, number: int) -> _Chooser:
             return program(candidates, free, kept, key_data)
 
         return _Chooser(program.facts["kind"], alone)
-    from jaxcal.learning import decoding
+    from jaxcal.learning.policies import decoding
 
     policy = source.policy
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.regression import log_det_gram
+from jaxcal.information.regression import log_det_gram
 
 __all__ = ["Problem", "make_problem", "make_problems", "whole_number"]
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.criteria import Criteria, criteria, d_efficiency
+from jaxcal.information.criteria import Criteria, criteria, d_efficiency
 from jaxcal.selection.problem import Problem
 
 __all__ = ["BatchSelection", "Selection", "Subset"]
@@ -54,7 +54,7 @@ class Selection:
             return max(self.known_bound, self.log_det)
         if self.problem is None:
             return None
-        from jaxcal.selection.exact import upper_bound
+        from jaxcal.selection.exact.exact import upper_bound
 
         return max(upper_bound(self.problem), self.log_det)
 

@@ -300,7 +300,7 @@ def test_the_shipped_policy_makes_the_default_choice():
 
 
 def test_without_a_checkpoint_the_choice_is_the_exact_optimum(tmp_path, monkeypatch):
-    from jaxcal.learning import checkpoint_folder
+    from jaxcal.learning.runtime import checkpoint_folder
     from jaxcal.selection import policy
 
     config = parse_config(example_text("simulate"))

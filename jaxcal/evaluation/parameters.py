@@ -1,0 +1,77 @@
+"""A and b identified from the chosen postures, over many episodes at once."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.checks import axis_letter
+from jaxcal.paper.datasets.datasets import Dataset
+
+__all__ = ["estimate_parameters", "least_squares", "parameter_names", "predict"]
+
+Array = NDArray[np.float64]
+
+
+def parameter_names(num_inputs: int, num_outputs: int) -> tuple[str, ...]:
+    """``a11 a12 ... | bx by bz``: A row by row, then b (Equation 9)."""
+    slopes = [f"a{i + 1}{j + 1}" for i in range(num_outputs) for j in range(num_inputs)]
+    biases = [f"b{axis_letter(i, num_outputs)}" for i in range(num_outputs)]
+    return (*slopes, *biases)
+
+
+def estimate_parameters(dataset: Dataset, indices: NDArray[np.int64]) -> Array | None:
+    """Least-squares parameters of every selection; the batched ``jaxcal.identify``.
+
+    Args:
+        dataset: candidates and what was measured there.
+        indices: (E, R, k) chosen candidates.
+
+    Returns:
+        (E, R, m (n + 1)) A row by row, then b; in the unit of ``dataset.ranges`` where
+        it has one, else in that of the candidates. None where nothing was measured.
+    """
+    if dataset.measured is None:
+        return None
+    commands = dataset.candidates
+    if dataset.ranges is not None:
+        commands = dataset.ranges.denormalise(commands)
+    gather = indices[..., None]
+    u = np.take_along_axis(commands[:, None], gather, axis=2)
+    y = np.take_along_axis(dataset.measured[:, None], gather, axis=2)
+    return least_squares(u, y)
+
+
+def least_squares(commands: Array, measured: Array) -> Array:
+    """Parameters of many sets of postures at once, without uncertainty.
+
+    Args:
+        commands: (..., N, n) with N > n, each set of full rank.
+        measured: (..., N, m).
+
+    Returns:
+        (..., m (n + 1)) A row by row, then b.
+    """
+    mean_u = commands.mean(axis=-2, keepdims=True)
+    mean_y = measured.mean(axis=-2, keepdims=True)
+    q, r = np.linalg.qr(commands - mean_u)
+    slopes = np.linalg.solve(r, np.matrix_transpose(q) @ (measured - mean_y))
+    biases = (mean_y - mean_u @ slopes)[..., 0, :]
+    matrix = np.matrix_transpose(slopes)
+    return np.concatenate([matrix.reshape(*biases.shape[:-1], -1), biases], axis=-1)
+
+
+def predict(parameters: Array, commands: Array) -> Array:
+    """Outputs of many calibrations, the batched ``Calibration.predict``.
+
+    Args:
+        parameters: (..., m (n + 1)) A row by row, then b.
+        commands: (..., N, n).
+
+    Returns:
+        (..., N, m).
+    """
+    n = commands.shape[-1]
+    m = parameters.shape[-1] // (n + 1)
+    matrix = parameters[..., : m * n].reshape(*parameters.shape[:-1], m, n)
+    return commands @ np.matrix_transpose(matrix) + parameters[..., None, m * n :]

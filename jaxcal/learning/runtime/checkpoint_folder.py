@@ -1,0 +1,73 @@
+"""Where a checkpoint lies and what is in it, without reading it: no JAX, no orbax."""
+
+from __future__ import annotations
+
+import hashlib
+import pathlib
+
+__all__ = ["CheckpointError", "default_folder", "digest", "newest_step", "resolve"]
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that is missing, damaged, or made by another version."""
+
+
+def default_folder(name: str = "default") -> pathlib.Path:
+    """A checkpoint that ships: inside the installed package, or in the repository.
+
+    Args:
+        name: "default", or "travel" for the policy that knows what time is worth.
+    """
+    package = pathlib.Path(__file__).resolve().parents[2]
+    inside = package / "checkpoints" / name
+    return inside if inside.is_dir() else package.parent / "checkpoints" / name
+
+
+def resolve(folder: str | pathlib.Path | None) -> pathlib.Path:
+    """The folder with the numbered steps: the one given, or its ``checkpoint``.
+
+    Args:
+        folder: a checkpoint folder or a training run's; the one that ships when None.
+
+    Raises:
+        CheckpointError: it does not exist.
+    """
+    path = default_folder() if folder is None else pathlib.Path(folder)
+    if not path.is_dir():
+        hint = " (train one with: python train.py)" if folder is None else ""
+        raise CheckpointError(f"checkpoint folder {path} does not exist{hint}")
+    return path / "checkpoint" if (path / "checkpoint").is_dir() else path
+
+
+def newest_step(folder: pathlib.Path) -> pathlib.Path:
+    """The folder of the newest complete step.
+
+    Args:
+        folder: from ``resolve``.
+
+    Raises:
+        CheckpointError: there is no step.
+    """
+    steps = [p for p in folder.iterdir() if p.name.isdigit() and p.is_dir()]
+    if not steps:
+        raise CheckpointError(f"checkpoint folder {folder} holds no checkpoint")
+    return max(steps, key=lambda step: int(step.name))
+
+
+def digest(folder: str | pathlib.Path | None = None) -> str:
+    """SHA-256 of the files of the newest policy, all but a run's training state.
+
+    Raises:
+        CheckpointError: there is none.
+        OSError: it cannot be read.
+    """
+    step = newest_step(resolve(folder))
+    found = hashlib.sha256()
+    for path in sorted(step.rglob("*")):
+        name = path.relative_to(step)
+        if name.parts[0] == "state" or not path.is_file():
+            continue
+        data = path.read_bytes()
+        found.update(f"{name.as_posix()}\0{len(data)}\0".encode())
+        found.update(data)
+    return found.hexdigest()

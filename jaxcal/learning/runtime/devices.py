@@ -1,0 +1,198 @@
+"""One update over many devices: candidate sets are spread, everything else is the same.
+
+The mesh has one axis, ``sets``. Keys are split for every set of the whole job before
+anything is placed, so an update draws the same numbers on one device and on many; only
+the order of sums differs. The weights are on every device. With one device there is no
+mesh and nothing here does anything. Process 0 alone reads and writes files: what it
+read goes to the others through ``on_first``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from jaxcal.learning.runtime.processes import losing_a_process
+
+__all__ = [
+    "any_process",
+    "by_set",
+    "describe",
+    "everywhere",
+    "is_first",
+    "local",
+    "make_mesh",
+    "on_first",
+    "replicate",
+    "require_divisible",
+]
+
+T = TypeVar("T")
+
+
+def make_mesh(num_devices: int | None = None) -> Mesh | None:
+    """All devices of the job along the axis ``sets``; None for a single one.
+
+    Args:
+        num_devices: as many of each process; all when None.
+
+    Raises:
+        ValueError: a process has fewer.
+    """
+    devices = jax.devices()
+    if num_devices is not None:
+        have = jax.local_device_count()
+        if not 1 <= num_devices <= have:
+            raise ValueError(f"devices must be in [1, {have}], got {num_devices}")
+        devices = [
+            device
+            for process in range(jax.process_count())
+            for device in [d for d in devices if d.process_index == process][
+                :num_devices
+            ]
+        ]
+    return Mesh(np.asarray(devices), ("sets",)) if len(devices) > 1 else None
+
+
+def require_divisible(sets: int, mesh: Mesh | None) -> None:
+    """Refuse a minibatch that the devices cannot share evenly.
+
+    Args:
+        sets: candidate sets in a minibatch.
+        mesh: from ``make_mesh``.
+    """
+    if mesh is not None and sets % mesh.size:
+        fewer = max(n for n in range(1, mesh.size) if sets % n == 0)
+        raise ValueError(
+            "episodes_per_update / (episodes_per_set x num_minibatches), the sets of a "
+            f"minibatch, must be a multiple of the {mesh.size} devices, got {sets}; "
+            f"change one of the three, or use {fewer} devices (--devices {fewer})"
+        )
+
+
+def describe(mesh: Mesh | None) -> str:
+    """The devices in words: "cpu", "8 x NVIDIA H100 in 2 processes"."""
+    text = str(jax.devices()[0].device_kind)
+    if mesh is not None:
+        text = f"{mesh.size} x {text}"
+    if jax.process_count() > 1:
+        text += f" in {jax.process_count()} processes"
+    return text
+
+
+def by_set(tree: Any, mesh: Mesh | None) -> Any:
+    """The same values, the leading axis of every leaf spread over the devices."""
+    if mesh is None:
+        return tree
+    return jax.lax.with_sharding_constraint(
+        tree, NamedSharding(mesh, PartitionSpec("sets"))
+    )
+
+
+def everywhere(tree: Any, mesh: Mesh | None) -> Any:
+    """The same values, whole on every device."""
+    if mesh is None:
+        return tree
+    return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec()))
+
+
+def is_first() -> bool:
+    """Whether this process writes, prints and validates for all."""
+    return jax.process_index() == 0
+
+
+def on_first(function: Callable[[], T]) -> T:
+    """Call on process 0 alone; every process gets the result, or raises the same error.
+
+    Args:
+        function: returns a pytree of arrays and of what can be pickled.
+
+    Raises:
+        ValueError, OSError: what ``function`` raised.
+    """
+    if jax.process_count() == 1:
+        return function()
+    answer: Any = None
+    if is_first():
+        try:
+            answer = (True, jax.tree.map(_without_key, function()))
+        except (ValueError, OSError) as error:
+            answer = (False, error)
+    data = np.frombuffer(pickle.dumps(answer), np.uint8)
+    with losing_a_process():
+        size = int(multihost_utils.broadcast_one_to_all(np.int32(data.size)))
+        buffer = data if is_first() else np.zeros(size, np.uint8)
+        data = np.asarray(multihost_utils.broadcast_one_to_all(buffer), np.uint8)
+    fine, result = pickle.loads(data.tobytes())
+    if not fine:
+        raise result
+    return jax.tree.map(_with_key, result)
+
+
+@dataclasses.dataclass(frozen=True)
+class _KeyData:
+    """A PRNG key on its way to another process."""
+
+    data: np.ndarray
+
+
+def _is_key(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array) and jax.dtypes.issubdtype(
+        leaf.dtype, jax.dtypes.prng_key
+    )
+
+
+def _without_key(leaf: Any) -> Any:
+    if _is_key(leaf):
+        return _KeyData(np.asarray(jax.random.key_data(leaf)))
+    return np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf
+
+
+def _with_key(leaf: Any) -> Any:
+    if isinstance(leaf, _KeyData):
+        return jax.random.wrap_key_data(jax.numpy.asarray(leaf.data))
+    return leaf
+
+
+def any_process(flag: bool) -> bool:
+    """Whether the flag is set in any process; all processes must ask."""
+    if jax.process_count() == 1:
+        return flag
+    with losing_a_process():
+        return bool(multihost_utils.process_allgather(np.asarray(flag)).any())
+
+
+def replicate(tree: Any, mesh: Mesh | None) -> Any:
+    """Put values that every process holds alike on every device of the mesh.
+
+    Args:
+        tree: arrays, typed PRNG keys among them.
+        mesh: from ``make_mesh``.
+    """
+    if mesh is None:
+        return tree
+    sharding = NamedSharding(mesh, PartitionSpec())
+
+    def put(leaf: Any) -> jax.Array:
+        plain = np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
+        array = jax.make_array_from_callback(
+            plain.shape, sharding, lambda cut: plain[cut]
+        )
+        return jax.random.wrap_key_data(array) if _is_key(leaf) else array
+
+    return jax.tree.map(put, tree)
+
+
+def local(tree: Any) -> Any:
+    """This process's copy of replicated values, on its first device."""
+    return jax.tree.map(
+        lambda leaf: leaf if len(leaf.devices()) == 1 else leaf.addressable_data(0),
+        tree,
+    )

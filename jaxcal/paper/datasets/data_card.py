@@ -1,0 +1,172 @@
+"""What a written dataset is, beside it: a JSON card for programs, a page for people."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import pathlib
+import platform
+from collections.abc import Mapping
+from typing import Any
+
+from jaxcal.paper.datasets import datasets
+from jaxcal.paper.datasets.datasets import (
+    BIAS_DEG,
+    NOISE_STD_DEG,
+    NUM_CANDIDATES,
+    RECORDED,
+    SCALE,
+    Dataset,
+)
+
+__all__ = ["card_of", "digest_of", "page_of"]
+
+_AXES = ("pitch", "yaw", "roll")
+_WHAT = {
+    "dataset0": "the ideal robot of Table 1 driven open loop in MuJoCo, 50 postures of "
+    "one second a group, read at the end of each second",
+    "dataset1": "commands for training",
+    "dataset2": "commands for evaluation",
+    "dataset3": "y = diag(scale) u + bias of Table 1, with noise",
+    "dataset4": "drawn from a pool of recorded postures, without repeats in an episode",
+    "dataset5": "one recorded session",
+}
+
+
+def card_of(
+    dataset: Dataset,
+    files: Mapping[str, str],
+    *,
+    recordings: pathlib.Path | str | None = None,
+) -> dict[str, Any]:
+    """Everything somebody needs who finds the files without us.
+
+    Args:
+        dataset: one of the paper's, or its first chunk where it is written in chunks.
+        files: SHA-256 of each file by its name.
+        recordings: folder that the recorded ones come from, when not the shipped one.
+    """
+    name = dataset.name
+    assert dataset.ranges is not None
+    low, high = dataset.ranges.low.tolist(), dataset.ranges.high.tolist()
+    card: dict[str, Any] = {
+        "schema": 1,
+        "name": name,
+        "what": _WHAT[name],
+        "episodes": dataset.num_episodes,
+        "candidates_per_episode": dataset.num_candidates,
+        "arrays": {
+            "candidates": {
+                "shape": list(dataset.candidates.shape),
+                "dtype": "float64",
+                "unit": "1; command in degrees = low + value * (high - low)",
+                "axes": list(_AXES),
+                "csv_columns": ["u_x", "u_y", "u_z"],
+            }
+        },
+        "ranges_deg": {a: [low[i], high[i]] for i, a in enumerate(_AXES)},
+        "distribution": "uniform within the ranges, independent",
+        "seed": dataset.seed,
+        "files": dict(files),
+        "command": f"python -m jaxcal.paper.datasets.datasets --out DIR --seed {dataset.seed} "
+        f"{name}",
+        "made_with": {
+            package: importlib.metadata.version(package)
+            for package in ("jaxcal", "numpy", "mujoco")
+        }
+        | {"python": platform.python_version()},
+    }
+    if dataset.measured is not None:
+        card["arrays"]["measured"] = {
+            "shape": list(dataset.measured.shape),
+            "dtype": "float64",
+            "unit": "degrees",
+            "axes": list(_AXES),
+            "csv_columns": ["y_x", "y_y", "y_z"],
+        }
+    if name in ("dataset0", "dataset3"):
+        card["noise"] = {
+            "kind": "white Gaussian on every output",
+            "std_deg": NOISE_STD_DEG,
+        }
+        card["truth"] = {
+            "scale": dict(zip(_AXES, SCALE.tolist(), strict=True)),
+            "bias_deg": dict(zip(_AXES, BIAS_DEG.tolist(), strict=True)),
+        }
+    if name == "dataset0":
+        card["simulation"] = _simulation()
+    if name in RECORDED:
+        card["recording"] = _recording(name, dataset, recordings)
+    return card
+
+
+def _simulation() -> dict[str, Any]:
+    from jaxcal.paper.twin.robot_model import HOLD_S, timestep_of
+
+    return {
+        "engine": "mujoco",
+        "sample_rate_hz": 1.0 / HOLD_S,
+        "seconds_per_episode": NUM_CANDIDATES * HOLD_S,
+        "timestep_s": timestep_of(datasets.dataset0_robot()),
+        "robot": dataclasses.asdict(datasets.dataset0_robot()),
+    }
+
+
+def _recording(
+    name: str, dataset: Dataset, recordings: pathlib.Path | str | None
+) -> dict[str, Any]:
+    import json
+
+    from jaxcal.paper.datasets.recordings import SHIPPED
+
+    folder = SHIPPED if recordings is None else pathlib.Path(recordings)
+    source: dict[str, Any] = {
+        "file": "shipped with jaxcal" if recordings is None else str(folder),
+        "sha256": dataset.sha256,
+    }
+    card = folder / f"{name}.json"
+    if card.is_file():
+        source["card"] = json.loads(card.read_text(encoding="utf-8"))
+    return source
+
+
+def digest_of(path: pathlib.Path) -> str:
+    """SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def page_of(cards: list[dict[str, Any]]) -> str:
+    """The cards as one Markdown page."""
+    lines = [
+        "# Datasets",
+        "",
+        "Commands (`u_x`, `u_y`, `u_z`: pitch, yaw, roll) are normalised to [0, 1]; "
+        "readings (`y_x`, `y_y`, `y_z`) are in degrees. `NAME.npz` holds `candidates`, "
+        "`measured`, `low` and `high`; `NAME.csv` the same, a posture a line; "
+        "`NAME.json` every number of this page.",
+        "",
+        "| name | episodes | postures | numbers each | noise | seed | what |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for card in cards:
+        noise = card.get("noise")
+        level = f"{noise['std_deg']:g} deg" if noise else "-"
+        if "recording" in card:
+            level = "as recorded"
+        lines.append(
+            f"| {card['name']} | {card['episodes']:,} | "
+            f"{card['candidates_per_episode']} | {3 * len(card['arrays'])} | {level} | "
+            f"{card['seed']} | {card['what']} |"
+        )
+    lines += ["", "Ranges in degrees, what 0 and 1 stand for:", ""]
+    for card in cards:
+        ranges = ", ".join(
+            f"{axis} {low:g} to {high:g}"
+            for axis, (low, high) in card["ranges_deg"].items()
+        )
+        lines.append(f"- {card['name']}: {ranges}")
+    lines += ["", "Made again by:", "", "```bash"]
+    lines += [card["command"] for card in cards]
+    return "\n".join([*lines, "```", ""])

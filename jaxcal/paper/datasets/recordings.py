@@ -1,0 +1,173 @@
+"""Datasets 4 and 5: what the rig recorded, as a pool of postures and draws from it.
+
+A recording is the ``pairs.csv`` that ``python -m rig collect`` writes: a posture a
+line, commands under ``u_deg_pitch, u_deg_yaw, u_deg_roll`` and what the phone read
+under ``y_deg_...``; other columns may stand beside them. A folder of recordings holds
+``dataset4.csv`` and ``dataset5.csv``, and beside each, optionally, a data card
+``dataset4.json`` whose ``ranges_deg`` say what [0, 1] stands for.
+
+The paper recorded 550 postures and speaks of 100 x 50 and 1 x 50. So dataset4 is drawn
+from its pool, 50 of 500 an episode, by seed; a recording with all 5,000 is used as it
+stands. Dataset5 is the first 50 postures of its own session.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+import json
+import os
+import pathlib
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.candidates import JointRanges, draw_from_pool
+from jaxcal.paper.datasets.datasets import RANGES, Dataset
+
+__all__ = ["SHIPPED", "read_pool", "recorded_dataset"]
+
+Array = NDArray[np.float64]
+
+SHIPPED = pathlib.Path(__file__).parent / "data"
+_AXES = ("pitch", "yaw", "roll")
+
+
+def recorded_dataset(
+    name: str,
+    num_episodes: int,
+    num_candidates: int,
+    seed: int = 0,
+    *,
+    folder: str | os.PathLike[str] | None = None,
+) -> Dataset:
+    """Episodes made of one recording.
+
+    With at least ``num_episodes * num_candidates`` postures they are taken in the order
+    they were recorded; with fewer every episode is a draw without repeats.
+
+    Args:
+        name: dataset4, say; the recording is ``name``.csv.
+        num_episodes: E.
+        num_candidates: M.
+        seed: of the draws.
+        folder: of the recording; the shipped one when not given.
+
+    Raises:
+        OSError: there is no such recording.
+        ValueError: naming the file and the line or column at fault.
+    """
+    path = (SHIPPED if folder is None else pathlib.Path(folder)) / f"{name}.csv"
+    commands, measured, ranges, digest = read_pool(path)
+    if len(commands) < num_candidates:
+        raise ValueError(
+            f"{path}: an episode takes {num_candidates} postures, the recording has "
+            f"{len(commands)}"
+        )
+    if len(commands) >= num_episodes * num_candidates:
+        rows = np.arange(num_episodes * num_candidates).reshape(num_episodes, -1)
+    else:
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(4,)))
+        rows = draw_from_pool(rng, len(commands), num_episodes, num_candidates)
+    return Dataset(
+        name,
+        ranges.normalise(commands)[rows],
+        measured[rows],
+        ranges=ranges,
+        seed=seed,
+        sha256=digest,
+    )
+
+
+def read_pool(
+    path: str | os.PathLike[str],
+) -> tuple[Array, Array, JointRanges, str]:
+    """A recording in the order in which it was made.
+
+    Returns:
+        (N, 3) commands and (N, 3) readings in degrees, the ranges that [0, 1] shall
+        stand for, and the SHA-256 of the file.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: naming the file and the line or column at fault.
+    """
+    file = pathlib.Path(path)
+    data = file.read_bytes()
+    ranges = _ranges_beside(file)
+    try:
+        values = _table(data)
+        outside = ~ranges.contains(values[:, :3])
+        if np.any(outside):
+            row = int(np.flatnonzero(outside)[0])
+            low, high = ranges.low.tolist(), ranges.high.tolist()
+            raise ValueError(
+                f"posture {row + 1} is commanded {values[row, :3].tolist()} deg, "
+                f"outside the ranges {low} to {high}; name wider ones as "
+                f'"ranges_deg" in {file.with_suffix(".json").name}'
+            )
+    except ValueError as error:
+        raise ValueError(f"{os.fspath(path)}: {error}") from None
+    return values[:, :3], values[:, 3:], ranges, hashlib.sha256(data).hexdigest()
+
+
+def _table(data: bytes) -> Array:
+    """(N, 6) commands and readings."""
+    try:
+        reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""))
+        rows = [(reader.line_num, row) for row in reader if any(row)]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"not a CSV file: {error}") from None
+    if not rows:
+        raise ValueError("the file is empty")
+    header = [name.strip() for name in rows[0][1]]
+    wanted = [f"{what}_deg_{axis}" for what in "uy" for axis in _AXES]
+    for name in wanted:
+        if header.count(name) != 1:
+            how = "missing" if name not in header else "there twice"
+            raise ValueError(f'line 1: column "{name}" is {how}')
+    places = [header.index(name) for name in wanted]
+    values = []
+    for line, row in rows[1:]:
+        if len(row) != len(header):
+            _fail(line, f"{len(row)} cells, {len(header)} in the header")
+        values.append([_number(line, header[i], row[i]) for i in places])
+    if not values:
+        raise ValueError("no postures below the header")
+    return np.array(values)
+
+
+def _number(line: int, name: str, cell: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        value = np.nan
+    if not np.isfinite(value):
+        _fail(line, f'"{name}" must be a finite number, got {cell!r}')
+    return value
+
+
+def _fail(line: int, problem: str) -> NoReturn:
+    raise ValueError(f"line {line}: {problem}")
+
+
+def _ranges_beside(recording: pathlib.Path) -> JointRanges:
+    """The ranges its data card names; ours where there is none."""
+    card = recording.with_suffix(".json")
+    try:
+        text = card.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return RANGES
+    try:
+        document: Any = json.loads(text)
+        named = document.get("ranges_deg")
+        if named is None:
+            return RANGES
+        low, high = zip(*(named[axis] for axis in _AXES), strict=True)
+        return JointRanges(low, high, _AXES)
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ValueError(
+            f'{card}: "ranges_deg" must give [low, high] of {", ".join(_AXES)}: {error}'
+        ) from None

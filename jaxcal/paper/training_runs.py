@@ -1,0 +1,335 @@
+"""Training runs kept for the report: one preset over several seeds, or a run there is.
+
+A run folder is large and not in version control. What a report needs of it is small and
+goes to a folder of its own: ``metrics.csv`` (the trainer's columns, at most
+``MAX_ROWS`` rows), ``last_rewards.npy`` (rewards of the last 1,000 episodes) and
+``summary.json`` (configuration, episodes, wall time, and how good the policy is).
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import io
+import json
+import pathlib
+import shutil
+import sys
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.files import require_writable_folder, write_text
+
+__all__ = ["FORMAT", "MAX_ROWS", "collect", "main", "thinned", "train_seed"]
+
+Array = NDArray[np.float64]
+
+FORMAT = "jaxcal-training-run"
+VERSION = 1
+MAX_ROWS = 1_000
+_VALIDATE_EVERY_S = 5.0  # a curve of a few minutes has some dozens of points
+_LAST_OF_BLOCK = ("update", "episodes", "seconds", "learning_rate")
+_IF_MEASURED = ("ratio_to_exact", "hit_rate")
+
+_DESCRIPTION = """\
+Train one preset with several seeds, or take up a run that is there, and keep what the
+reproduction report draws of it: metrics.csv, last_rewards.npy and summary.json, in a
+folder a run under --out.
+"""
+_EPILOG = """\
+examples:
+  python -m jaxcal.paper.training_runs --preset compact --seeds 5 \\
+      --out studies/compact_seeds
+      trains seeds 0 to 4, a few minutes each, into studies/compact_seeds/seed_0 ...
+  python -m jaxcal.paper.training_runs --collect runs/paper --out studies/paper
+      a run of train.py, finished or still going, into studies/paper
+
+The same command again goes on where it was stopped: finished seeds are left alone, a
+seed that was cut off continues from its last checkpoint, which is under --runs.
+"""
+
+
+def train_seed(
+    config: Any, folder: pathlib.Path, *, validate: bool = True, report: Any = None
+) -> None:
+    """Train one run, or what is left of it where ``folder`` holds a part.
+
+    Args:
+        config: a ``TrainConfig``.
+        folder: of the run.
+        validate: measure it on fixed sets while it trains.
+        report: called with a ``training.Report`` now and then.
+
+    Raises:
+        ValueError: the folder holds a run of another configuration.
+    """
+    from jaxcal.evaluation.validation import fixed_validation
+    from jaxcal.learning.training import checkpoint
+    from jaxcal.learning.training import run as training
+
+    require_writable_folder(folder)
+    steps = folder / "checkpoint"
+    resume = steps.is_dir() and any(path.name.isdigit() for path in steps.iterdir())
+    if resume:
+        held = training.TrainConfig.from_meta(checkpoint.load(folder).meta)
+        if held.as_meta() != config.as_meta():
+            raise ValueError(
+                f"{folder} holds a run of another configuration: name another --runs"
+            )
+    training.train(
+        config,
+        folder,
+        resume=resume,
+        validation=fixed_validation(config) if validate else None,
+        report=report or (lambda _: None),
+    )
+
+
+def collect(run: pathlib.Path, out: pathlib.Path) -> dict[str, Any]:
+    """Keep what a report needs of a run folder; the summary that was written.
+
+    Args:
+        run: folder of a run, finished or not.
+        out: made where missing; what it holds of an earlier collection is replaced.
+
+    Raises:
+        OSError: the run holds no metrics.csv, or ``out`` cannot be written.
+        ValueError: a file of the run cannot be understood.
+    """
+    from jaxcal.evaluation.training_figure import read_metrics
+
+    metrics = read_metrics(run / "metrics.csv")
+    summary = _summary(run, metrics)
+    out.mkdir(parents=True, exist_ok=True)
+    rewards = run / "last_rewards.npy"
+    if rewards.is_file():
+        shutil.copyfile(rewards, out / "last_rewards.npy")
+    write_text(out / "metrics.csv", _as_csv(thinned(metrics)))
+    write_text(out / "summary.json", json.dumps(summary, indent=1) + "\n")
+    return summary
+
+
+def thinned(metrics: dict[str, Array], most: int = MAX_ROWS) -> dict[str, Array]:
+    """The same run in at most ``most`` rows, each the mean of a block of updates.
+
+    ``reward_std`` stays that of single episodes: within and between the updates of a
+    block. Counts and times are those at the end of the block; what is measured now and
+    then is the block's last value.
+    """
+    count = len(metrics["episodes"])
+    if count <= most:
+        return metrics
+    blocks = np.array_split(np.arange(count), most)
+    out: dict[str, Array] = {}
+    for name, values in metrics.items():
+        if name in _LAST_OF_BLOCK:
+            rows = [values[block[-1]] for block in blocks]
+        elif name in _IF_MEASURED:
+            known = [values[block][np.isfinite(values[block])] for block in blocks]
+            rows = [part[-1] if part.size else np.nan for part in known]
+        elif name == "reward_std":
+            mean = metrics["reward_mean"]
+            rows = [np.sqrt((values[b] ** 2).mean() + mean[b].var()) for b in blocks]
+        else:
+            rows = [values[block].mean() for block in blocks]
+        out[name] = np.array(rows)
+    return out
+
+
+def _as_csv(metrics: dict[str, Array]) -> str:
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(metrics)
+    for row in zip(*metrics.values(), strict=True):
+        writer.writerow(["" if np.isnan(v) else f"{v:.7g}" for v in row])
+    return text.getvalue()
+
+
+def _summary(run: pathlib.Path, metrics: dict[str, Array]) -> dict[str, Any]:
+    """What the run was and how good its policy is, measured on dataset2."""
+    import jax
+
+    from jaxcal.evaluation.methods import evaluate
+    from jaxcal.learning.training import checkpoint
+    from jaxcal.paper.datasets.datasets import make_dataset
+
+    policy = checkpoint.load(run)
+    measured = evaluate(
+        make_dataset("dataset2"), 4, ("policy",), (str(run),), random_draws=1
+    )
+    row = measured.summary(measured.results[0])
+    progress = policy.meta["progress"]
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "preset": policy.meta["preset"],
+        "network": policy.meta["network"]["kind"],
+        "parameters": sum(leaf.size for leaf in jax.tree.leaves(policy.params)),
+        "seed": policy.meta["seed"],
+        "episodes": progress["episodes"],
+        "planned_episodes": policy.meta["ppo"]["num_episodes"],
+        "episodes_per_update": policy.meta["ppo"]["episodes_per_update"],
+        "finished": progress["episodes"] >= policy.meta["ppo"]["num_episodes"],
+        "seconds": float(progress["seconds"]),
+        "device": progress["device"],
+        "versions": policy.meta["versions"],
+        "rows": [len(metrics["episodes"]), min(len(metrics["episodes"]), MAX_ROWS)],
+        "dataset2": {
+            "episodes": measured.dataset.num_episodes,
+            "ratio_to_exact": row["ratio_to_exact"],
+            "hit_rate": row["hit_rate"],
+            "log_det_s_mean": row["log_det_s"]["mean"],
+        },
+    }
+
+
+# -- command ---------------------------------------------------------------------------
+
+
+class _Parser(argparse.ArgumentParser):
+    """One clear line instead of the usage and a line."""
+
+    def error(self, message: str) -> NoReturn:
+        print(f"{self.prog}: error: {message}; see --help", file=sys.stderr)
+        sys.exit(2)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Train or collect; the exit code."""
+    options = _parse(arguments)
+    try:
+        if options.collect is not None:
+            if not (options.collect / "metrics.csv").is_file():
+                raise ValueError(f"--collect {options.collect} holds no metrics.csv")
+            require_writable_folder(options.out)
+            _say(options.out, collect(options.collect, options.out))
+        else:
+            _train_all(options)
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on from here", file=sys.stderr)
+        return 130
+    except (ValueError, OSError) as error:
+        text = " ".join(str(error).split())
+        print(f"training_runs: error: {text}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _train_all(options: argparse.Namespace) -> None:
+    from jaxcal.learning.runtime import cache
+    from jaxcal.learning.training import presets
+
+    cache.keep_compiled_programs()
+    runs = options.runs or pathlib.Path("runs") / options.out.resolve().name
+    for folder in (options.out, runs):
+        require_writable_folder(folder)
+    for number, seed in enumerate(options.seeds):
+        values = {"seed": seed}
+        if options.episodes is not None:
+            values["num_episodes"] = options.episodes
+        config = presets.with_values(presets.PRESETS[options.preset], values)
+        config = dataclasses.replace(config, validate_every=_VALIDATE_EVERY_S)
+        target = options.out / f"seed_{seed}"
+        if _is_finished(target / "summary.json", config):
+            print(f"{target}: finished before", flush=True)
+            continue
+        name = f"seed {seed} ({number + 1} of {len(options.seeds)})"
+
+        def report(
+            now: Any, name: str = name, total: int = config.ppo.num_episodes
+        ) -> None:
+            print(
+                f"{name}: {now.episodes:,} of {total:,} episodes, "
+                f"{now.episodes_per_second:,.0f}/s, {now.eta / 60:.1f} min left, "
+                f"reward {now.metrics['reward_mean']:.4f}",
+                file=sys.stderr,
+                flush=True,
+            )
+
+        train_seed(config, runs / f"seed_{seed}", report=report)
+        _say(target, collect(runs / f"seed_{seed}", target))
+
+
+def _is_finished(path: pathlib.Path, config: Any) -> bool:
+    """Whether this seed is done; ValueError where it is one of another training."""
+    if not path.is_file():
+        return False
+    try:
+        held = json.loads(path.read_text(encoding="utf-8"))
+        same = (held["preset"], held["planned_episodes"], held["seed"])
+        finished = bool(held["finished"])
+    except (ValueError, KeyError, TypeError):
+        raise ValueError(f"{path} is not the summary of a training run") from None
+    wanted = (config.preset, config.ppo.num_episodes, config.ppo.seed)
+    if same != wanted:
+        raise ValueError(
+            f"{path} is of preset {same[0]}, {same[1]} episodes, seed {same[2]}, not "
+            f"{wanted[0]}, {wanted[1]}, {wanted[2]}: name another --out"
+        )
+    return finished
+
+
+def _say(out: pathlib.Path, summary: dict[str, Any]) -> None:
+    good = summary["dataset2"]
+    print(
+        f"{out}: {summary['episodes']:,} of {summary['planned_episodes']:,} episodes, "
+        f"{summary['seconds'] / 60:.1f} min, det S/det S* "
+        f"{good['ratio_to_exact']:.4f}, hit rate {good['hit_rate']:.3f} on dataset2",
+        flush=True,
+    )
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = _Parser(
+        prog="python -m jaxcal.paper.training_runs",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    add = parser.add_argument
+    add("--preset", metavar="NAME", help="compact, general or paper")
+    add("--seeds", type=_seeds, metavar="N", help="0 to N-1, or a list 3,5,8; 5")
+    add("--episodes", type=int, metavar="N", help="budget of each; the preset's")
+    add(
+        "--collect", type=pathlib.Path, metavar="RUN", help="keep this run; no training"
+    )
+    add("--out", type=pathlib.Path, metavar="DIR", required=True, help="kept files")
+    add("--runs", type=pathlib.Path, metavar="DIR", help="run folders; runs/(--out)")
+    options = parser.parse_args(arguments)
+    if (options.preset is None) == (options.collect is None):
+        parser.error("give one of --preset and --collect")
+    if options.preset is not None:
+        from jaxcal.learning.training.presets import PRESETS
+
+        if options.preset not in PRESETS:
+            known = ", ".join(sorted(PRESETS))
+            parser.error(f"--preset must be one of {known}, got {options.preset!r}")
+    elif options.seeds or options.episodes or options.runs:
+        parser.error("--seeds, --episodes and --runs go with --preset")
+    if options.episodes is not None and options.episodes < 1:
+        parser.error(f"--episodes must be at least 1, got {options.episodes}")
+    options.seeds = options.seeds or list(range(5))
+    return options
+
+
+def _seeds(text: str) -> list[int]:
+    try:
+        numbers = [int(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if "," not in text and numbers and numbers[0] > 0:
+        return list(range(numbers[0]))
+    if "," not in text or min(numbers, default=-1) < 0:
+        raise argparse.ArgumentTypeError(
+            f"must be a number of seeds or a list like 3,5,8, got {text!r}"
+        )
+    return list(dict.fromkeys(numbers))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

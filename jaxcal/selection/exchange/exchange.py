@@ -1,0 +1,89 @@
+"""Fedorov exchange with random restarts: near-optimal in milliseconds, no proof.
+
+Each start is a random selection that is not singular; each chosen posture in turn is
+swapped for the candidate that raises det most, ``(1 + d_j)(1 - d_i) + d_ij^2`` times,
+until no swap helps. Source: Fedorov, Theory of Optimal Experiments, 1972; Cook and
+Nachtsheim 1980 for one posture at a time.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.selection.problem import Problem
+
+__all__ = ["default_restarts", "exchange_from", "exchange_indices"]
+
+
+def default_restarts(max_replicates: int) -> int:
+    """Random starts that found the proven optimum of nearly all sets of 50 tried.
+
+    None of 12,000 distinct selections was missed (4, 8 or 12 of 50); replicates leave
+    more local optima, and 1 in 1,000 selections of 12 was.
+    """
+    return 200 if max_replicates == 1 else 400
+
+
+def exchange_indices(
+    problem: Problem, restarts: int | None = None, seed: int = 0
+) -> NDArray[np.int64]:
+    """(k,) the best local optimum, required candidates first."""
+    if restarts is None:
+        restarts = default_restarts(problem.max_replicates)
+    from jaxcal.selection.exchange.kernel import exchange_starts
+
+    usable = np.flatnonzero(problem.available)
+    rows = np.ascontiguousarray(problem.rows[usable])
+    chosen, log_det, _ = exchange_starts(
+        rows,
+        np.ascontiguousarray(rows.T),
+        problem.upper[usable],
+        np.searchsorted(usable, problem.required),
+        problem.k,
+        restarts,
+        np.uint64(seed % 2**64),
+    )
+    if not np.isfinite(log_det):
+        raise ValueError(
+            "candidates must allow an invertible selection, "
+            "but every start was singular"
+        )
+    return usable[chosen]
+
+
+def exchange_from(problem: Problem, indices: ArrayLike) -> NDArray[np.int64]:
+    """The local optimum that a given selection climbs to; never worse than it was.
+
+    Args:
+        problem: what may be chosen; its required candidates stay.
+        indices: (k,) where to start, not singular.
+
+    Returns:
+        (k,) the required candidates first.
+    """
+    from jaxcal.selection.exchange.kernel import climb
+
+    rest = np.asarray(indices, dtype=np.int64).tolist()
+    for i in problem.required.tolist():
+        if i not in rest:
+            raise ValueError(f"indices must hold every required candidate, got no {i}")
+        rest.remove(i)
+    chosen = np.array([*problem.required, *rest], dtype=np.int64)
+    p = problem.num_regressors
+    log_det = climb(
+        problem.rows,
+        np.ascontiguousarray(problem.rows.T),
+        problem.upper,
+        len(problem.required),
+        chosen,
+        np.bincount(chosen, minlength=len(problem.rows)),
+        np.empty((p, p)),
+        np.empty((p, p)),
+    )
+    if not np.isfinite(log_det):
+        raise ValueError(
+            "indices must give an invertible information matrix, but the postures "
+            f"{chosen.tolist()} lie in one plane"
+        )
+    return chosen

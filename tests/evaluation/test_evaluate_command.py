@@ -1,0 +1,246 @@
+"""python evaluate.py as a process: exit codes, what it writes, what it refuses."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from jaxcal.evaluation.dataset_files import save_csv, save_npz
+from jaxcal.information.regression import regression_matrix
+from jaxcal.paper.datasets.datasets import Dataset, make_dataset
+
+ROOT = pathlib.Path(__file__).parents[2]
+
+
+def run(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, str(ROOT / "evaluate.py"), *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+    )
+
+
+def test_the_json_says_what_the_full_matrices_say(tmp_path: pathlib.Path) -> None:
+    data = make_dataset("dataset3", 4, 20)
+    save_npz(data, tmp_path / "mine.npz")
+    out = tmp_path / "deep" / "out.json"
+    done = run(
+        *("--dataset", tmp_path / "mine.npz", "dataset2", "--episodes", 20),
+        *("--methods", "random,greedy,exact", "--draws", 7, "--json", out, "--indices"),
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == "" and "greedy" in done.stdout
+    document = json.loads(out.read_text())
+    assert document["command"][:2] == ["python", "evaluate.py"]
+    mine, two = document["results"]
+    assert mine["dataset"]["name"] == "mine.npz" and mine["dataset"]["sha256"]
+    assert two["dataset"]["name"] == "dataset2" and two["dataset"]["seed"] == 0
+    assert mine["checkpoint"] is None and mine["seed"] == 0 and mine["proven"] == 1.0
+    log_det = {}
+    for method in ("greedy", "exact"):
+        chosen = mine["methods"][method]["indices"]
+        matrices = [regression_matrix(data.candidates[e][chosen[e]]) for e in range(20)]
+        log_det[method] = np.array([np.linalg.slogdet(a.T @ a)[1] for a in matrices])
+    ratio = np.exp(log_det["greedy"] - log_det["exact"])
+    row = mine["methods"]["greedy"]
+    assert row["ratio_to_exact"] == pytest.approx(ratio.mean(), rel=1e-8)
+    assert row["hit_rate"] == pytest.approx((ratio > 1 - 1e-8).mean())
+    assert row["d_efficiency"] == pytest.approx((ratio ** (1 / 12)).mean(), rel=1e-8)
+    assert row["det_s"]["mean"] == pytest.approx(np.exp(log_det["greedy"]).mean())
+    assert row["log_det_s"]["std"] == pytest.approx(log_det["greedy"].std())
+    ratio_of_means = row["det_s"]["mean"] / mine["methods"]["random"]["det_s"]["mean"]
+    assert row["ratio_to_random"] == pytest.approx(ratio_of_means)
+
+
+def test_csv_with_a_mask_and_two_inputs(tmp_path: pathlib.Path) -> None:
+    rng = np.random.default_rng(0)
+    mask = np.ones((3, 9), bool)
+    mask[:, ::4] = False
+    save_csv(
+        Dataset("x", rng.normal(size=(3, 9, 2)), available=mask), tmp_path / "d.csv"
+    )
+    out = tmp_path / "out.json"
+    done = run(
+        *("--dataset", tmp_path / "d.csv", "--k", 3, "--json", out, "--indices"),
+        *("--methods", "greedy,exchange,exact"),
+    )
+    assert done.returncode == 0, done.stderr
+    entry = json.loads(out.read_text())["results"][0]
+    assert entry["dataset"]["num_inputs"] == 2 and entry["k"] == 3
+    for row in entry["methods"].values():
+        assert not np.isin(row["indices"], [0, 4, 8]).any()
+
+
+def test_the_report_is_one_page_and_figures(tmp_path: pathlib.Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "metrics.csv").write_text("episodes,reward_mean\n16,-1\n32,-0.5\n")
+    done = run(
+        *("--dataset", "dataset3", "--episodes", 5, "--methods", "random,exact"),
+        *("--report", tmp_path / "report", "--run", folder),
+    )
+    assert done.returncode == 0, done.stderr
+    names = {path.name for path in (tmp_path / "report").iterdir()}
+    assert "index.html" in names and "training_curves.png" in names
+    assert {name for name in names if name.endswith(".svg")} == {
+        f"{pathlib.Path(name).stem}.svg" for name in names if name.endswith(".png")
+    }
+    page = (tmp_path / "report" / "index.html").read_text()
+    assert page.count("<img") == 7 and "dataset3" in page
+
+
+def test_baselines_load_no_jax() -> None:
+    script = (
+        "import sys; sys.argv = ['evaluate.py']; import evaluate\n"
+        "code = evaluate.main(['--episodes', '3', '--methods', 'greedy,exact'])\n"
+        "bad = [m for m in ('jax', 'flax', 'brax', 'mujoco', 'matplotlib') "
+        "if m in sys.modules]\n"
+        "sys.exit(f'{code} {bad}' if code or bad else 0)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_help_teaches() -> None:
+    done = run("--help")
+    assert done.returncode == 0
+    for word in ("examples:", "policy:first", "FILE.csv", "det S/det S*", "--json"):
+        assert word in done.stdout
+
+
+FLAT = np.random.default_rng(0).normal(size=(2, 6, 3))
+FLAT[1, :, 2] = 1.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--k", "3"], "k must be at least 4"),
+        (["--k", "51"], "k must not exceed what is available"),
+        (["--k", "x"], "--k: must be a whole number of at least 1, got 'x'"),
+        (["--episodes", "0"], "--episodes: must be a whole number"),
+        (["--seed", "-1"], "--seed: must be a whole number of at least 0"),
+        (["--time-limit", "nan"], "--time-limit: must be seconds above 0"),
+        (["--methods", "best"], "method must be one of policy, .* got 'best'"),
+        (["--methods", ""], "at least one method"),
+        (["--dataset", "dataset7"], "--dataset must be one of .* got 'dataset7'"),
+        (["--dataset", "{tmp}/none.npz"], "none.npz: No such file"),
+        (["--dataset", "{tmp}/torn.npz"], "torn.npz: not a .npz file, or a truncated"),
+        (["--dataset", "{tmp}/key.npz"], 'key "candidates" is missing'),
+        (["--dataset", "{tmp}/bad.csv"], 'bad.csv: line 2: "u_y" must be a number'),
+        (["--dataset", "{tmp}/flat.npz"], "flat.npz: .* in set 1 lie in one plane"),
+        (["--checkpoint", "x", "--methods", "exact"], "no policy is among --methods"),
+        (["--run", "{tmp}"], "holds no metrics.csv"),
+        (["--bogus"], "unrecognized arguments: --bogus"),
+        (["--report", "{tmp}/torn.npz/x"], "torn.npz is not a folder"),
+        (["--report", "/proc/none/x"], "/proc"),
+        (["--json", "{tmp}"], "--json must be a file"),
+    ],
+)
+def test_every_error_is_one_line_and_code_2(
+    tmp_path: pathlib.Path, arguments: list[str], message: str
+) -> None:
+    (tmp_path / "torn.npz").write_bytes(b"PK\x03\x04 torn")
+    (tmp_path / "bad.csv").write_text("episode,candidate,u_x,u_y\n0,0,1,two\n")
+    np.savez(tmp_path / "key.npz", postures=np.ones((1, 5, 3)))
+    np.savez(tmp_path / "flat.npz", candidates=FLAT)
+    before = {path.name for path in tmp_path.iterdir()}
+    given = [argument.format(tmp=tmp_path) for argument in arguments]
+    outputs = ["--json", tmp_path / "o.json"] if "--json" not in given else []
+    methods = ["--methods", "greedy"] if "--methods" not in given else []
+    done = run(*methods, *outputs, *given)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert done.stderr.startswith("evaluate.py: error: ")
+    assert re.search(message, done.stderr), done.stderr
+    assert done.stdout == ""
+    assert {path.name for path in tmp_path.iterdir()} == before
+
+
+def test_a_missing_checkpoint_is_one_line_and_code_2(tmp_path: pathlib.Path) -> None:
+    done = run(
+        *("--episodes", 2, "--methods", "policy", "--checkpoint", tmp_path / "none"),
+        *("--json", tmp_path / "o.json", "--report", tmp_path / "report"),
+    )
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "says"),
+    [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")],
+)
+def test_a_stopped_command_writes_nothing(
+    tmp_path: pathlib.Path, number: int, code: int, says: str
+) -> None:
+    child = subprocess.Popen(
+        [
+            *(sys.executable, str(ROOT / "evaluate.py"), "--dataset", "dataset3"),
+            # minutes of work, so that the signal cannot come too late
+            *("dataset1", "--methods", "exact", "--k", "9"),
+            *("--json", str(tmp_path / "o.json")),
+        ],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
+    assert child.stdout is not None
+    assert child.stdout.readline().startswith("dataset3")
+    child.send_signal(number)
+    _, errors = child.communicate(timeout=120)
+    assert child.returncode == code, errors
+    assert errors.splitlines()[-1] == f"evaluate.py: {says}, nothing was written"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_stream_stopped_by_sigterm_says_so_and_keeps_its_parts(
+    tmp_path: pathlib.Path,
+) -> None:
+    folder = tmp_path / "parts"
+    child = subprocess.Popen(
+        [
+            *(sys.executable, str(ROOT / "evaluate.py"), "--stream", str(folder)),
+            *("--episodes", "10000000", "--methods", "greedy", "--draws", "2"),
+        ],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
+    assert child.stderr is not None
+    while not list(folder.glob("part-*")):
+        assert child.poll() is None
+        time.sleep(0.1)
+    child.send_signal(signal.SIGTERM)
+    _, errors = child.communicate(timeout=120)
+    assert child.returncode == 143, errors
+    says = "evaluate.py: terminated, finished parts are kept; the same command goes on"
+    assert errors.splitlines()[-1] == says
+    assert not [path for path in folder.iterdir() if path.suffix != ".json"]
+
+
+@pytest.mark.slow
+def test_the_shipped_policy_has_a_row_for_each_decoding(
+    tmp_path: pathlib.Path,
+) -> None:
+    out = tmp_path / "out.json"
+    done = run("--episodes", 200, "--methods", "policy:all,random", "--json", out)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(out.read_text())["results"][0]["methods"]
+    assert rows["policy"]["ratio_to_exact"] > 0.9
+    assert rows["policy:samples"]["ratio_to_exact"] > 0.9
+    for name in ("first", "exchange"):
+        better = rows[f"policy:{name}"]["ratio_to_exact"]
+        assert better >= rows["policy"]["ratio_to_exact"] - 1e-3

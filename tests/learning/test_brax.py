@@ -1,0 +1,62 @@
+"""The environment under brax: the adapter, fresh episodes, and brax's own PPO."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxcal.learning.environments import selection as environment
+from jaxcal.learning.environments.selection import SelectionConfig
+from jaxcal.learning.training import checkpoint
+from jaxcal.learning.training.presets import PRESETS, with_values
+
+brax_env = pytest.importorskip("jaxcal.learning.environments.brax_env")
+
+
+def test_the_adapter_plays_the_same_episode():
+    config = SelectionConfig()
+    env = brax_env.SelectionEnv(config)
+    key = jax.random.PRNGKey(0)
+    state = env.reset(key)
+    plain = environment.reset(key, config)
+    assert state.obs.shape == (env.observation_size,) == (210,)
+    assert env.action_size == 50
+    for action in (4, 8, 15, 16):
+        state = env.step(state, jnp.int32(action))
+        plain, reward, done = environment.step(plain, jnp.int32(action), config)
+        np.testing.assert_array_equal(state.obs, environment.observe(plain, config))
+        assert float(state.reward) == float(reward)
+        assert bool(state.done) == bool(done)
+
+
+def test_reset_after_done_draws_new_candidates_and_nothing_is_truncated():
+    config = SelectionConfig(num_candidates=8)
+    with jax.numpy_rank_promotion("allow"):
+        env = brax_env.wrap_fresh(brax_env.SelectionEnv(config), config.num_selected, 1)
+        state = env.reset(jax.random.split(jax.random.PRNGKey(1), 3))
+        step = jax.jit(env.step)
+        seen = set()
+        for episode in range(6):
+            seen.add(np.asarray(state.obs[:, :24]).tobytes())
+            for action in range(4):
+                state = step(state, jnp.full(3, action))
+                assert not np.asarray(state.info["truncation"]).any()
+            assert np.asarray(state.done).all(), episode
+    assert len(seen) == 6
+
+
+@pytest.mark.slow
+def test_braxs_own_ppo_trains_it(tmp_path):
+    from jaxcal.learning.training import brax_ppo
+
+    config = with_values(PRESETS["compact"], {"num_episodes": 20_000})
+    lines: list[str] = []
+    brax_ppo.train(config, tmp_path, lines.append, num_evals=3)
+    values = [float(line.rsplit(" ", 1)[1]) for line in lines if "log det" in line]
+    assert values[-1] > values[0] + 3.0  # from random towards the optimum of -1.2
+    assert not hasattr(jax, "device_put_replicated") or jax.__version__ < "0.10"
+    policy = checkpoint.load(tmp_path)
+    assert policy.meta["trainer"] == "brax"
+    assert policy.network.config.kind == "paper"

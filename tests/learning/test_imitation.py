@@ -1,0 +1,179 @@
+"""Imitation: what a lesson holds, its loss against numpy, that it teaches, resuming."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxcal.learning.environments.selection import SelectionConfig
+from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.training import checkpoint, imitation, ppo
+from jaxcal.learning.training import run as training
+from jaxcal.learning.training.ppo import PPOConfig, Task
+from jaxcal.learning.training.run import TrainConfig
+
+PPO = PPOConfig(
+    num_episodes=64 * 4,
+    episodes_per_update=64,
+    episodes_per_set=4,
+    num_minibatches=2,
+    warmup_updates=1,
+    imitation=0.5,
+    seed=3,
+)
+TASK = Task(
+    SelectionConfig(num_candidates=11, num_selected=5, reward_gain=True),
+    masked=0.3,
+    random_starts=0.5,
+)
+NETWORK = networks.build(NetworkConfig(width=8, encoder_rounds=1))
+
+
+def brute_force(candidates, available, given, k):
+    """The best completion of the given postures, by trying them all."""
+    indices, best = [], []
+    for points, free, begun in zip(candidates, available, given, strict=True):
+        z = np.column_stack([points.astype(float), np.ones(len(points))])
+        rest = [i for i in np.flatnonzero(free) if i not in set(begun)]
+        tries = [
+            [*begun, *more] for more in itertools.combinations(rest, k - len(begun))
+        ]
+        values = [np.linalg.slogdet(z[t].T @ z[t])[1] for t in tries]
+        indices.append(tries[int(np.argmax(values))])
+        best.append(max(values))
+    return np.array(indices), np.array(best)
+
+
+@pytest.fixture(scope="module")
+def lesson():
+    return imitation.draw(PPO, TASK, NETWORK, brute_force, 5)
+
+
+def test_a_lesson_holds_the_best_completion_of_what_is_given(lesson):
+    lengths = np.asarray(lesson.length)
+    assert set(lengths) == {
+        0,
+        1,
+        2,
+    }  # three decisions are learned, one at least is left
+    for row in range(len(lengths)):
+        given = set(np.asarray(lesson.given)[row, : lengths[row]].tolist())
+        wanted = set(np.flatnonzero(lesson.wanted[row]).tolist())
+        assert len(given) == lengths[row]
+        assert given <= wanted <= set(np.flatnonzero(lesson.available[row]).tolist())
+        assert len(wanted) == 5
+        z = np.column_stack([np.asarray(lesson.candidates[row], float), np.ones(11)])
+        chosen = z[sorted(wanted)]
+        value = np.linalg.slogdet(chosen.T @ chosen)[1]
+        assert abs(value - float(lesson.best[row])) < 1e-5
+
+
+def test_a_lesson_is_the_same_whenever_it_is_asked_for(lesson):
+    again = imitation.draw(PPO, TASK, NETWORK, brute_force, 5)
+    other = imitation.draw(PPO, TASK, NETWORK, brute_force, 6)
+    for one, two in zip(jax.tree.leaves(lesson), jax.tree.leaves(again), strict=True):
+        np.testing.assert_array_equal(one, two)
+    assert not np.array_equal(lesson.candidates, other.candidates)
+
+
+@jax.jit
+def measured(params, lesson):
+    attempt = imitation.follow(lesson, TASK, NETWORK, params)
+    return imitation.loss(params, attempt, PPO, TASK, NETWORK)
+
+
+@pytest.mark.slow
+def test_the_loss_is_that_of_the_definition(lesson):
+    state = ppo.init(PPO, TASK, NETWORK)
+    total, metrics = measured(state.params, lesson)
+    view = NETWORK.look(lesson.candidates, lesson.available)
+    memory = networks.encode(NETWORK, state.params, view)
+    surprise, error, number = 0.0, 0.0, 0
+    chosen = np.full((64, 5), -1)
+    free, wanted = np.array(lesson.available), np.array(lesson.wanted)
+    rows = np.arange(64)
+    for count in range(3):
+        glance = NETWORK.look_at(view, jnp.asarray(chosen), jnp.asarray(free), count)
+        logits, value = networks.decode(NETWORK, state.params, memory, glance)
+        weights = np.exp(np.asarray(logits, float))
+        share = weights / weights.sum(-1, keepdims=True)
+        counted = count >= np.asarray(lesson.length)
+        surprise -= np.log((share * wanted).sum(-1))[counted].sum()
+        gap = 0.1 * 3 * (np.asarray(value) - np.asarray(lesson.best))
+        error += (gap**2)[counted].sum()
+        number += counted.sum()
+        best = (share * wanted).argmax(-1)
+        action = np.where(counted, best, np.asarray(lesson.given)[:, count])
+        chosen[:, count] = action
+        free[rows, action] = wanted[rows, action] = False
+    np.testing.assert_allclose(metrics["policy_loss"], surprise / number, rtol=1e-4)
+    np.testing.assert_allclose(metrics["value_loss"], error / number, rtol=1e-3)
+    np.testing.assert_allclose(
+        total, (surprise + PPO.value_coefficient * error) / number, rtol=1e-3
+    )
+
+
+@pytest.mark.slow
+def test_the_order_of_the_candidates_does_not_matter(lesson, rng):
+    state = ppo.init(PPO, TASK, NETWORK)
+    order = rng.permutation(11)
+    where = np.argsort(order)
+    turned = dataclasses.replace(
+        lesson,
+        candidates=lesson.candidates[:, order],
+        available=lesson.available[:, order],
+        wanted=lesson.wanted[:, order],
+        given=jnp.asarray(where)[lesson.given],
+    )
+    one, _ = measured(state.params, lesson)
+    two, _ = measured(state.params, turned)
+    np.testing.assert_allclose(one, two, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_lessons_teach():
+    config = dataclasses.replace(
+        PPO, num_episodes=64 * 40, imitation=1.0, learning_rate=5e-3
+    )
+    # Without the look-ahead it has to be learned what to choose.
+    network = networks.build(NetworkConfig(width=8, encoder_rounds=1, lookahead=1))
+    task = Task(SelectionConfig(num_candidates=8))
+    state = ppo.init(config, task, network)
+    losses = []
+    for index in range(config.num_imitated):
+        shown = imitation.draw(config, task, network, brute_force, index)
+        state, metrics = imitation.update(state, shown, config, task, network)
+        losses.append(float(metrics["policy_loss"]))
+    assert np.mean(losses[-5:]) < 0.85 * np.mean(losses[:5])
+
+
+@pytest.mark.slow
+def test_resume_across_the_end_of_imitation_is_bit_for_bit(tmp_path):
+    config = TrainConfig(network=NETWORK.config, ppo=PPO, tasks=(TASK,))
+    whole = training.train(config, tmp_path / "whole", teacher=brute_force)
+    for last in (1, 3, 4):
+        parts = training.train(
+            config,
+            tmp_path / "parts",
+            resume=last > 1,
+            num_updates=last,
+            teacher=brute_force,
+        )
+    for one, two in zip(
+        jax.tree.leaves(checkpoint._plain_keys(whole)),
+        jax.tree.leaves(checkpoint._plain_keys(parts)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(np.asarray(one), np.asarray(two))
+
+
+def test_a_missing_teacher_is_told(tmp_path):
+    config = TrainConfig(network=NETWORK.config, ppo=PPO, tasks=(TASK,))
+    with pytest.raises(ValueError, match=r"teacher must be given .* 2 updates"):
+        training.train(config, tmp_path)

@@ -1,0 +1,256 @@
+"""The networks: size, invariances, masks."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxcal.learning.policies import decoding, networks
+from jaxcal.learning.policies.networks import NetworkConfig
+
+SMALL = NetworkConfig(width=8, encoder_rounds=1)
+CLOSE = NetworkConfig(width=8, encoder_rounds=1, close_up=True)
+
+
+def made(config, m=12, n=3, k=4, seed=0):
+    network = networks.build(config)
+    params = network.init(
+        jax.random.key(seed),
+        jnp.zeros((1, m, n)),
+        jnp.ones((1, m), bool),
+        jnp.full((1, k), -1),
+        jnp.ones((1, m), bool),
+    )["params"]
+    # Every parameter away from its initial zero, so that nothing is hidden by one.
+    noisy = jax.tree.map(lambda leaf: leaf + 0.1 * jnp.cos(jnp.arange(leaf.size)
+                         .reshape(leaf.shape)), params)  # fmt: skip
+    return network, noisy
+
+
+def score(network, params, points, chosen, k=4):
+    points = jnp.asarray(points, jnp.float32)
+    batch, m, _ = points.shape
+    view = network.look(points, jnp.ones((batch, m), bool))
+    memory = network.apply({"params": params}, view, method="encode")
+    picks = jnp.full((batch, k), -1).at[:, : len(chosen)].set(jnp.asarray(chosen, int))
+    free = jnp.ones((batch, m), bool).at[:, jnp.asarray(chosen, int)].set(False)
+    glance = network.look_at(view, picks, free, len(chosen))
+    return network.apply({"params": params}, memory, glance, method="decode")
+
+
+def test_the_papers_network_has_its_size_and_its_share():
+    network = networks.build(NetworkConfig(kind="paper", width=768))
+    shapes = jax.eval_shape(
+        network.init,
+        jax.random.key(0),
+        jnp.zeros((1, 50, 3)),
+        jnp.ones((1, 50), bool),
+        jnp.full((1, 4), -1),
+        jnp.ones((1, 50), bool),
+    )["params"]
+    size = {name: sum(x.size for x in jax.tree.leaves(part)) for name, part in
+            shapes.items()}  # fmt: skip
+    total = sum(size.values())
+    heads = sum(size[name] for name in networks.PAPER_HEADS)
+    assert abs(total - 3.5e6) <= 0.03 * 3.5e6
+    assert abs((1 - heads / total) - 0.71) <= 0.01
+
+
+@pytest.mark.parametrize(
+    ("k", "chosen"), [(4, []), (4, [3]), (4, [3, 7]), (7, [1, 2]), (7, [1, 2, 5, 8, 9])]
+)
+def test_compact_is_blind_to_affine_maps(rng, k, chosen):
+    network, params = made(SMALL)
+    points = rng.uniform(size=(3, 12, 3))
+    shear = np.array([[3.0, 1.0, 0.0], [0.0, 0.5, 2.0], [1.0, 0.0, 1.0]])
+    logits, value = score(network, params, points, chosen, k)
+    mapped, other = score(network, params, points @ shear.T + 5.0, chosen, k)
+    np.testing.assert_allclose(logits, mapped, rtol=2e-3, atol=5e-3)
+    # The value moves by the log-determinant of the map, squared.
+    moved = 2.0 * np.log(abs(np.linalg.det(shear)))
+    np.testing.assert_allclose(other - value, moved, atol=5e-3)
+
+
+@pytest.mark.parametrize(
+    "config", [SMALL, CLOSE, NetworkConfig(kind="paper", width=32)]
+)
+def test_permuting_the_candidates_permutes_the_logits(rng, config):
+    network, params = made(config)
+    points = rng.uniform(size=(1, 12, 3))
+    order = rng.permutation(12)
+    logits, value = score(network, params, points, [4, 6])
+    where = [int(np.flatnonzero(order == i)[0]) for i in (4, 6)]
+    mixed, other = score(network, params, points[:, order], where)
+    np.testing.assert_allclose(logits[:, order], mixed, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(value, other, atol=1e-3)
+
+
+@pytest.mark.parametrize("k", [4, 7])
+def test_a_network_can_begin_as_the_look_ahead_rule(rng, k):
+    start = dataclasses.replace(CLOSE, initial_trust=4.0, initial_actor=0.0)
+    network = networks.build(start)
+    params = made(start)[0].init(
+        jax.random.key(0),
+        jnp.zeros((1, 12, 3)),
+        jnp.ones((1, 12), bool),
+        jnp.full((1, k), -1),
+        jnp.ones((1, 12), bool),
+    )["params"]
+    points = jnp.asarray(rng.uniform(size=(50, 12, 3)), jnp.float32)
+    free = jnp.ones((50, 12), bool)
+    nothing = jnp.zeros((50, 0), jnp.int32)
+    key = jax.random.key(0)
+    own = decoding.choose(network, params, points, free, nothing, key, k=k)
+    chosen = jnp.full((50, k), -1, jnp.int32)
+    rule = jax.jit(  # without parameters every choice is the look-ahead's
+        lambda: decoding.complete(
+            network, None, network.look(points, free), None, chosen, free, 0, None
+        )
+    )()
+    # The members of one set tie; which of them comes first is rounding.
+    reached = [decoding.log_det_of(points, picked) for picked in (own, rule)]
+    np.testing.assert_allclose(*reached, atol=1e-4)
+    assert (np.sort(own) == np.sort(rule)).all(axis=1).mean() > 0.9
+
+
+@pytest.mark.parametrize("lookahead", [1, 3])
+def test_a_loop_over_like_choices_chooses_as_if_written_out(rng, lookahead):
+    config = NetworkConfig(width=8, encoder_rounds=1, lookahead=lookahead)
+    network, params = made(config)
+    points = jnp.asarray(rng.normal(size=(50, 15, 2)), jnp.float32)
+    free = jnp.asarray(rng.uniform(size=(50, 15)) < 0.8)
+    free = free.at[:, :10].set(True)
+    k = 9
+    view = network.look(points, free)
+    memory = networks.encode(network, params, view)
+    assert len(network.alike(view, k)) >= 4
+    nothing = jnp.zeros((50, 0), jnp.int32)
+    found = decoding.choose(
+        network, params, points, free, nothing, jax.random.key(0), k=k
+    )
+    chosen, left = jnp.full((50, k), -1, jnp.int32), free
+    for count in range(k):
+        if count in network.alike(view, k):
+            known = network.after(view, chosen, count)
+            traced = network.after(view, chosen, jnp.asarray(count))
+            for part in (0, 2, 3):
+                np.testing.assert_allclose(known[part], traced[part], atol=2e-5)
+        logits, _ = decoding.logits_at(
+            network, params, view, memory, chosen, left, count
+        )
+        taken = logits.argmax(-1)
+        chosen = chosen.at[:, count].set(taken)
+        left = left & ~jax.nn.one_hot(taken, 15, dtype=bool)
+    # Look-aheads that end in the same set tie; which comes first is rounding.
+    assert (np.sort(found) == np.sort(chosen)).all(axis=1).mean() >= 0.9
+    assert jnp.take_along_axis(free, found, axis=1).all()
+    assert (np.diff(np.sort(found)) > 0).all()
+
+
+def test_a_close_up_tells_near_equal_look_aheads_apart(rng):
+    network = networks.build(CLOSE)
+    points = jnp.asarray(rng.uniform(size=(1, 12, 3)), jnp.float32)
+    view = network.look(points, jnp.ones((1, 12), bool))
+    plain = networks.build(SMALL).look(points, jnp.ones((1, 12), bool))
+    assert (np.asarray(view["features"])[..., :13] == plain["features"]).all()
+    shown, behind = np.asarray(view["features"])[0, :, 13:], view["ahead"][0, :, 3]
+    best = int(np.argmax(behind))
+    assert (shown[best] == 1.0).all() and shown.shape == (12, 3)
+    for scale, column in zip((32.0, 256.0, 2048.0), shown.T, strict=True):
+        wanted = np.exp(scale * np.maximum(np.asarray(behind, np.float64), -8.0))
+        np.testing.assert_allclose(column, wanted, atol=1e-5)
+
+
+@pytest.mark.parametrize("config", [SMALL, NetworkConfig(kind="paper", width=32)])
+@pytest.mark.slow
+def test_masked_candidates_are_never_likely_and_gradients_stay_finite(rng, config):
+    network, params = made(config)
+    points = jnp.asarray(rng.uniform(size=(2, 12, 3)), jnp.float32)
+
+    def loss(params):
+        logits, value = score(network, params, points, [0, 1])
+        log_probs = jax.nn.log_softmax(logits)
+        entropy = -(jnp.exp(log_probs) * log_probs).sum()
+        return entropy + value.sum(), jnp.exp(log_probs)
+
+    grads, probabilities = jax.grad(loss, has_aux=True)(params)
+    assert float(probabilities[:, :2].max()) == 0.0
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(grads))
+
+
+@pytest.mark.slow
+def test_one_set_of_weights_serves_any_m_k_and_n(rng):
+    network, params = made(SMALL)
+    for m, n, k in ((5, 1, 2), (9, 2, 3), (30, 4, 5), (40, 3, 11)):
+        logits, value = score(network, params, rng.uniform(size=(2, m, n)), [], k)
+        assert logits.shape == (2, m) and bool(jnp.isfinite(value).all())
+
+
+def test_a_masked_candidate_does_not_touch_the_others(rng):
+    network, params = made(SMALL)
+    points = jnp.asarray(rng.uniform(size=(1, 12, 3)), jnp.float32)
+    usable = jnp.ones((1, 12), bool).at[:, 9:].set(False)
+
+    def logits(points):
+        view = network.look(points, usable)
+        memory = network.apply({"params": params}, view, method="encode")
+        glance = network.look_at(view, jnp.full((1, 4), -1), usable, 0)
+        return network.apply({"params": params}, memory, glance, method="decode")[0]
+
+    moved = points.at[:, 9:].set(50.0)
+    np.testing.assert_allclose(logits(points)[:, :9], logits(moved)[:, :9], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("values", "named"),
+    [
+        ({"kind": "big"}, "kind"),
+        ({"width": 0}, "width"),
+        ({"lookahead": 0}, "lookahead"),
+    ],
+)
+def test_a_bad_configuration_is_named(values, named):
+    with pytest.raises(ValueError, match=named):
+        NetworkConfig(**values)
+
+
+def test_the_papers_scores_are_those_of_keys_that_are_written_out(rng):
+    # Attention as the paper has it: a key for every candidate, a query for the context.
+    network, params = made(NetworkConfig(kind="paper", width=32), m=20)
+    candidates = jnp.asarray(rng.uniform(size=(1, 20, 3)), jnp.float32)
+    free = jnp.arange(20)[None] != 7
+    chosen = jnp.array([[7, -1, -1, -1]])
+    view = network.look(candidates, free)
+    glance = network.look_at(view, chosen, free, 1)
+    poses = networks.encode(network, params, view)
+    logits, _ = networks.decode(network, params, poses, glance)
+    params, poses, context = jax.tree.map(
+        np.asarray, (params, poses, glance["context"])
+    )
+
+    def dense(name, rows):
+        return rows @ params[name]["kernel"] + params[name]["bias"]
+
+    def relu(rows):
+        return np.maximum(rows, 0.0)
+
+    def norm(name, rows):
+        centred = rows - rows.mean(-1, keepdims=True)
+        unit = centred / np.sqrt((centred**2).mean(-1, keepdims=True) + 1e-6)
+        return unit * params[name]["scale"] + params[name]["bias"]
+
+    keys = dense("key", poses)[0]
+    context = relu(dense("context_1", context))
+    context = norm("context_norm", relu(dense("context_2", context)))
+    scores = keys @ dense("query", context)[0] / 32**0.5
+    weights = np.asarray(jax.nn.softmax(np.where(free[0], scores, -np.inf)))
+    squeezed = relu(dense("squeeze", context + weights @ keys))
+    shared = context + dense("expand", squeezed)
+    expected = np.where(free[0], keys @ dense("actor", shared)[0] / 32**0.5, -np.inf)
+    np.testing.assert_allclose(
+        jax.nn.softmax(logits[0]), jax.nn.softmax(expected), rtol=1e-4, atol=1e-6
+    )

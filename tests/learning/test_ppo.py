@@ -1,0 +1,123 @@
+"""PPO: advantages, the surrogate's bookkeeping, learning, one compilation."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from jaxcal.learning.environments.selection import SelectionConfig
+from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.training import ppo
+from jaxcal.learning.training.ppo import PPOConfig, Task
+
+SMALL = NetworkConfig(width=8, encoder_rounds=1)
+TINY = PPOConfig(
+    num_episodes=64 * 40,
+    episodes_per_update=64,
+    episodes_per_set=4,
+    num_minibatches=2,
+    warmup_updates=1,
+)
+
+
+def test_advantages_are_those_of_the_definition(rng):
+    rewards, values = rng.normal(size=(2, 5, 3))
+    got = ppo.advantages(jnp.asarray(rewards), jnp.asarray(values), 0.9, 0.8)
+    deltas = rewards + 0.9 * np.vstack([values[1:], np.zeros((1, 3))]) - values
+    for t in range(5):
+        weights = (0.9 * 0.8) ** np.arange(5 - t)
+        np.testing.assert_allclose(got[t], weights @ deltas[t:], rtol=1e-5)
+
+
+def test_undiscounted_advantages_are_return_less_value(rng):
+    rewards, values = rng.normal(size=(2, 4, 2))
+    got = ppo.advantages(jnp.asarray(rewards), jnp.asarray(values), 1.0, 1.0)
+    returns = np.cumsum(rewards[::-1], axis=0)[::-1]
+    np.testing.assert_allclose(got, returns - values, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("size", [1e-3, 0.2, 30.0])
+def test_clipping_is_that_of_optax(rng, size):
+    grads = {"a": size * rng.normal(size=(7, 3)), "b": size * rng.normal(size=4)}
+    grads = jax.tree.map(jnp.asarray, grads)
+    ours = ppo._clip_by_global_norm(0.5)
+    theirs = optax.clip_by_global_norm(0.5)
+    got, _ = ours.update(grads, ours.init(grads))
+    expected, _ = theirs.update(grads, theirs.init(grads))
+    for name in grads:
+        np.testing.assert_allclose(got[name], expected[name], rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["compact", "paper"])
+@pytest.mark.parametrize("k", [4, 6])
+def test_the_first_minibatch_sees_the_probabilities_that_played(kind, k):
+    # Play and loss compute the same probabilities in differently compiled programs;
+    # a difference here would silently make every gradient wrong.
+    env = SelectionConfig(num_candidates=12, num_selected=k)
+    task = Task(env, random_starts=0.5)
+    network = networks.build(dataclasses.replace(SMALL, kind=kind))
+    config = dataclasses.replace(TINY, episodes_per_update=512)
+    state = ppo.init(config, task, network)
+    rollout, _ = jax.jit(
+        lambda params: ppo._play(config, task, network, params, jax.random.key(1))
+    )(state.params)
+    _, metrics = jax.jit(
+        lambda params: ppo._loss(params, rollout, jnp.float32(0), config, task, network)
+    )(state.params)
+    assert abs(float(metrics["kl"])) < 1e-6
+
+
+def test_update_compiles_once_and_changes_everything_it_should():
+    network = networks.build(SMALL)
+    task = Task(SelectionConfig(num_candidates=10))
+    state = ppo.init(TINY, task, network)
+    before = jax.tree.map(np.asarray, state.params)
+    sizes = []
+    for _ in range(3):
+        state, metrics = ppo.update(state, TINY, task, network)
+        sizes.append(ppo.update._cache_size())
+    assert sizes[0] == sizes[2]
+    assert int(state.num_updates) == 3
+    assert metrics["rewards"].shape == (64,)
+    moved = jax.tree.map(lambda a, b: bool((a != b).any()), before, state.params)
+    # The value reads every part of the network, the policy all but the critic.
+    assert all(jax.tree.leaves(moved))
+
+
+def test_the_policy_learns_on_a_small_task():
+    # Without the look ahead and the endgame, so that it must learn by itself.
+    network = networks.build(
+        dataclasses.replace(SMALL, lookahead=1, endgame=False, width=16)
+    )
+    config = dataclasses.replace(
+        TINY, num_episodes=512 * 40, episodes_per_update=512, learning_rate=5e-3
+    )
+    task = Task(SelectionConfig(num_candidates=8))
+    state = ppo.init(config, task, network)
+    rewards = []
+    for _ in range(config.num_updates):
+        state, metrics = ppo.update(state, config, task, network)
+        rewards.append(float(metrics["reward_mean"]))
+    assert np.mean(rewards[-5:]) > np.mean(rewards[:3]) + 0.3
+    assert float(metrics["value_loss"]) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("values", "named"),
+    [
+        ({"episodes_per_update": 100}, "episodes_per_update"),
+        ({"num_epochs": 0}, "num_epochs"),
+        ({"learning_rate": 0.0}, "learning_rate"),
+        ({"gae_lambda": 1.5}, "gae_lambda"),
+        ({"seed": -1}, "seed"),
+    ],
+)
+def test_a_bad_configuration_is_named(values, named):
+    with pytest.raises(ValueError, match=named):
+        PPOConfig(**values)

@@ -1,0 +1,55 @@
+"""The fast uniform numbers are jax's own."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from jaxcal.learning.environments import randomness
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (7,), (50, 3), (3, 5, 2)])
+def test_uniform_is_jaxs_bit_for_bit(key, shape):
+    wanted = np.asarray(jax.random.uniform(key, shape))
+    assert (np.asarray(randomness.uniform(key, shape)) == wanted).all()
+
+
+def test_uniform_is_jaxs_for_many_keys_and_for_legacy_ones(key):
+    keys = jax.random.split(key, 5)
+    drawn = jax.vmap(lambda key: randomness.uniform(key, (4,)))(keys)
+    wanted = jax.vmap(lambda key: jax.random.uniform(key, (4,)))(keys)
+    assert (np.asarray(drawn) == np.asarray(wanted)).all()
+    legacy = jax.random.PRNGKey(3)
+    drawn = randomness.uniform(legacy, (4,))
+    assert (np.asarray(drawn) == np.asarray(jax.random.uniform(legacy, (4,)))).all()
+
+
+def test_another_generators_key_is_left_to_jax():
+    key = jax.random.key(0, impl="rbg")
+    drawn = randomness.uniform(key, (4,))
+    assert (np.asarray(drawn) == np.asarray(jax.random.uniform(key, (4,)))).all()
+
+
+@pytest.mark.parametrize("kind", ["typed", "legacy", "rbg"])
+def test_split_is_jaxs_bit_for_bit(kind):
+    keys = {
+        "typed": jax.random.key(5),
+        "legacy": jax.random.PRNGKey(5),
+        "rbg": jax.random.key(5, impl="rbg"),
+    }
+    wanted = jax.random.split(keys[kind])
+    for drawn, own in zip(randomness.split(keys[kind]), wanted, strict=True):
+        assert drawn.dtype == own.dtype
+        if kind != "legacy":
+            drawn, own = jax.random.key_data(drawn), jax.random.key_data(own)
+        assert (np.asarray(drawn) == np.asarray(own)).all()
+
+
+def test_split_is_jaxs_for_many_keys(key):
+    keys = jax.random.split(key, 5)
+    drawn = jax.vmap(randomness.split)(keys)
+    wanted = jax.vmap(jax.random.split)(keys)
+    for i, halves in enumerate(drawn):
+        own = jax.random.key_data(wanted[:, i])
+        assert (np.asarray(jax.random.key_data(halves)) == np.asarray(own)).all()

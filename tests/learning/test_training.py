@@ -1,0 +1,343 @@
+"""Training runs: resume, kills, damage, and what a checkpoint says of itself."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import os
+import pathlib
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+
+import jax
+import numpy as np
+import pytest
+
+from jaxcal.learning.environments.selection import SelectionConfig
+from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.training import checkpoint, presets
+from jaxcal.learning.training import run as training
+from jaxcal.learning.training.checkpoint import CheckpointError
+from jaxcal.learning.training.ppo import PPOConfig, Task
+from jaxcal.learning.training.run import TrainConfig, Validation
+
+ROOT = pathlib.Path(__file__).parents[2]
+
+CONFIG = TrainConfig(
+    network=NetworkConfig(width=8, encoder_rounds=1),
+    ppo=PPOConfig(
+        num_episodes=64 * 6,
+        episodes_per_update=64,
+        episodes_per_set=4,
+        num_minibatches=2,
+        warmup_updates=1,
+        seed=3,
+    ),
+    tasks=(
+        Task(SelectionConfig(num_candidates=10)),
+        Task(SelectionConfig(num_candidates=8, num_selected=5, reward_gain=True)),
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    return folder, training.train(CONFIG, folder)
+
+
+def leaves(state):
+    return [np.asarray(x) for x in jax.tree.leaves(checkpoint._plain_keys(state))]
+
+
+def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished, tmp_path):
+    folder, whole = finished
+    training.train(CONFIG, tmp_path, num_updates=2)
+    training.train(CONFIG, tmp_path, resume=True, num_updates=3)
+    resumed = training.train(CONFIG, tmp_path, resume=True)
+    for one, other in zip(leaves(whole), leaves(resumed), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+    def rows(path):
+        with (path / "metrics.csv").open() as file:
+            return [
+                {k: v for k, v in row.items() if k != "seconds"}
+                for row in csv.DictReader(file)
+            ]
+
+    assert rows(folder) == rows(tmp_path)
+    assert len(rows(folder)) == 6
+    np.testing.assert_array_equal(
+        np.load(folder / "last_rewards.npy"), np.load(tmp_path / "last_rewards.npy")
+    )
+
+
+def test_metrics_have_the_columns_that_figures_read(finished):
+    folder, _ = finished
+    header = (folder / "metrics.csv").read_text().splitlines()[0]
+    assert header == ",".join(training.COLUMNS)
+    assert any(p.name.startswith("events.out.tfevents") for p in folder.iterdir())
+
+
+def test_rows_that_were_never_saved_are_dropped_on_resume(finished, tmp_path):
+    folder, _ = finished
+    copy = tmp_path / "copy"
+    shutil.copytree(folder, copy)
+    with (copy / "metrics.csv").open("a") as file:
+        file.write("7,448,1.0,0.1\n8,51")
+    training.train(CONFIG, copy, resume=True)
+    assert len((copy / "metrics.csv").read_text().splitlines()) == 7
+
+
+def test_a_checkpoint_names_its_configuration_seed_and_versions(finished):
+    folder, state = finished
+    policy = checkpoint.load(folder)
+    assert policy.step == 6
+    assert policy.meta["seed"] == 3
+    assert policy.meta["versions"]["jax"] == jax.__version__
+    assert policy.meta["progress"]["episodes"] == 384
+    assert TrainConfig.from_meta(policy.meta).ppo == CONFIG.ppo
+    assert TrainConfig.from_meta(policy.meta).tasks == CONFIG.tasks
+    for one, other in zip(
+        jax.tree.leaves(policy.params), jax.tree.leaves(state.average), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_validation_of_the_optimum_itself_is_one():
+    rng = np.random.default_rng(0)
+    sets = rng.uniform(size=(6, 10, 3))
+
+    from jaxcal.selection import exact_batch
+
+    best = np.asarray(exact_batch(sets, 4, num_outputs=1).log_det)
+    network = NetworkConfig(width=8, encoder_rounds=1)
+    state = training.ppo.init(CONFIG.ppo, CONFIG.tasks[0],
+                              training.networks.build(network))  # fmt: skip
+    ratio, hits = Validation(sets, best, 3).measure(
+        training.networks.build(network), state.params, 4
+    )
+    assert 0.0 <= ratio <= 1.0 and 0.0 <= hits <= 1.0
+    worse, none = Validation(sets, best + 1.0, 3).measure(
+        training.networks.build(network), state.params, 4
+    )
+    assert worse == pytest.approx(ratio * np.exp(-3.0), rel=1e-3) and none == 0.0
+
+
+@pytest.mark.parametrize(
+    ("damage", "says"),
+    [
+        (lambda step: shutil.rmtree(step / "policy"), "weights are damaged"),
+        (lambda step: (step / "meta" / "metadata").write_text("{"), "meta is damaged"),
+        (lambda step: _edit(step, version=99), "version 99"),
+        (lambda step: _edit(step, schema="other"), "not a jaxcal policy"),
+        (
+            lambda step: _edit(step, network={"kind": "compact", "size": 1}),
+            "no network",
+        ),
+        (lambda step: _edit(step, network={"width": 16}), "does not fit its network"),
+        (lambda step: shutil.rmtree(step), "holds no checkpoint"),
+        (lambda step: _truncate(step), "damaged"),
+    ],
+)
+def test_damage_is_told_in_one_error(finished, tmp_path, damage, says):
+    folder, _ = finished
+    shutil.copytree(folder / "checkpoint" / "6", tmp_path / "6")
+    damage(tmp_path / "6")
+    with pytest.raises(CheckpointError, match=says) as caught:
+        checkpoint.load(tmp_path)
+    assert str(tmp_path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def _edit(step: pathlib.Path, **values: object) -> None:
+    path = step / "meta" / "metadata"
+    path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+
+def _truncate(step: pathlib.Path) -> None:
+    data = [
+        p for p in (step / "policy").rglob("*") if p.is_file() and p.parent.name == "d"
+    ]
+    assert data
+    for path in data:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def test_a_missing_folder_and_a_policy_without_state_are_told(finished, tmp_path):
+    with pytest.raises(CheckpointError, match="does not exist"):
+        checkpoint.load(tmp_path / "nowhere")
+    policy = checkpoint.load(finished[0])
+    checkpoint.save(tmp_path, 1, policy.params, CONFIG.as_meta())
+    with pytest.raises(CheckpointError, match="no training state"):
+        training.train(CONFIG, tmp_path, resume=True)
+
+
+def test_exporting_keeps_the_policy_and_leaves_the_state(finished, tmp_path):
+    for _ in range(2):  # the second replaces the first
+        checkpoint.export(finished[0], tmp_path / "policy")
+    assert [p.name for p in tmp_path.iterdir()] == ["policy"]
+    one, other = checkpoint.load(finished[0]), checkpoint.load(tmp_path / "policy")
+    for a, b in zip(
+        jax.tree.leaves(one.params), jax.tree.leaves(other.params), strict=True
+    ):
+        np.testing.assert_array_equal(a, b)
+    with pytest.raises(CheckpointError, match="no training state"):
+        checkpoint.restore(tmp_path / "policy", None)
+    text = "".join(
+        path.read_text(errors="ignore")
+        for path in (tmp_path / "policy").rglob("*")
+        if path.is_file()
+    )
+    assert str(tmp_path) not in text
+
+
+def test_a_state_of_another_configuration_is_refused(finished, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(finished[0], copy)
+    other = dataclasses.replace(CONFIG, network=NetworkConfig(width=16))
+    with pytest.raises(CheckpointError, match="cannot be resumed"):
+        training.train(other, copy, resume=True)
+
+
+def test_killed_save_leaves_the_previous_checkpoint(finished, tmp_path):
+    # Saves in a loop and is killed at a random moment; whatever step is newest loads.
+    script = tmp_path / "save.py"
+    script.write_text(
+        textwrap.dedent(
+            f"""
+            import sys
+            from jaxcal.learning.training import checkpoint
+            policy = checkpoint.load({str(finished[0])!r})
+            for step in range(1, 10_000):
+                meta = {{k: policy.meta[k] for k in ("network", "tasks")}}
+                checkpoint.save(sys.argv[1], step, policy.params, meta, policy.params)
+                print(step, flush=True)
+            """
+        )
+    )
+    for attempt, pause in enumerate((0.01, 0.05, 0.11)):
+        folder = tmp_path / f"kill{attempt}"
+        process = subprocess.Popen(
+            [sys.executable, script, folder],
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=ROOT,
+        )
+        for _ in range(2):
+            seen = int(process.stdout.readline())
+        time.sleep(pause)
+        process.send_signal(signal.SIGKILL)
+        rest = process.stdout.read().split()
+        process.wait()
+        last = int(rest[-1]) if rest else seen
+        policy = checkpoint.load(folder)
+        assert policy.step in (last, last + 1)
+
+
+@pytest.mark.parametrize("preset", sorted(presets.PRESETS))
+def test_presets_survive_their_own_metadata(preset):
+    config = presets.PRESETS[preset]
+    meta = json.loads(json.dumps(config.as_meta()))
+    again = TrainConfig.from_meta(meta)
+    assert (again.network, again.ppo, again.tasks) == (
+        config.network,
+        config.ppo,
+        config.tasks,
+    )
+
+
+def test_the_paper_preset_is_table_2():
+    paper = presets.PRESETS["paper"]
+    assert paper.ppo.episodes_per_update == 16
+    assert paper.ppo.num_epochs == 10
+    assert paper.ppo.num_episodes == 200_000
+    assert paper.tasks[0].environment == SelectionConfig(50, 4, 3, 3, 0.1)
+    assert (paper.network.kind, paper.network.width) == ("paper", 768)
+
+
+def test_single_values_change_and_unknown_ones_are_named():
+    config = presets.with_values(
+        presets.PRESETS["compact"], {"num_candidates": 20, "width": 16, "seed": 5}
+    )
+    assert config.tasks[0].environment.num_candidates == 20
+    assert (config.network.width, config.ppo.seed) == (16, 5)
+    with pytest.raises(ValueError, match="wings"):
+        presets.with_values(config, {"wings": 2})
+
+
+def run_train(*arguments, cwd=ROOT, **options):
+    command = [sys.executable, str(ROOT / "train.py"), *map(str, arguments)]
+    return subprocess.run(
+        command, capture_output=True, text=True, cwd=cwd, timeout=300, **options
+    )
+
+
+SHORT = (
+    "--episodes=128 --episodes-per-update=64 --episodes-per-set=4 --num-minibatches=2 "
+    "--width=8 --encoder-rounds=1 --num-candidates=10"
+).split()
+
+
+def test_train_command_trains_saves_and_refuses_to_overwrite(tmp_path):
+    out = tmp_path / "run"
+    first = run_train("--out", out, *SHORT)
+    assert first.returncode == 0, first.stderr
+    assert "ratio to exact" in first.stdout and "saved" in first.stdout
+    assert checkpoint.load(out).step == 2
+    again = run_train("--out", out, *SHORT)
+    assert again.returncode == 2
+    assert again.stderr.startswith("train.py: --out") and "--resume" in again.stderr
+    clash = run_train("--out", out, "--resume", "--seed", "4")
+    assert clash.returncode == 2 and "--seed" in clash.stderr
+    done = run_train("--out", out, "--resume", "--no-validation")
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--episodes", "0"], "num_episodes must be at least 1"),
+        (["--num-selected", "3"], "num_selected must be in"),
+        (["--seed", "one"], "argument --seed: invalid int value: 'one'"),
+        (["--resume"], "does not exist"),
+        (["--out", "/proc/nowhere/run"], "cannot write in /proc"),
+    ],
+)
+def test_train_command_refuses_in_one_line(arguments, says, tmp_path):
+    if "--out" not in arguments:
+        arguments = [*arguments, "--out", str(tmp_path / "none")]
+    result = run_train(*arguments)
+    assert result.returncode == 2
+    assert says in result.stderr and result.stderr.count("\n") == 1
+    assert not (tmp_path / "none" / "checkpoint").exists()
+
+
+def test_ctrl_c_saves_and_resume_goes_on(tmp_path):
+    out = tmp_path / "run"
+    process = subprocess.Popen(
+        [sys.executable, str(ROOT / "train.py"), "--out", str(out), "--no-validation",
+         *SHORT, "--episodes=6400000"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        env=os.environ | {"PYTHONUNBUFFERED": "1"},
+    )  # fmt: skip
+    for line in process.stdout:
+        if line.split()[:2] == ["1", "64"]:
+            break
+    time.sleep(1.0)
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    assert "and saved; go on" in output
+    step = checkpoint.load(out).step
+    assert step >= 1
+    rows = (out / "metrics.csv").read_text().splitlines()
+    assert len(rows) - 1 == step

@@ -1,0 +1,286 @@
+"""The least time at a wanted efficiency, against every subset in every order."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxcal
+from jaxcal.information.regression import log_det_gram
+from jaxcal.selection.fastest.fastest import (
+    Motion,
+    fastest_tour,
+    pareto_figure,
+    pareto_front,
+    select_fastest,
+    travel_times,
+)
+
+MOTION = Motion(speed=(20.0, 10.0, 30.0), acceleration=(50.0, 100.0, 20.0), settle=0.5)
+
+
+def seconds_of(candidates, order, start):
+    """Move by move, axis by axis, from the definition of the profile."""
+    at, total = start, 0.0
+    for i in order:
+        if at is not None:
+            longest = 0.0
+            for axis in range(3):
+                v, a = MOTION.speed[axis], MOTION.acceleration[axis]
+                d = abs(candidates[i, axis] - at[axis])
+                cruise = d / v + v / a if d >= v * v / a else 2 * (d / a) ** 0.5
+                longest = max(longest, cruise)
+            total += longest
+        total += MOTION.settle
+        at = candidates[i]
+    return total
+
+
+def every_run(candidates, k, start, required=(), available=None):
+    """(log det S, least seconds) of every subset allowed."""
+    usable = range(len(candidates)) if available is None else np.flatnonzero(available)
+    runs = []
+    for subset in itertools.combinations(usable, k):
+        if set(required) <= set(subset):
+            value = 3 * float(log_det_gram(candidates[list(subset)]))
+            orders = itertools.permutations(subset)
+            runs.append((value, min(seconds_of(candidates, o, start) for o in orders)))
+    return np.array(runs)
+
+
+@settings(max_examples=12)
+@given(st.integers(0, 2**31), st.floats(0.5, 1.0), st.booleans(), st.integers(0, 2))
+def test_exact_is_the_least_of_every_subset_and_order(seed, least, started, r):
+    rng = np.random.default_rng(seed)
+    candidates = rng.uniform(-20, 20, (8, 3))
+    start = np.zeros(3) if started else None
+    available = rng.permutation(8) < 7
+    required = np.flatnonzero(available)[:r]
+    runs = every_run(candidates, 4, start, required, available)
+    enough = np.exp((runs[:, 0] - runs[:, 0].max()) / 12) >= least - 1e-12
+    found = select_fastest(
+        candidates,
+        4,
+        motion=MOTION,
+        least_efficiency=least,
+        start=start,
+        available=available,
+        required=required,
+    )
+    assert found.proven
+    assert found.seconds == pytest.approx(runs[enough, 1].min(), abs=1e-8)
+    assert found.seconds == pytest.approx(
+        seconds_of(candidates, found.indices, start), abs=1e-9
+    )
+    assert found.efficiency >= least - 1e-9
+    assert found.log_det == pytest.approx(
+        jaxcal.log_det_information(candidates[found.indices])
+    )
+    assert set(required.tolist()) <= set(found.indices.tolist())
+    assert available[found.indices].all()
+
+
+@pytest.mark.parametrize("k", [5, 6])
+def test_exact_holds_for_more_postures_than_regressors(rng, k):
+    candidates = rng.uniform(-20, 20, (8, 3))
+    runs = every_run(candidates, k, np.zeros(3))
+    for least in (0.7, 0.9, 0.99):
+        enough = np.exp((runs[:, 0] - runs[:, 0].max()) / 12) >= least - 1e-12
+        found = select_fastest(
+            candidates, k, motion=MOTION, least_efficiency=least, start=np.zeros(3)
+        )
+        assert found.proven
+        assert found.seconds == pytest.approx(runs[enough, 1].min(), abs=1e-8)
+
+
+@pytest.mark.parametrize("started", [False, True])
+def test_the_front_is_that_of_every_subset(rng, started):
+    for _ in range(3):
+        candidates = rng.uniform(-20, 20, (9, 3))
+        start = np.zeros(3) if started else None
+        runs = every_run(candidates, 4, start)
+        runs[:, 0] = np.exp((runs[:, 0] - runs[:, 0].max()) / 12)
+        runs = runs[runs[:, 0] >= 0.6]
+        best = np.array(
+            [
+                run
+                for run in runs
+                if not ((runs[:, 1] <= run[1] + 1e-9) & (runs[:, 0] > run[0])).any()
+            ]
+        )
+        best = best[np.argsort(best[:, 1])]
+        front = pareto_front(
+            candidates, 4, motion=MOTION, least_efficiency=0.6, start=start
+        )
+        assert front.proven
+        got = np.array([(p.efficiency, p.seconds) for p in front.points])
+        np.testing.assert_allclose(got, best, rtol=1e-7)
+
+
+@settings(max_examples=6)
+@given(st.integers(0, 2**31), st.sampled_from([4, 5, 8, 13]))
+def test_the_heuristic_keeps_every_rule_and_is_never_faster_than_exact(seed, k):
+    rng = np.random.default_rng(seed)
+    candidates = rng.uniform(-20, 20, (20, 3))
+    found = select_fastest(
+        candidates,
+        k,
+        motion=MOTION,
+        least_efficiency=0.9,
+        required=[3],
+        method="heuristic",
+        seed=seed,
+    )
+    assert found.efficiency >= 0.9 - 1e-9
+    assert not found.proven
+    assert len(set(found.indices.tolist())) == k
+    assert 3 in found.indices
+    assert found.seconds == pytest.approx(seconds_of(candidates, found.indices, None))
+    if k <= 5:
+        best = select_fastest(
+            candidates, k, motion=MOTION, least_efficiency=0.9, required=[3]
+        )
+        assert best.seconds <= found.seconds + 1e-9
+
+
+@given(st.integers(0, 2**31))
+def test_travel_time_is_a_metric_and_the_slowest_axis(seed):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-30, 30, (6, 3))
+    t = travel_times(points, points, MOTION)
+    np.testing.assert_allclose(t, t.T)
+    np.testing.assert_array_equal(np.diagonal(t), 0.0)
+    assert (t[:, None] <= t[:, :, None] + t[None] + 1e-12).all()
+    for i, j in itertools.permutations(range(6), 2):
+        one_way = seconds_of(points, [j], points[i]) - MOTION.settle
+        assert t[i, j] == pytest.approx(one_way)
+
+
+def test_a_profile_reaches_its_speed_or_does_not():
+    motion = Motion(speed=(2.0,), acceleration=(1.0,))
+    far = travel_times([[0.0]], [[10.0], [4.0], [1.0]], motion)
+    np.testing.assert_allclose(far, [[7.0, 4.0, 2.0]])
+
+
+@given(st.integers(0, 2**31), st.integers(1, 6), st.booleans())
+def test_the_tour_is_the_best_permutation(seed, k, started):
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-30, 30, (k, 3))
+    t = travel_times(points, points, MOTION)
+    start = rng.random(k) if started else np.zeros(k)
+    order, seconds = fastest_tour(t, start if started else None)
+    lengths = [
+        start[p[0]] + sum(t[a, b] for a, b in itertools.pairwise(p))
+        for p in itertools.permutations(range(k))
+    ]
+    assert sorted(order.tolist()) == list(range(k))
+    assert seconds == pytest.approx(min(lengths))
+
+
+def test_long_tours_are_no_worse_than_any_nearest_neighbour_tour(rng):
+    points = rng.uniform(-30, 30, (16, 3))
+    t = travel_times(points, points, MOTION)
+    order, seconds = fastest_tour(t)
+    assert sorted(order.tolist()) == list(range(16))
+    assert seconds == pytest.approx(t[order[:-1], order[1:]].sum())
+    for first in range(16):
+        tour, left = [first], set(range(16)) - {first}
+        while left:
+            tour.append(min(left, key=lambda j: t[tour[-1], j]))
+            left.remove(tour[-1])
+        assert seconds <= sum(t[a, b] for a, b in itertools.pairwise(tour)) + 1e-9
+
+
+def test_all_of_the_efficiency_is_the_d_optimum_in_its_best_order(rng):
+    candidates = rng.uniform(-20, 20, (40, 3))
+    found = select_fastest(candidates, 5, motion=MOTION, least_efficiency=1.0)
+    best = jaxcal.select(candidates, 5, "exact")
+    assert found.log_det == pytest.approx(best.log_det, abs=1e-8)
+    assert set(found.indices.tolist()) == set(best.indices.tolist())
+
+
+def test_less_efficiency_never_takes_longer(rng):
+    candidates = rng.uniform(-20, 20, (40, 3))
+    seconds = [
+        select_fastest(candidates, 4, motion=MOTION, least_efficiency=e).seconds
+        for e in (0.5, 0.8, 0.9, 0.95, 1.0)
+    ]
+    assert seconds == sorted(seconds)
+
+
+def test_out_of_time_is_said(rng):
+    candidates = rng.uniform(-20, 20, (60, 3))
+    found = select_fastest(
+        candidates,
+        10,
+        motion=MOTION,
+        least_efficiency=0.3,
+        method="exact",
+        time_limit=0.2,
+    )
+    assert found.method == "exact"
+    assert not found.proven
+    assert found.efficiency >= 0.3
+
+
+def test_the_figure_holds_every_point(rng):
+    front = pareto_front(rng.uniform(-20, 20, (10, 3)), 4, motion=MOTION)
+    axes = pareto_figure({"K = 4": front}).axes[0]
+    assert len(axes.lines[0].get_xdata()) == len(front.points)
+    assert "efficiency" in axes.get_xlabel()
+    assert "(s)" in axes.get_ylabel()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"least_efficiency": 0.0}, r"least_efficiency must be in \(0, 1\], got 0"),
+        (
+            {"method": "magic"},
+            "method must be one of exact, heuristic, policy, lookahead, got 'magic'",
+        ),
+        ({"k": 13, "method": "exact"}, "k must be at most 12 with exact, got 13"),
+        ({"motion": 20.0}, "motion must be a Motion, got 20.0"),
+        ({"k": 3}, "k must be at least 4"),
+        ({"start": np.zeros(2)}, r"start must have shape \(3,\), got \(2,\)"),
+        ({"time_limit": -1}, "time_limit must be above 0 seconds, got -1"),
+        ({"motion": Motion((1.0, 2.0), (1.0,))}, "motion.speed must hold 1 or 3"),
+    ],
+)
+def test_bad_requests_name_argument_rule_and_value(rng, change, message):
+    given = {"k": 4, "motion": MOTION} | change
+    with pytest.raises(ValueError, match=message):
+        select_fastest(rng.random((20, 3)), given.pop("k"), **given)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (((0.0,), (1.0,), 0.0), "speed must be positive"),
+        (((1.0,), (-1.0,), 0.0), "acceleration must be positive"),
+        (((1.0,), (1.0,), -0.1), "settle must be at least 0 seconds, got -0.1"),
+    ],
+)
+def test_a_motion_is_checked_once(values, message):
+    with pytest.raises(ValueError, match=message):
+        Motion(*values)
+
+
+def test_cost_loads_neither_jax_nor_matplotlib():
+    code = (
+        "import sys, numpy\n"
+        "from jaxcal.selection.fastest.fastest import Motion, select_fastest\n"
+        "c = numpy.random.default_rng(0).random((9, 3))\n"
+        "select_fastest(c, motion=Motion((1.0,), (1.0,)))\n"
+        "print(sorted({'jax', 'matplotlib'} & set(sys.modules)))"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "[]"

@@ -1,0 +1,115 @@
+"""The Fedorov exchange, and the kernels beneath it."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from jaxcal.information.linear_algebra import draw, factor
+from jaxcal.selection import exchange_batch, make_problem, select
+from jaxcal.selection.exchange.exchange import exchange_from, exchange_indices
+
+
+def uniform(seed, m, n=3):
+    return np.random.default_rng(seed).random((m, n))
+
+
+@pytest.mark.parametrize("k", [4, 6, 9])
+@pytest.mark.parametrize("cap", [1, 2, 9])
+def test_no_single_swap_improves_the_result(k, cap):
+    candidates = uniform(k, 20)
+    problem = make_problem(candidates, k, max_replicates=cap)
+    chosen = exchange_indices(problem, restarts=1, seed=3)
+    best = problem.log_det(chosen)
+    for position, new in itertools.product(range(k), range(20)):
+        swapped = chosen.copy()
+        swapped[position] = new
+        if np.bincount(swapped).max() <= cap:
+            assert problem.log_det(swapped) <= best + 1e-8
+
+
+@pytest.mark.parametrize("k", [4, 8, 12])
+def test_default_restarts_find_the_proven_optimum(k):
+    candidates = np.random.default_rng(k).random((60, 50, 3))
+    found = exchange_batch(candidates, k)
+    for b in range(60):
+        optimum = select(candidates[b], k, "exact")
+        assert optimum.proven
+        assert found.log_det[b] == pytest.approx(optimum.log_det, abs=1e-8)
+
+
+def test_the_seed_decides_and_is_recorded():
+    candidates = uniform(0, 60)
+    one = select(candidates, 10, "exchange", restarts=1, seed=5)
+    same = select(candidates, 10, "exchange", restarts=1, seed=5)
+    np.testing.assert_array_equal(one.indices, same.indices)
+    assert (one.seed, one.restarts) == (5, 1)
+    picks = {
+        tuple(select(candidates, 10, "exchange", restarts=1, seed=s).indices)
+        for s in range(20)
+    }
+    assert len(picks) > 1
+    assert select(candidates, 10, "exchange", seed=2**70).log_det >= one.log_det - 1e-9
+
+
+def test_more_restarts_never_lower_the_result():
+    candidates = uniform(1, 50)
+    values = [
+        select(candidates, 8, "exchange", restarts=r).log_det for r in (1, 2, 5, 20, 80)
+    ]
+    assert np.all(np.diff(values) >= -1e-9)
+
+
+@pytest.mark.parametrize("k", [4, 6])
+def test_required_and_mask_are_respected(k):
+    candidates = uniform(2, 30)
+    available = np.arange(30) % 3 > 0
+    found = select(candidates, k, "exchange", available=available, required=[4, 1])
+    np.testing.assert_array_equal(found.indices[:2], [4, 1])
+    assert available[found.indices].all()
+    assert len(set(found.indices.tolist())) == k
+
+
+def test_starts_are_not_singular_on_grids_of_duplicates():
+    axis = np.array([0.0, 1.0])
+    corners = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    candidates = np.concatenate([np.tile(corners[:3], (40, 1)), corners])
+    for seed in range(10):
+        found = select(candidates, 4, "exchange", restarts=1, seed=seed)
+        assert np.isfinite(found.log_det)
+
+
+def test_climbing_from_a_selection_never_lowers_it():
+    problem = make_problem(uniform(4, 40), 7, required=[3, 9])
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        others = rng.permutation(np.setdiff1d(np.arange(40), [3, 9]))[:5]
+        start = np.concatenate([[9], others, [3]])
+        chosen = exchange_from(problem, start)
+        assert problem.log_det(chosen) >= problem.log_det(start) - 1e-9
+        assert {3, 9} <= set(chosen.tolist())
+        assert len(set(chosen.tolist())) == 7
+    with pytest.raises(ValueError, match="indices must give an invertible"):
+        exchange_from(problem, [3, 9, 3, 9, 3, 9, 3])
+    with pytest.raises(ValueError, match="indices must hold every required"):
+        exchange_from(problem, np.arange(4, 11))
+
+
+@pytest.mark.parametrize("p", [1, 2, 4, 7])
+def test_factor_is_log_det_and_inverse(p):
+    root = np.random.default_rng(p).normal(size=(p + 3, p))
+    gram = root.T @ root
+    inverse = np.empty((p, p))
+    assert factor(gram, inverse) == pytest.approx(np.linalg.slogdet(gram)[1])
+    np.testing.assert_allclose(inverse @ gram, np.eye(p), atol=1e-9)
+
+
+def test_factor_refuses_a_singular_matrix():
+    assert np.isneginf(factor(np.ones((3, 3)), np.empty((3, 3))))
+
+
+def test_draw_is_uniform():
+    state = np.array([12345], dtype=np.uint64)
+    counts = np.bincount([draw(state, 7) for _ in range(7000)], minlength=7)
+    assert counts.min() > 850
+    assert counts.max() < 1150

@@ -1,0 +1,250 @@
+"""How many postures: against brute force, against simulation, and what it refuses."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+import jaxcal
+from jaxcal.information.criteria import criteria
+from jaxcal.selection.plan import plan, plan_figure
+
+
+def value_of(candidates, indices, criterion, region=None):
+    where = candidates if region is None else region
+    return getattr(criteria(candidates[list(indices)], where), criterion)
+
+
+def brute_force(candidates, k, criterion, region=None, repeat=False):
+    """The least criterion of any design of k, plain algebra."""
+    choose = (
+        itertools.combinations_with_replacement if repeat else (itertools.combinations)
+    )
+    where = candidates if region is None else region
+    z, at = (np.c_[x, np.ones(len(x))] for x in (candidates, where))
+    subsets = np.array(list(choose(range(len(candidates)), k)))
+    grams = np.swapaxes(z[subsets], 1, 2) @ z[subsets]
+    grams = grams[np.linalg.det(grams) > 1e-12]
+    v = np.einsum("ra,bac,rc->br", at, np.linalg.inv(grams), at)
+    return (v.max(axis=1) if criterion == "G" else v.mean(axis=1)).min()
+
+
+@pytest.mark.parametrize("criterion", ["G", "I"])
+@pytest.mark.parametrize("repeat", [False, True])
+def test_the_smallest_k_and_the_bounds_hold_against_brute_force(criterion, repeat):
+    for seed in range(4):
+        candidates = np.random.default_rng(seed).random((9, 2))
+        best = {
+            k: brute_force(candidates, k, criterion, repeat=repeat) for k in range(3, 7)
+        }
+        target = 0.5 * np.sqrt(best[5] * 1.0001)
+        found = plan(
+            candidates,
+            target_accuracy=target,
+            noise_std=0.5,
+            criterion=criterion,
+            max_replicates=8 if repeat else 1,
+            more=1,
+        )
+        assert found.k == 5
+        for row in found.rows:
+            truth = 0.5 * np.sqrt(best[row.k])
+            assert row.least_error[0] <= truth * (1 + 1e-9)
+            assert row.standard_error[0] >= truth * (1 - 1e-9)
+            assert row.standard_error[0] <= truth * 1.02
+            assert row.standard_error[0] <= row.d_optimal_error[0] * (1 + 1e-9)
+        if found.smallest_proven:
+            assert 0.5 * np.sqrt(best[4]) > target
+
+
+@settings(max_examples=15)
+@example(1398425, "G", 1, True)  # not even all fourteen are enough
+@given(st.integers(0, 2**31), st.sampled_from("GI"), st.integers(1, 3), st.booleans())
+def test_laws_of_a_plan(seed, criterion, cap, with_region):
+    rng = np.random.default_rng(seed)
+    candidates = rng.random((14, 3)) * 50 - 20
+    region = rng.random((7, 3)) * 50 - 20 if with_region else None
+    wanted = {
+        "target_accuracy": 1.2,
+        "noise_std": 1.0,
+        "criterion": criterion,
+        "region": region,
+        "max_replicates": cap,
+        "design": "exchange",
+    }
+    everything = np.repeat(np.arange(14), cap)
+    if np.sqrt(value_of(candidates, everything, criterion, region)) > 1.2:
+        with pytest.raises(ValueError, match="must be reachable"):
+            plan(candidates, **wanted)
+        return
+    found = plan(candidates, **wanted)
+    assert len(found.indices) == found.k
+    assert np.bincount(found.indices).max() <= cap
+    assert (found.standard_error <= 1.2 * (1 + 1e-9)).all()
+    value = value_of(candidates, found.indices, criterion, region)
+    np.testing.assert_allclose(found.standard_error, np.sqrt(value), rtol=1e-8)
+    errors = [row.standard_error[0] for row in found.rows]
+    assert all(a >= b * (1 - 1e-9) for a, b in itertools.pairwise(errors))
+    assert all(
+        (row.least_error <= row.standard_error * (1 + 1e-9)).all() for row in found.rows
+    )
+    assert [row.k for row in found.rows] == list(range(4, found.k + 1))
+
+
+def test_an_affine_map_changes_no_k_and_no_error(rng):
+    candidates = rng.random((15, 3))
+    mapped = candidates @ (rng.normal(size=(3, 3)) + 2 * np.eye(3)) * 1e4 + 3e4
+    first, second = (
+        plan(c, target_accuracy=0.9, noise_std=1.0) for c in (candidates, mapped)
+    )
+    assert first.k == second.k
+    np.testing.assert_allclose(
+        first.rows[0].least_error, second.rows[0].least_error, rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("criterion", ["G", "I"])
+def test_simulated_calibrations_err_as_planned(rng, criterion):
+    candidates = rng.random((20, 3)) * 40 - 20
+    noise = np.array([0.05, 0.1, 0.2])
+    found = plan(
+        candidates,
+        target_accuracy=0.17,
+        noise_std=noise,
+        criterion=criterion,
+        max_replicates=3,
+    )
+    matrix, bias = np.diag([0.43, 0.71, 0.87]), np.array([3.1, -5.8, 2.41])
+    commands = candidates[found.indices]
+    trials = 1500
+    errors = np.empty((trials, 20, 3))
+    for trial in range(trials):
+        measured = commands @ matrix.T + bias + rng.normal(size=(found.k, 3)) * noise
+        fitted = jaxcal.identify(commands, measured, noise_std=noise)
+        errors[trial] = fitted.predict(candidates) - candidates @ matrix.T - bias
+    spread = np.sqrt((errors**2).mean(axis=0))  # (M, m)
+    seen = spread.max(0) if criterion == "G" else np.sqrt((spread**2).mean(axis=0))
+    np.testing.assert_allclose(seen, found.standard_error, rtol=0.08)
+    assert (found.standard_error <= 0.17).all()
+    predicted = fitted.predict_std(candidates)
+    told = (
+        predicted.max(axis=0)
+        if criterion == "G"
+        else np.sqrt((predicted**2).mean(axis=0))
+    )
+    np.testing.assert_allclose(told, found.standard_error, rtol=1e-6)
+
+
+def test_replicates_need_no_more_measurements(rng):
+    candidates = rng.random((12, 3))
+    single = plan(candidates, target_accuracy=0.8, noise_std=1.0)
+    several = plan(candidates, target_accuracy=0.8, noise_std=1.0, max_replicates=4)
+    assert several.k <= single.k
+
+
+def test_the_bound_is_that_of_kiefer_and_wolfowitz_where_nothing_limits(rng):
+    """The corners of a cube are its G-optimal design: p / K is reached at K = 8."""
+    corners = np.array(list(itertools.product([0.0, 1.0], repeat=3)))
+    found = plan(corners, target_accuracy=np.sqrt(0.5) * (1 + 1e-9), noise_std=1.0)
+    assert found.k == 8
+    assert found.rows[-1].least_error[0] == pytest.approx(np.sqrt(4 / 8))
+    assert found.smallest_proven
+
+
+def test_required_and_masked_postures_are_kept(rng):
+    candidates = rng.random((15, 3))
+    available = np.arange(15) != 4
+    found = plan(
+        candidates,
+        target_accuracy=0.9,
+        noise_std=1.0,
+        required=[2, 7],
+        available=available,
+    )
+    assert {2, 7} <= set(found.indices.tolist())
+    assert 4 not in found.indices
+
+
+def test_required_postures_in_a_plane_raise_the_least_k(rng):
+    candidates = np.r_[rng.random((6, 3)) * [1, 1, 0], rng.random((8, 3))]
+    found = plan(
+        candidates, target_accuracy=9.0, noise_std=1.0, required=[0, 1, 2, 3, 4]
+    )
+    assert found.k == 6
+
+
+def test_each_output_has_its_own_target(rng):
+    candidates = rng.random((15, 3))
+    strict = plan(candidates, target_accuracy=[9, 9, 0.9], noise_std=1.0)
+    loose = plan(candidates, target_accuracy=0.9, noise_std=[0.1, 0.1, 1.0])
+    assert strict.k == loose.k
+    assert strict.standard_error.shape == (3,)
+
+
+def test_out_of_reach_names_the_best_achievable(rng):
+    candidates = rng.random((9, 3))
+    everything = np.sqrt(value_of(candidates, range(9), "G"))
+    with pytest.raises(ValueError, match="target_accuracy must be reachable") as error:
+        plan(candidates, target_accuracy=0.01, noise_std=1.0)
+    assert f"{everything:.6g}" in str(error.value)
+    assert "9 measurements (all that are allowed)" in str(error.value)
+    with pytest.raises(ValueError, match="max_k = 5 measurements:"):
+        plan(candidates, target_accuracy=0.01, noise_std=1.0, max_k=5)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"criterion": "D"}, "criterion must be one of G, I, got 'D'"),
+        ({"design": "policy"}, "design must be one of exact, exchange, got 'policy'"),
+        ({"noise_std": 0.0}, "noise_std must be positive, got 0"),
+        ({"noise_std": [1.0, 2.0], "num_outputs": 3}, "noise_std must be one number"),
+        ({"target_accuracy": -1.0}, "target_accuracy must be positive, got -1"),
+        ({"target_accuracy": np.nan}, "target_accuracy must be finite"),
+        ({"time_limit": 0}, "time_limit must be above 0"),
+        ({"max_k": 3}, "max_k must be at least 4, got 3"),
+        ({"max_k": 13}, "max_k must not exceed the 12 measurements allowed, got 13"),
+        ({"more": -1}, "more must be at least 0, got -1"),
+        ({"region": np.zeros((3, 2))}, r"region must have shape \(R, 3\), got"),
+        ({"required": [40]}, "required must lie in"),
+        ({"candidates": np.zeros(3)}, r"candidates must have shape \(M, n\)"),
+        ({"candidates": np.zeros((9, 3))}, "candidates must vary"),
+    ],
+)
+def test_bad_requests_name_argument_rule_and_value(rng, change, message):
+    given = {
+        "candidates": rng.random((12, 3)),
+        "target_accuracy": 1.0,
+        "noise_std": 1.0,
+    } | change
+    with pytest.raises(ValueError, match=message):
+        plan(given.pop("candidates"), **given)
+
+
+def test_the_table_and_the_figure_show_every_row(rng):
+    found = plan(rng.random((15, 3)), target_accuracy=0.9, noise_std=1.0, more=2)
+    lines = found.table().splitlines()
+    assert len(lines) == len(found.rows) + 3
+    assert sum(line.endswith("<-") for line in lines) == 1
+    axes = plan_figure(found).axes[0]
+    assert len(axes.lines[0].get_xdata()) == len(found.rows)
+    assert "standard error" in axes.get_ylabel()
+
+
+def test_planning_loads_neither_jax_nor_matplotlib():
+    code = (
+        "import sys, numpy, jaxcal\n"
+        "c = numpy.random.default_rng(0).random((9, 3))\n"
+        "jaxcal.plan(c, target_accuracy=2.0, noise_std=1.0)\n"
+        "print(sorted({'jax', 'matplotlib'} & set(sys.modules)))"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "[]"
