@@ -12,9 +12,9 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
+    from jaxcal.evaluation.dataset import Dataset
     from jaxcal.evaluation.progress import Progress
     from jaxcal.evaluation.results import Evaluation
-    from jaxcal.paper.datasets.datasets import Dataset
 
 EXIT_OK = 0
 EXIT_ERROR = 2

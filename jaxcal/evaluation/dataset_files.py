@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges
 from jaxcal.checks import axis_letter
+from jaxcal.evaluation.dataset import Dataset
 from jaxcal.files import atomic_write
-from jaxcal.paper.datasets.datasets import Dataset
 
 __all__ = ["load_dataset", "save_csv", "save_csv_parts", "save_npz"]
 

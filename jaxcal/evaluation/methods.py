@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.parameters import estimate_parameters
 from jaxcal.evaluation.results import Evaluation, MethodResult
 from jaxcal.information.regression import log_det_gram
-from jaxcal.paper.datasets.datasets import Dataset
 
 __all__ = [
     "BASELINES",

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.checks import axis_letter
-from jaxcal.paper.datasets.datasets import Dataset
+from jaxcal.evaluation.dataset import Dataset
 
 __all__ = ["estimate_parameters", "least_squares", "parameter_names", "predict"]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.paper.datasets.datasets import Dataset
+from jaxcal.evaluation.dataset import Dataset
 
 __all__ = [
     "Evaluation",

@@ -13,9 +13,10 @@ import time
 import numpy as np
 import pytest
 
+from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import save_csv, save_npz
 from jaxcal.information.regression import regression_matrix
-from jaxcal.paper.datasets.datasets import Dataset, make_dataset
+from jaxcal.paper.datasets.datasets import make_dataset
 
 ROOT = pathlib.Path(__file__).parents[2]
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.figures import evaluation_figures
 from jaxcal.evaluation.methods import check_methods, evaluate
 from jaxcal.evaluation.parameters import estimate_parameters, parameter_names
@@ -21,7 +22,7 @@ from jaxcal.evaluation.report import file_prefix, html_page, json_document, text
 from jaxcal.evaluation.results import Evaluation, MethodResult
 from jaxcal.evaluation.training_figure import training_curves
 from jaxcal.information.regression import regression_matrix
-from jaxcal.paper.datasets.datasets import Dataset, make_dataset
+from jaxcal.paper.datasets.datasets import make_dataset
 from jaxcal.plots import as_bytes
 
 BASELINES = ("random", "greedy", "exchange", "exact")

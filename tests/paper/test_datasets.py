@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 import jaxcal
 from jaxcal.candidates import JointRanges
+from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import (
     load_dataset,
     save_csv,
@@ -31,7 +32,6 @@ from jaxcal.paper.datasets.datasets import (
     RANGES,
     RECORDED,
     SCALE,
-    Dataset,
     chunks,
     make_dataset,
 )

@@ -10,6 +10,7 @@ import platform
 from collections.abc import Mapping
 from typing import Any
 
+from jaxcal.evaluation.dataset import Dataset
 from jaxcal.paper.datasets import datasets
 from jaxcal.paper.datasets.datasets import (
     BIAS_DEG,
@@ -17,7 +18,6 @@ from jaxcal.paper.datasets.datasets import (
     NUM_CANDIDATES,
     RECORDED,
     SCALE,
-    Dataset,
 )
 
 __all__ = ["card_of", "digest_of", "page_of"]

@@ -11,11 +11,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import save_csv_parts, save_npz
 from jaxcal.evaluation.progress import Progress
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.paper.datasets.data_card import card_of, digest_of, page_of
-from jaxcal.paper.datasets.datasets import EPISODES, NAMES, Dataset, chunks
+from jaxcal.paper.datasets.datasets import EPISODES, NAMES, chunks
 
 __all__ = ["main", "write_datasets"]
 

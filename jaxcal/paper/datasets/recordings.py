@@ -25,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges, draw_from_pool
-from jaxcal.paper.datasets.datasets import RANGES, Dataset
+from jaxcal.evaluation.dataset import Dataset
+from jaxcal.paper.datasets.datasets import RANGES
 
 __all__ = ["SHIPPED", "read_pool", "recorded_dataset"]
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.methods import Progress, evaluate
 from jaxcal.evaluation.parameters import least_squares
 from jaxcal.evaluation.results import Evaluation, MethodResult
-from jaxcal.paper.datasets.datasets import Dataset, make_dataset
+from jaxcal.paper.datasets.datasets import make_dataset
 from jaxcal.paper.exhibits.exhibit import Settings
 
 __all__ = ["METHODS", "Material", "commands_deg"]

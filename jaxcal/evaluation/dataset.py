@@ -1,0 +1,94 @@
+"""Candidate sets to evaluate on, and what was measured at them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.candidates import JointRanges
+
+__all__ = ["Dataset"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Dataset:
+    """Candidate sets, and what was measured at them where that is known."""
+
+    name: str
+    candidates: Array  # (E, M, n) commands
+    measured: Array | None = None  # (E, M, m) postures reached
+    available: Mask | None = None  # (E, M) True where a candidate may be chosen
+    ranges: JointRanges | None = None  # what [0, 1] stands for, where normalised
+    seed: int | None = None  # of a generated dataset
+    sha256: str | None = None  # of the file it was read from
+
+    def __post_init__(self) -> None:
+        if self.candidates.ndim != 3 or 0 in self.candidates.shape:
+            raise ValueError(
+                "candidates must have shape (episodes, M, n), none of them 0, got "
+                f"{self.candidates.shape}"
+            )
+        if self.measured is not None and (
+            self.measured.ndim != 3
+            or self.measured.shape[:2] != self.candidates.shape[:2]
+            or self.measured.shape[2] < 1
+        ):
+            raise ValueError(
+                f"measured must have shape {(*self.candidates.shape[:2], 'm')}, got "
+                f"{self.measured.shape}"
+            )
+        if self.available is not None and (
+            self.available.shape != self.candidates.shape[:2]
+        ):
+            raise ValueError(
+                f"available must have shape {self.candidates.shape[:2]}, got "
+                f"{self.available.shape}"
+            )
+
+    @property
+    def num_episodes(self) -> int:
+        """E."""
+        return self.candidates.shape[0]
+
+    @property
+    def num_candidates(self) -> int:
+        """M."""
+        return self.candidates.shape[1]
+
+    @property
+    def num_inputs(self) -> int:
+        """n."""
+        return self.candidates.shape[2]
+
+    @property
+    def num_outputs(self) -> int:
+        """m: that of ``measured``, or n where nothing was measured."""
+        return self.num_inputs if self.measured is None else self.measured.shape[2]
+
+    def first(self, episodes: int) -> Dataset:
+        """The first episodes only.
+
+        Raises:
+            ValueError: fewer than one, or more than there are.
+        """
+        if not 1 <= episodes <= self.num_episodes:
+            raise ValueError(
+                f"episodes must be in [1, {self.num_episodes}] for {self.name}, "
+                f"got {episodes}"
+            )
+        return self.part(0, episodes)
+
+    def part(self, begin: int, end: int) -> Dataset:
+        """Episodes ``begin`` to ``end``, the last one not included."""
+        cut = slice(begin, end)
+        return dataclasses.replace(
+            self,
+            candidates=self.candidates[cut],
+            measured=None if self.measured is None else self.measured[cut],
+            available=None if self.available is None else self.available[cut],
+        )
