@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
     from jaxcal.evaluation.dataset import Dataset
-    from jaxcal.evaluation.progress import Progress
+    from jaxcal.progress import Progress
     from jaxcal.evaluation.results import Evaluation
 
 EXIT_OK = 0
@@ -89,7 +89,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _alone(arguments: list[str] | None) -> int:
     """The command in this process, which may be one of several."""
-    from jaxcal.evaluation.progress import Progress
+    from jaxcal.progress import Progress
 
     options = _parse(arguments)
     progress = Progress(quiet=options.quiet)

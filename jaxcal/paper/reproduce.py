@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
-    from jaxcal.evaluation.progress import Progress
+    from jaxcal.progress import Progress
     from jaxcal.paper.exhibits.exhibit import Claim, Exhibit, Settings
 
 _DESCRIPTION = """\
@@ -50,7 +50,7 @@ class _Parser(argparse.ArgumentParser):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compute, write, say where; the exit code."""
-    from jaxcal.evaluation.progress import Progress
+    from jaxcal.progress import Progress
 
     options = _parse(arguments)
     progress = Progress(quiet=options.quiet)

@@ -17,7 +17,7 @@ from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.figures import evaluation_figures
 from jaxcal.evaluation.methods import check_methods, evaluate
 from jaxcal.evaluation.parameters import estimate_parameters, parameter_names
-from jaxcal.evaluation.progress import Progress
+from jaxcal.progress import Progress
 from jaxcal.evaluation.report import file_prefix, html_page, json_document, text_table
 from jaxcal.evaluation.results import Evaluation, MethodResult
 from jaxcal.evaluation.training_figure import training_curves
@@ -473,7 +473,7 @@ def test_progress_is_silent_at_first_and_says_what_is_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     now = [0.0]
-    monkeypatch.setattr("jaxcal.evaluation.progress.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("jaxcal.progress.time.monotonic", lambda: now[0])
     stream = io.StringIO()
     progress = Progress(stream)
     progress("exact", 0, 1000)

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import save_csv_parts, save_npz
-from jaxcal.evaluation.progress import Progress
+from jaxcal.progress import Progress
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.paper.datasets.data_card import card_of, digest_of, page_of
 from jaxcal.paper.datasets.datasets import EPISODES, NAMES, chunks

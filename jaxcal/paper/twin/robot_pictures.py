@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.evaluation.progress import Progress as Reporter
+from jaxcal.progress import Progress as Reporter
 from jaxcal.files import atomic_write
 from jaxcal.paper.twin.robot import RobotConfig, joint_angles, read_out
 from jaxcal.paper.twin.robot_parts import AXIS_COLOURS
