@@ -6,7 +6,7 @@ import dataclasses
 import threading
 import time
 
-from rig.settings import AXIS_NAMES
+from rig.config.settings import AXIS_NAMES
 
 __all__ = ["BUS_KINDS", "KINDS", "PHASES", "FaultInjector", "FaultSpec", "parse_fault"]
 

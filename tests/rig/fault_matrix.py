@@ -27,8 +27,8 @@ from harness import (
 )
 
 from rig.config import parse_config
-from rig.journal import read_journal
-from rig.session import Run
+from rig.outputs.journal import read_journal
+from rig.session.run import Run
 from rig.simulator import Simulator, parse_fault
 
 PHASES = ("zeroing", "moving", "settling", "measuring", "saving")

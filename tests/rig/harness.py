@@ -13,11 +13,11 @@ import signal
 import sys
 import time
 
-from rig.calibrate import calibrate
-from rig.config import EXAMPLES, parse_config
-from rig.runner import run_safely
-from rig.session import Run
-from rig.settings import RigConfig
+from rig.config import RigConfig, parse_config
+from rig.config.files import EXAMPLES
+from rig.session.calibrate import calibrate
+from rig.session.run import Run
+from rig.session.runner import run_safely
 from rig.simulator import Simulator, Truth
 
 RATE_HZ = 250.0
@@ -45,6 +45,11 @@ def fast_text(changes: dict[str, str] | None = None, session: str = SESSION) -> 
         assert old in text, old
         text = text.replace(old, new)
     return text + session
+
+
+def changed(settings, **changes):
+    """The same settings but for some."""
+    return settings.model_copy(update=changes)
 
 
 def fast_config(changes: dict[str, str] | None = None) -> RigConfig:

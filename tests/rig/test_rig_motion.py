@@ -10,14 +10,21 @@ import numpy as np
 import pytest
 from harness import fast_config, fast_text, simulator
 
-from rig.bus import Bus
 from rig.config import parse_config
-from rig.faults import MotionFault, Unreachable
-from rig.imu import Imu
-from rig.limits import LimitError, approach_point, check_plan
-from rig.motion import Motion
+from rig.device.bus import Bus
+from rig.device.imu import Imu
+from rig.guard.faults import (
+    LimitError,
+    MotionFault,
+    PauseRequested,
+    StopRequested,
+    Unreachable,
+)
+from rig.guard.limits import approach_point, check_plan
+from rig.guard.signals import Signals
+from rig.guard.stop import Stopper
+from rig.session.motion import Motion
 from rig.simulator import parse_fault
-from rig.stop import PauseRequested, Signals, Stopper, StopRequested
 
 
 @contextlib.contextmanager
@@ -297,7 +304,7 @@ def test_the_motion_and_stop_modules_never_load_jax():
     import sys
 
     program = (
-        "import sys, rig.motion, rig.measuring, rig.stop, rig.runner\n"
+        "import sys, rig.session.motion, rig.session.measuring, rig.guard.stop\n"
         "heavy = {'jax', 'matplotlib', 'numba', 'flax'} & set(sys.modules)\n"
         "sys.exit(f'loaded {heavy}' if heavy else 0)\n"
     )

@@ -1,6 +1,7 @@
 """Whole sessions: calibrate, collect, verify, goto, resume, and the command line."""
 
 import csv
+import itertools
 import json
 import os
 import pathlib
@@ -11,19 +12,27 @@ import sys
 
 import numpy as np
 import pytest
-from harness import PATIENT, SESSION, fast_config, fast_text, session, simulator
+from harness import (
+    PATIENT,
+    SESSION,
+    changed,
+    fast_config,
+    fast_text,
+    session,
+    simulator,
+)
 
 import jaxcal
 from rig.__main__ import main
-from rig.calibrate import calibrate
 from rig.config import example_text, parse_config
-from rig.exits import Refused
-from rig.identification import order_residuals, uncertainty
-from rig.journal import read_journal
-from rig.other_sessions import collect
-from rig.planning import choose, draw_candidates, travel_order
-from rig.runner import run_safely
-from rig.session import Run
+from rig.guard.faults import Refused
+from rig.outputs.journal import read_journal
+from rig.session.calibrate import calibrate
+from rig.session.checking import collect
+from rig.session.identification import order_residuals, uncertainty
+from rig.session.planning import choose, draw_candidates, travel_order
+from rig.session.run import Run
+from rig.session.runner import run_safely
 from rig.simulator import Truth, parse_fault
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
@@ -174,12 +183,12 @@ def test_a_posture_out_of_reach_is_masked_and_the_rest_chosen_anew(tmp_path):
 
 
 def test_a_disk_that_fills_while_saving_loses_nothing(tmp_path, monkeypatch):
-    import rig.report
+    import rig.outputs.report
 
-    def full(path, text):
+    def full(path, page):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(rig.report, "write_text", full)
+    monkeypatch.setattr(rig.outputs.report, "write_page", full)
     said = []
     with simulator(fast_config()) as sim:
         config = sim.start()
@@ -267,7 +276,7 @@ def test_collect_records_a_dataset_and_resumes(tmp_path):
     assert data["candidates"].shape == data["measured"].shape == (1, 8, 3)
     predicted = data["candidates"] @ TRUTH[:, :3].T + TRUTH[:, 3]
     np.testing.assert_allclose(data["measured"], predicted, atol=1e-3)
-    low, high = np.array(config.session.ranges).T
+    low, high = np.array(config.ranges).T
     assert (data["candidates"] >= low - 0.01).all()
     assert (data["candidates"] <= high + 0.01).all()
 
@@ -361,34 +370,38 @@ def test_auto_lets_the_policy_answer_where_it_is_good_enough(
     assert "was asked for" in choice.note
 
 
-def test_travel_order_beats_the_drawn_order(rng):
+def test_travel_order_takes_the_least_time(rng):
+    speeds = {"pitch": 10.0, "yaw": 20.0, "roll": 5.0}
+    plain = fast_config()
+    axes = (
+        changed(axis, speed_deg_s=speeds[axis.name], accel_deg_s2=50.0)
+        for axis in plain.axes
+    )
+    config = changed(plain, axes=tuple(axes))
     points = rng.uniform(-20, 20, size=(12, 3))
-    speeds = np.array([10.0, 20.0, 5.0])
 
-    def seconds(order):
-        path = np.vstack([[0, 0, 0], points[list(order)]])
-        return (np.abs(np.diff(path, axis=0)) / speeds).max(axis=1).sum()
+    def seconds(order, points=points):
+        """Trapezoid profiles, the slowest axis sets the time; written apart."""
+        path = np.vstack([np.zeros(3), points[list(order)]])
+        ways, total = np.abs(np.diff(path, axis=0)), 0.0
+        for way in ways:
+            total += max(
+                d / v + v / 50.0 if d > v * v / 50.0 else 2 * np.sqrt(d / 50.0)
+                for d, v in zip(way, speeds.values(), strict=True)
+            )
+        return total
 
-    order = travel_order(points, np.zeros(3), speeds)
+    order = travel_order(config, points, np.zeros(3))
     assert sorted(order) == list(range(12))
     assert seconds(order) < seconds(range(12))
-    import itertools
-
-    few = points[:6]
-    best = min(
-        itertools.permutations(range(6)),
-        key=lambda o: (
-            (np.abs(np.diff(np.vstack([[0, 0, 0], few[list(o)]]), axis=0)) / speeds)
-            .max(axis=1)
-            .sum()
-        ),
-    )
-    points = few
-    assert seconds(travel_order(few, np.zeros(3), speeds)) == pytest.approx(
-        seconds(best)
-    )
-    many = travel_order(rng.uniform(-20, 20, size=(30, 3)), np.zeros(3), speeds)
-    assert sorted(many) == list(range(30))
+    few = points[:5]
+    best = min(seconds(o, few) for o in itertools.permutations(range(5)))
+    found = travel_order(config, few, np.zeros(3))
+    assert seconds(found, few) == pytest.approx(best)
+    for count in (14, 201):  # above 12 improved, above 200 nearest neighbours
+        many = travel_order(config, rng.uniform(-20, 20, (count, 3)), np.zeros(3))
+        assert sorted(many) == list(range(count))
+    assert travel_order(config, np.empty((0, 3)), np.zeros(3)) == []
 
 
 # The command line
@@ -442,7 +455,7 @@ def test_verify_says_when_it_is_time_to_recalibrate(finished, tmp_path, capsys):
 )
 def test_every_example_calibrates_on_the_simulator(name, tmp_path):
     """Each map, and HyperIMU, Sensor Logger and a line stream in client mode."""
-    from rig.config import EXAMPLES
+    from rig.config.files import EXAMPLES
 
     code = main(["calibrate", "--simulate", "--speedup", "20", "--out", str(tmp_path),
                  "--config", str(EXAMPLES / f"{name}.toml")])  # fmt: skip
@@ -578,7 +591,7 @@ def test_simulate_serves_a_session_in_another_process(tmp_path):
 
 
 def test_run_folders_are_never_reused(tmp_path):
-    from rig.session import new_run_folder
+    from rig.session.run import new_run_folder
 
     folders = {new_run_folder(tmp_path, "calibrate") for _ in range(5)}
     assert len(folders) == 5

@@ -12,11 +12,11 @@ from collections.abc import Callable
 import numpy as np
 
 from rig.attitude import Array, Frame, mean_rotation
-from rig.drives import Status
-from rig.faults import MotionFault, NotFollowing
-from rig.imu import Imu
-from rig.settings import AXIS_NAMES, RigConfig
-from rig.stream import Reading
+from rig.config.settings import AXIS_NAMES, Pulses, RigConfig
+from rig.device.drives import Status
+from rig.device.imu import Imu
+from rig.device.stream import Reading
+from rig.guard.faults import MotionFault, NotFollowing
 
 __all__ = ["Measurement", "Observer"]
 
@@ -29,8 +29,8 @@ FOLLOW_LEADING = 0.3  # of axes that move at least this share of the largest mov
 class Measurement:
     """One settled posture."""
 
-    pulses: tuple[int, int, int]  # commanded
-    feedback: tuple[int, int, int]  # the drives' own positions
+    pulses: Pulses  # commanded
+    feedback: Pulses  # the drives' own positions
     attitude: Array  # (3, 3) mean attitude of the phone
     angles: Array  # (3,) degrees: pitch, yaw, roll of the end-effector
     std: Array  # (3,) degrees, of single readings
@@ -58,14 +58,14 @@ class Observer:
         self._seen: tuple[Array, Array] | None = None  # (commanded, measured) last
         self._unproven: list[list[str]] = [[], [], []]  # postures, an axis
 
-    def zeroed(self, frame: Frame, pulses: tuple[int, int, int]) -> None:
+    def zeroed(self, frame: Frame, pulses: Pulses) -> None:
         """Measure against this zero posture from now on."""
         self.frame = frame
         self._seen = (self.config.to_deg(pulses), np.zeros(3))
 
     def measure(
         self,
-        target: tuple[int, int, int],
+        target: Pulses,
         label: str = "",
         samples: int | None = None,
     ) -> Measurement:
@@ -121,7 +121,7 @@ class Observer:
             return self.frame
         config = self.config
         return Frame(
-            readings[0].matrix, config.imu.mounting, config.mechanism_order,
+            readings[0].matrix, config.imu.mounting, config.mechanism.order,
             config.letters,
         )  # fmt: skip
 
@@ -147,7 +147,10 @@ class Observer:
                 if quiet:
                     return statuses, since, reason
             if now > deadline:
-                raise MotionFault(f"did not settle in {settle.timeout_s:g} s: {reason}")
+                raise MotionFault(
+                    f"the device did not settle in settle.timeout_s = "
+                    f"{settle.timeout_s:g} s: {reason}"
+                )
             time.sleep(poll)
 
     def _window(self, since: float, now: float) -> list[Reading]:
@@ -190,7 +193,10 @@ class Observer:
             if now - polled > self.config.motion.poll_s:
                 polled = now
                 if any(status.moving for status in self._statuses()):
-                    raise MotionFault("a drive moves while the posture is measured")
+                    raise MotionFault(
+                        "a drive moves while the posture is measured. Stop the other "
+                        "controller"
+                    )
             time.sleep(0.002)
 
     def _check_agreement(self, measurement: Measurement, label: str) -> None:
@@ -203,7 +209,10 @@ class Observer:
             if abs(pulses - feedback) > axis.pulses_within(
                 config.motion.position_tolerance_deg
             ):
-                raise MotionFault(f"{axis.name} left its target while settling")
+                raise MotionFault(
+                    f"{axis.name} left its target while settling: {feedback} pulses "
+                    f"instead of {pulses}. Check holding torque and load"
+                )
         if self.frame is None:
             return
         apart = np.abs(measurement.angles - commanded)
@@ -211,7 +220,8 @@ class Observer:
             worst = int(np.argmax(apart))
             raise MotionFault(
                 f"the IMU reads {AXIS_NAMES[worst]} {apart[worst]:.1f} deg away from "
-                "the command: wrong zero, axis order or signs?"
+                "the command, more than motion.max_disagreement_deg. Check zero, axis "
+                "order and signs"
             )
         if self._seen is not None:
             asked = np.abs(commanded - self._seen[0])
@@ -223,8 +233,8 @@ class Observer:
                 elif seen[index] < FOLLOW_SHARE * asked[index]:
                     raise NotFollowing(
                         f"the drive of {name} turned {asked[index]:.1f} deg, the IMU "
-                        f"saw {seen[index]:.2f}: a slipped coupling, a frozen stream, "
-                        "or axes mixed up",
+                        f"saw {seen[index]:.2f}. Look for a slipped coupling, a frozen "
+                        "stream, or axes mixed up",
                         self._unproven[index],
                     )
                 else:

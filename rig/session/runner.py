@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rig.bus import BusError
-from rig.exits import EXIT_BAD_INPUT, EXIT_FAULT, EXIT_PAUSED, Refused
-from rig.faults import MotionFault
-from rig.imu import ImuError
-from rig.journal import JournalError
-from rig.limits import LimitError
-from rig.session import Run
-from rig.stop import PauseRequested, StopRequested
+from rig.device.bus import BusError
+from rig.device.imu import ImuError
+from rig.guard.faults import (
+    EXIT_BAD_INPUT,
+    EXIT_FAULT,
+    EXIT_PAUSED,
+    LimitError,
+    MotionFault,
+    PauseRequested,
+    Refused,
+    StopRequested,
+)
+from rig.outputs.journal import JournalError
+from rig.session.run import Run
 
 __all__ = ["run_safely"]
 

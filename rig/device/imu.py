@@ -9,8 +9,8 @@ import threading
 import time
 from collections import Counter, deque
 
-from rig.settings import ImuSettings
-from rig.stream import MAX_BODY, LineSplitter, Parser, Reading, StreamFault
+from rig.config.settings import ImuSettings
+from rig.device.stream import MAX_BODY, LineSplitter, Parser, Reading, StreamFault
 
 __all__ = ["Imu", "ImuError"]
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import dataclasses
 import time
 
-from rig.bus import Bus, Rejected
-from rig.registers import Write, encode
-from rig.settings import Axis
+from rig.config.registers import Writes, encode
+from rig.config.settings import Axis
+from rig.device.bus import Bus, Rejected
 
-__all__ = ["Drive", "Status", "motion_counts"]
+__all__ = ["Drive", "Status"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,37 +23,6 @@ class Status:
     fault: bool
     enabled: bool
     time: float  # monotonic seconds
-
-
-def motion_counts(axis: Axis, speed_deg_s: float) -> dict[str, int]:
-    """Register values of speed and acceleration of a move.
-
-    Raises:
-        ValueError: one does not fit its register.
-    """
-    counts: dict[str, int] = {}
-    turns = axis.scale.rev_per_s(speed_deg_s)
-    ramp = axis.scale.rev_per_s(axis.accel_deg_s2)
-    if axis.map.speed_unit == "pulse_per_s":
-        turns *= axis.scale.pulses_per_rev
-    counts["speed"] = max(1, round(turns * axis.map.speed_per_unit))
-    if axis.map.accel_unit == "s_per_rev_per_s":
-        counts["accel"] = max(1, round(axis.map.accel_per_unit / ramp))
-    else:
-        if axis.map.accel_unit == "pulse_per_s2":
-            ramp *= axis.scale.pulses_per_rev
-        counts["accel"] = max(1, round(ramp * axis.map.accel_per_unit))
-    counts["decel"] = counts["accel"]
-    for frame in axis.map.move:
-        for name in ("speed", "accel", "decel"):
-            found = frame.offset_of(name)
-            if found is None:
-                continue
-            try:
-                encode(counts[name], found[1], axis.map.word_order)
-            except ValueError as error:
-                raise ValueError(f"{name}: {error}") from None
-    return counts
 
 
 class Drive:
@@ -71,10 +40,10 @@ class Drive:
         return Status(
             word=word,
             position=position,
-            done=m.done.holds(word),
-            moving=m.moving.holds(word),
-            fault=m.fault.holds(word),
-            enabled=True if m.enabled is None else m.enabled.holds(word),
+            done=m.status.done.holds(word),
+            moving=m.status.moving.holds(word),
+            fault=m.status.fault.holds(word),
+            enabled=m.status.enabled is None or m.status.enabled.holds(word),
             time=time.monotonic(),
         )
 
@@ -84,13 +53,10 @@ class Drive:
         if m.alarm is None:
             return ""
         code = self.bus.read(self.axis.unit, m.alarm, m.word_order)
-        if code == 0:
-            return ""
-        return f"alarm 0x{code:X}" + (
-            f" ({m.alarm_names[code]})" if code in m.alarm_names else ""
-        )
+        name = m.alarm.names.get(code)
+        return (f"alarm 0x{code:X}" + (f" ({name})" if name else "")) if code else ""
 
-    def move(self, pulses: int, speed_deg_s: float | None = None) -> None:
+    def move(self, pulses: int) -> None:
         """Start an absolute move; every frame is sent exactly once.
 
         Raises:
@@ -103,26 +69,25 @@ class Drive:
                 f"{axis.name}: {pulses} pulses leave the limits "
                 f"{axis.min_pulses}..{axis.max_pulses}"
             )
-        speed = min(speed_deg_s or axis.speed_deg_s, axis.speed_deg_s)
-        values = {"position": pulses, **motion_counts(axis, speed)}
-        self._write(axis.map.move, values)
+        self._write(axis.map.move, {"position": pulses, **axis.motion_counts()})
 
     def stop(self) -> None:
         """Quick stop; torque stays on."""
-        self._write(self.axis.map.stop, {})
+        self._write(self.axis.map.stop)
 
     def enable(self) -> None:
         """Enable the power stage, where the map can."""
-        self._write(self.axis.map.enable, {})
+        self._write(self.axis.map.enable)
 
     def reset_alarm(self) -> None:
         """Reset an alarm, where the map can."""
-        self._write(self.axis.map.alarm_reset, {})
+        self._write(self.axis.map.alarm_reset)
 
     def set_comm_timeout(self, seconds: float) -> None:
-        """Tell the drive to stop by itself when the line is silent for so long."""
-        count = max(1, round(seconds * self.axis.map.comm_timeout_per_s))
-        self._write(self.axis.map.comm_timeout, {"timeout": count})
+        """Make the drive stop by itself when the line is silent, where the map can."""
+        table = self.axis.map.comm_timeout
+        if table is not None:
+            self._write(table, {"timeout": max(1, round(seconds * table.per_s))})
 
     def mirror_limits(self) -> None:
         """Write the soft limits to the drive, where the map can."""
@@ -133,20 +98,24 @@ class Drive:
         """Read what the map calls identity; a register that refuses says so."""
         m = self.axis.map
         found: dict[str, int | str] = {}
-        for name, read in m.identity:
+        for name, read in m.identity.items():
             try:
                 found[name] = self.bus.read(self.axis.unit, read, m.word_order)
             except Rejected as error:
                 found[name] = f"exception {error.code}"
         return found
 
-    def _write(self, frames: tuple[Write, ...], values: dict[str, int]) -> None:
-        for frame in frames:
+    def _write(
+        self, table: Writes | None, values: dict[str, int] | None = None
+    ) -> None:
+        for frame in table.write if table else ():
             words: list[int] = []
             for word in frame.words:
                 if isinstance(word, int):
                     words.append(word)
                 else:
-                    order = self.axis.map.word_order
-                    words += encode(values[word[0]], word[1], order)
+                    name, kind = word
+                    words += encode(
+                        (values or {})[name], kind, self.axis.map.word_order
+                    )
             self.bus.write(self.axis.unit, frame.address, frame.function, words)

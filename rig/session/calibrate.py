@@ -2,30 +2,57 @@
 
 from __future__ import annotations
 
-import json
-import time
 from typing import Any
 
 import numpy as np
 
-from jaxcal.files import write_text
 from rig.attitude import Array
-from rig.exits import EXIT_OK, EXIT_RECALIBRATE
-from rig.faults import MotionFault
-from rig.identification import (
+from rig.config.settings import AXIS_NAMES
+from rig.guard.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault
+from rig.guard.limits import check_plan
+from rig.outputs.console import plan_lines, summary_lines
+from rig.session.identification import (
     errors,
     fit,
     order_residuals,
+    reading_noise,
     uncertainty,
     zero_variance,
 )
-from rig.limits import check_plan
-from rig.planning import Choice, choose, draw_candidates, draw_held_out, travel_order
-from rig.session import Run
-from rig.settings import AXIS_NAMES
-from rig.words import degrees_of, describe_plan, pairs_csv, say_summary, speeds
+from rig.session.planning import (
+    Choice,
+    choose,
+    draw_candidates,
+    draw_held_out,
+    travel_order,
+)
+from rig.session.run import DRY_RUN, Record, Run
 
-__all__ = ["calibrate"]
+__all__ = ["calibrate", "visit_pairs"]
+
+
+def calibrate(run: Run, dry_run: bool = False) -> int:
+    """Run the whole session; returns the exit code."""
+    config, session = run.config, run.config.session
+    candidates, choice = _plan(run)
+    check_plan(config, [tuple(candidates[i].tolist()) for i in choice.indices])
+    if dry_run:
+        run.say(DRY_RUN)
+        return EXIT_OK
+    run.planned = session.k + 2 * session.verify_postures + 1
+    if run.zero_pulses is None:
+        run.ready()
+    chosen = _visit_chosen(run, candidates, choice)
+    run.phase("saving")
+    first = fit(chosen, reading_noise(chosen))
+    first.save(run.folder / "calibration.partial.json")
+    held = _held_out(run, first)
+    run.planned = session.k + 2 * len(held) + 1
+    before, after, desired = visit_pairs(run, held)
+    end = run.visit("reference:end", run.zero_pulses, role="reference")
+    run.say("drives at rest; identifying")
+    drift = None if end is None else float(np.abs(end["measured_deg"]).max())
+    return _finish(run, chosen, before, after, desired, choice, drift)
 
 
 def _plan(run: Run) -> tuple[Array, Choice]:
@@ -34,69 +61,39 @@ def _plan(run: Run) -> tuple[Array, Choice]:
 
     def make() -> dict[str, Any]:
         candidates = draw_candidates(config)
-        begun = time.perf_counter()
-        choice = choose(config, degrees_of(config, candidates))
-        return {
-            "candidates": candidates.tolist(),
-            "choice": choice.described(),
-            "seconds": round(time.perf_counter() - begun, 4),
-        }
+        choice = choose(config, config.to_deg(candidates))
+        return {"candidates": candidates.tolist(), "choice": choice.described()}
 
     record = run.remember("plan", make)
-    return np.array(record["candidates"]), _choice_of(record["choice"])
+    candidates, choice = np.array(record["candidates"]), Choice(**record["choice"])
+    start = config.to_deg(run.zero_pulses or (0, 0, 0))
+    chosen = np.array(choice.indices)
+    order = chosen[travel_order(config, config.to_deg(candidates[chosen]), start)]
+    shown = Choice(**{**choice.described(), "indices": tuple(order.tolist())})
+    for line in plan_lines(config, shown, candidates, start):
+        run.say(line)
+    return candidates, choice
 
 
-def _choice_of(data: dict[str, Any]) -> Choice:
-    return Choice(**{**data, "indices": tuple(data["indices"])})
-
-
-def calibrate(run: Run, dry_run: bool = False) -> int:
-    """Run the whole session; returns the exit code."""
-    config, session = run.config, run.config.session
-    candidates, choice = _plan(run)
-    describe_plan(run, candidates, choice)
-    a, b, c = candidates[list(choice.indices)].T.tolist()
-    check_plan(config, zip(a, b, c, strict=True))
-    if dry_run:
-        run.say("dry run: nothing was sent to the bus")
-        return EXIT_OK
-    run.planned = session.k + 2 * session.verify_postures + 1
-    if run.zero_pulses is None:
-        run.ready()
-    chosen = _visit_chosen(run, candidates, choice)
-    run.phase("saving")
-    first = fit(chosen, _reading_noise(chosen))
-    first.save(run.folder / "calibration.partial.json")
-    held = _held_out(run, first)
-    run.planned = session.k + 2 * len(held) + 1
-    before, after, desired = _verify(run, held)
-    end = run.visit("reference:end", run.zero_pulses, role="reference")
-    run.say("drives at rest; identifying")
-    drift = None if end is None else float(np.abs(end["measured_deg"]).max())
-    return _finish(run, chosen, before, after, desired, choice, drift)
-
-
-def _visit_chosen(run: Run, candidates: Array, choice: Choice) -> list[dict[str, Any]]:
-    """Measure K postures; one out of reach is masked and the rest chosen anew."""
-    config = run.config
-    degrees = degrees_of(config, candidates)
+def _visit_chosen(run: Run, candidates: Array, choice: Choice) -> list[Record]:
+    """Measure K postures; without one out of reach the rest are selected again."""
+    config, degrees = run.config, run.config.to_deg(candidates)
     available = np.ones(len(candidates), dtype=bool)
-    records: dict[int, dict[str, Any]] = {}
-    assert run.zero_pulses is not None
+    records: dict[int, Record] = {}
     start = config.to_deg(run.zero_pulses)
     plans = run.journal.events("replan")
     while True:
         left = np.array([i for i in choice.indices if i not in records], dtype=int)
-        here = start if not records else degrees[list(records)[-1]]
+        here = degrees[list(records)[-1]] if records else start
         failed = None
-        for index in left[travel_order(degrees[left], here, speeds(config))]:
+        for index in left[travel_order(config, degrees[left], here)].tolist():
             record = run.visit(
-                f"select:{index}", candidates[index], role="select", index=int(index)
+                f"select:{index}", candidates[index], role="select", index=index
             )
             if record is None:
-                failed = int(index)
+                failed = index
                 break
-            records[int(index)] = record
+            records[index] = record
         if failed is None:
             return list(records.values())
         available[failed] = False
@@ -104,30 +101,24 @@ def _visit_chosen(run: Run, candidates: Array, choice: Choice) -> list[dict[str,
         if lost > config.session.max_unreachable:
             raise MotionFault(
                 f"{lost} postures are out of reach, more than session.max_unreachable "
-                f"({config.session.max_unreachable}): check the ranges"
+                f"({config.session.max_unreachable}). Check the ranges"
             )
         if len(plans) >= lost:
-            choice = _choice_of(plans[lost - 1]["choice"])
+            choice = Choice(**plans[lost - 1]["choice"])
         else:
-            choice = choose(config, degrees, available, tuple(records), policy=False)
+            choice = choose(config, degrees, available, tuple(records), replanning=True)
             run.journal.write("replan", sync=True, choice=choice.described())
         run.say(
-            f"  chosen anew without {failed}: log det {choice.log_det:.4f}, "
+            f"  selected again without {failed}: log det {choice.log_det:.4f}, "
             f"{len(records)} measured postures kept"
         )
-
-
-def _reading_noise(records: list[dict[str, Any]]) -> float:
-    std = np.array([r["std_deg"] for r in records])
-    counts = np.array([[r["samples"]] for r in records])
-    return float(max(1e-9, np.sqrt((std**2 / counts).mean())))
 
 
 def _held_out(run: Run, calibration: Any) -> list[Any]:
     """Pairs of pulses, raw and compensated; drawn once for one set of chosen postures.
 
-    Where chosen postures were made void since, the compensated commands came from a
-    wrong calibration: they are drawn anew, and what was measured there is void too.
+    Where a chosen posture was withdrawn since, the compensated commands came from a
+    wrong calibration: they are drawn again, and what was measured there is withdrawn.
     """
     known = run.journal.events("held_out")
     voids = [
@@ -140,28 +131,31 @@ def _held_out(run: Run, calibration: Any) -> list[Any]:
     stale = [n for n in run.postures() if n.startswith(("before:", "after:"))]
     if stale:
         run.journal.write("void", sync=True, names=stale)
-    found = draw_held_out(run.config, calibration, run.config.session.verify_postures)
-    if len(found) < run.config.session.verify_postures:
+    wanted = run.config.session.verify_postures
+    found = draw_held_out(run.config, calibration, wanted)
+    if len(found) < wanted:
         run.say(
-            f"  note: only {len(found)} held-out targets can be reached compensated "
-            "within the ranges"
+            f"  note: only {len(found)} of {wanted} held-out targets can be reached "
+            "compensated within the ranges"
         )
-    drawn = [[list(raw), list(command)] for raw, command in found]
-    return run.journal.write("held_out", sync=True, pairs=drawn)["pairs"]
+    return run.journal.write("held_out", sync=True, pairs=found)["pairs"]
 
 
-def _verify(
-    run: Run, held: list[Any]
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]], Array]:
-    """Visit every held-out target raw and compensated, in the order of least travel."""
+def visit_pairs(run: Run, held: list[Any]) -> tuple[list[Record], list[Record], Array]:
+    """Visit held-out targets raw and compensated, in the order of least travel.
+
+    Returns:
+        Records before and after compensation, and the (N, 3) desired degrees, of the
+        targets of which both could be reached.
+    """
     config = run.config
-    assert run.zero_pulses is not None
     visits = [(f"before:{i}", raw) for i, (raw, _) in enumerate(held)]
     visits += [(f"after:{i}", command) for i, (_, command) in enumerate(held)]
-    start = config.to_deg(run.zero_pulses)
-    points = np.array([config.to_deg(pulses) for _, pulses in visits]).reshape(-1, 3)
-    found: dict[str, dict[str, Any] | None] = {}
-    for number in travel_order(points, start, speeds(config)):
+    points = config.to_deg([pulses for _, pulses in visits] or np.empty((0, 3)))
+    found: dict[str, Record | None] = {}
+    for number in travel_order(
+        config, points, config.to_deg(run.zero_pulses or (0, 0, 0))
+    ):
         name, pulses = visits[number]
         found[name] = run.visit(name, pulses, role=name.partition(":")[0])
     before, after, desired = [], [], []
@@ -176,29 +170,32 @@ def _verify(
 
 def _finish(
     run: Run,
-    chosen: list[dict[str, Any]],
-    before: list[dict[str, Any]],
-    after: list[dict[str, Any]],
+    chosen: list[Record],
+    before: list[Record],
+    after: list[Record],
     desired: Array,
     choice: Choice,
     drift: float | None,
 ) -> int:
     """Identify, check, save, report. The drives are stopped and let go first."""
     assert run.frame is not None
+    config = run.config
     run.phase("finishing")
     if run.motion is not None:
         run.stop("", latch=False)
         run.disarm()
     run.signals.check_stop()
-    everything = chosen + before + after
-    first = fit(chosen, _reading_noise(chosen))
     zero = run.journal.events("zero")[-1]
-    limits = uncertainty(first, chosen, before + after, zero)
-    notes = {
+    limits = uncertainty(
+        fit(chosen, reading_noise(chosen)), chosen, before + after, zero
+    )
+    shared = {
         "zero_pulses": list(run.zero_pulses or ()),
-        "fingerprint": run.config.fingerprint(),
-        "mechanism_order": run.config.mechanism_order,
-        "postures": [r["name"] for r in chosen],
+        "fingerprint": config.fingerprint(),
+        "postures": [record["name"] for record in chosen],
+    }
+    notes = shared | {
+        "mechanism_order": config.mechanism.order,
         "noise_from": limits["basis"],
         "run": run.folder.name,
     }
@@ -213,26 +210,28 @@ def _finish(
         "A": np.asarray(calibration.matrix).tolist(),
         "b": np.asarray(calibration.bias).tolist(),
         **limits,
+        **shared,
         "choice": choice.described(),
-        "postures": [r["name"] for r in chosen],
-        "zero_pulses": list(run.zero_pulses or ()),
         "drift_deg": drift,
-        "orders": order_residuals(run.config, run.frame, everything),
+        "orders": order_residuals(config, run.frame, chosen + before + after),
         "simulated": run.journal.records[0].get("simulated"),
-        "fingerprint": run.config.fingerprint(),
     }
     code = EXIT_OK
     if before:
         summary["before"] = errors(before, desired)
         summary["after"] = errors(after, desired)
-        if summary["after"]["max"] > run.config.session.verify_limit_deg:
+        if summary["after"]["max"] > config.session.verify_limit_deg:
             code = EXIT_RECALIBRATE
     calibration.save(run.folder / "calibration.json")
     (run.folder / "calibration.partial.json").unlink(missing_ok=True)
-    write_text(run.folder / "pairs.csv", pairs_csv(run))
-    write_text(run.folder / "summary.json", json.dumps(summary, indent=1))
-    from rig.report import write_report
+    run.save_pairs()
+    run.save_summary(summary)
+    from rig.outputs.report import write_report
 
     write_report(run.folder, summary, run.journal.records[0], run.postures())
-    say_summary(run, summary, code)
+    for line in summary_lines(summary, config.session.verify_limit_deg):
+        run.say(line)
+    run.say(
+        f"saved: {run.folder}/calibration.json, pairs.csv, summary.json, report.html"
+    )
     return code

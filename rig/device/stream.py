@@ -20,7 +20,7 @@ from rig.attitude import (
     euler_to_matrix,
     quaternion_to_matrix,
 )
-from rig.settings import ImuSettings
+from rig.config.settings import ImuSettings
 
 __all__ = ["Attitude", "LineSplitter", "Parser", "Reading", "StreamFault"]
 
@@ -97,7 +97,7 @@ class Parser:
 
     def __init__(self, settings: ImuSettings) -> None:
         self._settings = settings
-        self._width = settings.column_count
+        self._width = settings.column_count or None
         self._widths: deque[int] = deque(maxlen=RECOUNT)
         self._stamp: float | None = None
         self._odd = 0
@@ -165,18 +165,17 @@ class Parser:
         fields = [field.strip(" \t") for field in text.split(s.separator)]
         if fields[-1] == "" and len(fields) > 1:
             fields.pop()
-        used = set(s.quaternion or s.columns)
-        if s.stamp_column is not None:
+        used = set(s.quaternion_columns or s.columns)
+        if s.stamp_column >= 0:
             used.add(s.stamp_column)
         if not all(TOKEN.fullmatch(field) for field in fields):
             raise _Dropped("garbage")
         self._check_width(fields, used)
         values = {column: _number(fields[column]) for column in used}
-        stamp = None
-        if s.stamp_column is not None:
-            stamp = values[s.stamp_column] / 1000.0
-        if s.quaternion:
-            return Attitude(stamp, _quaternion([values[c] for c in s.quaternion]))
+        stamp = values[s.stamp_column] / 1000.0 if s.stamp_column >= 0 else None
+        if s.quaternion_columns:
+            numbers = [values[c] for c in s.quaternion_columns]
+            return Attitude(stamp, _quaternion(numbers))
         angles = [values[c] for c in s.columns]
         if not any(angles):
             self._check_zeros(now)
@@ -211,7 +210,7 @@ class Parser:
     def _euler(self, values: list[float]) -> Array:
         s = self._settings
         degrees = values
-        if s.angle_unit == "rad":
+        if s.unit == "rad":
             degrees = [math.degrees(value) for value in values]
         middle = degrees[1]  # an arc sine
         if s.format == "lines":
@@ -219,7 +218,7 @@ class Parser:
         if max(map(abs, degrees)) > 360.0 * ROUNDED or abs(middle) > 90.0 * ROUNDED:
             raise _Dropped("an angle no rotation has")
         signed = [v * sign for v, sign in zip(degrees, s.signs, strict=True)]
-        return euler_to_matrix(signed, s.order)
+        return euler_to_matrix(signed, str(s.order))
 
     def _entry(self, entry: dict[str, Any], now: float) -> Attitude:
         values = entry.get("values")

@@ -12,14 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from rig.bus import Bus, BusError, Rejected
-from rig.drives import Drive, Status
-from rig.faults import MotionFault, Unreachable
-from rig.imu import Imu, ImuError
-from rig.limits import LimitError, approach_point, check_plan, outside
-from rig.measuring import Observer
-from rig.settings import Axis, RigConfig
-from rig.stop import Heartbeat, Signals, Stopper
+from rig.config.settings import Axis, Pulses, RigConfig
+from rig.device.bus import Bus, BusError, Rejected
+from rig.device.drives import Drive, Status
+from rig.device.imu import Imu, ImuError
+from rig.guard.faults import LimitError, MotionFault, Unreachable
+from rig.guard.limits import approach_point, check_plan, outside
+from rig.guard.signals import Signals
+from rig.guard.stop import Stopper
+from rig.guard.watchdog import Heartbeat
+from rig.session.measuring import Observer
 
 __all__ = ["Motion"]
 
@@ -53,7 +55,7 @@ class Motion:
             stopper, config.motion.heartbeat_s, min(watched) / 4 if watched else 0.0
         )
         self.observer = Observer(
-            config, imu, self._guard_standing, self._statuses, phase
+            config, imu, lambda: self._guard(moving=False), self._statuses, phase
         )
 
     # Arming
@@ -67,32 +69,8 @@ class Motion:
         """
         self.stopper.check()
         for drive in self.drives:
+            self._check_fit(drive, reset_alarms)
             axis = drive.axis
-            status = drive.status()
-            if status.fault and reset_alarms and axis.map.alarm_reset:
-                drive.reset_alarm()
-                status = drive.status()
-            if status.fault:
-                raise MotionFault(
-                    f"{axis.name} is in alarm: {drive.alarm() or 'no code given'}; "
-                    "find the cause, then reset it (--reset-alarms)"
-                )
-            if status.moving:
-                raise MotionFault(f"{axis.name} is moving already: who moves it?")
-            if not status.enabled:
-                drive.enable()
-                if not drive.status().enabled:
-                    raise MotionFault(f"{axis.name} cannot be enabled")
-            tolerance = self._tolerance(axis)
-            if not (
-                axis.min_pulses - tolerance
-                <= status.position
-                <= axis.max_pulses + tolerance
-            ):
-                raise MotionFault(
-                    f"{axis.name} stands at {status.position} pulses, outside its "
-                    f"limits {axis.min_pulses}..{axis.max_pulses}: home it first"
-                )
             if axis.comm_timeout_s is not None:
                 drive.set_comm_timeout(axis.comm_timeout_s)
             if self.config.motion.mirror_limits:
@@ -104,7 +82,36 @@ class Motion:
         self.armed = True
         self.heartbeat.start()
 
-    def positions(self) -> tuple[int, int, int]:
+    def _check_fit(self, drive: Drive, reset_alarms: bool) -> None:
+        axis, status = drive.axis, drive.status()
+        if status.fault and reset_alarms and axis.map.alarm_reset:
+            drive.reset_alarm()
+            status = drive.status()
+        if status.fault:
+            raise MotionFault(
+                f"{axis.name} is in alarm: {drive.alarm() or 'no code given'}. Find "
+                "the cause, then start again with --reset-alarms"
+            )
+        if status.moving:
+            raise MotionFault(
+                f"{axis.name} is already moving. Stop the other controller, then run "
+                "`stop`"
+            )
+        if not status.enabled:
+            drive.enable()
+            if not drive.status().enabled:
+                raise MotionFault(
+                    f"{axis.name} does not enable its power stage. Check its "
+                    "supply and its enable and STO inputs"
+                )
+        slack = self._tolerance(axis)
+        if not axis.min_pulses - slack <= status.position <= axis.max_pulses + slack:
+            raise MotionFault(
+                f"{axis.name} stands at {status.position} pulses, outside its limits "
+                f"{axis.min_pulses}..{axis.max_pulses}. Home it first"
+            )
+
+    def positions(self) -> Pulses:
         """Where the drives stand, in pulses."""
         a, b, c = (drive.status().position for drive in self.drives)
         return a, b, c
@@ -114,7 +121,7 @@ class Motion:
 
     # Moving
 
-    def move_to(self, target: tuple[int, int, int], label: str) -> None:
+    def move_to(self, target: Pulses, label: str) -> None:
         """Move all three axes to absolute pulses, in steps, from the chosen side.
 
         Raises:
@@ -132,7 +139,7 @@ class Motion:
             self._travel(via, label)
         self._travel(target, label)
 
-    def _travel(self, target: tuple[int, int, int], label: str) -> None:
+    def _travel(self, target: Pulses, label: str) -> None:
         start = self.config.to_deg(self.positions())
         way = self.config.to_deg(target) - start
         longest = float(np.abs(way).max())
@@ -143,7 +150,7 @@ class Motion:
                 point = self.config.to_pulses(start + way * step / steps)
             self._step(point, label)
 
-    def _step(self, target: tuple[int, int, int], label: str) -> None:
+    def _step(self, target: Pulses, label: str) -> None:
         faults = outside(self.config, target)
         if faults:
             raise LimitError("; ".join(faults))
@@ -154,15 +161,12 @@ class Motion:
         try:
             for drive, start, pulses in zip(self.drives, starts, target, strict=True):
                 self._guard()
-                if abs(start.position - pulses) <= 0 and start.done:
+                if start.position == pulses and start.done:
                     continue
                 self._moves += 1
+                name, number = drive.axis.name, self._moves
                 self._log(
-                    "command",
-                    number=self._moves,
-                    label=label,
-                    axis=drive.axis.name,
-                    pulses=pulses,
+                    "command", number=number, label=label, axis=name, pulses=pulses
                 )
                 self._send(drive, pulses)
             self._watch(starts, target, begun, deadline)
@@ -180,11 +184,11 @@ class Motion:
             self._status(drive)  # an alarm says more than a refusal
             raise
 
-    def _deadline_s(self, starts: list[int], target: tuple[int, int, int]) -> float:
+    def _deadline_s(self, starts: list[int], target: Pulses) -> float:
         motion = self.config.motion
         longest = 0.0
         for axis, start, end in zip(self.config.axes, starts, target, strict=True):
-            way = abs(axis.scale.to_deg(end - start))
+            way = abs(axis.to_deg(end - start))
             ramp = axis.speed_deg_s / axis.accel_deg_s2
             longest = max(longest, way / axis.speed_deg_s + ramp)
         return motion.deadline_factor * longest + motion.deadline_slack_s
@@ -192,7 +196,7 @@ class Motion:
     def _watch(
         self,
         starts: list[Status],
-        target: tuple[int, int, int],
+        target: Pulses,
         begun: float,
         deadline: float,
     ) -> None:
@@ -213,35 +217,38 @@ class Motion:
                 if abs(status.position - last[index][0]) > 1:
                     last[index] = (status.position, status.time)
                 elif status.time - last[index][1] > motion.stall_s:
-                    way = axis.scale.to_deg(target[index] - status.position)
+                    left = abs(axis.to_deg(target[index] - status.position))
                     moved = abs(status.position - starts[index].position) > tolerance
                     if status.done and not status.moving and moved:
                         raise Unreachable(
-                            f"{axis.name} ended {abs(way):.3f} deg short of its target"
+                            f"{axis.name} ended {left:.3f} deg short of its target"
                         )
                     raise MotionFault(
-                        f"{axis.name} does not follow: standing for "
-                        f"{status.time - last[index][1]:.2f} s, {abs(way):.3f} deg "
-                        "from its target"
+                        f"{axis.name} does not follow: it stands {left:.3f} deg from "
+                        f"its target for {status.time - last[index][1]:.2f} s (limit "
+                        f"motion.stall_s = {motion.stall_s:g}). Look for an obstacle, "
+                        "a loose coupling, or a drive that is not enabled"
                     )
             if arrived == len(self.drives):
                 return
             if time.monotonic() > deadline:
                 raise MotionFault(
-                    f"the move missed its deadline of {deadline - begun:.2f} s"
+                    f"the move took longer than its deadline, {deadline - begun:.2f} s."
+                    " Check the drives' speed, or raise motion.deadline_factor"
                 )
             self._check_attitude()
             time.sleep(motion.poll_s)
 
     def _corridor(self, drive: Drive, start: int, end: int, status: Status) -> None:
         axis = drive.axis
-        slack = self.config.motion.following_deg * abs(axis.scale.pulses_per_deg)
+        slack = self.config.motion.following_deg * abs(axis.pulses_per_deg)
         low, high = min(start, end) - slack, max(start, end) + slack
         if not low <= status.position <= high:
-            here, begin, goal = map(axis.scale.to_deg, (status.position, start, end))
+            here, begin, goal = map(axis.to_deg, (status.position, start, end))
             raise MotionFault(
                 f"{axis.name} is at {here:.3f} deg on its way from {begin:.3f} to "
-                f"{goal:.3f}"
+                f"{goal:.3f}, more than motion.following_deg off it. Check gearing and "
+                "direction, and that no other controller moves it"
             )
 
     def _status(self, drive: Drive) -> Status:
@@ -255,15 +262,10 @@ class Motion:
             raise MotionFault(f"{drive.axis.name}: {text}")
         return status
 
-    def _guard(self) -> None:
+    def _guard(self, moving: bool = True) -> None:
         self.signals.check_stop()
         self.stopper.check()
-        self.heartbeat.feed(moving=True)
-
-    def _guard_standing(self) -> None:
-        self.signals.check_stop()
-        self.stopper.check()
-        self.heartbeat.feed(moving=False)
+        self.heartbeat.feed(moving)
 
     def _statuses(self) -> list[Status]:
         return [self._status(drive) for drive in self.drives]
@@ -282,5 +284,6 @@ class Motion:
             if not low <= angle <= high:
                 raise MotionFault(
                     f"the IMU reads {axis.name} at {angle:.2f} deg, outside its "
-                    f"envelope {low:.1f}..{high:.1f}"
+                    f"envelope {low:.1f}..{high:.1f}. Check zero, axis order and "
+                    "signs, and that the phone is fixed"
                 )

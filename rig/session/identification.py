@@ -8,9 +8,17 @@ from typing import Any
 import numpy as np
 
 from rig.attitude import ORDERS, Array, Frame
-from rig.settings import AXIS_NAMES, RigConfig
+from rig.config.settings import AXIS_NAMES, RigConfig
 
-__all__ = ["errors", "fit", "order_residuals", "pairs", "uncertainty", "zero_variance"]
+__all__ = [
+    "errors",
+    "fit",
+    "order_residuals",
+    "pairs",
+    "reading_noise",
+    "uncertainty",
+    "zero_variance",
+]
 
 
 def pairs(records: list[dict[str, Any]]) -> tuple[Array, Array]:
@@ -119,6 +127,13 @@ def uncertainty(
     }
 
 
+def reading_noise(records: list[dict[str, Any]]) -> float:
+    """Degrees, of a recorded mean as the scatter of its readings has it."""
+    std = np.array([r["std_deg"] for r in records])
+    counts = np.array([[r["samples"]] for r in records])
+    return float(max(1e-9, np.sqrt((std**2 / counts).mean())))
+
+
 def zero_variance(zero: dict[str, Any]) -> Array:
     """(3,) degrees squared, of the zero reference."""
     return np.array(zero["std_deg"]) ** 2 / zero["samples"]
@@ -148,7 +163,7 @@ def order_residuals(
         rms (order to degrees), configured, best, warning (empty where all is well).
     """
     if len(records) < 6:
-        return {"rms": {}, "configured": config.mechanism_order, "warning": ""}
+        return {"rms": {}, "configured": config.mechanism.order, "warning": ""}
     commands, _ = pairs(records)
     design = np.column_stack([commands, np.ones(len(commands))])
     attitudes = np.array([r["attitude"] for r in records])
@@ -158,7 +173,7 @@ def order_residuals(
         solution = np.linalg.lstsq(design, angles, rcond=None)[0]
         left = angles - design @ solution
         rms[order] = float(np.sqrt((left**2).sum() / (3 * (len(commands) - 4))))
-    configured = config.mechanism_order
+    configured = config.mechanism.order
     best = min(rms, key=lambda order: rms[order])
     noise = float(np.mean([r["std_deg"] for r in records]))
     warning = ""

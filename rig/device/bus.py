@@ -16,8 +16,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from rig.registers import Read, decode
-from rig.settings import BusSettings
+from rig.config.registers import Read, decode
+from rig.config.settings import BusSettings
 
 __all__ = ["Bus", "BusError", "Rejected"]
 

@@ -4,23 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from rig.settings import RigConfig
+from rig.config.settings import Pulses, RigConfig
+from rig.guard.faults import LimitError
 
-__all__ = ["LimitError", "Pulses", "approach_point", "check_plan", "outside"]
-
-Pulses = tuple[int, int, int]
-
-
-class LimitError(ValueError):
-    """A target leaves the soft limits; nothing was sent."""
+__all__ = ["approach_point", "check_plan", "outside"]
 
 
 def outside(config: RigConfig, target: Pulses) -> list[str]:
     """What of (3,) pulses leaves its limits, in words; empty where nothing does."""
     faults = []
     for axis, pulses in zip(config.axes, target, strict=True):
-        angle = axis.scale.to_deg(pulses)
-        rounding = 0.51 / abs(axis.scale.pulses_per_deg)
+        angle = axis.to_deg(pulses)
+        rounding = 0.51 / abs(axis.pulses_per_deg)
         if not (
             axis.min_pulses <= pulses <= axis.max_pulses
             and axis.min_deg - rounding <= angle <= axis.max_deg + rounding
@@ -53,4 +48,4 @@ def check_plan(config: RigConfig, targets: Iterable[Pulses]) -> None:
         for point in (target,) if via == target else (via, target):
             faults += outside(config, point)
     if faults:
-        raise LimitError("leaves the limits: " + "; ".join(faults))
+        raise LimitError("the plan leaves the limits: " + "; ".join(faults))

@@ -7,6 +7,7 @@ is taken from there, so resuming is running the same sequence again.
 from __future__ import annotations
 
 import datetime
+import json
 import pathlib
 import platform
 import sys
@@ -16,27 +17,34 @@ from typing import Any
 
 import numpy as np
 
+from jaxcal.files import write_text
 from rig.attitude import Array, Frame
-from rig.bus import Bus
-from rig.exits import EXIT_FAULT, Refused
-from rig.faults import MotionFault, NotFollowing, Unreachable
-from rig.imu import Imu
-from rig.journal import Journal, JournalError
-from rig.limits import check_plan
-from rig.measuring import Measurement
-from rig.motion import Motion
-from rig.settings import RigConfig
-from rig.stop import Signals, Stopper, UnitStop
+from rig.config.settings import AXIS_NAMES, Pulses, RigConfig
+from rig.device.bus import Bus
+from rig.device.imu import Imu
+from rig.guard.faults import (
+    EXIT_FAULT,
+    MotionFault,
+    NotFollowing,
+    Refused,
+    Unreachable,
+)
+from rig.guard.limits import check_plan
+from rig.guard.signals import Signals
+from rig.guard.stop import Stopper, UnitStop
+from rig.outputs.console import numbers
+from rig.outputs.journal import Journal, JournalError
+from rig.session.measuring import Measurement
+from rig.session.motion import Motion
 
-__all__ = [
-    "Run",
-    "new_run_folder",
-]
+__all__ = ["DRY_RUN", "JOURNAL", "Record", "Run", "new_run_folder"]
 
 JOURNAL = "journal.jsonl"
+DRY_RUN = "dry run: nothing was sent to the bus"
 STREAM_WAIT_S = 60.0  # time to start the app on the phone
 ZERO_FACTOR = 4  # readings of the zero posture, in those of a posture
 
+Record = dict[str, Any]  # of the journal
 Say = Callable[[str], None]
 
 
@@ -68,7 +76,7 @@ class Run:
         start: dict[str, Any] | None = None,
         reset_alarms: bool = False,
         on_imu_port: Callable[[int], None] | None = None,
-        zero_at: tuple[int, int, int] | None = None,
+        zero_at: Pulses | None = None,
     ) -> None:
         self.config = config
         self.folder = folder
@@ -78,7 +86,7 @@ class Run:
         self.confirm: Callable[[Run], None] = lambda run: None
         self.motion: Motion | None = None
         self.frame: Frame | None = None
-        self.zero_pulses: tuple[int, int, int] | None = None
+        self.zero_pulses: Pulses | None = None
         self.zero_at = zero_at
         self.signals = Signals(self.say)
         self.planned = 0
@@ -103,7 +111,7 @@ class Run:
             if starts[0]["fingerprint"] != fingerprint:
                 raise Refused(
                     f"{self.folder}: the configuration changed since this run began "
-                    "(what moves or measures may not); start a new run"
+                    "(only the addresses of bus and phone may). Start a new run"
                 )
             if starts[0]["mode"] != self.mode:
                 raise Refused(f"{self.folder} is a {starts[0]['mode']} run")
@@ -180,9 +188,8 @@ class Run:
             return self.motion
         config = self.config
         self.confirm(self)
-        silence = max(axis.map.inter_frame_s for axis in config.axes)
-        if config.bus.transport == "tcp":
-            silence = 0.0  # the gateway keeps the line's silence
+        # On Modbus TCP the gateway keeps the line's silence.
+        silence = 0.0 if config.bus.transport == "tcp" else config.silence_s
         self._imu = Imu(config.imu).open()
         self.say(
             f"IMU: waiting for the phone on port {self._imu.port} ({config.imu.format})"
@@ -200,16 +207,15 @@ class Run:
         )
         self.motion.arm(self._reset_alarms)
         self.say(f"armed: {len(self.motion.drives)} drives on {config.bus.where}")
-        if self.frame is None or not self.postures():
+        if self.frame is None or self.zero_pulses is None or not self.postures():
             self._zero(self.motion)
         else:
-            assert self.zero_pulses is not None
             self.motion.observer.zeroed(self.frame, self.zero_pulses)
-            self._check_reference(self.motion)
+            self._check_reference(self.motion, self.zero_pulses)
         return self.motion
 
     def _zero(self, motion: Motion) -> None:
-        """Take the zero, or take it anew where nothing was measured against it yet."""
+        """Take the zero, also again where nothing was measured against it yet."""
         self.phase("zeroing")
         target = self.zero_at or self.zero_pulses
         if target is None and self.config.session.zero == "drive":
@@ -241,15 +247,14 @@ class Run:
         self.frame = Frame(
             np.array(record["attitude"]),
             self.config.imu.mounting,
-            self.config.mechanism_order,
+            self.config.mechanism.order,
             self.config.letters,
         )
 
-    def _check_reference(self, motion: Motion) -> None:
+    def _check_reference(self, motion: Motion, zero: Pulses) -> None:
         """Before a resumed run goes on: the zero posture must still read zero."""
-        assert self.zero_pulses is not None
-        motion.move_to(self.zero_pulses, "reference")
-        measured = motion.observer.measure(self.zero_pulses, "reference")
+        motion.move_to(zero, "reference")
+        measured = motion.observer.measure(zero, "reference")
         worst = float(np.abs(measured.angles).max())
         limit = self.config.session.reference_tolerance_deg
         self.journal.write(
@@ -258,7 +263,7 @@ class Run:
         if worst > limit:
             raise MotionFault(
                 f"the zero posture now reads {worst:.3f} deg away from zero (limit "
-                f"{limit:g}): the phone or the device was moved; start a new run"
+                f"{limit:g}): the phone or the device was moved. Start a new run"
             )
         self.say(f"reference posture reads {worst:.3f} deg from zero: going on")
 
@@ -289,12 +294,14 @@ class Run:
         except NotFollowing as fault:
             if fault.suspects:
                 self.journal.write("void", sync=True, names=fault.suspects)
-                self.say(f"  void, to be measured again: {', '.join(fault.suspects)}")
+                self.say(
+                    f"  withdrawn, to be measured again: {', '.join(fault.suspects)}"
+                )
             raise
         except Unreachable as reason:
             motion.stopper.stop(str(reason), latch=False)
             if not all(result.standing for result in motion.stopper.results):
-                raise MotionFault(f"{reason}; and not all drives stand") from None
+                raise MotionFault(f"{reason}, and not all drives stand") from None
             self.journal.write("unreachable", sync=True, name=name, reason=str(reason))
             self.say(f"  {name} is out of reach: {reason}")
             return None
@@ -327,13 +334,30 @@ class Run:
     def _progress(self, record: dict[str, Any]) -> None:
         left = max(0, self.planned - self._visited)
         eta = left * float(np.mean(self._visit_s[-10:]))
-        commanded = " ".join(f"{v:8.3f}" for v in record["commanded_deg"])
-        measured = " ".join(f"{v:8.3f}" for v in record["measured_deg"])
         self.say(
             f"  [{self._visited:>3}/{self.planned}] {record['name']:<12} "
-            f"u [{commanded}]  y [{measured}]  {self._visit_s[-1]:5.2f} s, "
+            f"u [{numbers(record['commanded_deg'], 8, 3)}]  "
+            f"y [{numbers(record['measured_deg'], 8, 3)}]  {self._visit_s[-1]:5.2f} s, "
             f"about {eta:.0f} s left"
         )
+
+    # Results
+
+    def save_pairs(self) -> None:
+        """Write pairs.csv: role, commands, measurements, scatter of every posture."""
+        columns = ["name", "role"]
+        for what in ("pulses", "u_deg", "y_deg", "std_deg"):
+            columns += [f"{what}_{axis}" for axis in AXIS_NAMES]
+        lines = [",".join([*columns, "samples"])]
+        for r in self.postures().values():
+            values = r["pulses"] + r["commanded_deg"] + r["measured_deg"] + r["std_deg"]
+            fields = [r["name"], r.get("role", ""), *(repr(v) for v in values)]
+            lines.append(",".join([*fields, str(r["samples"])]))
+        write_text(self.folder / "pairs.csv", "\n".join(lines) + "\n")
+
+    def save_summary(self, summary: dict[str, Any]) -> None:
+        """Write summary.json."""
+        write_text(self.folder / "summary.json", json.dumps(summary, indent=1))
 
     # Log and stop
 
@@ -370,9 +394,6 @@ class Run:
         if self._bus is not None:
             self._bus.close()
         if self._imu is not None:
-            self.dropped = {
-                k: v for k, v in self._imu.counts.items() if k != "accepted"
-            }
             self._imu.close()
         self._bus = self._imu = None
         self.motion = None

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import pathlib
 from typing import Any
 
 import numpy as np
 
-from jaxcal.files import atomic_write, write_text
+from jaxcal.files import atomic_write
 from rig.attitude import Array
-from rig.exits import EXIT_OK, EXIT_RECALIBRATE, Refused
-from rig.identification import errors, pairs
-from rig.limits import LimitError
-from rig.planning import draw_held_out
-from rig.session import Run
-from rig.settings import RigConfig
-from rig.words import pairs_csv
+from rig.config.settings import Pulses
+from rig.guard.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
+from rig.outputs.console import numbers
+from rig.session.calibrate import visit_pairs
+from rig.session.identification import errors, pairs
+from rig.session.planning import draw_collection, draw_held_out
+from rig.session.run import DRY_RUN, Run
 
 __all__ = ["collect", "goto", "load_calibration", "verify"]
 
@@ -28,19 +27,13 @@ def collect(run: Run, count: int, dry_run: bool = False) -> int:
     (episodes, M, 3), M as configured; the last, unfinished episode is in the CSV only.
     """
     config = run.config
-
-    def make() -> dict[str, Any]:
-        rng = np.random.default_rng([config.session.seed, 2])
-        low, high = np.array(config.session.ranges).T
-        angles = rng.uniform(low, high, size=(count, 3))
-        return {"pulses": [list(config.to_pulses(angle)) for angle in angles]}
-
-    targets = run.remember("collection", make)["pulses"]
+    targets = run.remember(
+        "collection", lambda: {"pulses": draw_collection(config, count).tolist()}
+    )["pulses"]
     if dry_run:
         for number, target in enumerate(targets):
-            degrees = " ".join(f"{v:9.4f}" for v in config.to_deg(target))
-            run.say(f"  {number:>5}   {degrees}   {target}")
-        run.say("dry run: nothing was sent to the bus")
+            run.say(f"  {number:>5}   {numbers(config.to_deg(target))}   {target}")
+        run.say(DRY_RUN)
         return EXIT_OK
     run.planned = len(targets)
     for number, target in enumerate(targets):
@@ -52,13 +45,13 @@ def collect(run: Run, count: int, dry_run: bool = False) -> int:
     episodes = len(records) // size
     if episodes == 0:
         episodes, size = 1, len(records)
-    write_text(run.folder / "pairs.csv", pairs_csv(run))
-    shape = (episodes, size, 3)
+    run.save_pairs()
+    whole, shape = episodes * size, (episodes, size, 3)
     with atomic_write(run.folder / "dataset.npz") as file:
         np.savez(
             file,
-            candidates=commands[: episodes * size].reshape(shape),
-            measured=measured[: episodes * size].reshape(shape),
+            candidates=commands[:whole].reshape(shape),
+            measured=measured[:whole].reshape(shape),
         )
     run.say(
         f"saved: {run.folder}/pairs.csv ({len(records)} postures), dataset.npz "
@@ -67,7 +60,7 @@ def collect(run: Run, count: int, dry_run: bool = False) -> int:
     return EXIT_OK
 
 
-def load_calibration(path: pathlib.Path, config: RigConfig) -> tuple[Any, Any]:
+def load_calibration(path: pathlib.Path) -> tuple[Any, Pulses | None]:
     """A saved calibration and the pulses of its zero posture (None where unknown).
 
     Raises:
@@ -81,70 +74,63 @@ def load_calibration(path: pathlib.Path, config: RigConfig) -> tuple[Any, Any]:
         calibration = jaxcal.Calibration.load(path)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise Refused(f"{path}: not a calibration: {error}") from None
-    zero = None
     notes = calibration.provenance.get("notes", {})
-    if "zero_pulses" in notes:
-        a, b, c = (int(value) for value in notes["zero_pulses"])
-        zero = (a, b, c)
-    return calibration, zero
+    if "zero_pulses" not in notes:
+        return calibration, None
+    a, b, c = (int(value) for value in notes["zero_pulses"])
+    return calibration, (a, b, c)
 
 
 def verify(run: Run, calibration: Any, count: int, dry_run: bool = False) -> int:
     """Fresh held-out postures against a saved calibration: is it still true?"""
     config = run.config
-
-    def make() -> dict[str, Any]:
-        found = draw_held_out(config, calibration, count)
-        return {"pairs": [[list(raw), list(command)] for raw, command in found]}
-
-    held = run.remember("held_out", make)["pairs"]
+    held = run.remember(
+        "held_out", lambda: {"pairs": draw_held_out(config, calibration, count)}
+    )["pairs"]
     if not held:
         raise Refused("no target in the ranges can be reached through this calibration")
     run.planned = 2 * len(held)
     if dry_run:
         for raw, command in held:
-            run.say(
-                f"  target {config.to_deg(raw).round(4).tolist()}  command {command}"
-            )
-        run.say("dry run: nothing was sent to the bus")
+            run.say(f"  target {numbers(config.to_deg(raw))}  command {list(command)}")
+        run.say(DRY_RUN)
         return EXIT_OK
-    before, after, desired = [], [], []
-    for number, (raw, command) in enumerate(held):
-        one = run.visit(f"before:{number}", raw, role="before")
-        two = run.visit(f"after:{number}", command, role="after")
-        if one is not None and two is not None:
-            before.append(one)
-            after.append(two)
-            desired.append(config.to_deg(raw))
-    if not desired:
+    before, after, desired = visit_pairs(run, held)
+    if not before:
         raise Refused("no held-out posture could be reached")
-    targets = np.array(desired)
-    found = {"before": errors(before, targets), "after": errors(after, targets)}
+    found = {"before": errors(before, desired), "after": errors(after, desired)}
     commands, measured = pairs(before + after)
-    predicted = measured - calibration.predict(commands)
-    limit = config.session.verify_limit_deg
-    worst = found["after"]["max"]
+    off = measured - calibration.predict(commands)
+    limit, worst = config.session.verify_limit_deg, found["after"]["max"]
     again = bool(worst > limit)
-    summary = {
-        **found,
-        "prediction_rms": float(np.sqrt((predicted**2).mean())),
-        "limit_deg": limit,
-        "recalibrate": again,
-    }
     run.phase("saving")
-    write_text(run.folder / "pairs.csv", pairs_csv(run))
-    write_text(run.folder / "summary.json", json.dumps(summary, indent=1))
+    run.save_pairs()
+    run.save_summary(
+        {
+            **found,
+            "prediction_rms": float(np.sqrt((off**2).mean())),
+            "limit_deg": limit,
+            "recalibrate": again,
+        }
+    )
     run.say(
         f"error raw {found['before']['rms']:.4f} deg rms (max "
         f"{found['before']['max']:.4f}), compensated {found['after']['rms']:.4f} (max "
         f"{worst:.4f}), limit {limit:g}"
     )
-    run.say("time to RECALIBRATE" if again else "the calibration still holds")
+    run.say("RECALIBRATE: over the limit" if again else "the calibration still holds")
     return EXIT_RECALIBRATE if again else EXIT_OK
 
 
 def goto(run: Run, calibration: Any, desired: Array, dry_run: bool = False) -> int:
-    """Move the end-effector to a desired posture through a calibration."""
+    """Move the end-effector to a desired posture through a calibration.
+
+    Args:
+        run: the run.
+        calibration: gives ``command_for``.
+        desired: (3,) degrees.
+        dry_run: move nothing.
+    """
     config = run.config
     command = np.asarray(calibration.command_for(desired), dtype=np.float64)
     for axis, value in zip(config.axes, command, strict=True):
@@ -159,15 +145,15 @@ def goto(run: Run, calibration: Any, desired: Array, dry_run: bool = False) -> i
         f"pulses {list(pulses)}"
     )
     if dry_run:
-        run.say("dry run: nothing was sent to the bus")
+        run.say(DRY_RUN)
         return EXIT_OK
     run.planned = 1
     record = run.visit("goto", pulses, role="goto")
     if record is None:
         return EXIT_RECALIBRATE
-    off = np.array(record["measured_deg"]) - desired
+    reached = np.array(record["measured_deg"])
     run.say(
-        f"reached {np.round(record['measured_deg'], 4).tolist()} deg, off by "
-        f"{off.round(4).tolist()}"
+        f"reached {reached.round(4).tolist()} deg, off by "
+        f"{(reached - desired).round(4).tolist()}"
     )
     return EXIT_OK

@@ -1,0 +1,17 @@
+"""What rig.toml and a register map may say, and what is wrong with one that does not.
+
+``settings`` and ``registers`` are the two schemas, one field a key; ``schema`` words
+the faults; ``files`` reads. (3,) arrays are in the order pitch, yaw, roll.
+"""
+
+from rig.config.files import ConfigError, example_text, load_config, parse_config
+from rig.config.settings import AXIS_NAMES, RigConfig
+
+__all__ = [
+    "AXIS_NAMES",
+    "ConfigError",
+    "RigConfig",
+    "example_text",
+    "load_config",
+    "parse_config",
+]
