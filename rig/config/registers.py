@@ -5,8 +5,6 @@ It says where a drive keeps its status, position and alarm, and which registers 
 to move, stop, enable. The classes below are its schema. Nothing here opens a port.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import pathlib

@@ -122,7 +122,8 @@ def rule(described: dict[str, Any], root: dict[str, Any]) -> str:
         noun = "a whole number" if kind == "integer" else "a number"
         if "minimum" not in described:
             return noun
-        return f"{noun} in [{described['minimum']:g}, {described['maximum']:g}]"
+        low, high = described["minimum"], described["maximum"]
+        return f"{noun} in [{low}, {high}]"
     return {"boolean": "true or false", "string": "a text"}.get(str(kind), "a table")
 
 

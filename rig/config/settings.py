@@ -1,7 +1,5 @@
 """What a configuration holds: one class a table, one field a key."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Callable, Iterator

@@ -18,7 +18,9 @@ import time
 
 import numpy as np
 from harness import (
+    HASTY,
     HOST_FAULTS,
+    changed,
     fast_config,
     fast_text,
     in_the_middle,
@@ -138,12 +140,12 @@ def run_cell(
     """Run one cell of the matrix; raises AssertionError where a promise is broken."""
     if fault in HOST_FAULTS:
         return _host_cell(fault, phase, truth, folder)
-    config = fast_config()
     said: list[str] = []
     spec = parse_fault(fault)
+    hasty = fast_config(HASTY)
     done: list[bool] = []
 
-    with simulator(config) as sim:
+    with simulator(fast_config()) as sim:
 
         def listen(run: Run, entered: str) -> None:
             if entered == phase and not done and in_the_middle(run, entered):
@@ -152,7 +154,10 @@ def run_cell(
                 sim.enter(entered)
 
         served = sim.start()
-        code = first = session(served, folder, sim, said, [listen])
+        bus = changed(served.bus, timeout_s=hasty.bus.timeout_s)
+        imu = changed(served.imu, stale_s=hasty.imu.stale_s)
+        spoilt = changed(served, bus=bus, imu=imu)
+        code = first = session(spoilt, folder, sim, said, [listen])
         assert done, f"the session never entered {phase}"
         reason = next((s for s in reversed(said) if s.startswith("fault:")), "")
         check_invariants(folder, sim, alive=True, deaf=spec.kind in DEAF)

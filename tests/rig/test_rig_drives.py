@@ -1,15 +1,17 @@
 """Drives: the makers' published frames, three transports, retries, and other stacks."""
 
 import asyncio
+import contextlib
 import itertools
 import pathlib
+import queue
 import socket
 import struct
 import threading
 import time
 
 import pytest
-from harness import changed, fast_config, simulator
+from harness import HASTY, changed, fast_config, simulator
 
 from rig.config.registers import load_map
 from rig.config.settings import BusSettings
@@ -180,7 +182,7 @@ def test_a_target_outside_the_limits_never_reaches_the_bus():
     "fault", ["lost_reply", "lost_request", "noise_bytes", "exception_reply"]
 )
 def test_reads_are_retried(fault):
-    config = fast_config()
+    config = fast_config(HASTY)
     with simulator(config) as sim, Bus(sim.start().bus) as bus:
         drive = Drive(bus, config.axes[0])
         sim.faults.add(parse_fault(f"{fault},count=2"))
@@ -192,7 +194,7 @@ def test_reads_are_retried(fault):
 
 @pytest.mark.parametrize("transport", ["tcp", "rtu_tcp"])
 def test_a_move_whose_reply_is_lost_is_executed_once_and_reported(transport):
-    config = fast_config()
+    config = fast_config(HASTY)
     with (
         simulator(config, transport=transport) as sim,
         Bus(sim.start().bus) as bus,
@@ -295,7 +297,7 @@ def test_identify_only_reads():
 
 
 def test_stop_reaches_the_others_when_one_unit_is_dead():
-    config = fast_config()
+    config = fast_config(HASTY)
     with simulator(config) as sim, Bus(sim.start().bus) as bus:
         drives = [Drive(bus, axis) for axis in config.axes]
         for drive in drives:
@@ -308,37 +310,50 @@ def test_stop_reaches_the_others_when_one_unit_is_dead():
         assert not sim.drives[0].moving and sim.drives[0].position != 5000
 
 
-def test_against_pymodbus_own_server_on_tcp():
-    """A second stack at the other end: registers stored there read back the same."""
+@contextlib.contextmanager
+def pymodbus_server():
+    """pymodbus' own server with 200 registers in a thread; gives its port.
+
+    Closing the loop under a connection that pymodbus still holds ends in errors that
+    are printed when the tests are over, so it is closed once nothing is left on it.
+    """
     from pymodbus.server import ModbusTcpServer
     from pymodbus.simulator import DataType, SimData, SimDevice
 
-    ready, ports = threading.Event(), []
-    stop = []
+    started: queue.Queue = queue.Queue()
+    left: list[object] = []
 
-    def serve():
-        async def run():
-            device = SimDevice(
-                1,
-                simdata=[SimData(0, count=200, values=0, datatype=DataType.REGISTERS)],
-            )
-            server = ModbusTcpServer([device], address=("127.0.0.1", 0))
-            await server.serve_forever(background=True)
-            ports.append(server.transport.sockets[0].getsockname()[1])
-            done = asyncio.Event()
-            stop.append((asyncio.get_running_loop(), done))
-            ready.set()
-            await done.wait()
-            await server.shutdown()
+    async def run():
+        registers = SimData(0, count=200, values=0, datatype=DataType.REGISTERS)
+        address = ("127.0.0.1", 0)
+        server = ModbusTcpServer([SimDevice(1, simdata=[registers])], address=address)
+        await server.serve_forever(background=True)
+        stop = asyncio.Event()
+        port = server.transport.sockets[0].getsockname()[1]
+        started.put((asyncio.get_running_loop(), stop, port))
+        await stop.wait()
+        while server.active_connections:  # until the client's end has arrived
+            await asyncio.sleep(0.01)
+        await server.shutdown()
+        await asyncio.sleep(0.01)
+        left.extend(asyncio.all_tasks() - {asyncio.current_task()})
 
-        asyncio.run(run())
-
-    thread = threading.Thread(target=serve, daemon=True)
+    thread = threading.Thread(target=asyncio.run, args=(run(),))
     thread.start()
-    assert ready.wait(10)
+    loop, stop, port = started.get(timeout=30)
     try:
+        yield port
+    finally:
+        loop.call_soon_threadsafe(stop.set)
+        thread.join(30)
+        assert not thread.is_alive() and not left, left
+
+
+def test_against_pymodbus_own_server_on_tcp():
+    """A second stack at the other end: registers stored there read back the same."""
+    with pymodbus_server() as port:
         settings = BusSettings(
-            transport="tcp", host="127.0.0.1", port=ports[0], timeout_s=1.0
+            transport="tcp", host="127.0.0.1", port=port, timeout_s=1.0
         )
         axis = changed(axis_with("generic"), unit=1)
         with Bus(settings) as bus:
@@ -349,10 +364,6 @@ def test_against_pymodbus_own_server_on_tcp():
             Drive(bus, axis).move(-321)
             assert bus.read_words(1, 0x20, 2) == [0xFFFF, 0x10000 - 321]
             assert bus.read_words(1, 0x28, 1) == [1]
-    finally:
-        loop, done = stop[0]
-        loop.call_soon_threadsafe(done.set)
-        thread.join(5)
 
 
 def test_only_one_file_opens_a_drive_port():
