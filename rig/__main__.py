@@ -8,8 +8,6 @@ from collections.abc import Sequence
 
 from rig.arguments import make_parser
 
-__all__ = ["main"]
-
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""

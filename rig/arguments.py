@@ -6,8 +6,6 @@ import argparse
 import pathlib
 from collections.abc import Callable
 
-__all__ = ["make_parser"]
-
 EPILOG = """\
 exit codes: 0 done; 1 done, but the error says calibrate (again); 2 bad input, nothing
 moved; 3 stopped by a fault; 4 paused by Ctrl-C; 128 + signal stopped by a signal.

@@ -7,10 +7,9 @@ import tomllib
 from collections.abc import Iterator
 from typing import Any
 
+from rig.config.axis import AXIS_NAMES, DEFAULT_ROTATES
+from rig.config.config import RigConfig
 from rig.config.schema import validated
-from rig.config.settings import AXIS_NAMES, DEFAULT_ROTATES, RigConfig
-
-__all__ = ["EXAMPLES", "ConfigError", "example_text", "load_config", "parse_config"]
 
 EXAMPLES = pathlib.Path(__file__).parent.parent / "examples"
 

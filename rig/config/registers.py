@@ -1,15 +1,6 @@
-"""Register maps: a drive family as data.
+"""The parts of a register map: values, words, frames, bits."""
 
-A map is one TOML file in ``rig/maps`` (or anywhere: a configuration may give a path).
-It says where a drive keeps its status, position and alarm, and which registers to write
-to move, stop, enable. The classes below are its schema. Nothing here opens a port.
-"""
-
-import hashlib
-import json
-import pathlib
 import struct
-import tomllib
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
@@ -17,35 +8,15 @@ from pydantic import (
     BeforeValidator,
     Field,
     PlainValidator,
-    PrivateAttr,
     WithJsonSchema,
 )
 
-from rig.config.schema import Section, key, validated
+from rig.config.schema import Section, key
 
-__all__ = [
-    "MAP_FOLDER",
-    "MapError",
-    "Read",
-    "RegisterMap",
-    "Write",
-    "Writes",
-    "available_maps",
-    "decode",
-    "encode",
-    "load_map",
-    "parse_map",
-]
-
-MAP_FOLDER = pathlib.Path(__file__).parent.parent / "maps"
 FORMATS = {"u16": ">H", "i16": ">h", "u32": ">I", "i32": ">i"}  # of struct
 VALUES = ("position", "speed", "accel", "decel", "timeout", "min", "max")
 Kind = Literal["u16", "i16", "u32", "i32"]
 Word = int | tuple[str, str]  # a constant, or (name of VALUES, type)
-
-
-class MapError(ValueError):
-    """A register map breaks the schema; the text lists every fault."""
 
 
 def encode(value: int, kind: str, word_order: str) -> list[int]:
@@ -136,9 +107,9 @@ class Predicate(Section):
             word >> b & 1 for b in self.clear
         )
 
-    def broken_rules(self) -> Iterator[tuple[str, str]]:
+    def broken_rules(self) -> Iterator[str]:
         if not self.set and not self.clear:
-            yield "set", "name at least one bit in set or clear"
+            yield "set: name at least one bit in set or clear"
 
 
 class StatusWord(Read):
@@ -149,11 +120,11 @@ class StatusWord(Read):
     fault: Predicate
     enabled: Predicate | None = None
 
-    def broken_rules(self) -> Iterator[tuple[str, str]]:
+    def broken_rules(self) -> Iterator[str]:
         for name in ("done", "moving", "fault", "enabled"):
             bits = getattr(self, name)
             if bits and max((*bits.set, *bits.clear)) >= 16 * self.count:
-                yield name, f"must name bits 0..{16 * self.count - 1} of {self.type}"
+                yield f"{name}: must name bits 0..{16 * self.count - 1} of {self.type}"
 
 
 class Write(Section):
@@ -179,11 +150,11 @@ class Write(Section):
             address += _registers([word])
         return None
 
-    def broken_rules(self) -> Iterator[tuple[str, str]]:
+    def broken_rules(self) -> Iterator[str]:
         if self.function == 6 and self.count != 1:
-            yield "function", "must be 16, or 6 for one register"
+            yield "function: must be 16, or 6 for one register"
         if self.count > 123 or self.address + self.count > 0x10000:
-            yield "words", f"{self.count} registers from {self.address} do not fit"
+            yield f"words: {self.count} registers from {self.address} do not fit"
 
 
 def _registers(words: Any) -> int:
@@ -212,13 +183,13 @@ class Move(Writes):
 
     trigger: Trigger
 
-    def broken_rules(self) -> Iterator[tuple[str, str]]:
+    def broken_rules(self) -> Iterator[str]:
         if not self.writes("position"):
-            yield "write", "no frame writes position"
+            yield "write: no frame writes position"
         last, trigger = self.write[-1], self.trigger
         ends = last.address + last.count - 1
         if (ends, last.words[-1]) != (trigger.address, trigger.value):
-            yield "trigger", "must be the last word of the last frame"
+            yield "trigger: must be the last word of the last frame"
 
 
 Positive = Annotated[float, Field(ge=1e-12, le=1e12)]
@@ -230,15 +201,6 @@ class CommTimeout(Writes):
     per_s: Positive  # register counts for one second
 
 
-class Serial(Section):
-    """The maker's default line format; for information, never assumed."""
-
-    baudrate: int | None = None
-    parity: Literal["N", "E", "O"] | None = None
-    stopbits: int | None = None
-    bytesize: int | None = None
-
-
 class Units(Section):
     """Units of the speed and acceleration registers, and their counts for 1."""
 
@@ -246,89 +208,3 @@ class Units(Section):
     speed_per_unit: Positive
     accel: Literal["rev_per_s2", "pulse_per_s2", "s_per_rev_per_s"]
     accel_per_unit: Positive
-
-
-class RegisterMap(Section):
-    """One drive family."""
-
-    schema_: Literal[1] = key("version of this schema", alias="schema")
-    name: str = key("name of the map", min_length=1)
-    title: str = key("drives it is for", min_length=1)
-    sources: str = key("where the addresses are from", min_length=1)
-    confidence: str = key("how far they were checked", "")
-    word_order: Literal["big", "little"] = key(
-        "of 32-bit pairs; big: high word first, little: low word first"
-    )
-    inter_frame_s: float = key("silence the drive wants between frames", ..., 0, 1)
-    serial: Serial = key("the maker's default line format; never assumed", Serial())
-    units: Units = key(
-        "`speed`, `accel` of the registers; `speed_per_unit`, `accel_per_unit` counts"
-    )
-    status: StatusWord = key(
-        "address, type; `done`, `moving`, `fault`, `enabled` as bits `{ set, clear }`"
-    )
-    position: Position = key("address, type (i32) of the position in pulses")
-    alarm: Alarm | None = key("address, type; `names` of its codes", None)
-    move: Move = key(
-        "`write`: frames of numbers, or `position:i32`, `speed:u16`, `accel`, `decel`; "
-        "`trigger` is the last word"
-    )
-    stop: Writes = key("`write`: frames of the quick stop; torque must stay on")
-    enable: Writes | None = key("`write`: switch the power stage on", None)
-    alarm_reset: Writes | None = key("`write`: reset an alarm", None)
-    comm_timeout: CommTimeout | None = key(
-        "`write` with `timeout`, counts `per_s`: the drive's own watch of the line",
-        None,
-    )
-    limits: Writes | None = key("`write` with `min` and `max` in pulses", None)
-    identity: dict[str, Read] = key("registers that `identify` prints", {})
-    _digest: str = PrivateAttr("")
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 of the parsed file, for the run's fingerprint."""
-        return self._digest
-
-    def broken_rules(self) -> Iterator[tuple[str, str]]:
-        if self.stop.writes("position"):
-            yield "stop.write", "must not write a position"
-
-
-def available_maps() -> list[str]:
-    """Names of the maps that ship."""
-    return sorted(path.stem for path in MAP_FOLDER.glob("*.toml"))
-
-
-def load_map(name: str, folder: pathlib.Path | None = None) -> RegisterMap:
-    """Read a map by name (one that ships) or by path, relative to ``folder``.
-
-    Raises:
-        MapError: no such map, not TOML, or the schema is broken.
-    """
-    path = MAP_FOLDER / f"{name}.toml"
-    if name.endswith(".toml"):
-        path = (folder or pathlib.Path()) / name
-    elif name not in available_maps():
-        raise MapError(
-            f"no register map {name!r}: have {', '.join(available_maps())}, "
-            "or give the path of a .toml file"
-        )
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise MapError(f"register map {path}: {error}") from None
-    return parse_map(data, path.name)
-
-
-def parse_map(data: dict[str, Any], source: str) -> RegisterMap:
-    """Check a parsed map as a whole.
-
-    Raises:
-        MapError: with every fault, one a line.
-    """
-    result, faults = validated(RegisterMap, data)
-    if result is None:
-        raise MapError("\n".join(f"{source}: {fault}" for fault in faults))
-    text = json.dumps(data, sort_keys=True, default=str)
-    result._digest = hashlib.sha256(text.encode()).hexdigest()
-    return result

@@ -2,7 +2,8 @@
 
 A key is described once, by its field: type, default, bounds and meaning; its unit ends
 its name. That one description checks the value, words the fault, and fills the tables
-of docs/rig.md.
+of docs/rig.md. Modules of tables leave out ``from __future__ import annotations``:
+pydantic would compile every annotation again at each start.
 """
 
 from __future__ import annotations
@@ -14,15 +15,6 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
-__all__ = ["BrokenRules", "Section", "key", "resolved", "rule", "validated"]
-
-
-class BrokenRules(PydanticCustomError):
-    """Rules that a table breaks, each with the key that is to be changed."""
-
-    def __new__(cls, faults: list[tuple[str, str]]) -> BrokenRules:
-        return super().__new__(cls, "rules", "{faults}", {"faults": faults})
-
 
 class Section(BaseModel):
     """A table of a file: frozen, unknown keys are faults, no silent conversions."""
@@ -31,14 +23,14 @@ class Section(BaseModel):
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False
     )
 
-    def broken_rules(self) -> Iterator[tuple[str, str]]:
-        """(key, fault) of every rule about more than one key that is not kept."""
+    def broken_rules(self) -> Iterator[str]:
+        """``key: fault`` of every rule about more than one key that is not kept."""
         return iter(())
 
     @model_validator(mode="after")
     def _keep_the_rules(self) -> Section:
         if faults := list(self.broken_rules()):
-            raise BrokenRules(faults)
+            raise PydanticCustomError("rules", "{faults}", {"faults": faults})
         return self
 
 
@@ -148,10 +140,9 @@ def _texts(error: Any, value: Any, root: dict[str, Any]) -> list[str]:
             others = table.get("additionalProperties") or {}
             here = table.get("properties", {}).get(part, others)
     if kind == "rules":
-        broken = error["ctx"]["faults"]
-        return [f"{f'{path}.{name}'.strip('.')}: {text}" for name, text in broken]
+        return [f"{path}.{fault}".lstrip(".") for fault in error["ctx"]["faults"]]
     if kind == "value_error":
-        return [f"{path}: {error['ctx']['error']}"]
+        return [f"{path}: {line}" for line in str(error["ctx"]["error"]).split("\n")]
     if kind == "extra_forbidden":
         near = difflib.get_close_matches(error["loc"][-1], known, 1)
         hint = f"did you mean {near[0]}? " if near else ""

@@ -1,35 +1,13 @@
-"""What a configuration holds: one class a table, one field a key."""
+"""The tables of rig.toml but for its axes: one class a table, one field a key."""
 
-import hashlib
-import json
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any, Literal
 
-import numpy as np
-from pydantic import BeforeValidator, Field, PrivateAttr, ValidationInfo, WithJsonSchema
+from pydantic import Field
 
 from rig.attitude import Array, euler_to_matrix
-from rig.config.registers import MapError, RegisterMap, encode, load_map
-from rig.config.schema import BrokenRules, Section, key
+from rig.config.schema import Section, key
 
-__all__ = [
-    "AXIS_NAMES",
-    "Axis",
-    "BusSettings",
-    "ImuSettings",
-    "MotionSettings",
-    "Pulses",
-    "RigConfig",
-    "Scale",
-    "SessionSettings",
-    "SettleSettings",
-]
-
-AXIS_NAMES = ("pitch", "yaw", "roll")  # the order of every (3,) in this package
-DEFAULT_ROTATES = {"pitch": "X", "yaw": "Z", "roll": "Y"}
-LOWEST, HIGHEST = -(2**31), 2**31 - 1
-
-Pulses = tuple[int, int, int]  # of pitch, yaw and roll
 Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
 Sign = Literal[1, -1]
 Column = Annotated[int, Field(ge=0, le=200)]
@@ -63,136 +41,10 @@ class BusSettings(Section):
             return f"{self.device} at {self.baudrate} baud"
         return f"{self.host}:{self.port} ({self.transport})"
 
-    def broken_rules(self) -> Iterator[tuple[str, str]]:
+    def broken_rules(self) -> Iterator[str]:
         wanted = "device" if self.transport == "rtu" else "host"
         if not getattr(self, wanted):
-            yield wanted, f"missing; transport {self.transport!r} needs one"
-
-
-class Scale(Section):
-    """Pulses and degrees of one axis: ``theta = 360 p / (omega kappa)``."""
-
-    pulses_per_rev: int = key(
-        "omega: pulses for one motor turn, as set in the drive", ..., 1, 100_000_000
-    )
-    reduction: float = key("kappa: motor turns for one joint turn", 1.0, 1e-3, 1e5)
-    direction: Sign = key("-1: positive pulses turn the joint the negative way", 1)
-
-    @property
-    def pulses_per_deg(self) -> float:
-        """Signed pulses for one degree of the joint."""
-        return self.direction * self.pulses_per_rev * self.reduction / 360.0
-
-    def to_pulses(self, angle_deg: float) -> int:
-        """Nearest whole pulse; the angle that counts is ``to_deg`` of it."""
-        return round(angle_deg * self.pulses_per_deg)
-
-    def to_deg(self, pulses: float) -> float:
-        """Joint angle in degrees of a pulse count."""
-        return pulses / self.pulses_per_deg
-
-
-def _limit(pick: Callable[..., int]) -> Callable[[dict[str, Any]], int]:
-    def pulses(made: dict[str, Any]) -> int:
-        scale = Scale(**{name: made[name] for name in Scale.model_fields})
-        return pick(scale.to_pulses(made["min_deg"]), scale.to_pulses(made["max_deg"]))
-
-    return pulses
-
-
-def _map(name: Any, info: ValidationInfo) -> RegisterMap:
-    if not isinstance(name, str) or not name:
-        raise ValueError(f"must be the name of a map or of a file, got {name!r}")
-    try:
-        return load_map(name, (info.context or {}).get("folder"))
-    except MapError as error:
-        raise BrokenRules([("", line) for line in str(error).splitlines()]) from None
-
-
-class Axis(Scale):
-    """One joint and the drive that moves it."""
-
-    name: Literal["pitch", "yaw", "roll"] = key("of the joint")
-    rotates: Literal["X", "Y", "Z"] = key(
-        "axis of the joint in the device's frame",
-        "X, Z, Y of pitch, yaw, roll",
-        by=lambda made: DEFAULT_ROTATES[made["name"]],
-    )
-    unit: int = key("Modbus unit id", ..., 1, 247)
-    map: Annotated[
-        RegisterMap, BeforeValidator(_map), WithJsonSchema({"type": "string"})
-    ] = key("register map: a name, or a .toml file relative to this one")
-    min_deg: float = key("soft limit", ..., -180, 180)
-    max_deg: float = key("soft limit", ..., -180, 180)
-    min_pulses: int = key(
-        "soft limit", "of the limits", LOWEST, HIGHEST, by=_limit(min)
-    )
-    max_pulses: int = key(
-        "soft limit", "of the limits", LOWEST, HIGHEST, by=_limit(max)
-    )
-    speed_deg_s: float = key("of every move", ..., 1e-3, 5000)
-    accel_deg_s2: float = key("of every move, also to brake", ..., 1e-3, 1e5)
-    comm_timeout_s: float | None = key(
-        "the drive stops itself when the line is silent for so long", None, 0.01, 60
-    )
-
-    def pulses_within(self, angle_deg: float) -> int:
-        """A tolerance in degrees as whole pulses, at least one."""
-        return max(1, round(angle_deg * abs(self.pulses_per_deg)))
-
-    def motion_counts(self) -> dict[str, int]:
-        """Register values of speed and acceleration of a move.
-
-        Raises:
-            ValueError: one does not fit its register.
-        """
-        units, turns = self.map.units, self.reduction / 360.0
-        speed, accel = self.speed_deg_s * turns, self.accel_deg_s2 * turns  # of motor
-        if units.speed == "pulse_per_s":
-            speed *= self.pulses_per_rev
-        if units.accel == "pulse_per_s2":
-            accel *= self.pulses_per_rev
-        if units.accel == "s_per_rev_per_s":
-            accel = 1.0 / accel
-        counts = {"speed": max(1, round(speed * units.speed_per_unit))}
-        counts["accel"] = counts["decel"] = max(1, round(accel * units.accel_per_unit))
-        for name, count in counts.items():
-            for frame in self.map.move.write:
-                if found := frame.offset_of(name):
-                    encode(count, found[1], self.map.word_order)
-        return counts
-
-    def broken_rules(self) -> Iterator[tuple[str, str]]:
-        if self.min_deg >= self.max_deg:
-            got = f"{self.min_deg} and {self.max_deg}"
-            yield "min_deg", f"must be under max_deg, got {got}"
-        elif self.min_pulses >= self.max_pulses:
-            got = f"{self.min_pulses} and {self.max_pulses}"
-            yield "min_pulses", f"must be under max_pulses, got {got}"
-        else:
-            for name in ("min_deg", "max_deg"):
-                end = getattr(self, name)
-                pulses = self.to_pulses(end)
-                if not self.min_pulses <= pulses <= self.max_pulses:
-                    yield (
-                        name,
-                        (
-                            f"{end} deg is {pulses} pulses, outside min_pulses.."
-                            f"max_pulses ({self.min_pulses}..{self.max_pulses})"
-                        ),
-                    )
-        try:
-            self.motion_counts()
-        except ValueError as error:
-            yield "speed_deg_s", f"or accel_deg_s2 is too large: {error}"
-        if self.comm_timeout_s is not None and self.map.comm_timeout is None:
-            yield (
-                "comm_timeout_s",
-                (
-                    f"the map {self.map.name} has no register for it; set it with the "
-                    "maker's tool and leave this key out"
-                ),
-            )
+            yield f"{wanted}: missing; transport {self.transport!r} needs one"
 
 
 def _by_format(hyperimu: Any, other: Any) -> Callable[[dict[str, Any]], Any]:
@@ -253,22 +105,17 @@ class ImuSettings(Section):
         """(3, 3) R_EP."""
         return euler_to_matrix(self.mounting_deg, "ZYX")
 
-    def broken_rules(self) -> Iterator[tuple[str, str]]:
+    def broken_rules(self) -> Iterator[str]:
         if self.format == "sensorlogger" and self.transport != "listen":
-            yield "transport", "must be listen: Sensor Logger pushes its messages"
+            yield "transport: must be listen: Sensor Logger pushes its messages"
         named = (*self.columns, *(self.quaternion_columns or ()), self.stamp_column)
         if self.column_count and max(named) >= self.column_count:
-            yield (
-                "column_count",
-                f"{self.column_count} is too few for the columns named",
-            )
+            yield f"column_count: {self.column_count} is too few for the columns named"
         if self.order is None:
-            yield "order", "missing; a line stream does not say the order of its angles"
+            yield "order: missing; a line stream does not say the order of its angles"
         if len(self.separator) != 1 or self.separator in "0123456789+-.eE\r\n":
-            yield (
-                "separator",
-                f"must be one character no number has: {self.separator!r}",
-            )
+            got = repr(self.separator)
+            yield f"separator: must be one character that no number has, got {got}"
 
 
 class MechanismSettings(Section):
@@ -310,9 +157,9 @@ class SettleSettings(Section):
     timeout_s: float = key("to settle", 10.0, 0.05, 600)
     samples: int = key("readings averaged for one measurement", 25, 1, 10_000)
 
-    def broken_rules(self) -> Iterator[tuple[str, str]]:
+    def broken_rules(self) -> Iterator[str]:
         if self.timeout_s <= self.window_s:
-            yield "timeout_s", f"must be longer than window_s, got {self.timeout_s}"
+            yield f"timeout_s: must be longer than window_s, got {self.timeout_s}"
 
 
 class SessionSettings(Section):
@@ -324,7 +171,7 @@ class SessionSettings(Section):
         "how they are chosen", "policy"
     )
     min_efficiency: float = key("under this D-efficiency exact is used", 0.9, 0, 1)
-    seed: int = key("of the candidates drawn", 0, 0, HIGHEST)
+    seed: int = key("of the candidates drawn", 0, 0, 2**31 - 1)
     pitch_range_deg: Range | None = key("of the candidates; absent: the limits", None)
     yaw_range_deg: Range | None = key("likewise", None)
     roll_range_deg: Range | None = key("likewise", None)
@@ -335,139 +182,3 @@ class SessionSettings(Section):
     zero: Literal["here", "drive"] = key(
         "here: the device stands in its zero posture; drive: go to pulse 0", "here"
     )
-
-
-class RigConfig(Section):
-    """A whole, valid configuration."""
-
-    bus: BusSettings
-    axes: tuple[Axis, Axis, Axis]
-    imu: ImuSettings
-    mechanism: MechanismSettings = MechanismSettings()
-    settle: SettleSettings = SettleSettings()
-    motion: MotionSettings = MotionSettings()
-    session: SessionSettings = SessionSettings()
-    output: str = key("every run makes its own folder in here", "runs")
-    _text: str = PrivateAttr("")
-
-    @property
-    def text(self) -> str:
-        """The TOML it came from."""
-        return self._text
-
-    @property
-    def letters(self) -> tuple[str, str, str]:
-        """Axis letters of pitch, yaw and roll."""
-        a, b, c = (axis.rotates for axis in self.axes)
-        return a, b, c
-
-    @property
-    def ranges(self) -> tuple[tuple[float, float], ...]:
-        """(3, 2) degrees in which candidates are drawn."""
-        overshoot = self.motion.approach_overshoot_deg
-        return tuple(
-            getattr(self.session, f"{axis.name}_range_deg")
-            or (axis.min_deg + overshoot, axis.max_deg)
-            for axis in self.axes
-        )
-
-    @property
-    def silence_s(self) -> float:
-        """Silence between frames that the slowest of the drives wants."""
-        return max(axis.map.inter_frame_s for axis in self.axes)
-
-    def to_pulses(self, angles_deg: Any) -> Pulses:
-        """Whole pulses of (3,) degrees."""
-        a, b, c = (
-            axis.to_pulses(float(angle))
-            for axis, angle in zip(self.axes, angles_deg, strict=True)
-        )
-        return a, b, c
-
-    def to_deg(self, pulses: Any) -> Array:
-        """(..., 3) degrees of (..., 3) pulses."""
-        scales = np.array([axis.pulses_per_deg for axis in self.axes])
-        return np.asarray(pulses, dtype=np.float64) / scales
-
-    def described(self) -> dict[str, Any]:
-        """Everything as JSON values, in the layout of run folders of version 1."""
-        axes = []
-        moved = {*Scale.model_fields, "rotates", "map"}
-        for axis in self.axes:
-            plain = axis.model_dump(exclude=moved)
-            plain["letter"] = axis.rotates
-            plain["map"] = {"name": axis.map.name, "digest": axis.map.digest}
-            plain["scale"] = axis.model_dump(include=set(Scale.model_fields))
-            axes.append(plain)
-        imu = self.imu.model_dump()
-        imu["quaternion"], imu["angle_unit"] = (
-            imu.pop("quaternion_columns"),
-            imu.pop("unit"),
-        )
-        imu["stamp_column"] = None if imu["stamp_column"] < 0 else imu["stamp_column"]
-        imu["column_count"] = imu["column_count"] or None
-        session = self.session.model_dump()
-        for name in AXIS_NAMES:
-            del session[f"{name}_range_deg"]
-        return {
-            "bus": self.bus.model_dump(),
-            "axes": axes,
-            "imu": imu,
-            "mechanism_order": self.mechanism.order,
-            "settle": self.settle.model_dump(),
-            "motion": self.motion.model_dump(),
-            "session": session | {"ranges": self.ranges},
-        }
-
-    def fingerprint(self) -> str:
-        """SHA-256 of what a measurement depends on.
-
-        Where the bus and the phone are reached may change between a run and its
-        resumption; how the device moves and is measured may not.
-        """
-        data = self.described()
-        del data["bus"]
-        for name in ("host", "port", "transport", "stale_s"):
-            del data["imu"][name]
-        text = json.dumps(data, sort_keys=True, default=str)
-        return hashlib.sha256(text.encode()).hexdigest()
-
-    def broken_rules(self) -> Iterator[tuple[str, str]]:
-        motion, session = self.motion, self.session
-        slowest = self.bus.timeout_s * (self.bus.read_retries + 1)
-        overshoot = motion.approach_overshoot_deg
-        if session.k >= session.candidates:
-            yield "session.k", f"must be under candidates ({session.candidates})"
-        for axis, (low, high) in zip(self.axes, self.ranges, strict=True):
-            name = axis.name
-            if abs(1.0 / axis.pulses_per_deg) > motion.position_tolerance_deg:
-                yield (
-                    f"axes.{name}.pulses_per_rev",
-                    ("one pulse is coarser than motion.position_tolerance_deg"),
-                )
-            if axis.comm_timeout_s is not None and axis.comm_timeout_s <= slowest:
-                yield (
-                    f"axes.{name}.comm_timeout_s",
-                    (
-                        "must exceed bus.timeout_s x (read_retries + 1) = "
-                        f"{slowest:g} s, got {axis.comm_timeout_s:g}"
-                    ),
-                )
-            if motion.mirror_limits and axis.map.limits is None:
-                yield (
-                    "motion.mirror_limits",
-                    (f"the map {axis.map.name} of {name} has no limit registers"),
-                )
-            if low >= high:
-                yield (
-                    f"session.{name}_range_deg",
-                    (f"must be [low, high], got [{low}, {high}]"),
-                )
-            elif low - overshoot < axis.min_deg - 1e-9 or high > axis.max_deg + 1e-9:
-                yield (
-                    f"session.{name}_range_deg",
-                    (
-                        f"[{low}, {high}] with an overshoot of {overshoot} leaves the "
-                        f"axis's limits [{axis.min_deg}, {axis.max_deg}]"
-                    ),
-                )

@@ -19,8 +19,6 @@ from typing import Any
 from rig.config.registers import Read, decode
 from rig.config.settings import BusSettings
 
-__all__ = ["Bus", "BusError", "Rejected"]
-
 
 class BusError(RuntimeError):
     """No valid reply: silence, noise, a closed port, or a reply to something else."""
@@ -116,7 +114,9 @@ class Bus:
     ) -> list[int]:
         """Read ``count`` holding registers; see ``read``."""
         tries = 1 + (self.settings.read_retries if retries < 0 else retries)
-        for attempt in range(tries):
+        left = tries
+        while True:
+            left -= 1
             try:
                 reply = self._exchange(
                     "read_holding_registers", unit, address, count=count
@@ -128,16 +128,12 @@ class Bus:
                         f"got {len(words)}"
                     )
                 return words
-            except Rejected as error:
-                if attempt == tries - 1:
-                    raise Rejected(
-                        f"{error} (asked {tries} times)", error.code
-                    ) from None
             except BusError as error:
-                self._resynchronise()
-                if attempt == tries - 1:
-                    raise BusError(f"{error} (tried {tries} times)") from None
-        raise AssertionError("unreachable: the last try returns or raises")
+                if not isinstance(error, Rejected):
+                    self._resynchronise()
+                if not left:
+                    error.args = (f"{error} (tried {tries} times)",)
+                    raise
 
     def write(self, unit: int, address: int, function: int, words: list[int]) -> None:
         """Write registers once. Never retried: a lost reply may hide a started move.

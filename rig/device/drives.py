@@ -5,11 +5,9 @@ from __future__ import annotations
 import dataclasses
 import time
 
+from rig.config.axis import Axis
 from rig.config.registers import Writes, encode
-from rig.config.settings import Axis
 from rig.device.bus import Bus, Rejected
-
-__all__ = ["Drive", "Status"]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,8 +12,6 @@ from collections import Counter, deque
 from rig.config.settings import ImuSettings
 from rig.device.stream import MAX_BODY, LineSplitter, Parser, Reading, StreamFault
 
-__all__ = ["Imu", "ImuError"]
-
 RING = 8192  # readings kept: over half a minute at 200 a second
 RECONNECT_S = 0.2
 

@@ -22,8 +22,6 @@ from rig.attitude import (
 )
 from rig.config.settings import ImuSettings
 
-__all__ = ["Attitude", "LineSplitter", "Parser", "Reading", "StreamFault"]
-
 MAX_LINE = 1024  # bytes; a phone's line has under 200
 MAX_BODY = 1 << 20  # bytes of one pushed message
 NUMBER = re.compile(r"[+-]?[0-9]{1,15}(?:\.[0-9]{1,17})?(?:[eE][+-]?[0-9]{1,2})?")

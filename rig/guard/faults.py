@@ -2,21 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = [
-    "EXIT_BAD_INPUT",
-    "EXIT_FAULT",
-    "EXIT_OK",
-    "EXIT_PAUSED",
-    "EXIT_RECALIBRATE",
-    "LimitError",
-    "MotionFault",
-    "NotFollowing",
-    "PauseRequested",
-    "Refused",
-    "StopRequested",
-    "Unreachable",
-]
-
 EXIT_OK = 0
 EXIT_RECALIBRATE = 1  # done, but the errors say: calibrate (again)
 EXIT_BAD_INPUT = 2

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from rig.config.settings import Pulses, RigConfig
+from rig.config.axis import Pulses
+from rig.config.config import RigConfig
 from rig.guard.faults import LimitError
-
-__all__ = ["approach_point", "check_plan", "outside"]
 
 
 def outside(config: RigConfig, target: Pulses) -> list[str]:

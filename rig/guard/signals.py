@@ -10,8 +10,6 @@ from typing import Any
 
 from rig.guard.faults import PauseRequested, StopRequested
 
-__all__ = ["Signals"]
-
 
 class Signals:
     """Ctrl-C once: finish the posture and pause; twice, SIGTERM or SIGHUP: stop now.

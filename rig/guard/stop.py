@@ -16,8 +16,6 @@ from collections.abc import Callable
 from rig.device.drives import Drive
 from rig.guard.faults import EXIT_FAULT, StopRequested
 
-__all__ = ["Stopper", "UnitStop", "stop_all"]
-
 ROUNDS = 3  # times a stop is sent to a unit that does not acknowledge
 VERIFY_S = 3.0  # for all units together to come to rest
 POLL_S = 0.02

@@ -8,8 +8,6 @@ import time
 from rig.device.bus import BusError
 from rig.guard.stop import Stopper
 
-__all__ = ["Heartbeat"]
-
 
 class Heartbeat:
     """A thread that stops the drives when the motion loop falls silent.

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 
 from rig.attitude import Array
-from rig.config.settings import AXIS_NAMES, RigConfig
-
-__all__ = ["numbers", "plan_lines", "summary_lines"]
+from rig.config.axis import AXIS_NAMES
+from rig.config.config import RigConfig
 
 
 def numbers(values: Any, width: int = 9, digits: int = 4) -> str:

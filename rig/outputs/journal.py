@@ -15,8 +15,6 @@ import threading
 import time
 from typing import Any
 
-__all__ = ["Journal", "JournalError", "read_journal"]
-
 
 class JournalError(RuntimeError):
     """The journal cannot be written, or is damaged."""

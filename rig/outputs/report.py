@@ -12,9 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal.pages import Figure, Page, Section, Strong, Table, Text, write_page
-from rig.config.settings import AXIS_NAMES
-
-__all__ = ["write_report"]
+from rig.config.axis import AXIS_NAMES
 
 
 def write_report(

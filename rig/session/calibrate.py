@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 from rig.attitude import Array
-from rig.config.settings import AXIS_NAMES
+from rig.config.axis import AXIS_NAMES
 from rig.guard.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault
 from rig.guard.limits import check_plan
 from rig.outputs.console import plan_lines, summary_lines
+from rig.session.folder import Record
 from rig.session.identification import (
     errors,
     fit,
@@ -26,9 +27,7 @@ from rig.session.planning import (
     draw_held_out,
     travel_order,
 )
-from rig.session.run import DRY_RUN, Record, Run
-
-__all__ = ["calibrate", "visit_pairs"]
+from rig.session.run import DRY_RUN, Run
 
 
 def calibrate(run: Run, dry_run: bool = False) -> int:

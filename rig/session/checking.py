@@ -9,15 +9,13 @@ import numpy as np
 
 from jaxcal.files import atomic_write
 from rig.attitude import Array
-from rig.config.settings import Pulses
+from rig.config.axis import Pulses
 from rig.guard.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
 from rig.outputs.console import numbers
 from rig.session.calibrate import visit_pairs
 from rig.session.identification import errors, pairs
 from rig.session.planning import draw_collection, draw_held_out
 from rig.session.run import DRY_RUN, Run
-
-__all__ = ["collect", "goto", "load_calibration", "verify"]
 
 
 def collect(run: Run, count: int, dry_run: bool = False) -> int:

@@ -8,17 +8,8 @@ from typing import Any
 import numpy as np
 
 from rig.attitude import ORDERS, Array, Frame
-from rig.config.settings import AXIS_NAMES, RigConfig
-
-__all__ = [
-    "errors",
-    "fit",
-    "order_residuals",
-    "pairs",
-    "reading_noise",
-    "uncertainty",
-    "zero_variance",
-]
+from rig.config.axis import AXIS_NAMES
+from rig.config.config import RigConfig
 
 
 def pairs(records: list[dict[str, Any]]) -> tuple[Array, Array]:

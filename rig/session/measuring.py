@@ -12,13 +12,12 @@ from collections.abc import Callable
 import numpy as np
 
 from rig.attitude import Array, Frame, mean_rotation
-from rig.config.settings import AXIS_NAMES, Pulses, RigConfig
+from rig.config.axis import AXIS_NAMES, Pulses
+from rig.config.config import RigConfig
 from rig.device.drives import Status
 from rig.device.imu import Imu
 from rig.device.stream import Reading
 from rig.guard.faults import MotionFault, NotFollowing
-
-__all__ = ["Measurement", "Observer"]
 
 FOLLOW_MIN_DEG = 3.0  # a commanded change this large must be seen by the IMU
 FOLLOW_SHARE = 0.1  # at least this share of it

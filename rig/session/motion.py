@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from rig.config.settings import Axis, Pulses, RigConfig
+from rig.config.axis import Axis, Pulses
+from rig.config.config import RigConfig
 from rig.device.bus import Bus, BusError, Rejected
 from rig.device.drives import Drive, Status
 from rig.device.imu import Imu, ImuError
@@ -22,8 +23,6 @@ from rig.guard.signals import Signals
 from rig.guard.stop import Stopper
 from rig.guard.watchdog import Heartbeat
 from rig.session.measuring import Observer
-
-__all__ = ["Motion"]
 
 
 class Motion:

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from rig.attitude import Array
-from rig.config.settings import Pulses, RigConfig
+from rig.config.axis import Pulses
+from rig.config.config import RigConfig
 
 try:
     from jaxcal.selection.fastest import Motion, fastest_tour, travel_times
 except ImportError:
     from jaxcal.selection.fastest.travel import Motion, fastest_tour, travel_times
 
-__all__ = ["Choice", "choose", "draw_candidates", "draw_held_out", "travel_order"]
 
 EXACT_LIMIT_S = 20.0  # for the proof that the choice is (or is not) the optimum
 REPLAN_LIMIT_S = 5.0  # the same while the drives stand armed

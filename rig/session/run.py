@@ -6,65 +6,41 @@ is taken from there, so resuming is running the same sequence again.
 
 from __future__ import annotations
 
-import datetime
-import json
 import pathlib
-import platform
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from jaxcal.files import write_text
-from rig.attitude import Array, Frame
-from rig.config.settings import AXIS_NAMES, Pulses, RigConfig
+from rig.attitude import Frame
+from rig.config.axis import Pulses
+from rig.config.config import RigConfig
 from rig.device.bus import Bus
 from rig.device.imu import Imu
 from rig.guard.faults import (
     EXIT_FAULT,
     MotionFault,
     NotFollowing,
-    Refused,
     Unreachable,
 )
 from rig.guard.limits import check_plan
 from rig.guard.signals import Signals
 from rig.guard.stop import Stopper, UnitStop
 from rig.outputs.console import numbers
-from rig.outputs.journal import Journal, JournalError
-from rig.session.measuring import Measurement
+from rig.outputs.journal import JournalError
+from rig.session.folder import Record, RunFolder, rounded
 from rig.session.motion import Motion
 
-__all__ = ["DRY_RUN", "JOURNAL", "Record", "Run", "new_run_folder"]
-
-JOURNAL = "journal.jsonl"
 DRY_RUN = "dry run: nothing was sent to the bus"
 STREAM_WAIT_S = 60.0  # time to start the app on the phone
 ZERO_FACTOR = 4  # readings of the zero posture, in those of a posture
 
-Record = dict[str, Any]  # of the journal
 Say = Callable[[str], None]
 
 
-def new_run_folder(output: pathlib.Path, mode: str) -> pathlib.Path:
-    """Make ``output/mode-date-time``, never an existing one."""
-    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
-    for number in range(100):
-        path = output / (f"{mode}-{stamp}" + (f"-{number}" if number else ""))
-        try:
-            path.mkdir(parents=True)
-        except FileExistsError:
-            continue
-        except OSError as error:
-            raise Refused(f"cannot make {path}: {error.strerror or error}") from None
-        return path
-    raise Refused(f"cannot make a new run under {output}")
-
-
-class Run:
-    """Journal, devices and visits of one run."""
+class Run(RunFolder):
+    """Devices and visits of one run."""
 
     def __init__(
         self,
@@ -73,14 +49,11 @@ class Run:
         mode: str,
         say: Say = print,
         *,
-        start: dict[str, Any] | None = None,
+        start: Record | None = None,
         reset_alarms: bool = False,
         on_imu_port: Callable[[int], None] | None = None,
         zero_at: Pulses | None = None,
     ) -> None:
-        self.config = config
-        self.folder = folder
-        self.mode = mode
         self._say = say
         self.phase_listeners: list[Callable[[str], None]] = []
         self.confirm: Callable[[Run], None] = lambda run: None
@@ -97,39 +70,9 @@ class Run:
         self._bus: Bus | None = None
         self._imu: Imu | None = None
         self._phase_name = ""
-        self.journal = Journal(folder / JOURNAL)
-        try:
-            self._begin(start or {})
-        except BaseException:
-            self.journal.close()
-            raise
-
-    def _begin(self, extra: dict[str, Any]) -> None:
-        fingerprint = self.config.fingerprint()
-        starts = self.journal.events("start")
-        if starts:
-            if starts[0]["fingerprint"] != fingerprint:
-                raise Refused(
-                    f"{self.folder}: the configuration changed since this run began "
-                    "(only the addresses of bus and phone may). Start a new run"
-                )
-            if starts[0]["mode"] != self.mode:
-                raise Refused(f"{self.folder} is a {starts[0]['mode']} run")
-            self.journal.write("resume", sync=True, **_provenance())
-            zeros = self.journal.events("zero")
-            if zeros:
-                self._set_zero(zeros[-1])
-            return
-        self.journal.write(
-            "start",
-            sync=True,
-            schema=1,
-            mode=self.mode,
-            fingerprint=fingerprint,
-            config=self.config.described(),
-            **_provenance(),
-            **extra,
-        )
+        super().__init__(config, folder, mode, start or {})
+        for record in self.journal.events("zero")[-1:]:
+            self._set_zero(record)
 
     def say(self, text: str) -> None:
         """Print a line. A terminal that is gone ends the run, but never a stop."""
@@ -137,34 +80,6 @@ class Run:
             self._say(text)
         except OSError:
             self.signals.request_stop("the terminal is gone", EXIT_FAULT)
-
-    # Memory
-
-    def remember(
-        self, event: str, make: Callable[[], dict[str, Any]]
-    ) -> dict[str, Any]:
-        """The record of an event, made and journalled on first use only."""
-        known = self.journal.events(event)
-        return known[0] if known else self.journal.write(event, sync=True, **make())
-
-    def posture(self, name: str) -> dict[str, Any] | None:
-        """The record of a posture, or None where it has not been measured."""
-        return self.postures().get(name)
-
-    def postures(self) -> dict[str, dict[str, Any]]:
-        """Every posture measured and not made void since, by name, in order."""
-        found: dict[str, dict[str, Any]] = {}
-        for record in self.journal.records:
-            if record["event"] == "posture":
-                found[record["name"]] = record
-            elif record["event"] == "void":
-                for name in record["names"]:
-                    found.pop(name, None)
-        return found
-
-    def unreachable(self, name: str) -> bool:
-        """Whether a posture was found out of reach."""
-        return any(r["name"] == name for r in self.journal.events("unreachable"))
 
     # Phases
 
@@ -232,8 +147,8 @@ class Run:
             "zero",
             sync=True,
             pulses=list(measured.pulses),
-            attitude=_rounded(measured.attitude, 12),
-            std_deg=_rounded(measured.std, 6),
+            attitude=rounded(measured.attitude, 12),
+            std_deg=rounded(measured.std, 6),
             samples=measured.samples,
         )
         self._set_zero(record)
@@ -241,7 +156,7 @@ class Run:
         motion.observer.zeroed(self.frame, measured.pulses)
         self.say(f"zero taken at pulses {list(measured.pulses)}")
 
-    def _set_zero(self, record: dict[str, Any]) -> None:
+    def _set_zero(self, record: Record) -> None:
         a, b, c = (int(value) for value in record["pulses"])
         self.zero_pulses = (a, b, c)
         self.frame = Frame(
@@ -258,7 +173,7 @@ class Run:
         worst = float(np.abs(measured.angles).max())
         limit = self.config.session.reference_tolerance_deg
         self.journal.write(
-            "reference", sync=True, angles=_rounded(measured.angles, 9), limit=limit
+            "reference", sync=True, angles=rounded(measured.angles, 9), limit=limit
         )
         if worst > limit:
             raise MotionFault(
@@ -269,7 +184,7 @@ class Run:
 
     # Visits
 
-    def visit(self, name: str, pulses: Any, **fields: Any) -> dict[str, Any] | None:
+    def visit(self, name: str, pulses: Any, **fields: Any) -> Record | None:
         """Measure a posture, once in the life of the run.
 
         Returns:
@@ -278,7 +193,7 @@ class Run:
         Raises:
             PauseRequested: between postures, after Ctrl-C.
         """
-        known = self.posture(name)
+        known = self.postures().get(name)
         if known is not None:
             self._visited += 1
             return known
@@ -305,33 +220,15 @@ class Run:
             self.journal.write("unreachable", sync=True, name=name, reason=str(reason))
             self.say(f"  {name} is out of reach: {reason}")
             return None
-        record = self._record(name, measured, fields)
+        self.phase("saving")
+        record = self.record_posture(name, measured, fields)
         self._visited += 1
         self._visit_s.append(time.monotonic() - begun)
         self._progress(record)
         self.signals.check_pause()
         return record
 
-    def _record(
-        self, name: str, measured: Measurement, fields: dict[str, Any]
-    ) -> dict[str, Any]:
-        self.phase("saving")
-        return self.journal.write(
-            "posture",
-            sync=True,
-            name=name,
-            pulses=list(measured.pulses),
-            feedback=list(measured.feedback),
-            commanded_deg=_rounded(self.config.to_deg(measured.pulses), 9),
-            measured_deg=_rounded(measured.angles, 9),
-            std_deg=_rounded(measured.std, 6),
-            samples=measured.samples,
-            attitude=_rounded(measured.attitude, 12),
-            raw_deg=_rounded(measured.raw, 5),
-            **fields,
-        )
-
-    def _progress(self, record: dict[str, Any]) -> None:
+    def _progress(self, record: Record) -> None:
         left = max(0, self.planned - self._visited)
         eta = left * float(np.mean(self._visit_s[-10:]))
         self.say(
@@ -340,24 +237,6 @@ class Run:
             f"y [{numbers(record['measured_deg'], 8, 3)}]  {self._visit_s[-1]:5.2f} s, "
             f"about {eta:.0f} s left"
         )
-
-    # Results
-
-    def save_pairs(self) -> None:
-        """Write pairs.csv: role, commands, measurements, scatter of every posture."""
-        columns = ["name", "role"]
-        for what in ("pulses", "u_deg", "y_deg", "std_deg"):
-            columns += [f"{what}_{axis}" for axis in AXIS_NAMES]
-        lines = [",".join([*columns, "samples"])]
-        for r in self.postures().values():
-            values = r["pulses"] + r["commanded_deg"] + r["measured_deg"] + r["std_deg"]
-            fields = [r["name"], r.get("role", ""), *(repr(v) for v in values)]
-            lines.append(",".join([*fields, str(r["samples"])]))
-        write_text(self.folder / "pairs.csv", "\n".join(lines) + "\n")
-
-    def save_summary(self, summary: dict[str, Any]) -> None:
-        """Write summary.json."""
-        write_text(self.folder / "summary.json", json.dumps(summary, indent=1))
 
     # Log and stop
 
@@ -378,13 +257,10 @@ class Run:
             "stop", {"reason": reason, "units": [vars(result) for result in results]}
         )
 
-    def stop(self, reason: str, latch: bool = True) -> bool:
-        """Stop every unit; whether each acknowledged and stands."""
-        motion = self.motion
-        if motion is None:
-            return True
-        results = motion.stopper.stop(reason, latch)
-        return all(result.acknowledged and result.standing for result in results)
+    def stop(self, reason: str, latch: bool = True) -> None:
+        """Stop every unit."""
+        if self.motion is not None:
+            self.motion.stopper.stop(reason, latch)
 
     def disarm(self) -> None:
         """Nothing more will move: close the bus and the IMU, free the signals."""
@@ -403,19 +279,3 @@ class Run:
         """Let go of everything."""
         self.disarm()
         self.journal.close()
-
-
-def _provenance() -> dict[str, Any]:
-    import jaxcal
-
-    return {
-        "jaxcal": jaxcal.__version__,
-        "python": platform.python_version(),
-        "host": platform.node(),
-        "arguments": sys.argv[1:],
-        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-    }
-
-
-def _rounded(values: Array, digits: int) -> Any:
-    return np.round(np.asarray(values, dtype=np.float64), digits).tolist()

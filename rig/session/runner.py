@@ -19,8 +19,6 @@ from rig.guard.faults import (
 from rig.outputs.journal import JournalError
 from rig.session.run import Run
 
-__all__ = ["run_safely"]
-
 
 def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
     """Run a procedure; whatever happens, the drives are told to stop and it is said.

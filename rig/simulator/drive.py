@@ -6,9 +6,8 @@ import math
 import time
 from collections.abc import Callable
 
-from rig.config.registers import RegisterMap, Writes, decode, encode
-
-__all__ = ["ILLEGAL_ADDRESS", "ILLEGAL_VALUE", "DriveException", "SimDrive"]
+from rig.config.maps import RegisterMap
+from rig.config.registers import Writes, decode, encode
 
 ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 2, 3, 4
 STEP_S = 0.001

@@ -12,33 +12,16 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rig.attitude import Array, matrix_to_euler
 from rig.config.settings import ImuSettings
 from rig.simulator.faults import FaultInjector
 
-__all__ = ["Phone", "format_line", "matrix_to_quaternion"]
-
 
 def matrix_to_quaternion(matrix: Array) -> Array:
-    """(4,) x, y, z, w of a (3, 3) rotation, by the largest of the four."""
-    m = matrix
-    squares = np.array(
-        [
-            1 + m[0, 0] - m[1, 1] - m[2, 2],
-            1 - m[0, 0] + m[1, 1] - m[2, 2],
-            1 - m[0, 0] - m[1, 1] + m[2, 2],
-            1 + np.trace(m),
-        ]
-    )
-    rows = [
-        [squares[0], m[1, 0] + m[0, 1], m[0, 2] + m[2, 0], m[2, 1] - m[1, 2]],
-        [m[1, 0] + m[0, 1], squares[1], m[2, 1] + m[1, 2], m[0, 2] - m[2, 0]],
-        [m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], squares[2], m[1, 0] - m[0, 1]],
-        [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], squares[3]],
-    ]
-    q = np.array(rows[int(np.argmax(squares))])
-    return q / np.linalg.norm(q)
+    """(4,) x, y, z, w of a (3, 3) rotation."""
+    return Rotation.from_matrix(matrix).as_quat()
 
 
 def format_line(

@@ -9,10 +9,8 @@ from collections.abc import Callable
 import numpy as np
 
 from rig.attitude import Array, euler_to_matrix, small_rotation
-from rig.config.settings import RigConfig
+from rig.config.config import RigConfig
 from rig.simulator.drive import SimDrive
-
-__all__ = ["Plant", "Truth"]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,14 +6,12 @@ import threading
 from typing import Any
 
 from rig.attitude import Array
-from rig.config.settings import RigConfig
+from rig.config.config import RigConfig
 from rig.simulator.drive import SimDrive
 from rig.simulator.faults import FaultInjector, FaultSpec
 from rig.simulator.phone import Phone
 from rig.simulator.plant import Plant, Truth
 from rig.simulator.server import ModbusServer
-
-__all__ = ["Simulator"]
 
 
 class Simulator:

@@ -9,9 +9,9 @@ import pathlib
 import sys
 from typing import Any
 
-from rig.config.registers import RegisterMap
+from rig.config.config import RigConfig
+from rig.config.maps import RegisterMap
 from rig.config.schema import Section, resolved, rule
-from rig.config.settings import RigConfig
 
 __all__ = ["configuration_table", "register_map_table"]
 

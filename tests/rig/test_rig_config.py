@@ -8,17 +8,10 @@ import pytest
 from reference import configuration_table, register_map_table
 
 from rig.config import ConfigError, load_config, parse_config
+from rig.config.axis import Scale
 from rig.config.files import EXAMPLES
-from rig.config.registers import (
-    MAP_FOLDER,
-    MapError,
-    available_maps,
-    decode,
-    encode,
-    load_map,
-    parse_map,
-)
-from rig.config.settings import Scale
+from rig.config.maps import MAP_FOLDER, MapError, available_maps, load_map, parse_map
+from rig.config.registers import decode, encode
 
 EXAMPLE_TEXT = (EXAMPLES / "simulate.toml").read_text()
 

@@ -13,7 +13,7 @@ import time
 import pytest
 from harness import HASTY, changed, fast_config, simulator
 
-from rig.config.registers import load_map
+from rig.config.maps import load_map
 from rig.config.settings import BusSettings
 from rig.device.bus import Bus, BusError, Rejected
 from rig.device.drives import Drive

@@ -241,7 +241,7 @@ def test_held_out_targets_are_drawn_anew_when_a_chosen_posture_is_void(tmp_path)
         served, folder, pressed = sim.start(), tmp_path / "run", []
 
         def press(run, phase):
-            if run.posture("before:0") or run.posture("after:0"):
+            if {"before:0", "after:0"} & set(run.postures()):
                 if not pressed:
                     pressed.append(True)
                     run.journal.write("void", names=[next(iter(run.postures()))])
@@ -661,7 +661,7 @@ def test_without_matplotlib_the_report_says_that_figures_are_missing(
 
 
 def test_run_folders_are_never_reused(tmp_path):
-    from rig.session.run import new_run_folder
+    from rig.session.folder import new_run_folder
 
     folders = {new_run_folder(tmp_path, "calibrate") for _ in range(5)}
     assert len(folders) == 5
