@@ -3,7 +3,7 @@
 pymodbus does the framing. What it leaves to its caller is done here: exception replies
 are errors, replies are checked against their request, the silence between frames is
 kept, reads are retried, and a motion write is sent exactly once. After any failed
-exchange the line is emptied (or the connection made anew), so that a late reply can
+exchange the line is emptied (or the connection opened again), so that a late reply can
 never be taken for the answer to a later request.
 """
 
@@ -207,7 +207,7 @@ class Bus:
             if self._client is None:
                 return
             if self.settings.transport != "rtu":
-                self._client.close()  # the next request connects anew
+                self._client.close()  # the next request connects again
                 return
             port = self._client.socket
             if port is None:
@@ -229,10 +229,10 @@ def _why_closed(settings: BusSettings) -> str:
     if settings.transport != "rtu":
         return "nothing answers there, or its connections are all taken"
     if not os.path.exists(settings.device):
-        return "there is no such port (adapter not plugged in?)"
+        return "there is no such port. Is the adapter plugged in?"
     if not os.access(settings.device, os.R_OK | os.W_OK):
-        return "this user may not open it (join its group, often dialout)"
-    return "held by another program (a running session?)"
+        return "this user may not open it. Join its group, often dialout"
+    return "held by another program. Is a session running?"
 
 
 def _exception_name(code: int) -> str:

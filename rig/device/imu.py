@@ -12,7 +12,7 @@ from collections import Counter, deque
 from rig.config.settings import ImuSettings
 from rig.device.stream import MAX_BODY, LineSplitter, Parser, Reading, StreamFault
 
-RING = 8192  # readings kept: over half a minute at 200 a second
+RING = 8192  # readings kept: over half a minute at 200 Hz
 RECONNECT_S = 0.2
 
 
@@ -97,12 +97,12 @@ class Imu:
             raise ImuError("the phone has sent no reading yet")
         age = time.monotonic() - reading.time
         if age > self.settings.stale_s:
-            late = ""
+            hint = "Check its Wi-Fi, and that its app is in front"
             if time.monotonic() - self._arrived < self.settings.stale_s:
-                late = "; it arrives late, or its stamps are not those configured"
+                hint = "It arrives late, or its stamps are not those configured"
             raise ImuError(
-                f"the phone's last reading is {age:.2f} s old "
-                f"(limit {self.settings.stale_s:g} s){late}"
+                f"the phone's last reading is {age:.2f} s old (limit imu.stale_s = "
+                f"{self.settings.stale_s:g} s). {hint}"
             )
         return reading
 
@@ -139,7 +139,8 @@ class Imu:
                     raise ImuError(
                         f"no usable reading from the phone in {timeout_s:g} s on "
                         f"{self.settings.host}:{self.port} ({self.connections} "
-                        f"connections{detail})"
+                        f"connections{detail}). Start its app, and check the address, "
+                        "port and [imu] format"
                     ) from None
             time.sleep(0.01)
 

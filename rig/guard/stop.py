@@ -89,7 +89,7 @@ def _send(drive: Drive, result: UnitStop) -> None:
 
 
 class Stopper:
-    """The latch. Once stopped for a fault, it lets nothing move again."""
+    """The latch: after a stop for a fault nothing moves again."""
 
     def __init__(
         self,

@@ -10,7 +10,7 @@ from rig.guard.stop import Stopper
 
 
 class Heartbeat:
-    """A thread that stops the drives when the motion loop falls silent.
+    """A thread that stops the drives when the motion loop is silent for too long.
 
     It also keeps the line alive for drives that watch their communication while the
     plan computes or writes, when nothing moves.

@@ -121,5 +121,5 @@ class Journal:
         return [record for record in self.records if record["event"] == event]
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         os.close(self._fd)

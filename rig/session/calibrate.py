@@ -176,7 +176,7 @@ def _finish(
     choice: Choice,
     drift: float | None,
 ) -> int:
-    """Identify, check, save, report. The drives are stopped and let go first."""
+    """Stop the drives, close the bus; then identify, check, save, report."""
     assert run.frame is not None
     config = run.config
     run.phase("finishing")

@@ -85,7 +85,7 @@ class RunFolder:
         return known[0] if known else self.journal.write(event, sync=True, **make())
 
     def postures(self) -> dict[str, Record]:
-        """Every posture measured and not made void since, by name, in order."""
+        """Every posture measured and not withdrawn since, by name, in order."""
         found: dict[str, Record] = {}
         for record in self.journal.records:
             if record["event"] == "posture":

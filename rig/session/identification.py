@@ -31,7 +31,7 @@ def fit(
         records: chosen postures.
         noise_std: degrees, of one recorded mean.
         notes: stored in the calibration's file.
-        zero_std: degrees, of the zero reference. It shifts every output alike, so it
+        zero_std: degrees, of the zero reference. It shifts every output equally, so it
             adds to the variance of the outputs' mean.
     """
     import jaxcal
@@ -61,16 +61,15 @@ def uncertainty(
 ) -> dict[str, Any]:
     """Noise of one recorded mean and 95 % half-widths of A and b.
 
-    ``ci95`` hold the truth of all twelve parameters at once in 95 % of all sessions
-    (Bonferroni); ``ci95_each`` that of each by itself, so that of twelve one or two
-    may well miss.
+    ``ci95`` holds all twelve parameters at once in 95 % of sessions (Bonferroni),
+    ``ci95_each`` each by itself, so that one or two of twelve may well miss.
 
     Four postures leave no residual, so the noise is taken from what they did not fit:
     the prediction errors at held-out postures (which also hold play and drift), each
     made smaller by the share its own prediction variance has in it, pooled with the
     residuals of the chosen where there are more than four. Without held-out postures
     only the scatter of single readings is known, which is too optimistic; ``basis``
-    says which it was. The noise of the zero reference shifts all postures alike and
+    says which it was. The noise of the zero reference shifts all postures equally and
     leaves no trace in them, so it is added to the bias from the zero's own scatter.
 
     Returns:
@@ -97,7 +96,7 @@ def uncertainty(
         dof += len(u)
         basis.append("held-out predictions")
     if dof:
-        # The three axes are measured alike; pooling them triples the freedom.
+        # One sensor measures the three axes; pooling triples the degrees of freedom.
         variance = np.full(3, squares.sum() / (3 * dof))
         law = stats.t(3 * dof)
     else:

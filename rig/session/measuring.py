@@ -80,32 +80,25 @@ class Observer:
                 drives. ImuError, BusError, StopRequested: stop everything.
         """
         settle = self.config.settle
-        begun = time.monotonic()
-        deadline = begun + settle.timeout_s
-        self._phase("settling")
-        since = begun
-        reason = "no reading"
-        while True:
-            statuses, since, reason = self._settled(since, deadline, reason)
+        deadline = time.monotonic() + settle.timeout_s
+        quiet = False
+        while not quiet:  # also again where the readings themselves were not
+            self._phase("settling")
+            statuses = self._settled(deadline)
             self._phase("measuring")
-            readings = self._collect(samples or settle.samples)
-            if readings is None:
-                since, reason = time.monotonic(), "the stream paused while measuring"
-                self._phase("settling")
+            collected = self._collect(samples or settle.samples)
+            if collected is None:  # the stream paused
                 continue
+            readings = collected
             frame = self._frame_for(readings)
             raw = frame.angles(np.array([r.matrix for r in readings]))
             std = raw.std(axis=0, ddof=1) if len(raw) > 1 else np.zeros(3)
-            if (std > settle.std_deg).any():
-                since, reason = time.monotonic(), _unquiet("deviation", std, "deg")
-                self._phase("settling")
-                continue
-            break
+            quiet = bool((std <= settle.std_deg).all())
         attitude = mean_rotation([r.matrix for r in readings])
-        feedback = tuple(status.position for status in statuses)
+        pitch, yaw, roll = (status.position for status in statuses)
         result = Measurement(
             pulses=target,
-            feedback=(feedback[0], feedback[1], feedback[2]),
+            feedback=(pitch, yaw, roll),
             attitude=attitude,
             angles=frame.angles(attitude),
             std=std,
@@ -124,16 +117,16 @@ class Observer:
             config.letters,
         )  # fmt: skip
 
-    def _settled(
-        self, since: float, deadline: float, reason: str
-    ) -> tuple[list[Status], float, str]:
+    def _settled(self, deadline: float) -> list[Status]:
+        """Poll until drives and IMU are quiet; what the drives say then."""
         settle, poll = self.config.settle, self.config.motion.poll_s
+        since = time.monotonic()
         while True:
             self._guard()
             statuses = self._statuses()
             now = time.monotonic()
             if any(status.moving for status in statuses):
-                since, reason = now, "a drive is moving"
+                since = now
             self.imu.check_fault()
             readings = self._window(since, now)
             span = readings[-1].time - readings[0].time if readings else 0.0
@@ -142,13 +135,13 @@ class Observer:
             elif now - readings[-1].time > self.config.imu.stale_s:
                 reason = "the phone's readings are stale"
             else:
-                quiet, reason = self._quiet(readings)
-                if quiet:
-                    return statuses, since, reason
+                reason = self._unquiet(readings)
+                if not reason:
+                    return statuses
             if now > deadline:
                 raise MotionFault(
-                    f"the device did not settle in settle.timeout_s = "
-                    f"{settle.timeout_s:g} s: {reason}"
+                    f"the device did not settle in {settle.timeout_s:g} s: {reason}. "
+                    "Look for vibration, a loose phone, or [settle] limits too narrow"
                 )
             time.sleep(poll)
 
@@ -159,19 +152,23 @@ class Observer:
         recent = sum(reading.time >= now - settle.window_s for reading in readings)
         return readings[-max(recent, settle.min_samples) :]
 
-    def _quiet(self, readings: list[Reading]) -> tuple[bool, str]:
+    def _unquiet(self, readings: list[Reading]) -> str:
+        """What of a window's readings is over its limit; empty where nothing is."""
         settle = self.config.settle
         frame = self._frame_for(readings)
         angles = frame.angles(np.array([reading.matrix for reading in readings]))
         times = np.array([reading.time for reading in readings])
-        std = angles.std(axis=0, ddof=1)
-        if (std > settle.std_deg).any():
-            return False, _unquiet("deviation", std, "deg")
         times = times - times.mean()
         slope = np.abs(times @ (angles - angles.mean(axis=0)) / (times @ times))
-        if (slope > settle.slope_deg_s).any():
-            return False, _unquiet("slope", slope, "deg/s")
-        return True, ""
+        for what, found, limit, unit in (
+            ("deviation", angles.std(axis=0, ddof=1), settle.std_deg, "deg"),
+            ("slope", slope, settle.slope_deg_s, "deg/s"),
+        ):
+            worst = int(np.argmax(found))
+            if found[worst] > limit:
+                axis, value = AXIS_NAMES[worst], found[worst]
+                return f"{what} of {axis} is {value:.3f} {unit} (limit {limit:g})"
+        return ""
 
     def _collect(self, wanted: int) -> list[Reading] | None:
         """Fresh readings as wanted, or None where the stream paused or time is up."""
@@ -239,8 +236,3 @@ class Observer:
                 else:
                     self._unproven[index] = []
         self._seen = (commanded, measurement.angles)
-
-
-def _unquiet(what: str, values: Array, unit: str) -> str:
-    worst = int(np.argmax(values))
-    return f"{what} of {AXIS_NAMES[worst]} is {values[worst]:.3f} {unit}"

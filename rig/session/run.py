@@ -84,7 +84,7 @@ class Run(RunFolder):
     # Phases
 
     def phase(self, name: str) -> None:
-        """Tell everybody which phase begins."""
+        """Journal which phase begins, and tell the listeners."""
         if name != self._phase_name:
             self._phase_name = name
             self.journal.write("phase", phase=name)
@@ -276,6 +276,6 @@ class Run(RunFolder):
         self.signals.armed = False
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Close devices and journal."""
         self.disarm()
         self.journal.close()

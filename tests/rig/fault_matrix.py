@@ -120,7 +120,7 @@ def check_invariants(folder: pathlib.Path, sim: Simulator, alive: bool, deaf: bo
         ran = [target for _, target in drive.executions]
         rest = iter(asked)
         missing = [target for target in ran if target not in rest]
-        assert not missing, f"{axis} ran moves twice or unasked: {missing}"
+        assert not missing, f"{axis} ran moves twice or without a command: {missing}"
     if not alive:
         return
     if deaf:  # the drives cannot say that they were told: the journal does

@@ -167,7 +167,7 @@ def test_resume_checks_the_reference_posture_first(tmp_path):
         assert sum(map(len, sim.executions())) > ran
 
 
-def test_a_posture_out_of_reach_is_masked_and_the_rest_chosen_anew(tmp_path):
+def test_a_posture_out_of_reach_is_masked_and_the_rest_selected_again(tmp_path):
     text = fast_text(session=SESSION + "max_unreachable = 40\nseed = 3\n")
     config, said = parse_config(text), []
     with simulator(config, travel_deg=(-20, 14)) as sim:
@@ -234,7 +234,7 @@ def test_a_terminal_that_goes_away_stops_the_run_and_not_the_stop(tmp_path):
         assert session(served, folder, sim) == 0
 
 
-def test_held_out_targets_are_drawn_anew_when_a_chosen_posture_is_void(tmp_path):
+def test_held_out_targets_are_drawn_again_when_a_chosen_posture_is_void(tmp_path):
     """A slip found during verification: the first calibration was wrong."""
     config = fast_config()
     with simulator(config) as sim:

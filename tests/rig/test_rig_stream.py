@@ -77,7 +77,7 @@ def test_a_malformed_line_is_dropped_and_counted(line):
     assert sum(parser.counts.values()) == 1
 
 
-def test_zeros_are_believed_once_they_last_or_follow_a_reading():
+def test_zeros_are_accepted_once_they_last_or_follow_a_reading():
     parser = Parser(PLAIN)
     assert parser.lines([b"0,0,0"], 10.0) == []
     assert parser.lines([b"0.0,0,-0"], 10.9) == []
