@@ -133,7 +133,8 @@ def _main(folder: str, config_path: str, fault: str, phase: str) -> int:
             _spoil(fault, pathlib.Path(folder) / "journal.jsonl")
 
     said: list[str] = []
-    code = session(config, pathlib.Path(folder), None, said, [listen])
+    whole = fault == "full_disk"  # the figures are what no longer fits on the disk
+    code = session(config, pathlib.Path(folder), None, said, [listen], figures=whole)
     print("\n".join(said[-6:]))
     return code
 

@@ -403,7 +403,8 @@ def test_travel_order_takes_the_least_time(rng):
 
 def test_calibrate_simulate_needs_no_configuration(tmp_path, capsys):
     """The shipped settings and the shipped policy."""
-    assert main(["calibrate", "--simulate", "--out", str(tmp_path)]) == 0
+    quick = ["--speedup", "5", "--rate", "250"]
+    assert main(["calibrate", "--simulate", *quick, "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert "95 % confidence" in said and "after compensation" in said
     plan, _, moved = said.partition("armed:")
