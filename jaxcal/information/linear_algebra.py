@@ -8,32 +8,58 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["add_outer", "draw", "factor", "gram_of"]
+__all__ = ["add_block", "add_cross", "add_products", "draw", "factor", "gram_of"]
 
 
 @njit(cache=True, nogil=True)
-def gram_of(rows, counts, gram):
-    """``gram = sum of counts_i x_i x_i.T`` of rows (M, p)."""
-    num_rows, p = rows.shape
+def gram_of(blocks, counts, prior, gram):
+    """``gram = prior + sum of counts_i B_i.T B_i`` of blocks (M, q, p)."""
+    num_blocks, q, p = blocks.shape
     gram[:] = 0.0
-    for i in range(num_rows):
+    for i in range(num_blocks):
         if counts[i] != 0:
-            for a in range(p):
-                scaled = counts[i] * rows[i, a]
-                for b in range(a + 1):
-                    gram[a, b] += scaled * rows[i, b]
+            for r in range(q):
+                for a in range(p):
+                    scaled = counts[i] * blocks[i, r, a]
+                    for b in range(a + 1):
+                        gram[a, b] += scaled * blocks[i, r, b]
     for a in range(p):
-        for b in range(a):
+        for b in range(a + 1):
+            gram[a, b] += prior[a, b]
             gram[b, a] = gram[a, b]
 
 
 @njit(cache=True, nogil=True)
-def add_outer(gram, x, weight):
-    """``gram += weight x x.T``."""
-    p = len(x)
+def add_block(gram, block, weight):
+    """``gram += weight B.T B`` of a block (q, p)."""
+    q, p = block.shape
+    for r in range(q):
+        for a in range(p):
+            for b in range(p):
+                gram[a, b] += weight * block[r, a] * block[r, b]
+
+
+@njit(cache=True, nogil=True)
+def add_products(columns, r, s, inverse, out):
+    """``out_j += B_j[r] inverse B_j[s]`` for columns (q, p, M), inverse symmetric."""
+    p, num_blocks = columns.shape[1:]
     for a in range(p):
+        for b in range(a + 1 if r == s else p):
+            w = inverse[a, b] if a == b or r != s else 2.0 * inverse[a, b]
+            for j in range(num_blocks):
+                out[j] += w * columns[r, a, j] * columns[s, b, j]
+
+
+@njit(cache=True, nogil=True)
+def add_cross(columns, s, inverse, x, out):
+    """``out_j += x inverse B_j[s]`` for x (p,)."""
+    p, num_blocks = columns.shape[1:]
+    for a in range(p):
+        total = 0.0
         for b in range(p):
-            gram[a, b] += weight * x[a] * x[b]
+            total += inverse[a, b] * x[b]
+        for j in range(num_blocks):
+            out[j] += total * columns[s, a, j]
 
 
 @njit(cache=True, nogil=True)
