@@ -207,5 +207,7 @@ def whiten(
     with np.errstate(divide="ignore"):
         log_scale = 2.0 * np.log(pivots * scale[:, 0]).sum(axis=1)
     white = orthonormal[:, : count * q].reshape(num_sets, count, q, p)
+    if not usable.all():  # zero but for rounding
+        white = white * usable[..., None, None]
     of_prior = orthonormal[:, count * q :]
     return white, np.matrix_transpose(of_prior) @ of_prior, log_scale, at

@@ -55,7 +55,8 @@ def directions_in_words(text: str, null: list[Array], names: tuple[str, ...]) ->
 def direction_in_words(vector: Array, names: tuple[str, ...]) -> str:
     """A direction in the named axes, largest component positive, unit length."""
     vector = vector / np.linalg.norm(vector)
-    vector = vector * np.sign(vector[np.abs(vector).argmax()])
+    size = np.abs(vector)
+    vector = vector * np.sign(vector[(size > (1.0 - 1e-9) * size.max()).argmax()])
     vector = np.where(np.abs(vector) < 1e-9, 0.0, vector)
     present = np.flatnonzero(vector)
     if present.size == 1:

@@ -8,7 +8,16 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["add_block", "add_cross", "add_products", "draw", "factor", "gram_of"]
+__all__ = [
+    "add_block",
+    "block_cross",
+    "block_products",
+    "draw",
+    "factor",
+    "gram_of",
+    "row_cross",
+    "row_products",
+]
 
 
 @njit(cache=True, nogil=True)
@@ -30,36 +39,57 @@ def gram_of(blocks, counts, prior, gram):
 
 
 @njit(cache=True, nogil=True)
-def add_block(gram, block, weight):
-    """``gram += weight B.T B`` of a block (q, p)."""
-    q, p = block.shape
+def add_block(gram, blocks, i, weight):
+    """``gram += weight B_i.T B_i`` of blocks (M, q, p)."""
+    _, q, p = blocks.shape
     for r in range(q):
         for a in range(p):
+            scaled = weight * blocks[i, r, a]
             for b in range(p):
-                gram[a, b] += weight * block[r, a] * block[r, b]
+                gram[a, b] += scaled * blocks[i, r, b]
 
 
 @njit(cache=True, nogil=True)
-def add_products(columns, r, s, inverse, out):
-    """``out_j += B_j[r] inverse B_j[s]`` for columns (q, p, M), inverse symmetric."""
-    p, num_blocks = columns.shape[1:]
+def row_products(x, y, inverse, same, out):
+    """``out_j = x[:, j] inverse y[:, j]``, (M,), of x and y (p, M); ``same``: y is x."""
+    p, num_blocks = x.shape
+    for j in range(num_blocks):
+        out[j] = 0.0
     for a in range(p):
-        for b in range(a + 1 if r == s else p):
-            w = inverse[a, b] if a == b or r != s else 2.0 * inverse[a, b]
+        for b in range(a + 1 if same else p):
+            w = inverse[a, b] if a == b or not same else 2.0 * inverse[a, b]
             for j in range(num_blocks):
-                out[j] += w * columns[r, a, j] * columns[s, b, j]
+                out[j] += w * x[a, j] * y[b, j]
 
 
 @njit(cache=True, nogil=True)
-def add_cross(columns, s, inverse, x, out):
-    """``out_j += x inverse B_j[s]`` for x (p,)."""
-    p, num_blocks = columns.shape[1:]
+def row_cross(x, inverse, y, i, out):
+    """``out_j = x[:, j] inverse y[i]``, (M,), of x (p, M) and y (N, p)."""
+    p, num_blocks = x.shape
+    for j in range(num_blocks):
+        out[j] = 0.0
     for a in range(p):
         total = 0.0
         for b in range(p):
-            total += inverse[a, b] * x[b]
+            total += inverse[a, b] * y[i, b]
         for j in range(num_blocks):
-            out[j] += total * columns[s, a, j]
+            out[j] += total * x[a, j]
+
+
+@njit(cache=True, nogil=True)
+def block_products(columns, inverse, out):
+    """Lower triangles of ``B_j inverse B_j.T``, (q, q, M), of columns (q, p, M)."""
+    for r in range(len(columns)):
+        for s in range(r + 1):
+            row_products(columns[r], columns[s], inverse, r == s, out[r, s])
+
+
+@njit(cache=True, nogil=True)
+def block_cross(columns, inverse, block, out):
+    """``block inverse B_j.T``, (q, q, M), of columns (q, p, M)."""
+    for r in range(len(columns)):
+        for s in range(len(columns)):
+            row_cross(columns[s], inverse, block, r, out[r, s])
 
 
 @njit(cache=True, nogil=True)

@@ -53,7 +53,7 @@ def relaxed_bound(
     value, most, _ = relax(
         blocks, _columns(blocks), prior, lower, upper, start.astype(np.float64),
         int(start.sum()), factor(gram, inverse), _BOUND_SHARE, gram, inverse,
-        np.empty((4, len(blocks))),
+        np.empty((3, len(blocks))),
     )  # fmt: skip
     return float(value + p * np.log(most / p))
 
@@ -97,7 +97,7 @@ def branch_and_bound(
         )
     root, branch = kernel.process(
         blocks, _columns(blocks), prior, low, high, weights, k, TOLERANCE,
-        best_counts, best_values, gram, inverse, np.empty((4, num_blocks)),
+        best_counts, best_values, gram, inverse, np.empty((3, num_blocks)),
     )  # fmt: skip
     nodes, proven, bound = 1, True, float(best_values[0])
     if branch >= 0:

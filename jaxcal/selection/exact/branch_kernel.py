@@ -23,10 +23,12 @@ from numba import njit
 
 from jaxcal.information.linear_algebra import (
     add_block,
-    add_cross,
-    add_products,
+    block_cross,
+    block_products,
     factor,
     gram_of,
+    row_cross,
+    row_products,
 )
 
 __all__ = ["offer", "offer_swaps", "process", "relax", "search"]
@@ -82,40 +84,40 @@ def offer_swaps(blocks, prior, low, high, counts, best_counts, best_values):
 
 
 @njit(cache=True, nogil=True)
-def _leverages(columns, inverse, leverage, curvature, dot):
-    """Fill leverage (M,), trace(B_j V B_j.T), and for q > 1 curvature, its squares.
+def _leverages(columns, inverse, products, leverage, curvature):
+    """Fill leverage (M,), trace(B_j V B_j.T), and for q > 1 its curvature (M,).
 
-    ``curvature_j`` is the squared Frobenius norm of B_j V B_j.T; dot (M,) is work space.
+    ``curvature_j`` is the squared Frobenius norm of B_j V B_j.T; ``products`` is work
+    space (q, q, M).
     """
     q = len(columns)
-    leverage[:] = 0.0
     if q == 1:
-        add_products(columns, 0, 0, inverse, leverage)
+        row_products(columns[0], columns[0], inverse, True, leverage)
         return
+    block_products(columns, inverse, products)
+    leverage[:] = 0.0
     curvature[:] = 0.0
     for r in range(q):
-        for s in range(r + 1):
-            dot[:] = 0.0
-            add_products(columns, r, s, inverse, dot)
-            for j in range(len(dot)):
-                if r == s:
-                    leverage[j] += dot[j]
-                    curvature[j] += dot[j] * dot[j]
-                else:
-                    curvature[j] += 2.0 * dot[j] * dot[j]
+        leverage += products[r, r]
+        curvature += products[r, r] ** 2
+        for s in range(r):
+            curvature += 2.0 * products[r, s] ** 2
 
 
 @njit(cache=True, nogil=True)
-def _cross_squares(columns, inverse, block, out, dot):
-    """out_j = squared Frobenius norm of ``block inverse B_j.T``; dot (M,) work space."""
+def _cross_squares(columns, inverse, block, products, out):
+    """out_j = squared Frobenius norm of ``block inverse B_j.T``; products as above."""
     q = len(columns)
+    if q == 1:
+        row_cross(columns[0], inverse, block, 0, out)
+        for j in range(len(out)):
+            out[j] *= out[j]
+        return
+    block_cross(columns, inverse, block, products)
     out[:] = 0.0
     for r in range(q):
         for s in range(q):
-            dot[:] = 0.0
-            add_cross(columns, s, inverse, block[r], dot)
-            for j in range(len(dot)):
-                out[j] += dot[j] * dot[j]
+            out += products[r, s] ** 2
 
 
 @njit(cache=True, nogil=True)
@@ -190,7 +192,7 @@ def relax(
         goal: a bound at or below it ends the climb.
         share: so does a bound this share of its distance to the goal from solved.
         gram, inverse: (p, p) work space.
-        work: (4, M); the first row holds the leverages afterwards.
+        work: (3, M); the first row holds the leverages afterwards.
 
     Returns:
         log det of the matrix the bound is taken at, the linear maximum a, and the
@@ -198,7 +200,8 @@ def relax(
         where every selection of the node is singular.
     """
     num_blocks, q, p = blocks.shape
-    leverage, curvature, cross, dot = work[0], work[1], work[2], work[3]
+    leverage, curvature, cross = work[0], work[1], work[2]
+    products = np.empty((q, q, num_blocks))
     gram_of(blocks, c, prior, gram)
     value = factor(gram, inverse)
     if not value > -np.inf:
@@ -207,7 +210,7 @@ def relax(
         value = factor(gram, inverse)
         if not value > -np.inf:
             return value, 0.0, 0.0
-    _leverages(columns, inverse, leverage, curvature, dot)
+    _leverages(columns, inverse, products, leverage, curvature)
     most, cut = 0.0, 0.0
     for step_number in range(_MAX_STEPS):
         up, down = -1, -1
@@ -223,7 +226,7 @@ def relax(
             gap = p * np.log(most / p)
             if solved or gap <= max(goal - value, 1e-11, share * (value - goal)):
                 break
-        _cross_squares(columns, inverse, blocks[up], cross, dot)
+        _cross_squares(columns, inverse, blocks[up], products, cross)
         best, best_gain, best_step = -1, 0.0, 0.0
         rise = high[up] - c[up]
         for j in range(num_blocks):
@@ -249,8 +252,8 @@ def relax(
         fall = c[best] - low[best]
         before, moved = value, 0.0
         while True:
-            add_block(gram, blocks[up], best_step - moved)
-            add_block(gram, blocks[best], moved - best_step)
+            add_block(gram, blocks, up, best_step - moved)
+            add_block(gram, blocks, best, moved - best_step)
             moved = best_step
             value = factor(gram, inverse)
             if q == 1 or value >= before or best_step < 1e-12:
@@ -258,7 +261,7 @@ def relax(
             best_step *= 0.5
         c[up] = float(high[up]) if best_step == rise else c[up] + best_step
         c[best] = float(low[best]) if best_step == fall else c[best] - best_step
-        _leverages(columns, inverse, leverage, curvature, dot)
+        _leverages(columns, inverse, products, leverage, curvature)
     return value, most, cut
 
 
@@ -285,7 +288,7 @@ def process(
         k: selections in all.
         slack: a bound this far above the incumbent still closes the node.
         best_counts, best_values: (best, M) and (best,) incumbents, changed in place.
-        gram, inverse, work: (p, p), (p, p), (4, M) work space.
+        gram, inverse, work: (p, p), (p, p), (3, M) work space.
 
     Returns:
         The node's upper bound (-inf when closed) and the candidate to branch on.
@@ -375,7 +378,7 @@ def search(
     room = len(bounds)
     gram = np.empty((p, p))
     inverse = np.empty((p, p))
-    work = np.empty((4, num_blocks))
+    work = np.empty((3, num_blocks))
     low = np.empty(num_blocks, dtype=np.int64)
     high = np.empty(num_blocks, dtype=np.int64)
     c = np.empty(num_blocks)

@@ -14,10 +14,12 @@ from numba import njit
 
 from jaxcal.information.linear_algebra import (
     add_block,
-    add_cross,
-    add_products,
+    block_cross,
+    block_products,
     draw,
     factor,
+    row_cross,
+    row_products,
 )
 
 __all__ = ["climb", "exchange_starts"]
@@ -56,13 +58,13 @@ def _random_start(
     rank = len(span)
     basis[:rank] = span
     for r in range(size):
-        rank = _extend(blocks[chosen[r]], basis, rank, 1e-18)
+        rank = _extend(blocks, chosen[r], basis, rank, 1e-18)
     for position in range(num_blocks):
         if rank == p or size == k:
             break
         i = order[position]
         if counts[i] < upper[i]:
-            grown = _extend(blocks[i], basis, rank, 1e-6 / num_blocks)
+            grown = _extend(blocks, i, basis, rank, 1e-6 / num_blocks)
             if grown - rank >= min(full, p - rank):
                 rank = grown
                 chosen[size] = i
@@ -72,13 +74,13 @@ def _random_start(
         farthest, most = -1, 0.0
         for i in range(num_blocks):
             if counts[i] < upper[i]:
-                outside = _outside(blocks[i], basis, rank)
+                outside = _outside(blocks, i, basis, rank)
                 if outside > most:
                     most = outside
                     farthest = i
         if farthest < 0:
             break
-        rank = _extend(blocks[farthest], basis, rank, 1e-15 * most)
+        rank = _extend(blocks, farthest, basis, rank, 1e-15 * most)
         chosen[size] = farthest
         counts[farthest] += 1
         size += 1
@@ -91,30 +93,30 @@ def _random_start(
 
 
 @njit(cache=True, nogil=True)
-def _outside(block, basis, rank):
-    """Squared length of the rows of a block outside the first ``rank`` basis rows."""
+def _outside(blocks, i, basis, rank):
+    """Squared length of the rows of block i outside the first ``rank`` basis rows."""
+    _, q, p = blocks.shape
     square = 0.0
-    for s in range(len(block)):
-        x = block[s]
-        for a in range(len(x)):
-            square += x[a] * x[a]
+    for s in range(q):
+        for a in range(p):
+            square += blocks[i, s, a] * blocks[i, s, a]
         for r in range(rank):
             dot = 0.0
-            for a in range(len(x)):
-                dot += basis[r, a] * x[a]
+            for a in range(p):
+                dot += basis[r, a] * blocks[i, s, a]
             square -= dot * dot
     return square
 
 
 @njit(cache=True, nogil=True)
-def _extend(block, basis, rank, least):
-    """Add to the basis the rows of which more than ``least`` is new; the new rank."""
-    q, p = block.shape
+def _extend(blocks, i, basis, rank, least):
+    """Add to the basis the rows of block i of which over ``least`` is new; the rank."""
+    _, q, p = blocks.shape
     for s in range(q):
         if rank == p:
             break
         for a in range(p):
-            basis[rank, a] = block[s, a]
+            basis[rank, a] = blocks[i, s, a]
         for _ in range(2):  # twice is enough for orthogonality to rounding
             for r in range(rank):
                 dot = 0.0
@@ -133,21 +135,33 @@ def _extend(block, basis, rank, least):
 
 
 @njit(cache=True, nogil=True)
-def _ratios(grown, cross, keep, work, ratio):
-    """Factor by which det grows when the block i of ``keep`` is swapped for each j.
+def _best_row(leverage, inner, out, counts, upper):
+    """The j, or -1, that raises det most when swapped for ``out``; see _best_block."""
+    best_ratio = _IMPROVES
+    best = -1
+    keep = 1.0 - leverage[out]
+    for j in range(len(leverage)):
+        ratio = (1.0 + leverage[j]) * keep + inner[j] * inner[j]
+        if ratio > best_ratio and counts[j] < upper[j]:
+            best_ratio = ratio
+            best = j
+    return best
+
+
+@njit(cache=True, nogil=True)
+def _best_block(grown, cross, out, counts, upper, work):
+    """The j, or -1, that raises det most when swapped for block ``out``.
 
     Args:
         grown: (q, q, M) lower triangles of D_jj.
-        cross: (q, q, M) D_ij.
-        keep: (q, q) ``I - D_ii``.
+        cross: (q, q, M) D_ij, i the block that goes out.
+        out: i.
+        counts, upper: (M,) how often each is and may be chosen.
         work: (3, q, q) work space.
-        ratio: (M,) filled.
     """
     q, _, num_blocks = grown.shape
-    if q == 1:
-        for j in range(num_blocks):
-            ratio[j] = (1.0 + grown[0, 0, j]) * keep[0, 0] + cross[0, 0, j] ** 2
-        return
+    best_ratio = _IMPROVES
+    best = -1
     lower, solved, left = work[0], work[1], work[2]
     for j in range(num_blocks):
         det = 1.0
@@ -169,7 +183,7 @@ def _ratios(grown, cross, keep, work, ratio):
                 solved[a, s] = total / lower[a, a]
         for a in range(q):  # left becomes the factor of what the swap leaves
             for b in range(a + 1):
-                total = keep[a, b]
+                total = (1.0 if a == b else 0.0) - grown[a, b, out]
                 for c in range(q):
                     total += solved[c, a] * solved[c, b]
                 for c in range(b):
@@ -179,7 +193,10 @@ def _ratios(grown, cross, keep, work, ratio):
                     left[a, a] = np.sqrt(max(total, 1e-300))
                 else:
                     left[a, b] = total / left[b, b]
-        ratio[j] = det
+        if det > best_ratio and counts[j] < upper[j]:
+            best_ratio = det
+            best = j
+    return best
 
 
 @njit(cache=True, nogil=True)
@@ -201,43 +218,37 @@ def climb(blocks, columns, upper, num_fixed, chosen, counts, prior, gram, invers
     k = len(chosen)
     gram[:] = prior
     for r in range(k):
-        add_block(gram, blocks[chosen[r]], 1.0)
+        add_block(gram, blocks, chosen[r], 1.0)
     log_det = factor(gram, inverse)
     if not log_det > -np.inf:
         return log_det
     grown = np.empty((q, q, num_blocks))
     cross = np.empty((q, q, num_blocks))
-    ratio = np.empty(num_blocks)
-    keep = np.empty((q, q))
     work = np.empty((3, q, q))
+    # Views made once: one reading per candidate is the case that has to be fast.
+    rows, first = blocks[:, 0], columns[0]
+    leverage, inner = grown[0, 0], cross[0, 0]
     stale = True
     since = 0
     position = num_fixed
     while since < k - num_fixed:
         if stale:
-            grown[:] = 0.0
-            for a in range(q):
-                for b in range(a + 1):
-                    add_products(columns, a, b, inverse, grown[a, b])
+            if q == 1:
+                row_products(first, first, inverse, True, leverage)
+            else:
+                block_products(columns, inverse, grown)
             stale = False
         out = chosen[position]
-        cross[:] = 0.0
-        for a in range(q):
-            for b in range(q):
-                add_cross(columns, b, inverse, blocks[out, a], cross[a, b])
-            for b in range(a + 1):
-                keep[a, b] = (1.0 if a == b else 0.0) - grown[a, b, out]
-        _ratios(grown, cross, keep, work, ratio)
-        best_ratio = _IMPROVES
-        best = -1
-        for j in range(num_blocks):
-            if ratio[j] > best_ratio and counts[j] < upper[j]:
-                best_ratio = ratio[j]
-                best = j
+        if q == 1:
+            row_cross(first, inverse, rows, out, inner)
+            best = _best_row(leverage, inner, out, counts, upper)
+        else:
+            block_cross(columns, inverse, blocks[out], cross)
+            best = _best_block(grown, cross, out, counts, upper, work)
         since += 1
         if best >= 0:
-            add_block(gram, blocks[out], -1.0)
-            add_block(gram, blocks[best], 1.0)
+            add_block(gram, blocks, out, -1.0)
+            add_block(gram, blocks, best, 1.0)
             after = factor(gram, inverse)
             if after > log_det:
                 counts[out] -= 1
@@ -246,8 +257,8 @@ def climb(blocks, columns, upper, num_fixed, chosen, counts, prior, gram, invers
                 log_det = after
                 since = 0
             else:  # rounding promised more than there is
-                add_block(gram, blocks[best], -1.0)
-                add_block(gram, blocks[out], 1.0)
+                add_block(gram, blocks, best, -1.0)
+                add_block(gram, blocks, out, 1.0)
                 factor(gram, inverse)
             stale = True
         position += 1
