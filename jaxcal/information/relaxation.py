@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["relaxed_bound"]
+__all__ = ["linear_maximum", "relaxed_bound"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -52,7 +52,7 @@ def relaxed_bound(
         i = int(rising.argmax())
         falling = np.where(can_fall, leverage, np.inf)
         if iteration % 8 == 0 or not can_rise.any() or not can_fall.any():
-            most = _linear_maximum(leverage, lower, upper, k)
+            most = linear_maximum(leverage, lower, upper, k)
             best = min(best, value + p * float(np.log(most / p)))
             if best - value <= tolerance or falling.min() >= rising[i]:
                 break
@@ -68,12 +68,12 @@ def relaxed_bound(
         c[j] -= step[j]
     gram = (rows * c[:, None]).T @ rows
     leverage = np.einsum("mp,mp->m", rows @ np.linalg.inv(gram), rows)
-    most = _linear_maximum(leverage, lower, upper, k)
+    most = linear_maximum(leverage, lower, upper, k)
     value = float(np.linalg.slogdet(gram)[1])
     return min(best, value + p * float(np.log(most / p)))
 
 
-def _linear_maximum(gain: Array, lower: Indices, upper: Indices, k: int) -> float:
+def linear_maximum(gain: Array, lower: Indices, upper: Indices, k: int) -> float:
     """Largest ``sum of c_i gain_i`` with counts within bounds and sum k."""
     order = np.argsort(-gain)
     room = (upper - lower)[order]

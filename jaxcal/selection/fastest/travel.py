@@ -1,4 +1,4 @@
-"""How long moves take, and the order of least time through some postures.
+"""How long moves take.
 
 A move is a trapezoid profile on every axis (accelerate, cruise, brake), all axes start
 together and the slowest sets the time. Each axis' time is a concave function of its
@@ -8,26 +8,15 @@ distance that is zero at zero, so the travel time is a metric. Loads numpy alone
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers
 
-__all__ = [
-    "MOST_EXACT",
-    "Motion",
-    "fastest_tour",
-    "improved_tour",
-    "tour_seconds",
-    "travel_times",
-]
+__all__ = ["Motion", "travel_times"]
 
 Array = NDArray[np.float64]
-Indices = NDArray[np.int64]
-
-MOST_EXACT = 12  # postures whose order Held and Karp find in a moment
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,86 +72,3 @@ def travel_times(points: ArrayLike, others: ArrayLike, motion: Motion) -> Array:
     cruise = way >= speed**2 / ramp
     seconds = np.where(cruise, way / speed + speed / ramp, 2.0 * np.sqrt(way / ramp))
     return seconds.max(axis=2)
-
-
-def fastest_tour(times: ArrayLike, start: ArrayLike | None = None) -> tuple[Any, float]:
-    """The order of least time through all postures, ending anywhere.
-
-    Exact up to 12 postures (Held and Karp 1962); beyond that 2-opt and moving single
-    postures from each nearest-neighbour tour, which proves nothing.
-
-    Args:
-        times: (K, K) symmetric travel times.
-        start: (K,) times from where the device stands; it begins anywhere when None.
-
-    Returns:
-        (K,) order, and the seconds of travel.
-    """
-    t = numbers("times", times)
-    k = len(t)
-    if t.shape != (k, k) or not k:
-        raise ValueError(f"times must have shape (K, K), got {t.shape}")
-    begin = np.zeros(k) if start is None else numbers("start", start)
-    if begin.shape != (k,):
-        raise ValueError(f"start must have shape ({k},), got {begin.shape}")
-    if k <= MOST_EXACT:
-        return _held_karp(t, begin)
-    tours = [improved_tour(_nearest(t, begin, first), t, begin) for first in range(k)]
-    seconds = [tour_seconds(order, t, begin) for order in tours]
-    best = int(np.argmin(seconds))
-    return tours[best], seconds[best]
-
-
-def tour_seconds(order: Any, times: Array, start: Array) -> float:
-    """Seconds of travel in the order given; arguments as of ``fastest_tour``."""
-    return float(start[order[0]] + times[order[:-1], order[1:]].sum())
-
-
-def _held_karp(times: Array, start: Array) -> tuple[Indices, float]:
-    """Best open tour by dynamic programming over subsets."""
-    k = len(times)
-    best = np.full((1 << k, k), np.inf)
-    before = np.full((1 << k, k), -1)
-    best[1 << np.arange(k), np.arange(k)] = start
-    for mask in range(1, 1 << k):
-        inside = [i for i in range(k) if mask >> i & 1]
-        if len(inside) < 2:
-            continue
-        for last in inside:
-            rest = mask & ~(1 << last)
-            reached = best[rest] + times[:, last]
-            before[mask, last] = reached.argmin()
-            best[mask, last] = reached.min()
-    mask, order = (1 << k) - 1, []
-    last = int(best[mask].argmin())
-    seconds = float(best[mask, last])
-    while last >= 0:
-        order.append(last)
-        mask, last = mask & ~(1 << last), int(before[mask, last])
-    return np.array(order[::-1]), seconds
-
-
-def _nearest(times: Array, start: Array, first: int) -> Indices:
-    order, left = [first], set(range(len(times))) - {first}
-    while left:
-        order.append(min(left, key=lambda j: times[order[-1], j]))
-        left.remove(order[-1])
-    return np.array(order)
-
-
-def improved_tour(order: Indices, times: Array, start: Array) -> Indices:
-    """2-opt and moves of one posture until neither shortens the tour."""
-    k = len(order)
-    length = tour_seconds(order, times, start)
-    again = True
-    while again:
-        again = False
-        for i in range(k - 1):
-            for j in range(i + 1, k):
-                flipped = np.r_[order[:i], order[i : j + 1][::-1], order[j + 1 :]]
-                moved = np.insert(np.delete(order, i), j, order[i])
-                for tried in (flipped, moved):
-                    reached = tour_seconds(tried, times, start)
-                    if reached < length - 1e-12:
-                        order, length, again = tried, reached, True
-    return order
