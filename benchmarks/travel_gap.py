@@ -20,7 +20,7 @@ from pareto import HOME, MOTION
 
 from jaxcal.selection.fastest.api import make_solver
 from jaxcal.selection.fastest.lookahead import PRICES, complete
-from jaxcal.selection.fastest.task import Task, log_det_gram, make_task
+from jaxcal.selection.fastest.task import Task, log_det_of_rows, make_task
 
 SHARES = (0.8, 0.9, 0.95, 0.99)
 
@@ -52,7 +52,7 @@ def greedy_seconds(task: Task, finish: bool) -> list[float]:
         if finish:
             found = complete(task, runs, wanted)
         else:
-            enough = [run for run in runs if log_det_gram(task.rows[run]) >= wanted]
+            enough = [run for run in runs if log_det_of_rows(task.rows[run]) >= wanted]
             found = min(enough, key=lambda run: task.tour(run)[1], default=None)
         found = task.optimum if found is None else found
         out.append(task.tour(found)[1] + task.settle)

@@ -12,9 +12,20 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from jaxcal.plots.selection import pareto_figure
     from jaxcal.selection.fastest.api import FastSelection, select_fastest
+    from jaxcal.selection.fastest.motion import Motion, travel_times
     from jaxcal.selection.fastest.pareto import ParetoFront, pareto_front
     from jaxcal.selection.fastest.tour import fastest_tour
-    from jaxcal.selection.fastest.travel import Motion, travel_times
+
+_HOME = {
+    "FastSelection": "jaxcal.selection.fastest.api",
+    "Motion": "jaxcal.selection.fastest.motion",
+    "ParetoFront": "jaxcal.selection.fastest.pareto",
+    "fastest_tour": "jaxcal.selection.fastest.tour",
+    "pareto_figure": "jaxcal.plots.selection",
+    "pareto_front": "jaxcal.selection.fastest.pareto",
+    "select_fastest": "jaxcal.selection.fastest.api",
+    "travel_times": "jaxcal.selection.fastest.motion",
+}
 
 __all__ = [
     "FastSelection",
@@ -26,17 +37,6 @@ __all__ = [
     "select_fastest",
     "travel_times",
 ]
-
-_HOME = {
-    "FastSelection": "jaxcal.selection.fastest.api",
-    "Motion": "jaxcal.selection.fastest.travel",
-    "ParetoFront": "jaxcal.selection.fastest.pareto",
-    "fastest_tour": "jaxcal.selection.fastest.tour",
-    "pareto_figure": "jaxcal.plots.selection",
-    "pareto_front": "jaxcal.selection.fastest.pareto",
-    "select_fastest": "jaxcal.selection.fastest.api",
-    "travel_times": "jaxcal.selection.fastest.travel",
-}
 
 
 def __getattr__(name: str) -> Any:

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import numbers
 from jaxcal.information.criteria import d_efficiency
 from jaxcal.selection.auto import check_least_efficiency
+from jaxcal.selection.fastest.motion import Motion
 from jaxcal.selection.fastest.task import Found, Solver, Task, make_task
-from jaxcal.selection.fastest.travel import Motion
 from jaxcal.selection.problem import whole_number
 
 __all__ = ["METHODS", "FastSelection", "answer", "make_solver", "select_fastest"]

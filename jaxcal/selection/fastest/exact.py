@@ -25,7 +25,7 @@ from jaxcal.selection.fastest.task import (
     Found,
     Solver,
     Task,
-    log_det_gram,
+    log_det_of_rows,
 )
 from jaxcal.selection.fastest.tour_kernel import extend
 
@@ -41,7 +41,7 @@ def solver(task: Task, seed: int) -> Solver:
         start, seconds = local_search(task, wanted, np.random.default_rng(seed))
         k, rows = task.k, task.rows
         chosen = np.zeros(k, np.int64) if start is None else np.sort(start)
-        value = -np.inf if start is None else log_det_gram(rows[chosen])
+        value = -np.inf if start is None else log_det_of_rows(rows[chosen])
         best = np.array([seconds, value])
         state, stack = np.array([-1, 0]), np.zeros(k + 1, np.int64)
         tours = np.full((1 << k, k), np.inf)
@@ -116,7 +116,7 @@ def _search(
         rows: (M, p) float64 whitened regressors.
         times: (M, M) float64 seconds, a metric.
         start: (M,) float64 seconds to each from the start, zero where there is none.
-        fixed: postures that are in every subset, the first of ``rows``.
+        fixed: postures in every subset, the first of ``rows``; fewer than k.
         k: postures in all.
         relaxed: (p, p) Gram matrix of a good selection of k; any leaves the bound true.
         wanted: log det(X_s.T X_s) a subset must have.
@@ -137,19 +137,11 @@ def _search(
     gains = np.empty(k)
     depth = state[0]
     if depth < 0:
-        least = 0.0
         for depth in range(fixed):
             chosen[depth] = depth
-            least = extend(tours, times, start, chosen, depth)
+            extend(tours, times, start, chosen, depth)
         depth = fixed
         chosen[depth] = fixed - 1  # the next one tried is one further
-        if fixed == k:
-            _gram(rows, chosen, k, gram)
-            log_det = factor(gram, inverse)
-            if log_det >= wanted and least < best[0] + SAME_TIME:
-                best[0], best[1] = least, log_det
-                best_chosen[:] = chosen[:k]
-            return True
     done = 0
     while depth >= fixed:
         chosen[depth] += 1

@@ -12,12 +12,11 @@ from jaxcal.selection.fastest.task import (
     Found,
     Solver,
     Task,
-    log_det_gram,
+    log_det_of_rows,
 )
 
 __all__ = ["local_search", "solver"]
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 _STARTS = 12  # the D-optimum and local optima of the exchange
@@ -56,7 +55,7 @@ def local_search(
     ]
     best, least = None, np.inf
     for start in starts:
-        if log_det_gram(task.rows[start]) >= wanted:
+        if log_det_of_rows(task.rows[start]) >= wanted:
             chosen, seconds = _shortened(task, start, wanted)
             if seconds < least - SAME_TIME:
                 best, least = chosen, seconds
@@ -73,7 +72,7 @@ def _kicked(
         for _ in range(_KICK_TRIES if len(free) and len(others) else 0):
             tried = chosen.copy()
             tried[rng.choice(free)] = rng.choice(others)
-            if log_det_gram(task.rows[tried]) >= wanted:
+            if log_det_of_rows(task.rows[tried]) >= wanted:
                 chosen = tried
                 break
     return chosen
@@ -89,7 +88,7 @@ def _shortened(task: Task, start: Indices, wanted: float) -> tuple[Indices, floa
             for swap in refills(task, np.delete(tour, i), wanted, _TRIED + 1)
         ]
         for _, tried in sorted(swaps, key=lambda swap: swap[0])[:_TRIED]:
-            if log_det_gram(task.rows[tried]) >= wanted:
+            if log_det_of_rows(task.rows[tried]) >= wanted:
                 shorter, reached = task.tour(tried)
                 if reached < seconds - SAME_TIME:
                     tour, seconds = shorter, reached

@@ -16,7 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from jaxcal.selection.fastest.refill import refills
-from jaxcal.selection.fastest.task import Found, Solver, Task, log_det_gram
+from jaxcal.selection.fastest.task import Found, Solver, Task, log_det_of_rows
 
 __all__ = ["complete", "lookahead_runs", "most_worth", "solver"]
 
@@ -47,7 +47,7 @@ def solver(task: Task, num: int) -> Solver:
         chosen = complete(task, runs(), wanted)
         if chosen is not None:
             return Found(chosen, "lookahead")
-        if log_det_gram(task.rows[task.optimum]) >= wanted:
+        if log_det_of_rows(task.rows[task.optimum]) >= wanted:
             return Found(task.optimum, "exact")
         return None
 
@@ -61,7 +61,7 @@ def most_worth(task: Task, weight: float, num: int) -> Indices:
     runs = lookahead_runs(task, prices, num)
     subsets = np.unique(np.sort(runs, axis=1), axis=0)
     worth = [
-        log_det_gram(task.rows[chosen]) / p - weight * task.tour(chosen)[1]
+        log_det_of_rows(task.rows[chosen]) / p - weight * task.tour(chosen)[1]
         for chosen in subsets
     ]
     return subsets[int(np.argmax(worth))]
@@ -106,7 +106,7 @@ def complete(task: Task, runs: Indices, wanted: float) -> Indices | None:
     best, least = None, np.inf
     for subset in sorted(soonest, key=lambda s: soonest[s])[:_SUBSETS]:
         chosen = np.array(subset)
-        if log_det_gram(task.rows[chosen]) >= wanted:
+        if log_det_of_rows(task.rows[chosen]) >= wanted:
             seconds = task.tour(chosen)[1]
             if seconds < least:
                 best, least = chosen, seconds
@@ -122,7 +122,8 @@ def _runs(rows, times, start, prices, fixed, k, num):
         times: (M, M) float64 seconds.
         start: (M,) float64 seconds from the start.
         prices: (W,) float64 log det(Z.T Z) a second.
-        fixed: postures chosen already, the first of ``rows``, visited in that order.
+        fixed: postures chosen already, the first of ``rows``, visited in that order;
+            fewer than k.
         k: postures in all.
         num: first postures.
     """
@@ -137,13 +138,10 @@ def _runs(rows, times, start, prices, fixed, k, num):
         free[:] = True
         free[:fixed] = False
         chosen[:fixed] = np.arange(fixed)
-        if fixed < k:
-            values = _values(rows, tolls, factors, entry, free, chosen, fixed, k)
-            firsts = np.argsort(-values, kind="mergesort")
+        values = _values(rows, tolls, factors, entry, free, chosen, fixed, k)
+        firsts = np.argsort(-values, kind="mergesort")
         for turn in range(num):
-            if fixed < k:
-                first = firsts[turn] if turn < m - fixed else firsts[0]
-                chosen[fixed] = first
+            chosen[fixed] = firsts[turn] if turn < m - fixed else firsts[0]
             for count in range(fixed + 1, k):
                 free[:] = True
                 free[chosen[:count]] = False

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 
 from jaxcal.selection.auto import check_least_efficiency
 from jaxcal.selection.fastest.api import FastSelection, answer, make_solver
+from jaxcal.selection.fastest.motion import Motion
 from jaxcal.selection.fastest.task import SAME_TIME, make_task
-from jaxcal.selection.fastest.travel import Motion
 from jaxcal.selection.problem import whole_number
 
 __all__ = ["ParetoFront", "pareto_front"]

@@ -24,7 +24,7 @@ def refills(
 
     Args:
         task: the postures and the times between them.
-        kept: (k - 2,) to (k,) postures in the order visited.
+        kept: (k - 2,) or (k - 1,) postures in the order visited.
         wanted: least log det(X_s.T X_s), met to 1e-6.
         most: completions to return.
 
@@ -33,9 +33,6 @@ def refills(
     """
     rows, times, begin = task.rows, task.times, task.start
     legs = np.concatenate([begin[kept[:1]], times[kept[:-1], kept[1:]], [0.0]])
-    missing = task.k - len(kept)
-    if not missing:
-        return [(float(legs.sum()), kept)]
     others = np.setdiff1d(np.arange(len(rows)), kept)
     lower = np.linalg.cholesky(
         rows[kept].T @ rows[kept] + _RIDGE * np.eye(rows.shape[1])
@@ -45,7 +42,7 @@ def refills(
     into = np.vstack([begin[others], times[np.ix_(kept, others)]])
     onward = np.vstack([times[np.ix_(kept, others)], np.zeros(len(others))])
     seconds = (into + onward - legs[:, None]).min(axis=0)
-    if missing == 2:
+    if len(kept) == task.k - 2:
         factor = np.outer(factor, factor) - (y @ y.T) ** 2
         last = into[-1][:, None] + times[np.ix_(others, others)]
         seconds = np.minimum(np.minimum(last, last.T), seconds[:, None] + seconds)

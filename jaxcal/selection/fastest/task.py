@@ -12,10 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers
 from jaxcal.selection.exact.exact import ExactResult, solve_exact
-from jaxcal.selection.fastest.travel import Motion, travel_times
+from jaxcal.selection.fastest.motion import Motion, travel_times
 from jaxcal.selection.problem import Problem, make_problem
 
-__all__ = ["SAME_TIME", "Found", "Solver", "Task", "log_det_gram", "make_task"]
+__all__ = ["SAME_TIME", "Found", "Solver", "Task", "log_det_of_rows", "make_task"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -42,8 +42,11 @@ class Task:
 
     @property
     def fixed(self) -> int:
-        """Postures of the pool that must be chosen, the first ones."""
-        return len(self.problem.required)
+        """Postures of the pool that every search holds fixed, the first ones.
+
+        One is always left to choose: where all k are required the pool is just those.
+        """
+        return min(len(self.problem.required), self.k - 1)
 
     @functools.cached_property
     def exact(self) -> ExactResult:
@@ -98,8 +101,8 @@ class Found:
 Solver = Callable[[float], Found | None]
 
 
-def log_det_gram(rows: Array) -> float:
-    """log det(X.T X) of rows (k, p); -inf where singular."""
+def log_det_of_rows(rows: Array) -> float:
+    """log det(X.T X) of whitened rows (k, p); -inf where singular."""
     sign, value = np.linalg.slogdet(rows.T @ rows)
     return float(value) if sign > 0 else -np.inf
 
@@ -129,6 +132,8 @@ def make_task(
     free = np.setdiff1d(np.flatnonzero(problem.available), problem.required)
     leverage = (problem.rows[free] ** 2).sum(axis=1)
     pool = np.concatenate([problem.required, free[np.argsort(-leverage)]])
+    if len(problem.required) == problem.k:
+        pool = problem.required
     points = problem.candidates[pool]
     begin = np.zeros(len(pool))
     if start is not None:
