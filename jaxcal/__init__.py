@@ -20,7 +20,7 @@ if TYPE_CHECKING:
         regression_matrix,
     )
     from jaxcal.selection import Selection, score, select
-    from jaxcal.selection.fastest.fastest import Motion, pareto_front, select_fastest
+    from jaxcal.selection.fastest import Motion, pareto_front, select_fastest
     from jaxcal.selection.plan import plan
 
 __all__ = [
@@ -49,9 +49,9 @@ _HOME = {
     "Selection": "jaxcal.selection",
     "score": "jaxcal.selection",
     "select": "jaxcal.selection",
-    "Motion": "jaxcal.selection.fastest.fastest",
-    "pareto_front": "jaxcal.selection.fastest.fastest",
-    "select_fastest": "jaxcal.selection.fastest.fastest",
+    "Motion": "jaxcal.selection.fastest",
+    "pareto_front": "jaxcal.selection.fastest",
+    "select_fastest": "jaxcal.selection.fastest",
 }
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.selection.fastest.travel import MOST_EXACT, fastest_tour
+from jaxcal.selection.fastest import fastest_tour
 from rig.attitude import Array
 from rig.settings import RigConfig
 
@@ -140,7 +140,7 @@ def travel_order(points_deg: Array, start_deg: Array, speeds: Array) -> list[int
         return []
     points = np.vstack([start_deg, points_deg])
     times = (np.abs(points[:, None] - points[None, :]) / speeds).max(axis=-1)
-    if count <= MOST_EXACT:
+    if count <= 12:
         order, _ = fastest_tour(times[1:, 1:], times[0, 1:])
         return [int(i) for i in order]
     path, left = [0], set(range(1, count + 1))

@@ -38,7 +38,7 @@ __all__ = [
 
 View = dict[str, jax.Array]
 
-KINDS = ("compact", "paper", "travel")
+KINDS = ("compact", "paper")
 
 _FLOOR = -8.0  # least log-volume, relative to the best, that a feature can show
 _RIDGE = 0.01  # of the mean square of a whitened coordinate, which is one
@@ -50,7 +50,7 @@ _SHARP = 60.0  # inverse temperature of the choices that need no learning
 class NetworkConfig:
     """Which network, and its size."""
 
-    kind: str = "compact"  # or "paper" or "travel"
+    kind: str = "compact"  # or "paper"
     width: int = 32  # features a candidate (compact), hidden width (paper: 768)
     encoder_rounds: int = 3  # message rounds over the whole set, once an episode
     decoder_rounds: int = 1  # message rounds over what is left, once a decision
@@ -493,8 +493,4 @@ def decode(
 
 def build(config: NetworkConfig) -> Network:
     """The network a config names, as a flax module."""
-    if config.kind == "travel":
-        from jaxcal.learning.policies.travel_network import TravelNetwork
-
-        return TravelNetwork(config)
     return CompactNetwork(config) if config.kind == "compact" else PaperNetwork(config)

@@ -20,7 +20,7 @@ import optax
 from flax import struct
 from jax.sharding import Mesh
 
-from jaxcal.learning.environments import scenarios, travel
+from jaxcal.learning.environments import scenarios
 from jaxcal.learning.environments import selection as environment
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies import networks
@@ -242,23 +242,24 @@ def _play(
 ) -> tuple[Rollout, dict[str, jax.Array]]:
     """Draw fresh sets and play every episode of one update."""
     env = task.environment
-    rules: Any = travel if isinstance(env, travel.TravelConfig) else environment
     repeats = config.episodes_per_set
     num_sets = config.episodes_per_update // repeats
     draw = scenarios.mixture(env, task.shapes, task.masked)
     key_sets, key_actions, key_starts = jax.random.split(key, 3)
-    sets = jax.vmap(lambda key: rules.reset(key, env, draw))(
+    sets = jax.vmap(lambda key: environment.reset(key, env, draw))(
         jax.random.split(key_sets, num_sets)
     )
     sets = devices.by_set(sets, mesh)
-    view = rules.look(network, sets)
+    view = environment.look(network, sets)
     memory = networks.encode(network, params, view)
     # Every episode of a set shares its candidates, their geometry and their memory.
     states = jax.tree.map(
         lambda leaf: jnp.broadcast_to(leaf[None], (repeats, *leaf.shape)), sets
     )
     decode = jax.vmap(lambda glance: networks.decode(network, params, memory, glance))
-    advance = jax.vmap(jax.vmap(lambda state, action: rules.step(state, action, env)))
+    advance = jax.vmap(
+        jax.vmap(lambda state, action: environment.step(state, action, env))
+    )
     key_share, key_length = jax.random.split(key_starts)
     shape = (repeats, num_sets)
     begun = jax.random.uniform(key_share, shape) < task.random_starts

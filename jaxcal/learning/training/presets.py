@@ -9,7 +9,6 @@ from typing import Any
 
 from jaxcal.learning.environments.scenarios import SHAPES
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.environments.travel import TravelConfig
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training.ppo import PPOConfig, Task
 from jaxcal.learning.training.run import TrainConfig
@@ -95,27 +94,7 @@ _PAPER = TrainConfig(
 )
 
 
-def _travel_task(num_selected: int = 4, num_candidates: int = 50, **task: Any) -> Task:
-    return Task(TravelConfig(num_candidates, num_selected), **task)
-
-
-# What ships for ``select_fastest(method="policy")``: every set has its own weight of
-# time, speeds, accelerations and start.
-_TRAVEL = TrainConfig(
-    preset="travel",
-    network=NetworkConfig(kind="travel", initial_trust=0.25),
-    ppo=PPOConfig(num_episodes=100_000),
-    tasks=(
-        _travel_task(),
-        _travel_task(5, shapes=("uniform", *SHAPES)),
-        _travel_task(),
-        _travel_task(6, masked=0.3, random_starts=0.2),
-        _travel_task(shapes=SHAPES, masked=0.4, random_starts=0.2),
-        _travel_task(4, 20, shapes=("uniform", *SHAPES)),
-    ),
-)
-
-PRESETS = {config.preset: config for config in (_COMPACT, _GENERAL, _PAPER, _TRAVEL)}
+PRESETS = {config.preset: config for config in (_COMPACT, _GENERAL, _PAPER)}
 
 _PARTS = {"ppo": PPOConfig, "network": NetworkConfig, "environment": SelectionConfig}
 

@@ -25,7 +25,6 @@ import numpy as np
 
 from jaxcal.files import atomic_write
 from jaxcal.learning.environments import selection as environment
-from jaxcal.learning.environments import travel
 from jaxcal.learning.policies import decoding, networks
 from jaxcal.learning.policies.networks import Network, NetworkConfig
 from jaxcal.learning.runtime import devices
@@ -80,11 +79,9 @@ class TrainConfig:
     @staticmethod
     def from_meta(meta: dict[str, Any]) -> TrainConfig:
         """The configuration a checkpoint was trained with."""
-        timed = meta["network"]["kind"] == "travel"
-        rules = travel.TravelConfig if timed else environment.SelectionConfig
         tasks = tuple(
             Task(
-                environment=rules(**task["environment"]),
+                environment=environment.SelectionConfig(**task["environment"]),
                 shapes=tuple(task["shapes"]),
                 masked=task["masked"],
                 random_starts=task["random_starts"],
