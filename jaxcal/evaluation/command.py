@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import pathlib
 import signal
 import sys
-import threading
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 if TYPE_CHECKING:
     from jaxcal.evaluation.catalogue import Catalogue
@@ -62,9 +60,9 @@ def _alone(
     options = parser(program, " ".join(command)).parse_args(given)
     options.command = [*command, *given]
     progress = Progress(quiet=options.quiet)
+    before = signal.signal(signal.SIGTERM, _terminate)
     try:
-        with _stopped_by_sigterm():
-            return _run(options, catalogue, progress)
+        return _run(options, catalogue, progress)
     except KeyboardInterrupt as stop:
         progress.clear()
         terminated = isinstance(stop, _Terminated)
@@ -78,25 +76,16 @@ def _alone(
         progress.clear()
         print(f"{program}: error: {_one_line(error)}", file=sys.stderr)
         return EXIT_ERROR
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 class _Terminated(KeyboardInterrupt):
     """SIGTERM, which ends the command as Ctrl-C does."""
 
 
-@contextlib.contextmanager
-def _stopped_by_sigterm() -> Iterator[None]:
-    def stop(number: int, frame: object) -> NoReturn:
-        raise _Terminated
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+def _terminate(number: int, frame: object) -> NoReturn:
+    raise _Terminated
 
 
 def _run(options: argparse.Namespace, catalogue: Catalogue, progress: Progress) -> int:
@@ -116,24 +105,25 @@ def _run(options: argparse.Namespace, catalogue: Catalogue, progress: Progress) 
     options.checkpoint = list(dict.fromkeys(options.checkpoint)) or [None]
     options.dataset = list(dict.fromkeys(options.dataset)) or ["dataset2"]
     many = len(options.checkpoint) > 1
-    found: list[Any] = []
-    evaluated = _streamed if options.stream is not None else _whole
-    for one in evaluated(options, catalogue, progress):
+    summaries: list[Summary] = []
+    whole: list[Evaluation] = []
+    evaluated = _whole if options.stream is None else _streamed
+    for summary, evaluation in evaluated(options, catalogue, progress):
         progress.clear()
-        if found:
+        if summaries:
             print()
-        found.append(one)
-        print(text_table(one, many=many), flush=True)
-    if options.report is not None and found:
+        print(text_table(summary, many=many), flush=True)
+        summaries.append(summary)
+        whole += [] if evaluation is None else [evaluation]
+    if options.report is not None:
         runs = _run_folders(options.run, options.checkpoint)
         number = write_report(
-            options.report, found, runs, command=options.command, many=many
+            options.report, whole, runs, command=options.command, many=many
         )
         print(f"saved: {options.report}/index.html and {number} figures")
-    if options.json is not None and found:
-        text = json_document(found, command=options.command, indices=options.indices)
+    if options.json is not None and summaries:
         options.json.parent.mkdir(parents=True, exist_ok=True)
-        write_text(options.json, text)
+        write_text(options.json, json_document(summaries, command=options.command))
         print(f"saved: {options.json}")
     return EXIT_OK
 
@@ -149,7 +139,7 @@ def _keep_compiled_programs() -> None:
 
 def _whole(
     options: argparse.Namespace, catalogue: Catalogue, progress: Progress
-) -> Iterator[Evaluation]:
+) -> Iterator[tuple[Summary, Evaluation]]:
     """Every dataset, read or made before the first is evaluated."""
     from jaxcal.evaluation.methods import evaluate
 
@@ -166,7 +156,7 @@ def _whole(
         for name in options.dataset
     ]
     for dataset in datasets:
-        yield evaluate(
+        found = evaluate(
             dataset,
             options.k,
             options.methods,
@@ -177,11 +167,12 @@ def _whole(
             time_limit=options.time_limit,
             progress=progress,
         )
+        yield found.summarise(indices=options.indices), found
 
 
 def _streamed(
     options: argparse.Namespace, catalogue: Catalogue, progress: Progress
-) -> Iterator[Summary]:
+) -> Iterator[tuple[Summary, None]]:
     """One dataset in parts; of several processes the first has the totals."""
     from jaxcal.evaluation.stream import Plan, evaluate_stream, open_folder
 
@@ -229,7 +220,7 @@ def _streamed(
         progress=progress,
     )
     if process[0] == 0:
-        yield found
+        yield found, None
 
 
 def _process() -> tuple[int, int]:

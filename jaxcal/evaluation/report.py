@@ -12,7 +12,7 @@ from jaxcal.files import atomic_write
 from jaxcal.pages import Block, Code, Figure, Page, Section, Table, Text, render
 
 __all__ = [
-    "file_prefix",
+    "file_prefixes",
     "html_page",
     "json_document",
     "notes",
@@ -43,14 +43,13 @@ _ABOUT = (
 )
 
 
-def text_table(found: Evaluation | Summary, *, many: bool = False) -> str:
+def text_table(shown: Summary, *, many: bool = False) -> str:
     """One dataset as a table for the terminal.
 
     Args:
-        found: what to show.
+        shown: the numbers.
         many: name the checkpoint of each policy.
     """
-    shown = _summary(found)
     rows = [_COLUMNS, *_rows(shown, many)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(_COLUMNS))]
     lines = [
@@ -63,9 +62,8 @@ def text_table(found: Evaluation | Summary, *, many: bool = False) -> str:
     return "\n  ".join([_heading(shown), *lines, *notes(shown)])
 
 
-def notes(found: Evaluation | Summary) -> list[str]:
+def notes(shown: Summary) -> list[str]:
     """What a reader must know beside the numbers."""
-    shown = _summary(found)
     texts = []
     episodes = shown.dataset["episodes"]
     unproven = episodes - shown.num_proven
@@ -83,35 +81,25 @@ def notes(found: Evaluation | Summary) -> list[str]:
     return [*texts, *shown.notes]
 
 
-def json_document(
-    evaluations: Sequence[Evaluation | Summary],
-    *,
-    command: Sequence[str],
-    indices: bool = False,
-) -> str:
+def json_document(summaries: Sequence[Summary], *, command: Sequence[str]) -> str:
     """The numbers of several evaluations; the layout is in docs/evaluation.md.
 
     Args:
-        evaluations: one a dataset.
+        summaries: one a dataset.
         command: what was typed, for the record.
-        indices: also what each method chose in every episode (random: its first draw).
     """
     document = {
         "format": FORMAT,
         "version": VERSION,
         "command": list(command),
         "versions": versions(),
-        "results": [
-            entry
-            for found in evaluations
-            for entry in _entries(_summary(found, indices))
-        ],
+        "results": [entry for shown in summaries for entry in _entries(shown)],
     }
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
 def html_page(
-    evaluations: Sequence[Evaluation | Summary],
+    summaries: Sequence[Summary],
     images: Mapping[str, bytes],
     *,
     command: Sequence[str],
@@ -120,19 +108,20 @@ def html_page(
     """One self-contained page: tables, notes and figures.
 
     Args:
-        evaluations: one a dataset.
+        summaries: one a dataset.
         images: SVG files by name; a name starts with that of its dataset's prefix.
         command: what was typed, for the record.
         many: name the checkpoint of each policy.
     """
     sections = []
     left = {name: Figure(data, name.replace("_", " ")) for name, data in images.items()}
-    for number, found in enumerate(evaluations):
-        shown = _summary(found)
-        prefix = f"{file_prefix(evaluations, number)}_"
+    prefixes = file_prefixes([shown.dataset["name"] for shown in summaries])
+    for shown, prefix in zip(summaries, prefixes, strict=True):
         blocks: list[Block] = [Table(_COLUMNS, _rows(shown, many))]
         blocks += [Text(note, "note") for note in notes(shown)]
-        blocks += [left.pop(name) for name in list(left) if name.startswith(prefix)]
+        blocks += [
+            left.pop(name) for name in list(left) if name.startswith(f"{prefix}_")
+        ]
         sections.append(Section(_heading(shown), blocks))
     if left:
         sections.append(Section("Training", list(left.values())))
@@ -172,8 +161,8 @@ def write_report(
     from jaxcal.plots import as_bytes
 
     figures = {}
-    for number, evaluation in enumerate(evaluations):
-        prefix = file_prefix(evaluations, number)
+    prefixes = file_prefixes([found.dataset.name for found in evaluations])
+    for evaluation, prefix in zip(evaluations, prefixes, strict=True):
         for name, figure in evaluation_figures(evaluation).items():
             figures[f"{prefix}_{name}"] = figure
     for number, run in enumerate(runs):
@@ -183,7 +172,8 @@ def write_report(
     files = {f"{name}.svg": data for name, data in images.items()}
     for name, figure in figures.items():
         files[f"{name}.png"] = as_bytes(figure, "png")
-    page = html_page(evaluations, images, command=command, many=many)
+    summaries = [evaluation.summarise() for evaluation in evaluations]
+    page = html_page(summaries, images, command=command, many=many)
     files["index.html"] = page.encode()
     folder.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
@@ -192,26 +182,18 @@ def write_report(
     return len(figures)
 
 
-def file_prefix(evaluations: Sequence[Evaluation | Summary], number: int) -> str:
-    """What the figure files of one evaluation are called first; unique among them."""
+def file_prefixes(names: Sequence[str]) -> list[str]:
+    """What the figure files of each dataset are called first; no two alike."""
 
     def plain(name: str) -> str:
         stem = pathlib.PurePath(name).stem or name
         return "".join(c if c.isalnum() or c in "-." else "-" for c in stem)
 
-    names = [plain(_name(found)) for found in evaluations]
-    name = names[number]
-    return name if names.count(name) == 1 else f"{name}-{number + 1}"
-
-
-def _name(found: Evaluation | Summary) -> str:
-    if isinstance(found, Summary):
-        return found.dataset["name"]
-    return found.dataset.name
-
-
-def _summary(found: Evaluation | Summary, indices: bool = False) -> Summary:
-    return found if isinstance(found, Summary) else found.summarise(indices=indices)
+    found = [plain(name) for name in names]
+    return [
+        name if found.count(name) == 1 else f"{name}-{number}"
+        for number, name in enumerate(found, start=1)
+    ]
 
 
 def _heading(shown: Summary) -> str:
