@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import pathlib
 import signal
 import sys
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NoReturn
+
+from jaxcal.extras import MissingExtraError, needs
 
 if TYPE_CHECKING:
     from jaxcal.evaluation.catalogue import Catalogue
@@ -54,17 +57,13 @@ def _alone(
 ) -> int:
     """The command in this process, which may be one of several."""
     from jaxcal.evaluation.arguments import parser
-    from jaxcal.extras import MissingExtraError
-    from jaxcal.progress import Progress
 
     options = parser(program, " ".join(command)).parse_args(given)
     options.command = [*command, *given]
-    progress = Progress(quiet=options.quiet)
     before = signal.signal(signal.SIGTERM, _terminate)
     try:
-        return _run(options, catalogue, progress)
+        return _run(options, catalogue)
     except KeyboardInterrupt as stop:
-        progress.clear()
         terminated = isinstance(stop, _Terminated)
         kept = "nothing was written"
         if options.stream is not None:
@@ -73,7 +72,6 @@ def _alone(
         print(f"{program}: {how}, {kept}", file=sys.stderr)
         return EXIT_TERMINATED if terminated else EXIT_INTERRUPTED
     except (ValueError, OSError, MissingExtraError) as error:
-        progress.clear()
         print(f"{program}: error: {_one_line(error)}", file=sys.stderr)
         return EXIT_ERROR
     finally:
@@ -88,7 +86,9 @@ def _terminate(number: int, frame: object) -> NoReturn:
     raise _Terminated
 
 
-def _run(options: argparse.Namespace, catalogue: Catalogue, progress: Progress) -> int:
+def _run(options: argparse.Namespace, catalogue: Catalogue) -> int:
+    with needs("study", "evaluate"):
+        from jaxcal.progress import Progress
     from jaxcal.evaluation.methods import POLICIES, check_methods
     from jaxcal.evaluation.report import json_document, text_table, write_report
     from jaxcal.files import write_text
@@ -100,7 +100,9 @@ def _run(options: argparse.Namespace, catalogue: Catalogue, progress: Progress) 
                 "--checkpoint is given, but no policy is among --methods "
                 f"{','.join(options.methods)}"
             )
-        _keep_compiled_programs()
+        with needs("policy", "--checkpoint"):  # it may need JAX
+            from jaxcal.learning.runtime import cache
+        cache.keep_compiled_programs()
     _check_outputs(options)
     options.checkpoint = list(dict.fromkeys(options.checkpoint)) or [None]
     options.dataset = list(dict.fromkeys(options.dataset)) or ["dataset2"]
@@ -108,13 +110,17 @@ def _run(options: argparse.Namespace, catalogue: Catalogue, progress: Progress) 
     summaries: list[Summary] = []
     whole: list[Evaluation] = []
     evaluated = _whole if options.stream is None else _streamed
-    for summary, evaluation in evaluated(options, catalogue, progress):
+    progress = Progress(quiet=options.quiet)
+    try:
+        for summary, evaluation in evaluated(options, catalogue, progress):
+            progress.clear()
+            if summaries:
+                print()
+            print(text_table(summary, many=many), flush=True)
+            summaries.append(summary)
+            whole += [] if evaluation is None else [evaluation]
+    finally:
         progress.clear()
-        if summaries:
-            print()
-        print(text_table(summary, many=many), flush=True)
-        summaries.append(summary)
-        whole += [] if evaluation is None else [evaluation]
     if options.report is not None:
         runs = _run_folders(options.run, options.checkpoint)
         number = write_report(
@@ -126,15 +132,6 @@ def _run(options: argparse.Namespace, catalogue: Catalogue, progress: Progress) 
         write_text(options.json, json_document(summaries, command=options.command))
         print(f"saved: {options.json}")
     return EXIT_OK
-
-
-def _keep_compiled_programs() -> None:
-    """A checkpoint may need JAX: keep what it compiles for the next time."""
-    from jaxcal.extras import needs
-
-    with needs("policy", "--checkpoint"):
-        from jaxcal.learning.runtime import cache
-    cache.keep_compiled_programs()
 
 
 def _whole(
@@ -242,6 +239,10 @@ def _check_outputs(options: argparse.Namespace) -> None:
         if options.json.is_dir():
             raise ValueError(f"--json must be a file, {options.json} is a folder")
         require_writable_folder(options.json.parent)
+    if options.report is not None:
+        with needs("study", "--report"):
+            importlib.import_module("jinja2")
+            importlib.import_module("matplotlib")
     for folder in (options.report, options.stream):
         if folder is not None:
             require_writable_folder(folder)

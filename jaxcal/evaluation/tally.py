@@ -31,8 +31,9 @@ __all__ = [
 Array = NDArray[np.float64]
 Tally = dict[str, Any]
 """int counts: episodes, selections (episodes times draws), hits (proven optima),
-singular (det S = 0; in no sum of logs), and one for each bin of log det S. Fraction sums:
-det, log_det, their squares, ratio (det S / det S*), efficiency (its p-th root), seconds."""
+singular (det S = 0; in no sum of logs), and one for each bin of log det S. Fraction
+sums: det, log_det, their squares, ratio (det S / det S*), efficiency (its p-th root),
+seconds."""
 
 BINS_PER_UNIT = 64  # of log det S: a median is within 1/64, 1.6 % of det S
 
@@ -76,7 +77,7 @@ def tally_of(
         "singular": log_det.size - finite.size,
         "seconds": Fraction(seconds),
         **{name: Fraction(math.fsum(v.ravel())) for name, v in sums.items()},
-        **{f"bin {b:.0f}": int(n) for b, n in zip(bins, counts, strict=True)},
+        **{f"bin {int(b)}": int(n) for b, n in zip(bins, counts, strict=True)},
     }
 
 
