@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from jaxcal.evaluation.results import Evaluation, Row, Summary, versions
-from jaxcal.files import atomic_write
+from jaxcal.files import atomic_write, write_text
 from jaxcal.pages import Block, Code, Figure, Page, Section, Table, Text, render
 
 __all__ = [
     "file_prefixes",
-    "html_page",
     "json_document",
     "notes",
     "text_table",
@@ -98,33 +97,52 @@ def json_document(summaries: Sequence[Summary], *, command: Sequence[str]) -> st
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
-def html_page(
-    summaries: Sequence[Summary],
-    images: Mapping[str, bytes],
+def write_report(
+    folder: pathlib.Path,
+    evaluations: Sequence[Evaluation],
+    runs: Sequence[pathlib.Path] = (),
     *,
     command: Sequence[str],
     many: bool = False,
-) -> str:
-    """One self-contained page: tables, notes and figures.
+) -> int:
+    """Draw everything, then write each figure as SVG and PNG, and ``index.html`` last.
 
     Args:
-        summaries: one a dataset.
-        images: SVG files by name; a name starts with that of its dataset's prefix.
+        folder: made where it is missing.
+        evaluations: one a dataset.
+        runs: folders of training runs to draw curves of.
         command: what was typed, for the record.
         many: name the checkpoint of each policy.
+
+    Returns:
+        How many figures there are.
     """
+    from jaxcal.evaluation.figures import evaluation_figures
+    from jaxcal.evaluation.training_figure import training_curves
+    from jaxcal.plots import as_bytes
+
+    files: dict[str, bytes] = {}
+
+    def drawn(name: str, figure: Any) -> Figure:
+        for suffix in ("svg", "png"):
+            files[f"{name}.{suffix}"] = as_bytes(figure, suffix)
+        return Figure(files[f"{name}.svg"], name.replace("_", " "))
+
     sections = []
-    left = {name: Figure(data, name.replace("_", " ")) for name, data in images.items()}
-    prefixes = file_prefixes([shown.dataset["name"] for shown in summaries])
-    for shown, prefix in zip(summaries, prefixes, strict=True):
+    prefixes = file_prefixes([found.dataset.name for found in evaluations])
+    for evaluation, prefix in zip(evaluations, prefixes, strict=True):
+        shown = evaluation.summarise()
         blocks: list[Block] = [Table(_COLUMNS, _rows(shown, many))]
         blocks += [Text(note, "note") for note in notes(shown)]
-        blocks += [
-            left.pop(name) for name in list(left) if name.startswith(f"{prefix}_")
-        ]
+        for name, figure in evaluation_figures(evaluation).items():
+            blocks.append(drawn(f"{prefix}_{name}", figure))
         sections.append(Section(_heading(shown), blocks))
-    if left:
-        sections.append(Section("Training", list(left.values())))
+    curves = []
+    for number, run in enumerate(runs, start=1):
+        suffix = f"_{number}" if len(runs) > 1 else ""
+        curves.append(drawn(f"training_curves{suffix}", training_curves(run)))
+    if curves:
+        sections.append(Section("Training", curves))
     page = Page(
         "Posture selection against the proven optimum",
         sections,
@@ -134,52 +152,13 @@ def html_page(
         ],
         footer=[Text(_ABOUT, "note")],
     )
-    return render(page)
-
-
-def write_report(
-    folder: pathlib.Path,
-    evaluations: Sequence[Evaluation],
-    runs: Sequence[pathlib.Path],
-    *,
-    command: Sequence[str],
-    many: bool = False,
-) -> int:
-    """Draw everything, then write every figure as SVG and PNG, and the page last.
-
-    Args:
-        folder: made where it is missing.
-        evaluations: one a dataset.
-        runs: folders of training runs to draw curves of.
-        command, many: see ``html_page``.
-
-    Returns:
-        How many figures there are.
-    """
-    from jaxcal.evaluation.figures import evaluation_figures
-    from jaxcal.evaluation.training_figure import training_curves
-    from jaxcal.plots import as_bytes
-
-    figures = {}
-    prefixes = file_prefixes([found.dataset.name for found in evaluations])
-    for evaluation, prefix in zip(evaluations, prefixes, strict=True):
-        for name, figure in evaluation_figures(evaluation).items():
-            figures[f"{prefix}_{name}"] = figure
-    for number, run in enumerate(runs):
-        suffix = f"_{number + 1}" if len(runs) > 1 else ""
-        figures[f"training_curves{suffix}"] = training_curves(run)
-    images = {name: as_bytes(figure, "svg") for name, figure in figures.items()}
-    files = {f"{name}.svg": data for name, data in images.items()}
-    for name, figure in figures.items():
-        files[f"{name}.png"] = as_bytes(figure, "png")
-    summaries = [evaluation.summarise() for evaluation in evaluations]
-    page = html_page(summaries, images, command=command, many=many)
-    files["index.html"] = page.encode()
+    text = render(page)
     folder.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
         with atomic_write(folder / name) as file:
             file.write(data)
-    return len(figures)
+    write_text(folder / "index.html", text)
+    return len(files) // 2
 
 
 def file_prefixes(names: Sequence[str]) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import pathlib
+import re
 import sys
 import types
 from typing import Any
@@ -19,7 +20,12 @@ from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.figures import evaluation_figures
 from jaxcal.evaluation.methods import check_methods, evaluate
 from jaxcal.evaluation.parameters import estimate_parameters, parameter_names
-from jaxcal.evaluation.report import file_prefixes, html_page, json_document, text_table
+from jaxcal.evaluation.report import (
+    file_prefixes,
+    json_document,
+    text_table,
+    write_report,
+)
 from jaxcal.evaluation.results import Evaluation, MethodResult
 from jaxcal.evaluation.training_figure import training_curves
 from jaxcal.information.regression import regression_matrix
@@ -414,12 +420,17 @@ def test_figures_have_axes_units_and_legends(shown: Evaluation) -> None:
     )
 
 
-def test_the_page_holds_everything_in_itself(shown: Evaluation) -> None:
-    images = {"dataset3_det_means": b"<svg/>", "training_curves": b"<svg/>"}
-    page = html_page([shown.summarise()], images, command=["a", "<b>"], many=True)
-    assert page.count("data:image/svg+xml;base64,") == 2
+def test_the_page_holds_everything_in_itself(
+    shown: Evaluation, tmp_path: pathlib.Path
+) -> None:
+    metrics(tmp_path)
+    out = tmp_path / "deep" / "report"
+    number = write_report(out, [shown], [tmp_path], command=["a", "<b>"], many=True)
+    page = (out / "index.html").read_text()
+    images = sorted(path.name for path in out.glob("*.svg"))
+    assert page.count("data:image/svg+xml;base64,") == len(images) == number == 7
     assert "&lt;b&gt;" in page and "policy (runs/a)" in page
-    assert "http" not in page
+    assert not re.search(r"(href|src)=['\"]?(https?:)?//", page)
 
 
 def test_two_files_of_one_name_keep_their_figures_apart() -> None:
