@@ -21,6 +21,7 @@ from jaxcal.selection.problem import Problem
 __all__ = ["lower_bound", "region_weighting"]
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 _ITERATIONS = 300  # any count gives a true bound
 
