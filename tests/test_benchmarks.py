@@ -87,10 +87,10 @@ def test_the_pytorch_peer_has_the_same_network(rng, folded):
         params = jax.tree.map(
             lambda leaf: leaf + 0.05 * jax.random.normal(key, leaf.shape), params
         )
-        view = network.look(sets, everything)
-        memory = networks.encode(network, params, view)
-        glance = network.look_at(view, chosen, free, 2)
-        return params, networks.decode(network, params, memory, glance)
+        features = network.candidate_features(sets, everything)
+        memory = networks.encode(network, params, features)
+        decision = network.decision_features(features, chosen, free, 2)
+        return params, networks.decode(network, params, memory, decision)
 
     params, (logits, value) = scored(jax.random.key(1))
     peer = PaperTorch(48, folded=folded)

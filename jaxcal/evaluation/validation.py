@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxcal.learning.training.run import TrainConfig, Validation
+from jaxcal.learning.training.config import TrainConfig
+from jaxcal.learning.training.run import Validation
 
 __all__ = ["fixed_validation", "teacher"]
 
