@@ -141,11 +141,11 @@ def run(arguments: argparse.Namespace) -> int:
     """Train, say how it went; of several processes the first speaks for all."""
     import jax
 
-    from jaxcal.evaluation.validation import fixed_validation, teacher
     from jaxcal.learning.policies import networks
     from jaxcal.learning.runtime import cache, devices
     from jaxcal.learning.training import checkpoint, ppo
     from jaxcal.learning.training import run as training
+    from jaxcal.selection.teacher import fixed_validation, teacher
 
     cache.keep_compiled_programs()
     if arguments.trainer == "brax":

@@ -37,7 +37,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcal.evaluation.validation import teacher
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.information.regression import log_det_information
 from jaxcal.learning.environments import scenarios
@@ -52,6 +51,7 @@ from jaxcal.learning.training import run as training
 from jaxcal.learning.training.checkpoint import package_versions
 from jaxcal.selection import exact_batch, greedy_batch, select
 from jaxcal.selection.policy import select_batch
+from jaxcal.selection.teacher import teacher
 
 HIT = 1e-9
 PARTS = ("unlearned", "shipped", "tasks", "time", "trained")

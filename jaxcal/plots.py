@@ -23,6 +23,9 @@ BLACK = "#000000"
 
 def as_bytes(figure: Figure, suffix: str) -> bytes:
     """The figure as a file of the given kind, "png" or "svg"; the same every time."""
+    # Ticks may change when the first layout gives the axes their size; the layout of
+    # savefig then makes room for them.
+    figure.draw_without_rendering()
     buffer = io.BytesIO()
     metadata: dict[str, Any] = {"Date": None} if suffix == "svg" else {}
     with rc_context({"svg.hashsalt": "jaxcal"}):

@@ -12,13 +12,15 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
+import math
 import os
 import pathlib
 import struct
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Iterable
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,15 +66,8 @@ def load_dataset(path: str | os.PathLike[str]) -> Dataset:
             fields = _read_csv(data)
         else:
             raise ValueError("a dataset must be a .npz or .csv file")
-        candidates, measured, available, ranges = fields
-        return Dataset(
-            name=file.name,
-            candidates=candidates,
-            measured=measured,
-            available=available,
-            ranges=ranges,
-            sha256=hashlib.sha256(data).hexdigest(),
-        )
+        sha256 = hashlib.sha256(data).hexdigest()
+        return Dataset(name=file.name, sha256=sha256, **fields)
     except ValueError as error:
         raise ValueError(f"{os.fspath(path)}: {error}") from None
 
@@ -139,10 +134,8 @@ def _write_rows(writer: Any, dataset: Dataset, first_episode: int) -> None:
             writer.writerow([first_episode + e, i, *row, *mask])
 
 
-_Fields = tuple[Array, Array | None, NDArray[np.bool_] | None, JointRanges | None]
-
-
-def _read_npz(data: bytes) -> _Fields:
+def _read_npz(data: bytes) -> dict[str, Any]:
+    """The fields of a ``Dataset``."""
     try:
         archive = np.load(io.BytesIO(data), allow_pickle=False)
     except (*_DAMAGE, ValueError):
@@ -154,23 +147,25 @@ def _read_npz(data: bytes) -> _Fields:
         if "candidates" not in keys:
             found = ", ".join(sorted(keys)) or "nothing"
             raise ValueError(f'key "candidates" is missing, found {found}')
-        candidates = _cube("candidates", _member(archive, "candidates"))
-        measured = available = ranges = None
-        if "measured" in keys:
-            measured = _cube("measured", _member(archive, "measured"))
+        fields: dict[str, Any] = {
+            key: _cube(key, _member(archive, key))
+            for key in ("candidates", "measured")
+            if key in keys
+        }
         if "available" in keys:
-            available = _mask(_member(archive, "available"))
+            fields["available"] = _mask(_member(archive, "available"))
         if {"low", "high"} & keys:
             if not {"low", "high"} <= keys:
                 raise ValueError('keys "low" and "high" must come together')
-            low, high = (_member(archive, key) for key in ("low", "high"))
-            ranges = JointRanges(low, high)
-            if ranges.num_inputs != candidates.shape[2]:
+            ranges = JointRanges(_member(archive, "low"), _member(archive, "high"))
+            width = fields["candidates"].shape[2]
+            if ranges.num_inputs != width:
                 raise ValueError(
-                    f'"low" and "high" must hold {candidates.shape[2]} numbers, got '
+                    f'"low" and "high" must hold {width} numbers, got '
                     f"{ranges.num_inputs}"
                 )
-    return candidates, measured, available, ranges
+            fields["ranges"] = ranges
+    return fields
 
 
 def _member(archive: np.lib.npyio.NpzFile, key: str) -> NDArray[np.generic]:
@@ -212,115 +207,95 @@ def _mask(array: NDArray[np.generic]) -> NDArray[np.bool_]:
     return array.astype(np.bool_)
 
 
-def _read_csv(data: bytes) -> _Fields:
+def _read_csv(data: bytes) -> dict[str, Any]:
+    """The fields of a ``Dataset``."""
     try:
-        reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""))
-        table = _Table(reader)
+        text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         raise ValueError(f"line {line}: not UTF-8 text") from None
-    except csv.Error as error:
-        raise ValueError(f"line {reader.line_num}: {error}") from None
-    count = table.require_rectangle()
-    order = np.lexsort((table.candidate, table.episode))
-    values = table.values[order].reshape(-1, count, table.values.shape[1])
-    n, m = table.num_inputs, table.num_outputs
-    return (
-        values[..., :n],
-        values[..., n : n + m] if m else None,
-        values[..., -1] == 1.0 if table.has_available else None,
-        None,
-    )
-
-
-class _Table:
-    """The lines of a .csv, parsed and checked one by one."""
-
-    def __init__(self, reader: Any) -> None:  # csv.reader's type has no name
-        rows = iter(reader)
-        header = [name.strip() for name in next(rows, [])]
-        inputs = [name for name in header if name.startswith("u_")]
-        outputs = [name for name in header if name.startswith("y_")]
-        self.has_available = "available" in header
-        self.num_inputs, self.num_outputs = len(inputs), len(outputs)
-        known = ["episode", "candidate", *inputs, *outputs]
-        known += ["available"] if self.has_available else []
-        for name in ("episode", "candidate"):
-            if name not in header:
-                self._fail(1, f'column "{name}" is missing, found {",".join(header)}')
-        if not inputs:
-            self._fail(1, 'no input column ("u_x", ...) in the header')
-        for name in header:
-            if name not in known:
-                self._fail(1, f'unknown column "{name}"')
-            if header.count(name) > 1:
-                self._fail(1, f'column "{name}" comes twice')
-        place = [header.index(name) for name in known]
-        episodes, candidates, values = [], [], []
-        self.lines: list[int] = []
-        for row in rows:
-            line: int = reader.line_num
+    reader = csv.reader(io.StringIO(text, newline=""))
+    lines: dict[tuple[int, int], int] = {}  # of each (episode, candidate)
+    values: dict[tuple[int, int], list[float]] = {}
+    try:
+        header = [name.strip() for name in next(reader, [])]
+        inputs, outputs, masks = _columns(header)
+        names = [*inputs, *outputs, *masks]
+        place = [header.index(name) for name in names]
+        first, second = header.index("episode"), header.index("candidate")
+        for row in reader:
             if not any(cell.strip() for cell in row):
                 continue
             if len(row) != len(header):
-                self._fail(line, f"{len(row)} cells, {len(header)} in the header")
-            cells = [row[i] for i in place]
-            episodes.append(self._whole(line, "episode", cells[0]))
-            candidates.append(self._whole(line, "candidate", cells[1]))
-            values.append(
-                [
-                    self._number(line, name, cell)
-                    for name, cell in zip(known[2:], cells[2:], strict=True)
-                ]
-            )
-            if self.has_available and values[-1][-1] not in (0.0, 1.0):
-                self._fail(line, f'"available" must be 0 or 1, got {cells[-1]!r}')
-            self.lines.append(line)
-        if not values:
-            raise ValueError("no candidates below the header")
-        self.episode = np.array(episodes)
-        self.candidate = np.array(candidates)
-        self.values = np.array(values)
-
-    def require_rectangle(self) -> int:
-        """M; every episode must have as many candidates, each of them once."""
-        seen: dict[tuple[int, int], int] = {}
-        pairs = zip(self.episode.tolist(), self.candidate.tolist(), strict=True)
-        for line, pair in zip(self.lines, pairs, strict=True):
-            if pair in seen:
-                self._fail(
-                    line,
-                    f"candidate {pair[1]} of episode {pair[0]} was already given in "
-                    f"line {seen[pair]}",
+                raise ValueError(f"{len(row)} cells, {len(header)} in the header")
+            label = _whole("episode", row[first]), _whole("candidate", row[second])
+            if label in lines:
+                raise ValueError(
+                    f"candidate {label[1]} of episode {label[0]} was already given in "
+                    f"line {lines[label]}"
                 )
-            seen[pair] = line
-        labels, counts = np.unique(self.episode, return_counts=True)
-        ragged = np.flatnonzero(counts != counts[0])
-        if ragged.size:
+            lines[label] = reader.line_num
+            values[label] = [
+                _number(name, row[i]) for name, i in zip(names, place, strict=True)
+            ]
+    except (ValueError, csv.Error) as error:
+        raise ValueError(f"line {max(reader.line_num, 1)}: {error}") from None
+    if not values:
+        raise ValueError("no candidates below the header")
+    counts = Counter(episode for episode, _ in sorted(values))
+    (label0, size), *others = counts.items()
+    for episode, count in others:
+        if count != size:
             raise ValueError(
-                f"every episode must have as many candidates: episode {labels[0]} has "
-                f"{counts[0]}, episode {labels[ragged[0]]} has {counts[ragged[0]]}"
+                f"every episode must have as many candidates: episode {label0} has "
+                f"{size}, episode {episode} has {count}"
             )
-        return int(counts[0])
+    table = np.array([values[label] for label in sorted(values)])
+    table = table.reshape(len(counts), size, len(names))
+    n, m = len(inputs), len(outputs)
+    fields: dict[str, Any] = {"candidates": table[..., :n]}
+    if outputs:
+        fields["measured"] = table[..., n : n + m]
+    if masks:
+        fields["available"] = table[..., -1] == 1.0
+    return fields
 
-    @staticmethod
-    def _fail(line: int, problem: str) -> NoReturn:
-        raise ValueError(f"line {line}: {problem}")
 
-    def _whole(self, line: int, name: str, cell: str) -> int:
-        try:
-            number = int(cell)
-        except ValueError:
-            self._fail(line, f'"{name}" must be a whole number, got {cell!r}')
-        if abs(number) > 2**53:
-            self._fail(line, f'"{name}" is out of range, got {cell!r}')
-        return number
+def _columns(header: list[str]) -> tuple[list[str], list[str], list[str]]:
+    """Inputs, outputs and, where it is there, ``available``."""
+    for name in ("episode", "candidate"):
+        if name not in header:
+            raise ValueError(f'column "{name}" is missing, found {",".join(header)}')
+    inputs = [name for name in header if name.startswith("u_")]
+    outputs = [name for name in header if name.startswith("y_")]
+    if not inputs:
+        raise ValueError('no input column ("u_x", ...) in the header')
+    known = {"episode", "candidate", "available", *inputs, *outputs}
+    for name in header:
+        if name not in known:
+            raise ValueError(f'unknown column "{name}"')
+        if header.count(name) > 1:
+            raise ValueError(f'column "{name}" comes twice')
+    return inputs, outputs, ["available"] if "available" in header else []
 
-    def _number(self, line: int, name: str, cell: str) -> float:
-        try:
-            number = float(cell)
-        except ValueError:
-            self._fail(line, f'"{name}" must be a number, got {cell!r}')
-        if not np.isfinite(number):
-            self._fail(line, f'"{name}" must be finite, got {cell!r}')
-        return number
+
+def _whole(name: str, cell: str) -> int:
+    try:
+        number = int(cell)
+    except ValueError:
+        raise ValueError(f'"{name}" must be a whole number, got {cell!r}') from None
+    if abs(number) > 2**53:
+        raise ValueError(f'"{name}" is out of range, got {cell!r}')
+    return number
+
+
+def _number(name: str, cell: str) -> float:
+    try:
+        number = float(cell)
+    except ValueError:
+        raise ValueError(f'"{name}" must be a number, got {cell!r}') from None
+    if not math.isfinite(number):
+        raise ValueError(f'"{name}" must be finite, got {cell!r}')
+    if name == "available" and number not in (0.0, 1.0):
+        raise ValueError(f'"available" must be 0 or 1, got {cell!r}')
+    return number

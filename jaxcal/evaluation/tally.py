@@ -1,8 +1,9 @@
 """What one method achieved over any number of episodes, in a few numbers that add.
 
-Sums are exact (``jaxcal.evaluation.exact_sums``) and counts are whole, so a tally does not
-depend on how its episodes were cut into parts. Medians cannot be added: they are read
-off a histogram of log det S.
+The sum over a block of episodes is rounded once (``math.fsum``); sums of blocks are
+kept as fractions, which add without rounding. So totals do not depend on the order in
+which blocks are added, to the last digit. Medians cannot be added: they are read off a
+histogram of log det S.
 """
 
 from __future__ import annotations
@@ -16,138 +17,94 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.evaluation.exact_sums import ExactSum, exact_sum
 from jaxcal.evaluation.results import HIT_TOLERANCE
 
-__all__ = ["BINS_PER_UNIT", "RunningTally", "Tally", "tally_of"]
+__all__ = ["BINS_PER_UNIT", "Tally", "tally_of"]
 
 Array = NDArray[np.float64]
 
 BINS_PER_UNIT = 64  # of log det S: a median is within 1/64, 1.6 % of det S
-_NOTHING = ExactSum()
-_SUMS = ("det", "det_squared", "log_det", "log_det_squared", "ratio", "efficiency")
+_COUNTS = ("episodes", "selections", "hits", "singular")
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class Tally:
-    """One method over some episodes."""
+    """One method over some episodes; ``add`` changes it in place."""
 
+    episodes: int = 0
     selections: int = 0  # episodes times draws
     hits: int = 0  # that are the proven optimum
-    singular: int = 0  # in one plane: det S = 0
-    det: ExactSum = _NOTHING
-    det_squared: ExactSum = _NOTHING  # each square rounded once, then summed exactly
-    log_det: ExactSum = _NOTHING  # singular ones left out
-    log_det_squared: ExactSum = _NOTHING
-    ratio: ExactSum = _NOTHING  # det S / det S*
-    efficiency: ExactSum = _NOTHING  # its p-th root
-    histogram: tuple[tuple[int, int], ...] = ()  # (bin of log det S, selections)
+    singular: int = 0  # with det S = 0; they are in no sum of logs
     seconds: float = 0.0  # spent choosing; the only field that is measured
+    sums: dict[str, Fraction] = dataclasses.field(default_factory=dict)  # by name
+    bins: Counter[int] = dataclasses.field(default_factory=Counter)  # of log det S
 
-    def __add__(self, other: Tally) -> Tally:
-        """Both together."""
-        bins = Counter(dict(self.histogram))
-        bins.update(dict(other.histogram))
-        return Tally(
-            selections=self.selections + other.selections,
-            hits=self.hits + other.hits,
-            singular=self.singular + other.singular,
-            histogram=tuple(sorted(bins.items())),
-            seconds=self.seconds + other.seconds,
-            **{name: getattr(self, name) + getattr(other, name) for name in _SUMS},
-        )
+    def add(self, other: Tally) -> None:
+        """Count the episodes of another tally as well."""
+        for name in _COUNTS:
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+        self.seconds += other.seconds
+        for name, value in other.sums.items():
+            self.sums[name] = self.sums.get(name, Fraction(0)) + value
+        self.bins.update(other.bins)
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values; ``from_json`` reads them back."""
-        row = {
-            name: [getattr(self, name).mantissa, getattr(self, name).exponent]
-            for name in _SUMS
-        }
-        return row | {
-            "selections": self.selections,
-            "hits": self.hits,
-            "singular": self.singular,
-            "histogram": [list(pair) for pair in self.histogram],
-            "seconds": self.seconds,
-        }
+        """Plain values; ``from_json`` reads them back without loss."""
+        row = {name: getattr(self, name) for name in (*_COUNTS, "seconds")}
+        row["sums"] = {name: str(value) for name, value in self.sums.items()}
+        return row | {"bins": sorted(self.bins.items())}
 
     @staticmethod
     def from_json(row: dict[str, Any]) -> Tally:
         """What ``as_json`` wrote."""
         return Tally(
-            selections=int(row["selections"]),
-            hits=int(row["hits"]),
-            singular=int(row["singular"]),
-            histogram=tuple((int(b), int(c)) for b, c in row["histogram"]),
+            **{name: int(row[name]) for name in _COUNTS},
             seconds=float(row["seconds"]),
-            **{name: ExactSum(*map(int, row[name])) for name in _SUMS},
+            sums={name: Fraction(text) for name, text in row["sums"].items()},
+            bins=Counter({int(number): int(count) for number, count in row["bins"]}),
         )
 
-    def mean_det(self) -> Fraction:
-        """Mean det S."""
-        return self.det.fraction() / self.selections
-
-    def summary(self, random: Tally, episodes: int) -> dict[str, Any]:
+    def summary(self, random: Tally) -> dict[str, Any]:
         """The numbers of one method, as documented in docs/evaluation.md.
 
         Args:
             random: the baseline behind ``ratio_to_random``.
-            episodes: how many there were.
         """
-        baseline = random.mean_det()
+        baseline = random.sums["det"] / random.selections
+        mean = {name: value / self.selections for name, value in self.sums.items()}
         log_det: dict[str, float | None] = {"mean": None, "std": None}
         if not self.singular:
-            log_det = self._moments(self.log_det, self.log_det_squared)
+            log_det = _moments(mean["log_det"], mean["log_det_squared"])
         middle = self.median_log_det()
-        with np.errstate(under="ignore"):
-            median = float(np.exp(middle))
         return {
-            "det_s": self._moments(self.det, self.det_squared) | {"median": median},
-            "log_det_s": log_det | {"median": middle if np.isfinite(middle) else None},
-            "ratio_to_exact": float(self.ratio.fraction() / self.selections),
+            "det_s": _moments(mean["det"], mean["det_squared"])
+            | {"median": math.exp(middle)},
+            "log_det_s": log_det | {"median": middle if middle > -math.inf else None},
+            "ratio_to_exact": float(mean["ratio"]),
             "hit_rate": self.hits / self.selections,
-            "d_efficiency": float(self.efficiency.fraction() / self.selections),
-            "ratio_to_random": float(self.mean_det() / baseline) if baseline else None,
-            "seconds_per_selection": self.seconds / episodes,
-            "draws_per_episode": self.selections // episodes,
+            "d_efficiency": float(mean["efficiency"]),
+            "ratio_to_random": float(mean["det"] / baseline) if baseline else None,
+            "seconds_per_selection": self.seconds / self.episodes,
+            "draws_per_episode": self.selections // self.episodes,
         }
-
-    def _moments(self, total: ExactSum, squares: ExactSum) -> dict[str, float | None]:
-        mean = total.fraction() / self.selections
-        variance = squares.fraction() / self.selections - mean**2
-        return {"mean": float(mean), "std": math.sqrt(max(variance, Fraction(0)))}
 
     def median_log_det(self) -> float:
         """Median of log det S, from the histogram; ``-inf`` where most are singular."""
-        half = Fraction(self.selections, 2)
+        half = self.selections / 2
         below = self.singular
         if below > half:
             return -math.inf
-        for number, count in self.histogram:
+        for number, count in sorted(self.bins.items()):
             if below + count >= half:
-                inside = (half - below) / count
-                return float((number + inside) / BINS_PER_UNIT)
+                return (number + (half - below) / count) / BINS_PER_UNIT
             below += count
         raise ValueError("a tally of nothing has no median")
 
 
-class RunningTally:
-    """Tallies added one after another; their histograms are merged in place."""
-
-    def __init__(self) -> None:
-        self._sums = Tally()
-        self._bins: Counter[int] = Counter()
-
-    def add(self, tally: Tally) -> None:
-        """One more."""
-        self._sums += dataclasses.replace(tally, histogram=())
-        self._bins.update(dict(tally.histogram))
-
-    def total(self) -> Tally:
-        """All of them together."""
-        return dataclasses.replace(
-            self._sums, histogram=tuple(sorted(self._bins.items()))
-        )
+def _moments(mean: Fraction, mean_square: Fraction) -> dict[str, float | None]:
+    # Each square was rounded once: of equal values the difference may fall below 0.
+    variance = max(mean_square - mean * mean, Fraction(0))
+    return {"mean": float(mean), "std": math.sqrt(variance)}
 
 
 def tally_of(
@@ -168,25 +125,28 @@ def tally_of(
         num_parameters: p.
         seconds: spent choosing.
     """
-    behind = np.minimum(log_det - reference[:, None], 0.0)
-    hits = proven[:, None] & (
-        log_det - reference[:, None] >= -HIT_TOLERANCE * num_outputs
-    )
+    behind = log_det - reference[:, None]
+    hits = proven[:, None] & (behind >= -HIT_TOLERANCE * num_outputs)
+    behind = np.minimum(behind, 0.0)
     finite = log_det[np.isfinite(log_det)]
     det = np.exp(log_det)
-    bins, counts = np.unique(
+    values = {
+        "det": det,
+        "det_squared": det * det,
+        "log_det": finite,
+        "log_det_squared": finite * finite,
+        "ratio": np.exp(behind),
+        "efficiency": np.exp(behind / num_parameters),
+    }
+    numbers, counts = np.unique(
         np.floor(finite * BINS_PER_UNIT).astype(np.int64), return_counts=True
     )
     return Tally(
+        episodes=len(log_det),
         selections=log_det.size,
         hits=int(hits.sum()),
         singular=log_det.size - finite.size,
-        det=exact_sum(det),
-        det_squared=exact_sum(det * det),
-        log_det=exact_sum(finite),
-        log_det_squared=exact_sum(finite * finite),
-        ratio=exact_sum(np.exp(behind)),
-        efficiency=exact_sum(np.exp(behind / num_parameters)),
-        histogram=tuple(zip(bins.tolist(), counts.tolist(), strict=True)),
         seconds=seconds,
+        sums={name: Fraction(math.fsum(v.ravel())) for name, v in values.items()},
+        bins=Counter(dict(zip(numbers.tolist(), counts.tolist(), strict=True))),
     )

@@ -67,10 +67,10 @@ def train_seed(
     Raises:
         ValueError: the folder holds a run of another configuration.
     """
-    from jaxcal.evaluation.validation import fixed_validation
     from jaxcal.learning.training import checkpoint
     from jaxcal.learning.training import run as training
     from jaxcal.learning.training.config import TrainConfig
+    from jaxcal.selection.teacher import fixed_validation
 
     require_writable_folder(folder)
     steps = folder / "checkpoint"

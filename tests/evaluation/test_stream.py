@@ -1,7 +1,8 @@
-"""Streams: exact sums, parts that add up, resumption, and the plain evaluation."""
+"""Streams: tallies that add up, resumption, sharing, and the plain evaluation."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import os
@@ -19,42 +20,48 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxcal.evaluation import streaming
-from jaxcal.evaluation.exact_sums import ExactSum, exact_sum
+from jaxcal.evaluation import stream
 from jaxcal.evaluation.methods import evaluate
 from jaxcal.evaluation.report import json_document, text_table
-from jaxcal.evaluation.results import StreamedEvaluation
-from jaxcal.evaluation.streaming import Plan, evaluate_stream, open_folder
+from jaxcal.evaluation.results import Summary
+from jaxcal.evaluation.stream import Plan, evaluate_stream, open_folder
 from jaxcal.evaluation.tally import BINS_PER_UNIT, Tally, tally_of
 from jaxcal.information.regression import log_det_information
+from jaxcal.paper.datasets.catalogue import CATALOGUE
 from jaxcal.paper.datasets.datasets import drawn, make_dataset
 
-FLOATS = st.floats(allow_nan=False, allow_infinity=False)
-PLAN = Plan(methods=("random", "greedy", "exact"), draws=3)
+LOGS = st.floats(-300.0, 300.0)
+PLAN = Plan(CATALOGUE, "dataset2", methods=("random", "greedy", "exact"), draws=3)
 
 
-@given(st.lists(FLOATS, max_size=30), st.integers(0, 30))
-def test_sums_are_those_of_fractions_however_they_are_cut(
-    values: list[float], cut: int
+@given(st.lists(st.lists(LOGS, min_size=1, max_size=9), min_size=1, max_size=6))
+def test_totals_do_not_depend_on_the_order_of_the_blocks(
+    blocks: list[list[float]],
 ) -> None:
-    truth = sum((Fraction(value) for value in values), Fraction(0))
-    whole = exact_sum(np.array(values))
-    assert whole.fraction() == truth
-    parts = exact_sum(np.array(values[:cut])) + exact_sum(np.array(values[cut:]))
-    assert parts == whole
-    shuffled = exact_sum(np.array(sorted(values)))
-    assert shuffled == whole
-
-
-def test_a_sum_keeps_what_floats_lose() -> None:
-    values = np.array([1e300, 1.0, -1e300, 5e-324, 2.0**-1074 * 3])
-    assert exact_sum(values).fraction() == 1 + Fraction(4, 2**1074)
-    assert exact_sum(np.zeros(0)) == exact_sum([0.0, -0.0]) == ExactSum()
-    many = np.full(1_000_001, 0.1)
-    assert exact_sum(many).fraction() == Fraction(0.1) * 1_000_001
-    assert float(exact_sum(many).fraction()) == math.fsum(many)
-    with pytest.raises(ValueError, match="finite"):
-        exact_sum([1.0, math.inf])
+    tallies = [
+        tally_of(
+            np.array(values)[:, None],
+            np.full(len(values), 400.0),
+            np.ones(len(values), bool),
+            3,
+            12,
+            0.0,
+        )
+        for values in blocks
+    ]
+    forward, backward, pairs = Tally(), Tally(), Tally()
+    for tally in tallies:
+        forward.add(tally)
+    for tally in reversed(tallies):
+        backward.add(tally)
+    for begin in range(0, len(tallies), 2):
+        part = Tally()
+        for tally in tallies[begin : begin + 2]:
+            part.add(tally)
+        pairs.add(Tally.from_json(json.loads(json.dumps(part.as_json()))))
+    assert forward == backward == pairs
+    exact = sum((Fraction(math.fsum(np.exp(v))) for v in blocks), Fraction(0))
+    assert forward.sums["det"] == exact
 
 
 def test_a_tally_has_the_moments_of_numpy(rng: np.random.Generator) -> None:
@@ -63,7 +70,7 @@ def test_a_tally_has_the_moments_of_numpy(rng: np.random.Generator) -> None:
     proven = rng.random(400) < 0.9
     tally = tally_of(log_det, reference, proven, 3, 12, 2.0)
     random = tally_of(log_det - 1.0, reference, proven, 3, 12, 0.0)
-    row = tally.summary(random, 400)
+    row = tally.summary(random)
     det, behind = np.exp(log_det), log_det - reference[:, None]
     assert row["det_s"]["mean"] == pytest.approx(det.mean(), rel=1e-14)
     assert row["det_s"]["std"] == pytest.approx(det.std(), rel=1e-12)
@@ -83,24 +90,24 @@ def test_a_tally_has_the_moments_of_numpy(rng: np.random.Generator) -> None:
 def test_singular_selections_are_counted_not_summed() -> None:
     log_det = np.array([[-np.inf], [0.5], [1.0]])
     tally = tally_of(log_det, np.ones(3), np.ones(3, bool), 3, 12, 0.0)
-    row = tally.summary(tally, 3)
+    row = tally.summary(tally)
     assert row["log_det_s"]["mean"] is None and row["hit_rate"] == 1 / 3
     assert row["det_s"]["mean"] == pytest.approx((np.exp(0.5) + np.exp(1)) / 3)
     flat = tally_of(log_det[:1], np.ones(1), np.ones(1, bool), 3, 12, 0.0)
-    row = flat.summary(tally, 1)
+    row = flat.summary(tally)
     assert row["log_det_s"]["median"] is None and row["det_s"]["median"] == 0.0
 
 
 def run(
     folder: pathlib.Path, episodes: int, plan: Plan = PLAN, **options: object
-) -> StreamedEvaluation:
+) -> Summary:
     open_folder(plan, folder)
     return evaluate_stream(plan, episodes, folder, **{"workers": 1} | options)  # type: ignore[arg-type]  # a test's shorthand
 
 
-def exact_numbers(found: StreamedEvaluation) -> list[dict[str, object]]:
+def exact_numbers(found: Summary) -> list[dict[str, object]]:
     """All but the measured seconds."""
-    rows = [dict(found.summary(result)) for result in found.results]
+    rows = [dict(row.numbers) for row in found.rows]
     assert all(row.pop("seconds_per_selection") > 0 for row in rows)
     return rows
 
@@ -112,8 +119,9 @@ def test_the_first_block_has_the_numbers_of_a_plain_evaluation(
     plain = evaluate(
         make_dataset("dataset2", episodes=300), 4, PLAN.methods, random_draws=3
     )
-    for one, other in zip(streamed.results, plain.results, strict=True):
-        row, expected = streamed.summary(one), plain.summary(other)
+    for one, other in zip(streamed.rows, plain.summarise().rows, strict=True):
+        row, expected = one.numbers, other.numbers
+        assert row["label"] == expected["label"]
         assert row["hit_rate"] == expected["hit_rate"]
         for name in ("ratio_to_exact", "d_efficiency", "ratio_to_random"):
             assert row[name] == pytest.approx(expected[name], rel=1e-13)
@@ -130,7 +138,7 @@ def test_the_first_block_has_the_numbers_of_a_plain_evaluation(
     assert entry["dataset"]["episodes"] == 300 and entry["proven"] == 1.0
 
 
-def quick_block(plan: Plan, begin: int, end: int) -> streaming._Block:
+def quick_block(plan: Plan, begin: int, end: int) -> tuple[int, dict[str, Tally]]:
     """In place of the solvers: the first four and the next four postures."""
     candidates = drawn(plan.dataset, plan.seed, begin, end).candidates
     first, next_four = (
@@ -146,13 +154,13 @@ def quick_block(plan: Plan, begin: int, end: int) -> streaming._Block:
             ("exact", best[:, None]),
         )
     }
-    return streaming._Block(best, proven, tallies)
+    return int(proven.sum()), tallies
 
 
 def test_cutting_stopping_and_sharing_do_not_change_a_digit(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(streaming, "_solve_block", quick_block)
+    monkeypatch.setattr(stream, "_solve_block", quick_block)
     whole = exact_numbers(run(tmp_path / "one", 7_300, part=10_000))
     assert exact_numbers(run(tmp_path / "parts", 7_300, part=1_000)) == whole
     assert exact_numbers(run(tmp_path / "pairs", 7_300, part=2_000)) == whole
@@ -171,7 +179,7 @@ def test_cutting_stopping_and_sharing_do_not_change_a_digit(
         assert (stopped / name).stat().st_mtime_ns == stamp
 
     # Three processes: each waits for the parts of the others.
-    def shared(number: int) -> StreamedEvaluation:
+    def shared(number: int) -> Summary:
         place = tmp_path / "shared"
         return run(place, 7_300, part=1_000, process=(number, 3))
 
@@ -187,7 +195,8 @@ def test_cutting_stopping_and_sharing_do_not_change_a_digit(
 
 @pytest.mark.slow
 def test_workers_do_not_change_a_digit(tmp_path: pathlib.Path) -> None:
-    plan = Plan(methods=("random", "greedy", "exchange", "exact"), draws=3)
+    methods = ("random", "greedy", "exchange", "exact")
+    plan = Plan(CATALOGUE, "dataset2", methods=methods, draws=3)
     here = run(tmp_path / "here", 2_200, plan, part=2_000)
     there = run(tmp_path / "there", 2_200, plan, part=1_000, workers=2)
     assert exact_numbers(here) == exact_numbers(there)
@@ -199,9 +208,10 @@ def test_a_killed_stream_leaves_no_worker_and_loses_no_part(
 ) -> None:
     root = pathlib.Path(__file__).resolve().parents[2]
     code = (
-        "import pathlib, sys; from jaxcal.evaluation import streaming as s\n"
+        "import pathlib, sys; from jaxcal.evaluation import stream as s\n"
+        "from jaxcal.paper.datasets.catalogue import CATALOGUE\n"
         "if __name__ == '__main__':\n"
-        f"    plan = s.Plan(methods={PLAN.methods!r}, draws=3)\n"
+        f"    plan = s.Plan(CATALOGUE, 'dataset2', methods={PLAN.methods!r}, draws=3)\n"
         "    folder = pathlib.Path(sys.argv[1]); s.open_folder(plan, folder)\n"
         "    s.evaluate_stream(plan, 10**7, folder, workers=2, part=1_000)\n"
     )
@@ -258,7 +268,7 @@ def test_a_stream_goes_on_where_the_dataset_ends() -> None:
 def test_memory_does_not_grow_with_the_episodes(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(streaming, "_solve_block", quick_block)
+    monkeypatch.setattr(stream, "_solve_block", quick_block)
     peaks = []
     for number, episodes in enumerate((2_000, 2_000, 12_000)):
         tracemalloc.start()
@@ -283,13 +293,13 @@ def test_another_plan_is_refused(
 ) -> None:
     open_folder(PLAN, tmp_path)
     open_folder(PLAN, tmp_path)
-    other = Plan(**{"methods": PLAN.methods, "draws": 3} | change)  # type: ignore[arg-type]  # a test's shorthand
+    other = dataclasses.replace(PLAN, **change)  # type: ignore[arg-type]  # a test's shorthand
     with pytest.raises(ValueError, match=says):
         open_folder(other, tmp_path)
 
 
 def test_damage_is_named(tmp_path: pathlib.Path) -> None:
-    plan = Plan(methods=("greedy",), draws=1)
+    plan = Plan(CATALOGUE, "dataset2", methods=("greedy",), draws=1)
     run(tmp_path, 20, plan)
     part = next(tmp_path.glob("part-*"))
     part.write_text(part.read_text()[:100])
@@ -298,6 +308,15 @@ def test_damage_is_named(tmp_path: pathlib.Path) -> None:
     (tmp_path / "stream.json").write_text("[1")
     with pytest.raises(ValueError, match=r"stream\.json is damaged"):
         open_folder(plan, tmp_path)
+
+
+def test_a_folder_of_another_version_is_refused(tmp_path: pathlib.Path) -> None:
+    open_folder(PLAN, tmp_path)
+    path = tmp_path / "stream.json"
+    held = json.loads(path.read_text())
+    path.write_text(json.dumps(held | {"version": 1, "seed": 5}))
+    with pytest.raises(ValueError, match=r"format 1, this one uses 2\): name another"):
+        open_folder(PLAN, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -310,7 +329,7 @@ def test_damage_is_named(tmp_path: pathlib.Path) -> None:
 )
 def test_bad_plans_are_named(values: dict[str, object], says: str) -> None:
     with pytest.raises(ValueError, match=says):
-        Plan(**values)  # type: ignore[arg-type]  # bad on purpose
+        dataclasses.replace(PLAN, **values)  # type: ignore[arg-type]  # bad on purpose
 
 
 def test_bad_parts_and_workers_are_named(tmp_path: pathlib.Path) -> None:

@@ -1,4 +1,4 @@
-"""What a training run takes from the exact solver: sets to watch it by, a teacher."""
+"""What the solvers give a training run: validation sets with optima, a teacher."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def fixed_validation(config: TrainConfig) -> Validation:
 def teacher(
     candidates: np.ndarray, available: np.ndarray, given: np.ndarray, k: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The best postures of every set; see ``jaxcal.learning.training.imitation.Teacher``.
+    """The best postures of every set, as ``imitation.Teacher`` wants them.
 
     The proven optimum where k is the number of regressors. Above it, what Fedorov
-    exchange finds from its default restarts: as good as always the optimum, and in a
-    time that does not depend on the shape of the candidates, as a proof's does.
+    exchange finds from its default restarts: almost always optimal, and in a time that
+    does not depend on the shape of the candidates, as that of a proof does.
     """
     from jaxcal.selection import exact_batch, exchange_batch
 
