@@ -121,3 +121,14 @@ def test_random_actions_are_uniform_over_what_is_left():
     units = (jnp.arange(47) + 0.5) / 47
     actions = random_action(jnp.tile(chosen, (47, 1)), 3, units)
     assert sorted(np.asarray(actions).tolist()) == sorted(set(range(50)) - {7, 0, 49})
+
+
+@pytest.mark.parametrize(("quick", "said"), [(False, "MISSED"), (True, "not judged")])
+def test_a_quick_run_is_not_judged(quick, said):
+    from benchmarks import report
+    from benchmarks.harness import Row, Verdict
+
+    row = Row("training", "title", verdicts=[Verdict("against brax", None, 10.0)])
+    shown = report.as_json(row) | {"quick": quick}
+    assert said in report.text(shown)
+    assert ("MISSED" in report.text(shown)) is not quick
