@@ -31,9 +31,7 @@ def settings_of(config: type) -> Iterator[Setting]:
             yield Setting(field.name, kinds[field.name], field.metadata["help"])
 
 
-def require(
-    config: Any, rule: str, holds: Callable[[Any], bool], *names: str
-) -> None:
+def require(config: Any, rule: str, holds: Callable[[Any], bool], *names: str) -> None:
     """Refuse a configuration in which one of the named fields breaks a rule.
 
     Raises:

@@ -51,7 +51,9 @@ class SelectionConfig:
     num_selected: int = setting(4, "postures chosen; num_inputs + 1 identify the model")
     num_inputs: int = setting(3, "commanded axes")
     num_outputs: int = setting(3, "measured axes; they multiply the log-determinant")
-    reward_scale: float = setting(0.1, "reward per unit of log det S (the paper's 1/10)")
+    reward_scale: float = setting(
+        0.1, "reward per unit of log det S (the paper's 1/10)"
+    )
     reward_gain: bool = setting(
         False, "pay the increase of log det S; on where num_selected > num_inputs + 1"
     )

@@ -32,9 +32,7 @@ DECODINGS = ("greedy", "samples", "first")
 
 def log_det_of(candidates: jax.Array, indices: jax.Array) -> jax.Array:
     """(...,) log det(Z.T Z) of the subsets ``indices`` (..., K) of (..., M, n)."""
-    return log_det_gram(
-        jnp.take_along_axis(candidates, indices[..., None], axis=-2)
-    )
+    return log_det_gram(jnp.take_along_axis(candidates, indices[..., None], axis=-2))
 
 
 def complete(

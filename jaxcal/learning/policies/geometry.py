@@ -234,5 +234,3 @@ def log_det_lengths(chosen: jax.Array) -> jax.Array:
         total = total + jnp.log(square)
         basis.append([a * jax.lax.rsqrt(square) for a in v])
     return total
-
-

@@ -28,7 +28,16 @@ from jaxcal.learning.training.optimiser import Keys, Metrics
 from jaxcal.learning.training.rules import Rules
 from jaxcal.learning.training.update import Update
 
-__all__ = ["Attempt", "Lesson", "Lessons", "Teacher", "draw", "follow", "loss", "updater"]
+__all__ = [
+    "Attempt",
+    "Lesson",
+    "Lessons",
+    "Teacher",
+    "draw",
+    "follow",
+    "loss",
+    "updater",
+]
 
 Teacher = Callable[
     [np.ndarray, np.ndarray, np.ndarray, int], tuple[np.ndarray, np.ndarray]

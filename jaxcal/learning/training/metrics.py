@@ -65,10 +65,6 @@ def _rows_until(path: pathlib.Path, done: int) -> list[str]:
     kept = []
     for line in path.read_text().splitlines()[1:]:
         cells = line.split(",")
-        if (
-            len(cells) == len(COLUMNS)
-            and cells[0].isdigit()
-            and int(cells[0]) <= done
-        ):
+        if len(cells) == len(COLUMNS) and cells[0].isdigit() and int(cells[0]) <= done:
             kept.append(line)
     return kept
