@@ -72,8 +72,14 @@ def parser(prog: str) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = out.add_argument
-    add("--preset", choices=sorted(known), default="compact", help="see below [compact]")
-    add("--episodes", type=int, metavar="N", help="training budget" + _held("num_episodes", known))
+    add(
+        "--preset",
+        choices=sorted(known),
+        default="compact",
+        help="see below [compact]",
+    )
+    budget = "training budget" + _held("num_episodes", known)
+    add("--episodes", type=int, metavar="N", help=budget)
     add("--seed", type=int, metavar="S", help="of everything random [0]")
     add("--out", metavar="DIR", help="run folder [runs/PRESET]")
     add("--resume", action="store_true", help="go on from the run folder's checkpoint")
@@ -132,7 +138,7 @@ def _abouts(known: dict[str, TrainConfig]) -> str:
 
 
 def _held(name: str, known: dict[str, TrainConfig]) -> str:
-    "[2; paper 10]" and a blank before it: the value of compact, and of presets that differ."""
+    """The value of compact, and of presets that differ: ``" [2; paper 10]"``."""
     values = {}
     for preset, config in known.items():
         task = config.tasks[0].environment

@@ -1,4 +1,4 @@
-"""Determinants and factors of small matrices in float32 JAX, written out entry by entry.
+"""Determinants and factors of small matrices, written out entry by entry in JAX.
 
 No library factorisation is used: for matrices of 3 to 5 rows unrolled arithmetic is
 faster on a batch, the same on every backend, and has a gradient. All functions

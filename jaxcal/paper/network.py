@@ -135,7 +135,7 @@ class PaperNetwork(nn.Module):
     def from_observation(
         self, observation: jax.Array, num_candidates: int, num_inputs: int
     ) -> tuple[jax.Array, jax.Array]:
-        """Logits and value from the paper's (..., 210) numbers, ``selection.observe``."""
+        """Logits and value from the (..., 210) numbers of ``selection.observe``."""
         m, n = num_candidates, num_inputs
         poses = observation[..., : n * m].reshape(*observation.shape[:-1], m, n)
         available = observation[..., n * m : (n + 1) * m] > 0.5

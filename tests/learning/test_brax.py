@@ -9,8 +9,7 @@ import pytest
 
 from jaxcal.learning.environments import selection as environment
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.training import checkpoint
-from jaxcal.learning.training import presets
+from jaxcal.learning.training import checkpoint, presets
 
 brax_env = pytest.importorskip("jaxcal.learning.environments.brax_env")
 

@@ -86,7 +86,8 @@ def play(params, keys, mesh):
 
 with jax.disable_jit():
     plain = play(params, keys, None)
-shared = jax.jit(lambda p, k: play(p, k, mesh))(*devices.replicate((params, keys), mesh))
+given = devices.replicate((params, keys), mesh)
+shared = jax.jit(lambda params, keys: play(params, keys, mesh))(*given)
 out["same actions"] = float((plain.action == np.asarray(shared.action)).mean())
 out["log_prob"] = distance(plain.log_prob, shared.log_prob)
 out["advantage"] = distance(plain.advantage, shared.advantage)

@@ -20,8 +20,8 @@ import pytest
 
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
-from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training import checkpoint, optimiser, presets
 from jaxcal.learning.training import run as training
 from jaxcal.learning.training.checkpoint import CheckpointError

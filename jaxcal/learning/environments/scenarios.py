@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxcal.learning.environments import randomness
 from jaxcal.learning.environments.selection import (
@@ -48,7 +49,7 @@ def uniform(
 
 
 def from_pool(
-    config: SelectionConfig, pool: jax.Array, available: jax.Array | None = None
+    config: SelectionConfig, pool: ArrayLike, available: ArrayLike | None = None
 ) -> Candidates:
     """Candidates drawn without replacement from a pool.
 
@@ -57,29 +58,29 @@ def from_pool(
         pool: (N, n) postures, N at least ``num_candidates``.
         available: (N,) bool, those that may be chosen; all when None.
     """
-    pool = jnp.asarray(pool, jnp.float32)
-    if pool.ndim != 2 or pool.shape[1] != config.num_inputs:
+    postures = np.asarray(pool, np.float32)
+    if postures.ndim != 2 or postures.shape[1] != config.num_inputs:
         raise ValueError(
-            f"pool must have shape (N, {config.num_inputs}), got {pool.shape}"
+            f"pool must have shape (N, {config.num_inputs}), got {postures.shape}"
         )
-    free = np.ones(len(pool), bool) if available is None else np.asarray(available)
+    free = np.ones(len(postures), bool) if available is None else np.asarray(available)
     keep = np.flatnonzero(free)
     if len(keep) < config.num_candidates:
         raise ValueError(
             f"pool must hold at least {config.num_candidates} postures, the "
             f"num_candidates of an episode, got {len(keep)} available"
         )
-    pool = pool[keep]
+    kept = jnp.asarray(postures[keep])
 
     def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        index = jax.random.permutation(key, pool.shape[0])[: config.num_candidates]
-        return pool[index], jnp.ones(config.num_candidates, bool)
+        index = jax.random.permutation(key, len(keep))[: config.num_candidates]
+        return kept[index], jnp.ones(config.num_candidates, bool)
 
     return draw
 
 
 def from_sets(
-    config: SelectionConfig, sets: jax.Array, available: jax.Array | None = None
+    config: SelectionConfig, sets: ArrayLike, available: ArrayLike | None = None
 ) -> Candidates:
     """One of the given candidate sets for every episode, each as likely.
 
@@ -88,13 +89,15 @@ def from_sets(
         sets: (B, M, n) candidates.
         available: (B, M) bool; all when None. At least ``num_selected`` in every set.
     """
-    sets = jnp.asarray(sets, jnp.float32)
+    points = jnp.asarray(sets, jnp.float32)
     shape = (config.num_candidates, config.num_inputs)
-    if sets.ndim != 3 or sets.shape[1:] != shape:
+    if points.ndim != 3 or points.shape[1:] != shape:
         raise ValueError(
-            f"sets must have shape (B, {shape[0]}, {shape[1]}), got {sets.shape}"
+            f"sets must have shape (B, {shape[0]}, {shape[1]}), got {points.shape}"
         )
-    free = np.ones(sets.shape[:2], bool) if available is None else np.asarray(available)
+    free = (
+        np.ones(points.shape[:2], bool) if available is None else np.asarray(available)
+    )
     few = np.flatnonzero(free.sum(axis=1) < config.num_selected)
     if few.size:
         raise ValueError(
@@ -104,8 +107,8 @@ def from_sets(
     masks = jnp.asarray(free)
 
     def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        index = jax.random.randint(key, (), 0, len(sets))
-        return sets[index], masks[index]
+        index = jax.random.randint(key, (), 0, len(points))
+        return points[index], masks[index]
 
     return draw
 

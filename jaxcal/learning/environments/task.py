@@ -1,4 +1,4 @@
-"""What is trained on: an episode of posture selection and where its candidates come from.
+"""What is trained on: an episode of selection and where its candidates come from.
 
 A ``Task`` is all that the trainer knows of an environment: how to begin, how to step,
 and what a decision pays (``training.rollout.Rules`` says what it needs). Another
@@ -86,7 +86,7 @@ class Task:
         return selection.step(state, action, self.environment)
 
     def paid(self, state: SelectionState) -> jax.Array:
-        """() reward received already of the final value; 0 where each payment is whole."""
+        """() reward received already of the final value; 0 if each payment is whole."""
         config = self.environment
         return config.reward_scale * state.paid * float(config.reward_gain)
 

@@ -10,7 +10,7 @@ for a decision and not in every epoch:
 
 ``value`` is the expected final log det(Z.T Z), unscaled. Networks are flax modules that
 are made from a ``NetworkConfig``. ``compact`` stands in this package; an installed
-package adds a kind by an entry point, as jaxcal's own pyproject.toml does for ``paper``:
+package adds a kind by an entry point, as jaxcal's own pyproject.toml adds ``paper``:
 
     [project.entry-points."jaxcal.networks"]
     paper = "jaxcal.paper.network:PaperNetwork"
@@ -78,6 +78,9 @@ class Network(Protocol):
 
     config: NetworkConfig
 
+    def __hash__(self) -> int:
+        """It is static to ``jit``."""
+
     @property
     def num_unlearned(self) -> int:
         """Choices at the end of an episode that ``finish`` makes without parameters."""
@@ -102,7 +105,7 @@ class Network(Protocol):
         """
 
     def shares_program(self, features: Any, k: int) -> range:
-        """Counts of choices made, out of K, after which the next is the same program."""
+        """Counts of choices made, out of K, whose next choice is the same program."""
 
     def encode(self, features: Any) -> jax.Array:
         """(..., M, width) memory of a set."""

@@ -31,7 +31,7 @@ from jaxcal.learning.settings import settings_of
 from jaxcal.learning.training import checkpoint
 from jaxcal.learning.training.config import TrainConfig
 
-__all__ = ["MaskedCategorical", "READ", "adapted", "require_read", "train"]
+__all__ = ["READ", "MaskedCategorical", "adapted", "require_read", "train"]
 
 READ = (
     "num_episodes",
@@ -48,7 +48,7 @@ _FASTEST = 1e-3  # learning rate; brax's updates diverge at the compact preset's
 
 
 def adapted(config: TrainConfig) -> TrainConfig:
-    """A preset as brax trains it: the paper's architecture, a learning rate it bears."""
+    """A preset as brax trains it: another architecture, a learning rate it bears."""
     width = config.network.width if config.network.kind == "paper" else _WIDTH
     rate = min(config.ppo.learning_rate, _FASTEST)
     return dataclasses.replace(

@@ -52,8 +52,8 @@ class PPOConfig:
     seed: int = setting(0, "of everything random")
 
     def __post_init__(self) -> None:
-        counts = ("num_episodes", "episodes_per_update", "episodes_per_set")
-        counts += ("num_epochs", "num_minibatches")
+        counts = ["num_episodes", "episodes_per_update", "episodes_per_set"]
+        counts += ["num_epochs", "num_minibatches"]
         require(self, "at least 1", lambda v: v >= 1, *counts)
         if self.episodes_per_update % (self.episodes_per_set * self.num_minibatches):
             raise ValueError(

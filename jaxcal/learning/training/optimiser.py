@@ -1,4 +1,4 @@
-"""From a loss to new weights: the state of a run, the optimiser, epochs of minibatches."""
+"""From a loss to new weights: a run's state, the optimiser, epochs of minibatches."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Keys(NamedTuple):
 
     @staticmethod
     def of(seed: int) -> Keys:
-        """All from one seed. Split once: ``fold_in(key, i)`` equals ``split(key)[i]``."""
+        """From one seed, split once; ``fold_in(key, i)`` would be ``split(key)[i]``."""
         return Keys(*jax.random.split(jax.random.key(seed), 3))
 
 

@@ -10,13 +10,16 @@ __all__ = ["Rules"]
 
 
 class Rules(Protocol):
-    """What the trainer needs of an environment; hashable, it is static to ``jit``.
+    """What the trainer needs of an environment.
 
-    A state is a tree of arrays with the leaves ``candidates`` (M, n), ``available`` (M,)
-    bool and ``chosen`` (K,) int, -1 where nothing is chosen yet.
+    A state is a tree of arrays; three of its leaves are ``candidates`` (M, n),
+    ``available`` (M,) bool and ``chosen`` (K,) int, -1 where nothing is chosen yet.
     """
 
     random_starts: float  # share of episodes begun with random choices
+
+    def __hash__(self) -> int:
+        """It is static to ``jit``."""
 
     @property
     def num_decisions(self) -> int:

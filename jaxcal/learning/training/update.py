@@ -1,4 +1,4 @@
-"""One jitted update: gather experience, then learn from it. Devices are placed here only.
+"""One jitted update: gather experience, learn from it. Only this places on devices.
 
 Whatever is gathered, an update has this shape:
 

@@ -31,7 +31,9 @@ def _network() -> dict[str, Any]:
     from jaxcal.paper.preset import PAPER as config
 
     network = networks.build(config.network)
-    shapes = jax.eval_shape(lambda: optimiser.init(config.ppo, config.tasks[0], network))
+    shapes = jax.eval_shape(
+        lambda: optimiser.init(config.ppo, config.tasks[0], network)
+    )
     size = {
         name: sum(leaf.size for leaf in jax.tree.leaves(part))
         for name, part in shapes.params.items()
