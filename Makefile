@@ -36,10 +36,11 @@ test: lint ## set everything up, lint, and run the quick tests (the ones CI runs
 test-all: lint ## every test, the slow ones too
 	$(BIN)/python -m pytest $(ARGS)
 
-lint: $(READY) ## ruff (lint and format) and mypy
+lint: $(READY) ## ruff (lint and format), mypy and the import contracts
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 format: $(READY) ## let ruff rewrite what it can
 	$(BIN)/ruff check --fix .

@@ -42,7 +42,9 @@ from jaxcal.information.regression import log_det_information
 from jaxcal.learning.environments import scenarios
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies import decoding
-from jaxcal.learning.policies.networks import CompactNetwork, NetworkConfig, View
+from jaxcal.learning.policies.compact import CompactNetwork
+from jaxcal.learning.policies.features import CandidateFeatures, DecisionFeatures
+from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import cache
 from jaxcal.learning.training import presets
 from jaxcal.learning.training import run as training
@@ -69,12 +71,12 @@ class Unlearned(CompactNetwork):
     def setup(self) -> None:
         """No parameters."""
 
-    def encode(self, view: View) -> jax.Array:
-        return view["features"][..., :1]
+    def encode(self, features: CandidateFeatures) -> jax.Array:
+        return features.vectors.columns[..., :1]
 
-    def finish(self, glance: View) -> tuple[jax.Array, jax.Array]:
-        score = glance["ahead"][..., self.column]
-        return jnp.where(glance["active"], score, -1e9), score.max(-1)
+    def finish(self, decision: DecisionFeatures) -> tuple[jax.Array, jax.Array]:
+        score = decision.vectors.ahead[..., self.column]
+        return jnp.where(decision.vectors.active, score, -1e9), score.max(-1)
 
 
 def unlearned(
@@ -257,7 +259,7 @@ def trained(
         "num_episodes": num,
         "seed": seed,
     }
-    config = presets.with_values(presets.PRESETS["compact"], values)
+    config = presets.with_values(presets.load("compact"), values)
     with tempfile.TemporaryDirectory() as folder:
         run = pathlib.Path(folder) / "run"
         begun = time.perf_counter()

@@ -69,13 +69,14 @@ def train_seed(
     """
     from jaxcal.learning.training import checkpoint
     from jaxcal.learning.training import run as training
+    from jaxcal.learning.training.config import TrainConfig
     from jaxcal.selection.teacher import fixed_validation
 
     require_writable_folder(folder)
     steps = folder / "checkpoint"
     resume = steps.is_dir() and any(path.name.isdigit() for path in steps.iterdir())
     if resume:
-        held = training.TrainConfig.from_meta(checkpoint.load(folder).meta)
+        held = TrainConfig.from_meta(checkpoint.load(folder).meta)
         if held.as_meta() != config.as_meta():
             raise ValueError(
                 f"{folder} holds a run of another configuration: name another --runs"
@@ -231,7 +232,7 @@ def _train_all(options: argparse.Namespace) -> None:
         values = {"seed": seed}
         if options.episodes is not None:
             values["num_episodes"] = options.episodes
-        config = presets.with_values(presets.PRESETS[options.preset], values)
+        config = presets.with_values(presets.load(options.preset), values)
         config = dataclasses.replace(config, validate_every=_VALIDATE_EVERY_S)
         target = options.out / f"seed_{seed}"
         if _is_finished(target / "summary.json", config):
@@ -304,10 +305,10 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     if (options.preset is None) == (options.collect is None):
         parser.error("give one of --preset and --collect")
     if options.preset is not None:
-        from jaxcal.learning.training.presets import PRESETS
+        from jaxcal.learning.training import presets
 
-        if options.preset not in PRESETS:
-            known = ", ".join(sorted(PRESETS))
+        if options.preset not in presets.names():
+            known = ", ".join(presets.names())
             parser.error(f"--preset must be one of {known}, got {options.preset!r}")
     elif options.seeds or options.episodes or options.runs:
         parser.error("--seeds, --episodes and --runs go with --preset")

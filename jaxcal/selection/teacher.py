@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxcal.learning.training.run import TrainConfig, Validation
+from jaxcal.learning.training.config import TrainConfig
+from jaxcal.learning.training.run import Validation
 
 __all__ = ["fixed_validation", "teacher"]
 
@@ -12,14 +13,24 @@ _SETS = 500
 
 
 def fixed_validation(config: TrainConfig) -> Validation:
-    """500 uniform sets of the first task's size, never trained on, and their optima.
+    """500 sets as the first task has them, and their optima.
 
-    The sets depend on M and n only, so runs with other seeds or networks are measured
-    on the same ones.
+    Uniform ones, never trained on, that depend on M and n only, so runs with other
+    seeds or networks are measured on the same ones. Where the user gave candidates, 500
+    draws of those.
     """
     from jaxcal.selection import exact_batch
 
-    env = config.tasks[0].environment
+    task = config.tasks[0]
+    env = task.environment
+    if task.given is not None:
+        import jax
+
+        states = jax.vmap(task.reset)(jax.random.split(jax.random.key(20261121), _SETS))
+        given = np.asarray(states.candidates, np.float64)
+        free = np.asarray(states.available)
+        found = exact_batch(given, env.num_selected, available=free, num_outputs=1)
+        return Validation(given, np.asarray(found.log_det), env.num_outputs, free)
     rng = np.random.default_rng([20261121, env.num_candidates, env.num_inputs])
     sets = rng.uniform(size=(_SETS, env.num_candidates, env.num_inputs))
     best = exact_batch(sets, env.num_selected, num_outputs=1).log_det

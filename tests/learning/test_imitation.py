@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from jaxcal.learning.environments.selection import SelectionConfig
+from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies import networks
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.training import checkpoint, imitation, ppo
+from jaxcal.learning.training import checkpoint, imitation, optimiser
 from jaxcal.learning.training import run as training
-from jaxcal.learning.training.ppo import PPOConfig, Task
-from jaxcal.learning.training.run import TrainConfig
+from jaxcal.learning.training.config import PPOConfig, TrainConfig
 
 PPO = PPOConfig(
     num_episodes=64 * 4,
@@ -90,17 +90,19 @@ def measured(params, lesson):
 
 @pytest.mark.slow
 def test_the_loss_is_that_of_the_definition(lesson):
-    state = ppo.init(PPO, TASK, NETWORK)
+    state = optimiser.init(PPO, TASK, NETWORK)
     total, metrics = measured(state.params, lesson)
-    view = NETWORK.look(lesson.candidates, lesson.available)
-    memory = networks.encode(NETWORK, state.params, view)
+    features = NETWORK.candidate_features(lesson.candidates, lesson.available)
+    memory = networks.encode(NETWORK, state.params, features)
     surprise, error, number = 0.0, 0.0, 0
     chosen = np.full((64, 5), -1)
     free, wanted = np.array(lesson.available), np.array(lesson.wanted)
     rows = np.arange(64)
     for count in range(3):
-        glance = NETWORK.look_at(view, jnp.asarray(chosen), jnp.asarray(free), count)
-        logits, value = networks.decode(NETWORK, state.params, memory, glance)
+        decision = NETWORK.decision_features(
+            features, jnp.asarray(chosen), jnp.asarray(free), count
+        )
+        logits, value = networks.decode(NETWORK, state.params, memory, decision)
         weights = np.exp(np.asarray(logits, float))
         share = weights / weights.sum(-1, keepdims=True)
         counted = count >= np.asarray(lesson.length)
@@ -121,7 +123,7 @@ def test_the_loss_is_that_of_the_definition(lesson):
 
 @pytest.mark.slow
 def test_the_order_of_the_candidates_does_not_matter(lesson, rng):
-    state = ppo.init(PPO, TASK, NETWORK)
+    state = optimiser.init(PPO, TASK, NETWORK)
     order = rng.permutation(11)
     where = np.argsort(order)
     turned = dataclasses.replace(
@@ -144,11 +146,11 @@ def test_lessons_teach():
     # Without the look-ahead it has to be learned what to choose.
     network = networks.build(NetworkConfig(width=8, encoder_rounds=1, lookahead=1))
     task = Task(SelectionConfig(num_candidates=8))
-    state = ppo.init(config, task, network)
+    state = optimiser.init(config, task, network)
     losses = []
     for index in range(config.num_imitated):
         shown = imitation.draw(config, task, network, brute_force, index)
-        state, metrics = imitation.update(state, shown, config, task, network)
+        state, metrics = imitation.updater(config, task, network)(state, shown)
         losses.append(float(metrics["policy_loss"]))
     assert np.mean(losses[-5:]) < 0.85 * np.mean(losses[:5])
 

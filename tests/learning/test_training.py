@@ -19,12 +19,15 @@ import numpy as np
 import pytest
 
 from jaxcal.learning.environments.selection import SelectionConfig
+from jaxcal.learning.environments.task import Task
+from jaxcal.learning.policies import networks
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.training import checkpoint, presets
+from jaxcal.learning.training import checkpoint, optimiser, presets
 from jaxcal.learning.training import run as training
 from jaxcal.learning.training.checkpoint import CheckpointError
-from jaxcal.learning.training.ppo import PPOConfig, Task
-from jaxcal.learning.training.run import TrainConfig, Validation
+from jaxcal.learning.training.config import PPOConfig, TrainConfig
+from jaxcal.learning.training.metrics import COLUMNS
+from jaxcal.learning.training.run import Validation
 
 ROOT = pathlib.Path(__file__).parents[2]
 
@@ -80,7 +83,7 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished, tmp_path):
 def test_metrics_have_the_columns_that_figures_read(finished):
     folder, _ = finished
     header = (folder / "metrics.csv").read_text().splitlines()[0]
-    assert header == ",".join(training.COLUMNS)
+    assert header == ",".join(COLUMNS)
     assert any(p.name.startswith("events.out.tfevents") for p in folder.iterdir())
 
 
@@ -117,15 +120,11 @@ def test_validation_of_the_optimum_itself_is_one():
 
     best = np.asarray(exact_batch(sets, 4, num_outputs=1).log_det)
     network = NetworkConfig(width=8, encoder_rounds=1)
-    state = training.ppo.init(CONFIG.ppo, CONFIG.tasks[0],
-                              training.networks.build(network))  # fmt: skip
-    ratio, hits = Validation(sets, best, 3).measure(
-        training.networks.build(network), state.params, 4
-    )
+    network = networks.build(network)
+    state = optimiser.init(CONFIG.ppo, CONFIG.tasks[0], network)
+    ratio, hits = Validation(sets, best, 3).measure(network, state.params, 4)
     assert 0.0 <= ratio <= 1.0 and 0.0 <= hits <= 1.0
-    worse, none = Validation(sets, best + 1.0, 3).measure(
-        training.networks.build(network), state.params, 4
-    )
+    worse, none = Validation(sets, best + 1.0, 3).measure(network, state.params, 4)
     assert worse == pytest.approx(ratio * np.exp(-3.0), rel=1e-3) and none == 0.0
 
 
@@ -240,9 +239,9 @@ def test_killed_save_leaves_the_previous_checkpoint(finished, tmp_path):
         assert policy.step in (last, last + 1)
 
 
-@pytest.mark.parametrize("preset", sorted(presets.PRESETS))
+@pytest.mark.parametrize("preset", presets.names())
 def test_presets_survive_their_own_metadata(preset):
-    config = presets.PRESETS[preset]
+    config = presets.load(preset)
     meta = json.loads(json.dumps(config.as_meta()))
     again = TrainConfig.from_meta(meta)
     assert (again.network, again.ppo, again.tasks) == (
@@ -253,7 +252,7 @@ def test_presets_survive_their_own_metadata(preset):
 
 
 def test_the_paper_preset_is_table_2():
-    paper = presets.PRESETS["paper"]
+    paper = presets.load("paper")
     assert paper.ppo.episodes_per_update == 16
     assert paper.ppo.num_epochs == 10
     assert paper.ppo.num_episodes == 200_000
@@ -263,7 +262,7 @@ def test_the_paper_preset_is_table_2():
 
 def test_single_values_change_and_unknown_ones_are_named():
     config = presets.with_values(
-        presets.PRESETS["compact"], {"num_candidates": 20, "width": 16, "seed": 5}
+        presets.load("compact"), {"num_candidates": 20, "width": 16, "seed": 5}
     )
     assert config.tasks[0].environment.num_candidates == 20
     assert (config.network.width, config.ppo.seed) == (16, 5)

@@ -26,16 +26,19 @@ def _network() -> dict[str, Any]:
     import jax
 
     from jaxcal.learning.policies import networks
-    from jaxcal.learning.training import ppo, presets
+    from jaxcal.learning.training import optimiser
+    from jaxcal.paper.network import HEADS
+    from jaxcal.paper.preset import PAPER as config
 
-    config = presets.PRESETS["paper"]
     network = networks.build(config.network)
-    shapes = jax.eval_shape(lambda: ppo.init(config.ppo, config.tasks[0], network))
+    shapes = jax.eval_shape(
+        lambda: optimiser.init(config.ppo, config.tasks[0], network)
+    )
     size = {
         name: sum(leaf.size for leaf in jax.tree.leaves(part))
         for name, part in shapes.params.items()
     }
-    heads = sum(size[name] for name in networks.PAPER_HEADS)
+    heads = sum(size[name] for name in HEADS)
     total = sum(size.values())
     return {
         "parameters": total,
@@ -46,9 +49,8 @@ def _network() -> dict[str, Any]:
 
 
 def _table_2() -> Exhibit:
-    from jaxcal.learning.training import presets
+    from jaxcal.paper.preset import PAPER as config
 
-    config = presets.PRESETS["paper"]
     environment, ppo = config.tasks[0].environment, config.ppo
     network, scale = _network(), environment.reward_scale
     m, k = environment.num_candidates, environment.num_selected
