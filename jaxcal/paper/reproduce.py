@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 if TYPE_CHECKING:
-    from jaxcal.progress import Progress
     from jaxcal.paper.exhibits.exhibit import Claim, Exhibit, Settings
+    from jaxcal.progress import Progress
 
 _DESCRIPTION = """\
 Make every figure and table of the paper from our own runs, each beside what the paper

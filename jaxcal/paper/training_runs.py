@@ -155,7 +155,7 @@ def _summary(run: pathlib.Path, metrics: dict[str, Array]) -> dict[str, Any]:
 
     from jaxcal.evaluation.methods import evaluate
     from jaxcal.learning.training import checkpoint
-    from jaxcal.paper.datasets.datasets import make_dataset
+    from jaxcal.paper.datasets import make_dataset
 
     policy = checkpoint.load(run)
     measured = evaluate(

@@ -19,8 +19,8 @@ from PIL import Image
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from jaxcal.paper.datasets.dataset_command import write_datasets
-from jaxcal.paper.datasets.datasets import BIAS_DEG, SCALE, make_dataset
+from jaxcal.paper.datasets import BIAS_DEG, SCALE, make_dataset
+from jaxcal.paper.datasets.__main__ import write_datasets
 from jaxcal.paper.reproduce import main
 
 ROOT = pathlib.Path(__file__).parents[2]

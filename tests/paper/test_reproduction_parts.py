@@ -15,7 +15,7 @@ from scipy import stats
 
 from jaxcal.calibration.identify import identify
 from jaxcal.evaluation.parameters import least_squares, predict
-from jaxcal.paper.datasets.datasets import make_dataset
+from jaxcal.paper.datasets import make_dataset
 from jaxcal.paper.exhibits import pictures
 from jaxcal.paper.exhibits.devices import Device
 from jaxcal.paper.exhibits.exhibit import Settings, as_csv

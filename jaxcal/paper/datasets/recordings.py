@@ -26,14 +26,13 @@ from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges, draw_from_pool
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.paper.datasets.datasets import RANGES
+from jaxcal.paper.datasets.constants import AXES, RANGES
 
 __all__ = ["SHIPPED", "read_pool", "recorded_dataset"]
 
 Array = NDArray[np.float64]
 
 SHIPPED = pathlib.Path(__file__).parent / "data"
-_AXES = ("pitch", "yaw", "roll")
 
 
 def recorded_dataset(
@@ -124,7 +123,7 @@ def _table(data: bytes) -> Array:
     if not rows:
         raise ValueError("the file is empty")
     header = [name.strip() for name in rows[0][1]]
-    wanted = [f"{what}_deg_{axis}" for what in "uy" for axis in _AXES]
+    wanted = [f"{what}_deg_{axis}" for what in "uy" for axis in AXES]
     for name in wanted:
         if header.count(name) != 1:
             how = "missing" if name not in header else "there twice"
@@ -166,9 +165,9 @@ def _ranges_beside(recording: pathlib.Path) -> JointRanges:
         named = document.get("ranges_deg")
         if named is None:
             return RANGES
-        low, high = zip(*(named[axis] for axis in _AXES), strict=True)
-        return JointRanges(low, high, _AXES)
+        low, high = zip(*(named[axis] for axis in AXES), strict=True)
+        return JointRanges(low, high, AXES)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(
-            f'{card}: "ranges_deg" must give [low, high] of {", ".join(_AXES)}: {error}'
+            f'{card}: "ranges_deg" must give [low, high] of {", ".join(AXES)}: {error}'
         ) from None

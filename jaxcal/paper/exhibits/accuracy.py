@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from jaxcal.evaluation.parameters import least_squares, parameter_names, predict
 from jaxcal.information.regression import regressors
-from jaxcal.paper.datasets.datasets import BIAS_DEG, NOISE_STD_DEG, SCALE
+from jaxcal.paper.datasets import BIAS_DEG, NOISE_STD_DEG, SCALE
 from jaxcal.paper.exhibits.devices import Device, pick, rms
 from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict
 from jaxcal.paper.exhibits.figures_accuracy import (

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from jaxcal.calibration.identify import identify
 from jaxcal.evaluation.parameters import least_squares, parameter_names, predict
-from jaxcal.paper.datasets.datasets import BIAS_DEG, NOISE_STD_DEG, RANGES, SCALE
+from jaxcal.paper.datasets import BIAS_DEG, NOISE_STD_DEG, RANGES, SCALE
 from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict
 from jaxcal.paper.exhibits.figures_calibration import error_boxes, order_bars
 from jaxcal.paper.exhibits.intervals import mean_interval, share_interval

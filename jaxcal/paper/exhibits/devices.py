@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.paper.datasets.datasets import BIAS_DEG, NOISE_STD_DEG, SCALE
+from jaxcal.paper.datasets import BIAS_DEG, NOISE_STD_DEG, SCALE
 
 __all__ = ["Device", "pick", "rms"]
 

@@ -8,7 +8,7 @@ import tempfile
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.paper.datasets.datasets import dataset0_robot
+from jaxcal.paper.datasets import dataset0_robot
 from jaxcal.paper.exhibits.exhibit import Exhibit
 from jaxcal.paper.exhibits.material import Material, commands_deg
 from jaxcal.paper.twin.robot import read_out

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from jaxcal.candidates import uniform_candidates
 from jaxcal.evaluation.parameters import least_squares, predict
-from jaxcal.paper.datasets.datasets import NOISE_STD_DEG, RANGES
+from jaxcal.paper.datasets import NOISE_STD_DEG, RANGES
 from jaxcal.paper.exhibits.devices import Device, pick, rms
 from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict
 from jaxcal.paper.exhibits.figures_recalibration import by_age, traces

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal.information.regression import log_det_information, regression_matrix
-from jaxcal.paper.datasets.datasets import EPISODES, NUM_CANDIDATES, RANGES
+from jaxcal.paper.datasets import EPISODES, NUM_CANDIDATES, RANGES
 from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict
 from jaxcal.paper.exhibits.intervals import mean_interval
 from jaxcal.paper.exhibits.material import Material

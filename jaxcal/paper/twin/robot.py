@@ -297,12 +297,3 @@ def _in_its_precision(function: Any, commands_deg: ArrayLike | jax.Array) -> Any
     commands = numbers("commands", commands_deg)
     with jax.enable_x64(True):
         return np.array(function(jnp.asarray(commands)), dtype=np.float64)
-
-
-def __getattr__(name: str) -> Any:
-    """``render`` and ``animate``, which load MuJoCo or matplotlib, on first use."""
-    if name in ("render", "animate"):
-        from jaxcal.paper.twin import robot_pictures
-
-        return getattr(robot_pictures, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
