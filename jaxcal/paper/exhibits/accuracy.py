@@ -18,7 +18,7 @@ from jaxcal.information.regression import regressors
 from jaxcal.paper.datasets import BIAS_DEG, NOISE_STD_DEG, SCALE
 from jaxcal.paper.exhibits.devices import Device, pick, rms
 from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict
-from jaxcal.paper.exhibits.figures_accuracy import (
+from jaxcal.paper.exhibits.figures.accuracy import (
     ellipses,
     four_against_fifty,
     number_of_postures,

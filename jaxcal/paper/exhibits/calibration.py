@@ -11,7 +11,7 @@ from jaxcal.calibration.identify import identify
 from jaxcal.evaluation.parameters import least_squares, parameter_names, predict
 from jaxcal.paper.datasets import BIAS_DEG, NOISE_STD_DEG, RANGES, SCALE
 from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict
-from jaxcal.paper.exhibits.figures_calibration import error_boxes, order_bars
+from jaxcal.paper.exhibits.figures.calibration import error_boxes, order_bars
 from jaxcal.paper.exhibits.intervals import mean_interval, share_interval
 from jaxcal.paper.exhibits.material import Material, commands_deg
 from jaxcal.paper.twin.robot import ORDERS, RobotConfig, read_out

@@ -45,6 +45,25 @@ class Settings:
         return "rig's simulator" if self.data is None else "rig recordings"
 
     @property
+    def about_recordings(self) -> str:
+        """Where Datasets 4 and 5 come from, in a sentence."""
+        if self.data is not None:
+            return f"Datasets 4 and 5: recordings given as --data {self.data}."
+        return (
+            "Datasets 4 and 5: shipped recordings, made by the rig's own code against "
+            "its simulator (play, noise, a heading that drifts), not on a device."
+        )
+
+    @property
+    def command(self) -> str:
+        """What makes the same report again."""
+        words = ["python -m jaxcal.paper"]
+        words += [f"--seed {self.seed}"] if self.seed else []
+        words += ["--quick"] if self.quick else []
+        words += [f"--data {self.data}"] if self.data is not None else []
+        return " ".join(words)
+
+    @property
     def episodes(self) -> int:
         """Of dataset2."""
         return 200 if self.quick else 1_000
@@ -56,7 +75,7 @@ class Settings:
 
     @property
     def random_draws(self) -> int:
-        """Random selections an episode."""
+        """Random selections per episode."""
         return 30 if self.quick else 100
 
     @property
@@ -92,6 +111,11 @@ class Exhibit:
     rows: Sequence[Sequence[str]] = ()  # a table, its header first
     pictures: Mapping[str, bytes] = field(default_factory=dict)  # PNG, GIF, by file
     notice: str = ""  # for the terminal: what had to be done otherwise
+
+    @property
+    def tables(self) -> dict[str, Columns]:
+        """The data by the name of its CSV file."""
+        return {f"{self.key}_{name}.csv": rows for name, rows in self.data.items()}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,7 +17,7 @@ from jaxcal.evaluation.parameters import least_squares, predict
 from jaxcal.paper.datasets import NOISE_STD_DEG, RANGES
 from jaxcal.paper.exhibits.devices import Device, pick, rms
 from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict
-from jaxcal.paper.exhibits.figures_recalibration import by_age, traces
+from jaxcal.paper.exhibits.figures.recalibration import by_age, traces
 from jaxcal.paper.exhibits.intervals import (
     median_interval,
     paired,
@@ -272,7 +272,7 @@ def _recorded(material: Material) -> Exhibit:
             f"{best + 1}). Predicted: {POINTS} postures, none of X_*'s own, of each of "
             f"the {len(others)} other episodes; {TRACED} of them are drawn. One X_0 "
             "and one X_* only: the intervals are over the episodes predicted. "
-            + material.about_recordings()
+            + material.settings.about_recordings
         ),
         paper="As above, on the paper's recordings.",
         ours=(

@@ -11,7 +11,7 @@ from jaxcal.evaluation import figures
 from jaxcal.evaluation.parameters import parameter_names
 from jaxcal.evaluation.results import HIT_TOLERANCE, Evaluation
 from jaxcal.paper.exhibits.exhibit import Columns, Exhibit, Settings, Verdict
-from jaxcal.paper.exhibits.figures_selection import gap_per_episode
+from jaxcal.paper.exhibits.figures.selection import gap_per_episode
 from jaxcal.paper.exhibits.intervals import (
     Interval,
     bootstrap_interval,

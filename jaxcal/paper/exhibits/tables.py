@@ -132,7 +132,7 @@ def _table_3(material: Material) -> Exhibit:
     return Exhibit(
         key="table_3",
         title="Table 3: datasets",
-        caption=material.about_recordings(),
+        caption=material.settings.about_recordings,
         paper="See the table; 550 recorded pairs in all.",
         ours=(
             "The same sizes. 550 pairs cannot be 100 x 50 + 50 = 5,050: Dataset 4 is "

@@ -21,7 +21,7 @@ from jaxcal.evaluation.training_figure import (
     training_curves,
 )
 from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict
-from jaxcal.paper.exhibits.figures_training import curves_over_seeds
+from jaxcal.paper.exhibits.figures.training import curves_over_seeds
 from jaxcal.paper.exhibits.intervals import Interval, mean_interval
 from jaxcal.paper.exhibits.material import Material
 
