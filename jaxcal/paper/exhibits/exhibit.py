@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import functools
 import io
 import pathlib
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import field
 from typing import Any, Literal
 
 import numpy as np
 from matplotlib.figure import Figure
+
+from jaxcal.paper.datasets import AXES
 
 __all__ = [
     "STUDIES",
@@ -21,6 +25,8 @@ __all__ = [
     "Settings",
     "Verdict",
     "as_csv",
+    "by_axis",
+    "from_rows",
 ]
 
 STUDIES = pathlib.Path(__file__).resolve().parents[3] / "studies"
@@ -112,10 +118,47 @@ class Exhibit:
     pictures: Mapping[str, bytes] = field(default_factory=dict)  # PNG, GIF, by file
     notice: str = ""  # for the terminal: what had to be done otherwise
 
+    @classmethod
+    def told(cls, section: str, words: Mapping[str, Any], **fields: Any) -> Exhibit:
+        """An exhibit with the texts of a section of texts.toml.
+
+        Args:
+            section: its name; the key too, where ``fields`` gives none.
+            words: what its texts cite beside the numbers of the exhibit.
+            fields: of the exhibit.
+        """
+        known = {**fields.get("numbers", {}), **words}
+        said = {
+            name: " ".join(text.split()).format_map(known)
+            for name, text in _texts()[section].items()
+            if name not in fields and name != "missing"
+        }
+        return cls(**{"key": section, **said, **fields})
+
+    @classmethod
+    def missing(cls, section: str, **numbers: Any) -> Exhibit:
+        """An exhibit whose kept runs are not there: how to make them."""
+        texts = _texts()[section]
+        return cls(
+            key=section,
+            title=texts["title"],
+            caption="",
+            paper=" ".join(texts["paper"].split()),
+            ours=" ".join(texts["missing"].split()).format_map(numbers),
+            verdict="not comparable",
+            numbers=numbers,
+        )
+
     @property
     def tables(self) -> dict[str, Columns]:
         """The data by the name of its CSV file."""
         return {f"{self.key}_{name}.csv": rows for name, rows in self.data.items()}
+
+
+@functools.cache
+def _texts() -> dict[str, dict[str, str]]:
+    path = pathlib.Path(__file__).parent / "texts.toml"
+    return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,6 +171,25 @@ class Claim:
     ours: str
     verdict: Verdict
     where: str  # key of the exhibit with the evidence, "" where it is a proof
+
+
+def by_axis(values: Mapping[str, np.ndarray], name: str = "{}_{}_deg") -> Columns:
+    """Columns of (..., 3) arrays: pitch, yaw and roll of each, flattened.
+
+    Args:
+        values: arrays by name.
+        name: of a column, from the array's name and the axis.
+    """
+    return {
+        name.format(key, axis): np.ravel(array[..., i])
+        for key, array in values.items()
+        for i, axis in enumerate(AXES)
+    }
+
+
+def from_rows(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> dict[str, Any]:
+    """Columns by name of a table given row by row."""
+    return dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True))
 
 
 def as_csv(columns: Columns) -> str:

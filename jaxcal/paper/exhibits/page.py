@@ -25,6 +25,12 @@ _TONES: dict[Verdict, Literal["good", "fair", "bad", "neutral"]] = {
     "disagrees": "bad",
     "not comparable": "neutral",
 }
+_PLURAL = {
+    "agrees": "agree",
+    "agrees in part": "agree in part",
+    "disagrees": "disagree",
+    "not comparable": "cannot be compared",
+}
 
 
 def page(
@@ -42,13 +48,13 @@ def page(
         settings: that the exhibits were made with.
     """
     count = Counter[str](claim.verdict for claim in claims)
-    summary = ", ".join(f"{count[v]} {v}" for v in _TONES if count[v])
+    summary = ", ".join(f"{count[v]} {_PLURAL[v]}" for v in _TONES if count[v])
     made_with = ", ".join(f"{name} {number}" for name, number in versions().items())
     intro = (
         "Hu, Celler, Mu and Su, “D-Optimality-Guided Reinforcement Learning for "
         "Efficient Open-Loop Calibration of a 3-DOF Ankle Rehabilitation Robot”: every "
         "figure and table made again from our own runs, each beside what the paper "
-        f"states. Of {len(claims)} claims: {summary}."
+        f"states. Of {len(claims)} claims, {summary}."
     )
     code, about = pages.Code, settings.about_recordings
     small_print: list[pages.Inline] = [
