@@ -46,7 +46,10 @@ def test_thinning_keeps_moments_and_last_values(rng: np.random.Generator) -> Non
         (["--preset", "best"], "--preset must be one of compact, general, paper"),
         (["--preset", "compact", "--seeds", "x"], "a number of seeds or a list"),
         (["--preset", "compact", "--seeds", "1,-2"], "a number of seeds or a list"),
-        (["--preset", "compact", "--episodes", "0"], "--episodes must be at least 1"),
+        (
+            ["--preset", "compact", "--episodes", "0"],
+            "--episodes: must be a whole number of at least 1, got '0'",
+        ),
         (["--collect", "{tmp}", "--seeds", "3"], "go with --preset"),
         (["--collect", "{tmp}"], "holds no metrics.csv"),
     ],

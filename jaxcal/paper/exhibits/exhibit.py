@@ -127,38 +127,28 @@ class Exhibit:
             words: what its texts cite beside the numbers of the exhibit.
             fields: of the exhibit.
         """
-        known = {**fields.get("numbers", {}), **words}
-        said = {
-            name: " ".join(text.split()).format_map(known)
-            for name, text in _texts()[section].items()
-            if name not in fields and name != "missing"
-        }
-        return cls(**{"key": section, **said, **fields})
+        said = dict(_texts()[section])
+        said.pop("missing", None)
+        told = _filled(said, {**fields.get("numbers", {}), **words})
+        return cls(**{"key": section, **told, **fields})
 
     @classmethod
     def missing(cls, section: str, **numbers: Any) -> Exhibit:
         """An exhibit whose kept runs are not there: how to make them."""
-        texts = _texts()[section]
+        said = _texts()[section]
+        told = {"title": said["title"], "paper": said["paper"], "ours": said["missing"]}
         return cls(
             key=section,
-            title=texts["title"],
             caption="",
-            paper=" ".join(texts["paper"].split()),
-            ours=" ".join(texts["missing"].split()).format_map(numbers),
             verdict="not comparable",
             numbers=numbers,
+            **_filled(told, numbers),
         )
 
     @property
     def tables(self) -> dict[str, Columns]:
         """The data by the name of its CSV file."""
         return {f"{self.key}_{name}.csv": rows for name, rows in self.data.items()}
-
-
-@functools.cache
-def _texts() -> dict[str, dict[str, str]]:
-    path = pathlib.Path(__file__).parent / "texts.toml"
-    return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,7 +160,41 @@ class Claim:
     paper: str  # its figure
     ours: str
     verdict: Verdict
-    where: str  # key of the exhibit with the evidence, "" where it is a proof
+    where: str  # key of the exhibit with the evidence
+
+    @classmethod
+    def told(
+        cls,
+        section: str,
+        exhibit: Exhibit,
+        verdict: Verdict | None,
+        key: str = "",
+        **words: Any,
+    ) -> Claim:
+        """A claim with the texts of ``claims.section`` of texts.toml.
+
+        Args:
+            section: its name; the key too, where none is given.
+            exhibit: with the evidence, whose numbers the texts cite.
+            verdict: "not comparable" when None.
+            key: of the claim.
+            words: what else its texts cite.
+        """
+        known = {**exhibit.numbers, **words}
+        told = _filled(_texts()["claims"][section], known)
+        verdict = verdict or "not comparable"
+        return cls(key=key or section, verdict=verdict, where=exhibit.key, **told)
+
+
+@functools.cache
+def _texts() -> dict[str, Any]:
+    path = pathlib.Path(__file__).parent / "texts.toml"
+    return tomllib.loads(path.read_text(encoding="utf-8"))
+
+
+def _filled(texts: Mapping[str, str], known: Mapping[str, Any]) -> dict[str, Any]:
+    """Texts on one line each, with the numbers in place of their names."""
+    return {k: " ".join(text.split()).format_map(known) for k, text in texts.items()}
 
 
 def by_axis(values: Mapping[str, np.ndarray], name: str = "{}_{}_deg") -> Columns:
