@@ -19,7 +19,7 @@ import io
 import json
 import os
 import pathlib
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,12 +128,14 @@ def _table(data: bytes) -> Array:
         if header.count(name) != 1:
             how = "missing" if name not in header else "there twice"
             raise ValueError(f'line 1: column "{name}" is {how}')
-    places = [header.index(name) for name in wanted]
     values = []
     for line, row in rows[1:]:
         if len(row) != len(header):
-            _fail(line, f"{len(row)} cells, {len(header)} in the header")
-        values.append([_number(line, header[i], row[i]) for i in places])
+            raise ValueError(
+                f"line {line}: {len(row)} cells, {len(header)} in the header"
+            )
+        cells = dict(zip(header, row, strict=True))
+        values.append([_number(line, name, cells[name]) for name in wanted])
     if not values:
         raise ValueError("no postures below the header")
     return np.array(values)
@@ -145,12 +147,8 @@ def _number(line: int, name: str, cell: str) -> float:
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        _fail(line, f'"{name}" must be a finite number, got {cell!r}')
+        raise ValueError(f'line {line}: "{name}" must be a finite number, got {cell!r}')
     return value
-
-
-def _fail(line: int, problem: str) -> NoReturn:
-    raise ValueError(f"line {line}: {problem}")
 
 
 def _ranges_beside(recording: pathlib.Path) -> JointRanges:

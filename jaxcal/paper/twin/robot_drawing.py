@@ -23,7 +23,7 @@ _LIGHT = np.array([0.35, 0.85, 0.40])
 
 
 class Drawing:
-    """A figure on which one model is drawn, as often as wanted.
+    """Draws one model as ``mujoco.Renderer`` does: the same three methods.
 
     Args:
         model: ``mujoco.MjModel`` whose geoms are boxes and capsules.
@@ -58,11 +58,19 @@ class Drawing:
         flat = (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX) & (model.geom_bodyid == 3)
         self._layer = _LAYER_M * (np.cumsum(flat) * flat)[self._geom]
 
-    def picture(self, data: Any) -> Image:
-        """(height, width, 3) of the model in the state of ``mujoco.MjData``."""
+    def update_scene(self, data: Any, camera: str) -> None:
+        """Take the state of ``mujoco.MjData``; there is one camera only."""
+        self._data = data
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def render(self) -> Image:
+        """(height, width, 3) of the model in that state."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.collections import PolyCollection
 
+        data = self._data
         turns = data.geom_xmat.reshape(-1, 3, 3)[self._geom]
         corners = self._corners @ np.matrix_transpose(turns)
         corners += data.geom_xpos[self._geom][:, None]

@@ -25,7 +25,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.files import atomic_write
 from jaxcal.paper import command
+from jaxcal.paper.datasets.constants import AXES
 from jaxcal.paper.twin.robot import RobotConfig, joint_angles, read_out
+from jaxcal.paper.twin.robot_drawing import Drawing
 from jaxcal.paper.twin.robot_model import load_model, pose, trajectory
 from jaxcal.paper.twin.robot_parts import AXIS_COLOURS
 from jaxcal.progress import Progress
@@ -100,16 +102,9 @@ def animate(
         config: the robot.
         path: of the GIF.
         commands_deg: (N, 3) pitch, yaw, roll in degrees, a second each.
-        size: width and height in pixels, at most 1280 x 960.
-        backend: mujoco, matplotlib, or auto: the first that works.
+        size: as ``backend`` and what is returned and raised, see ``render``.
+        backend: mujoco, matplotlib or auto.
         progress: told how many frames of how many are drawn.
-
-    Returns:
-        What drew it: mujoco or matplotlib.
-
-    Raises:
-        OSError: the file cannot be written.
-        RuntimeError: mujoco was asked for and cannot draw here.
     """
     way = _smooth(np.asarray(commands_deg, dtype=np.float64).reshape(-1, 3))
     links = trajectory(
@@ -141,33 +136,23 @@ def draw(
         raise ValueError(f"size must be within 1280 x 960 pixels, got {size}")
     model = load_model(config)
     data = mujoco.MjData(model)
-    renderer: Any = None
-    if backend != "matplotlib":
-        try:
-            renderer = _renderer(model, width, height)
-        except Exception as error:  # drivers fail in many ways
-            if backend == "mujoco":
-                why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-                raise RuntimeError(f"MuJoCo cannot draw here: {why}") from None
-    if renderer is not None:
+    try:
+        if backend == "matplotlib":
+            raise RuntimeError("not asked for")
+        canvas, name = _renderer(model, width, height), "mujoco"
+    except Exception as error:  # drivers fail in many ways
+        if backend == "mujoco":
+            why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+            raise RuntimeError(f"MuJoCo cannot draw here: {why}") from None
+        canvas, name = Drawing(model, width, height), "matplotlib"
 
-        def picture(joints_deg: ArrayLike) -> Image:
-            pose(model, data, joints_deg)
-            renderer.update_scene(data, "view")
-            return renderer.render()
-
-        with contextlib.closing(renderer):
-            yield "mujoco", picture
-        return
-    from jaxcal.paper.twin.robot_drawing import Drawing
-
-    drawing = Drawing(model, width, height)
-
-    def drawn(joints_deg: ArrayLike) -> Image:
+    def picture(joints_deg: ArrayLike) -> Image:
         pose(model, data, joints_deg)
-        return drawing.picture(data)
+        canvas.update_scene(data, "view")
+        return canvas.render()
 
-    yield "matplotlib", drawn
+    with contextlib.closing(canvas):
+        yield name, picture
 
 
 def _renderer(model: Any, width: int, height: int) -> Any:
@@ -202,7 +187,7 @@ def _renderer(model: Any, width: int, height: int) -> Any:
 # -- captions and files ----------------------------------------------------------------
 
 
-def _captioned(config: RobotConfig, image: Image, command: Array) -> Any:
+def _captioned(config: RobotConfig, image: Image, command_deg: Array) -> Any:
     """A pillow image that says what was commanded and what the phone reads."""
     from PIL import Image as Pillow
     from PIL import ImageDraw, ImageFont
@@ -211,15 +196,11 @@ def _captioned(config: RobotConfig, image: Image, command: Array) -> Any:
     pen = ImageDraw.Draw(picture)
     size = max(11, picture.height // 30)
     font = ImageFont.load_default(size)
-    read = np.asarray(read_out(config, command))
+    read = np.asarray(read_out(config, command_deg))
     rows = [("axis", "command", "phone", (60, 60, 60))]
-    for i, (name, letter) in enumerate(
-        zip(("pitch", "yaw", "roll"), "XYZ", strict=True)
-    ):
+    for name, letter, told, seen in zip(AXES, "XYZ", command_deg, read, strict=True):
         red, green, blue = (round(255 * value) for value in AXIS_COLOURS[letter])
-        rows.append(
-            (name, f"{command[i]:+.1f}°", f"{read[i]:+.1f}°", (red, green, blue))
-        )
+        rows.append((name, f"{told:+.1f}°", f"{seen:+.1f}°", (red, green, blue)))
     for line, (name, told, reached, colour) in enumerate(rows):
         y = size * (0.6 + 1.35 * line)
         pen.text((0.7 * size, y), name, colour, font)
@@ -230,20 +211,14 @@ def _captioned(config: RobotConfig, image: Image, command: Array) -> Any:
 
 
 def _save(path: str | os.PathLike[str], frames: list[Any], frame_ms: int) -> None:
+    """One frame as a PNG, several as a GIF that repeats."""
     buffer = io.BytesIO()
     if frame_ms == 0:
         frames[0].save(buffer, "PNG", optimize=True)
     else:
-        few = _in_one_palette(frames)
-        few[0].save(
-            buffer,
-            "GIF",
-            save_all=True,
-            append_images=few[1:],
-            duration=frame_ms,
-            loop=0,
-            optimize=False,
-        )
+        first, *rest = _in_one_palette(frames)
+        film = {"save_all": True, "append_images": rest, "duration": frame_ms}
+        first.save(buffer, "GIF", loop=0, optimize=False, **film)
     with atomic_write(path) as file:
         file.write(buffer.getvalue())
 
@@ -266,11 +241,9 @@ def _smooth(postures_deg: Array) -> Array:
     stops = np.concatenate([np.zeros((1, 3)), postures_deg, np.zeros((1, 3))])
     t = np.linspace(0.0, 1.0, round(_MOVE_S * _FRAMES_PER_S) + 1)[1:]
     bend = t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
-    way = []
-    for start, end in itertools.pairwise(stops):
-        way.append(start + bend[:, None] * (end - start))
-        way.append(np.repeat(end[None], round(_REST_S * _FRAMES_PER_S), axis=0))
-    return np.concatenate(way)
+    bend = np.append(bend, np.ones(round(_REST_S * _FRAMES_PER_S)))
+    pairs = itertools.pairwise(stops)
+    return np.concatenate([start + np.outer(bend, end - start) for start, end in pairs])
 
 
 def main(arguments: list[str] | None = None) -> int:
