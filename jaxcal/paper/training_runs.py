@@ -38,8 +38,8 @@ _IF_MEASURED = ("ratio_to_exact", "hit_rate")
 
 _DESCRIPTION = """\
 Train one preset with several seeds, or collect an existing run, and keep what the
-reproduction report draws of it: metrics.csv, last_rewards.npy and summary.json, in a
-folder a run under --out.
+reproduction report draws of it: metrics.csv, last_rewards.npy and summary.json, in one
+folder per run under --out.
 """
 _EPILOG = """\
 examples:
@@ -57,7 +57,7 @@ interrupted seed resumes from its last checkpoint, which is under --runs.
 def train_seed(
     config: Any, folder: pathlib.Path, *, validate: bool = True, report: Any = None
 ) -> None:
-    """Train one run, or what is left of it where ``folder`` holds a part.
+    """Train one run, or the rest of it where ``folder`` holds a part.
 
     Args:
         config: a ``TrainConfig``.
@@ -118,8 +118,8 @@ def thinned(metrics: dict[str, Array], most: int = MAX_ROWS) -> dict[str, Array]
     """The same run in at most ``most`` rows, each the mean of a block of updates.
 
     ``reward_std`` stays that of single episodes: within and between the updates of a
-    block. Counts and times are those at the end of the block; what is measured now and
-    then is the block's last value.
+    block. Counts and times are those at the end of the block; what is measured
+    occasionally is the block's last value.
     """
     count = len(metrics["episodes"])
     if count <= most:
@@ -223,7 +223,7 @@ def _train_all(options: argparse.Namespace) -> None:
         config = dataclasses.replace(config, validate_every=_VALIDATE_EVERY_S)
         target = options.out / f"seed_{seed}"
         if _is_finished(target / "summary.json", config):
-            print(f"{target}: finished before", flush=True)
+            print(f"{target}: already finished", flush=True)
             continue
         name = f"seed {seed} ({number + 1} of {len(options.seeds)})"
 

@@ -106,4 +106,4 @@ def test_the_command_trains_keeps_and_does_not_train_again(
     rewards = np.load(kept / "last_rewards.npy")
     assert rewards.shape == (1000,)
     again = subprocess.run([*given, *folders], capture_output=True, text=True, cwd=ROOT)
-    assert again.returncode == 0 and "finished before" in again.stdout
+    assert again.returncode == 0 and "already finished" in again.stdout

@@ -30,7 +30,7 @@ __all__ = ["card_of", "digest_of", "page_of"]
 
 _WHAT = {
     "dataset0": "the ideal robot of Table 1 driven open loop in MuJoCo, 50 postures of "
-    "one second a group, read at the end of each second",
+    "one second per group, read at the end of each second",
     "dataset1": "commands for training",
     "dataset2": "commands for evaluation",
     "dataset3": "y = diag(scale) u + bias of Table 1, with noise",
@@ -45,7 +45,7 @@ def card_of(
     *,
     recordings: pathlib.Path | str | None = None,
 ) -> dict[str, Any]:
-    """Everything somebody needs who finds the files without us.
+    """Everything a reader of the files needs, without jaxcal.
 
     Args:
         dataset: one of the paper's, or its first chunk where it is written in chunks.
@@ -140,7 +140,7 @@ def page_of(cards: list[dict[str, Any]]) -> str:
         "",
         "Commands (`u_x`, `u_y`, `u_z`: pitch, yaw, roll) are normalised to [0, 1]; "
         "readings (`y_x`, `y_y`, `y_z`) are in degrees. `NAME.npz` holds `candidates`, "
-        "`measured`, `low` and `high`; `NAME.csv` the same, a posture a line; "
+        "`measured`, `low` and `high`; `NAME.csv` the same, one posture per line; "
         "`NAME.json` every number of this page.",
         "",
         "| name | episodes | postures | numbers each | noise | seed | what |",
@@ -163,6 +163,6 @@ def page_of(cards: list[dict[str, Any]]) -> str:
             for axis, (low, high) in card["ranges_deg"].items()
         )
         lines.append(f"- {card['name']}: {ranges}")
-    lines += ["", "Made again by:", "", "```bash"]
+    lines += ["", "Commands that make them:", "", "```bash"]
     lines += [card["command"] for card in cards]
     return "\n".join([*lines, "```", ""])

@@ -20,7 +20,7 @@ each posture, with the same noise. ``recordings`` reads what 4 and 5 are made fr
 Every block of 1,000 episodes of every simulated dataset (every group of dataset0) has a
 random stream of its own, spawned from the seed, the dataset's number and the block's.
 So no dataset shares candidates with another, and asking for fewer episodes gives the
-first of them. Training draws from JAX's generator, which is a different one altogether.
+first of them. Training draws from JAX's generator, a different generator.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def _blocks(
 
 
 def drawn(name: str, seed: int, begin: int, end: int) -> Dataset:
-    """Episodes of a drawn dataset, which goes on beyond its size in the paper.
+    """Episodes of a drawn dataset, of any length: the paper's size is not a limit.
 
     Args:
         name: one of ``DRAWN``.

@@ -1,13 +1,13 @@
 """Datasets 4 and 5: what the rig recorded, as a pool of postures and draws from it.
 
-A recording is the ``pairs.csv`` that ``python -m rig collect`` writes: a posture a
+A recording is the ``pairs.csv`` that ``python -m rig collect`` writes: one posture per
 line, commands under ``u_deg_pitch, u_deg_yaw, u_deg_roll`` and what the phone read
 under ``y_deg_...``; other columns may stand beside them. A folder of recordings holds
 ``dataset4.csv`` and ``dataset5.csv``, and beside each, optionally, a data card
 ``dataset4.json`` whose ``ranges_deg`` say what [0, 1] stands for.
 
 The paper recorded 550 postures and speaks of 100 x 50 and 1 x 50. So dataset4 is drawn
-from its pool, 50 of 500 an episode, by seed; a recording with all 5,000 is used as it
+from its pool, 50 of 500 per episode, by seed; a recording with all 5,000 is used as it
 stands. Dataset5 is the first 50 postures of its own session.
 """
 
@@ -87,8 +87,8 @@ def read_pool(
     """A recording in the order in which it was made.
 
     Returns:
-        (N, 3) commands and (N, 3) readings in degrees, the ranges that [0, 1] shall
-        stand for, and the SHA-256 of the file.
+        (N, 3) commands and (N, 3) readings in degrees, the ranges that [0, 1]
+        stands for, and the SHA-256 of the file.
 
     Raises:
         OSError: it cannot be read.

@@ -37,7 +37,7 @@ __all__ = ["exhibits"]
 
 Array = NDArray[np.float64]
 
-DRIFT_DEG = 0.05  # a posture, in the scenario with drift
+DRIFT_DEG = 0.05  # per posture, in the scenario with drift
 OUTLIER_SHARE = 0.05
 SWEEPS: dict[str, tuple[str, tuple[float, ...]]] = {
     "white noise": ("noise_std_deg", (0.02, 0.05, 0.1, 0.2, 0.4)),
@@ -237,7 +237,12 @@ def _ellipsoids(material: Material) -> Exhibit:
         "policy": material.result("dataset3", "policy").indices[0, 0],
         "all 50": np.arange(len(commands)),
     }
-    pitch = ("a11", "a12", "a13", "bx")  # one row of A and b; the others are alike
+    pitch = (
+        "a11",
+        "a12",
+        "a13",
+        "bx",
+    )  # all three rows have this covariance
     covariance: dict[str, Any] = {}
     rows: list[tuple[Any, ...]] = []
     for label, indices in chosen.items():

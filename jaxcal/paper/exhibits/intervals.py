@@ -49,7 +49,7 @@ def mean_interval(values: ArrayLike, most: float = np.inf) -> Interval:
     """Mean of independent values, with Student's t.
 
     Args:
-        values: (E,) one an episode, at least two.
+        values: (E,) one per episode, at least two.
         most: the largest value there can be; the interval ends there.
     """
     sample = np.asarray(values, dtype=np.float64)
@@ -62,7 +62,7 @@ def median_interval(values: ArrayLike) -> Interval:
     """Median of independent values, between two order statistics.
 
     Args:
-        values: (E,) one an episode, at least six.
+        values: (E,) one per episode, at least six.
     """
     sample = np.asarray(values, dtype=np.float64)
     ends = stats.quantile_test(sample).confidence_interval(0.95)
@@ -129,7 +129,7 @@ class Paired:
 def paired(
     a: ArrayLike, b: ArrayLike, rng: np.random.Generator, resamples: int = 2_000
 ) -> Paired:
-    """Compare two values an episode.
+    """Compare two values per episode.
 
     Args:
         a: (E,) of one method.

@@ -53,7 +53,7 @@ def page(
     intro = (
         "Hu, Celler, Mu and Su, “D-Optimality-Guided Reinforcement Learning for "
         "Efficient Open-Loop Calibration of a 3-DOF Ankle Rehabilitation Robot”: every "
-        "figure and table made again from our own runs, each beside what the paper "
+        "figure and table reproduced from our own runs, each beside what the paper "
         f"states. Of {len(claims)} claims, {summary}."
     )
     code, about = pages.Code, settings.about_recordings

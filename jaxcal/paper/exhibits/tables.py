@@ -92,7 +92,7 @@ def _table_3(material: Material) -> Exhibit:
     rows: list[tuple[str, ...]] = [head]
     numbers = {}
     for name, (kind, episodes, dim) in paper.items():
-        size, width, used = NUM_CANDIDATES, 3, "no; training draws anew"
+        size, width, used = NUM_CANDIDATES, 3, "no; training draws its own sets"
         if name != "dataset1":
             data = material.dataset(name)
             size, used = data.num_candidates, f"{data.num_episodes:,}"

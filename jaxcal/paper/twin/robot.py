@@ -110,9 +110,9 @@ class RobotConfig:
 
 
 def read_out(config: RobotConfig, commands_deg: ArrayLike | jax.Array) -> Any:
-    """What the phone reads once all is settled, without play, drift and noise.
+    """What the phone reads at rest, without play, drift and noise.
 
-    Differentiable, and fit for ``jit`` and ``vmap``, where it is given JAX arrays.
+    Given JAX arrays it is differentiable and works under ``jit`` and ``vmap``.
 
     Args:
         config: the robot.
@@ -173,7 +173,7 @@ def measure(
 def bias_drift(
     config: RobotConfig, session: int | Sequence[int] | NDArray[np.int64]
 ) -> Array:
-    """(..., 3) degrees by which the bias has wandered when a session begins.
+    """(..., 3) degrees by which the bias has drifted at the start of a session.
 
     A random walk from zero in session 0; the same for the same ``drift_seed``.
     """

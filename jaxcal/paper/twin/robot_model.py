@@ -34,7 +34,7 @@ __all__ = [
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
-HOLD_S = 1.0  # a posture: the paper samples at 1 Hz
+HOLD_S = 1.0  # per posture: the paper samples at 1 Hz
 STIFFNESS = 200.0  # Nm/rad, of the servo of a joint that does not comply
 _ARMATURE = 0.02  # kg m^2, of a motor behind its gear
 _INERTIA = 0.03  # about what a servo moves, for its damping

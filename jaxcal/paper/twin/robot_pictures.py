@@ -52,7 +52,7 @@ TOUR_DEG = (  # what the film goes through: each axis alone, then all of them
     (-15.0, -10.0, 14.0),
 )
 _FRAMES_PER_S = 10.0
-_MOVE_S, _REST_S = 0.7, 0.3  # of the film, a posture
+_MOVE_S, _REST_S = 0.7, 0.3  # of the film, per posture
 _PALETTE, _PALETTE_FRAMES = 96, 8  # colours of a GIF, frames they are taken from
 
 
@@ -101,7 +101,7 @@ def animate(
     Args:
         config: the robot.
         path: of the GIF.
-        commands_deg: (N, 3) pitch, yaw, roll in degrees, a second each.
+        commands_deg: (N, 3) pitch, yaw, roll in degrees, one second each.
         size: as ``backend`` and what is returned and raised, see ``render``.
         backend: mujoco, matplotlib or auto.
         progress: told how many frames of how many are drawn.

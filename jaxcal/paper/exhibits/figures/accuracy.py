@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 _LABELS = {
     "white noise": "white noise (° s.d.)",
-    "drift": "drift of the bias (° s.d. a posture)",
+    "drift": "drift of the bias (° s.d. per posture)",
     "outliers": "share of gross errors",
 }
 
@@ -78,7 +78,7 @@ def number_of_postures(
     """
     titles = {
         "white noise": f"white noise, {noise_std_deg}°",
-        "drift": f"white noise, {noise_std_deg}°, and drift, {drift_deg}° a posture",
+        "drift": f"white noise, {noise_std_deg}°, and drift, {drift_deg}° per posture",
     }
     figure, axes = panels(
         (9.0, 3.9), "Number of postures against accuracy", 1, 2, sharey=True

@@ -69,7 +69,7 @@ def traces(columns: Mapping[str, Any], title: str) -> Figure:
 
 def by_age(columns: Mapping[str, Any], later: int, drift_deg: float) -> Figure:
     """Error of prediction in each session, by choice and session of the calibration."""
-    title = f"Old and recent calibration, bias drifting {drift_deg}° a session"
+    title = f"Old and recent calibration, bias drifting {drift_deg}° per session"
     figure, axes = panels((8.0, 4.0), title)
     for calibrated, name, line in ((1, "X$_0$", "--"), (later, "X$_*$", "-")):
         for i, (choice, colour) in enumerate(
