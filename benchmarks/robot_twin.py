@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 import jaxcal
-from jaxcal.paper.datasets.datasets import BIAS_DEG, SCALE, make_dataset
+from jaxcal.paper.datasets import BIAS_DEG, SCALE, make_dataset
 from jaxcal.paper.twin.robot import ORDERS, RobotConfig, measure, read_out
 from jaxcal.paper.twin.robot_model import simulate
 

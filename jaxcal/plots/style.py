@@ -22,13 +22,15 @@ BLACK = "#000000"
 
 
 def as_bytes(figure: Figure, suffix: str) -> bytes:
-    """The figure as a file of the given kind, "png" or "svg"; the same every time."""
-    # Ticks may change when the first layout gives the axes their size; the layout of
-    # savefig then makes room for them.
-    figure.draw_without_rendering()
+    """The figure as a file of the given kind, "png" or "svg"; the same every time.
+
+    The constrained layout makes room for the tick labels of the drawing before, so the
+    first drawing of a figure can cut a label off: the figure is drawn twice.
+    """
     buffer = io.BytesIO()
     metadata: dict[str, Any] = {"Date": None} if suffix == "svg" else {}
     with rc_context({"svg.hashsalt": "jaxcal"}):
+        figure.draw_without_rendering()
         figure.savefig(buffer, format=suffix, dpi=150, metadata=metadata)
     return buffer.getvalue()
 

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import functools
 import io
 import pathlib
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import field
 from typing import Any, Literal
 
 import numpy as np
 from matplotlib.figure import Figure
+
+from jaxcal.paper.datasets import AXES
 
 __all__ = [
     "STUDIES",
@@ -21,6 +25,8 @@ __all__ = [
     "Settings",
     "Verdict",
     "as_csv",
+    "by_axis",
+    "from_rows",
 ]
 
 STUDIES = pathlib.Path(__file__).resolve().parents[3] / "studies"
@@ -45,6 +51,25 @@ class Settings:
         return "rig's simulator" if self.data is None else "rig recordings"
 
     @property
+    def about_recordings(self) -> str:
+        """Where Datasets 4 and 5 come from, in a sentence."""
+        if self.data is not None:
+            return f"Datasets 4 and 5: recordings given as --data {self.data}."
+        return (
+            "Datasets 4 and 5: shipped recordings, made by the rig's own code against "
+            "its simulator (play, noise, a heading that drifts), not on a device."
+        )
+
+    @property
+    def command(self) -> str:
+        """What makes the same report again."""
+        words = ["python -m jaxcal.paper"]
+        words += [f"--seed {self.seed}"] if self.seed else []
+        words += ["--quick"] if self.quick else []
+        words += [f"--data {self.data}"] if self.data is not None else []
+        return " ".join(words)
+
+    @property
     def episodes(self) -> int:
         """Of dataset2."""
         return 200 if self.quick else 1_000
@@ -56,7 +81,7 @@ class Settings:
 
     @property
     def random_draws(self) -> int:
-        """Random selections an episode."""
+        """Random selections per episode."""
         return 30 if self.quick else 100
 
     @property
@@ -93,6 +118,38 @@ class Exhibit:
     pictures: Mapping[str, bytes] = field(default_factory=dict)  # PNG, GIF, by file
     notice: str = ""  # for the terminal: what had to be done otherwise
 
+    @classmethod
+    def told(cls, section: str, words: Mapping[str, Any], **fields: Any) -> Exhibit:
+        """An exhibit with the texts of a section of texts.toml.
+
+        Args:
+            section: its name; the key too, where ``fields`` gives none.
+            words: what its texts cite beside the numbers of the exhibit.
+            fields: of the exhibit.
+        """
+        said = dict(_texts()[section])
+        said.pop("missing", None)
+        told = _filled(said, {**fields.get("numbers", {}), **words})
+        return cls(**{"key": section, **told, **fields})
+
+    @classmethod
+    def missing(cls, section: str, **numbers: Any) -> Exhibit:
+        """An exhibit whose kept runs are not there: how to make them."""
+        said = _texts()[section]
+        told = {"title": said["title"], "paper": said["paper"], "ours": said["missing"]}
+        return cls(
+            key=section,
+            caption="",
+            verdict="not comparable",
+            numbers=numbers,
+            **_filled(told, numbers),
+        )
+
+    @property
+    def tables(self) -> dict[str, Columns]:
+        """The data by the name of its CSV file."""
+        return {f"{self.key}_{name}.csv": rows for name, rows in self.data.items()}
+
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
@@ -103,7 +160,60 @@ class Claim:
     paper: str  # its figure
     ours: str
     verdict: Verdict
-    where: str  # key of the exhibit with the evidence, "" where it is a proof
+    where: str  # key of the exhibit with the evidence
+
+    @classmethod
+    def told(
+        cls,
+        section: str,
+        exhibit: Exhibit,
+        verdict: Verdict | None,
+        key: str = "",
+        **words: Any,
+    ) -> Claim:
+        """A claim with the texts of ``claims.section`` of texts.toml.
+
+        Args:
+            section: its name; the key too, where none is given.
+            exhibit: with the evidence, whose numbers the texts cite.
+            verdict: "not comparable" when None.
+            key: of the claim.
+            words: what else its texts cite.
+        """
+        known = {**exhibit.numbers, **words}
+        told = _filled(_texts()["claims"][section], known)
+        verdict = verdict or "not comparable"
+        return cls(key=key or section, verdict=verdict, where=exhibit.key, **told)
+
+
+@functools.cache
+def _texts() -> dict[str, Any]:
+    path = pathlib.Path(__file__).parent / "texts.toml"
+    return tomllib.loads(path.read_text(encoding="utf-8"))
+
+
+def _filled(texts: Mapping[str, str], known: Mapping[str, Any]) -> dict[str, Any]:
+    """Texts on one line each, with the numbers in place of their names."""
+    return {k: " ".join(text.split()).format_map(known) for k, text in texts.items()}
+
+
+def by_axis(values: Mapping[str, np.ndarray], name: str = "{}_{}_deg") -> Columns:
+    """Columns of (..., 3) arrays: pitch, yaw and roll of each, flattened.
+
+    Args:
+        values: arrays by name.
+        name: of a column, from the array's name and the axis.
+    """
+    return {
+        name.format(key, axis): np.ravel(array[..., i])
+        for key, array in values.items()
+        for i, axis in enumerate(AXES)
+    }
+
+
+def from_rows(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> dict[str, Any]:
+    """Columns by name of a table given row by row."""
+    return dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True))
 
 
 def as_csv(columns: Columns) -> str:

@@ -9,7 +9,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from jaxcal.plots import BLACK, COLOURS, GREY, plain_axes
+from jaxcal.paper.exhibits.figures.parts import band, boxes, panels
+from jaxcal.plots import COLOURS, GREY
 
 __all__ = ["curves_over_seeds"]
 
@@ -30,8 +31,9 @@ def curves_over_seeds(
         rewards: of the last episodes, by run.
         paper: the run of the paper's network, if any.
     """
-    figure = Figure(figsize=(12.0, 3.8), layout="constrained")
-    left, middle, right = figure.subplots(1, 3)
+    figure, (left, middle, right) = panels(
+        (12.0, 3.8), "Training of the compact preset", 1, 3
+    )
     for i, run in enumerate(runs):
         left.plot(
             run.metrics["episodes"] / 1e3,
@@ -41,40 +43,22 @@ def curves_over_seeds(
             alpha=0.7,
             label="one seed" if i == 0 else None,
         )
-    thousands = np.asarray(columns["episodes"]) / 1e3
-    left.fill_between(
-        thousands,
+    band(
+        left,
+        np.asarray(columns["episodes"]) / 1e3,
+        columns["reward_mean"],
         columns["reward_low"],
         columns["reward_high"],
         color=COLOURS[0],
-        alpha=0.3,
-        linewidth=0,
-        label="95 % of the mean",
+        label="mean; band: its 95 % interval",
     )
-    left.plot(thousands, columns["reward_mean"], color=COLOURS[0], label="mean")
     left.set_title(f"(a) reward, {len(runs)} seeds", fontsize=10)
-    left.set_ylabel("reward (log det S / 10)")
 
-    boxes = middle.boxplot(
-        list(rewards.values()),
-        whis=(5, 95),
-        showfliers=False,
-        patch_artist=True,
-        widths=0.6,
-        medianprops={"color": BLACK},
-    )
-    for patch, name in zip(boxes["boxes"], rewards, strict=True):
-        patch.set_facecolor(COLOURS[0] if name.startswith("seed") else COLOURS[1])
-        patch.set_alpha(0.6)
-    middle.set_xticks(
-        range(1, len(rewards) + 1),
-        [
-            name.replace("seed ", "").replace("paper's network", "paper")
-            for name in rewards
-        ],
-    )
+    colours = [COLOURS[0 if name.startswith("seed") else 1] for name in rewards]
+    boxes(middle, list(rewards.values()), colours, (5, 95))
+    short = [n.removeprefix("seed ").removesuffix("'s network") for n in rewards]
+    middle.set_xticks(range(1, len(rewards) + 1), short)
     middle.set_xlabel("seed; box: quartiles, whiskers: 5 to 95 %")
-    middle.set_ylabel("reward (log det S / 10)")
     middle.set_title("(b) reward, last 1,000 episodes", fontsize=10)
 
     for i, run in enumerate(runs):
@@ -84,12 +68,11 @@ def curves_over_seeds(
     right.set_ylim(0.0, 1.02)
     right.set_title("(c) share of the optimum, validation", fontsize=10)
     right.set_ylabel("mean det S / det S*")
+    for axes in (left, middle):
+        axes.set_ylabel("reward (log det S / 10)")
     for axes in (left, right):
         axes.set_xlabel("training episodes (thousands)")
         axes.legend(fontsize=8, frameon=False, loc="lower right")
-    for axes in (left, middle, right):
-        plain_axes(axes)
-    figure.suptitle("Training of the compact preset", fontsize=10)
     return figure
 
 

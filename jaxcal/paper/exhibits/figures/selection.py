@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from matplotlib.figure import Figure
 
-from jaxcal.plots import BLACK, COLOURS, plain_axes
+from jaxcal.paper.exhibits.figures.parts import legend_right, panels
+from jaxcal.plots import BLACK, COLOURS
 
 __all__ = ["gap_per_episode"]
 
@@ -21,19 +21,16 @@ def gap_per_episode(columns: dict[str, Any], name: str) -> Figure:
         columns: ``episode``, ``ratio_policy`` and ``ratio_greedy``, (E,) each.
         name: of the dataset.
     """
-    figure = Figure(figsize=(8.0, 3.6), layout="constrained")
-    axes = figure.subplots()
-    plain_axes(axes)
-    shown = slice(min(len(columns["episode"]), _SHOWN))
-    episodes = np.asarray(columns["episode"])[shown]
+    title = f"Gap to the proven optimum, episode by episode: {name}, 4 of 50"
+    figure, axes = panels((8.0, 3.6), title)
     axes.axhline(1.0, color=BLACK, linewidth=0.8, label="proven optimum")
     for method, colour, marker, size in (  # where both are optimal, a dot in a square
         ("policy", COLOURS[0], "o", 3.0),
         ("greedy", COLOURS[1], "s", 6.0),
     ):
         axes.plot(
-            episodes,
-            np.asarray(columns[f"ratio_{method}"])[shown],
+            columns["episode"][:_SHOWN],
+            columns[f"ratio_{method}"][:_SHOWN],
             linestyle="none",
             marker=marker,
             markersize=size,
@@ -44,11 +41,6 @@ def gap_per_episode(columns: dict[str, Any], name: str) -> Figure:
         )
     total = len(columns["episode"])
     part = "" if total <= _SHOWN else f", first {_SHOWN} of {total:,}"
-    axes.set_xlabel(f"episode{part}")
-    axes.set_ylabel("det S / det S*")
-    axes.set_ylim(0.0, 1.05)
-    axes.set_title(
-        f"Gap to the proven optimum, episode by episode: {name}, 4 of 50", fontsize=10
-    )
-    axes.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    axes.set(xlabel=f"episode{part}", ylabel="det S / det S*", ylim=(0.0, 1.05))
+    legend_right(axes)
     return figure
