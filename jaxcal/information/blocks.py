@@ -100,7 +100,9 @@ def prior_root(precision: Array) -> Array:
     unit = precision / scale[:, None] / scale
     tolerance = 1e-9 * p
     if np.abs(unit - unit.T).max(initial=0.0) > tolerance:
-        raise ValueError("prior must be a symmetric precision matrix, got one that is not")
+        raise ValueError(
+            "prior must be a symmetric precision matrix, got one that is not"
+        )
     values, vectors = np.linalg.eigh((unit + unit.T) / 2.0)
     if values.min(initial=0.0) < -tolerance:
         raise ValueError(
@@ -111,9 +113,7 @@ def prior_root(precision: Array) -> Array:
     return np.sqrt(values[keep])[:, None] * vectors.T[keep] * scale
 
 
-def _stack(
-    blocks: Array, usable: Mask | None, root: Array
-) -> tuple[Array, Array]:
+def _stack(blocks: Array, usable: Mask | None, root: Array) -> tuple[Array, Array]:
     """Centred rows (..., N q + r, p) of blocks and prior, and the largest entries."""
     *batch, count, q, p = blocks.shape
     number = count

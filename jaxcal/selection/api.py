@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from jaxcal.checks import one_of, seconds
 from jaxcal.selection.exact.exact import TIME_LIMIT, solve_exact
@@ -241,9 +241,7 @@ def _labels(
     return None if names is None else tuple(names), axes
 
 
-def _checked_names(
-    names: Sequence[str] | None, count: int
-) -> tuple[str, ...] | None:
+def _checked_names(names: Sequence[str] | None, count: int) -> tuple[str, ...] | None:
     if names is None:
         return None
     given = tuple(names)

@@ -77,9 +77,7 @@ def test_the_first_posture_is_where_greedy_leads_furthest(price):
         order = [first]
         for _ in range(3):
             rest = [j for j in range(12) if j not in order]
-            order.append(
-                max(rest, key=lambda j: worth_of(task, price, [*order, j]))
-            )
+            order.append(max(rest, key=lambda j: worth_of(task, price, [*order, j])))
         ends[first] = worth_of(task, price, order)
     run = run_of(task, price)[0]
     assert ends[run[0]] == pytest.approx(max(ends.values()), abs=1e-9)
