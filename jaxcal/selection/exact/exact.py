@@ -1,10 +1,9 @@
 """The proven optimum, by whichever proof is cheaper.
 
 k = n + 1: the absolute determinant is convex in each posture, so only vertices of the
-convex hull matter, and :mod:`jaxcal.selection.exact.volume` enumerates them without numba.
-Everything else (more postures, hulls too large to enumerate, many inputs) goes to
-branch and bound, started from the exchange. The runner-up need not lie on the hull, so
-``best`` > 1 does without it.
+convex hull matter, and :mod:`jaxcal.selection.exact.volume` finds the largest volume.
+Everything else (more postures, many runners-up) goes to branch and bound, started from
+the exchange. The runner-up need not lie on the hull, so ``best`` > 1 does without it.
 """
 
 from __future__ import annotations
@@ -32,7 +31,6 @@ STARTING_RESTARTS = (
 )
 
 _CHEAP = 3e7  # multiplications of an enumeration: about 20 ms
-_CONVEX_POSITION = 3e10  # those of 500 points on a sphere, some seconds
 _LARGEST_HULL_DIMENSION = 4  # qhull's facets grow as M^(n // 2)
 
 
@@ -65,7 +63,7 @@ def solve_exact(
     if problem.k == problem.num_regressors:
         pool = _pool(problem, hull=best == 1)
         free = problem.k - len(problem.required)
-        if enumeration_cost(len(pool), free) <= _most_multiplications(free, best):
+        if best == 1 or enumeration_cost(len(pool), free) <= _CHEAP:
             return _enumerate(problem, pool, best, deadline)
     start = exchange_indices(problem, restarts, seed)
     groups = _groups(problem, merge=best == 1)
@@ -97,15 +95,6 @@ def upper_bound(problem: Problem) -> float:
         problem.rows[keep], problem.lower[keep], problem.upper[keep], start
     )
     return problem.num_outputs * (relaxed + problem.log_scale)
-
-
-def _most_multiplications(free: int, best: int) -> float:
-    """Cost up to which enumeration is tried before branch and bound.
-
-    With up to three inputs a large hull means postures in convex position (a sphere),
-    where every relaxation is nearly flat and enumeration is the faster proof.
-    """
-    return _CONVEX_POSITION if free <= 4 and best == 1 else _CHEAP
 
 
 def _pool(problem: Problem, hull: bool) -> Indices:
@@ -143,7 +132,7 @@ def _enumerate(
     ]
     if found.complete:
         return _result(problem, subsets, best, None, found.examined)
-    # Out of time: whatever greedy has, if that is better, and the relaxation's bound.
+    # Out of time: whatever greedy has, if that is better, and the sharper bound.
     greedy = np.sort(greedy_indices(problem))
     keep = np.flatnonzero(problem.available)
     relaxed = relaxed_bound(
@@ -152,7 +141,10 @@ def _enumerate(
         problem.upper[keep],
         np.searchsorted(keep, greedy),
     )
-    return _result(problem, [*subsets, greedy], best, relaxed, found.examined)
+    # log det(X_s.T X_s) is twice the log of the volume, beside that of ``required``.
+    fixed = np.linalg.slogdet(required @ required.T)[1] if len(required) else 0.0
+    bound = min(relaxed, fixed + 2.0 * float(np.log(found.bound)))
+    return _result(problem, [*subsets, greedy], best, bound, found.examined)
 
 
 def _result(
