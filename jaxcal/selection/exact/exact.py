@@ -1,10 +1,10 @@
 """The proven optimum, by whichever proof is cheaper.
 
 k = n + 1 affine postures: the absolute determinant is convex in each posture, so only
-vertices of the convex hull matter, and :mod:`jaxcal.selection.exact.volume` enumerates
-them without numba. Everything else (more postures, blocks, priors, hulls too large to
-enumerate, many inputs) goes to branch and bound, started from the exchange. The
-runner-up need not lie on the hull, so ``best`` > 1 does without it.
+vertices of the convex hull matter, and :mod:`jaxcal.selection.exact.volume` finds the
+largest volume. Everything else (more postures, blocks, priors, many runners-up) goes to
+branch and bound, started from the exchange. The runner-up need not lie on the hull, so
+``best`` > 1 does without it.
 """
 
 from __future__ import annotations
@@ -36,7 +36,6 @@ STARTING_RESTARTS = 30  # of the exchange: the search does the rest
 TIME_LIMIT = 10.0  # seconds of one search where none is given
 
 _CHEAP = 3e7  # multiplications of an enumeration: about 20 ms
-_CONVEX_POSITION = 3e10  # those of 500 points on a sphere, some seconds
 _LARGEST_HULL_DIMENSION = 4  # qhull's facets grow as M^(n // 2)
 
 
@@ -111,7 +110,7 @@ def solve_exact(
         pool = _pool(problem, hull=best == 1)
         free = problem.k - len(problem.required)
         cost = enumeration_cost(len(pool), free)
-        if cost <= _most_multiplications(free, best):
+        if best == 1 or cost <= _CHEAP:
             if enough and cost > _CHEAP:  # the relaxation may do without
                 start = np.sort(exchange_indices(problem, restarts, seed))
                 relaxed = _relaxed(problem, start)
@@ -163,15 +162,6 @@ def _relaxed(problem: Problem, start: Indices) -> float:
     )
 
 
-def _most_multiplications(free: int, best: int) -> float:
-    """Cost up to which enumeration is tried before branch and bound.
-
-    With up to three inputs a large hull means postures in convex position (a sphere),
-    where every relaxation is nearly flat and enumeration is the faster proof.
-    """
-    return _CONVEX_POSITION if free <= 4 and best == 1 else _CHEAP
-
-
 def _pool(problem: Problem, hull: bool) -> Indices:
     """Candidates that may join the required ones in an optimum with k = p."""
     usable = problem.available.copy()
@@ -211,10 +201,12 @@ def _enumerate(
     ]
     if found.complete:
         return _result(problem, subsets, best, None, found.examined)
-    # Out of time: whatever greedy has, if that is better, and the relaxation's bound.
+    # Out of time: whatever greedy has, if that is better, and the sharper bound.
     greedy = np.sort(greedy_indices(problem))
-    relaxed = _relaxed(problem, greedy)
-    return _result(problem, [*subsets, greedy], best, relaxed, found.examined)
+    # log det(X_s.T X_s) is twice the log of the volume, beside that of ``required``.
+    fixed = np.linalg.slogdet(required @ required.T)[1] if len(required) else 0.0
+    bound = min(_relaxed(problem, greedy), fixed + 2.0 * float(np.log(found.bound)))
+    return _result(problem, [*subsets, greedy], best, bound, found.examined)
 
 
 def _result(
