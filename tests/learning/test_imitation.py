@@ -28,7 +28,7 @@ PPO = PPOConfig(
     seed=3,
 )
 TASK = Task(
-    SelectionConfig(num_candidates=11, num_selected=5, reward_gain=True),
+    SelectionConfig(11, 5, 1, 1, reward_gain=True),
     masked=0.3,
     random_starts=0.5,
 )
@@ -82,6 +82,25 @@ def test_a_lesson_is_the_same_whenever_it_is_asked_for(lesson):
     assert not np.array_equal(lesson.candidates, other.candidates)
 
 
+def test_lessons_share_no_key_with_the_weights_and_the_updates():
+    # In JAX 0.10 fold_in(key, i) is split(key)[i]: streams must be split apart first.
+    key = jax.random.key(PPO.seed)
+    np.testing.assert_array_equal(
+        jax.random.key_data(jax.random.split(key)[1]),
+        jax.random.key_data(jax.random.fold_in(key, 1)),
+    )
+    streams = optimiser.Keys.of(PPO.seed)
+    assert np.array_equal(
+        jax.random.key_data(optimiser.init(PPO, TASK, NETWORK).key),
+        jax.random.key_data(streams.updates),
+    )
+    for index in range(3):
+        drawn = imitation.draw(PPO, TASK, NETWORK, brute_force, index)
+        for used in (streams.weights, streams.updates):
+            sets, _ = imitation._drawn(jax.random.split(used, 4)[0], 64, TASK)
+            assert not np.array_equal(sets, drawn.candidates)
+
+
 @jax.jit
 def measured(params, lesson):
     attempt = imitation.follow(lesson, TASK, NETWORK, params)
@@ -107,7 +126,7 @@ def test_the_loss_is_that_of_the_definition(lesson):
         share = weights / weights.sum(-1, keepdims=True)
         counted = count >= np.asarray(lesson.length)
         surprise -= np.log((share * wanted).sum(-1))[counted].sum()
-        gap = 0.1 * 3 * (np.asarray(value) - np.asarray(lesson.best))
+        gap = 0.1 * (np.asarray(value) - np.asarray(lesson.best))
         error += (gap**2)[counted].sum()
         number += counted.sum()
         best = (share * wanted).argmax(-1)

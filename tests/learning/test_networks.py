@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import json
+import pathlib
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +15,7 @@ import pytest
 from jaxcal.learning.policies import decoding, networks
 from jaxcal.learning.policies.features import remaining
 from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.training import checkpoint
 from jaxcal.paper.network import HEADS
 
 SMALL = NetworkConfig(width=8, encoder_rounds=1)
@@ -52,7 +56,7 @@ def test_the_papers_network_has_its_size_and_its_share():
 
 
 @pytest.mark.parametrize(
-    ("k", "chosen"), [(4, []), (4, [3]), (4, [3, 7]), (7, [1, 2]), (7, [1, 2, 5, 8, 9])]
+    ("k", "chosen"), [(4, []), (4, [3, 7]), (7, [1, 2]), (7, [1, 2, 5, 8, 9])]
 )
 def test_compact_is_blind_to_affine_maps(rng, k, chosen):
     network, params = made(SMALL)
@@ -107,6 +111,63 @@ def test_a_network_can_begin_as_the_look_ahead_rule(rng, k):
     reached = [decoding.log_det_of(points, picked) for picked in (own, rule)]
     np.testing.assert_allclose(*reached, atol=1e-4)
     assert (np.sort(own) == np.sort(rule)).all(axis=1).mean() > 0.9
+
+
+SHIPPED = json.loads((pathlib.Path(__file__).parent / "shipped_picks.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("name", "n", "mask", "how"),
+    [("k5", 3, 0.0, {}), ("n2k4first", 2, 0.2, {"decoding": "first", "num": 4})],
+)
+def test_the_shipped_policy_chooses_what_it_always_chose(name, n, mask, how):
+    policy, picks = checkpoint.load(), np.array(SHIPPED[name])
+    batch, k = picks.shape
+    rng = np.random.default_rng([20, n, k, 0])
+    sets = rng.uniform(size=(batch, 20, n)).astype(np.float32)
+    free = rng.uniform(size=(batch, 20)) >= mask
+    found = decoding.choose(
+        policy.network,
+        policy.params,
+        jnp.asarray(sets),
+        jnp.asarray(free),
+        jnp.zeros((batch, 0), jnp.int32),
+        jax.random.key(0),
+        k=k,
+        **how,
+    )
+    # The best of the last pair comes first; where they tie, rounding decides.
+    assert (np.sort(found) == np.sort(picks)).all(axis=1).mean() > 0.98
+
+
+@pytest.mark.parametrize(("k", "close"), [(4, False), (5, True)])
+def test_the_last_pair_is_the_best_one_unless_little_is_spanned(rng, k, close):
+    # Three inputs. At K = n + 2 the choices before the pair do not span the space: the
+    # pair is rated with a ridge beside them, which counts where they nearly coincide.
+    (network, params), m, batch = made(SMALL), 12, 300
+    points = rng.uniform(size=(batch, m, 3)).astype(np.float32)
+    if close:
+        points[:, : k - 2] = points[:, :1] + 0.03 * points[:, : k - 2]
+    found = decoding.choose(
+        network,
+        params,
+        jnp.asarray(points),
+        jnp.ones((batch, m), bool),
+        jnp.tile(jnp.arange(k - 2), (batch, 1)),
+        jax.random.key(0),
+        k=k,
+        num_required=k - 2,
+    )
+
+    def log_det(sets):
+        z = np.concatenate([sets.astype(float), np.ones((*sets.shape[:2], 1))], -1)
+        return np.linalg.slogdet(np.swapaxes(z, 1, 2) @ z)[1]
+
+    pairs = itertools.combinations(range(k - 2, m), 2)
+    best = np.max([log_det(points[:, [*range(k - 2), *p]]) for p in pairs], axis=0)
+    own = log_det(np.take_along_axis(points, np.asarray(found)[..., None], axis=1))
+    exact = best - own < 1e-4
+    assert 0.5 < exact.mean() < 0.95 if close else exact.all()
 
 
 @pytest.mark.parametrize("lookahead", [1, 3])

@@ -56,12 +56,12 @@ def test_clipping_is_that_of_optax(rng, size):
         np.testing.assert_allclose(got[name], expected[name], rtol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["compact", "paper"])
-@pytest.mark.parametrize("k", [4, 6])
-def test_the_first_minibatch_sees_the_probabilities_that_played(kind, k):
+@pytest.mark.parametrize(("kind", "n", "k"), [("compact", 2, 3), ("compact", 1, 4),
+                                              ("paper", 1, 4)])  # fmt: skip
+def test_the_first_minibatch_sees_the_probabilities_that_played(kind, n, k):
     # Play and loss compute the same probabilities in differently compiled programs;
     # a difference here would silently make every gradient wrong.
-    env = SelectionConfig(num_candidates=12, num_selected=k)
+    env = SelectionConfig(12, k, n, n)
     task = Task(env, random_starts=0.5)
     network = networks.build(dataclasses.replace(SMALL, kind=kind))
     config = dataclasses.replace(TINY, episodes_per_update=512)
@@ -82,7 +82,7 @@ def test_the_first_minibatch_sees_the_probabilities_that_played(kind, k):
 
 def test_update_compiles_once_and_changes_everything_it_should():
     network = networks.build(SMALL)
-    task = Task(SelectionConfig(num_candidates=10))
+    task = Task(SelectionConfig(8, 3, 2, 2))
     state = optimiser.init(TINY, task, network)
     before = jax.tree.map(np.asarray, state.params)
     update = ppo.updater(TINY, task, network)
@@ -105,7 +105,7 @@ def test_the_policy_learns_on_a_small_task():
     config = dataclasses.replace(
         TINY, num_episodes=512 * 40, episodes_per_update=512, learning_rate=5e-3
     )
-    task = Task(SelectionConfig(num_candidates=8))
+    task = Task(SelectionConfig(8, 3, 2, 2))
     state = optimiser.init(config, task, network)
     rewards = []
     update = ppo.updater(config, task, network)
@@ -116,6 +116,35 @@ def test_the_policy_learns_on_a_small_task():
     assert float(metrics["value_loss"]) < 0.2
 
 
+def test_the_averaged_weights_owe_nothing_to_the_initial_ones(rng):
+    # A mean with weights decay^age that add up to one, from the first step on.
+    config = dataclasses.replace(
+        TINY, num_minibatches=1, num_epochs=1, average_decay=0.9, learning_rate=0.1
+    )
+    params = {"w": jnp.asarray(rng.normal(size=3) + 100.0, jnp.float32)}
+    state = optimiser.TrainState(
+        params=params,
+        average=params,
+        opt_state=optimiser.optimiser(config).init(params),
+        key=jax.random.key(0),
+        num_updates=jnp.zeros((), jnp.int32),
+    )
+    data, seen = jnp.asarray(rng.normal(size=(4, 3)), jnp.float32), []
+    for _ in range(4):
+        state, _ = optimiser.learn(
+            state,
+            config,
+            4,
+            lambda index: data[index],
+            lambda params, rows: (((params["w"][None] - rows) ** 2).sum(), {}),
+            jax.random.key(1),
+        )
+        seen.append(np.asarray(state.params["w"], np.float64))
+        ages = 0.9 ** np.arange(len(seen))[::-1]
+        expected = ages @ np.stack(seen) / ages.sum()
+        np.testing.assert_allclose(state.average["w"], expected, rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("values", "named"),
     [
@@ -123,6 +152,7 @@ def test_the_policy_learns_on_a_small_task():
         ({"num_epochs": 0}, "num_epochs"),
         ({"learning_rate": 0.0}, "learning_rate"),
         ({"gae_lambda": 1.5}, "gae_lambda"),
+        ({"average_decay": 1.0}, "average_decay"),
         ({"seed": -1}, "seed"),
     ],
 )

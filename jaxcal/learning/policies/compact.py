@@ -54,11 +54,10 @@ class CompactNetwork(nn.Module):
     It sees the candidates only through inner products of whitened regressors, so no
     affine map of the commands and no order of the candidates can change the pick.
 
-    The last two choices are the look-ahead's (``endgame``). The last one is the largest
-    gain, which is optimal given the others. The last two are the best pair, optimal
-    too, except where K = n + 2: there the choices before the pair do not span the space
-    yet, the pair is rated with the ridge of ``features``, and now and then it is second
-    best (docs/policy.md says how often).
+    The last two choices are the look-ahead's (``endgame``): the best pair given what was
+    chosen before, then the largest gain. At K = n + 2 the choices before the pair do not
+    span the space and it is rated with the ridge of ``features`` beside them: it may be
+    second best where those choices nearly coincide (docs/policy.md).
     """
 
     config: NetworkConfig
