@@ -11,7 +11,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.identify import Calibration, identify
+    from jaxcal.calibration import Calibration, identify
     from jaxcal.information.regression import (
         hat_matrix,
         information_matrix,
@@ -43,8 +43,8 @@ __all__ = [
 __version__ = "0.1.0"
 
 _HOME = {
-    "Calibration": "jaxcal.calibration.identify",
-    "identify": "jaxcal.calibration.identify",
+    "Calibration": "jaxcal.calibration",
+    "identify": "jaxcal.calibration",
     "plan": "jaxcal.selection.plan",
     "Selection": "jaxcal.selection",
     "score": "jaxcal.selection",

@@ -84,6 +84,8 @@ def choose(
     best = float(exact.log_det)
     if session.method == "exact" or not policy:
         return _choice(exact, best, bool(exact.proven), "")
+    if session.method == "greedy":
+        extra.pop("seed")  # greedy draws nothing
     if session.method == "auto":
         extra |= {"least_efficiency": session.min_efficiency, "time_limit": limit}
     try:

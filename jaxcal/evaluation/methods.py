@@ -41,7 +41,7 @@ DEFAULT_METHODS = (*POLICIES, *BASELINES)
 METHODS = (*DEFAULT_METHODS, "auto")
 DEFAULT_RANDOM_DRAWS = 100
 
-_LEARNED = (*POLICIES, "auto")  # what a checkpoint matters to
+_LEARNED = POLICIES  # what a checkpoint matters to
 _CHUNK = 250  # episodes between two reports of progress
 _CHUNK_EXACT = 50  # the slow one for k above n + 1
 _REDRAWS = 20
@@ -119,10 +119,7 @@ def evaluate(
     found: dict[tuple[str, str | None], MethodResult] = {}
     for method in methods:
         for checkpoint in checkpoints if method in _LEARNED else ():
-            if method == "auto":
-                found[method, checkpoint] = run.auto(checkpoint)
-            else:
-                found[method, checkpoint] = run.policy(method, checkpoint)
+            found[method, checkpoint] = run.policy(method, checkpoint)
     random = run.random(random_draws)
     exact, reference, proven = run.exact(time_limit)
     found["random", None] = random
@@ -130,6 +127,8 @@ def evaluate(
     for method in methods:
         if method in ("greedy", "exchange"):
             found[method, None] = run.baseline(method)
+        elif method == "auto":
+            found[method, None] = run.auto()
     results = [
         found[method, checkpoint]
         for method in methods
@@ -275,15 +274,14 @@ class _Run:
         self.require_valid(label, indices)
         return self.result(method, indices[:, None], seconds / len(indices), checkpoint)
 
-    def auto(self, checkpoint: str | None) -> MethodResult:
-        """The policy where it proves good enough, else the optimum, one by one."""
+    def auto(self) -> MethodResult:
+        """What is proven good enough at the least cost, one set at a time."""
         from jaxcal.selection import select
 
-        label = "auto" if checkpoint is None else f"auto ({checkpoint})"
         part = self.part(slice(None))
         masks = part["available"]
         chosen, seconds = [], 0.0
-        for cut in (slice(0, 1), *self.pieces(label)):  # the first compiles
+        for cut in (slice(0, 1), *self.pieces("auto")):  # the first compiles
             for i in range(cut.start, cut.stop):
                 found = select(
                     part["candidates"][i],
@@ -292,12 +290,11 @@ class _Run:
                     available=None if masks is None else masks[i],
                     num_outputs=self.dataset.num_outputs,
                     seed=self.seed,
-                    checkpoint=checkpoint,
                 )
                 chosen.append(found.indices)
                 seconds += found.seconds if len(chosen) > 1 else 0.0
         indices = np.array(chosen[1:])
-        return self.result("auto", indices[:, None], seconds / len(indices), checkpoint)
+        return self.result("auto", indices[:, None], seconds / len(indices))
 
     def require_valid(self, label: str, indices: Indices) -> None:
         """A policy is trained, not proven: look at what it returned."""

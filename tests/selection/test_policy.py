@@ -24,9 +24,9 @@ def optimum(sets, k, **options):
     return np.asarray(exact_batch(sets, k, num_outputs=1, **options).log_det)
 
 
-def test_select_uses_the_shipped_policy_by_default(rng):
+def test_select_uses_the_shipped_policy_when_asked(rng):
     candidates = rng.uniform(size=(50, 3))
-    chosen = jaxcal.select(candidates)
+    chosen = jaxcal.select(candidates, method="policy")
     assert chosen.method == "policy"
     assert len(set(chosen.indices.tolist())) == 4
     rows = jaxcal.regression_matrix(candidates[chosen.indices])

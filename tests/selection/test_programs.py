@@ -182,7 +182,7 @@ def test_a_second_process_needs_jax_alone(kept):
     code = (
         "import json, sys, numpy as np, jaxcal\n"
         "points = np.random.default_rng(0).random((30, 3))\n"
-        "chosen = jaxcal.select(points, 4).indices.tolist()\n"
+        "chosen = jaxcal.select(points, 4, 'policy').indices.tolist()\n"
         "heavy = {'flax', 'orbax', 'optax', 'scipy', 'numba'} & set(sys.modules)\n"
         "print(json.dumps([chosen, sorted(heavy)]))"
     )
