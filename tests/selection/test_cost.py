@@ -249,14 +249,17 @@ def test_the_figure_holds_every_point(rng):
         ({"motion": 20.0}, "motion must be a Motion, got 20.0"),
         ({"k": 3}, "k must be at least 4"),
         ({"start": np.zeros(2)}, r"start must have shape \(3,\), got \(2,\)"),
-        ({"time_limit": -1}, "time_limit must be above 0 seconds, got -1"),
+        ({"time_limit": -1}, "time_limit must be a number above 0 in seconds, got -1"),
         ({"motion": Motion((1.0, 2.0), (1.0,))}, "motion.speed must hold 1 or 3"),
-        ({"num": 4}, "num is an option of lookahead, not of exact: leave it out"),
+        ({"num": 4}, 'num is not an option of method "exact" .it is of lookahead.'),
         (
             {"method": "lookahead", "seed": 1},
-            "seed is an option of exact, heuristic, not of lookahead",
+            'seed is not an option of method "lookahead" .it is of exact, heuristic.',
         ),
-        ({"method": "heuristic", "num": 2}, "num is an option of lookahead, not"),
+        (
+            {"method": "heuristic", "num": 2},
+            'num is not an option of method "heuristic"',
+        ),
     ],
 )
 def test_bad_requests_name_argument_rule_and_value(rng, change, message):

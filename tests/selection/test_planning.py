@@ -208,7 +208,7 @@ def test_out_of_reach_names_the_best_achievable(rng):
         ({"noise_std": [1.0, 2.0], "num_outputs": 3}, "noise_std must be one number"),
         ({"target_accuracy": -1.0}, "target_accuracy must be positive, got -1"),
         ({"target_accuracy": np.nan}, "target_accuracy must be finite"),
-        ({"time_limit": 0}, "time_limit must be above 0"),
+        ({"time_limit": 0}, "time_limit must be a number above 0 in seconds"),
         ({"max_k": 3}, "max_k must be at least 4, got 3"),
         ({"max_k": 13}, "max_k must not exceed the 12 measurements allowed, got 13"),
         ({"more": -1}, "more must be at least 0, got -1"),
@@ -244,7 +244,7 @@ def test_a_masked_candidate_may_hold_anything(rng):
     wanted = {"target_accuracy": 0.9, "noise_std": 1.0}
     available = np.arange(15) != 4
     plain = plan(candidates, available=available, **wanted)
-    candidates[4] = 1e3
+    candidates[4] = np.nan
     odd = plan(candidates, available=available, **wanted)
     assert odd.indices.tolist() == plain.indices.tolist()
 

@@ -261,7 +261,7 @@ def test_the_front_ascends_to_the_optimum_and_is_never_faster_than_the_proven_on
         ({"weight": -1.0}, "weight must be a number of at least 0, got -1.0"),
         ({"weight": 0.1, "least_efficiency": 0.9}, "must not both be given"),
         ({"weight": 0.1, "method": "exact"}, "method must be lookahead with a weight"),
-        ({"weight": 0.1, "seed": 3}, "seed is an option of exact, heuristic, not of"),
+        ({"weight": 0.1, "seed": 3}, 'seed is not an option of method "lookahead"'),
         ({"method": "lookahead", "num": 0}, "num must be"),
     ],
 )

@@ -5,24 +5,24 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import time
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers
+from jaxcal.checks import numbers, one_of, share, whole_number
 from jaxcal.information.criteria import d_efficiency
-from jaxcal.selection.auto import check_least_efficiency
 from jaxcal.selection.fastest.motion import Motion
 from jaxcal.selection.fastest.task import Found, Solver, Task, make_task
-from jaxcal.selection.problem import whole_number
+from jaxcal.selection.solvers import checked_seed
 
 __all__ = ["METHODS", "FastSelection", "answer", "make_solver", "select_fastest"]
 
 # Module of each method; its ``solver`` takes the task and the options named here.
 METHODS = {
-    "exact": ("jaxcal.selection.fastest.exact", {"seed": 0}),
-    "heuristic": ("jaxcal.selection.fastest.local_search", {"seed": 0}),
-    "lookahead": ("jaxcal.selection.fastest.lookahead", {"num": 8}),
+    "exact": ("jaxcal.selection.fastest.exact", ("seed",)),
+    "heuristic": ("jaxcal.selection.fastest.local_search", ("seed",)),
+    "lookahead": ("jaxcal.selection.fastest.lookahead", ("num",)),
 }
 
 _LEAST_EFFICIENCY = 0.95  # where neither one nor a weight is given
@@ -62,7 +62,7 @@ def select_fastest(
     method: str | None = None,
     time_limit: float = 60.0,
     num: int | None = None,
-    seed: int | None = None,
+    seed: int | np.random.Generator | None = None,
 ) -> FastSelection:
     """Subset and order of least time with a D-efficiency of ``least_efficiency``.
 
@@ -85,7 +85,8 @@ def select_fastest(
         time_limit: seconds of the exact search and of the D-optimum behind all three.
         num: of the look-ahead: first postures tried at each of 32 prices of time; 8
             when not given.
-        seed: of the heuristic's starts, from which exact starts too; 0 when not given.
+        seed: of the heuristic's starts, from which exact starts too; an int, 0 when
+            not given, or a numpy Generator.
 
     Returns:
         The selection; among runs of equal time the one with the largest determinant.
@@ -105,8 +106,9 @@ def select_fastest(
         method = method or "lookahead"
         if method != "lookahead":
             raise ValueError(f"method must be lookahead with a weight, got {method!r}")
-    least = check_least_efficiency(
-        _LEAST_EFFICIENCY if least_efficiency is None else least_efficiency
+    least = share(
+        "least_efficiency",
+        _LEAST_EFFICIENCY if least_efficiency is None else least_efficiency,
     )
     task = make_task(
         candidates, k, motion, start, available, required, num_outputs, time_limit
@@ -127,12 +129,11 @@ def select_fastest(
     return found
 
 
-def make_solver(task: Task, method: str | None, **given: int | None) -> Solver:
+def make_solver(task: Task, method: str | None, **given: Any) -> Solver:
     """The solver of ``method``, or of the one that suits k; its options are checked."""
     if method is None:
         method = "exact" if task.k <= _EXACT_BY_DEFAULT else "heuristic"
-    if method not in METHODS:
-        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {method!r}")
+    one_of("method", method, tuple(METHODS))
     if method == "exact" and task.k > _MOST_EXACT:
         raise ValueError(f"k must be at most {_MOST_EXACT} with exact, got {task.k}")
     options = _options(method, **given)
@@ -141,22 +142,21 @@ def make_solver(task: Task, method: str | None, **given: int | None) -> Solver:
     return solver
 
 
-def _options(method: str, **given: int | None) -> dict[str, int]:
+def _options(method: str, *, num: Any, seed: Any) -> dict[str, int]:
     """The options that a method reads, checked; any other that is given is refused."""
-    read = METHODS[method][1]
-    for name, value in given.items():
-        if value is not None and name not in read:
-            readers = [other for other, (_, names) in METHODS.items() if name in names]
-            raise ValueError(
-                f"{name} is an option of {', '.join(readers)}, not of {method}: leave "
-                f"it out, got {value!r}"
-            )
-    return {
-        name: default
-        if given[name] is None
-        else whole_number(name, given[name], 0 if name == "seed" else 1)
-        for name, default in read.items()
+    checked = {
+        "num": 8 if num is None else whole_number("num", num, 1),
+        "seed": 0 if seed is None else checked_seed(seed),
     }
+    reads = METHODS[method][1]
+    for name, value in (("num", num), ("seed", seed)):
+        if value is not None and name not in reads:
+            others = [other for other in METHODS if name in METHODS[other][1]]
+            raise ValueError(
+                f'{name} is not an option of method "{method}" '
+                f"(it is of {', '.join(others)})"
+            )
+    return {name: checked[name] for name in reads}
 
 
 def answer(

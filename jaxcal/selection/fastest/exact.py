@@ -18,7 +18,7 @@ import time
 import numpy as np
 from numba import njit
 
-from jaxcal.information.linear_algebra import add_outer, factor
+from jaxcal.information.linear_algebra import add_block, factor
 from jaxcal.selection.fastest.local_search import local_search
 from jaxcal.selection.fastest.task import (
     SAME_TIME,
@@ -65,7 +65,7 @@ def _gram(rows, chosen, count, gram):
     """``gram`` (p, p) of the first ``count`` of ``chosen``, all into rows (M, p)."""
     gram[:] = 0.0
     for c in range(count):
-        add_outer(gram, rows[chosen[c]], 1.0)
+        add_block(gram, rows[:, None, :], chosen[c], 1.0)
 
 
 @njit(cache=True, nogil=True)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.selection.auto import check_least_efficiency
+from jaxcal.checks import share, whole_number
 from jaxcal.selection.fastest.api import FastSelection, answer, make_solver
 from jaxcal.selection.fastest.motion import Motion
 from jaxcal.selection.fastest.task import SAME_TIME, make_task
-from jaxcal.selection.problem import whole_number
 
 __all__ = ["ParetoFront", "pareto_front"]
 
@@ -38,7 +38,7 @@ def pareto_front(
     time_limit: float = 60.0,
     max_points: int = 200,
     num: int | None = None,
-    seed: int | None = None,
+    seed: int | np.random.Generator | None = None,
 ) -> ParetoFront:
     """Time against D-efficiency, from ``least_efficiency`` up to the D-optimum.
 
@@ -51,7 +51,7 @@ def pareto_front(
         time_limit: seconds for each point.
         max_points: points after which to stop; the front is then not proven.
     """
-    least_efficiency = check_least_efficiency(least_efficiency)
+    least_efficiency = share("least_efficiency", least_efficiency)
     max_points = whole_number("max_points", max_points, 1)
     task = make_task(
         candidates, k, motion, start, available, required, num_outputs, time_limit

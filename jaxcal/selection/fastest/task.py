@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers
+from jaxcal.checks import numbers, seconds
 from jaxcal.selection.exact.exact import ExactResult, solve_exact
 from jaxcal.selection.fastest.motion import Motion, travel_times
 from jaxcal.selection.problem import Problem, make_problem
@@ -118,22 +118,18 @@ def make_task(
     time_limit: float,
 ) -> Task:
     """Check the arguments of ``select_fastest`` and find the D-optimum."""
-    if k is None:
-        shape = np.shape(candidates)
-        k = shape[1] + 1 if len(shape) == 2 else 1
     problem = make_problem(
         candidates, k, available=available, required=required, num_outputs=num_outputs
     )
     if not isinstance(motion, Motion):
         raise ValueError(f"motion must be a Motion, got {motion!r}")
-    limit = numbers("time_limit", time_limit, finite=False)
-    if limit.ndim or not limit > 0.0:
-        raise ValueError(f"time_limit must be above 0 seconds, got {time_limit!r}")
+    limit = seconds("time_limit", time_limit)
     free = np.setdiff1d(np.flatnonzero(problem.available), problem.required)
     leverage = (problem.rows[free] ** 2).sum(axis=1)
     pool = np.concatenate([problem.required, free[np.argsort(-leverage)]])
     if len(problem.required) == problem.k:
         pool = problem.required
+    assert problem.candidates is not None
     points = problem.candidates[pool]
     begin = np.zeros(len(pool))
     if start is not None:
@@ -151,5 +147,5 @@ def make_task(
         times=times,
         start=begin,
         settle=float(motion.settle) * problem.k,
-        time_limit=float(limit),
+        time_limit=limit,
     )

@@ -21,10 +21,11 @@ import time
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers
+from jaxcal.checks import numbers, one_of, seconds, whole_number
 from jaxcal.selection.plan.bound import lower_bound, region_weighting
 from jaxcal.selection.plan.designs import CRITERIA, Design, best_design, criterion_of
-from jaxcal.selection.problem import Problem, make_problem, whole_number
+from jaxcal.selection.problem import Problem, make_problem
+from jaxcal.selection.solvers import checked_seed
 
 __all__ = ["Plan", "PlanRow", "plan"]
 
@@ -117,7 +118,7 @@ def plan(
     more: int = 0,
     design: str = "exact",
     time_limit: float = 1.0,
-    seed: int = 0,
+    seed: int | np.random.Generator = 0,
 ) -> Plan:
     """The smallest number of measurements that predicts accurately enough.
 
@@ -149,18 +150,10 @@ def plan(
             ``max_k`` suffices, with the accuracy that can be reached.
     """
     begun = time.perf_counter()
-    for name, value, allowed_values in (
-        ("criterion", criterion, tuple(CRITERIA)),
-        ("design", design, DESIGNS),
-    ):
-        if value not in allowed_values:
-            raise ValueError(
-                f"{name} must be one of {', '.join(allowed_values)}, got {value!r}"
-            )
-    limit = numbers("time_limit", time_limit, finite=False)
-    if limit.ndim or not limit > 0.0:
-        raise ValueError(f"time_limit must be above 0 seconds, got {time_limit!r}")
-    more, seed = whole_number("more", more, 0), whole_number("seed", seed, 0)
+    one_of("criterion", criterion, tuple(CRITERIA))
+    one_of("design", design, DESIGNS)
+    limit = seconds("time_limit", time_limit)
+    more, start = whole_number("more", more, 0), checked_seed(seed)
     noise, target = _levels(noise_std, target_accuracy, num_outputs, candidates)
     everything = _whole_problem(
         candidates, available, required, max_replicates, len(noise)
@@ -186,9 +179,7 @@ def plan(
 
     def design_of(k: int, how: str, previous: Indices | None) -> Design:
         problem = dataclasses.replace(everything, k=k)
-        return best_design(
-            problem, points, criterion, how, float(limit), previous, seed
-        )
+        return best_design(problem, points, criterion, how, limit, previous, start)
 
     def enough(found: Design) -> bool:
         return found.variance <= allowed * (1 + 1e-12)
@@ -304,6 +295,7 @@ def _region_rows(problem: Problem, region: ArrayLike | None) -> Array:
     n = problem.num_regressors - 1
     if where.ndim != 2 or where.shape[1] != n or not len(where):
         raise ValueError(f"region must have shape (R, {n}), got {where.shape}")
+    assert problem.candidates is not None
     usable = problem.candidates[problem.available]
     centre = usable.mean(axis=0)
     scale = np.abs(usable - centre).max(axis=0)

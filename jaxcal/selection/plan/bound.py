@@ -58,15 +58,22 @@ def lower_bound(problem: Problem, weighting: Array, k: int) -> float:
         inverse = np.linalg.pinv(gram, hermitian=True)
         gain = np.einsum("ma,ab,mb->m", rows, inverse @ weighting @ inverse, rows)
         if iteration % 10 == 0 or iteration == _ITERATIONS - 1:
-            most = _linear_maximum(gain, lower, upper, k)
+            most = _largest_sum(gain, lower, upper, k)
             best = max(best, float(np.trace(weighting @ inverse)) ** 2 / most)
         count = _scaled_to(count * np.sqrt(np.maximum(gain, 0.0)), lower, upper, k)
     return best
 
 
-def _scaled_to(
-    count: Array, lower: NDArray[np.int64], upper: NDArray[np.int64], k: int
-) -> Array:
+def _largest_sum(gain: Array, lower: Indices, upper: Indices, k: int) -> float:
+    """Largest ``sum of c_i gain_i`` with counts within their limits and sum k."""
+    order = np.argsort(-gain)
+    room = (upper - lower)[order]
+    free = k - int(lower.sum())
+    filled = np.clip(free - (np.cumsum(room) - room), 0, room)
+    return float(lower @ gain + filled @ gain[order])
+
+
+def _scaled_to(count: Array, lower: Indices, upper: Indices, k: int) -> Array:
     """``clip(c count, lower, upper)`` with the c that makes the sum k, by bisection."""
     low, high = 0.0, 1.0
     while np.clip(high * count, lower, upper).sum() < k and high < 1e12:
@@ -78,12 +85,3 @@ def _scaled_to(
         else:
             high = middle
     return np.clip(high * count, lower, upper)
-
-
-def _linear_maximum(gain: Array, lower: Indices, upper: Indices, k: int) -> float:
-    """Largest ``sum of c_i gain_i`` with counts within bounds and sum k."""
-    order = np.argsort(-gain)
-    room = (upper - lower)[order]
-    free = k - int(lower.sum())
-    filled = np.clip(free - (np.cumsum(room) - room), 0, room)
-    return float(lower @ gain + filled @ gain[order])
