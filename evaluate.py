@@ -89,9 +89,11 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _alone(arguments: list[str] | None) -> int:
     """The command in this process, which may be one of several."""
+    from jaxcal.learning.runtime import cache
     from jaxcal.progress import Progress
 
     options = _parse(arguments)
+    cache.keep_compiled_programs()
     progress = Progress(quiet=options.quiet)
     try:
         with _stopped_by_sigterm():

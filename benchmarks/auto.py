@@ -16,7 +16,6 @@ import time
 import numpy as np
 
 import jaxcal
-from jaxcal.learning.runtime import cache
 
 CASES = ((4, 0.999), (6, 0.99), (6, 0.999), (8, 0.99), (8, 0.999))
 
@@ -25,7 +24,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--sets", type=int, default=200, help="candidate sets a row")
     number = parser.parse_args().sets
-    cache.keep_compiled_programs()
     print(" K  least efficiency  policy answered  proven optimal  least proven  ms")
     for k, least in CASES:
         sets = np.random.default_rng([41, k]).random((number + 1, 50, 3))

@@ -233,41 +233,27 @@ class _Run:
 
     def policy(self, method: str, checkpoint: str | None) -> MethodResult:
         """One decoding of one checkpoint."""
-        import jax
-
         from jaxcal.selection.policy import select_batch
 
         label = label_of(method, self.num)
         if checkpoint is not None:
             label = f"{label} ({checkpoint})"
         count = self.dataset.num_episodes
-        chunk = min(_CHUNK, count)
-        size = min(chunk * jax.local_device_count(), -(-count // chunk) * chunk)
 
         def choose(cut: slice) -> Indices:
-            part = self.part(cut)
-            number = len(part["candidates"])
-            # A short last piece is filled up: another shape would compile again.
-            fill = np.minimum(np.arange(size), number - 1)
-            part = {
-                key: None if value is None else value[fill]
-                for key, value in part.items()
-            }
-            chosen = select_batch(
+            return select_batch(
                 k=self.k,
                 decoding=method.partition(":")[2] or "greedy",
                 num=self.num,
                 seed=self.seed + cut.start,
                 checkpoint=checkpoint,
-                chunk=chunk,
-                **part,
+                **self.part(cut),
             )
-            return np.asarray(chosen, dtype=np.int64)[:number]
 
         self.progress(label, 0, count)
-        choose(slice(0, size))  # compiles
+        choose(slice(0, min(_CHUNK, count)))  # compiles
         chosen, seconds = [], 0.0
-        for cut in self.pieces(label, size):
+        for cut in self.pieces(label):
             start = time.perf_counter()
             chosen.append(choose(cut))
             seconds += time.perf_counter() - start

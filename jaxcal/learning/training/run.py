@@ -30,7 +30,7 @@ from jaxcal.learning.policies import decoding, networks
 from jaxcal.learning.policies.networks import Network, NetworkConfig
 from jaxcal.learning.runtime import devices
 from jaxcal.learning.runtime.processes import losing_a_process
-from jaxcal.learning.training import checkpoint, imitation, ppo, updates
+from jaxcal.learning.training import checkpoint, imitation, ppo
 from jaxcal.learning.training.ppo import PPOConfig, Task
 
 __all__ = ["COLUMNS", "Report", "TrainConfig", "Validation", "train"]
@@ -202,7 +202,6 @@ def train(
     looked = saved = begun
     mark_time, mark_update = begun, done
     k = config.tasks[0].environment.num_selected
-    update_of: dict[Task, updates.Update] = {}
     imitated = min(config.ppo.num_imitated, last)
     lessons = imitation.Lessons(
         functools.partial(_lesson, config, network, teacher), imitated
@@ -218,11 +217,7 @@ def train(
                     )
                     rewards = np.zeros(0, np.float32)
                 else:
-                    if task not in update_of:
-                        update_of[task] = updates.updater(
-                            config.ppo, task, network, mesh, state
-                        )
-                    state, metrics = update_of[task](state)
+                    state, metrics = ppo.update(state, config.ppo, task, network, mesh)
                     rewards = np.asarray(metrics.pop("rewards"))
                 row = {name: float(value) for name, value in metrics.items()}
             done += 1

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.selection.fastest.travel import fastest_tour, improved_tour
-from jaxcal.selection.policy import load_policy, to_order_one
 from jaxcal.selection.problem import Problem
 
 __all__ = ["METHODS", "WEIGHTS", "completed", "runs"]
@@ -39,14 +38,13 @@ _RIDGE = 1e-8  # of the whitened Gram matrix of fewer postures than parameters
 def _network(method: str, checkpoint: str | pathlib.Path | None) -> tuple[Any, Any]:
     """The network and its parameters; none for the look-ahead."""
     from jaxcal.learning.policies import networks
-    from jaxcal.learning.runtime import cache
     from jaxcal.learning.runtime.checkpoint_folder import default_folder
+    from jaxcal.learning.training import checkpoint as checkpoints
 
     if method == "lookahead":
-        cache.keep_compiled_programs()
         return networks.build(networks.NetworkConfig(kind="travel")), None
     folder = default_folder("travel") if checkpoint is None else checkpoint
-    policy = load_policy(folder)
+    policy = checkpoints.load(folder)
     kind = policy.network.config.kind
     if kind != "travel":
         raise ValueError(
@@ -84,8 +82,7 @@ def runs(
     usable = problem.available.copy()
     usable[problem.required] = True
     m, k = len(usable), problem.k
-    scaled = to_order_one(problem.candidates[None], usable[None], white=True)[0]
-    points = np.where(usable[:, None], scaled, 0.0).astype(np.float32)
+    points = np.where(usable[:, None], problem.rows[:, :-1], 0.0).astype(np.float32)
     pairs = usable[:, None] & usable
     mean = times[pairs].mean()
     priced = np.where(pairs, times, 0.0) / (mean if mean > 0 else 1.0)
