@@ -131,7 +131,7 @@ def test_the_shipped_checkpoint_says_how_it_was_made():
     policy = load_policy()
     assert policy.meta["preset"] == "general"
     assert policy.meta["progress"]["episodes"] >= 200_000
-    assert policy.network.config.kind == "compact"
+    assert policy.kind == "compact"
 
 
 def test_importing_jaxcal_loads_nothing_heavy():
