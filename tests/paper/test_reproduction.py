@@ -25,6 +25,8 @@ from jaxcal.paper.reproduce import main
 
 ROOT = pathlib.Path(__file__).parents[2]
 
+pytestmark = pytest.mark.xdist_group("report")  # one report, made by one worker
+
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
