@@ -13,7 +13,6 @@ from rig.attitude import Array
 from rig.config.axis import Pulses
 from rig.config.config import RigConfig
 
-
 EXACT_LIMIT_S = 20.0  # for the proof that the choice is (or is not) the optimum
 REPLAN_LIMIT_S = 5.0  # the same while the drives stand armed
 MOST_IMPROVED = 200  # postures whose tour is searched; beyond, nearest neighbours
