@@ -32,6 +32,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import Network, NetworkConfig
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.checkpoint_folder import (
@@ -222,7 +223,7 @@ def load(folder: str | pathlib.Path | None = None) -> Policy:
             f"checkpoint {path} cannot be read: its weights are damaged "
             f"({_first_line(error)})"
         ) from error
-    network = networks.build(config)
+    network = build(config)
     _check_weights(path, params, network, meta)
     return Policy(network, params, meta, root, step)
 

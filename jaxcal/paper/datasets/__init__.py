@@ -4,7 +4,7 @@
 ``python -m jaxcal.paper.datasets.record`` records 4 and 5 against the rig's simulator.
 """
 
-from jaxcal.paper.datasets.constants import (
+from jaxcal.paper.constants import (
     AXES,
     BIAS_DEG,
     BLOCK,

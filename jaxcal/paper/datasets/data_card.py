@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.paper.datasets import dataset0_robot
-from jaxcal.paper.datasets.constants import (
+from jaxcal.paper.constants import (
     AXES,
     BIAS_DEG,
     NOISE_STD_DEG,
@@ -24,6 +23,7 @@ from jaxcal.paper.datasets.constants import (
     RECORDED,
     SCALE,
 )
+from jaxcal.paper.datasets import dataset0_robot
 from jaxcal.paper.datasets.recordings import SHIPPED
 
 __all__ = ["card_of", "digest_of", "page_of"]

@@ -34,7 +34,7 @@ import numpy as np
 
 from jaxcal.candidates import uniform_candidates
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.paper.datasets.constants import (
+from jaxcal.paper.constants import (
     BIAS_DEG,
     BLOCK,
     DRAWN,

@@ -21,7 +21,7 @@ import time
 
 from jaxcal.files import atomic_write, require_writable_folder, write_text
 from jaxcal.paper import command
-from jaxcal.paper.datasets.constants import AXES, RANGES
+from jaxcal.paper.constants import AXES, RANGES
 
 __all__ = ["main", "record"]
 

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges, draw_from_pool
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.paper.datasets.constants import AXES, RANGES
+from jaxcal.paper.constants import AXES, RANGES
 
 __all__ = ["SHIPPED", "read_pool", "recorded_dataset"]
 

@@ -25,12 +25,12 @@ def _network() -> dict[str, Any]:
     """Size of the ``paper`` preset's network, counted from its weights' shapes."""
     import jax
 
-    from jaxcal.learning.policies import networks
+    from jaxcal.learning.policies.build import build
     from jaxcal.learning.training import optimiser
     from jaxcal.paper.network import HEADS
     from jaxcal.paper.preset import PAPER as config
 
-    network = networks.build(config.network)
+    network = build(config.network)
     shapes = jax.eval_shape(
         lambda: optimiser.init(config.ppo, config.tasks[0], network)
     )

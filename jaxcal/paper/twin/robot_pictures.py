@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.files import atomic_write
 from jaxcal.paper import command
-from jaxcal.paper.datasets.constants import AXES
+from jaxcal.paper.constants import AXES
 from jaxcal.paper.twin.robot import RobotConfig, joint_angles, read_out
 from jaxcal.paper.twin.robot_drawing import Drawing
 from jaxcal.paper.twin.robot_model import load_model, pose, trajectory
