@@ -100,20 +100,20 @@ def prior_root(precision: Array) -> Array:
     unit = precision / scale[:, None] / scale
     tolerance = 1e-9 * p
     if np.abs(unit - unit.T).max(initial=0.0) > tolerance:
-        raise ValueError("prior must be a symmetric precision matrix, got one that is not")
+        raise ValueError(
+            "prior must be a symmetric precision matrix, got one that is not"
+        )
     values, vectors = np.linalg.eigh((unit + unit.T) / 2.0)
     if values.min(initial=0.0) < -tolerance:
         raise ValueError(
-            "prior must be positive semidefinite (a precision, no covariance of "
-            f"differences), got the eigenvalue {values.min():.3g} in units of its diagonal"
+            "prior must be a positive semidefinite precision matrix, got the eigenvalue "
+            f"{values.min():.3g} in units of its diagonal"
         )
     keep = values > 8.0 * _EPS * p
     return np.sqrt(values[keep])[:, None] * vectors.T[keep] * scale
 
 
-def _stack(
-    blocks: Array, usable: Mask | None, root: Array
-) -> tuple[Array, Array]:
+def _stack(blocks: Array, usable: Mask | None, root: Array) -> tuple[Array, Array]:
     """Centred rows (..., N q + r, p) of blocks and prior, and the largest entries."""
     *batch, count, q, p = blocks.shape
     number = count

@@ -7,7 +7,12 @@ from jaxcal.selection.batch import (
     greedy_batch,
     random_batch,
 )
-from jaxcal.selection.problem import Problem, make_block_problem, make_problem, make_problems
+from jaxcal.selection.problem import (
+    Problem,
+    make_block_problem,
+    make_problem,
+    make_problems,
+)
 from jaxcal.selection.result import BatchSelection, Selection, Subset
 from jaxcal.selection.solvers import METHODS
 

@@ -241,9 +241,7 @@ def _labels(
     return None if names is None else tuple(names), axes
 
 
-def _checked_names(
-    names: Sequence[str] | None, count: int
-) -> tuple[str, ...] | None:
+def _checked_names(names: Sequence[str] | None, count: int) -> tuple[str, ...] | None:
     if names is None:
         return None
     given = tuple(names)

@@ -151,7 +151,9 @@ class Selection:
                 row += [f"{x:.6g}" for x in self.problem.candidates[i]]
         widths = [max(map(len, column)) for column in zip(head, *cells, strict=True)]
         lines = [
-            "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True))
+            "  ".join(
+                cell.rjust(width) for cell, width in zip(row, widths, strict=True)
+            )
             for row in (head, *cells)
         ]
         count = int(self.problem.available.sum())
@@ -161,10 +163,13 @@ class Selection:
             f"{len(self.indices)} of {count} candidates, method {self.method}",
             *lines,
             f"log det S     {self.log_det:.6g} ({best})",
-            f"D-efficiency  {self.efficiency:.6f}" + ("" if self.proven else " or more"),
+            f"D-efficiency  {self.efficiency:.6f}"
+            + ("" if self.proven else " or more"),
             f"time          {1e3 * self.seconds:.3g} ms{extra}",
         ]
-        return "\n".join(lines + ([f"reason        {self.reason}"] if self.reason else []))
+        return "\n".join(
+            lines + ([f"reason        {self.reason}"] if self.reason else [])
+        )
 
     __repr__ = __str__
 

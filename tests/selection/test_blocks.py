@@ -179,7 +179,9 @@ def test_the_hull_is_used_wherever_rows_lie_in_a_plane():
     assert make_block_problem(mapped, 4).simplex
     assert not make_problem(candidates, 5).simplex
     assert not make_block_problem(rows, 4, prior=np.eye(4)).simplex
-    assert not make_block_problem(np.random.default_rng(1).normal(size=(9, 1, 4))).simplex
+    assert not make_block_problem(
+        np.random.default_rng(1).normal(size=(9, 1, 4))
+    ).simplex
     found = select(blocks=mapped, k=4, method="exact")
     assert set(found.indices) == set(select(candidates, 4, "exact").indices)
 
@@ -246,8 +248,10 @@ def test_bad_blocks_are_one_clear_error():
     refused(r"k must be at least 2 .* and 1 known", k=1, prior=np.diag([1.0, 0, 0, 0]))
     refused(r"prior must be a precision of shape \(4, 4\)", prior=np.eye(3))
     refused("prior must be a symmetric", prior=np.triu(np.ones((4, 4))))
-    refused("prior must be positive semidefinite", prior=-np.eye(4))
-    refused("prior must come with blocks", blocks=None, candidates=np.ones((8, 3)), prior=1)
+    refused("prior must be a positive semidefinite", prior=-np.eye(4))
+    refused(
+        "prior must come with blocks", blocks=None, candidates=np.ones((8, 3)), prior=1
+    )
     refused('blocks cannot be used with method "policy"', method="policy")
     blind = blocks * [1, 1, 0, 1]
     refused("say nothing of the direction theta3", blocks=blind)

@@ -365,7 +365,9 @@ def test_a_masked_candidate_may_be_nan():
         np.testing.assert_array_equal(found.indices, plain[method].indices)
         assert found.log_det == plain[method].log_det
         assert found.criteria == plain[method].criteria
-    with pytest.raises(ValueError, match=r"candidates must be finite, got nan at \(7, 0"):
+    with pytest.raises(
+        ValueError, match=r"candidates must be finite, got nan at \(7, 0"
+    ):
         select(candidates, 6, available=np.arange(20) != 8)
 
 
@@ -439,7 +441,7 @@ def test_a_data_frame_keeps_its_labels(monkeypatch):
     assert str(found).splitlines()[1].split()[2:] == ["pitch", "yaw", "roll"]
     assert score(Frame(uniform(0)), found.indices).labels == found.labels
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ImportError, match="to_frame needs pandas, .* pip install"):
+    with pytest.raises(ImportError, match=r"to_frame needs pandas, .* pip install"):
         found.to_frame()
 
 
