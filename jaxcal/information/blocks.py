@@ -106,8 +106,8 @@ def prior_root(precision: Array) -> Array:
     values, vectors = np.linalg.eigh((unit + unit.T) / 2.0)
     if values.min(initial=0.0) < -tolerance:
         raise ValueError(
-            "prior must be positive semidefinite (a precision, no covariance of "
-            f"differences), got the eigenvalue {values.min():.3g} in units of its diagonal"
+            "prior must be a positive semidefinite precision matrix, got the eigenvalue "
+            f"{values.min():.3g} in units of its diagonal"
         )
     keep = values > 8.0 * _EPS * p
     return np.sqrt(values[keep])[:, None] * vectors.T[keep] * scale

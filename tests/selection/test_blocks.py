@@ -248,7 +248,7 @@ def test_bad_blocks_are_one_clear_error():
     refused(r"k must be at least 2 .* and 1 known", k=1, prior=np.diag([1.0, 0, 0, 0]))
     refused(r"prior must be a precision of shape \(4, 4\)", prior=np.eye(3))
     refused("prior must be a symmetric", prior=np.triu(np.ones((4, 4))))
-    refused("prior must be positive semidefinite", prior=-np.eye(4))
+    refused("prior must be a positive semidefinite", prior=-np.eye(4))
     refused(
         "prior must come with blocks", blocks=None, candidates=np.ones((8, 3)), prior=1
     )

@@ -441,7 +441,7 @@ def test_a_data_frame_keeps_its_labels(monkeypatch):
     assert str(found).splitlines()[1].split()[2:] == ["pitch", "yaw", "roll"]
     assert score(Frame(uniform(0)), found.indices).labels == found.labels
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ImportError, match="to_frame needs pandas, .* pip install"):
+    with pytest.raises(ImportError, match=r"to_frame needs pandas, .* pip install"):
         found.to_frame()
 
 

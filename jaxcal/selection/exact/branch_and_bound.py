@@ -9,14 +9,13 @@ is within ``TOLERANCE`` of the incumbent, far above the rounding of either (1e-1
 from __future__ import annotations
 
 import dataclasses
-import functools
 import time
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["TOLERANCE", "BranchResult", "branch_and_bound", "load", "relaxed_bound"]
+__all__ = ["TOLERANCE", "BranchResult", "branch_and_bound", "relaxed_bound"]
 
 TOLERANCE = 1e-10  # of log det of the blocks; times their multiplicity in log det S
 _CHUNK = 16  # nodes between looks at the clock, where there is a deadline
@@ -113,31 +112,6 @@ def branch_and_bound(
         best_counts[:, alive] = few
     found = np.isfinite(best_values)
     return BranchResult(best_counts[found], best_values[found], bound, nodes, proven)
-
-
-@functools.cache
-def load() -> float:
-    """Compile or load the search, once in a process; seconds it took.
-
-    No part of a time limit: on the first use on a machine it takes longer than most.
-    """
-    from jaxcal.selection.exact.branch_kernel import search
-    from jaxcal.selection.exchange.kernel import exchange_starts
-
-    begun = time.perf_counter()
-    blocks, prior, ones = np.ones((2, 1, 1)), np.zeros((1, 1)), np.ones(2, np.int64)
-    none = np.zeros(0, np.int64)
-    exchange_starts(
-        blocks, _columns(blocks), prior, np.zeros((0, 1)), 1, ones, none, 1, 1,
-        np.uint64(0),
-    )  # fmt: skip
-    branch_and_bound(blocks, prior, 0 * ones, ones, ones)
-    search(
-        blocks, _columns(blocks), prior, 1, TOLERANCE, np.zeros((3, 2), np.int64),
-        np.ones((3, 2), np.int64), np.ones((3, 2)), np.zeros(3), 0,
-        np.zeros((1, 2), np.int64), np.zeros(1), 1, 1,
-    )  # fmt: skip
-    return time.perf_counter() - begun
 
 
 def _columns(blocks: Array) -> Array:

@@ -95,13 +95,14 @@ def _leverages(columns, inverse, products, leverage, curvature):
         row_products(columns[0], columns[0], inverse, True, leverage)
         return
     block_products(columns, inverse, products)
-    leverage[:] = 0.0
-    curvature[:] = 0.0
-    for r in range(q):
-        leverage += products[r, r]
-        curvature += products[r, r] ** 2
-        for s in range(r):
-            curvature += 2.0 * products[r, s] ** 2
+    for j in range(len(leverage)):
+        leverage[j] = 0.0
+        curvature[j] = 0.0
+        for r in range(q):
+            leverage[j] += products[r, r, j]
+            curvature[j] += products[r, r, j] ** 2
+            for s in range(r):
+                curvature[j] += 2.0 * products[r, s, j] ** 2
 
 
 @njit(cache=True, nogil=True)
@@ -114,10 +115,11 @@ def _cross_squares(columns, inverse, block, products, out):
             out[j] *= out[j]
         return
     block_cross(columns, inverse, block, products)
-    out[:] = 0.0
-    for r in range(q):
-        for s in range(q):
-            out += products[r, s] ** 2
+    for j in range(len(out)):
+        out[j] = 0.0
+        for r in range(q):
+            for s in range(q):
+                out[j] += products[r, s, j] ** 2
 
 
 @njit(cache=True, nogil=True)
