@@ -27,9 +27,9 @@ Indices = NDArray[np.int64]
 
 _PRUNE = 200_000  # products from which a known volume to prune by is worth its time
 _SEARCH = 4_000_000  # products, 15 ms, from which the compiled search is used
-_MINORS = 400_000  # entries of the minors from which making them takes as long
+_MINORS = 200_000  # entries of the minors from which making them takes as long
 _STEPS = 5  # towards the D-optimal weights
-_STARTS = 8  # climbs to a known volume
+_STARTS = 4  # climbs to a known volume
 _UNTHREADED = 240_000  # multiplications up to which BLAS starts no threads, which stall
 _WORK = 4_000_000  # of the search between two looks at the clock, about 10 ms
 
