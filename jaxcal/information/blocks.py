@@ -106,7 +106,7 @@ def prior_root(precision: Array) -> Array:
     values, vectors = np.linalg.eigh((unit + unit.T) / 2.0)
     if values.min(initial=0.0) < -tolerance:
         raise ValueError(
-            "prior must be a positive semidefinite precision matrix, got the eigenvalue "
+            "prior must be a positive semidefinite precision matrix, got eigenvalue "
             f"{values.min():.3g} in units of its diagonal"
         )
     keep = values > 8.0 * _EPS * p

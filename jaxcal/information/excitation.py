@@ -45,7 +45,7 @@ def require_excited(
 
 
 def directions_in_words(text: str, null: list[Array], names: tuple[str, ...]) -> str:
-    """``text`` with its plural at {}, then every direction; empty where there is none."""
+    """``text`` with its plural at {}, then every direction; empty if there is none."""
     if not null:
         return ""
     named = "; ".join(direction_in_words(vector, names) for vector in null)

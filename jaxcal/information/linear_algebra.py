@@ -51,7 +51,7 @@ def add_block(gram, blocks, i, weight):
 
 @njit(cache=True, nogil=True)
 def row_products(x, y, inverse, same, out):
-    """``out_j = x[:, j] inverse y[:, j]``, (M,), of x and y (p, M); ``same``: y is x."""
+    """``out_j = x[:, j] inverse y[:, j]``, (M,), x and y (p, M); ``same``: y is x."""
     p, num_blocks = x.shape
     for j in range(num_blocks):
         out[j] = 0.0

@@ -52,8 +52,8 @@ def select(
             that are not available may hold NaN.
         k: candidates to choose; the fewest that identify (n + 1) when not given.
         method: "auto" (the cheapest way to an answer proven to have
-            ``least_efficiency``), "exact" (proven), "exchange" (near-optimal), "greedy",
-            "random" or "policy" (the trained network).
+            ``least_efficiency``), "exact" (proven), "exchange" (near-optimal),
+            "greedy", "random" or "policy" (the trained network).
         blocks: (M, q, p) instead of candidates, for any model: candidate i gives q
             readings ``B_i theta`` with noise of unit variance.
         prior: with blocks, (p, p) precision of what is known of theta beforehand.

@@ -58,8 +58,8 @@ def solve(
         )
     else:
         reason = (
-            f"the exact search ran out of time after {limit:g} s with a D-efficiency of "
-            f"at least {proven_share:.6f} proven, not the {least_efficiency:g} asked for"
+            f"the exact search ran out of time after {limit:g} s with a D-efficiency "
+            f"of at least {proven_share:.6f} proven; {least_efficiency:g} was asked for"
         )
     stopped = not result.proven and result.bound - log_det <= enough
     return as_found(

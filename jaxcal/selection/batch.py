@@ -1,7 +1,7 @@
 """The solvers over many candidate sets at once, for labels and evaluation.
 
-Each function takes candidates (B, M, n) and k, and by keyword ``available`` (B, M) bool,
-``required`` (B, r), ``max_replicates`` and ``num_outputs`` as ``select`` does.
+Each function takes candidates (B, M, n) and k, and by keyword ``available`` (B, M)
+bool, ``required`` (B, r), ``max_replicates`` and ``num_outputs`` as ``select`` does.
 """
 
 from __future__ import annotations

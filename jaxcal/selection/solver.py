@@ -1,7 +1,7 @@
 """What a solver is: functions from a checked problem to what it found.
 
-``solve(problem, *, option, ...) -> Found`` solves one problem; its keyword arguments are
-the options it reads, checked and complete. ``solve_many(problems, *, option, ...)``
+``solve(problem, *, option, ...) -> Found`` solves one problem; its keyword arguments
+are the options it reads, checked and complete. ``solve_many(problems, *, option, ...)``
 solves a batch. :mod:`jaxcal.selection.solvers` is the table of all of them.
 """
 
@@ -39,7 +39,7 @@ class Found:
 def in_threads(
     problems: list[Problem], solve: Callable[[Problem], Found], compiled: bool = True
 ) -> list[Found]:
-    """Solve every problem; compiled solvers release the interpreter, so threads help."""
+    """Solve every problem, in threads: compiled solvers release the interpreter."""
     if len(problems) == 1 or not compiled:
         return [solve(problem) for problem in problems]
     first = solve(problems[0])  # compiles once, before the threads start

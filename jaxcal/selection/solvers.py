@@ -42,8 +42,8 @@ def _policy(
 
     if problem.candidates is None:
         raise ValueError(
-            'blocks cannot be used with method "policy", which is trained on candidates '
-            "of the affine model; use auto, exact or exchange"
+            'blocks cannot be used with method "policy", which is trained on '
+            "candidates of the affine model; use auto, exact or exchange"
         )
     if problem.max_replicates > 1:
         raise ValueError(

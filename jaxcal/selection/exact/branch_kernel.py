@@ -1,4 +1,4 @@
-"""Compiled branch and bound; :mod:`jaxcal.selection.exact.branch_and_bound` is its front.
+"""Compiled branch and bound, called by :mod:`jaxcal.selection.exact.branch_and_bound`.
 
 A node bounds the count of every candidate, ``low_i <= c_i <= high_i``, sum k. Its
 relaxation lets counts be real numbers; it is climbed by moving weight between two
