@@ -14,11 +14,10 @@ import time
 import numpy as np
 import pytest
 
-from jaxcal.evaluation import command
+from jaxcal.commands import evaluate as command
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import save_csv, save_npz
 from jaxcal.information.regression import regression_matrix
-from jaxcal.paper.datasets.catalogue import CATALOGUE
 from jaxcal.paper.datasets.datasets import make_dataset
 
 ROOT = pathlib.Path(__file__).parents[2]
@@ -45,7 +44,7 @@ class Done:
 def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> Done:
     """The command in this process, which is quicker."""
     try:
-        code = command.main([str(argument) for argument in arguments], CATALOGUE)
+        code = command.main([str(argument) for argument in arguments], "evaluate.py")
     except SystemExit as leaving:
         code = int(str(leaving.code))
     return Done(code, *capsys.readouterr())

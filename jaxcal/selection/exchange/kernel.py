@@ -44,7 +44,7 @@ def _random_start(
         basis: (p, p) work space.
         chosen, counts: (k,) and (M,), filled.
     """
-    num_blocks, q, p = blocks.shape
+    num_blocks, _, p = blocks.shape
     counts[:] = 0
     size = len(required)
     for r in range(size):
@@ -214,7 +214,7 @@ def climb(blocks, columns, upper, num_fixed, chosen, counts, prior, gram, invers
     Returns:
         log det of the local optimum; -inf, and nothing changed, from a singular start.
     """
-    num_blocks, q, p = blocks.shape
+    num_blocks, q, _ = blocks.shape
     k = len(chosen)
     gram[:] = prior
     for r in range(k):

@@ -25,38 +25,34 @@ EXIT_INTERRUPTED = 130
 EXIT_TERMINATED = 143
 
 
-def main(
-    arguments: Sequence[str] | None,
-    catalogue: Catalogue,
-    command: Sequence[str] = ("python", "evaluate.py"),
-) -> int:
+def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> int:
     """Evaluate, print, write.
 
     Args:
-        arguments: of the command line; those of the process when None.
-        catalogue: the datasets known by name.
-        command: what was typed before the arguments, for messages and the record.
+        argv: the command line; that of the process when None.
+        prog: what was typed before it, for messages and the record.
 
     Returns:
         The exit code.
     """
     from jaxcal.learning.runtime import processes
+    from jaxcal.paper.datasets.catalogue import CATALOGUE
 
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    program = " ".join(command).removeprefix("python ")
+    given = list(sys.argv[1:] if argv is None else argv)
+    command = ["python", prog] if prog.endswith(".py") else prog.split()
     advice = "finished parts stay: start every process again"
 
     def work() -> int:
-        return _alone(given, catalogue, command, program)
+        return _alone(given, CATALOGUE, command, prog)
 
-    return processes.run_job(program, given, work, advice)
+    return processes.run_job(prog, given, work, advice)
 
 
 def _alone(
     given: list[str], catalogue: Catalogue, command: Sequence[str], program: str
 ) -> int:
     """The command in this process, which may be one of several."""
-    from jaxcal.evaluation.arguments import parser
+    from jaxcal.commands.evaluate_arguments import parser
 
     options = parser(program, " ".join(command)).parse_args(given)
     options.command = [*command, *given]
