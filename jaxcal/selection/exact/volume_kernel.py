@@ -87,7 +87,7 @@ def _open(points, index, size, volume, depth, c, reached):
     """Fill depth + 1 with what comes after c, without what is too short to matter."""
     q = points.shape[2]
     left = q - depth - 1  # dimensions after the choice
-    chosen, below = points[depth, c], points[depth + 1]
+    chosen, below, names = points[depth, c], points[depth + 1], index[depth + 1]
     length = _length(chosen, left + 1)
     volume[depth + 1] = volume[depth] * length
     # The reflection that takes the chosen onto the first axis, which is then dropped.
@@ -117,14 +117,17 @@ def _open(points, index, size, volume, depth, c, reached):
         if lengths[k] >= least:
             for a in range(left):
                 below[kept, a] = below[k, a]
-            index[depth + 1, kept] = index[depth, c + 1 + k]
-            lengths[kept] = lengths[k]
+            names[kept] = index[depth, c + 1 + k]
+            lengths[kept] = -lengths[k]
             kept += 1
     size[depth + 1] = kept
-    if left > 2:
-        order = np.argsort(-lengths[:kept])
-        below[:kept] = below[:kept][order]
-        index[depth + 1, :kept] = index[depth + 1, :kept][order]
+    if left > 2:  # longest first; loops, since slices take seconds to compile
+        order = np.argsort(lengths[:kept])
+        unsorted, unsorted_names = below[:kept].copy(), names[:kept].copy()
+        for k in range(kept):
+            names[k] = unsorted_names[order[k]]
+            for a in range(left):
+                below[k, a] = unsorted[order[k], a]
 
 
 @njit(cache=True, nogil=True)
@@ -141,7 +144,8 @@ def _best_pair(plane, index, size, volume, chosen, subset, largest):
             found = volume[last] * abs(x * plane[j, 1] - y * plane[j, 0])
             if found > largest[0]:
                 largest[0] = found
-                subset[:last] = chosen[:last]
+                for a in range(last):
+                    subset[a] = chosen[a]
                 subset[last], subset[last + 1] = index[last, i], index[last, j]
 
 
