@@ -25,8 +25,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from jaxcal.learning.policies import networks
-from jaxcal.learning.policies.networks import Network, NetworkConfig
+from jaxcal.learning.policies.networks import Network, NetworkConfig, build
 from jaxcal.learning.runtime.checkpoint_folder import (
     CheckpointError,
     default_folder,
@@ -209,7 +208,7 @@ def load(folder: str | pathlib.Path | None = None) -> Policy:
             f"checkpoint {path} cannot be read: its weights are damaged "
             f"({_first_line(error)})"
         ) from error
-    network = networks.build(config)
+    network = build(config)
     _check_weights(path, params, network, meta)
     return Policy(network, params, meta, root, step)
 
@@ -240,8 +239,13 @@ def _check_weights(
             f"checkpoint {path} does not say what it was trained on: no {error}"
         ) from error
     expected = jax.eval_shape(
-        lambda: networks.initial(network, jax.random.key(0), m, n, k)
-    )
+        network.init,
+        jax.random.key(0),
+        jax.ShapeDtypeStruct((1, m, n), np.float32),
+        jax.ShapeDtypeStruct((1, m), bool),
+        jax.ShapeDtypeStruct((1, k), np.int32),
+        jax.ShapeDtypeStruct((1, m), bool),
+    )["params"]
     wanted, held = _shapes(expected), _shapes(params)
     if wanted != held:
         name = sorted(set(wanted.items()) ^ set(held.items()))[0][0]
