@@ -11,8 +11,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.sharding import Mesh, PartitionSpec
 
 from jaxcal.learning.policies import networks
 from jaxcal.learning.policies.networks import Network
@@ -21,7 +19,6 @@ from jaxcal.learning.small_matrices import log_det_gram
 __all__ = [
     "DECODINGS",
     "choose",
-    "choose_on_devices",
     "complete",
     "log_det_of",
     "logits_at",
@@ -166,73 +163,3 @@ def choose(
     values = jax.vmap(lambda tried: log_det_of(candidates, tried))(tries)
     best = jnp.argmax(values, axis=0)
     return jnp.take_along_axis(tries, best[None, :, None], axis=0)[0]
-
-
-def choose_on_devices(
-    network: Network,
-    params: Any,
-    candidates: jax.Array,
-    available: jax.Array,
-    required: jax.Array,
-    keys: jax.Array,
-    *,
-    k: int,
-    num_required: int = 0,
-    decoding: str = "greedy",
-    num: int = 16,
-) -> jax.Array:
-    """``choose`` on the first devices of this process at once, an equal share on each.
-
-    Every device runs the program that a single one would run on its share, so what is
-    chosen does not depend on their number; the order of the last two postures, equal in
-    all but rounding, may.
-
-    Args:
-        network, params: see ``choose``.
-        candidates, available, required: see ``choose``; D B sets for D devices.
-        keys: (D,) PRNG keys, one a device.
-        k, num_required, decoding, num: see ``choose``.
-
-    Returns:
-        (D B, k) int32.
-    """
-    run = _on_devices(network, len(keys), k, num_required, decoding, num)
-    return run(params, candidates, available, required, keys)
-
-
-@functools.lru_cache(maxsize=32)
-def _on_devices(
-    network: Network, number: int, k: int, num_required: int, decoding: str, num: int
-) -> Any:
-    mesh = Mesh(np.asarray(jax.local_devices()[:number]), ("sets",))
-
-    def share(
-        params: Any,
-        candidates: jax.Array,
-        available: jax.Array,
-        required: jax.Array,
-        keys: jax.Array,
-    ) -> jax.Array:
-        return choose(
-            network,
-            params,
-            candidates,
-            available,
-            required,
-            keys[0],
-            k=k,
-            num_required=num_required,
-            decoding=decoding,
-            num=num,
-        )
-
-    cut = PartitionSpec("sets")
-    return jax.jit(
-        jax.shard_map(
-            share,
-            mesh=mesh,
-            in_specs=(PartitionSpec(), cut, cut, cut, cut),
-            out_specs=cut,
-            check_vma=False,
-        )
-    )
