@@ -13,7 +13,8 @@ from jaxcal.paper import command
 from jaxcal.progress import Progress
 
 if TYPE_CHECKING:
-    from jaxcal.paper.exhibits.exhibit import Claim, Exhibit, Settings
+    from jaxcal.paper.exhibits.exhibit import Claim, Exhibit
+    from jaxcal.paper.exhibits.settings import Settings
 
 __all__ = ["main"]
 
@@ -73,7 +74,7 @@ def _run(options: argparse.Namespace, progress: Progress) -> None:
 
     from jaxcal.learning.runtime import cache
     from jaxcal.paper.exhibits.claims import claims
-    from jaxcal.paper.exhibits.exhibit import STUDIES, Settings
+    from jaxcal.paper.exhibits.settings import STUDIES, Settings
 
     cache.keep_compiled_programs()
     settings = Settings(
@@ -134,7 +135,7 @@ def _files(
     progress: Progress,
 ) -> dict[str, bytes]:
     """Everything to write, by path below the folder; the page last."""
-    from jaxcal.paper.exhibits.exhibit import as_csv
+    from jaxcal.paper.exhibits.columns import as_csv
     from jaxcal.paper.exhibits.page import json_document, page
     from jaxcal.plots import as_bytes
 

@@ -18,8 +18,8 @@ from jaxcal.calibration.identify import identify
 from jaxcal.evaluation.parameters import least_squares, predict
 from jaxcal.paper.datasets import make_dataset
 from jaxcal.paper.exhibits import pictures
+from jaxcal.paper.exhibits.columns import as_csv
 from jaxcal.paper.exhibits.devices import Device
-from jaxcal.paper.exhibits.exhibit import Settings, as_csv
 from jaxcal.paper.exhibits.intervals import (
     bootstrap_interval,
     mean_interval,
@@ -29,6 +29,7 @@ from jaxcal.paper.exhibits.intervals import (
 )
 from jaxcal.paper.exhibits.material import Material
 from jaxcal.paper.exhibits.selection import variance_table
+from jaxcal.paper.exhibits.settings import Settings
 from jaxcal.paper.exhibits.training import exhibits, kept_runs, plateau
 from jaxcal.paper.training_runs import FORMAT
 from jaxcal.paper.twin import robot_pictures

@@ -17,8 +17,9 @@ from scipy import stats
 from jaxcal.evaluation.parameters import least_squares, parameter_names, predict
 from jaxcal.information.regression import regressors
 from jaxcal.paper.datasets import BIAS_DEG, NOISE_STD_DEG, SCALE
+from jaxcal.paper.exhibits.columns import from_rows
 from jaxcal.paper.exhibits.devices import Device, pick, rms
-from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict, from_rows
+from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict
 from jaxcal.paper.exhibits.figures.accuracy import (
     ellipses,
     four_against_fifty,
@@ -101,7 +102,7 @@ def _four_or_fifty(material: Material) -> Exhibit:
         verdict = "agrees"
     elif max(drift.high, gross.high) < 0.5:
         verdict = "disagrees"
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "four_or_fifty",
         {"count": count, "drift_deg": DRIFT_DEG, "outlier_share": OUTLIER_SHARE},
         verdict=verdict,
@@ -200,7 +201,7 @@ def _postures(material: Material) -> Exhibit:
     agreement = squares / theory
     half = [k for k, v in zip(POSTURES, white, strict=True) if v <= 0.5 * white[0]]
     figure = number_of_postures(table, NOISE_STD_DEG, DRIFT_DEG)
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "number_of_postures",
         {
             **{"count": count, "noise": NOISE_STD_DEG, "drift_deg": DRIFT_DEG},
@@ -263,7 +264,7 @@ def _ellipsoids(material: Material) -> Exhibit:
     deviation = {c: np.sqrt(np.diag(value)).tolist() for c, value in covariance.items()}
     wider = np.array(deviation["random, median draw"]) / deviation["policy"]
     shown, row = found[:200], numbers_of_rows[0]
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "ellipsoids",
         {
             **{"noise": NOISE_STD_DEG, "least": wider.min(), "most": wider.max()},

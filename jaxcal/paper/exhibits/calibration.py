@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from jaxcal.calibration.identify import identify
 from jaxcal.evaluation.parameters import least_squares, parameter_names, predict
 from jaxcal.paper.datasets import AXES, BIAS_DEG, NOISE_STD_DEG, RANGES, SCALE
-from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict, by_axis
+from jaxcal.paper.exhibits.columns import by_axis
+from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict
 from jaxcal.paper.exhibits.figures.calibration import error_boxes, order_bars
 from jaxcal.paper.exhibits.intervals import mean_interval, share_interval
 from jaxcal.paper.exhibits.material import Material
@@ -73,7 +74,7 @@ def _errors(material: Material, name: str, key: str, title: str, where: str) -> 
     verdict: Verdict = "agrees" if widest == "yaw" else "agrees in part"
     if min(shrink.values()) <= 1.0:
         verdict = "disagrees"
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "errors",
         {
             **{"title": title, "where": where, "name": name, "groups": groups},
@@ -124,7 +125,7 @@ def _table_1(material: Material) -> Exhibit:
     share = share_interval(covered.ravel())
     inside = int(((low <= truth) & (truth <= high)).sum())
     agrees = inside == 12 and share.low <= 0.95 <= share.high
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "table_1",
         {"groups": commands.shape[0], "per_group": commands.shape[1]},
         verdict="agrees" if agrees else "disagrees",
@@ -163,7 +164,7 @@ def _orders(material: Material) -> Exhibit:
         columns[f"largest_{label}_deg"] = largest[:, axis]
     overall = np.sqrt((rms**2).mean(axis=1))
     best, worst = int(overall.argmin()), int(overall.argmax())
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "euler_orders",
         {
             **{"count": len(commands), "noise": NOISE_STD_DEG},

@@ -9,6 +9,7 @@ from jaxcal.paper.exhibits.exhibit import Claim, Exhibit, Verdict
 __all__ = ["claims"]
 
 Found = Mapping[str, Exhibit]
+claim = Claim.from_texts
 
 
 def claims(exhibits: list[Exhibit], recorded: str) -> list[Claim]:
@@ -26,7 +27,7 @@ def claims(exhibits: list[Exhibit], recorded: str) -> list[Claim]:
         *_recalibration(found),
         *_training(found),
         *_calibration(found, recorded),
-        Claim.told("pairs", found["table_3"], "disagrees"),
+        claim("pairs", found["table_3"], "disagrees"),
     ]
 
 
@@ -51,16 +52,16 @@ def _information(found: Found, recorded: str) -> Iterator[Claim]:
                 _verdict(max(log, relative, raw) < 1.0, min(log, relative) < 1.0),
             ),
         ):
-            yield Claim.told(name, found[key], verdict, f"{name}_{key}", where=where)
+            yield claim(name, found[key], verdict, f"{name}_{key}", where=where)
     best = found["figure_4"]
     policy = best.numbers["comparison"]["policy"]
     far = policy["times_random"].low > 100
     seen = found["figure_3"].numbers["policy"]["ratio_to_exact"]
     as_good = policy["ratio_to_exact"].high >= seen.low
-    yield Claim.told("generalises", best, _verdict(far and as_good, far), seen=seen)
+    yield claim("generalises", best, _verdict(far and as_good, far), seen=seen)
     never = best.numbers["random_draws_that_never_reach_policys_first"]
     soon = best.numbers["policy_first_episode_within_half_of_best"] <= 50
-    yield Claim.told("best_so_far", best, _verdict(never > 0.95 and soon, never > 0.5))
+    yield claim("best_so_far", best, _verdict(never > 0.95 and soon, never > 0.5))
 
 
 def _parameters(found: Found, recorded: str) -> Iterator[Claim]:
@@ -69,7 +70,7 @@ def _parameters(found: Found, recorded: str) -> Iterator[Claim]:
         fifty = found[key].numbers["all 50/policy"]
         lower = int((random["low"] > 1.0).sum())
         fewer = int((fifty["high"] < 1.0).sum())
-        yield Claim.told(
+        yield claim(
             "parameter_variance",
             found[key],
             _verdict(lower > 6 and fewer == 0, lower > 6),
@@ -87,7 +88,7 @@ def _four_and_fifty(exhibit: Exhibit) -> Iterator[Claim]:
         ratio = exhibit.numbers[scenario]["ratio_of_means"]
         better = exhibit.numbers[scenario]["four_better"]
         sides = ratio.high < 1.0, better.low > 0.5
-        yield Claim.told(
+        yield claim(
             "four_or_fifty",
             exhibit,
             _verdict(all(sides), any(sides)),
@@ -97,7 +98,7 @@ def _four_and_fifty(exhibit: Exhibit) -> Iterator[Claim]:
             better=better,
         )
     better = exhibit.numbers["recorded"]["ratio_of_means"].high < 1.0
-    yield Claim.told("four_or_fifty_recorded", exhibit, _verdict(better))
+    yield claim("four_or_fifty_recorded", exhibit, _verdict(better))
 
 
 def _recalibration(found: Found) -> Iterator[Claim]:
@@ -108,26 +109,26 @@ def _recalibration(found: Found) -> Iterator[Claim]:
     ):
         ratio = exhibit.numbers["error_of_second_over_first"][key]
         verdict = _verdict(ratio.high < 1.0)
-        yield Claim.told(
+        yield claim(
             "recalibration", exhibit, verdict, key, reading=reading, ratio=ratio
         )
     recorded = found["figure_10_recorded"]
-    yield Claim.told("recalibration_recorded", recorded, recorded.verdict)
+    yield claim("recalibration_recorded", recorded, recorded.verdict)
 
 
 def _training(found: Found) -> Iterator[Claim]:
     reward, network = found["reward_range"], found["table_2"]
     bound = reward.numbers["largest_log_det_s_in_unit_cube"] / 10.0
-    yield Claim.told("reward_range", reward, _verdict(bound >= 3.0), bound=bound)
+    yield claim("reward_range", reward, _verdict(bound >= 3.0), bound=bound)
     size, share = (network.numbers[name] for name in ("parameters", "shared_share"))
     near = _verdict(abs(size / 3.5e6 - 1.0) < 0.03)
-    yield Claim.told("parameters", network, near, millions=size / 1e6)
-    yield Claim.told("shared", network, _verdict(abs(share - 0.71) < 0.015))
+    yield claim("parameters", network, near, millions=size / 1e6)
+    yield claim("shared", network, _verdict(abs(share - 0.71) < 0.015))
     for key, name, how in (
         ("figure_2_paper", "the paper's network", _convergence_of_paper),
         ("figure_2", "our compact network", _convergence_of_seeds),
     ):
-        yield Claim.told(
+        yield claim(
             "convergence",
             found[key],
             found[key].verdict,
@@ -176,7 +177,7 @@ def _calibration(found: Found, recorded: str) -> Iterator[Claim]:
         before = {axis: numbers[f"{axis}_before"] for axis in shrink}
         widest = max(shrink, key=lambda a: before[a]["interquartile_range_deg"])
         furthest = max(shrink, key=lambda a: abs(before[a]["median_deg"]))
-        yield Claim.told(
+        yield claim(
             "errors_shrink",
             found[key],
             _verdict(least > 2.0, least > 1.0),
@@ -184,7 +185,7 @@ def _calibration(found: Found, recorded: str) -> Iterator[Claim]:
             where=where,
             by=", ".join(f"{v:.3g} ({a})" for a, v in shrink.items()),
         )
-        yield Claim.told(
+        yield claim(
             "yaw",
             found[key],
             _verdict(widest == furthest == "yaw", "yaw" in (widest, furthest)),
@@ -193,5 +194,5 @@ def _calibration(found: Found, recorded: str) -> Iterator[Claim]:
             furthest=furthest,
             widest=widest,
         )
-    yield Claim.told("table_1", found["table_1"], found["table_1"].verdict)
-    yield Claim.told("four_suffice", found["rank"], found["rank"].verdict)
+    yield claim("table_1", found["table_1"], found["table_1"].verdict)
+    yield claim("four_suffice", found["rank"], found["rank"].verdict)

@@ -10,7 +10,7 @@ from jaxcal.evaluation.methods import Progress, evaluate
 from jaxcal.evaluation.parameters import least_squares
 from jaxcal.evaluation.results import Evaluation, MethodResult
 from jaxcal.paper.datasets import make_dataset
-from jaxcal.paper.exhibits.exhibit import Settings
+from jaxcal.paper.exhibits.settings import Settings
 
 __all__ = ["METHODS", "Material", "commands_deg"]
 

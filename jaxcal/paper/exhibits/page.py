@@ -12,7 +12,8 @@ import numpy as np
 
 from jaxcal import pages
 from jaxcal.evaluation.report import versions
-from jaxcal.paper.exhibits.exhibit import Claim, Exhibit, Settings, Verdict
+from jaxcal.paper.exhibits.exhibit import Claim, Exhibit, Verdict
+from jaxcal.paper.exhibits.settings import Settings
 
 __all__ = ["FORMAT", "VERSION", "json_document", "page"]
 

@@ -34,7 +34,7 @@ def exhibits(material: Material) -> list[Exhibit]:
     drawn_by, pictures = _draw(postures, four[0], material)
     apart = np.abs(simulate(robot, postures) - np.asarray(read_out(robot, postures)))
     return [
-        Exhibit.told(
+        Exhibit.from_texts(
             "robot",
             {"way": way, "drawn_by": drawn_by},
             numbers={"largest_difference_deg": float(apart.max())},

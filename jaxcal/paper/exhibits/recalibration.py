@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from jaxcal.candidates import uniform_candidates
 from jaxcal.evaluation.parameters import least_squares, predict
 from jaxcal.paper.datasets import AXES, NOISE_STD_DEG, RANGES
+from jaxcal.paper.exhibits.columns import by_axis, from_rows
 from jaxcal.paper.exhibits.devices import Device, pick, rms
-from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict, by_axis, from_rows
+from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict
 from jaxcal.paper.exhibits.figures.recalibration import by_age, traces
 from jaxcal.paper.exhibits.intervals import (
     median_interval,
@@ -119,7 +120,7 @@ def _drifting(material: Material) -> Exhibit:
         ratios[f"{x}_x0_against_x_star"].high < 1.0 for x in ("policy", "random")
     )
     title = "one device that drifts, sessions after X$_*$"
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "figure_10",
         {
             **{"count": count, "sessions": SESSIONS, "later": LATER + 1},
@@ -224,7 +225,7 @@ def _recorded(material: Material) -> Exhibit:
     elif all(r.low > 1.0 for r in ratio.values()):
         verdict = "disagrees"
     caution = " The largest determinant alone does not single one out."
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "figure_10_recorded",
         {
             **{"repeats": repeats, "best": best + 1, "points": POINTS},

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from jaxcal.evaluation import figures
 from jaxcal.evaluation.parameters import parameter_names
 from jaxcal.evaluation.results import HIT_TOLERANCE, Evaluation
-from jaxcal.paper.exhibits.exhibit import Columns, Exhibit, Settings, Verdict
+from jaxcal.paper.exhibits.columns import Columns
+from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict
 from jaxcal.paper.exhibits.figures.selection import gap_per_episode
 from jaxcal.paper.exhibits.intervals import (
     Interval,
@@ -19,6 +20,7 @@ from jaxcal.paper.exhibits.intervals import (
     share_interval,
 )
 from jaxcal.paper.exhibits.material import Material
+from jaxcal.paper.exhibits.settings import Settings
 from jaxcal.plots import BLACK, COLOURS, GREY
 
 __all__ = ["comparison", "exhibits", "variance_table"]
@@ -131,7 +133,7 @@ def _determinants(material: Material, name: str, key: str, title: str) -> Exhibi
         verdict = "disagrees"
     elif spread.high < 1.0 and absolute.high < 1.0 and times.low > 100.0:
         verdict = "agrees"
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "determinants",
         _words(material, name, title),
         key=key,
@@ -156,7 +158,7 @@ def _gap(material: Material, name: str) -> Exhibit:
         columns[f"ratio_{method}"] = ratio
         numbers[method] = {"worst": ratio.min(), "mean": mean_interval(ratio, most=1.0)}
     proven = "proven" if evaluation.proven.all() else "proven or bounded"
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "gap_to_optimum",
         {"name": name, "count": len(evaluation.reference), "proven": proven},
         figures={
@@ -186,7 +188,7 @@ def _best(material: Material, name: str, key: str, title: str) -> Exhibit:
     first, most = best["policy"][0, 0], best["exact"][-1, 0]
     reached = int(np.argmax(best["policy"][:, 0] >= most - np.log(2.0))) + 1
     never = float((random[-1] < first).mean())
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "best",
         _words(material, name, title),
         key=key,
@@ -293,7 +295,7 @@ def _variance(material: Material, name: str, key: str, title: str) -> Exhibit:
     ratio = against[0]
     words = {"middle": np.median(ratio), "least": ratio.min(), "most": ratio.max()}
     words |= {"lower": lower, "fifty": np.median(fifty[0])}
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "variance",
         _words(material, name, title) | words,
         key=key,

@@ -9,7 +9,8 @@ import numpy as np
 
 from jaxcal.information.regression import log_det_information, regression_matrix
 from jaxcal.paper.datasets import EPISODES, NUM_CANDIDATES, RANGES
-from jaxcal.paper.exhibits.exhibit import Exhibit, from_rows
+from jaxcal.paper.exhibits.columns import from_rows
+from jaxcal.paper.exhibits.exhibit import Exhibit
 from jaxcal.paper.exhibits.intervals import mean_interval
 from jaxcal.paper.exhibits.material import Material
 
@@ -71,7 +72,7 @@ def _table_2() -> Exhibit:
     ]
     exact = [row for row in rows if "about" not in row[1] and "see" not in row[2]]
     same = sum(row[1] == row[2] for row in exact)
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "table_2",
         {"same": same, "exact": len(exact)},
         verdict="agrees" if same == len(exact) else "disagrees",
@@ -105,7 +106,7 @@ def _table_3(material: Material) -> Exhibit:
         told = (f"{e:,} x {m}, {d}" for e, m, d in ((episodes, 50, dim), ours))
         rows.append((name, kind, *told, used))
     same = all(entry["paper"] == entry["ours"] for entry in numbers.values())
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "table_3",
         {"recordings": material.settings.about_recordings},
         verdict="agrees" if same else "agrees in part",
@@ -125,7 +126,7 @@ def _reward(material: Material) -> Exhibit:
     reward = policy / 10.0
     side = float(np.exp((36.0 - best.mean()) / 18.0))
     words = {"count": len(policy), "bound": bound / 10, "side": side}
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "reward_range",
         words | {"constant": RANGES.log_det_scale / 10},
         verdict="disagrees" if bound / 10 < 3.0 else "agrees",
@@ -148,7 +149,7 @@ def _rank(material: Material) -> Exhibit:
         for k in (3, 4, 5)
     }
     least = {k: min(values) for k, values in ranks.items()}
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "rank",
         {"count": len(sets)},
         verdict="agrees" if least[4] == 12 and max(ranks[3]) < 12 else "disagrees",

@@ -157,7 +157,7 @@ def _seeds(runs: list[Run], paper: Run | None) -> Exhibit:
     rewards |= {"paper's network": paper.rewards} if paper else {}
     least, most = min(numbers["episodes"]), max(numbers["episodes"])
     length = f"{most:,}" if least == most else f"{least:,} to {most:,}"
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "figure_2",
         {"range": length, "caution": _caution(runs), "measured": text},
         verdict=_converges(runs, flat),
@@ -221,7 +221,7 @@ def _paper(runs: list[Run]) -> Exhibit:
     size = held["parameters"]
     figure = training_curves(run.folder)
     figure.suptitle("Training of the paper's network", fontsize=10)
-    return Exhibit.told(
+    return Exhibit.from_texts(
         "figure_2_paper",
         {
             "planned": held["planned_episodes"] or CLAIMED,

@@ -25,7 +25,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.files import atomic_write
 from jaxcal.paper import command
-from jaxcal.paper.constants import AXES
 from jaxcal.paper.twin.robot import RobotConfig, joint_angles, read_out
 from jaxcal.paper.twin.robot_drawing import Drawing
 from jaxcal.paper.twin.robot_model import load_model, pose, trajectory
@@ -198,7 +197,8 @@ def _captioned(config: RobotConfig, image: Image, command_deg: Array) -> Any:
     font = ImageFont.load_default(size)
     read = np.asarray(read_out(config, command_deg))
     rows = [("axis", "command", "phone", (60, 60, 60))]
-    for name, letter, told, seen in zip(AXES, "XYZ", command_deg, read, strict=True):
+    names = ("pitch", "yaw", "roll")
+    for name, letter, told, seen in zip(names, "XYZ", command_deg, read, strict=True):
         red, green, blue = (round(255 * value) for value in AXIS_COLOURS[letter])
         rows.append((name, f"{told:+.1f}°", f"{seen:+.1f}°", (red, green, blue)))
     for line, (name, told, reached, colour) in enumerate(rows):
