@@ -3,8 +3,8 @@
 Solvers read whitened information blocks: candidate i adds ``B_i.T @ B_i`` to the
 prior's precision, and with everything available measured at once the sum is the
 identity (see :mod:`jaxcal.information.blocks`). A solver that reads nothing else picks
-the same candidates in pulses, degrees or [0, 1]. Postures of the affine model are blocks [u, 1]
-whose log det counts once per output.
+the same candidates in pulses, degrees or [0, 1]. Postures of the affine model are
+blocks [u, 1] whose log det counts once per output.
 """
 
 from __future__ import annotations
