@@ -8,15 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxcal.selection.fastest import Motion, fastest_tour, travel_times
 from rig.attitude import Array
 from rig.config.axis import Pulses
 from rig.config.config import RigConfig
-
-try:
-    from jaxcal.selection.fastest import Motion, fastest_tour, travel_times
-except ImportError:
-    from jaxcal.selection.fastest.travel import Motion, fastest_tour, travel_times
-
 
 EXACT_LIMIT_S = 20.0  # for the proof that the choice is (or is not) the optimum
 REPLAN_LIMIT_S = 5.0  # the same while the drives stand armed
@@ -106,6 +101,8 @@ def choose(
 
     if session.method == "exact" or replanning:
         return rated(exact, "")
+    if session.method == "greedy":
+        del given["seed"]  # greedy draws nothing
     if session.method == "auto":
         given |= {"least_efficiency": session.min_efficiency, "time_limit": limit}
     try:

@@ -316,16 +316,11 @@ def test_the_shipped_policy_makes_the_default_choice():
 
 def test_without_a_checkpoint_the_choice_is_the_exact_optimum(tmp_path, monkeypatch):
     from jaxcal.learning.runtime import checkpoint_folder
-    from jaxcal.selection import policy
 
     config = parse_config(example_text("simulate"))
     candidates = config.to_deg(draw_candidates(config))
     monkeypatch.setattr(checkpoint_folder, "default_folder", lambda: tmp_path / "none")
-    policy._source.cache_clear()
-    try:
-        choice = choose(config, candidates)
-    finally:
-        policy._source.cache_clear()
+    choice = choose(config, candidates)
     assert (choice.method, choice.efficiency) == ("exact", 1.0)
     assert "no policy could be used" in choice.note
 
@@ -351,6 +346,20 @@ def test_the_policys_place_is_taken_by_exact_when_it_is_missing_or_poor(monkeypa
         choice = choose(config, candidates)
         assert choice.log_det == pytest.approx(best)
         assert part in choice.note and "\n" not in choice.note
+
+
+@pytest.mark.parametrize("method", ["auto", "exact", "exchange", "greedy", "random"])
+def test_every_method_of_a_session_makes_a_choice(method):
+    text = f'\n[session]\nmethod = "{method}"\nmin_efficiency = 0.01\nseed = 3\n'
+    config = parse_config(fast_text(session=text))
+    degrees = config.to_deg(draw_candidates(config))
+    best = jaxcal.select(degrees, 4, method="exact")
+    choice = choose(config, degrees)
+    assert choice.method == ("exact" if method == "auto" else method)
+    assert choice.log_det <= best.log_det + 1e-9
+    if method in ("auto", "exact"):
+        assert choice.log_det == pytest.approx(best.log_det)
+    assert ("proved" in choice.note) == (method == "auto")
 
 
 @pytest.mark.parametrize("least", [0.5, 1.0])
