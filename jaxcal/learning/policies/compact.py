@@ -54,10 +54,10 @@ class CompactNetwork(nn.Module):
     It sees the candidates only through inner products of whitened regressors, so no
     affine map of the commands and no order of the candidates can change the pick.
 
-    The last two choices are the look-ahead's (``endgame``): the best pair given what was
-    chosen before, then the largest gain. At K = n + 2 the choices before the pair do not
-    span the space and it is rated with the ridge of ``features`` beside them: it may be
-    second best where those choices nearly coincide (docs/policy.md).
+    The last two choices are the look-ahead's (``endgame``): the best pair given what
+    was chosen before, then the largest gain. At K = n + 2 the choices before the pair
+    do not span the space and it is rated with the ridge of ``features`` beside them: it
+    may be second best where those choices nearly coincide (docs/policy.md).
     """
 
     config: NetworkConfig
