@@ -28,7 +28,7 @@ evaluate: $(READY) ## compare every method with the proven optimum on 1,000 unse
 	$(BIN)/python evaluate.py $(ARGS)
 
 reproduce: $(READY) ## the paper's figures, tables and claims from our own runs, in report/index.html
-	$(BIN)/python -m jaxcal.paper.reproduce $(ARGS)
+	$(BIN)/python -m jaxcal.paper $(ARGS)
 
 test: lint ## set everything up, lint, and run the quick tests (the ones CI runs)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m 'not slow' $(ARGS)

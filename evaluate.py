@@ -1,6 +1,7 @@
 """How close each way of choosing postures comes to the proven optimum.
 
-``python evaluate.py``; ``--help`` lists the rest. ``jaxcal evaluate`` is the same.
+``python evaluate.py``; ``--help`` lists the rest. ``jaxcal evaluate`` is the same;
+``jaxcal/commands/evaluate.py`` holds it.
 """
 
 from __future__ import annotations
@@ -11,10 +12,9 @@ from collections.abc import Sequence
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Evaluate, print, write; the exit code."""
-    from jaxcal.evaluation import command
-    from jaxcal.paper.datasets.catalogue import CATALOGUE
+    from jaxcal.commands import evaluate
 
-    return command.main(arguments, CATALOGUE)
+    return evaluate.main(arguments, prog="evaluate.py")
 
 
 if __name__ == "__main__":

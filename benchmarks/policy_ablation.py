@@ -160,7 +160,7 @@ def uniform_sets(num: int, m: int, k: int, n: int, seed: int) -> np.ndarray:
 
 
 def shaped_sets(num: int, name: str, seed: int) -> np.ndarray:
-    """(num, 50, 3) candidates of one shape of ``jaxcal.learning.environments.scenarios``."""
+    """(num, 50, 3) candidates of one shape of ``environments.scenarios``."""
     draw = scenarios.mixture(SelectionConfig(), (name,))
     keys = jax.random.split(jax.random.key(seed), num)
     return np.asarray(jax.jit(jax.vmap(draw))(keys)[0], np.float64)

@@ -15,7 +15,7 @@ import time
 
 import jax
 
-from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.runtime import cache, devices
 from jaxcal.learning.training import optimiser, ppo, presets
 
@@ -24,7 +24,7 @@ def measure(preset: str, number: int, num_updates: int) -> dict[str, float]:
     """Seconds an update on so many devices, compilation left out."""
     config = presets.load(preset)
     settings = dataclasses.replace(config.ppo, num_episodes=10**8)
-    network = networks.build(config.network)
+    network = build(config.network)
     mesh = devices.make_mesh(number)
     devices.require_divisible(settings.sets_per_minibatch, mesh)
     state = devices.replicate(optimiser.init(settings, config.tasks[0], network), mesh)

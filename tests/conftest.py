@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import pathlib
 import signal
-from collections.abc import Iterator
 
 # A shell that runs the tests in the background has SIGINT ignored, and every program
 # that a test starts and interrupts would inherit that.
@@ -35,12 +34,3 @@ def key() -> jax.Array:
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(0)
-
-
-@pytest.fixture
-def kept(tmp_path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """The folder of kept programs, empty, for the length of a test."""
-    before = jax.config.values["jax_compilation_cache_dir"]
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-    yield tmp_path / "programs"
-    jax.config.update("jax_compilation_cache_dir", before)

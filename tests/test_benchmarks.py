@@ -10,6 +10,7 @@ import pytest
 from jaxcal.learning.environments import selection as environment
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 
 CONFIG = SelectionConfig()
@@ -79,7 +80,7 @@ def test_the_pytorch_peer_has_the_same_network(rng, folded):
     everything = jnp.ones((3, 50), bool)
     chosen = jnp.asarray([[3, 9, -1, -1]] * 3)
     free = everything.at[:, chosen[0, :2]].set(False)
-    network = networks.build(NetworkConfig(kind="paper", width=48))
+    network = build(NetworkConfig(kind="paper", width=48))
 
     @jax.jit
     def scored(key):

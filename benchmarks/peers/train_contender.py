@@ -85,7 +85,7 @@ def ours(which: str, sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
 
 def brax(sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
     """``python train.py --trainer brax``: brax's own PPO, the network 64 wide."""
-    from jaxcal.learning.policies import networks
+    from jaxcal.learning.policies.build import build
     from jaxcal.learning.runtime import cache
     from jaxcal.learning.training import brax_ppo, presets
     from jaxcal.learning.training import run as training
@@ -94,7 +94,7 @@ def brax(sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
     config = presets.with_values(
         brax_ppo.adapted(presets.load("compact")), {"num_episodes": 3_000_000}
     )
-    network = networks.build(config.network)
+    network = build(config.network)
     validation = training.Validation(sets, best, 3)
 
     def watch(step: int, params: Any) -> None:

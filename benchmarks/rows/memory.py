@@ -42,12 +42,13 @@ _UPDATE = (
     + """
 import dataclasses, jax
 from jaxcal.learning.runtime import cache
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies import networks
 from jaxcal.learning.training import optimiser, ppo, presets
 cache.keep_compiled_programs()
 config = presets.with_values(presets.load("compact"), {
     "episodes_per_update": EPISODES, "num_minibatches": EPISODES // 512})
-network = networks.build(config.network)
+network = build(config.network)
 jax.devices()
 before = mib("VmRSS")
 state = optimiser.init(config.ppo, config.tasks[0], network)

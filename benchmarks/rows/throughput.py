@@ -17,7 +17,7 @@ from benchmarks.harness import (
     interleaved,
     median_ratio,
 )
-from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.training import optimiser, ppo, presets
 
 NAME = "throughput"
@@ -29,7 +29,7 @@ _WIDTH, _M, _K, _N, _EPOCHS = 768, 50, 4, 3, 10
 def ours() -> Callable[[], None]:
     """An update of the paper preset."""
     config = presets.load("paper")
-    network = networks.build(config.network)
+    network = build(config.network)
     step = ppo.updater(config.ppo, config.tasks[0], network)
     held = [optimiser.init(config.ppo, config.tasks[0], network)]
 
@@ -110,7 +110,7 @@ def run(budget: Budget) -> Row:
             )
         )
     config = presets.load("paper")
-    network = networks.build(config.network)
+    network = build(config.network)
     state = optimiser.init(config.ppo, config.tasks[0], network)
     flops, peak = floor_gigaflops(), peak_gigaflops()
     moved = floor_gigabytes(sum(leaf.size for leaf in jax.tree.leaves(state.params)))

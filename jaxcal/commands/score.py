@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
             raise ValueError(f"{arguments.subset}: index must hold whole numbers")
         indices = column.astype(int)
     selection = score(
-        table.columns(names),
+        table.frame(names),
         indices,
         available=table.available(),
         num_outputs=arguments.num_outputs,
@@ -53,7 +53,6 @@ def run(arguments: argparse.Namespace) -> int:
         else arguments.max_replicates,
         reference=arguments.reference,
         time_limit=arguments.time_limit,
-        names=names,
     )
     show(selection, table, arguments)
     return 0

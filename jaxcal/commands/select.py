@@ -114,14 +114,13 @@ def run(arguments: argparse.Namespace) -> int:
     names = table.inputs(arguments.columns)
     given = {name: getattr(arguments, name) for name in _OPTIONS}
     selection = select(
-        table.columns(names),
+        table.frame(names),
         arguments.k,
         arguments.method,
         available=table.available(),
         required=arguments.required,
         max_replicates=arguments.max_replicates,
         num_outputs=arguments.num_outputs,
-        names=names,
         **{name: value for name, value in given.items() if value is not None},
     )
     show(selection, table, arguments)

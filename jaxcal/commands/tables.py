@@ -17,11 +17,27 @@ from numpy.typing import NDArray
 from jaxcal.checks import axis_letter
 from jaxcal.files import write_text
 
-__all__ = ["Table", "read_table", "write_json", "write_rows"]
+__all__ = ["Frame", "Table", "read_table", "write_json", "write_rows"]
 
 Array = NDArray[np.float64]
 
 _NPZ_COLUMNS = {"candidates": "u", "commands": "u", "measured": "y"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """As much of a data frame as ``select`` reads: numbers with their names."""
+
+    values: Array  # (N, n)
+    columns: tuple[str, ...]
+    index: tuple[str, ...]  # names of the rows; empty where there are none
+
+    def to_numpy(self) -> Array:
+        """(N, n)."""
+        return self.values
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
+        return np.array(self.values, dtype=dtype)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,6 +66,11 @@ class Table:
                     f"{self.source}: there is no column {name!r}; columns: {known}"
                 )
         return self.values[:, [self.names.index(name) for name in wanted]]
+
+    def frame(self, wanted: Sequence[str]) -> Frame:
+        """The named columns, with the first column of text as the rows' names."""
+        rows = next(iter(self.labels.values()), [])
+        return Frame(self.columns(wanted), tuple(wanted), tuple(rows))
 
     def inputs(self, chosen: str | None) -> tuple[str, ...]:
         """Columns of commands: those chosen, else ``u_...``, else all but outputs."""

@@ -259,10 +259,10 @@ def _introduce(config: TrainConfig, out: pathlib.Path, devices: str) -> None:
     """What will be trained, in one line and in every number."""
     import jax
 
-    from jaxcal.learning.policies import networks
+    from jaxcal.learning.policies.build import build
     from jaxcal.learning.training import optimiser
 
-    network, task = networks.build(config.network), config.tasks[0]
+    network, task = build(config.network), config.tasks[0]
     shapes = jax.eval_shape(lambda: optimiser.init(config.ppo, task, network))
     size = sum(leaf.size for leaf in jax.tree.leaves(shapes.params))
     env = task.environment

@@ -10,6 +10,7 @@ from typing import Any
 
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import load_dataset
+from jaxcal.extras import needs
 
 __all__ = ["Catalogue"]
 
@@ -51,9 +52,10 @@ class Catalogue:
         if name in self.sizes:
             size = self.sizes[name]
             count = size if episodes is None else min(episodes, size)
-            return self.make(
-                name, seed, count, recordings=recordings, progress=progress
-            )
+            with needs("study", f"--dataset {name}"):
+                return self.make(
+                    name, seed, count, recordings=recordings, progress=progress
+                )
         if pathlib.Path(name).suffix.lower() not in (".npz", ".csv"):
             raise ValueError(
                 f"--dataset must be one of {', '.join(self.sizes)} or a .npz or .csv "

@@ -5,6 +5,7 @@ Functions return a matplotlib ``Figure`` and touch no file and no global state.
 
 from __future__ import annotations
 
+import itertools
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -199,9 +200,9 @@ def parameter_variance(evaluation: Evaluation) -> Figure:
     dataset = evaluation.dataset
     if dataset.measured is None:
         raise ValueError(f"{dataset.name} holds no measured outputs")
-    results = [r for r in evaluation.results if r.parameters is not None]
     rows = []
-    for result, style in zip(results, _styles(evaluation, results), strict=True):
+    styles = _styles(evaluation)
+    for result, style in zip(evaluation.results, styles, strict=True):
         label = "random, median over draws" if result.method == "random" else None
         variance = evaluation.parameter_variance(result)
         rows.append((label or _label(evaluation, result), variance, None, style))
@@ -306,23 +307,14 @@ def _main(evaluation: Evaluation) -> MethodResult | None:
     return next((r for r in others if r.is_policy), others[0] if others else None)
 
 
-def _styles(
-    evaluation: Evaluation, results: Sequence[MethodResult]
-) -> list[dict[str, Any]]:
+def _styles(evaluation: Evaluation) -> list[dict[str, Any]]:
     """Colour, line and marker of each; random and exact look the same everywhere."""
-    coloured = [r for r in evaluation.results if r.method not in _FIXED]
-    styles = []
-    for result in results:
-        style = _FIXED.get(result.method)
-        if style is None:
-            i = coloured.index(result)
-            style = {
-                "color": COLOURS[i % len(COLOURS)],
-                "linestyle": STYLES[i % len(STYLES)],
-                "marker": MARKERS[i % len(MARKERS)],
-            }
-        styles.append(style)
-    return styles
+    looks = zip(*map(itertools.cycle, (COLOURS, STYLES, MARKERS)), strict=False)
+    return [
+        _FIXED.get(result.method)
+        or dict(zip(("color", "linestyle", "marker"), next(looks), strict=True))
+        for result in evaluation.results
+    ]
 
 
 def _line(style: dict[str, Any]) -> dict[str, Any]:
@@ -338,7 +330,7 @@ def _with_random(evaluation: Evaluation) -> list[tuple[str, Array, dict[str, Any
     results = evaluation.results
     rows = [
         (_label(evaluation, result), result.log_det, style)
-        for result, style in zip(results, _styles(evaluation, results), strict=True)
+        for result, style in zip(results, _styles(evaluation), strict=True)
     ]
     if all(result.method != "random" for result in results):
         rows.append(("random", evaluation.random_log_det, _FIXED["random"]))

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from jaxcal.evaluation.results import Evaluation, Row, Summary, versions
-from jaxcal.files import atomic_write
+from jaxcal.files import atomic_write, write_text
 from jaxcal.pages import Block, Code, Figure, Page, Section, Table, Text, render
 
 __all__ = [
-    "file_prefix",
-    "html_page",
+    "file_prefixes",
     "json_document",
     "notes",
     "text_table",
@@ -43,14 +42,13 @@ _ABOUT = (
 )
 
 
-def text_table(found: Evaluation | Summary, *, many: bool = False) -> str:
+def text_table(shown: Summary, *, many: bool = False) -> str:
     """One dataset as a table for the terminal.
 
     Args:
-        found: what to show.
+        shown: the numbers.
         many: name the checkpoint of each policy.
     """
-    shown = _summary(found)
     rows = [_COLUMNS, *_rows(shown, many)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(_COLUMNS))]
     lines = [
@@ -63,9 +61,8 @@ def text_table(found: Evaluation | Summary, *, many: bool = False) -> str:
     return "\n  ".join([_heading(shown), *lines, *notes(shown)])
 
 
-def notes(found: Evaluation | Summary) -> list[str]:
+def notes(shown: Summary) -> list[str]:
     """What a reader must know beside the numbers."""
-    shown = _summary(found)
     texts = []
     episodes = shown.dataset["episodes"]
     unproven = episodes - shown.num_proven
@@ -83,59 +80,69 @@ def notes(found: Evaluation | Summary) -> list[str]:
     return [*texts, *shown.notes]
 
 
-def json_document(
-    evaluations: Sequence[Evaluation | Summary],
-    *,
-    command: Sequence[str],
-    indices: bool = False,
-) -> str:
+def json_document(summaries: Sequence[Summary], *, command: Sequence[str]) -> str:
     """The numbers of several evaluations; the layout is in docs/evaluation.md.
 
     Args:
-        evaluations: one a dataset.
+        summaries: one a dataset.
         command: what was typed, for the record.
-        indices: also what each method chose in every episode (random: its first draw).
     """
     document = {
         "format": FORMAT,
         "version": VERSION,
         "command": list(command),
         "versions": versions(),
-        "results": [
-            entry
-            for found in evaluations
-            for entry in _entries(_summary(found, indices))
-        ],
+        "results": [entry for shown in summaries for entry in _entries(shown)],
     }
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
-def html_page(
-    evaluations: Sequence[Evaluation | Summary],
-    images: Mapping[str, bytes],
+def write_report(
+    folder: pathlib.Path,
+    evaluations: Sequence[Evaluation],
+    runs: Sequence[pathlib.Path] = (),
     *,
     command: Sequence[str],
     many: bool = False,
-) -> str:
-    """One self-contained page: tables, notes and figures.
+) -> int:
+    """Draw everything, then write each figure as SVG and PNG, and ``index.html`` last.
 
     Args:
+        folder: made where it is missing.
         evaluations: one a dataset.
-        images: SVG files by name; a name starts with that of its dataset's prefix.
+        runs: folders of training runs to draw curves of.
         command: what was typed, for the record.
         many: name the checkpoint of each policy.
+
+    Returns:
+        How many figures there are.
     """
+    from jaxcal.evaluation.figures import evaluation_figures
+    from jaxcal.evaluation.training_figure import training_curves
+    from jaxcal.plots import as_bytes
+
+    files: dict[str, bytes] = {}
+
+    def drawn(name: str, figure: Any) -> Figure:
+        for suffix in ("svg", "png"):
+            files[f"{name}.{suffix}"] = as_bytes(figure, suffix)
+        return Figure(files[f"{name}.svg"], name.replace("_", " "))
+
     sections = []
-    left = {name: Figure(data, name.replace("_", " ")) for name, data in images.items()}
-    for number, found in enumerate(evaluations):
-        shown = _summary(found)
-        prefix = f"{file_prefix(evaluations, number)}_"
+    prefixes = file_prefixes([found.dataset.name for found in evaluations])
+    for evaluation, prefix in zip(evaluations, prefixes, strict=True):
+        shown = evaluation.summarise()
         blocks: list[Block] = [Table(_COLUMNS, _rows(shown, many))]
         blocks += [Text(note, "note") for note in notes(shown)]
-        blocks += [left.pop(name) for name in list(left) if name.startswith(prefix)]
+        for name, figure in evaluation_figures(evaluation).items():
+            blocks.append(drawn(f"{prefix}_{name}", figure))
         sections.append(Section(_heading(shown), blocks))
-    if left:
-        sections.append(Section("Training", list(left.values())))
+    curves = []
+    for number, run in enumerate(runs, start=1):
+        suffix = f"_{number}" if len(runs) > 1 else ""
+        curves.append(drawn(f"training_curves{suffix}", training_curves(run)))
+    if curves:
+        sections.append(Section("Training", curves))
     page = Page(
         "Posture selection against the proven optimum",
         sections,
@@ -145,73 +152,27 @@ def html_page(
         ],
         footer=[Text(_ABOUT, "note")],
     )
-    return render(page)
-
-
-def write_report(
-    folder: pathlib.Path,
-    evaluations: Sequence[Evaluation],
-    runs: Sequence[pathlib.Path],
-    *,
-    command: Sequence[str],
-    many: bool = False,
-) -> int:
-    """Draw everything, then write every figure as SVG and PNG, and the page last.
-
-    Args:
-        folder: made where it is missing.
-        evaluations: one a dataset.
-        runs: folders of training runs to draw curves of.
-        command, many: see ``html_page``.
-
-    Returns:
-        How many figures there are.
-    """
-    from jaxcal.evaluation.figures import evaluation_figures
-    from jaxcal.evaluation.training_figure import training_curves
-    from jaxcal.plots import as_bytes
-
-    figures = {}
-    for number, evaluation in enumerate(evaluations):
-        prefix = file_prefix(evaluations, number)
-        for name, figure in evaluation_figures(evaluation).items():
-            figures[f"{prefix}_{name}"] = figure
-    for number, run in enumerate(runs):
-        suffix = f"_{number + 1}" if len(runs) > 1 else ""
-        figures[f"training_curves{suffix}"] = training_curves(run)
-    images = {name: as_bytes(figure, "svg") for name, figure in figures.items()}
-    files = {f"{name}.svg": data for name, data in images.items()}
-    for name, figure in figures.items():
-        files[f"{name}.png"] = as_bytes(figure, "png")
-    page = html_page(evaluations, images, command=command, many=many)
-    files["index.html"] = page.encode()
+    text = render(page)
     folder.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
         with atomic_write(folder / name) as file:
             file.write(data)
-    return len(figures)
+    write_text(folder / "index.html", text)
+    return len(files) // 2
 
 
-def file_prefix(evaluations: Sequence[Evaluation | Summary], number: int) -> str:
-    """What the figure files of one evaluation are called first; unique among them."""
+def file_prefixes(names: Sequence[str]) -> list[str]:
+    """What the figure files of each dataset are called first; no two alike."""
 
     def plain(name: str) -> str:
         stem = pathlib.PurePath(name).stem or name
         return "".join(c if c.isalnum() or c in "-." else "-" for c in stem)
 
-    names = [plain(_name(found)) for found in evaluations]
-    name = names[number]
-    return name if names.count(name) == 1 else f"{name}-{number + 1}"
-
-
-def _name(found: Evaluation | Summary) -> str:
-    if isinstance(found, Summary):
-        return found.dataset["name"]
-    return found.dataset.name
-
-
-def _summary(found: Evaluation | Summary, indices: bool = False) -> Summary:
-    return found if isinstance(found, Summary) else found.summarise(indices=indices)
+    found = [plain(name) for name in names]
+    return [
+        name if found.count(name) == 1 else f"{name}-{number}"
+        for number, name in enumerate(found, start=1)
+    ]
 
 
 def _heading(shown: Summary) -> str:

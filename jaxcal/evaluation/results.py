@@ -32,17 +32,23 @@ HIT_TOLERANCE = 1e-9  # of log det(Z.T Z): the same determinant to a billionth
 
 
 @dataclasses.dataclass(frozen=True)
-class Row:
-    """One method in the numbers that the table, the JSON and the page show."""
+class _Named:
+    """Which method it is."""
 
     method: str  # as asked for: "greedy", "policy:first", ...
     checkpoint: str | None  # of a policy; None for the shipped one and for baselines
-    numbers: dict[str, Any]  # as documented in docs/evaluation.md; "label": in words
 
     @property
     def is_policy(self) -> bool:
         """True where a checkpoint chose."""
         return self.method.startswith("policy")
+
+
+@dataclasses.dataclass(frozen=True)
+class Row(_Named):
+    """One method in the numbers that the table, the JSON and the page show."""
+
+    numbers: dict[str, Any]  # as documented in docs/evaluation.md; "label": in words
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,21 +70,14 @@ class Summary:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class MethodResult:
+class MethodResult(_Named):
     """What one method chose in every episode of a dataset; R draws, 1 unless random."""
 
-    method: str  # as asked for: "greedy", "policy:first", ...
     label: str  # in words
-    checkpoint: str | None  # of a policy; None for the shipped one and for baselines
     indices: Indices  # (E, R, k)
     log_det: Array  # (E, R) natural log det S
     seconds: float  # a selection, averaged over the batch, compilation left out
     parameters: Array | None  # (E, R, m (n + 1)) identified from the chosen postures
-
-    @property
-    def is_policy(self) -> bool:
-        """True where a checkpoint chose."""
-        return self.method.startswith("policy")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

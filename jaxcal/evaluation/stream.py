@@ -19,6 +19,7 @@ from concurrent.futures import Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
+from jaxcal.evaluation import tally
 from jaxcal.evaluation.catalogue import Catalogue
 from jaxcal.evaluation.methods import (
     BASELINES,
@@ -30,7 +31,7 @@ from jaxcal.evaluation.methods import (
     rows_of,
 )
 from jaxcal.evaluation.results import Row, Summary, versions
-from jaxcal.evaluation.tally import BINS_PER_UNIT, Tally, tally_of
+from jaxcal.evaluation.tally import BINS_PER_UNIT, Tally
 from jaxcal.evaluation.workers import num_cores, worker_pool
 from jaxcal.files import write_text
 
@@ -188,7 +189,7 @@ def _solve_block(plan: Plan, begin: int, end: int) -> tuple[int, dict[str, Tally
     )
     m = dataset.num_outputs
     tallies = {
-        _key(result.method, result.checkpoint): tally_of(
+        _key(result.method, result.checkpoint): tally.tally_of(
             result.log_det,
             found.reference,
             found.proven,
@@ -224,7 +225,7 @@ def _begun(
 def _added(cut: Cut, blocks: list[Block]) -> dict[str, Any]:
     """What a part adds to the totals, as its file holds it."""
     proven = 0
-    methods: dict[str, Tally] = collections.defaultdict(Tally)
+    methods: dict[str, Tally] = collections.defaultdict(dict)
     for block in blocks:
         try:
             count, tallies = block.result()
@@ -234,9 +235,9 @@ def _added(cut: Cut, blocks: list[Block]) -> dict[str, Any]:
                 "(--workers)"
             ) from None
         proven += count
-        for name, tally in tallies.items():
-            methods[name].add(tally)
-    rows = {name: tally.as_json() for name, tally in methods.items()}
+        for name, row in tallies.items():
+            tally.add(methods[name], row)
+    rows = {name: tally.as_json(row) for name, row in methods.items()}
     return {"episodes": list(cut), "proven": proven, "methods": rows}
 
 
@@ -260,7 +261,7 @@ def _total(
 ) -> Summary:
     """All parts of a folder added up."""
     proven = 0
-    totals: dict[str, Tally] = collections.defaultdict(Tally)
+    totals: dict[str, Tally] = collections.defaultdict(dict)
     for number, cut in enumerate(cuts):
         report("parts added up", number, len(cuts))
         path = _path(folder, cut)
@@ -270,7 +271,7 @@ def _total(
                 raise ValueError(f"it says episodes {part['episodes']}")
             proven += int(part["proven"])
             for name, row in part["methods"].items():
-                totals[name].add(Tally.from_json(row))
+                tally.add(totals[name], tally.from_json(row))
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ValueError(
                 f"{path} is damaged ({error}); delete it, and it is computed again"
@@ -286,7 +287,7 @@ def _total(
                 method,
                 checkpoint,
                 {"label": label_of(method, plan.num)}
-                | totals[_key(method, checkpoint)].summary(totals["random"]),
+                | tally.summary(totals[_key(method, checkpoint)], totals["random"]),
             )
             for method, checkpoint in rows_of(plan.methods, plan.checkpoints)
         ),

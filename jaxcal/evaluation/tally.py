@@ -1,16 +1,15 @@
 """What one method achieved over any number of episodes, in a few numbers that add.
 
-The sum over a block of episodes is rounded once (``math.fsum``); sums of blocks are
-kept as fractions, which add without rounding. So totals do not depend on the order in
-which blocks are added, to the last digit. Medians cannot be added: they are read off a
-histogram of log det S.
+A tally holds counts and sums by name. The sum over a block of episodes is rounded once
+(``math.fsum``); sums of blocks are fractions, which add without rounding. So totals do
+not depend on the order in which blocks are added, to the last digit. Medians cannot be
+added: they are read off a histogram of log det S.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections import Counter
+from collections.abc import Mapping
 from fractions import Fraction
 from typing import Any
 
@@ -19,92 +18,24 @@ from numpy.typing import NDArray
 
 from jaxcal.evaluation.results import HIT_TOLERANCE
 
-__all__ = ["BINS_PER_UNIT", "Tally", "tally_of"]
+__all__ = [
+    "BINS_PER_UNIT",
+    "Tally",
+    "add",
+    "as_json",
+    "from_json",
+    "summary",
+    "tally_of",
+]
 
 Array = NDArray[np.float64]
+Tally = dict[str, Any]
+"""int counts: episodes, selections (episodes times draws), hits (proven optima),
+singular (det S = 0; in no sum of logs), and one for each bin of log det S. Fraction
+sums: det, log_det, their squares, ratio (det S / det S*), efficiency (its p-th root),
+seconds."""
 
 BINS_PER_UNIT = 64  # of log det S: a median is within 1/64, 1.6 % of det S
-_COUNTS = ("episodes", "selections", "hits", "singular")
-
-
-@dataclasses.dataclass
-class Tally:
-    """One method over some episodes; ``add`` changes it in place."""
-
-    episodes: int = 0
-    selections: int = 0  # episodes times draws
-    hits: int = 0  # that are the proven optimum
-    singular: int = 0  # with det S = 0; they are in no sum of logs
-    seconds: float = 0.0  # spent choosing; the only field that is measured
-    sums: dict[str, Fraction] = dataclasses.field(default_factory=dict)  # by name
-    bins: Counter[int] = dataclasses.field(default_factory=Counter)  # of log det S
-
-    def add(self, other: Tally) -> None:
-        """Count the episodes of another tally as well."""
-        for name in _COUNTS:
-            setattr(self, name, getattr(self, name) + getattr(other, name))
-        self.seconds += other.seconds
-        for name, value in other.sums.items():
-            self.sums[name] = self.sums.get(name, Fraction(0)) + value
-        self.bins.update(other.bins)
-
-    def as_json(self) -> dict[str, Any]:
-        """Plain values; ``from_json`` reads them back without loss."""
-        row = {name: getattr(self, name) for name in (*_COUNTS, "seconds")}
-        row["sums"] = {name: str(value) for name, value in self.sums.items()}
-        return row | {"bins": sorted(self.bins.items())}
-
-    @staticmethod
-    def from_json(row: dict[str, Any]) -> Tally:
-        """What ``as_json`` wrote."""
-        return Tally(
-            **{name: int(row[name]) for name in _COUNTS},
-            seconds=float(row["seconds"]),
-            sums={name: Fraction(text) for name, text in row["sums"].items()},
-            bins=Counter({int(number): int(count) for number, count in row["bins"]}),
-        )
-
-    def summary(self, random: Tally) -> dict[str, Any]:
-        """The numbers of one method, as documented in docs/evaluation.md.
-
-        Args:
-            random: the baseline behind ``ratio_to_random``.
-        """
-        baseline = random.sums["det"] / random.selections
-        mean = {name: value / self.selections for name, value in self.sums.items()}
-        log_det: dict[str, float | None] = {"mean": None, "std": None}
-        if not self.singular:
-            log_det = _moments(mean["log_det"], mean["log_det_squared"])
-        middle = self.median_log_det()
-        return {
-            "det_s": _moments(mean["det"], mean["det_squared"])
-            | {"median": math.exp(middle)},
-            "log_det_s": log_det | {"median": middle if middle > -math.inf else None},
-            "ratio_to_exact": float(mean["ratio"]),
-            "hit_rate": self.hits / self.selections,
-            "d_efficiency": float(mean["efficiency"]),
-            "ratio_to_random": float(mean["det"] / baseline) if baseline else None,
-            "seconds_per_selection": self.seconds / self.episodes,
-            "draws_per_episode": self.selections // self.episodes,
-        }
-
-    def median_log_det(self) -> float:
-        """Median of log det S, from the histogram; ``-inf`` where most are singular."""
-        half = self.selections / 2
-        below = self.singular
-        if below > half:
-            return -math.inf
-        for number, count in sorted(self.bins.items()):
-            if below + count >= half:
-                return (number + (half - below) / count) / BINS_PER_UNIT
-            below += count
-        raise ValueError("a tally of nothing has no median")
-
-
-def _moments(mean: Fraction, mean_square: Fraction) -> dict[str, float | None]:
-    # Each square was rounded once: of equal values the difference may fall below 0.
-    variance = max(mean_square - mean * mean, Fraction(0))
-    return {"mean": float(mean), "std": math.sqrt(variance)}
 
 
 def tally_of(
@@ -130,7 +61,7 @@ def tally_of(
     behind = np.minimum(behind, 0.0)
     finite = log_det[np.isfinite(log_det)]
     det = np.exp(log_det)
-    values = {
+    sums = {
         "det": det,
         "det_squared": det * det,
         "log_det": finite,
@@ -138,15 +69,74 @@ def tally_of(
         "ratio": np.exp(behind),
         "efficiency": np.exp(behind / num_parameters),
     }
-    numbers, counts = np.unique(
-        np.floor(finite * BINS_PER_UNIT).astype(np.int64), return_counts=True
-    )
-    return Tally(
-        episodes=len(log_det),
-        selections=log_det.size,
-        hits=int(hits.sum()),
-        singular=log_det.size - finite.size,
-        seconds=seconds,
-        sums={name: Fraction(math.fsum(v.ravel())) for name, v in values.items()},
-        bins=Counter(dict(zip(numbers.tolist(), counts.tolist(), strict=True))),
-    )
+    bins, counts = np.unique(np.floor(finite * BINS_PER_UNIT), return_counts=True)
+    return {
+        "episodes": len(log_det),
+        "selections": log_det.size,
+        "hits": int(hits.sum()),
+        "singular": log_det.size - finite.size,
+        "seconds": Fraction(seconds),
+        **{name: Fraction(math.fsum(v.ravel())) for name, v in sums.items()},
+        **{f"bin {int(b)}": int(n) for b, n in zip(bins, counts, strict=True)},
+    }
+
+
+def add(total: Tally, part: Tally) -> None:
+    """Count a part as well: ``total`` changes in place."""
+    for name, value in part.items():
+        total[name] = total.get(name, 0) + value
+
+
+def as_json(tally: Tally) -> dict[str, int | str]:
+    """Counts as numbers, sums as text: ``from_json`` reads both without loss."""
+    return {n: v if isinstance(v, int) else str(v) for n, v in tally.items()}
+
+
+def from_json(row: Mapping[str, int | str]) -> Tally:
+    """What ``as_json`` wrote."""
+    return {n: v if isinstance(v, int) else Fraction(v) for n, v in row.items()}
+
+
+def summary(tally: Tally, random: Tally) -> dict[str, Any]:
+    """The numbers of one method, as documented in docs/evaluation.md.
+
+    Args:
+        tally: of the method.
+        random: the baseline behind ``ratio_to_random``.
+    """
+    count, episodes = tally["selections"], tally["episodes"]
+    log_det: dict[str, float | None] = {"mean": None, "std": None}
+    if not tally["singular"]:
+        log_det = _moments(tally, "log_det")
+    middle = _median_log_det(tally)
+    mean, baseline = tally["det"] / count, random["det"] / random["selections"]
+    return {
+        "det_s": _moments(tally, "det") | {"median": math.exp(middle)},
+        "log_det_s": log_det | {"median": middle if middle > -math.inf else None},
+        "ratio_to_exact": float(tally["ratio"] / count),
+        "hit_rate": tally["hits"] / count,
+        "d_efficiency": float(tally["efficiency"] / count),
+        "ratio_to_random": float(mean / baseline) if baseline else None,
+        "seconds_per_selection": float(tally["seconds"] / episodes),
+        "draws_per_episode": count // episodes,
+    }
+
+
+def _moments(tally: Tally, name: str) -> dict[str, float | None]:
+    mean = tally[name] / tally["selections"]
+    variance = tally[f"{name}_squared"] / tally["selections"] - mean * mean
+    # Each square was rounded once: of equal values the difference may fall below 0.
+    return {"mean": float(mean), "std": math.sqrt(max(variance, Fraction(0)))}
+
+
+def _median_log_det(tally: Tally) -> float:
+    """Median of log det S, from the histogram; ``-inf`` where most are singular."""
+    half, below = tally["selections"] / 2, tally["singular"]
+    if below > half:
+        return -math.inf
+    bins = {int(n[4:]): v for n, v in tally.items() if n.startswith("bin ")}
+    for number, count in sorted(bins.items()):
+        if below + count >= half:
+            return (number + (half - below) / count) / BINS_PER_UNIT
+        below += count
+    raise ValueError("a tally of nothing has no median")

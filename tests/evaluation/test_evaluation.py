@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import pathlib
+import re
 import sys
 import types
 from typing import Any
@@ -19,7 +20,12 @@ from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.figures import evaluation_figures
 from jaxcal.evaluation.methods import check_methods, evaluate
 from jaxcal.evaluation.parameters import estimate_parameters, parameter_names
-from jaxcal.evaluation.report import file_prefix, html_page, json_document, text_table
+from jaxcal.evaluation.report import (
+    file_prefixes,
+    json_document,
+    text_table,
+    write_report,
+)
 from jaxcal.evaluation.results import Evaluation, MethodResult
 from jaxcal.evaluation.training_figure import training_curves
 from jaxcal.information.regression import regression_matrix
@@ -171,8 +177,8 @@ def test_det_s_too_large_for_a_float_is_no_error() -> None:
     row = found.summary(found.results[-1])
     assert row["det_s"]["mean"] is None and row["ratio_to_exact"] == 1.0
     assert np.isfinite(row["ratio_to_random"])
-    json.loads(json_document([found], command=["x"]))
-    assert "-" in text_table(found)
+    json.loads(json_document([found.summarise()], command=["x"]))
+    assert "-" in text_table(found.summarise())
     for figure in evaluation_figures(found).values():
         as_bytes(figure, "svg")
 
@@ -283,7 +289,7 @@ def test_what_cannot_be_proven_in_time_is_bounded() -> None:
     truth = evaluate(dataset, 12, ["exact"])
     assert (found.reference >= truth.reference - 1e-9).all()
     if not found.proven.all():
-        assert "not proven" in text_table(found)
+        assert "not proven" in text_table(found.summarise())
         for result in found.results:
             row = found.summary(result)
             assert row["hit_rate"] <= found.proven.mean()
@@ -366,7 +372,7 @@ def shown(calls: list[dict[str, Any]]) -> Evaluation:
 
 
 def test_the_table_has_a_row_for_each_method(shown: Evaluation) -> None:
-    text = text_table(shown, many=True)
+    text = text_table(shown.summarise(), many=True)
     assert "policy (runs/a)" in text and "policy (runs/b)" in text
     for method in BASELINES:
         assert f"\n  {method}" in text
@@ -376,7 +382,7 @@ def test_the_table_has_a_row_for_each_method(shown: Evaluation) -> None:
 
 
 def test_the_json_has_an_entry_for_each_checkpoint(shown: Evaluation) -> None:
-    document = json.loads(json_document([shown], command=["x"], indices=True))
+    document = json.loads(json_document([shown.summarise(indices=True)], command=["x"]))
     assert document["format"] == "jaxcal-evaluation" and document["version"] == 1
     assert {"python", "numpy", "jaxcal"} <= set(document["versions"])
     assert [entry["checkpoint"] for entry in document["results"]] == [
@@ -414,17 +420,21 @@ def test_figures_have_axes_units_and_legends(shown: Evaluation) -> None:
     )
 
 
-def test_the_page_holds_everything_in_itself(shown: Evaluation) -> None:
-    images = {"dataset3_det_means": b"<svg/>", "training_curves": b"<svg/>"}
-    page = html_page([shown], images, command=["a", "<b>"], many=True)
-    assert page.count("data:image/svg+xml;base64,") == 2
+def test_the_page_holds_everything_in_itself(
+    shown: Evaluation, tmp_path: pathlib.Path
+) -> None:
+    metrics(tmp_path)
+    out = tmp_path / "deep" / "report"
+    number = write_report(out, [shown], [tmp_path], command=["a", "<b>"], many=True)
+    page = (out / "index.html").read_text()
+    images = sorted(path.name for path in out.glob("*.svg"))
+    assert page.count("data:image/svg+xml;base64,") == len(images) == number == 7
     assert "&lt;b&gt;" in page and "policy (runs/a)" in page
-    assert "http" not in page
+    assert not re.search(r"(href|src)=['\"]?(https?:)?//", page)
 
 
-def test_two_files_of_one_name_keep_their_figures_apart(shown: Evaluation) -> None:
-    prefixes = [file_prefix([shown, shown], i) for i in range(2)]
-    assert prefixes == ["dataset3-1", "dataset3-2"]
+def test_two_files_of_one_name_keep_their_figures_apart() -> None:
+    assert file_prefixes(["a/d.csv", "x", "b/d.npz"]) == ["d-1", "x", "d-3"]
 
 
 def texts_outside(figure: Figure) -> list[str]:

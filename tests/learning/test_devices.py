@@ -19,6 +19,7 @@ BEGIN = """
 import json, sys
 import jax, jax.numpy as jnp, numpy as np
 from jaxcal.learning.runtime import devices
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies import networks
 from jaxcal.learning.training import optimiser, ppo, presets, rollout
 from jaxcal.learning.environments.selection import SelectionConfig
@@ -33,7 +34,7 @@ def distance(one, other):
 """
 
 TINY = """
-network = networks.build(NetworkConfig(width=8, encoder_rounds=1))
+network = build(NetworkConfig(width=8, encoder_rounds=1))
 task = Task(SelectionConfig(6, 3, 1, 1), random_starts=0.3, masked=0.2)
 config = PPOConfig(
     num_episodes=64 * 3, episodes_per_update=64, episodes_per_set=4,
@@ -168,7 +169,7 @@ def test_the_papers_sixteen_episodes_are_shared_by_eight_devices() -> None:
     paper = """
     import dataclasses
     preset = presets.load("paper")
-    network = networks.build(dataclasses.replace(preset.network, width=16))
+    network = build(dataclasses.replace(preset.network, width=16))
     task, config = preset.tasks[0], preset.ppo
     """
     check_equal(python(BEGIN, paper, COMPARE))

@@ -13,6 +13,7 @@ import pytest
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training import checkpoint, imitation, optimiser
 from jaxcal.learning.training import run as training
@@ -32,7 +33,7 @@ TASK = Task(
     masked=0.3,
     random_starts=0.5,
 )
-NETWORK = networks.build(NetworkConfig(width=8, encoder_rounds=1))
+NETWORK = build(NetworkConfig(width=8, encoder_rounds=1))
 
 
 def brute_force(candidates, available, given, k):
@@ -163,7 +164,7 @@ def test_lessons_teach():
         PPO, num_episodes=64 * 40, imitation=1.0, learning_rate=5e-3
     )
     # Without the look-ahead it has to be learned what to choose.
-    network = networks.build(NetworkConfig(width=8, encoder_rounds=1, lookahead=1))
+    network = build(NetworkConfig(width=8, encoder_rounds=1, lookahead=1))
     task = Task(SelectionConfig(num_candidates=8))
     state = optimiser.init(config, task, network)
     losses = []

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from jaxcal.learning.policies import decoding, networks
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.features import remaining
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training import checkpoint
@@ -23,7 +24,7 @@ CLOSE = NetworkConfig(width=8, encoder_rounds=1, close_up=True)
 
 
 def made(config, m=12, n=3, k=4, seed=0):
-    network = networks.build(config)
+    network = build(config)
     params = networks.initial(network, jax.random.key(seed), m, n, k)
     # Every parameter away from its initial zero, so that nothing is hidden by one.
     noisy = jax.tree.map(lambda leaf: leaf + 0.1 * jnp.cos(jnp.arange(leaf.size)
@@ -43,7 +44,7 @@ def score(network, params, points, chosen, k=4):
 
 
 def test_the_papers_network_has_its_size_and_its_share():
-    network = networks.build(NetworkConfig(kind="paper", width=768))
+    network = build(NetworkConfig(kind="paper", width=768))
     shapes = jax.eval_shape(
         lambda: networks.initial(network, jax.random.key(0), 50, 3, 4)
     )
@@ -87,7 +88,7 @@ def test_permuting_the_candidates_permutes_the_logits(rng, config):
 @pytest.mark.parametrize("k", [4, 7])
 def test_a_network_can_begin_as_the_look_ahead_rule(rng, k):
     start = dataclasses.replace(CLOSE, initial_trust=4.0, initial_actor=0.0)
-    network = networks.build(start)
+    network = build(start)
     params = networks.initial(network, jax.random.key(0), 12, 3, k)
     points = jnp.asarray(rng.uniform(size=(50, 12, 3)), jnp.float32)
     free = jnp.ones((50, 12), bool)
@@ -207,11 +208,11 @@ def test_a_loop_over_like_choices_chooses_as_if_written_out(rng, lookahead):
 
 
 def test_a_close_up_tells_near_equal_look_aheads_apart(rng):
-    network = networks.build(CLOSE)
+    network = build(CLOSE)
     points = jnp.asarray(rng.uniform(size=(1, 12, 3)), jnp.float32)
     free = jnp.ones((1, 12), bool)
     vectors = network.candidate_features(points, free).vectors
-    plain = networks.build(SMALL).candidate_features(points, free).vectors
+    plain = build(SMALL).candidate_features(points, free).vectors
     assert (np.asarray(vectors.columns)[..., :13] == plain.columns).all()
     shown, behind = np.asarray(vectors.columns)[0, :, 13:], vectors.ahead[0, :, 3]
     best = int(np.argmax(behind))

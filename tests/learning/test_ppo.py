@@ -12,7 +12,7 @@ import pytest
 
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
-from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training import optimiser, ppo, rollout
 from jaxcal.learning.training.config import PPOConfig
@@ -63,7 +63,7 @@ def test_the_first_minibatch_sees_the_probabilities_that_played(kind, n, k):
     # a difference here would silently make every gradient wrong.
     env = SelectionConfig(12, k, n, n)
     task = Task(env, random_starts=0.5)
-    network = networks.build(dataclasses.replace(SMALL, kind=kind))
+    network = build(dataclasses.replace(SMALL, kind=kind))
     config = dataclasses.replace(TINY, episodes_per_update=512)
     state = optimiser.init(config, task, network)
     keys = jax.random.split(jax.random.key(1), 3)
@@ -81,12 +81,12 @@ def test_the_first_minibatch_sees_the_probabilities_that_played(kind, n, k):
 
 
 def test_update_compiles_once_and_changes_everything_it_should():
-    network = networks.build(SMALL)
+    network = build(SMALL)
     task = Task(SelectionConfig(8, 3, 2, 2))
     state = optimiser.init(TINY, task, network)
     before = jax.tree.map(np.asarray, state.params)
     update = ppo.updater(TINY, task, network)
-    assert ppo.updater(TINY, task, networks.build(SMALL)) is update
+    assert ppo.updater(TINY, task, build(SMALL)) is update
     for _ in range(3):
         state, metrics = update(state)
     assert update._cache_size() == 1
@@ -99,9 +99,7 @@ def test_update_compiles_once_and_changes_everything_it_should():
 
 def test_the_policy_learns_on_a_small_task():
     # Without the look ahead and the endgame, so that it must learn by itself.
-    network = networks.build(
-        dataclasses.replace(SMALL, lookahead=1, endgame=False, width=16)
-    )
+    network = build(dataclasses.replace(SMALL, lookahead=1, endgame=False, width=16))
     config = dataclasses.replace(
         TINY, num_episodes=512 * 40, episodes_per_update=512, learning_rate=5e-3
     )

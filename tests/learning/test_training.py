@@ -21,7 +21,7 @@ import pytest
 from jaxcal.commands import train as command
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
-from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training import checkpoint, optimiser, presets
 from jaxcal.learning.training import run as training
@@ -121,7 +121,7 @@ def test_validation_of_the_optimum_itself_is_one():
 
     best = np.asarray(exact_batch(sets, 3, num_outputs=1).log_det)
     network = NetworkConfig(width=8, encoder_rounds=1)
-    network = networks.build(network)
+    network = build(network)
     state = optimiser.init(CONFIG.ppo, CONFIG.tasks[0], network)
     ratio, hits = Validation(sets, best, 3).measure(network, state.params, 3)
     assert 0.0 <= ratio <= 1.0 and 0.0 <= hits <= 1.0

@@ -174,7 +174,9 @@ def test_hull_enumeration_and_branch_and_bound_agree_on_a_sphere():
     problem = make_problem(sphere(0, 40), 4)
     enumerated = solve_exact(problem)
     start = np.bincount(exchange_indices(problem, 5), minlength=40)
-    branched = branch_and_bound(problem.rows, problem.lower, problem.upper, start)
+    branched = branch_and_bound(
+        problem.blocks.copy(), problem.prior.copy(), problem.lower, problem.upper, start
+    )
     assert branched.proven
     assert problem.log_det(enumerated.subsets[0]) == pytest.approx(
         problem.log_det(np.flatnonzero(branched.counts[0])), abs=1e-8

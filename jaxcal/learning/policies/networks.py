@@ -30,7 +30,7 @@ from jaxcal.learning.settings import require, setting
 __all__ = [
     "Network",
     "NetworkConfig",
-    "build",
+    "added_kinds",
     "decode",
     "encode",
     "initial",
@@ -62,9 +62,9 @@ class NetworkConfig:
     initial_actor: float = setting(0.1, "scale of the learned score before learning")
 
     def __post_init__(self) -> None:
-        if self.kind != "compact" and self.kind not in _added():
+        if self.kind != "compact" and self.kind not in added_kinds():
             raise ValueError(
-                f"kind must be one of {', '.join(['compact', *_added()])}, got "
+                f"kind must be one of {', '.join(['compact', *added_kinds()])}, got "
                 f"{self.kind!r}; a package adds a kind by an entry point in the group "
                 f"{_GROUP}, when it is installed"
             )
@@ -123,16 +123,7 @@ class Network(Protocol):
         """flax's: a method with given parameters."""
 
 
-def build(config: NetworkConfig) -> Network:
-    """The network that a configuration names, as a flax module."""
-    if config.kind == "compact":
-        from jaxcal.learning.policies.compact import CompactNetwork
-
-        return cast(Network, CompactNetwork(config))
-    return cast(Network, _added()[config.kind].load()(config))
-
-
-def _added() -> dict[str, importlib.metadata.EntryPoint]:
+def added_kinds() -> dict[str, importlib.metadata.EntryPoint]:
     """The kinds of installed packages."""
     return {p.name: p for p in importlib.metadata.entry_points(group=_GROUP)}
 

@@ -1,25 +1,29 @@
-"""Compiled programs are kept on disk, so that a second process starts at once."""
+"""JAX's cache of compiled code on disk, so that a second command starts sooner.
+
+Only commands turn it on; a program that imports jaxcal keeps its own settings.
+"""
 
 from __future__ import annotations
 
 import os
 import pathlib
+import sys
 
-import jax
-
-__all__ = ["cache_folder", "keep_compiled_programs"]
-
-
-def cache_folder() -> pathlib.Path:
-    """Where programs are kept: XDG_CACHE_HOME or ~/.cache, then jaxcal/jax."""
-    home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
-    return pathlib.Path(home) / "jaxcal" / "jax"
+__all__ = ["keep_compiled_programs"]
 
 
 def keep_compiled_programs() -> None:
-    """Turn on JAX's persistent compilation cache, unless the user already chose one."""
-    if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
-        jax.config.update("jax_compilation_cache_dir", str(cache_folder()))
-    # Small programs too: a start has a hundred of them.
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+    """Have JAX keep compiled code, in the user's folder for it if one is chosen, else
+    in ``jaxcal/jax`` under ``XDG_CACHE_HOME`` or ``~/.cache``. Does not load JAX."""
+    home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+    settings = {
+        "jax_compilation_cache_dir": str(pathlib.Path(home) / "jaxcal" / "jax"),
+        # Small programs too: a start has a hundred of them.
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_persistent_cache_min_entry_size_bytes": 0,
+    }
+    for name, value in settings.items():
+        os.environ.setdefault(name.upper(), str(value))  # read when JAX is loaded
+        jax = sys.modules.get("jax")
+        if jax and not (name.endswith("dir") and getattr(jax.config, name)):
+            jax.config.update(name, value)

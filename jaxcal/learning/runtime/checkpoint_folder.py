@@ -1,11 +1,10 @@
-"""Where a checkpoint lies and what is in it, without reading it: no JAX, no orbax."""
+"""Where a checkpoint lies, without reading it."""
 
 from __future__ import annotations
 
-import hashlib
 import pathlib
 
-__all__ = ["CheckpointError", "default_folder", "digest", "newest_step", "resolve"]
+__all__ = ["CheckpointError", "default_folder", "newest_step", "resolve"]
 
 
 class CheckpointError(ValueError):
@@ -16,7 +15,7 @@ def default_folder(name: str = "default") -> pathlib.Path:
     """A checkpoint that ships: inside the installed package, or in the repository.
 
     Args:
-        name: "default", or "travel" for the policy that knows what time is worth.
+        name: "default", the only one.
     """
     package = pathlib.Path(__file__).resolve().parents[2]
     inside = package / "checkpoints" / name
@@ -52,22 +51,3 @@ def newest_step(folder: pathlib.Path) -> pathlib.Path:
     if not steps:
         raise CheckpointError(f"checkpoint folder {folder} holds no checkpoint")
     return max(steps, key=lambda step: int(step.name))
-
-
-def digest(folder: str | pathlib.Path | None = None) -> str:
-    """SHA-256 of the files of the newest policy, all but a run's training state.
-
-    Raises:
-        CheckpointError: there is none.
-        OSError: it cannot be read.
-    """
-    step = newest_step(resolve(folder))
-    found = hashlib.sha256()
-    for path in sorted(step.rglob("*")):
-        name = path.relative_to(step)
-        if name.parts[0] == "state" or not path.is_file():
-            continue
-        data = path.read_bytes()
-        found.update(f"{name.as_posix()}\0{len(data)}\0".encode())
-        found.update(data)
-    return found.hexdigest()

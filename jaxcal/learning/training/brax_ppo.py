@@ -26,6 +26,7 @@ from brax.training.networks import FeedForwardNetwork
 from jaxcal.learning.environments.brax_env import SelectionEnv, wrap_fresh
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.settings import settings_of
 from jaxcal.learning.training import checkpoint
@@ -119,7 +120,7 @@ def _make_networks(
     env: SelectionConfig, config: NetworkConfig
 ) -> Callable[..., brax_networks.PPONetworks]:
     """A network read from the observation, for the policy and the value."""
-    network = networks.build(config)
+    network = build(config)
     m, n = env.num_candidates, env.num_inputs
 
     def read(part: int) -> FeedForwardNetwork:

@@ -1,9 +1,15 @@
 """Checkpoints, by orbax: the policy, what it was trained with, and how to go on.
 
 A checkpoint folder holds one numbered folder a save. Each has ``policy`` (the averaged
-weights), ``meta`` (JSON: schema, configuration, seed, package versions, progress) and,
-in a training run, ``state`` (all an uninterrupted run would need). Orbax writes a step
-beside the others and renames it, so a kill during a save leaves the previous one.
+weights), ``meta`` (JSON: schema, configuration, seed, package versions, progress),
+``policy.npz`` (weights and meta again, for inference without JAX) and, in a training
+run, ``state`` (all an uninterrupted run would need). Orbax writes a step beside the
+others and renames it, so a kill during a save leaves the previous one; ``policy.npz``
+follows, and a step that lost it is still read through orbax.
+
+    python -m jaxcal.learning.training.checkpoint FOLDER
+
+adds ``policy.npz`` to the newest step of a folder that has none.
 
 orbax calls this interface legacy and its successor is still experimental; it is used
 here alone, so that changing it touches one file.
@@ -13,11 +19,11 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
-import hashlib
 import importlib.metadata
 import logging
 import pathlib
 import platform
+import sys
 import tempfile
 from typing import Any
 
@@ -25,17 +31,22 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from jaxcal.learning.policies.networks import Network, NetworkConfig, build
+from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.build import build
+from jaxcal.learning.policies.networks import Network, NetworkConfig
+from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.checkpoint_folder import (
     CheckpointError,
     default_folder,
     newest_step,
     resolve,
 )
+from jaxcal.learning.runtime.weights import Weights
 
 __all__ = [
     "CheckpointError",
     "Policy",
+    "as_weights",
     "default_folder",
     "export",
     "fingerprint",
@@ -137,12 +148,9 @@ def save(
         state: what ``restore`` gives back, or None for a policy only.
         keep: older steps beyond these are deleted.
     """
-    meta = {
-        "schema": SCHEMA,
-        "version": VERSION,
-        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "versions": package_versions(),
-    } | meta
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    own: dict[str, Any] = {"schema": SCHEMA, "version": VERSION}
+    meta = own | {"created": now, "versions": package_versions()} | meta
     items = {
         "policy": ocp.args.StandardSave(_plain_keys(params)),
         "meta": ocp.args.JsonSave(meta),
@@ -150,8 +158,15 @@ def save(
     if state is not None:
         items["state"] = ocp.args.StandardSave(_plain_keys(state))
     with _manager(pathlib.Path(folder), keep, create=True) as manager:
-        if step not in manager.all_steps():
-            manager.save(step, args=ocp.args.Composite(**items))
+        if step in manager.all_steps():
+            return
+        manager.save(step, args=ocp.args.Composite(**items))
+    plain = _weights(NetworkConfig(**meta["network"]), params, meta)
+    weights.write(pathlib.Path(folder) / str(step) / weights.NAME, plain)
+
+
+def _weights(config: NetworkConfig, params: Any, meta: dict[str, Any]) -> Weights:
+    return Weights(dataclasses.asdict(config), weights.flat(params), meta)
 
 
 def _latest(folder: pathlib.Path) -> tuple[pathlib.Path, int, dict[str, Any]]:
@@ -213,18 +228,18 @@ def load(folder: str | pathlib.Path | None = None) -> Policy:
     return Policy(network, params, meta, root, step)
 
 
+def as_weights(policy: Policy) -> Weights:
+    """A policy as plain arrays, which ``policy.npz`` holds."""
+    return _weights(policy.network.config, policy.params, policy.meta)
+
+
 def fingerprint(folder: str | pathlib.Path | None = None) -> str:
     """SHA-256 of a policy's network and weights, the same wherever it lies.
 
     Raises:
         CheckpointError: see ``load``.
     """
-    policy = load(folder)
-    digest = hashlib.sha256(repr(policy.network.config).encode())
-    for keys, leaf in jax.tree_util.tree_leaves_with_path(policy.params):
-        digest.update(jax.tree_util.keystr(keys).encode())
-        digest.update(np.ascontiguousarray(leaf).tobytes())
-    return digest.hexdigest()
+    return as_weights(load(folder)).fingerprint
 
 
 def _check_weights(
@@ -239,13 +254,8 @@ def _check_weights(
             f"checkpoint {path} does not say what it was trained on: no {error}"
         ) from error
     expected = jax.eval_shape(
-        network.init,
-        jax.random.key(0),
-        jax.ShapeDtypeStruct((1, m, n), np.float32),
-        jax.ShapeDtypeStruct((1, m), bool),
-        jax.ShapeDtypeStruct((1, k), np.int32),
-        jax.ShapeDtypeStruct((1, m), bool),
-    )["params"]
+        lambda: networks.initial(network, jax.random.key(0), m, n, k)
+    )
     wanted, held = _shapes(expected), _shapes(params)
     if wanted != held:
         name = sorted(set(wanted.items()) ^ set(held.items()))[0][0]
@@ -331,3 +341,23 @@ def restore(folder: str | pathlib.Path, fresh: Any) -> tuple[Any, dict[str, Any]
         plain,
     )
     return state, meta
+
+
+def main(argv: list[str]) -> int:
+    """Add the weights file to the newest step of a checkpoint or run folder."""
+    if len(argv) != 1 or argv[0].startswith("-"):
+        print((__doc__ or "").partition("\n\n    ")[2].strip())
+        return 2
+    try:
+        policy = load(argv[0])
+        path = policy.folder / str(policy.step) / weights.NAME
+        weights.write(path, as_weights(policy))
+    except (CheckpointError, OSError) as error:
+        print(f"checkpoint: {error}", file=sys.stderr)
+        return 2
+    print(f"wrote {path}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

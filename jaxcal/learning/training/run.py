@@ -20,7 +20,8 @@ import numpy as np
 from jax.sharding import Mesh
 
 from jaxcal.files import atomic_write
-from jaxcal.learning.policies import decoding, networks
+from jaxcal.learning.policies import decoding
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import Network
 from jaxcal.learning.runtime import devices
 from jaxcal.learning.runtime.processes import losing_a_process
@@ -119,7 +120,7 @@ def train(
     """
     mesh = devices.make_mesh(num_devices)
     devices.require_divisible(config.ppo.sets_per_minibatch, mesh)
-    network = networks.build(config.network)
+    network = build(config.network)
     last = config.ppo.num_updates if num_updates is None else num_updates
     updates = _Updates(config, network, mesh, teacher, last)
     root = pathlib.Path(folder)

@@ -1,0 +1,179 @@
+"""Choosing by a checkpoint: its weights read once, its kind of network looked up.
+
+The compact network is inferred in numpy and numba and needs no JAX; any other kind goes
+through JAX, which the extra ``policy`` installs. Both read whitened or rescaled
+candidates, so pulses and degrees give the same pick.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import os
+import pathlib
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.extras import needs
+from jaxcal.learning.runtime import weights
+from jaxcal.learning.runtime.weights import Weights
+from jaxcal.selection.problem import Problem, make_problems, whole_number
+
+__all__ = ["DECODINGS", "Policy", "load_policy", "select_batch"]
+
+DECODINGS = ("greedy", "samples", "first", "exchange")
+
+_ROWS = 1_024  # candidates of all episodes in a piece of work: they fit a core's cache
+
+Indices = NDArray[np.int64]
+
+
+class Network(Protocol):
+    """Chooses for problems of one shape: the same M, n, k and number of required."""
+
+    def __call__(
+        self, problems: Sequence[Problem], decoding: str, num: int, seed: int
+    ) -> Indices:
+        """(B, k) indices, the required first, then in the order of choice."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Policy:
+    """A trained policy, ready to choose."""
+
+    kind: str  # of its network
+    meta: dict[str, Any]  # as saved with the checkpoint
+    choose: Network
+
+
+def load_policy(checkpoint: str | pathlib.Path | None = None) -> Policy:
+    """The newest policy of a checkpoint; read again only where its files have changed.
+
+    Args:
+        checkpoint: a checkpoint folder, a training run's, or a weights file; the
+            checkpoint that ships when None.
+
+    Raises:
+        ValueError: it is missing, damaged, or made by another version.
+        MissingExtraError: it needs JAX, which is not installed.
+    """
+    path = weights.locate(checkpoint)
+    # A checkpoint of version 1 may have no weights file: its step's folder tells.
+    state = (path if path.exists() else path.parent).stat()
+    return _loaded(path, (state.st_mtime_ns, state.st_size, state.st_ino))
+
+
+@functools.lru_cache(maxsize=8)
+def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Policy:
+    """Args: the weights file, there or not, and what changes when it is replaced."""
+    if path.exists():
+        found = weights.read(path)
+    else:
+        with needs("policy", f"checkpoint {path.parent}, which holds no {path.name},"):
+            from jaxcal.learning.training import checkpoint
+        found = checkpoint.as_weights(checkpoint.load(path.parent.parent))
+    kind = found.network["kind"]
+    choose = _compact(found) if kind == "compact" else _through_jax(path)
+    return Policy(kind, found.meta, choose)
+
+
+def _compact(found: Weights) -> Network:
+    from jaxcal.selection.policy.compact import CompactPolicy
+
+    network = CompactPolicy(found.network, found.arrays)
+
+    def piece(
+        problems: Sequence[Problem], first: int, decoding: str, num: int, seed: int
+    ) -> Indices:
+        draws = decoding == "samples"
+        sets = range(first, first + len(problems)) if draws else ()
+        return network.choose(
+            np.stack([problem.rows for problem in problems]),
+            np.stack([problem.available for problem in problems]),
+            np.stack([problem.required for problem in problems]),
+            problems[0].k,
+            decoding,
+            num,
+            [np.random.default_rng((seed, i)) for i in sets],
+        )
+
+    def choose(
+        problems: Sequence[Problem], decoding: str, num: int, seed: int
+    ) -> Indices:
+        tries = 1 if decoding == "greedy" else num
+        size = max(1, _ROWS // (len(problems[0].rows) * tries))
+        cuts = [problems[i : i + size] for i in range(0, len(problems), size)]
+        if len(cuts) == 1:
+            return piece(problems, 0, decoding, num, seed)
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            found = pool.map(
+                lambda i: piece(cuts[i], i * size, decoding, num, seed),
+                range(len(cuts)),
+            )
+            return np.concatenate(list(found))
+
+    return choose
+
+
+def _through_jax(path: pathlib.Path) -> Network:
+    with needs("policy", f"checkpoint {path.parent}, whose network is not compact,"):
+        from jaxcal.selection.policy.through_jax import JaxNetwork
+    return JaxNetwork(path.parent.parent)
+
+
+def select_batch(
+    candidates: ArrayLike,
+    k: int,
+    *,
+    available: ArrayLike | None = None,
+    required: ArrayLike | None = None,
+    decoding: str = "greedy",
+    num: int = 16,
+    seed: int = 0,
+    checkpoint: str | pathlib.Path | None = None,
+) -> Indices:
+    """Choose k postures for every candidate set of a batch.
+
+    What is chosen from a set does not depend on the other sets, nor on the number of
+    cores or devices. (The last two postures are the best pair; which of them is named
+    first, rounding may decide.)
+
+    Args:
+        candidates: (B, M, n) commands, none of the sets in one plane.
+        k: postures to choose, at least n + 1.
+        available: (B, M) bool, True where a candidate may be chosen; all by default.
+        required: (B, r) candidates that must be chosen; the policy goes on from them.
+        decoding: "greedy": the likeliest at every step, one pass; "samples": the best
+            of ``num`` sampled passes; "first": the best of the ``num`` likeliest first
+            picks, each completed greedily; "exchange": greedy, then Fedorov exchange
+            from there.
+        num: passes of "samples" and "first".
+        seed: of "samples"; set b draws from ``numpy.random.default_rng((seed, b))``.
+        checkpoint: see ``load_policy``.
+
+    Returns:
+        (B, k) distinct indices, required ones first, then in the order of choice.
+
+    Raises:
+        ValueError: naming the argument, the rule and the value; or what is wrong with
+            the checkpoint.
+    """
+    if decoding not in DECODINGS:
+        raise ValueError(
+            f"decoding must be one of {', '.join(DECODINGS)}, got {decoding!r}"
+        )
+    num, seed = whole_number("num", num, 1), whole_number("seed", seed, 0)
+    problems = make_problems(candidates, k, available=available, required=required)
+    climbs = decoding == "exchange"
+    choose = load_policy(checkpoint).choose
+    indices = choose(problems, "greedy" if climbs else decoding, num, seed)
+    if climbs:
+        from jaxcal.selection.exchange.exchange import exchange_from
+
+        found = zip(problems, indices, strict=True)
+        indices = np.stack([exchange_from(problem, start) for problem, start in found])
+    return indices

@@ -1,0 +1,321 @@
+"""The policy without JAX against the policy in JAX, and what a rig relies on."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxcal.extras import MissingExtraError
+from jaxcal.information.regression import log_det_gram
+from jaxcal.learning.environments.selection import SelectionConfig
+from jaxcal.learning.policies import decoding, networks
+from jaxcal.learning.policies.build import build
+from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.runtime import weights
+from jaxcal.learning.runtime.checkpoint_folder import default_folder
+from jaxcal.learning.training import checkpoint
+from jaxcal.selection.policy import select_batch
+from jaxcal.selection.policy.compact import CompactPolicy, _Sets
+from jaxcal.selection.policy.kernel import look_ahead
+from jaxcal.selection.problem import make_problems
+
+
+def drawn(rng, sets, m, n, k, masked=0.0, required=0):
+    """Random problems, and their candidates, mask and required postures."""
+    candidates = rng.uniform(size=(sets, m, n))
+    available = rng.uniform(size=(sets, m)) >= masked
+    available[:, : k + 1] = True
+    kept = rng.permuted(np.tile(np.arange(k), (sets, 1)), axis=1)[:, :required]
+    given = {"available": available, "required": kept}
+    return make_problems(candidates, k, **given), candidates, available, kept
+
+
+def whitened(problems):
+    """(B, M, n) what JAX is given: it whitens again."""
+    return np.stack([p.rows[:, :-1] * np.sqrt(p.available.sum()) for p in problems])
+
+
+SHAPES = [  # M, n, k, masked, required, decoding
+    (20, 3, 4, 0.0, 0, "greedy"),
+    (16, 3, 6, 0.3, 2, "greedy"),
+    (12, 2, 3, 0.2, 0, "first"),
+    *(
+        pytest.param(*shape, marks=pytest.mark.slow)
+        for shape in (
+            (50, 3, 4, 0.0, 0, "greedy"),
+            (50, 3, 12, 0.0, 0, "greedy"),
+            (30, 4, 7, 0.2, 1, "first"),
+            (30, 5, 6, 0.2, 0, "greedy"),
+            (30, 6, 8, 0.0, 0, "greedy"),
+            (1100, 3, 4, 0.0, 0, "greedy"),
+        )
+    ),
+]
+
+
+@pytest.mark.parametrize(("m", "n", "k", "masked", "required", "how"), SHAPES)
+def test_the_picks_are_those_of_jax(rng, m, n, k, masked, required, how):
+    number = 20 if m > 1000 else 200
+    problems, sets, available, kept = drawn(rng, number, m, n, k, masked, required)
+    policy = checkpoint.load()
+    expected = np.asarray(
+        decoding.choose(
+            policy.network,
+            policy.params,
+            jnp.asarray(whitened(problems), jnp.float32),
+            jnp.asarray(available),
+            jnp.asarray(kept, jnp.int32),
+            jax.random.key(0),
+            k=k,
+            num_required=required,
+            decoding=how,
+            num=4,
+        )
+    )
+    found = select_batch(
+        sets, k, available=available, required=kept, decoding=how, num=4
+    )
+    np.testing.assert_array_equal(found[:, :required], kept)
+    # The last two are one pair: rounding decides which of them is named first.
+    same = (np.sort(found, axis=1) == np.sort(expected, axis=1)).all(axis=1)
+    value, other = (
+        log_det_gram(np.take_along_axis(sets, picks[..., None], axis=1))
+        for picks in (found, expected)
+    )
+    assert (same | (abs(value - other) < 1e-6)).mean() >= 0.995
+
+
+VARIANTS = [
+    None,  # the one that ships
+    NetworkConfig(width=8, encoder_rounds=1, decoder_rounds=2, endgame=False),
+    NetworkConfig(width=8, encoder_rounds=0, messages=False, lookahead=2),
+]
+
+
+@pytest.mark.parametrize("config", VARIANTS)
+@pytest.mark.parametrize(("n", "k", "made"), [(2, 3, 0), (3, 6, 2), (3, 6, 4)])
+def test_the_scores_are_those_of_jax_in_double_precision(rng, key, config, n, k, made):
+    problems, _, available, _ = drawn(rng, 5, 14, n, k, masked=0.3)
+    if config is None:
+        held = checkpoint.load()
+        config, params = held.network.config, held.params
+    else:
+        points = jnp.zeros((1, 14, n)), jnp.ones((1, 14), bool)
+        chosen = jnp.full((1, k), -1)
+        init = build(config).init(key, *points, chosen, points[1])
+        scale = np.random.default_rng(1)
+        params = jax.tree.map(
+            lambda leaf: np.float32(leaf + 0.3 * scale.normal(size=leaf.shape)),
+            init["params"],
+        )
+    network = build(config)
+    chosen = np.full((5, k), -1)
+    chosen[:, :made] = np.arange(made)
+    free = available.copy()
+    free[:, :made] = False
+    with jax.enable_x64(True):
+        double = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
+        view = network.look(jnp.asarray(whitened(problems)), jnp.asarray(available))
+        memory = networks.encode(network, double, view)
+        given = view, memory, jnp.asarray(chosen, jnp.int32), jnp.asarray(free)
+        logits, _ = decoding.logits_at(network, double, *given, made)
+    ours = CompactPolicy(dataclasses.asdict(config), weights.flat(params))
+    x = np.stack([p.rows.T * np.sqrt(p.available.sum()) for p in problems])
+    own = ours._encoded(np.ascontiguousarray(x), available)
+    np.testing.assert_allclose(own, memory, rtol=1e-4, atol=1e-4)
+    scores = ours._scores(_Sets(x, own, chosen, free), made)
+    assert np.isneginf(scores[~free]).all()
+    np.testing.assert_allclose(
+        scores[free], np.asarray(logits)[free], rtol=1e-4, atol=1e-4
+    )
+
+
+@pytest.mark.parametrize("spanned", [True, False])
+def test_the_look_ahead_is_greedy_choice_by_determinants(rng, spanned):
+    p, m, depth = 4, 9, 4
+    y = rng.normal(size=(p, m))
+    active = np.arange(m) != 3
+    y[:, ~active] = 0.0
+    values = np.empty((4, m))
+    look_ahead(y, active, spanned, depth, values)
+
+    def log_volume(subset):
+        gram = y[:, subset].T @ y[:, subset] + spanned * np.eye(len(subset))
+        return np.linalg.slogdet(gram)[1]
+
+    for i in np.flatnonzero(active):
+        subset = [i]
+        for d in range(depth):
+            assert values[d, i] == pytest.approx(log_volume(subset), abs=1e-9)
+            rest = [j for j in np.flatnonzero(active) if j not in subset]
+            subset.append(max(rest, key=lambda j: log_volume([*subset, j])))
+    assert (values[:, 3] == -30.0).all()
+
+
+def test_of_many_candidates_the_512_of_largest_gain_are_starts(rng):
+    y = rng.normal(size=(4, 1100))
+    values = np.empty((4, 1100))
+    look_ahead(y, np.ones(1100, bool), False, 2, values)
+    started = values[1] > -30.0
+    assert started.sum() == 512
+    square = (y**2).sum(axis=0)
+    assert square[started].min() > square[~started].max()
+
+
+def test_samples_are_drawn_from_the_policy(rng):
+    config = NetworkConfig(width=4, encoder_rounds=1, endgame=False)
+    network = build(config)
+    problems, _, available, _ = drawn(rng, 1, 6, 2, 3)
+    begin = jnp.zeros((1, 6, 2)), jnp.ones((1, 6), bool), jnp.full((1, 3), -1)
+    params = network.init(jax.random.key(0), *begin, begin[1])["params"]
+    policy = CompactPolicy(dataclasses.asdict(config), weights.flat(params))
+    rows = np.repeat(problems[0].rows[None], 4000, axis=0)
+    mask = np.repeat(available, 4000, axis=0)
+    streams = [np.random.default_rng((1, b)) for b in range(4000)]
+    picks = policy.choose(
+        rows, mask, np.zeros((4000, 0), np.int64), 3, "samples", 1, streams
+    )
+    x = np.ascontiguousarray(np.matrix_transpose(rows[:1])) * np.sqrt(6)
+    none = np.full((1, 3), -1)
+    scores = policy._scores(
+        _Sets(x, policy._encoded(x, mask[:1]), none, mask[:1].copy()), 0
+    )[0]
+    expected = np.exp(scores - scores.max())
+    expected /= expected.sum()
+    share = np.bincount(picks[:, 0], minlength=6) / 4000
+    np.testing.assert_allclose(share, expected, atol=0.03)
+
+
+def test_what_is_chosen_depends_on_no_other_set(rng):
+    sets = rng.uniform(size=(60, 20, 3))
+    np.testing.assert_array_equal(
+        select_batch(sets, 4),
+        np.concatenate([select_batch(one[None], 4) for one in sets]),
+    )
+    drawn = select_batch(sets, 6, decoding="samples", num=2, seed=3)
+    first = select_batch(sets[:1], 6, decoding="samples", num=2, seed=3)
+    np.testing.assert_array_equal(drawn[:1], first)
+    again = select_batch(sets, 6, decoding="samples", num=2, seed=3)
+    np.testing.assert_array_equal(drawn, again)
+    assert (drawn != select_batch(sets, 6, decoding="samples", num=2, seed=4)).any()
+
+
+def copy_of_the_shipped(folder: pathlib.Path) -> pathlib.Path:
+    shutil.copytree(default_folder(), folder)
+    return folder
+
+
+def test_weights_that_were_replaced_are_read_again(rng, tmp_path):
+    folder = copy_of_the_shipped(tmp_path / "policy")
+    sets = rng.uniform(size=(30, 20, 3))
+    before = select_batch(sets, 6, checkpoint=folder)
+    path = weights.locate(folder)
+    held = weights.read(path)
+    held.arrays["trust"] = np.float32(-1.0)  # away from the look-ahead
+    weights.write(path, held)
+    retrained = select_batch(sets, 6, checkpoint=folder)
+    assert (retrained != before).any()
+    np.testing.assert_array_equal(
+        select_batch(sets, 6, checkpoint=path), retrained
+    )  # the file itself
+
+
+def test_a_folder_without_the_weights_file_gives_the_same_answer(
+    rng, tmp_path, monkeypatch
+):
+    folder = copy_of_the_shipped(tmp_path / "policy")
+    weights.locate(folder).unlink()
+    sets = rng.uniform(size=(10, 20, 3))
+    np.testing.assert_array_equal(
+        select_batch(sets, 4, checkpoint=folder), select_batch(sets, 4)
+    )
+    other = copy_of_the_shipped(tmp_path / "other")
+    weights.locate(other).unlink()
+    monkeypatch.delitem(sys.modules, "jaxcal.learning.training.checkpoint")
+    monkeypatch.delattr(sys.modules["jaxcal.learning.training"], "checkpoint")
+    monkeypatch.setitem(sys.modules, "orbax", None)
+    monkeypatch.setitem(sys.modules, "orbax.checkpoint", None)
+    with pytest.raises(MissingExtraError, match=r"policy\.npz.*jaxcal\[policy\]"):
+        select_batch(sets, 4, checkpoint=other)
+
+
+@pytest.fixture(scope="module")
+def papers(tmp_path_factory):
+    """A checkpoint of the paper's network, not trained."""
+    config = NetworkConfig(kind="paper", width=16)
+    network = build(config)
+    points = jnp.zeros((1, 10, 3)), jnp.ones((1, 10), bool), jnp.full((1, 4), -1)
+    params = network.init(jax.random.key(0), *points, points[1])["params"]
+    environment = dataclasses.asdict(SelectionConfig(num_candidates=10))
+    folder = tmp_path_factory.mktemp("paper")
+    meta = {
+        "network": dataclasses.asdict(config),
+        "tasks": [{"environment": environment}],
+    }
+    checkpoint.save(folder, 1, params, meta)
+    return folder
+
+
+def test_a_papers_pick_depends_on_no_other_set(rng, papers):
+    inside = rng.uniform(0.3, 0.6, size=(8, 10, 3))
+    outside = 100.0 * rng.uniform(size=(8, 10, 3))
+    settings = dict(jax.config.values)
+    alone = select_batch(inside, 4, checkpoint=papers)
+    mixed = select_batch(np.concatenate([inside, outside]), 4, checkpoint=papers)
+    np.testing.assert_array_equal(mixed[:8], alone)
+    assert dict(jax.config.values) == settings  # the caller's own
+
+
+def test_deciding_needs_no_jax():
+    code = (
+        "import json, sys, numpy as np, jaxcal\n"
+        "points = np.random.default_rng(0).random((30, 3))\n"
+        "chosen = jaxcal.select(points, 4, 'policy').indices.tolist()\n"
+        "heavy = {'jax', 'flax', 'orbax', 'scipy.linalg'} & set(sys.modules)\n"
+        "print(json.dumps([chosen, sorted(heavy)]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    points = np.random.default_rng(0).random((1, 30, 3))
+    assert json.loads(done.stdout) == [select_batch(points, 4)[0].tolist(), []]
+
+
+def test_commands_alone_have_jax_keep_compiled_code(tmp_path):
+    code = (
+        "import sys\n"
+        "from jaxcal.learning.runtime import cache\n"
+        "if 'late' in sys.argv: import jax\n"
+        "cache.keep_compiled_programs()\n"
+        "print('jax' in sys.modules)\n"
+        "import jax\n"
+        "print(jax.config.jax_compilation_cache_dir)"
+    )
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    environment["XDG_CACHE_HOME"] = str(tmp_path)
+
+    def run(*argv, **more):
+        done = subprocess.run(
+            [sys.executable, "-c", code, *argv],
+            env=environment | more,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        return done.stdout.split()
+
+    ours = str(tmp_path / "jaxcal" / "jax")
+    assert run() == ["False", ours]
+    assert run("late") == ["True", ours]
+    own = str(tmp_path / "own")
+    assert run(JAX_COMPILATION_CACHE_DIR=own) == ["False", own]
