@@ -1,8 +1,8 @@
 """Fedorov exchange with random restarts: near-optimal in milliseconds, no proof.
 
 Each start is a random selection that is not singular; each chosen posture in turn is
-swapped for the candidate that raises det most, until no swap helps. Source: Fedorov, Theory of Optimal Experiments, 1972; Cook and
-Nachtsheim 1980 for one posture at a time.
+swapped for the candidate that raises det most, until no swap helps. Source: Fedorov,
+Theory of Optimal Experiments, 1972; Cook and Nachtsheim 1980 for one posture at a time.
 """
 
 from __future__ import annotations
