@@ -32,7 +32,7 @@ _COMMANDS = {
     "select, method policy": [
         "-c",
         "import numpy as np, jaxcal;"
-        "jaxcal.select(np.random.default_rng(0).random((50, 3)), 4)",
+        "jaxcal.select(np.random.default_rng(0).random((50, 3)), 4, 'policy')",
     ],
 }
 

@@ -24,7 +24,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "benchmarks"))
 
 import replanning
 
-REST = ((4, 2), (4, 3), (6, 1), (6, 2), (6, 3))  # each compiles a program of its own
+REST = ((4, 2), (4, 3), (6, 1), (6, 2), (6, 3))
 
 
 def conditional_optimum(candidates, k, required, available):
@@ -112,7 +112,7 @@ def test_a_lost_posture_never_helps_and_a_found_one_never_hurts(rng):
 
 def test_what_is_complete_already_is_left_alone(rng):
     candidates = rng.uniform(size=(14, 3))
-    found = jaxcal.select(candidates, 4, required=[3, 9, 1, 7])
+    found = jaxcal.select(candidates, 4, "policy", required=[3, 9, 1, 7])
     assert found.indices.tolist() == [3, 9, 1, 7]
 
 

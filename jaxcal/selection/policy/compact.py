@@ -200,7 +200,7 @@ class CompactPolicy:
             inner += np.matrix_transpose(seen.moments) @ (sent @ mix[width:])
         inner += shared[:, None]
         np.maximum(inner, 0.0, out=inner)
-        out: Array32 = inner @ weights[f"{name}.out.kernel"]
+        out: Array32 = np.matmul(inner, weights[f"{name}.out.kernel"])
         out += weights[f"{name}.out.bias"]
         out *= seen.active[..., None]
         out += h
