@@ -28,7 +28,7 @@ evaluate: $(READY) ## compare every method with the proven optimum on 1,000 unse
 	$(BIN)/python evaluate.py $(ARGS)
 
 reproduce: $(READY) ## the paper's figures, tables and claims from our own runs, in report/index.html
-	$(BIN)/python -m jaxcal.paper.reproduce $(ARGS)
+	$(BIN)/python -m jaxcal.paper $(ARGS)
 
 test: lint ## set everything up, lint, and run the quick tests (the ones CI runs)
 	$(BIN)/python -m pytest -n 2 --dist loadgroup -m 'not slow' $(ARGS)
@@ -36,10 +36,11 @@ test: lint ## set everything up, lint, and run the quick tests (the ones CI runs
 test-all: lint ## every test, the slow ones too
 	$(BIN)/python -m pytest $(ARGS)
 
-lint: $(READY) ## ruff (lint and format) and mypy
+lint: $(READY) ## ruff (lint and format), mypy and the import contracts
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 format: $(READY) ## let ruff rewrite what it can
 	$(BIN)/ruff check --fix .

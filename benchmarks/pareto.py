@@ -1,7 +1,7 @@
 """The time of a run against its D-efficiency: the Pareto front, table and figure.
 
     python benchmarks/pareto.py [--candidates 50] [--k 4,5,6] [--least 0.7] [--seed 1]
-                                [--beside policy,lookahead] [--figure pareto.png]
+                                [--beside lookahead] [--figure pareto.png]
 
 Candidates are uniform in +-20 degrees on three axes that move at 20 deg/s, accelerate
 at 100 deg/s^2 and settle for 1 s; the run starts at the zero posture. Beside each
@@ -19,7 +19,7 @@ import pathlib
 import numpy as np
 
 from jaxcal.selection import select
-from jaxcal.selection.fastest.fastest import (
+from jaxcal.selection.fastest import (
     Motion,
     ParetoFront,
     fastest_tour,

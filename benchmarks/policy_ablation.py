@@ -37,19 +37,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcal.evaluation.validation import teacher
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.information.regression import log_det_information
 from jaxcal.learning.environments import scenarios
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies import decoding
-from jaxcal.learning.policies.networks import CompactNetwork, NetworkConfig, View
+from jaxcal.learning.policies.compact import CompactNetwork
+from jaxcal.learning.policies.features import CandidateFeatures, DecisionFeatures
+from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import cache
 from jaxcal.learning.training import presets
 from jaxcal.learning.training import run as training
 from jaxcal.learning.training.checkpoint import package_versions
 from jaxcal.selection import exact_batch, greedy_batch, select
 from jaxcal.selection.policy import select_batch
+from jaxcal.selection.teacher import teacher
 
 HIT = 1e-9
 PARTS = ("unlearned", "shipped", "tasks", "time", "trained")
@@ -69,12 +71,12 @@ class Unlearned(CompactNetwork):
     def setup(self) -> None:
         """No parameters."""
 
-    def encode(self, view: View) -> jax.Array:
-        return view["features"][..., :1]
+    def encode(self, features: CandidateFeatures) -> jax.Array:
+        return features.vectors.columns[..., :1]
 
-    def finish(self, glance: View) -> tuple[jax.Array, jax.Array]:
-        score = glance["ahead"][..., self.column]
-        return jnp.where(glance["active"], score, -1e9), score.max(-1)
+    def finish(self, decision: DecisionFeatures) -> tuple[jax.Array, jax.Array]:
+        score = decision.vectors.ahead[..., self.column]
+        return jnp.where(decision.vectors.active, score, -1e9), score.max(-1)
 
 
 def unlearned(
@@ -158,7 +160,7 @@ def uniform_sets(num: int, m: int, k: int, n: int, seed: int) -> np.ndarray:
 
 
 def shaped_sets(num: int, name: str, seed: int) -> np.ndarray:
-    """(num, 50, 3) candidates of one shape of ``jaxcal.learning.environments.scenarios``."""
+    """(num, 50, 3) candidates of one shape of ``environments.scenarios``."""
     draw = scenarios.mixture(SelectionConfig(), (name,))
     keys = jax.random.split(jax.random.key(seed), num)
     return np.asarray(jax.jit(jax.vmap(draw))(keys)[0], np.float64)
@@ -257,7 +259,7 @@ def trained(
         "num_episodes": num,
         "seed": seed,
     }
-    config = presets.with_values(presets.PRESETS["compact"], values)
+    config = presets.with_values(presets.load("compact"), values)
     with tempfile.TemporaryDirectory() as folder:
         run = pathlib.Path(folder) / "run"
         begun = time.perf_counter()

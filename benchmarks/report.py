@@ -38,15 +38,17 @@ def text(row: dict[str, Any]) -> str:
             f"{number(line['value']):>12} {line['unit']}{note}"
         )
     for verdict in row["verdicts"]:
-        out.append("  " + judged(verdict))
+        out.append("  " + judged(verdict, row["quick"]))
     out += [f"  note: {note}" for note in row["notes"]]
     return "\n".join(out)
 
 
-def judged(verdict: dict[str, Any]) -> str:
-    """What was wanted and what came out."""
+def judged(verdict: dict[str, Any], quick: bool) -> str:
+    """What was wanted and what came out; a quick run is too small to be judged."""
     sign = "at least" if verdict["larger"] else "at most"
     met = "met" if verdict["met"] else "MISSED"
+    if quick:
+        met = "not judged (--quick)"
     note = f", {verdict['note']}" if verdict["note"] else ""
     return (
         f"{verdict['case']}: {number(verdict['value'])} {verdict['unit']}, wanted "
@@ -76,7 +78,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
             )
         if row["verdicts"]:
             out.append("")
-        out += [f"- {judged(verdict)}" for verdict in row["verdicts"]]
+        out += [f"- {judged(verdict, row['quick'])}" for verdict in row["verdicts"]]
         out += [f"- {note}" for note in row["notes"]]
     return "\n".join(out) + "\n"
 
@@ -99,6 +101,8 @@ def overview(results: dict[str, dict[str, Any]]) -> Any:
 
     bars = []
     for row in results.values():
+        if row["quick"]:
+            continue
         for verdict in row["verdicts"]:
             value, target = verdict["value"], verdict["target"]
             if value is None or value <= 0:

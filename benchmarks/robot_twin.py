@@ -1,10 +1,10 @@
-"""What the robot's twin does: closed form against MuJoCo, and what each flaw costs.
+"""The robot's twin: closed form against MuJoCo, and the error that each flaw causes.
 
     python benchmarks/robot_twin.py
 
-Prints the tables of docs/robot.md: how far the closed form and MuJoCo are apart, what a
-wrong Euler order, a phone askew, play and compliance leave behind the best A and b, how
-often the intervals of dataset0 hold Table 1, and the seconds it all takes.
+Prints the tables of docs/robot.md: how far the closed form and MuJoCo are apart, the
+residual of the best A and b under a wrong Euler order, a misaligned phone, play and
+compliance, how often the intervals of dataset0 hold Table 1, and the seconds it takes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 import jaxcal
-from jaxcal.paper.datasets.datasets import BIAS_DEG, SCALE, make_dataset
+from jaxcal.paper.datasets import BIAS_DEG, SCALE, make_dataset
 from jaxcal.paper.twin.robot import ORDERS, RobotConfig, measure, read_out
 from jaxcal.paper.twin.robot_model import simulate
 
@@ -47,7 +47,7 @@ def agreement() -> None:
     )
     robots = {
         "ideal, Table 1": RobotConfig(),
-        "wrong order, phone askew": crooked,
+        "wrong order, phone misaligned": crooked,
         "the same, bending under 2 kg": soft,
         "play of 0.5 deg": RobotConfig(backlash_deg=0.5),
     }
@@ -78,9 +78,9 @@ def flaws() -> None:
             config = RobotConfig(scale, bias, "YXZ", order)
             rms, top, off = left_over(commands, read_out(config, commands))
             print(f"    read as {order}: {rms:.4f}, {top:.3f}; {off:.4f}")
-    turn = 3.0 / np.sqrt(3.0)
+    turned = RobotConfig(mounting_deg=(3.0 / np.sqrt(3.0),) * 3)
     rows = {
-        "phone askew by 3 deg about (1, 1, 1)": RobotConfig(mounting_deg=(turn,) * 3),
+        "phone misaligned by 3 deg about (1, 1, 1)": turned,
         "play of 0.5 deg, random order": RobotConfig(backlash_deg=0.5),
         "compliance 0.14 deg/Nm, 1 kg": RobotConfig(compliance_deg_per_nm=0.14),
         "compliance 0.95 deg/Nm, 1 kg": RobotConfig(compliance_deg_per_nm=0.95),

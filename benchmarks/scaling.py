@@ -15,23 +15,24 @@ import time
 
 import jax
 
-from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.runtime import cache, devices
-from jaxcal.learning.training import ppo, presets
+from jaxcal.learning.training import optimiser, ppo, presets
 
 
 def measure(preset: str, number: int, num_updates: int) -> dict[str, float]:
     """Seconds an update on so many devices, compilation left out."""
-    config = presets.PRESETS[preset]
+    config = presets.load(preset)
     settings = dataclasses.replace(config.ppo, num_episodes=10**8)
-    network = networks.build(config.network)
+    network = build(config.network)
     mesh = devices.make_mesh(number)
     devices.require_divisible(settings.sets_per_minibatch, mesh)
-    state = devices.replicate(ppo.init(settings, config.tasks[0], network), mesh)
+    state = devices.replicate(optimiser.init(settings, config.tasks[0], network), mesh)
+    update = ppo.updater(settings, config.tasks[0], network, mesh)
     for warm in (True, False):
         wall, used = time.perf_counter(), time.process_time()
         for _ in range(1 if warm else num_updates):
-            state, _ = ppo.update(state, settings, config.tasks[0], network, mesh)
+            state, _ = update(state)
         jax.block_until_ready(state.num_updates)
         wall, used = time.perf_counter() - wall, time.process_time() - used
         if warm:
@@ -48,7 +49,7 @@ def measure(preset: str, number: int, num_updates: int) -> dict[str, float]:
 def main() -> None:
     """A JSON line for each number of devices."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--preset", choices=sorted(presets.PRESETS), default="compact")
+    parser.add_argument("--preset", choices=presets.names(), default="compact")
     parser.add_argument("--devices", default="1,2,4,8", help="comma separated")
     parser.add_argument("--updates", type=int, default=10)
     arguments = parser.parse_args()

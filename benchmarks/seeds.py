@@ -53,7 +53,7 @@ def main() -> None:
     sets = np.random.default_rng(20261122).random((arguments.sets, 50, 3))
     optimum = exact_batch(sets, 4)
     assert optimum.proven.all()
-    budget = arguments.episodes or presets.PRESETS["compact"].ppo.num_episodes
+    budget = arguments.episodes or presets.load("compact").ppo.num_episodes
     print(f"compact preset, {budget:,} episodes, {arguments.sets} sets")
     print(f"{'seed':>8}" + "".join(f"{name:>12}" for name in NAMES) + "   trained (s)")
     with tempfile.TemporaryDirectory() as scratch:
@@ -62,7 +62,7 @@ def main() -> None:
         for seed in seeds:
             folder = root / f"seed_{seed}"
             values = {"seed": seed, "num_episodes": budget}
-            config = presets.with_values(presets.PRESETS["compact"], values)
+            config = presets.with_values(presets.load("compact"), values)
             begun = time.perf_counter()
             train_seed(config, folder, validate=False)
             seconds = time.perf_counter() - begun

@@ -11,7 +11,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from jaxcal.calibration.identify import Calibration, identify
+    from jaxcal.calibration import Calibration, identify
     from jaxcal.information.regression import (
         hat_matrix,
         information_matrix,
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
         regression_matrix,
     )
     from jaxcal.selection import Selection, score, select
-    from jaxcal.selection.fastest.fastest import Motion, pareto_front, select_fastest
+    from jaxcal.selection.fastest import Motion, pareto_front, select_fastest
     from jaxcal.selection.plan import plan
 
 __all__ = [
@@ -43,15 +43,15 @@ __all__ = [
 __version__ = "0.1.0"
 
 _HOME = {
-    "Calibration": "jaxcal.calibration.identify",
-    "identify": "jaxcal.calibration.identify",
+    "Calibration": "jaxcal.calibration",
+    "identify": "jaxcal.calibration",
     "plan": "jaxcal.selection.plan",
     "Selection": "jaxcal.selection",
     "score": "jaxcal.selection",
     "select": "jaxcal.selection",
-    "Motion": "jaxcal.selection.fastest.fastest",
-    "pareto_front": "jaxcal.selection.fastest.fastest",
-    "select_fastest": "jaxcal.selection.fastest.fastest",
+    "Motion": "jaxcal.selection.fastest",
+    "pareto_front": "jaxcal.selection.fastest",
+    "select_fastest": "jaxcal.selection.fastest",
 }
 
 

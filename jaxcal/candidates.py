@@ -1,9 +1,8 @@
-"""Candidate postures: joint ranges, normalised coordinates, sampling, availability.
+"""Candidate postures: joint ranges, normalised coordinates, sampling.
 
 Selection by D-optimality does not depend on the unit (an affine map multiplies det S
 of every subset by one constant), so postures may stay in degrees; ``normalise`` is for
-the paper's [0, 1] inputs. Randomness comes from a ``numpy.random.Generator`` that the
-caller makes from a seed.
+the paper's [0, 1] inputs.
 """
 
 from __future__ import annotations
@@ -14,9 +13,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import axis_names, in_words, numbers
+from jaxcal.checks import axis_names, numbers
 
-__all__ = ["JointRanges", "draw_from_pool", "random_availability", "uniform_candidates"]
+__all__ = ["JointRanges", "draw_from_pool", "uniform_candidates"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -24,7 +23,7 @@ Mask = NDArray[np.bool_]
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
 class JointRanges:
-    """Least and greatest command of each axis."""
+    """Least and greatest command of each axis; both ends are copied and frozen."""
 
     low: Array  # (n,)
     high: Array  # (n,)
@@ -41,15 +40,13 @@ class JointRanges:
                 f"{lower.shape} and {upper.shape}"
             )
         axes = axis_names("names", names, "u", len(lower))
-        bad = np.flatnonzero(~(lower < upper))
-        if bad.size:
-            i = int(bad[0])
+        for i in np.flatnonzero(lower >= upper):
             raise ValueError(
                 f"low must be below high on every axis, got [{lower[i]:.6g}, "
                 f"{upper[i]:.6g}] on {axes[i]}"
             )
+        lower, upper = lower.copy(), upper.copy()
         for name, value in (("low", lower), ("high", upper)):
-            value = value.copy()
             value.setflags(write=False)
             object.__setattr__(self, name, value)
         object.__setattr__(self, "names", axes)
@@ -85,23 +82,6 @@ class JointRanges:
         points = self._points(commands)
         return np.all((points >= self.low) & (points <= self.high), axis=-1)
 
-    def require(self, commands: ArrayLike) -> None:
-        """Refuse commands outside the ranges.
-
-        Raises:
-            ValueError: naming the first posture outside, its axis and its range.
-        """
-        points = self._points(commands)
-        outside = (points < self.low) | (points > self.high)
-        if outside.any():
-            where = tuple(int(i) for i in np.argwhere(outside)[0])
-            axis = where[-1]
-            raise ValueError(
-                f"commands must lie within the joint ranges, got "
-                f"{in_words(points[where[:-1]])} at {where[:-1]}: {self.names[axis]} "
-                f"is outside [{self.low[axis]:.6g}, {self.high[axis]:.6g}]"
-            )
-
     def _points(self, commands: ArrayLike) -> Array:
         points = numbers("commands", commands)
         if points.ndim < 1 or points.shape[-1] != self.num_inputs:
@@ -117,72 +97,49 @@ def uniform_candidates(
     num_candidates: int,
     ranges: JointRanges | int = 3,
 ) -> Array:
-    """Candidate sets drawn uniformly within the ranges.
+    """(B, M, n) candidate sets drawn uniformly within the ranges, in their unit.
 
     Args:
         rng: source of the draw.
         num_sets: B.
         num_candidates: M.
         ranges: the joint ranges, or n for [0, 1] on each of n axes.
-
-    Returns:
-        (B, M, n) in the ranges' unit.
     """
-    box = _unit_cube(ranges) if isinstance(ranges, int) else ranges
-    for name, value in (("num_sets", num_sets), ("num_candidates", num_candidates)):
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
-    unit = rng.random((num_sets, num_candidates, box.num_inputs))
-    return box.low + unit * box.span
-
-
-def random_availability(
-    rng: np.random.Generator, num_sets: int, num_candidates: int, num_available: int
-) -> Mask:
-    """Masks with exactly ``num_available`` candidates left, every such mask as likely.
-
-    Returns:
-        (B, M) bool, True where a candidate may be chosen.
-    """
-    if not 1 <= num_available <= num_candidates:
-        raise ValueError(
-            f"num_available must be in [1, {num_candidates}], got {num_available}"
-        )
-    ranks = np.argsort(rng.random((num_sets, num_candidates)), axis=1)
-    return ranks < num_available
+    _require_count("num_sets", num_sets)
+    _require_count("num_candidates", num_candidates)
+    if isinstance(ranges, int):
+        _require_count("ranges given as a number of axes", ranges)
+        return rng.random((num_sets, num_candidates, ranges))
+    unit = rng.random((num_sets, num_candidates, ranges.num_inputs))
+    return ranges.low + unit * ranges.span
 
 
 def draw_from_pool(
     rng: np.random.Generator, pool_size: int, num_sets: int, num_candidates: int
 ) -> NDArray[np.int64]:
-    """Indices of candidate sets drawn from one pool of recorded postures.
+    """(B, M) indices of candidate sets drawn from one pool of recorded postures.
 
-    Within a set no posture comes twice; between sets it may.
+    Within a set no posture comes twice; between sets it may. ``pool[indices]`` are the
+    candidates, and ``measured[indices]`` what was measured there.
 
     Args:
         rng: source of the draw.
         pool_size: postures in the pool.
         num_sets: B.
         num_candidates: M, at most ``pool_size``.
-
-    Returns:
-        (B, M) indices; ``pool[indices]`` are the candidates, and ``measured[indices]``
-        what was measured there.
     """
     if not 1 <= num_candidates <= pool_size:
         raise ValueError(
             f"num_candidates must be in [1, {pool_size}], the size of the pool, "
             f"got {num_candidates}"
         )
-    if num_sets < 1:
-        raise ValueError(f"num_sets must be at least 1, got {num_sets}")
+    _require_count("num_sets", num_sets)
     draws = [
         rng.choice(pool_size, num_candidates, replace=False) for _ in range(num_sets)
     ]
     return np.stack(draws).astype(np.int64)
 
 
-def _unit_cube(num_inputs: int) -> JointRanges:
-    if num_inputs < 1:
-        raise ValueError(f"ranges must be of at least 1 axis, got {num_inputs}")
-    return JointRanges(np.zeros(num_inputs), np.ones(num_inputs))
+def _require_count(name: str, value: int) -> None:
+    if value < 1:
+        raise ValueError(f"{name} must be at least 1, got {value}")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,9 +15,14 @@ __all__ = [
     "in_words",
     "noise_levels",
     "numbers",
+    "one_of",
     "relative_weights",
+    "require_finite",
+    "seconds",
+    "share",
     "table",
     "text",
+    "whole_number",
 ]
 
 Array = NDArray[np.float64]
@@ -39,10 +46,16 @@ def numbers(name: str, values: ArrayLike, *, finite: bool = True) -> Array:
         raise ValueError(
             f"{name} must be an array of numbers, got {type(values).__name__}"
         ) from error
-    if finite and not np.isfinite(array).all():
-        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise ValueError(f"{name} must be finite, got {array[where]} at {where}")
+    if finite:
+        require_finite(name, array)
     return array
+
+
+def require_finite(name: str, array: Array) -> None:
+    bad = ~np.isfinite(array)
+    if bad.any():
+        where = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise ValueError(f"{name} must be finite, got {array[where]} at {where}")
 
 
 def table(name: str, values: ArrayLike) -> Array:
@@ -98,3 +111,46 @@ def text(argument: str, value: str) -> str:
     if not isinstance(value, str):
         raise ValueError(f"{argument} must be text, got {value!r}")
     return value
+
+
+def one_of(argument: str, value: Any, choices: Sequence[str]) -> str:
+    """``value`` where it is one of the choices, else a ValueError that lists them."""
+    if not isinstance(value, str) or value not in choices:
+        raise ValueError(
+            f"{argument} must be one of {', '.join(choices)}, got {value!r}"
+        )
+    return value
+
+
+def whole_number(argument: str, value: Any, least: int) -> int:
+    """``value`` as an int of at least ``least``; True and False are no numbers."""
+    try:
+        if isinstance(value, bool | np.bool_):
+            raise TypeError
+        number = operator.index(value)
+    except TypeError:
+        raise ValueError(f"{argument} must be a whole number, got {value!r}") from None
+    if number < least:
+        raise ValueError(f"{argument} must be at least {least}, got {number}")
+    return number
+
+
+def share(argument: str, value: Any) -> float:
+    """``value`` as a float in (0, 1]."""
+    if not _is_number(value) or not 0.0 < value <= 1.0:
+        raise ValueError(f"{argument} must be in (0, 1], got {value!r}")
+    return float(value)
+
+
+def seconds(argument: str, value: Any) -> float:
+    """``value`` as a time limit above 0 s; infinity is no limit."""
+    if not _is_number(value) or not value > 0.0:
+        raise ValueError(
+            f"{argument} must be a number above 0 in seconds, got {value!r}"
+        )
+    return float(value)
+
+
+def _is_number(value: Any) -> bool:
+    number = isinstance(value, int | float | np.integer | np.floating)
+    return number and not isinstance(value, bool)

@@ -13,17 +13,6 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "ORDERS",
-    "Frame",
-    "angle_between_deg",
-    "euler_to_matrix",
-    "matrix_to_euler",
-    "mean_rotation",
-    "quaternion_to_matrix",
-    "small_rotation",
-]
-
 Array = NDArray[np.float64]
 ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
 _INDEX = {"X": 0, "Y": 1, "Z": 2}

@@ -10,6 +10,7 @@ import pytest
 from jaxcal.learning.environments import selection as environment
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 
 CONFIG = SelectionConfig()
@@ -79,7 +80,7 @@ def test_the_pytorch_peer_has_the_same_network(rng, folded):
     everything = jnp.ones((3, 50), bool)
     chosen = jnp.asarray([[3, 9, -1, -1]] * 3)
     free = everything.at[:, chosen[0, :2]].set(False)
-    network = networks.build(NetworkConfig(kind="paper", width=48))
+    network = build(NetworkConfig(kind="paper", width=48))
 
     @jax.jit
     def scored(key):
@@ -87,10 +88,10 @@ def test_the_pytorch_peer_has_the_same_network(rng, folded):
         params = jax.tree.map(
             lambda leaf: leaf + 0.05 * jax.random.normal(key, leaf.shape), params
         )
-        view = network.look(sets, everything)
-        memory = networks.encode(network, params, view)
-        glance = network.look_at(view, chosen, free, 2)
-        return params, networks.decode(network, params, memory, glance)
+        features = network.candidate_features(sets, everything)
+        memory = networks.encode(network, params, features)
+        decision = network.decision_features(features, chosen, free, 2)
+        return params, networks.decode(network, params, memory, decision)
 
     params, (logits, value) = scored(jax.random.key(1))
     peer = PaperTorch(48, folded=folded)
@@ -121,3 +122,14 @@ def test_random_actions_are_uniform_over_what_is_left():
     units = (jnp.arange(47) + 0.5) / 47
     actions = random_action(jnp.tile(chosen, (47, 1)), 3, units)
     assert sorted(np.asarray(actions).tolist()) == sorted(set(range(50)) - {7, 0, 49})
+
+
+@pytest.mark.parametrize(("quick", "said"), [(False, "MISSED"), (True, "not judged")])
+def test_a_quick_run_is_not_judged(quick, said):
+    from benchmarks import report
+    from benchmarks.harness import Row, Verdict
+
+    row = Row("training", "title", verdicts=[Verdict("against brax", None, 10.0)])
+    shown = report.as_json(row) | {"quick": quick}
+    assert said in report.text(shown)
+    assert ("MISSED" in report.text(shown)) is not quick

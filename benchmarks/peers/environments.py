@@ -1,7 +1,8 @@
 """The selection task as others would write it: Gymnasium, and NumPy over a batch.
 
 Both give jaxcal's numbers: observation (210 for M = 50), reward and end are those of
-``jaxcal.learning.environments.selection`` on the same candidates; ``tests/test_benchmarks.py``
+``jaxcal.learning.environments.selection`` on the same candidates;
+``tests/test_benchmarks.py``
 compares them.
 """
 

@@ -1,6 +1,6 @@
 """The paper's network and its PPO update in plain PyTorch, as one would write it.
 
-The same function as ``jaxcal.learning.policies.networks.PaperNetwork`` (keys are made for every
+The same function as ``jaxcal.paper.network.PaperNetwork`` (keys are made for every
 candidate, as attention is usually written; ``folded=True`` takes the query to the
 candidates instead, as jaxcal does) and the same update as the ``paper`` preset: 16
 episodes, 10 epochs, Adam, clipped by global norm, averaged weights.

@@ -62,7 +62,7 @@ def ours(which: str, sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
     from jaxcal.learning.training import run as training
 
     cache.keep_compiled_programs()
-    config = presets.PRESETS["compact"]
+    config = presets.load("compact")
     if which == "observation":
         config = presets.with_values(
             config, {"kind": "paper", "width": 64, "num_episodes": 800_000}
@@ -85,17 +85,16 @@ def ours(which: str, sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
 
 def brax(sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
     """``python train.py --trainer brax``: brax's own PPO, the network 64 wide."""
-    from jaxcal.learning.policies import networks
-    from jaxcal.learning.policies.networks import NetworkConfig
+    from jaxcal.learning.policies.build import build
     from jaxcal.learning.runtime import cache
     from jaxcal.learning.training import brax_ppo, presets
     from jaxcal.learning.training import run as training
 
     cache.keep_compiled_programs()
     config = presets.with_values(
-        presets.PRESETS["compact"], {"num_episodes": 3_000_000}
+        brax_ppo.adapted(presets.load("compact")), {"num_episodes": 3_000_000}
     )
-    network = networks.build(NetworkConfig(kind="paper", width=64))
+    network = build(config.network)
     validation = training.Validation(sets, best, 3)
 
     def watch(step: int, params: Any) -> None:

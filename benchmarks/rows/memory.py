@@ -42,17 +42,19 @@ _UPDATE = (
     + """
 import dataclasses, jax
 from jaxcal.learning.runtime import cache
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies import networks
-from jaxcal.learning.training import ppo, presets
+from jaxcal.learning.training import optimiser, ppo, presets
 cache.keep_compiled_programs()
-config = presets.with_values(presets.PRESETS["compact"], {
+config = presets.with_values(presets.load("compact"), {
     "episodes_per_update": EPISODES, "num_minibatches": EPISODES // 512})
-network = networks.build(config.network)
+network = build(config.network)
 jax.devices()
 before = mib("VmRSS")
-state = ppo.init(config.ppo, config.tasks[0], network)
+state = optimiser.init(config.ppo, config.tasks[0], network)
+update = ppo.updater(config.ppo, config.tasks[0], network)
 for _ in range(2):
-    state, metrics = ppo.update(state, config.ppo, config.tasks[0], network)
+    state, metrics = update(state)
     float(metrics["reward_mean"])
 print(json.dumps({"before": before, "last": mib("VmRSS"), "peak": mib("VmHWM")}))
 """
@@ -65,7 +67,7 @@ import dataclasses, tempfile
 from jaxcal.learning.runtime import cache
 from jaxcal.learning.training import presets, run as training
 cache.keep_compiled_programs()
-config = presets.with_values(presets.PRESETS["compact"], {
+config = presets.with_values(presets.load("compact"), {
     "episodes_per_update": 16, "episodes_per_set": 4, "num_minibatches": 1,
     "num_epochs": 1, "width": 8, "encoder_rounds": 1, "num_candidates": 8,
     "num_episodes": 16 * UPDATES})

@@ -17,8 +17,8 @@ from benchmarks.harness import (
     interleaved,
     median_ratio,
 )
-from jaxcal.learning.policies import networks
-from jaxcal.learning.training import ppo, presets
+from jaxcal.learning.policies.build import build
+from jaxcal.learning.training import optimiser, ppo, presets
 
 NAME = "throughput"
 TITLE = "Training throughput, paper preset (3.5 M parameters)"
@@ -28,12 +28,13 @@ _WIDTH, _M, _K, _N, _EPOCHS = 768, 50, 4, 3, 10
 
 def ours() -> Callable[[], None]:
     """An update of the paper preset."""
-    config = presets.PRESETS["paper"]
-    network = networks.build(config.network)
-    held = [ppo.init(config.ppo, config.tasks[0], network)]
+    config = presets.load("paper")
+    network = build(config.network)
+    step = ppo.updater(config.ppo, config.tasks[0], network)
+    held = [optimiser.init(config.ppo, config.tasks[0], network)]
 
     def update() -> None:
-        state, metrics = ppo.update(held[0], config.ppo, config.tasks[0], network)
+        state, metrics = step(held[0])
         held[0] = state
         jax.block_until_ready(metrics["reward_mean"])
 
@@ -108,9 +109,9 @@ def run(budget: Budget) -> Row:
                 "against PyTorch", median_ratio(times["PyTorch"], times["jaxcal"]), 2.0
             )
         )
-    config = presets.PRESETS["paper"]
-    network = networks.build(config.network)
-    state = ppo.init(config.ppo, config.tasks[0], network)
+    config = presets.load("paper")
+    network = build(config.network)
+    state = optimiser.init(config.ppo, config.tasks[0], network)
     flops, peak = floor_gigaflops(), peak_gigaflops()
     moved = floor_gigabytes(sum(leaf.size for leaf in jax.tree.leaves(state.params)))
     bandwidth = copy_bandwidth() / 1e9

@@ -5,179 +5,148 @@ Everything under ``derived`` is for other programs to read and is ignored on loa
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import pathlib
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
 
+from jaxcal.calibration.fit import AffineFit
 from jaxcal.files import write_text
 
-if TYPE_CHECKING:
-    from jaxcal.calibration.identify import Calibration
-
-__all__ = ["FORMAT", "VERSION", "load", "save"]
+__all__ = ["FORMAT", "VERSION", "fields", "read", "save", "to_dict"]
 
 FORMAT = "jaxcal-calibration"
 VERSION = 1
 
-# Shapes of the arrays, in terms of n inputs, m outputs and any number N of rows.
-_ARRAYS: dict[str, tuple[str, ...]] = {
-    "matrix": ("m", "n"),
-    "bias": ("m",),
-    "residuals": ("N", "m"),
-    "centre": ("n",),
-    "scale": ("n",),
-    "slope_covariance": ("n", "n"),
-}
-_OPTIONAL_ARRAYS = {"noise_std": ("m",), "residual_std": ("m",)}
-_POSITIVE = {"condition_number", "scaled_condition_number", "total_weight"}
-_COUNTS = {"noise_dof": 0, "dof": 0, "num_measurements": 1}
+_NAMES = {"input_names": "n", "output_names": "m"}
 _TEXTS = ("command_unit", "measured_unit")
+# Shapes in terms of n inputs, m outputs and any number N of rows; "" for one number.
+_SHAPES = {
+    "matrix": "mn",
+    "bias": "m",
+    "residuals": "Nm",
+    "noise_std": "m",
+    "residual_std": "m",
+    "residual_std_overall": "",
+    "condition_number": "",
+    "scaled_condition_number": "",
+    "centre": "n",
+    "scale": "n",
+    "slope_covariance": "nn",
+    "total_weight": "",
+}
+_COUNTS = {"noise_dof": 0, "dof": 0, "num_measurements": 1}  # and their least value
+_MAY_BE_NULL = ("noise_std", "residual_std", "residual_std_overall")
+_POSITIVE = ("scale", "condition_number", "scaled_condition_number", "total_weight")
 
 
-def save(calibration: Calibration, path: str | os.PathLike[str]) -> None:
-    """Write the file atomically."""
+def to_dict(self: AffineFit) -> dict[str, Any]:
+    """The content of the file: names, numbers and lists, as JSON has them."""
     content: dict[str, Any] = {"format": FORMAT, "version": VERSION}
-    content |= {name: getattr(calibration, name).tolist() for name in _ARRAYS}
-    for name in _OPTIONAL_ARRAYS:
-        value = getattr(calibration, name)
-        content[name] = None if value is None else value.tolist()
-    for name in ("noise_known", "residual_std_overall", *_POSITIVE, *_COUNTS, *_TEXTS):
-        content[name] = getattr(calibration, name)
-    content["input_names"] = list(calibration.input_names)
-    content["output_names"] = list(calibration.output_names)
-    content["provenance"] = dict(calibration.provenance)
-    covariance = calibration.covariance
+    content |= {key: list(getattr(self, key)) for key in _NAMES}
+    for key in (*_TEXTS, *_SHAPES, *_COUNTS, "noise_known", "provenance"):
+        value = copy.deepcopy(getattr(self, key))
+        content[key] = value.tolist() if isinstance(value, np.ndarray) else value
+    covariance = self.covariance
     content["derived"] = {
-        "parameter_names": list(calibration.parameter_names),
-        "parameters": calibration.parameters.tolist(),
+        "parameter_names": list(self.parameter_names),
+        "parameters": self.parameters.tolist(),
         "covariance": None if covariance is None else covariance.tolist(),
     }
-    head = ["format", "version", "input_names", "output_names", *_TEXTS]
-    ordered = {key: content[key] for key in [*head, *(k for k in content)]}
-    write_text(path, json.dumps(ordered, indent=1, allow_nan=False) + "\n")
+    return content
 
 
-def load(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The fields of a ``Calibration``, checked.
+def save(self: AffineFit, path: str | os.PathLike[str]) -> None:
+    """Write a versioned JSON file atomically; see ``docs/calibration.md``.
 
     Raises:
-        OSError: the file cannot be read.
-        ValueError: naming the file and what is wrong in it.
+        OSError: the folder is missing, not writable or full; the old file stays.
     """
-    where = os.fspath(path)
+    write_text(path, json.dumps(to_dict(self), indent=1, allow_nan=False) + "\n")
 
-    def fail(problem: str) -> NoReturn:
-        raise ValueError(f"{where}: {problem}") from None
+
+def read(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """``fields`` of a file; a ValueError names the file as well."""
 
     def constant(text: str) -> NoReturn:
-        fail(f"holds {text}, where only finite numbers are allowed")
+        raise ValueError(f"holds {text}, where only finite numbers are allowed")
 
     data = pathlib.Path(path).read_bytes()
     try:
-        content = json.loads(data.decode("utf-8"), parse_constant=constant)
+        return fields(json.loads(data.decode("utf-8"), parse_constant=constant))
     except json.JSONDecodeError as error:
-        fail(f"not JSON: {error.msg} in line {error.lineno}")
+        problem = f"not JSON: {error.msg} in line {error.lineno}"
     except (UnicodeDecodeError, RecursionError):
-        fail("not JSON: not text")
+        problem = "not JSON: not text"
+    except ValueError as error:
+        problem = str(error)
+    raise ValueError(f"{os.fspath(path)}: {problem}")
+
+
+def fields(content: Any) -> dict[str, Any]:
+    """The arguments of a calibration from the content of its file, checked.
+
+    Raises:
+        ValueError: naming the key and what is wrong with it.
+    """
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        fail(f'not a calibration: "format" is not "{FORMAT}"')
+        raise ValueError(f'not a calibration: "format" is not "{FORMAT}"')
     if content.get("version") != VERSION:
-        fail(
+        raise ValueError(
             f"a calibration of version {content.get('version')!r}, this jaxcal reads "
             f"version {VERSION}"
         )
-    try:
-        return _fields(content)
-    except ValueError as error:
-        fail(str(error))
-
-
-def _fields(content: dict[str, Any]) -> dict[str, Any]:
-    def get(key: str) -> Any:
+    found: dict[str, Any] = {}
+    for key in (*_SHAPES, *_COUNTS, *_TEXTS, *_NAMES, "noise_known", "provenance"):
         if key not in content:
             raise ValueError(f'key "{key}" is missing')
-        return content[key]
+        found[key] = content[key]
 
-    fields: dict[str, Any] = {}
+    def require(holds: bool, key: str, rule: str) -> None:
+        if not holds:
+            raise ValueError(f'"{key}" must {rule}, got {found[key]!r}')
+
     sizes: dict[str, int] = {}
-    for key, shape in _ARRAYS.items():
-        fields[key] = _array(key, get(key), shape, sizes)
-    for key, shape in _OPTIONAL_ARRAYS.items():
-        value = get(key)
-        fields[key] = None if value is None else _array(key, value, shape, sizes)
-        if value is not None and (fields[key] < 0.0).any():
-            raise ValueError(f'"{key}" must not be negative')
-    if (fields["scale"] <= 0.0).any():
-        raise ValueError('"scale" must be positive')
-    for key in _POSITIVE:
-        fields[key] = _number(key, get(key))
-        if fields[key] <= 0.0:
-            raise ValueError(f'"{key}" must be positive, got {fields[key]}')
+    for key, shape in _SHAPES.items():
+        if found[key] is None and key in _MAY_BE_NULL:
+            continue
+        array = _array(key, found[key], shape, sizes)
+        require(key not in _POSITIVE or bool((array > 0.0).all()), key, "be positive")
+        least = 0.0 if key in _MAY_BE_NULL else -np.inf
+        require(bool((array >= least).all()), key, "not be negative")
+        found[key] = array if shape else float(array)
     for key, least in _COUNTS.items():
-        value = get(key)
-        if type(value) is not int or value < least:
-            raise ValueError(
-                f'"{key}" must be a whole number >= {least}, got {value!r}'
-            )
-        fields[key] = value
-    overall = get("residual_std_overall")
-    fields["residual_std_overall"] = (
-        None if overall is None else _number("residual_std_overall", overall)
-    )
-    if not isinstance(get("noise_known"), bool):
-        raise ValueError(
-            f'"noise_known" must be true or false, got {get("noise_known")}'
-        )
-    fields["noise_known"] = get("noise_known")
-    _consistent_noise(fields)
+        whole = type(found[key]) is int and found[key] >= least
+        require(whole, key, f"be a whole number >= {least}")
     for key in _TEXTS:
-        if not isinstance(get(key), str):
-            raise ValueError(f'"{key}" must be text, got {get(key)!r}')
-        fields[key] = get(key)
-    for key, size in (("input_names", sizes["n"]), ("output_names", sizes["m"])):
-        names = get(key)
-        if (
-            not isinstance(names, list)
-            or len(names) != size
-            or not all(isinstance(name, str) for name in names)
-        ):
-            raise ValueError(f'"{key}" must hold {size} names, got {names!r}')
-        fields[key] = tuple(names)
-    if not isinstance(get("provenance"), dict):
-        raise ValueError('"provenance" must be an object')
-    fields["provenance"] = get("provenance")
-    return fields
+        require(isinstance(found[key], str), key, "be text")
+    for key, letter in _NAMES.items():
+        kinds = [type(x) for x in found[key]] if isinstance(found[key], list) else None
+        require(kinds == [str] * sizes[letter], key, f"hold {sizes[letter]} names")
+        found[key] = tuple(found[key])
+    require(isinstance(found["noise_known"], bool), "noise_known", "be true or false")
+    require(isinstance(found["provenance"], dict), "provenance", "be an object")
+    _require_consistent_noise(found)
+    return found
 
 
-def _consistent_noise(fields: dict[str, Any]) -> None:
+def _require_consistent_noise(found: dict[str, Any]) -> None:
     """A noise level must have a source: given, or degrees of freedom."""
-    if fields["noise_known"] and fields["noise_std"] is None:
+    if found["noise_known"] and found["noise_std"] is None:
         raise ValueError('"noise_known" is true but "noise_std" is null')
-    if not fields["noise_known"] and (fields["noise_std"] is None) != (
-        fields["noise_dof"] == 0
-    ):
-        raise ValueError('"noise_std" and "noise_dof" contradict each other')
-    for key in ("residual_std", "residual_std_overall"):
-        if (fields[key] is None) != (fields["dof"] == 0):
-            raise ValueError(f'"{key}" and "dof" contradict each other')
+    sources = [("residual_std", "dof"), ("residual_std_overall", "dof")]
+    if not found["noise_known"]:
+        sources.append(("noise_std", "noise_dof"))
+    for key, freedom in sources:
+        if (found[key] is None) != (found[freedom] == 0):
+            raise ValueError(f'"{key}" and "{freedom}" contradict each other')
 
 
-def _number(key: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f'"{key}" must be a number, got {value!r}')
-    if not np.isfinite(float(value)):
-        raise ValueError(f'"{key}" must be finite, got {value}')
-    return float(value)
-
-
-def _array(
-    key: str, value: Any, shape: tuple[str, ...], sizes: dict[str, int]
-) -> NDArray[np.float64]:
-    """Numbers of the shape named; sizes not known yet are learned."""
+def _array(key: str, value: Any, shape: str, sizes: dict[str, int]) -> Any:
+    """float64 array with an axis per letter; sizes not known yet are learned."""
     try:
         array = np.asarray(value)
     except ValueError:
@@ -192,6 +161,4 @@ def _array(
             raise ValueError(f'"{key}" must have shape ({want}), got {array.shape}')
     if not np.isfinite(array).all():
         raise ValueError(f'"{key}" must be finite')
-    array = array.astype(np.float64)
-    array.setflags(write=False)
-    return array
+    return array.astype(np.float64)

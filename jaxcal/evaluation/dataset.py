@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,6 +70,18 @@ class Dataset:
     def num_outputs(self) -> int:
         """m: that of ``measured``, or n where nothing was measured."""
         return self.num_inputs if self.measured is None else self.measured.shape[2]
+
+    def facts(self) -> dict[str, Any]:
+        """Name, sizes and origin, as reports and JSON documents give them."""
+        return {
+            "name": self.name,
+            "episodes": self.num_episodes,
+            "num_candidates": self.num_candidates,
+            "num_inputs": self.num_inputs,
+            "num_outputs": self.num_outputs,
+            "seed": self.seed,
+            "sha256": self.sha256,
+        }
 
     def first(self, episodes: int) -> Dataset:
         """The first episodes only.

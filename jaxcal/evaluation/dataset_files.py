@@ -9,7 +9,6 @@ optionally ``,y_x,y_y,y_z`` and ``,available``; any columns ``u_...`` are inputs
 
 from __future__ import annotations
 
-import csv
 import hashlib
 import io
 import os
@@ -17,15 +16,14 @@ import pathlib
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterable
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges
-from jaxcal.checks import axis_letter
 from jaxcal.evaluation.dataset import Dataset
+from jaxcal.evaluation.dataset_csv import read_csv, save_csv, save_csv_parts
 from jaxcal.files import atomic_write
 
 __all__ = ["load_dataset", "save_csv", "save_csv_parts", "save_npz"]
@@ -61,18 +59,11 @@ def load_dataset(path: str | os.PathLike[str]) -> Dataset:
         if file.suffix.lower() == ".npz":
             fields = _read_npz(data)
         elif file.suffix.lower() == ".csv":
-            fields = _read_csv(data)
+            fields = read_csv(data)
         else:
             raise ValueError("a dataset must be a .npz or .csv file")
-        candidates, measured, available, ranges = fields
-        return Dataset(
-            name=file.name,
-            candidates=candidates,
-            measured=measured,
-            available=available,
-            ranges=ranges,
-            sha256=hashlib.sha256(data).hexdigest(),
-        )
+        sha256 = hashlib.sha256(data).hexdigest()
+        return Dataset(name=file.name, sha256=sha256, **fields)
     except ValueError as error:
         raise ValueError(f"{os.fspath(path)}: {error}") from None
 
@@ -94,55 +85,8 @@ def save_npz(dataset: Dataset, path: str | os.PathLike[str]) -> None:
         np.savez(file, allow_pickle=False, **arrays)
 
 
-def save_csv(dataset: Dataset, path: str | os.PathLike[str]) -> None:
-    """Write a .csv atomically, every number with all its digits; ranges are not kept.
-
-    Raises:
-        OSError: the folder is missing, not writable or full.
-    """
-    save_csv_parts([dataset], path)
-
-
-def save_csv_parts(parts: Iterable[Dataset], path: str | os.PathLike[str]) -> None:
-    """Write one .csv of a dataset that comes in parts, each with as many columns.
-
-    Raises:
-        OSError: the folder is missing, not writable or full.
-    """
-    with atomic_write(path) as file:
-        episode = 0
-        for dataset in parts:
-            text = io.StringIO()
-            writer = csv.writer(text, lineterminator="\n")
-            if episode == 0:
-                writer.writerow(_header(dataset))
-            _write_rows(writer, dataset, episode)
-            file.write(text.getvalue().encode("utf-8"))
-            episode += dataset.num_episodes
-
-
-def _header(dataset: Dataset) -> list[str]:
-    n, m = dataset.num_inputs, dataset.num_outputs
-    header = ["episode", "candidate", *(f"u_{axis_letter(i, n)}" for i in range(n))]
-    if dataset.measured is not None:
-        header += [f"y_{axis_letter(i, m)}" for i in range(m)]
-    return header if dataset.available is None else [*header, "available"]
-
-
-def _write_rows(writer: Any, dataset: Dataset, first_episode: int) -> None:
-    columns = [dataset.candidates]
-    if dataset.measured is not None:
-        columns.append(dataset.measured)
-    for e, episode in enumerate(np.concatenate(columns, axis=2).tolist()):
-        for i, row in enumerate(episode):
-            mask = [] if dataset.available is None else [int(dataset.available[e, i])]
-            writer.writerow([first_episode + e, i, *row, *mask])
-
-
-_Fields = tuple[Array, Array | None, NDArray[np.bool_] | None, JointRanges | None]
-
-
-def _read_npz(data: bytes) -> _Fields:
+def _read_npz(data: bytes) -> dict[str, Any]:
+    """The fields of a ``Dataset``."""
     try:
         archive = np.load(io.BytesIO(data), allow_pickle=False)
     except (*_DAMAGE, ValueError):
@@ -154,23 +98,25 @@ def _read_npz(data: bytes) -> _Fields:
         if "candidates" not in keys:
             found = ", ".join(sorted(keys)) or "nothing"
             raise ValueError(f'key "candidates" is missing, found {found}')
-        candidates = _cube("candidates", _member(archive, "candidates"))
-        measured = available = ranges = None
-        if "measured" in keys:
-            measured = _cube("measured", _member(archive, "measured"))
+        fields: dict[str, Any] = {
+            key: _cube(key, _member(archive, key))
+            for key in ("candidates", "measured")
+            if key in keys
+        }
         if "available" in keys:
-            available = _mask(_member(archive, "available"))
+            fields["available"] = _mask(_member(archive, "available"))
         if {"low", "high"} & keys:
             if not {"low", "high"} <= keys:
                 raise ValueError('keys "low" and "high" must come together')
-            low, high = (_member(archive, key) for key in ("low", "high"))
-            ranges = JointRanges(low, high)
-            if ranges.num_inputs != candidates.shape[2]:
+            ranges = JointRanges(_member(archive, "low"), _member(archive, "high"))
+            width = fields["candidates"].shape[2]
+            if ranges.num_inputs != width:
                 raise ValueError(
-                    f'"low" and "high" must hold {candidates.shape[2]} numbers, got '
+                    f'"low" and "high" must hold {width} numbers, got '
                     f"{ranges.num_inputs}"
                 )
-    return candidates, measured, available, ranges
+            fields["ranges"] = ranges
+    return fields
 
 
 def _member(archive: np.lib.npyio.NpzFile, key: str) -> NDArray[np.generic]:
@@ -210,117 +156,3 @@ def _mask(array: NDArray[np.generic]) -> NDArray[np.bool_]:
     if array.dtype.kind not in "biuf" or not np.isin(array, (0, 1)).all():
         raise ValueError('key "available" must hold true and false (or 1 and 0)')
     return array.astype(np.bool_)
-
-
-def _read_csv(data: bytes) -> _Fields:
-    try:
-        reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""))
-        table = _Table(reader)
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise ValueError(f"line {line}: not UTF-8 text") from None
-    except csv.Error as error:
-        raise ValueError(f"line {reader.line_num}: {error}") from None
-    count = table.require_rectangle()
-    order = np.lexsort((table.candidate, table.episode))
-    values = table.values[order].reshape(-1, count, table.values.shape[1])
-    n, m = table.num_inputs, table.num_outputs
-    return (
-        values[..., :n],
-        values[..., n : n + m] if m else None,
-        values[..., -1] == 1.0 if table.has_available else None,
-        None,
-    )
-
-
-class _Table:
-    """The lines of a .csv, parsed and checked one by one."""
-
-    def __init__(self, reader: Any) -> None:  # csv.reader's type has no name
-        rows = iter(reader)
-        header = [name.strip() for name in next(rows, [])]
-        inputs = [name for name in header if name.startswith("u_")]
-        outputs = [name for name in header if name.startswith("y_")]
-        self.has_available = "available" in header
-        self.num_inputs, self.num_outputs = len(inputs), len(outputs)
-        known = ["episode", "candidate", *inputs, *outputs]
-        known += ["available"] if self.has_available else []
-        for name in ("episode", "candidate"):
-            if name not in header:
-                self._fail(1, f'column "{name}" is missing, found {",".join(header)}')
-        if not inputs:
-            self._fail(1, 'no input column ("u_x", ...) in the header')
-        for name in header:
-            if name not in known:
-                self._fail(1, f'unknown column "{name}"')
-            if header.count(name) > 1:
-                self._fail(1, f'column "{name}" comes twice')
-        place = [header.index(name) for name in known]
-        episodes, candidates, values = [], [], []
-        self.lines: list[int] = []
-        for row in rows:
-            line: int = reader.line_num
-            if not any(cell.strip() for cell in row):
-                continue
-            if len(row) != len(header):
-                self._fail(line, f"{len(row)} cells, {len(header)} in the header")
-            cells = [row[i] for i in place]
-            episodes.append(self._whole(line, "episode", cells[0]))
-            candidates.append(self._whole(line, "candidate", cells[1]))
-            values.append(
-                [
-                    self._number(line, name, cell)
-                    for name, cell in zip(known[2:], cells[2:], strict=True)
-                ]
-            )
-            if self.has_available and values[-1][-1] not in (0.0, 1.0):
-                self._fail(line, f'"available" must be 0 or 1, got {cells[-1]!r}')
-            self.lines.append(line)
-        if not values:
-            raise ValueError("no candidates below the header")
-        self.episode = np.array(episodes)
-        self.candidate = np.array(candidates)
-        self.values = np.array(values)
-
-    def require_rectangle(self) -> int:
-        """M; every episode must have as many candidates, each of them once."""
-        seen: dict[tuple[int, int], int] = {}
-        pairs = zip(self.episode.tolist(), self.candidate.tolist(), strict=True)
-        for line, pair in zip(self.lines, pairs, strict=True):
-            if pair in seen:
-                self._fail(
-                    line,
-                    f"candidate {pair[1]} of episode {pair[0]} was already given in "
-                    f"line {seen[pair]}",
-                )
-            seen[pair] = line
-        labels, counts = np.unique(self.episode, return_counts=True)
-        ragged = np.flatnonzero(counts != counts[0])
-        if ragged.size:
-            raise ValueError(
-                f"every episode must have as many candidates: episode {labels[0]} has "
-                f"{counts[0]}, episode {labels[ragged[0]]} has {counts[ragged[0]]}"
-            )
-        return int(counts[0])
-
-    @staticmethod
-    def _fail(line: int, problem: str) -> NoReturn:
-        raise ValueError(f"line {line}: {problem}")
-
-    def _whole(self, line: int, name: str, cell: str) -> int:
-        try:
-            number = int(cell)
-        except ValueError:
-            self._fail(line, f'"{name}" must be a whole number, got {cell!r}')
-        if abs(number) > 2**53:
-            self._fail(line, f'"{name}" is out of range, got {cell!r}')
-        return number
-
-    def _number(self, line: int, name: str, cell: str) -> float:
-        try:
-            number = float(cell)
-        except ValueError:
-            self._fail(line, f'"{name}" must be a number, got {cell!r}')
-        if not np.isfinite(number):
-            self._fail(line, f'"{name}" must be finite, got {cell!r}')
-        return number

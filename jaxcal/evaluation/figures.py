@@ -5,16 +5,18 @@ Functions return a matplotlib ``Figure`` and touch no file and no global state.
 
 from __future__ import annotations
 
+import itertools
 import pathlib
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
 from jaxcal.evaluation.parameters import parameter_names
-from jaxcal.evaluation.results import Evaluation, MethodResult
+from jaxcal.evaluation.results import Evaluation, MethodResult, log_mean
 from jaxcal.plots import BLACK, COLOURS, GREY, MARKERS, STYLES, plain_axes
 
 __all__ = [
@@ -32,6 +34,10 @@ Array = NDArray[np.float64]
 
 _CURVE_POINTS = 600  # draw any step curve
 _SHOWN_EPISODES = 200  # more than these points side by side cannot be told apart
+_FIXED: dict[str, dict[str, Any]] = {  # the style of random and exact in every figure
+    "random": {"color": GREY, "linestyle": ":", "marker": "x"},
+    "exact": {"color": BLACK, "linestyle": "-", "marker": "*"},
+}
 
 
 def evaluation_figures(evaluation: Evaluation) -> dict[str, Figure]:
@@ -50,58 +56,40 @@ def evaluation_figures(evaluation: Evaluation) -> dict[str, Figure]:
 
 def det_per_episode(evaluation: Evaluation) -> Figure:
     """det S in each episode: the main method, the optimum and one random draw."""
-    figure, axes = _figure(8.0, 3.8)
-    shown = min(evaluation.dataset.num_episodes, _SHOWN_EPISODES)
+    figure, axes = _figure(evaluation, "det S per episode", 3.8)
+    total = evaluation.dataset.num_episodes
+    shown = min(total, _SHOWN_EPISODES)
     episodes = np.arange(1, shown + 1)
-    axes.plot(
-        episodes,
-        _log10(evaluation.random_log_det[:shown, 0]),
-        linestyle="none",
-        marker="x",
-        markersize=4,
-        color=GREY,
-        label="random, one draw",
-    )
-    axes.plot(
-        episodes,
-        _log10(evaluation.reference[:shown]),
-        color=BLACK,
-        linewidth=0.8,
-        label=_reference_name(evaluation),
-    )
+
+    def draw(log_det: Array, label: str, **look: Any) -> None:
+        axes.plot(episodes, _log10(log_det[:shown]), label=label, **look)
+
+    random = evaluation.random_log_det[:, 0]
+    draw(random, "random, one draw", ls="none", marker="x", ms=4, color=GREY)
+    draw(evaluation.reference, _reference_name(evaluation), lw=0.8, color=BLACK)
     main = _main(evaluation)
     if main is not None:
-        axes.plot(
-            episodes,
-            _log10(main.log_det[:shown, 0]),
-            linestyle="none",
-            marker="o",
-            markersize=3.5,
-            color=COLOURS[0],
-            label=_label(evaluation, main),
-        )
-    total = evaluation.dataset.num_episodes
+        look = {"ls": "none", "marker": "o", "ms": 3.5, "color": COLOURS[0]}
+        draw(main.log_det[:, 0], _label(evaluation, main), **look)
     part = "" if shown == total else f", first {shown} of {total:,}"
     axes.set_xlabel(f"episode{part}")
     axes.set_ylabel(_det_label(evaluation))
     _powers_of_ten(axes.yaxis)
     _legend(axes)
-    _title(axes, evaluation, "det S per episode")
     return figure
 
 
 def det_means(evaluation: Evaluation) -> Figure:
     """Mean det S by method with its 95 % interval, and how many times random it is."""
     results = _with_random(evaluation)
-    figure, axes = _figure(8.0, 0.9 + 0.42 * len(results))
+    height = 0.9 + 0.42 * len(results)
+    figure, axes = _figure(evaluation, "Mean det S by method", height)
     for row, (name, log_det, style) in enumerate(results):
         values = np.exp(log_det - log_det.max()).mean(axis=1)
         mean = values.mean()
         half = 1.96 * values.std() / np.sqrt(len(values))
-        shift = float(log_det.max()) / np.log(10.0)
-        centre = float(np.log10(mean)) + shift
-        low = float(np.log10(max(mean - half, 0.1 * mean))) + shift
-        high = float(np.log10(mean + half)) + shift
+        ends = np.array([max(mean - half, 0.1 * mean), mean, mean + half])
+        low, centre, high = np.log10(ends) + _log10(log_det.max())
         axes.errorbar(
             centre,
             row,
@@ -110,29 +98,29 @@ def det_means(evaluation: Evaluation) -> Figure:
             color=style["color"],
             capsize=3,
         )
-        times = np.exp(_log_mean(log_det) - _log_mean(evaluation.random_log_det))
-        text = "" if name == "random" else f"{times:,.0f} x random"
-        axes.annotate(
-            text,
-            (centre, row),
-            xytext=(0, 7),
-            textcoords="offset points",
-            ha="center",
-            fontsize=8,
-        )
+        if name != "random":
+            times = np.exp(log_mean(log_det) - log_mean(evaluation.random_log_det))
+            axes.annotate(
+                f"{times:,.0f} x random",
+                (centre, row),
+                xytext=(0, 7),
+                textcoords="offset points",
+                ha="center",
+                fontsize=8,
+            )
     axes.set_yticks(range(len(results)), [name for name, _, _ in results])
     axes.set_ylim(len(results) - 0.5, -0.7)
     axes.margins(x=0.12)
     axes.set_xlabel(f"mean {_det_label(evaluation)}, with its 95 % interval")
     _powers_of_ten(axes.xaxis)
-    _title(axes, evaluation, "Mean det S by method")
     return figure
 
 
 def det_distributions(evaluation: Evaluation) -> Figure:
     """Distribution of det S over the selections of each method, on a log scale."""
     results = _with_random(evaluation)
-    figure, axes = _figure(8.0, 1.1 + 0.42 * len(results))
+    height = 1.1 + 0.42 * len(results)
+    figure, axes = _figure(evaluation, "Distribution of det S", height)
     boxes = axes.boxplot(
         [_log10(log_det.ravel()) for _, log_det, _ in results],
         orientation="horizontal",
@@ -151,13 +139,12 @@ def det_distributions(evaluation: Evaluation) -> Figure:
         f"{_det_label(evaluation)}; box: quartiles and median, whiskers: 5 to 95 %"
     )
     _powers_of_ten(axes.xaxis)
-    _title(axes, evaluation, "Distribution of det S")
     return figure
 
 
 def gap_to_optimum(evaluation: Evaluation) -> Figure:
     """Share of selections that reach at least each fraction of the optimum."""
-    figure, axes = _figure(8.0, 4.0)
+    figure, axes = _figure(evaluation, "Gap to the optimum", 4.0)
     for name, log_det, style in _with_random(evaluation):
         behind = np.minimum(log_det - evaluation.reference[:, None], 0.0)
         ratio = np.exp(behind).ravel()
@@ -177,7 +164,6 @@ def gap_to_optimum(evaluation: Evaluation) -> Figure:
     axes.set_xlim(0.0, 1.005)
     axes.set_ylim(0.0, 1.02)
     _legend(axes)
-    _title(axes, evaluation, "Gap to the optimum")
     return figure
 
 
@@ -186,29 +172,22 @@ def best_so_far(evaluation: Evaluation) -> Figure:
 
     Of several draws an episode the median curve, with a band from 5 to 95 % of them.
     """
-    figure, axes = _figure(8.0, 3.8)
+    figure, axes = _figure(evaluation, "Best det S so far", 3.8)
     episodes = np.arange(1, evaluation.dataset.num_episodes + 1)
     for name, log_det, style in _with_random(evaluation):
         best = _log10(np.maximum.accumulate(log_det, axis=0))
-        label = name
-        if best.shape[1] > 1:
-            low, high = np.quantile(best, [0.05, 0.95], axis=1)
+        low, middle, high = np.quantile(best, [0.05, 0.5, 0.95], axis=1)
+        label, draws = name, best.shape[1]
+        if draws > 1:
             axes.fill_between(
                 episodes, low, high, step="post", color=style["color"], alpha=0.2, lw=0
             )
-            label = f"{name}, median and\n5 to 95 % of {best.shape[1]} draws"
-        axes.step(
-            episodes,
-            np.median(best, axis=1),
-            where="post",
-            label=label,
-            **_line(style),
-        )
+            label = f"{name}, median and\n5 to 95 % of {draws} draws"
+        axes.step(episodes, middle, where="post", label=label, **_line(style))
     axes.set_xlabel("episode")
     axes.set_ylabel(f"best {_det_label(evaluation)} so far")
     _powers_of_ten(axes.yaxis)
     _legend(axes)
-    _title(axes, evaluation, "Best det S so far")
     return figure
 
 
@@ -221,24 +200,19 @@ def parameter_variance(evaluation: Evaluation) -> Figure:
     dataset = evaluation.dataset
     if dataset.measured is None:
         raise ValueError(f"{dataset.name} holds no measured outputs")
-    results = [r for r in evaluation.results if r.parameters is not None]
     rows = []
-    for result, style in zip(results, _styles(evaluation, results), strict=True):
+    styles = _styles(evaluation)
+    for result, style in zip(evaluation.results, styles, strict=True):
         label = "random, median over draws" if result.method == "random" else None
         variance = evaluation.parameter_variance(result)
         rows.append((label or _label(evaluation, result), variance, None, style))
-    figure = variances(
-        rows,
-        parameter_names(dataset.num_inputs, dataset.num_outputs),
-        "unit of measured and commands, squared"
-        if dataset.ranges is None
-        else "A: no unit, b: deg²",
-    )
-    _title(
-        figure.axes[0],
-        evaluation,
-        "Cross-episode variance of the identified parameters",
-    )
+    unit = "unit of measured and commands, squared"
+    if dataset.ranges is not None:
+        unit = "A: no unit, b: deg²"
+    names = parameter_names(dataset.num_inputs, dataset.num_outputs)
+    figure = variances(rows, names, unit)
+    title = "Cross-episode variance of the identified parameters"
+    _title(figure.axes[0], evaluation, title)
     return figure
 
 
@@ -254,7 +228,7 @@ def variances(
         names: of the P parameters.
         unit: in words.
     """
-    figure, axes = _figure(8.0, 4.0)
+    figure, axes = _axes(4.0)
     offsets = np.linspace(-0.3, 0.3, len(rows)) if len(rows) > 1 else [0.0]
     for (label, variance, ends, style), offset in zip(rows, offsets, strict=True):
         error = None
@@ -283,8 +257,15 @@ def variances(
     return figure
 
 
-def _figure(width: float, height: float) -> tuple[Figure, Any]:
-    figure = Figure(figsize=(width, height), layout="constrained")
+def _figure(evaluation: Evaluation, title: str, height: float) -> tuple[Figure, Any]:
+    """A titled figure of one panel, and its axes; height in inches."""
+    figure, axes = _axes(height)
+    _title(axes, evaluation, title)
+    return figure, axes
+
+
+def _axes(height: float) -> tuple[Figure, Any]:
+    figure = Figure(figsize=(8.0, height), layout="constrained")
     axes = figure.subplots()
     plain_axes(axes)
     return figure, axes
@@ -326,29 +307,14 @@ def _main(evaluation: Evaluation) -> MethodResult | None:
     return next((r for r in others if r.is_policy), others[0] if others else None)
 
 
-def _styles(
-    evaluation: Evaluation, results: Sequence[MethodResult]
-) -> list[dict[str, Any]]:
+def _styles(evaluation: Evaluation) -> list[dict[str, Any]]:
     """Colour, line and marker of each; random and exact look the same everywhere."""
-    fixed = {
-        "random": {"color": GREY, "linestyle": ":", "marker": "x"},
-        "exact": {"color": BLACK, "linestyle": "-", "marker": "*"},
-    }
-    coloured = [r for r in evaluation.results if r.method not in fixed]
-    styles = []
-    for result in results:
-        if result.method in fixed:
-            styles.append(fixed[result.method])
-        else:
-            i = coloured.index(result)
-            styles.append(
-                {
-                    "color": COLOURS[i % len(COLOURS)],
-                    "linestyle": STYLES[i % len(STYLES)],
-                    "marker": MARKERS[i % len(MARKERS)],
-                }
-            )
-    return styles
+    looks = zip(*map(itertools.cycle, (COLOURS, STYLES, MARKERS)), strict=False)
+    return [
+        _FIXED.get(result.method)
+        or dict(zip(("color", "linestyle", "marker"), next(looks), strict=True))
+        for result in evaluation.results
+    ]
 
 
 def _line(style: dict[str, Any]) -> dict[str, Any]:
@@ -361,27 +327,18 @@ def _line(style: dict[str, Any]) -> dict[str, Any]:
 
 def _with_random(evaluation: Evaluation) -> list[tuple[str, Array, dict[str, Any]]]:
     """Name, (E, R) log det S and style of every method; random also when not asked."""
+    results = evaluation.results
     rows = [
         (_label(evaluation, result), result.log_det, style)
-        for result, style in zip(
-            evaluation.results,
-            _styles(evaluation, evaluation.results),
-            strict=True,
-        )
+        for result, style in zip(results, _styles(evaluation), strict=True)
     ]
-    if all(result.method != "random" for result in evaluation.results):
-        style = {"color": GREY, "linestyle": ":", "marker": "x"}
-        rows.append(("random", evaluation.random_log_det, style))
+    if all(result.method != "random" for result in results):
+        rows.append(("random", evaluation.random_log_det, _FIXED["random"]))
     return rows
 
 
-def _log10(log_values: Array) -> Array:
+def _log10(log_values: Any) -> Any:
     return log_values / np.log(10.0)
-
-
-def _log_mean(log_values: Array) -> float:
-    top = float(log_values.max())
-    return top + float(np.log(np.exp(log_values - top).mean()))
 
 
 def _powers_of_ten(axis: Any) -> None:
@@ -390,7 +347,5 @@ def _powers_of_ten(axis: Any) -> None:
     The logs are drawn rather than a log axis, because det S of many axes in encoder
     pulses can exceed the largest float.
     """
-    from matplotlib.ticker import FuncFormatter, MaxNLocator
-
     axis.set_major_locator(MaxNLocator(nbins=8, integer=True))
     axis.set_major_formatter(FuncFormatter(lambda x, _: f"$10^{{{x:g}}}$"))

@@ -7,53 +7,61 @@ each draw counts as one selection in its statistics.
 
 from __future__ import annotations
 
+import dataclasses
 import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal import selection
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.parameters import estimate_parameters
+from jaxcal.evaluation.random_draws import draw_random, log_det_gram_of
 from jaxcal.evaluation.results import Evaluation, MethodResult
-from jaxcal.information.regression import log_det_gram
 
 __all__ = [
     "BASELINES",
     "DEFAULT_METHODS",
     "DEFAULT_RANDOM_DRAWS",
+    "METHODS",
+    "POLICIES",
     "check_methods",
     "evaluate",
-    "evaluate_policies",
     "label_of",
+    "rows_of",
 ]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
+T = TypeVar("T")
 Progress = Callable[[str, int, int], None]
 """label, selections done, selections in all"""
 
+METHODS = {  # each with its label in the table
+    "policy": "policy",
+    "policy:samples": "policy best of {num} samples",
+    "policy:first": "policy best of {num} first picks",
+    "policy:exchange": "policy + exchange",
+    "random": "random",
+    "greedy": "greedy",
+    "exchange": "exchange",
+    "exact": "exact",
+    "auto": "auto",
+}
+POLICIES = tuple(name for name in METHODS if name.startswith("policy"))
 BASELINES = ("random", "greedy", "exchange", "exact")
-DECODINGS = ("greedy", "samples", "first", "exchange")
-POLICIES = ("policy", "policy:samples", "policy:first", "policy:exchange")
 DEFAULT_METHODS = (*POLICIES, *BASELINES)
-METHODS = (*DEFAULT_METHODS, "auto")
 DEFAULT_RANDOM_DRAWS = 100
 
-_LEARNED = (*POLICIES, "auto")  # what a checkpoint matters to
 _CHUNK = 250  # episodes between two reports of progress
-_CHUNK_EXACT = 50  # the slow one for k above n + 1
-_REDRAWS = 20
+_CHUNK_EXACT = 50  # exact is slow for k above n + 1
 
 
 def label_of(method: str, num: int = 16) -> str:
     """A method in words, as in the table."""
-    return {
-        "policy:samples": f"policy best of {num} samples",
-        "policy:first": f"policy best of {num} first picks",
-        "policy:exchange": "policy + exchange",
-    }.get(method, method)
+    return METHODS[method].format(num=num)
 
 
 def check_methods(methods: Sequence[str]) -> tuple[str, ...]:
@@ -80,6 +88,17 @@ def check_methods(methods: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(chosen))
 
 
+def rows_of(
+    methods: Sequence[str], checkpoints: Sequence[str | None]
+) -> list[tuple[str, str | None]]:
+    """(method, checkpoint) of every row: a policy has one for each checkpoint."""
+    return [
+        (method, checkpoint)
+        for method in methods
+        for checkpoint in (checkpoints if method in POLICIES else (None,))
+    ]
+
+
 def evaluate(
     dataset: Dataset,
     k: int = 4,
@@ -97,7 +116,7 @@ def evaluate(
     Args:
         dataset: candidate sets.
         k: postures to choose in each episode.
-        methods: names from ``DEFAULT_METHODS``, or "auto".
+        methods: names from ``METHODS``.
         checkpoints: of the policy; None is the one that ships.
         num: decodings tried by ``policy:samples`` and ``policy:first``.
         random_draws: random selections an episode.
@@ -114,79 +133,41 @@ def evaluate(
     for name, value in (("num", num), ("random_draws", random_draws)):
         if value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
-    _check(dataset, k)
+    try:
+        selection.make_problems(dataset.candidates, k, available=dataset.available)
+    except ValueError as error:
+        raise ValueError(f"{dataset.name}: {error}") from None
     run = _Run(dataset, k, num, seed, progress or (lambda *_: None))
+    rows = rows_of(methods, checkpoints)
     found: dict[tuple[str, str | None], MethodResult] = {}
+    for method, checkpoint in rows:
+        if method in POLICIES:
+            found[method, checkpoint] = run.policy(method, checkpoint)
+    random = found["random", None] = run.random(random_draws)
+    found["exact", None], reference, proven = run.exact(time_limit)
     for method in methods:
-        for checkpoint in checkpoints if method in _LEARNED else ():
-            if method == "auto":
-                found[method, checkpoint] = run.auto(checkpoint)
-            else:
-                found[method, checkpoint] = run.policy(method, checkpoint)
-    random = run.random(random_draws)
-    exact, reference, proven = run.exact(time_limit)
-    found["random", None] = random
-    found["exact", None] = exact
-    for method in methods:
-        if method in ("greedy", "exchange"):
-            found[method, None] = run.baseline(method)
-    results = [
-        found[method, checkpoint]
-        for method in methods
-        for checkpoint in (checkpoints if method in _LEARNED else (None,))
-    ]
+        if method in _SOLVERS:
+            found[method, None] = run.solver(method)
     return Evaluation(
         dataset=dataset,
         k=k,
         seed=seed,
-        results=tuple(results),
+        results=tuple(found[row] for row in rows),
         reference=reference,
         proven=proven,
         random_log_det=random.log_det,
     )
 
 
-def evaluate_policies(
-    dataset: Dataset,
-    k: int,
-    policies: Sequence[tuple[str, str | None]],
-    *,
-    num: int = 16,
-    seed: int = 0,
-) -> dict[tuple[str, str | None], MethodResult]:
-    """The (method, checkpoint) rows that policies have in ``evaluate``, alone.
-
-    Args:
-        dataset, k, num, seed: see ``evaluate``.
-        policies: methods from ``POLICIES`` with their checkpoints.
-    """
-    run = _Run(dataset, k, num, seed, lambda *_: None)
-    return {
-        (method, checkpoint): run.policy(method, checkpoint)
-        for method, checkpoint in policies
-    }
-
-
-def _check(dataset: Dataset, k: int) -> None:
-    from jaxcal.selection import make_problems
-
-    try:
-        make_problems(dataset.candidates, k, available=dataset.available)
-    except ValueError as error:
-        raise ValueError(f"{dataset.name}: {error}") from None
-
-
+@dataclasses.dataclass(frozen=True)
 class _Run:
     """The methods on one dataset, timed."""
 
-    def __init__(
-        self, dataset: Dataset, k: int, num: int, seed: int, progress: Progress
-    ) -> None:
-        self.dataset = dataset
-        self.k = k
-        self.num = num
-        self.seed = seed
-        self.progress = progress
+    dataset: Dataset
+    k: int
+    num: int
+    seed: int
+    progress: Progress
 
     def result(
         self,
@@ -197,39 +178,64 @@ class _Run:
         log_det: Array | None = None,
     ) -> MethodResult:
         """Judge (E, R, k) indices, unless their (E, R) ``log_det`` is known."""
+        if log_det is None:
+            gram = [
+                log_det_gram_of(self.dataset.candidates[cut], indices[cut])
+                for cut in self.pieces()
+            ]
+            log_det = self.dataset.num_outputs * np.concatenate(gram)
         return MethodResult(
             method=method,
             label=label_of(method, self.num),
             checkpoint=checkpoint,
             indices=indices,
-            log_det=self.log_det(indices) if log_det is None else log_det,
-            seconds=seconds,
+            log_det=log_det,
+            seconds=seconds / self.dataset.num_episodes,
             parameters=estimate_parameters(self.dataset, indices),
         )
 
-    def log_det(self, indices: Indices) -> Array:
-        """(E, R) natural log det S of (E, R, k) indices."""
-        gram = np.empty(indices.shape[:2])
-        for begin in range(0, len(indices), _CHUNK):
-            cut = slice(begin, begin + _CHUNK)
-            gram[cut] = _log_det_gram(self.dataset.candidates[cut], indices[cut])
-        return self.dataset.num_outputs * gram
-
-    def pieces(self, label: str, size: int = _CHUNK) -> Any:
-        """Slices of episodes, reporting progress between them."""
+    def pieces(self, size: int = _CHUNK) -> Iterator[slice]:
+        """All episodes in slices of at most ``size``."""
         total = self.dataset.num_episodes
         for begin in range(0, total, size):
-            end = min(begin + size, total)
-            yield slice(begin, end)
-            self.progress(label, end, total)
+            yield slice(begin, min(begin + size, total))
 
     def part(self, cut: slice) -> dict[str, Any]:
-        """Candidates and mask of some episodes."""
+        """What every solver is given of some episodes."""
         available = self.dataset.available
         return {
             "candidates": self.dataset.candidates[cut],
+            "k": self.k,
             "available": None if available is None else available[cut],
         }
+
+    def timed(
+        self,
+        label: str,
+        choose: Callable[[slice], T],
+        *,
+        size: int = _CHUNK,
+        warm: int = 1,
+    ) -> tuple[list[T], float]:
+        """What ``choose`` returns for every piece, and the seconds that took.
+
+        Args:
+            label: for the progress.
+            choose: runs the method on some episodes.
+            size: episodes of a piece.
+            warm: episodes of a first call that is not counted: it may compile.
+        """
+        total = self.dataset.num_episodes
+        self.progress(label, 0, total)
+        if warm:
+            choose(slice(0, min(warm, total)))
+        found, seconds = [], 0.0
+        for cut in self.pieces(size):
+            start = time.perf_counter()
+            found.append(choose(cut))
+            seconds += time.perf_counter() - start
+            self.progress(label, cut.stop, total)
+        return found, seconds
 
     def policy(self, method: str, checkpoint: str | None) -> MethodResult:
         """One decoding of one checkpoint."""
@@ -238,55 +244,23 @@ class _Run:
         label = label_of(method, self.num)
         if checkpoint is not None:
             label = f"{label} ({checkpoint})"
-        count = self.dataset.num_episodes
 
         def choose(cut: slice) -> Indices:
             return select_batch(
-                k=self.k,
+                **self.part(cut),
                 decoding=method.partition(":")[2] or "greedy",
                 num=self.num,
                 seed=self.seed + cut.start,
                 checkpoint=checkpoint,
-                **self.part(cut),
             )
 
-        self.progress(label, 0, count)
-        choose(slice(0, min(_CHUNK, count)))  # compiles
-        chosen, seconds = [], 0.0
-        for cut in self.pieces(label):
-            start = time.perf_counter()
-            chosen.append(choose(cut))
-            seconds += time.perf_counter() - start
-        indices = np.concatenate(chosen)
+        found, seconds = self.timed(label, choose, warm=_CHUNK)
+        indices = np.concatenate(found)
         self.require_valid(label, indices)
-        return self.result(method, indices[:, None], seconds / len(indices), checkpoint)
-
-    def auto(self, checkpoint: str | None) -> MethodResult:
-        """The policy where it proves good enough, else the optimum, one by one."""
-        from jaxcal.selection import select
-
-        label = "auto" if checkpoint is None else f"auto ({checkpoint})"
-        part = self.part(slice(None))
-        masks = part["available"]
-        chosen, seconds = [], 0.0
-        for cut in (slice(0, 1), *self.pieces(label)):  # the first compiles
-            for i in range(cut.start, cut.stop):
-                found = select(
-                    part["candidates"][i],
-                    self.k,
-                    "auto",
-                    available=None if masks is None else masks[i],
-                    num_outputs=self.dataset.num_outputs,
-                    seed=self.seed,
-                    checkpoint=checkpoint,
-                )
-                chosen.append(found.indices)
-                seconds += found.seconds if len(chosen) > 1 else 0.0
-        indices = np.array(chosen[1:])
-        return self.result("auto", indices[:, None], seconds / len(indices), checkpoint)
+        return self.result(method, indices[:, None], seconds, checkpoint)
 
     def require_valid(self, label: str, indices: Indices) -> None:
-        """A policy is trained, not proven: look at what it returned."""
+        """A policy is trained, not proven: check what it returned."""
         expected = (self.dataset.num_episodes, self.k)
         if indices.shape != expected:
             raise ValueError(f"{label} must return {expected}, got {indices.shape}")
@@ -302,128 +276,76 @@ class _Run:
                 f"{indices[episode].tolist()} in episode {episode}"
             )
 
-    def baseline(self, method: str) -> MethodResult:
-        """Greedy or exchange."""
-        from jaxcal import selection
-
-        solve: Any = {
-            "greedy": selection.greedy_batch,
-            "exchange": selection.exchange_batch,
-        }[method]
-        options = {"seed": self.seed} if method == "exchange" else {}
-        solve(k=self.k, **self.part(slice(0, 1)), **options)  # compiles
-        chosen, seconds = [], 0.0
-        for cut in self.pieces(method):
-            batch = solve(k=self.k, **self.part(cut), **options)
-            chosen.append(batch.indices)
-            seconds += batch.seconds
-        indices = np.concatenate(chosen)[:, None]
-        return self.result(method, indices, seconds / len(indices))
+    def solver(self, method: str) -> MethodResult:
+        """A method without proof and without weights."""
+        solve = _SOLVERS[method]
+        found, seconds = self.timed(method, lambda cut: solve(self, self.part(cut)))
+        return self.result(method, np.concatenate(found)[:, None], seconds)
 
     def exact(
         self, time_limit: float | None
     ) -> tuple[MethodResult, Array, NDArray[np.bool_]]:
-        """The optimum, its log det S or an upper bound, and where it is proven."""
-        from jaxcal.selection import exact_batch
+        """The optimum, its (E,) log det S or an upper bound, and (E,) where proven."""
 
-        m = self.dataset.num_outputs
-        exact_batch(
-            k=self.k, **self.part(slice(0, 1)), time_limit=time_limit
-        )  # compiles
-        chosen, bounds, proofs = [], [], []
-        seconds = 0.0
-        for cut in self.pieces("exact", _CHUNK_EXACT):
-            left = None if time_limit is None else max(time_limit - seconds, 1e-3)
-            batch = exact_batch(
-                k=self.k, **self.part(cut), num_outputs=m, time_limit=left
+        def choose(cut: slice) -> selection.BatchSelection:
+            left = None
+            if time_limit is not None:
+                left = max(begun + time_limit - time.perf_counter(), 1e-3)
+            m = self.dataset.num_outputs
+            return selection.exact_batch(
+                **self.part(cut), num_outputs=m, time_limit=left
             )
-            chosen.append(batch.indices)
-            bounds.append(batch.bound)
-            proofs.append(batch.proven)
-            seconds += batch.seconds
-        indices = np.concatenate(chosen)[:, None]
-        result = self.result("exact", indices, seconds / len(indices))
-        proven = np.concatenate(proofs)
-        bound = np.maximum(np.concatenate(bounds), result.log_det[:, 0])
-        return result, np.where(proven, result.log_det[:, 0], bound), proven
+
+        begun = time.perf_counter()
+        choose(slice(0, 1))  # may compile
+        begun = time.perf_counter()
+        found, seconds = self.timed("exact", choose, size=_CHUNK_EXACT, warm=0)
+        indices = np.concatenate([batch.indices for batch in found])
+        proven = np.concatenate([batch.proven for batch in found])
+        bound = np.concatenate([batch.bound for batch in found])
+        result = self.result("exact", indices[:, None], seconds)
+        reached = result.log_det[:, 0]
+        return result, np.where(proven, reached, np.maximum(bound, reached)), proven
 
     def random(self, draws: int) -> MethodResult:
-        """``draws`` selections an episode, uniform among the invertible ones."""
-        from jaxcal.selection import random_batch
-
-        timed = random_batch(k=self.k, **self.part(slice(None)), seed=self.seed)
-        count, size = self.dataset.num_episodes, self.dataset.num_candidates
+        """``draws`` selections an episode; the time is that of ``random_batch``."""
+        batch = selection.random_batch(**self.part(slice(None)), seed=self.seed)
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(0,)))
-        available = self.dataset.available
-        chosen, grams = [], []
-        for cut in self.pieces("random"):
-            mask = None if available is None else available[cut]
-            shape = (min(cut.stop, count) - cut.start, draws, size)
-            picks = _draw(rng, shape, self.k, mask)
-            grams.append(self._without_singular(rng, cut, picks, mask))
-            chosen.append(picks)
+
+        def choose(cut: slice) -> tuple[Indices, Array]:
+            return draw_random(rng, **self.part(cut), num=draws)
+
+        found, _ = self.timed("random", choose, warm=0)
+        gram = np.concatenate([gram for _, gram in found])
         return self.result(
             "random",
-            np.concatenate(chosen),
-            timed.seconds / count,
-            log_det=self.dataset.num_outputs * np.concatenate(grams),
+            np.concatenate([picks for picks, _ in found]),
+            batch.seconds,
+            log_det=self.dataset.num_outputs * gram,
         )
 
-    def _without_singular(
-        self,
-        rng: np.random.Generator,
-        cut: slice,
-        picks: Indices,
-        mask: NDArray[np.bool_] | None,
-    ) -> Array:
-        """Draw the singular ones again; the few that stay so are left to the solver.
 
-        Args:
-            rng: source of the draws.
-            cut: the episodes.
-            picks: (E, R, k), mended in place.
-            mask: (E, M) available candidates.
-
-        Returns:
-            (E, R) log det of the Gram matrices of what is then in ``picks``.
-        """
-        from jaxcal.selection import random_batch
-
-        candidates = self.dataset.candidates[cut]
-        gram = _log_det_gram(candidates, picks)
-        for attempt in range(_REDRAWS + 1):
-            episode, draw = np.nonzero(np.isneginf(gram))
-            if not episode.size:
-                break
-            sets = candidates[episode]
-            again = None if mask is None else mask[episode]
-            if attempt < _REDRAWS:
-                shape = (len(episode), 1, candidates.shape[1])
-                fresh = _draw(rng, shape, self.k, again)
-            else:
-                batch = random_batch(sets, self.k, available=again, seed=self.seed)
-                fresh = batch.indices[:, None]
-            picks[episode, draw] = fresh[:, 0]
-            gram[episode, draw] = _log_det_gram(sets, fresh)[:, 0]
-        return gram
+def _auto(run: _Run, part: dict[str, Any]) -> Indices:
+    masks = part["available"]
+    return np.array(
+        [
+            selection.select(
+                candidates,
+                part["k"],
+                "auto",
+                available=None if masks is None else masks[i],
+                num_outputs=run.dataset.num_outputs,
+                seed=run.seed,
+            ).indices
+            for i, candidates in enumerate(part["candidates"])
+        ]
+    )
 
 
-def _log_det_gram(candidates: Array, indices: Indices) -> Array:
-    """(E, R) log det of Z.T Z for (E, R, k) indices into (E, M, n) candidates."""
-    chosen = np.take_along_axis(candidates[:, None], indices[..., None], axis=2)
-    return log_det_gram(chosen)
-
-
-def _draw(
-    rng: np.random.Generator,
-    shape: tuple[int, int, int],
-    k: int,
-    mask: NDArray[np.bool_] | None,
-) -> Indices:
-    """(E, R, k) distinct candidates out of (E, R, M), uniform among the available."""
-    order = rng.random(shape)
-    if mask is not None:
-        order[np.broadcast_to(~mask[:, None], shape)] = 2.0
-    if k == shape[2]:
-        return np.argsort(order, axis=2)
-    return np.argpartition(order, k - 1, axis=2)[..., :k]
+_SOLVERS: dict[str, Callable[[_Run, dict[str, Any]], Indices]] = {
+    "greedy": lambda run, part: selection.greedy_batch(**part).indices,
+    "exchange": lambda run, part: (
+        selection.exchange_batch(**part, seed=run.seed).indices
+    ),
+    "auto": _auto,
+}

@@ -1,21 +1,28 @@
-"""What an evaluation found: one method on one dataset, and all of them together."""
+"""What an evaluation found: every selection of every method, and the numbers shown."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import platform
+from importlib import metadata
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from jaxcal.evaluation.dataset import Dataset
+from jaxcal.evaluation.parameters import parameter_names
 
 __all__ = [
+    "HIT_TOLERANCE",
     "Evaluation",
     "MethodResult",
-    "StreamedData",
-    "StreamedEvaluation",
-    "StreamedResult",
+    "Row",
+    "Summary",
+    "log_mean",
+    "versions",
 ]
 
 Array = NDArray[np.float64]
@@ -24,17 +31,12 @@ Indices = NDArray[np.int64]
 HIT_TOLERANCE = 1e-9  # of log det(Z.T Z): the same determinant to a billionth
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class MethodResult:
-    """What one method chose in every episode of a dataset; R draws, 1 unless random."""
+@dataclasses.dataclass(frozen=True)
+class _Named:
+    """Which method it is."""
 
     method: str  # as asked for: "greedy", "policy:first", ...
-    label: str  # in words
     checkpoint: str | None  # of a policy; None for the shipped one and for baselines
-    indices: Indices  # (E, R, k)
-    log_det: Array  # (E, R) natural log det S
-    seconds: float  # a selection, averaged over the batch, compilation left out
-    parameters: Array | None  # (E, R, m (n + 1)) identified from the chosen postures
 
     @property
     def is_policy(self) -> bool:
@@ -42,9 +44,45 @@ class MethodResult:
         return self.method.startswith("policy")
 
 
+@dataclasses.dataclass(frozen=True)
+class Row(_Named):
+    """One method in the numbers that the table, the JSON and the page show."""
+
+    numbers: dict[str, Any]  # as documented in docs/evaluation.md; "label": in words
+
+
+@dataclasses.dataclass(frozen=True)
+class Summary:
+    """All methods on one dataset, in the numbers that reports show."""
+
+    dataset: dict[str, Any]  # its entry in the JSON document: name, episodes, ...
+    k: int
+    seed: int
+    num_proven: int
+    rows: tuple[Row, ...]
+    parameter_names: tuple[str, ...] | None = None  # where outputs were measured
+    notes: tuple[str, ...] = ()  # beyond those that follow from the numbers
+
+    @property
+    def num_parameters(self) -> int:
+        """m (n + 1), 12 for three inputs and three outputs."""
+        return self.dataset["num_outputs"] * (self.dataset["num_inputs"] + 1)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MethodResult(_Named):
+    """What one method chose in every episode of a dataset; R draws, 1 unless random."""
+
+    label: str  # in words
+    indices: Indices  # (E, R, k)
+    log_det: Array  # (E, R) natural log det S
+    seconds: float  # a selection, averaged over the batch, compilation left out
+    parameters: Array | None  # (E, R, m (n + 1)) identified from the chosen postures
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Evaluation:
-    """All methods on one dataset."""
+    """All methods on one dataset, selection by selection."""
 
     dataset: Dataset
     k: int  # postures chosen
@@ -54,37 +92,44 @@ class Evaluation:
     proven: NDArray[np.bool_]  # (E,)
     random_log_det: Array  # (E, R) the baseline behind ratio_to_random
 
-    @property
-    def num_proven(self) -> int:
-        """Episodes whose optimum is proven."""
-        return int(self.proven.sum())
+    def summarise(self, *, indices: bool = False) -> Summary:
+        """The numbers of every method.
 
-    @property
-    def num_parameters(self) -> int:
-        """m (n + 1), 12 for three inputs and three outputs."""
-        return self.dataset.num_outputs * (self.dataset.num_inputs + 1)
+        Args:
+            indices: also what each chose in every episode (random: its first draw).
+        """
+        rows = []
+        for result in self.results:
+            numbers = self.summary(result)
+            if indices:
+                numbers["indices"] = result.indices[:, 0].tolist()
+            rows.append(Row(result.method, result.checkpoint, numbers))
+        names = None
+        if self.dataset.measured is not None:
+            names = parameter_names(self.dataset.num_inputs, self.dataset.num_outputs)
+        proven = int(self.proven.sum())
+        facts = self.dataset.facts()
+        return Summary(facts, self.k, self.seed, proven, tuple(rows), names)
 
     def summary(self, result: MethodResult) -> dict[str, Any]:
         """The numbers of one method, as documented in docs/evaluation.md."""
+        m = self.dataset.num_outputs
         log_det = result.log_det
         behind = log_det - self.reference[:, None]
-        hits = self.proven[:, None] & (
-            behind >= -HIT_TOLERANCE * self.dataset.num_outputs
-        )
+        hits = self.proven[:, None] & (behind >= -HIT_TOLERANCE * m)
+        behind = np.minimum(behind, 0.0)
         with np.errstate(over="ignore"):
             det = np.exp(log_det)
+        num_parameters = m * (self.dataset.num_inputs + 1)
+        times = np.exp(log_mean(log_det) - log_mean(self.random_log_det))
         row: dict[str, Any] = {
             "label": result.label,
             "det_s": _moments(det),
             "log_det_s": _moments(log_det),
-            "ratio_to_exact": float(np.exp(np.minimum(behind, 0.0)).mean()),
+            "ratio_to_exact": float(np.exp(behind).mean()),
             "hit_rate": float(hits.mean()),
-            "d_efficiency": float(
-                np.exp(np.minimum(behind, 0.0) / self.num_parameters).mean()
-            ),
-            "ratio_to_random": _finite(
-                np.exp(_log_mean(log_det) - _log_mean(self.random_log_det))
-            ),
+            "d_efficiency": float(np.exp(behind / num_parameters).mean()),
+            "ratio_to_random": _finite(times),
             "seconds_per_selection": result.seconds,
             "draws_per_episode": log_det.shape[1],
         }
@@ -96,60 +141,25 @@ class Evaluation:
         """(m (n + 1),) variance over the episodes of each identified parameter.
 
         Of several draws an episode the median variance: that of random has so heavy a
-        tail that a mean over draws says nothing but the worst of them.
+        tail that a mean over draws shows the worst of them only.
         """
         if result.parameters is None:
             raise ValueError(f"{self.dataset.name} holds no measured outputs")
         return np.median(result.parameters.var(axis=0), axis=0)
 
 
-@dataclasses.dataclass(frozen=True)
-class StreamedData:
-    """What is known of episodes that were never held all at once."""
-
-    name: str
-    num_episodes: int
-    num_candidates: int
-    num_inputs: int
-    num_outputs: int
-    seed: int
-    sha256: None = None
-    measured: None = None
+def versions() -> dict[str, str]:
+    """What computed the numbers: Python and the packages that matter."""
+    found = {"python": platform.python_version()}
+    for name in ("jaxcal", "numpy", "scipy", "numba", "jax", "flax"):
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            found[name] = metadata.version(name)
+    return found
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class StreamedResult:
-    """One method on a stream: its numbers, and no episode by itself."""
-
-    method: str
-    label: str
-    checkpoint: str | None
-    numbers: dict[str, Any]  # as in ``Evaluation.summary``
-
-    @property
-    def is_policy(self) -> bool:
-        """True where a checkpoint chose."""
-        return self.method.startswith("policy")
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class StreamedEvaluation:
-    """All methods on a stream of episodes, as ``jaxcal.evaluation.report`` shows them."""
-
-    dataset: StreamedData
-    k: int
-    seed: int
-    results: tuple[StreamedResult, ...]
-    num_proven: int
-
-    @property
-    def num_parameters(self) -> int:
-        """m (n + 1)."""
-        return self.dataset.num_outputs * (self.dataset.num_inputs + 1)
-
-    def summary(self, result: StreamedResult) -> dict[str, Any]:
-        """The numbers of one method."""
-        return {"label": result.label, **result.numbers}
+def log_mean(log_values: Array) -> float:
+    """Log of the mean of exp, without overflow."""
+    return float(logsumexp(log_values) - np.log(log_values.size))
 
 
 def _moments(values: Array) -> dict[str, float | None]:
@@ -164,9 +174,3 @@ def _moments(values: Array) -> dict[str, float | None]:
 def _finite(value: Any) -> float | None:
     """A float, or None where it is too large for one."""
     return float(value) if np.isfinite(value) else None
-
-
-def _log_mean(log_values: Array) -> float:
-    """Log of the mean of exp, without overflow."""
-    top = float(log_values.max())
-    return top + float(np.log(np.exp(log_values - top).mean()))

@@ -8,6 +8,7 @@ import pathlib
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from jaxcal.plots import COLOURS, plain_axes
 
@@ -158,18 +159,15 @@ def last_rewards(folder: pathlib.Path, metrics: dict[str, Array]) -> tuple[Array
 
 def _moving_average(values: Array, window: int) -> Array:
     """Mean of the last ``window`` values, of fewer at the beginning."""
-    total = np.cumsum(np.insert(values, 0, 0.0))
-    end = np.arange(1, len(values) + 1)
-    begin = np.maximum(end - window, 0)
-    return (total[end] - total[begin]) / (end - begin)
+    count = len(values)
+    sums = np.convolve(values, np.ones(window))[:count]
+    return sums / np.minimum(np.arange(1, count + 1), window)
 
 
 def _exponential(values: Array, keep: float = 0.95) -> Array:
     """Exponential moving average, unbiased at the beginning."""
-    smoothed, weight = 0.0, 0.0
-    out = np.empty_like(values)
-    for i, value in enumerate(values):
-        smoothed = keep * smoothed + (1.0 - keep) * value
-        weight = keep * weight + (1.0 - keep)
-        out[i] = smoothed / weight
-    return out
+    sums, weights = (
+        lfilter([1.0 - keep], [1.0, -keep], column)
+        for column in (values, np.ones(len(values)))
+    )
+    return sums / weights

@@ -8,32 +8,88 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-__all__ = ["add_outer", "draw", "factor", "gram_of"]
+__all__ = [
+    "add_block",
+    "block_cross",
+    "block_products",
+    "draw",
+    "factor",
+    "gram_of",
+    "row_cross",
+    "row_products",
+]
 
 
 @njit(cache=True, nogil=True)
-def gram_of(rows, counts, gram):
-    """``gram = sum of counts_i x_i x_i.T`` of rows (M, p)."""
-    num_rows, p = rows.shape
+def gram_of(blocks, counts, prior, gram):
+    """``gram = prior + sum of counts_i B_i.T B_i`` of blocks (M, q, p)."""
+    num_blocks, q, p = blocks.shape
     gram[:] = 0.0
-    for i in range(num_rows):
+    for i in range(num_blocks):
         if counts[i] != 0:
-            for a in range(p):
-                scaled = counts[i] * rows[i, a]
-                for b in range(a + 1):
-                    gram[a, b] += scaled * rows[i, b]
+            for r in range(q):
+                for a in range(p):
+                    scaled = counts[i] * blocks[i, r, a]
+                    for b in range(a + 1):
+                        gram[a, b] += scaled * blocks[i, r, b]
     for a in range(p):
-        for b in range(a):
+        for b in range(a + 1):
+            gram[a, b] += prior[a, b]
             gram[b, a] = gram[a, b]
 
 
 @njit(cache=True, nogil=True)
-def add_outer(gram, x, weight):
-    """``gram += weight x x.T``."""
-    p = len(x)
+def add_block(gram, blocks, i, weight):
+    """``gram += weight B_i.T B_i`` of blocks (M, q, p)."""
+    _, q, p = blocks.shape
+    for r in range(q):
+        for a in range(p):
+            scaled = weight * blocks[i, r, a]
+            for b in range(p):
+                gram[a, b] += scaled * blocks[i, r, b]
+
+
+@njit(cache=True, nogil=True)
+def row_products(x, y, inverse, same, out):
+    """``out_j = x[:, j] inverse y[:, j]``, (M,), x and y (p, M); ``same``: y is x."""
+    p, num_blocks = x.shape
+    for j in range(num_blocks):
+        out[j] = 0.0
     for a in range(p):
+        for b in range(a + 1 if same else p):
+            w = inverse[a, b] if a == b or not same else 2.0 * inverse[a, b]
+            for j in range(num_blocks):
+                out[j] += w * x[a, j] * y[b, j]
+
+
+@njit(cache=True, nogil=True)
+def row_cross(x, inverse, y, i, out):
+    """``out_j = x[:, j] inverse y[i]``, (M,), of x (p, M) and y (N, p)."""
+    p, num_blocks = x.shape
+    for j in range(num_blocks):
+        out[j] = 0.0
+    for a in range(p):
+        total = 0.0
         for b in range(p):
-            gram[a, b] += weight * x[a] * x[b]
+            total += inverse[a, b] * y[i, b]
+        for j in range(num_blocks):
+            out[j] += total * x[a, j]
+
+
+@njit(cache=True, nogil=True)
+def block_products(columns, inverse, out):
+    """Lower triangles of ``B_j inverse B_j.T``, (q, q, M), of columns (q, p, M)."""
+    for r in range(len(columns)):
+        for s in range(r + 1):
+            row_products(columns[r], columns[s], inverse, r == s, out[r, s])
+
+
+@njit(cache=True, nogil=True)
+def block_cross(columns, inverse, block, out):
+    """``block inverse B_j.T``, (q, q, M), of columns (q, p, M)."""
+    for r in range(len(columns)):
+        for s in range(len(columns)):
+            row_cross(columns[s], inverse, block, r, out[r, s])
 
 
 @njit(cache=True, nogil=True)

@@ -16,6 +16,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.checks import numbers, require_finite, whole_number
+from jaxcal.information.blocks import rank_rule
+
 __all__ = [
     "hat_matrix",
     "information_matrix",
@@ -31,21 +34,13 @@ Array = NDArray[np.float64]
 
 def _as_commands(commands: ArrayLike) -> Array:
     """(..., N, n) finite float64, or a ValueError that says what is wrong."""
-    try:
-        array = np.asarray(commands, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            "commands must be an array of numbers (..., N, n), "
-            f"got {type(commands).__name__}"
-        ) from error
+    array = numbers("commands", commands, finite=False)
     if array.ndim < 2 or array.shape[-1] < 1 or array.shape[-2] < 1:
         raise ValueError(
             "commands must have shape (..., N, n) with N >= 1 and n >= 1, "
             f"got {array.shape}"
         )
-    if not np.isfinite(array).all():
-        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
-        raise ValueError(f"commands must be finite, got {array[where]} at {where}")
+    require_finite("commands", array)
     return array
 
 
@@ -79,8 +74,7 @@ def regression_matrix(commands: ArrayLike, num_outputs: int | None = None) -> Ar
     commands = _as_commands(commands)
     *batch, num_postures, num_inputs = commands.shape
     m = num_inputs if num_outputs is None else num_outputs
-    if m < 1:
-        raise ValueError(f"num_outputs must be at least 1, got {m}")
+    whole_number("num_outputs", m, 1)
     eye = np.eye(m)
     slopes = np.einsum("ab,...ni->...nabi", eye, commands)
     slopes = slopes.reshape(*batch, num_postures, m, m * num_inputs)
@@ -120,24 +114,8 @@ def log_det_gram(commands: ArrayLike) -> Array:
     if num_postures <= num_inputs:
         return np.full(commands.shape[:-2], -np.inf)
     centred = commands - commands.mean(axis=-2, keepdims=True)
-    norms = np.linalg.norm(centred, axis=-2, keepdims=True)
-    scaled = centred / np.where(norms == 0.0, 1.0, norms)
-    singular = np.linalg.svd(scaled, compute_uv=False)
-    # The commands are exact to half a unit in the last place of their size, not of
-    # their spread: a direction no wider than that is rounding, not a posture.
-    largest = np.abs(commands).max(axis=-2, keepdims=True)
-    resolution = np.finfo(np.float64).eps * num_postures
-    flat = norms <= resolution * largest
-    rounding = (largest / np.where(flat, np.inf, norms)).max(axis=(-1, -2))
-    tolerance = resolution * np.maximum(8.0, rounding)
-    deficient = flat.any(axis=(-1, -2)) | (singular[..., -1] <= tolerance)
-    with np.errstate(divide="ignore"):
-        value = (
-            np.log(num_postures)
-            + 2.0 * np.log(singular).sum(axis=-1)
-            + 2.0 * np.log(norms).sum(axis=(-1, -2))
-        )
-    return np.where(deficient, -np.inf, value)
+    largest = np.abs(commands).max(axis=-2)
+    return np.log(num_postures) + rank_rule(centred, largest)[1]
 
 
 def log_det_information(

@@ -1,4 +1,4 @@
-"""Training runs kept for the report: one preset over several seeds, or a run there is.
+"""Training runs kept for the report: one preset over several seeds, or an existing run.
 
 A run folder is large and not in version control. What a report needs of it is small and
 goes to a folder of its own: ``metrics.csv`` (the trainer's columns, at most
@@ -17,12 +17,13 @@ import pathlib
 import shutil
 import sys
 from collections.abc import Sequence
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.files import require_writable_folder, write_text
+from jaxcal.paper import command
 
 __all__ = ["FORMAT", "MAX_ROWS", "collect", "main", "thinned", "train_seed"]
 
@@ -36,9 +37,9 @@ _LAST_OF_BLOCK = ("update", "episodes", "seconds", "learning_rate")
 _IF_MEASURED = ("ratio_to_exact", "hit_rate")
 
 _DESCRIPTION = """\
-Train one preset with several seeds, or take up a run that is there, and keep what the
-reproduction report draws of it: metrics.csv, last_rewards.npy and summary.json, in a
-folder a run under --out.
+Train one preset with several seeds, or collect an existing run, and keep what the
+reproduction report draws of it: metrics.csv, last_rewards.npy and summary.json, in one
+folder per run under --out.
 """
 _EPILOG = """\
 examples:
@@ -48,34 +49,35 @@ examples:
   python -m jaxcal.paper.training_runs --collect runs/paper --out studies/paper
       a run of train.py, finished or still going, into studies/paper
 
-The same command again goes on where it was stopped: finished seeds are left alone, a
-seed that was cut off continues from its last checkpoint, which is under --runs.
+The same command again continues where it was stopped: finished seeds are skipped, an
+interrupted seed resumes from its last checkpoint, which is under --runs.
 """
 
 
 def train_seed(
     config: Any, folder: pathlib.Path, *, validate: bool = True, report: Any = None
 ) -> None:
-    """Train one run, or what is left of it where ``folder`` holds a part.
+    """Train one run, or the rest of it where ``folder`` holds a part.
 
     Args:
         config: a ``TrainConfig``.
         folder: of the run.
         validate: measure it on fixed sets while it trains.
-        report: called with a ``training.Report`` now and then.
+        report: called with a ``training.Report`` every few seconds.
 
     Raises:
         ValueError: the folder holds a run of another configuration.
     """
-    from jaxcal.evaluation.validation import fixed_validation
     from jaxcal.learning.training import checkpoint
     from jaxcal.learning.training import run as training
+    from jaxcal.learning.training.config import TrainConfig
+    from jaxcal.selection.teacher import fixed_validation
 
     require_writable_folder(folder)
     steps = folder / "checkpoint"
     resume = steps.is_dir() and any(path.name.isdigit() for path in steps.iterdir())
     if resume:
-        held = training.TrainConfig.from_meta(checkpoint.load(folder).meta)
+        held = TrainConfig.from_meta(checkpoint.load(folder).meta)
         if held.as_meta() != config.as_meta():
             raise ValueError(
                 f"{folder} holds a run of another configuration: name another --runs"
@@ -117,8 +119,8 @@ def thinned(metrics: dict[str, Array], most: int = MAX_ROWS) -> dict[str, Array]
     """The same run in at most ``most`` rows, each the mean of a block of updates.
 
     ``reward_std`` stays that of single episodes: within and between the updates of a
-    block. Counts and times are those at the end of the block; what is measured now and
-    then is the block's last value.
+    block. Counts and times are those at the end of the block; what is measured
+    occasionally is the block's last value.
     """
     count = len(metrics["episodes"])
     if count <= most:
@@ -155,7 +157,7 @@ def _summary(run: pathlib.Path, metrics: dict[str, Array]) -> dict[str, Any]:
 
     from jaxcal.evaluation.methods import evaluate
     from jaxcal.learning.training import checkpoint
-    from jaxcal.paper.datasets.datasets import make_dataset
+    from jaxcal.paper.datasets import make_dataset
 
     policy = checkpoint.load(run)
     measured = evaluate(
@@ -190,33 +192,20 @@ def _summary(run: pathlib.Path, metrics: dict[str, Array]) -> dict[str, Any]:
 # -- command ---------------------------------------------------------------------------
 
 
-class _Parser(argparse.ArgumentParser):
-    """One clear line instead of the usage and a line."""
-
-    def error(self, message: str) -> NoReturn:
-        print(f"{self.prog}: error: {message}; see --help", file=sys.stderr)
-        sys.exit(2)
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train or collect; the exit code."""
     options = _parse(arguments)
-    try:
-        if options.collect is not None:
-            if not (options.collect / "metrics.csv").is_file():
-                raise ValueError(f"--collect {options.collect} holds no metrics.csv")
-            require_writable_folder(options.out)
-            _say(options.out, collect(options.collect, options.out))
-        else:
+
+    def keep() -> None:
+        if options.collect is None:
             _train_all(options)
-    except KeyboardInterrupt:
-        print("stopped; the same command goes on from here", file=sys.stderr)
-        return 130
-    except (ValueError, OSError) as error:
-        text = " ".join(str(error).split())
-        print(f"training_runs: error: {text}", file=sys.stderr)
-        return 2
-    return 0
+            return
+        if not (options.collect / "metrics.csv").is_file():
+            raise ValueError(f"--collect {options.collect} holds no metrics.csv")
+        require_writable_folder(options.out)
+        _say(options.out, collect(options.collect, options.out))
+
+    return command.run(keep, "training_runs", "the same command continues from here")
 
 
 def _train_all(options: argparse.Namespace) -> None:
@@ -231,19 +220,17 @@ def _train_all(options: argparse.Namespace) -> None:
         values = {"seed": seed}
         if options.episodes is not None:
             values["num_episodes"] = options.episodes
-        config = presets.with_values(presets.PRESETS[options.preset], values)
+        config = presets.with_values(presets.load(options.preset), values)
         config = dataclasses.replace(config, validate_every=_VALIDATE_EVERY_S)
         target = options.out / f"seed_{seed}"
         if _is_finished(target / "summary.json", config):
-            print(f"{target}: finished before", flush=True)
+            print(f"{target}: already finished", flush=True)
             continue
         name = f"seed {seed} ({number + 1} of {len(options.seeds)})"
 
-        def report(
-            now: Any, name: str = name, total: int = config.ppo.num_episodes
-        ) -> None:
+        def report(now: Any, name: str = name, config: Any = config) -> None:
             print(
-                f"{name}: {now.episodes:,} of {total:,} episodes, "
+                f"{name}: {now.episodes:,} of {config.ppo.num_episodes:,} episodes, "
                 f"{now.episodes_per_second:,.0f}/s, {now.eta / 60:.1f} min left, "
                 f"reward {now.metrics['reward_mean']:.4f}",
                 file=sys.stderr,
@@ -284,35 +271,31 @@ def _say(out: pathlib.Path, summary: dict[str, Any]) -> None:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = _Parser(
+    parser = command.Parser(
         prog="python -m jaxcal.paper.training_runs",
         description=_DESCRIPTION,
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     add = parser.add_argument
+    number: dict[str, Any] = {"type": command.positive, "metavar": "N"}
+    folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
     add("--preset", metavar="NAME", help="compact, general or paper")
     add("--seeds", type=_seeds, metavar="N", help="0 to N-1, or a list 3,5,8; 5")
-    add("--episodes", type=int, metavar="N", help="budget of each; the preset's")
-    add(
-        "--collect", type=pathlib.Path, metavar="RUN", help="keep this run; no training"
-    )
-    add("--out", type=pathlib.Path, metavar="DIR", required=True, help="kept files")
-    add("--runs", type=pathlib.Path, metavar="DIR", help="run folders; runs/(--out)")
+    add("--episodes", help="budget of each; the preset's", **number)
+    add("--collect", help="keep this run; no training", **folder)
+    add("--out", required=True, help="kept files", **folder)
+    add("--runs", help="run folders; runs/(--out)", **folder)
     options = parser.parse_args(arguments)
     if (options.preset is None) == (options.collect is None):
         parser.error("give one of --preset and --collect")
     if options.preset is not None:
-        from jaxcal.learning.training.presets import PRESETS
+        from jaxcal.learning.training import presets
 
-        if options.preset not in PRESETS:
-            known = ", ".join(sorted(PRESETS))
+        if options.preset not in presets.names():
+            known = ", ".join(presets.names())
             parser.error(f"--preset must be one of {known}, got {options.preset!r}")
     elif options.seeds or options.episodes or options.runs:
         parser.error("--seeds, --episodes and --runs go with --preset")
-    if options.episodes is not None and options.episodes < 1:
-        parser.error(f"--episodes must be at least 1, got {options.episodes}")
     options.seeds = options.seeds or list(range(5))
     return options
 
@@ -321,10 +304,10 @@ def _seeds(text: str) -> list[int]:
     try:
         numbers = [int(part) for part in text.split(",")]
     except ValueError:
-        numbers = []
-    if "," not in text and numbers and numbers[0] > 0:
+        numbers = [-1]
+    if "," not in text and numbers[0] > 0:
         return list(range(numbers[0]))
-    if "," not in text or min(numbers, default=-1) < 0:
+    if "," not in text or min(numbers) < 0:
         raise argparse.ArgumentTypeError(
             f"must be a number of seeds or a list like 3,5,8, got {text!r}"
         )

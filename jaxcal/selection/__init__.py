@@ -1,14 +1,20 @@
 """Which few of many candidate postures to measure: one signature for every solver."""
 
-from jaxcal.selection.api import METHODS, score, select
+from jaxcal.selection.api import score, select
 from jaxcal.selection.batch import (
     exact_batch,
     exchange_batch,
     greedy_batch,
     random_batch,
 )
-from jaxcal.selection.problem import Problem, make_problem, make_problems
+from jaxcal.selection.problem import (
+    Problem,
+    make_block_problem,
+    make_problem,
+    make_problems,
+)
 from jaxcal.selection.result import BatchSelection, Selection, Subset
+from jaxcal.selection.solvers import METHODS
 
 __all__ = [
     "METHODS",
@@ -19,6 +25,7 @@ __all__ = [
     "exact_batch",
     "exchange_batch",
     "greedy_batch",
+    "make_block_problem",
     "make_problem",
     "make_problems",
     "random_batch",

@@ -3,138 +3,116 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from jaxcal.selection.auto import check_least_efficiency, solve_auto
-from jaxcal.selection.exact.exact import STARTING_RESTARTS, solve_exact
-from jaxcal.selection.exchange.exchange import default_restarts, exchange_indices
-from jaxcal.selection.greedy import greedy_indices
-from jaxcal.selection.problem import Problem, make_problem, whole_number
-from jaxcal.selection.random import random_indices
+from jaxcal.checks import one_of, seconds
+from jaxcal.selection.exact.exact import TIME_LIMIT, solve_exact
+from jaxcal.selection.problem import Problem, make_block_problem, make_problem
 from jaxcal.selection.result import Selection, Subset
+from jaxcal.selection.solver import Found
+from jaxcal.selection.solvers import SOLVERS, checked_options
 
-__all__ = ["METHODS", "score", "select"]
+__all__ = ["score", "select"]
 
-METHODS = ("random", "greedy", "exchange", "exact", "policy")
-_CHOICES = (*METHODS, "auto")  # auto is one of the last two, whichever suffices
 _REFERENCES = ("bound", "exact")
 _PROVEN = 1e-9  # log det S this near a proven optimum is that optimum
 
 
 def select(
-    candidates: ArrayLike,
-    k: int = 4,
-    method: str = "policy",
+    candidates: ArrayLike | None = None,
+    k: int | None = None,
+    method: str = "auto",
     *,
+    blocks: ArrayLike | None = None,
+    prior: ArrayLike | None = None,
+    names: Sequence[str] | None = None,
     available: ArrayLike | None = None,
     required: ArrayLike | None = None,
     max_replicates: int = 1,
     num_outputs: int | None = None,
-    seed: int = 0,
+    reference: str = "bound",
+    seed: int | np.random.Generator = 0,
     restarts: int | None = None,
     time_limit: float | None = None,
     best: int = 1,
-    reference: str = "bound",
+    least_efficiency: float = 0.999,
     checkpoint: Any = None,
     decoding: str = "greedy",
     num: int = 16,
-    least_efficiency: float = 0.999,
 ) -> Selection:
-    """Choose the k postures whose information matrix has the largest determinant.
+    """Choose the k candidates whose information matrix has the largest determinant.
 
     Args:
-        candidates: (M, n) commands that could be measured, in any unit.
-        k: postures to choose, at least n + 1.
-        method: "random", "greedy", "exchange" (near-optimal), "exact" (proven),
-            "policy" (the trained network) or "auto": the policy where it provably has
-            ``least_efficiency``, else exact; ``method`` of the answer says which.
+        candidates: (M, n) commands that could be measured, in any unit, of the affine
+            model ``y = A u + b``; an array or a data frame, whose labels are kept. Rows
+            that are not available may hold NaN.
+        k: candidates to choose; the fewest that identify (n + 1) when not given.
+        method: "auto" (the cheapest way to an answer proven to have
+            ``least_efficiency``), "exact" (proven), "exchange" (near-optimal),
+            "greedy", "random" or "policy" (the trained network).
+        blocks: (M, q, p) instead of candidates, for any model: candidate i gives q
+            readings ``B_i theta`` with noise of unit variance.
+        prior: with blocks, (p, p) precision of what is known of theta beforehand.
+        names: (M,) names of the candidates, for the answer.
         available: (M,) bool, True where a candidate may be chosen; all when not given.
         required: (r,) candidates that must be among the chosen.
         max_replicates: how often one candidate may be chosen; 1 keeps them distinct.
         num_outputs: m, as many as inputs when not given; log det S is m times that of
-            the (n + 1) x (n + 1) matrix.
-        seed: for random and exchange, and for the policy where it samples.
-        restarts: random starts of the exchange; when not given 200, with replicates
-            400, and 30 where it only starts the exact search.
-        time_limit: seconds after which exact, also within auto, returns the best found,
-            not proven.
-        best: how many best subsets exact proves, in ``alternatives``.
+            the (n + 1) x (n + 1) matrix. With blocks, how often log det counts, 1.
         reference: what ``bound`` and ``efficiency`` are measured against, "bound" (the
             cheapest upper bound, computed when read) or "exact" (the proven optimum).
-        checkpoint: folder of a trained policy; the one that ships when not given.
-        decoding: how the policy chooses, see ``jaxcal.selection.policy``.
-        num: decodings the policy tries, where ``decoding`` tries several.
-        least_efficiency: of auto, the D-efficiency in (0, 1] against the optimum or an
-            upper bound on it from which the policy's answer is kept.
+        seed: whole number or numpy Generator; of all methods but greedy.
+        restarts: random starts of exchange (200, or 400 with replicates, when not
+            given), and of the one that starts exact and auto (30).
+        time_limit: seconds after which exact and auto return the best found with a true
+            ``bound``, not proven; 10 when not given, ``math.inf`` for none.
+        best: of exact, how many best subsets to prove, in ``alternatives``.
+        least_efficiency: of auto, the D-efficiency in (0, 1] that suffices.
+        checkpoint: of policy, folder of a trained one; that which ships when not given.
+        decoding: of policy, how it chooses, see ``jaxcal.selection.policy``.
+        num: of policy, decodings tried, where ``decoding`` tries several.
 
     Returns:
-        The selection; never a singular one. That of auto also has a ``reason``.
+        The selection; never a singular one.
 
     Raises:
-        ValueError: naming the argument, the rule and the value.
+        ValueError: naming the argument, the rule and the value; also where an option is
+            given that the method does not read.
     """
-    if method not in _CHOICES:
-        raise ValueError(f"method must be one of {', '.join(_CHOICES)}, got {method!r}")
-    _check_reference(reference)
-    least_efficiency = check_least_efficiency(least_efficiency)
-    seed = whole_number("seed", seed, 0)
-    if restarts is not None:
-        restarts = whole_number("restarts", restarts, 1)
-    best = whole_number("best", best, 1)
-    if best > 1 and method != "exact":
-        raise ValueError(f'best must be 1 unless method is "exact", got {best}')
-    _check_time_limit(time_limit)
+    one_of("reference", reference, _REFERENCES)
+    given = {
+        "seed": seed, "restarts": restarts, "time_limit": time_limit, "best": best,
+        "least_efficiency": least_efficiency, "checkpoint": checkpoint,
+        "decoding": decoding, "num": num,
+    }  # fmt: skip
+    also = ("time_limit",) if reference == "exact" else ()
+    options = checked_options(method, given, also)
     start = time.perf_counter()
-    problem = make_problem(
-        candidates,
-        k,
-        available=available,
-        required=required,
-        max_replicates=max_replicates,
-        num_outputs=num_outputs,
-    )
-    if method == "exact":
-        deadline = None if time_limit is None else start + time_limit
-        starts = restarts or STARTING_RESTARTS
-        return _exact(problem, best, deadline, starts, seed, start)
-    if method == "auto":
-        return solve_auto(
-            problem,
-            lambda: _policy(problem, checkpoint, decoding, num, seed),
-            least_efficiency,
-            reference,
-            time_limit,
-            restarts or STARTING_RESTARTS,
-            seed,
-        )
-    starts = restarts or default_restarts(problem.max_replicates)
-    used_seed: int | None = seed
-    used_restarts: int | None = None
-    if method == "random":
-        indices = random_indices(problem, np.random.default_rng(seed))
-    elif method == "greedy":
-        indices, used_seed = greedy_indices(problem), None
-    elif method == "exchange":
-        indices, used_restarts = exchange_indices(problem, starts, seed), starts
+    rules: dict[str, Any] = {
+        "available": available,
+        "required": required,
+        "max_replicates": max_replicates,
+        "num_outputs": num_outputs,
+    }
+    if (candidates is None) == (blocks is None):
+        got = "neither" if blocks is None else "both"
+        raise ValueError(f"either candidates or blocks must be given, got {got}")
+    axes = None
+    if blocks is not None:
+        problem = make_block_problem(blocks, k, prior=prior, **rules)
+    elif prior is not None:
+        raise ValueError("prior must come with blocks, whose parameters it is about")
     else:
-        indices = _policy(problem, checkpoint, decoding, num, seed)
-    log_det = _judge(problem, indices, method)
-    seconds = time.perf_counter() - start
-    bound = _reference_bound(problem, reference, time_limit)
-    return Selection(
-        indices=indices,
-        log_det=log_det,
-        method=method,
-        proven=_is_proven(log_det, bound),
-        seconds=seconds,
-        seed=used_seed,
-        restarts=used_restarts,
-        alternatives=(Subset(indices, log_det),),
-        known_bound=None if bound is None else bound[0],
-        problem=problem,
+        names, axes = _labels(candidates, names)
+        problem = make_problem(candidates, k, **rules)  # type: ignore[arg-type]  # not None
+    names = _checked_names(names, len(problem.blocks))
+    found = SOLVERS[method].solve(problem, **options)
+    return _selection(
+        problem, found, method, start, reference, time_limit, names=names, axes=axes
     )
 
 
@@ -151,20 +129,21 @@ def score(
     """Judge a subset made elsewhere as if a solver had returned it.
 
     Args:
-        candidates: (M, n), in any unit.
+        candidates: (M, n), in any unit; an array or a data frame.
         indices: (k,) the subset; repeated entries are replicates.
         available: (M,) bool, True where a candidate could have been chosen.
         num_outputs: m; as many as inputs when not given.
         reference: "bound" or "exact", as in :func:`select`.
         max_replicates: the cap that the optimum is allowed; as often as the subset
             repeats a candidate when not given.
-        time_limit: seconds for ``reference="exact"``.
+        time_limit: seconds for ``reference="exact"``, 10 when not given.
 
     Raises:
         ValueError: also where the subset is singular.
     """
-    _check_reference(reference)
-    _check_time_limit(time_limit)
+    one_of("reference", reference, _REFERENCES)
+    if time_limit is not None:
+        seconds("time_limit", time_limit)
     start = time.perf_counter()
     subset = np.asarray(indices)
     if subset.ndim != 1 or not np.issubdtype(subset.dtype, np.integer):
@@ -181,12 +160,12 @@ def score(
             f"indices must lie in [0, {num_candidates}), got {subset[outside][0]}"
         )
     repeats = int(np.unique(subset, return_counts=True)[1].max())
-    cap = repeats if max_replicates is None else max_replicates
+    names, axes = _labels(candidates, None)
     problem = make_problem(
         candidates,
         len(subset),
         available=available,
-        max_replicates=cap,
+        max_replicates=repeats if max_replicates is None else max_replicates,
         num_outputs=num_outputs,
     )
     if repeats > problem.max_replicates:
@@ -198,111 +177,77 @@ def score(
     if not problem.available[subset].all():
         masked = subset[~problem.available[subset]][0]
         raise ValueError(f"indices must be available, got {masked}, which is masked")
-    log_det = _judge(problem, subset, "score")
-    seconds = time.perf_counter() - start
-    bound = _reference_bound(problem, reference, time_limit)
-    return Selection(
-        indices=subset,
-        log_det=log_det,
-        method="score",
-        proven=_is_proven(log_det, bound),
-        seconds=seconds,
-        alternatives=(Subset(subset, log_det),),
-        known_bound=None if bound is None else bound[0],
-        problem=problem,
+    found = Found(subset)
+    return _selection(
+        problem, found, "score", start, reference, time_limit, names=names, axes=axes
     )
 
 
-def _exact(
+def _selection(
     problem: Problem,
-    best: int,
-    deadline: float | None,
-    restarts: int,
-    seed: int,
+    found: Found,
+    method: str,
     start: float,
+    reference: str,
+    time_limit: float | None,
+    **labels: tuple[str, ...] | None,
 ) -> Selection:
-    found = solve_exact(problem, best, deadline, restarts, seed)
-    return Selection(
-        indices=found.subsets[0],
-        log_det=float(found.log_dets[0]),
-        method="exact",
-        proven=found.proven,
-        seconds=time.perf_counter() - start,
-        seed=seed,
-        restarts=restarts,
-        nodes=found.nodes,
-        alternatives=tuple(
-            Subset(indices, float(value))
-            for indices, value in zip(found.subsets, found.log_dets, strict=True)
-        ),
-        known_bound=found.bound,
-        problem=problem,
-    )
-
-
-def _policy(
-    problem: Problem, checkpoint: Any, decoding: str, num: int, seed: int
-) -> NDArray[np.int64]:
-    from jaxcal.selection.policy import select_batch
-
-    if problem.max_replicates > 1:
-        raise ValueError(
-            'max_replicates must be 1 with method "policy", which picks distinct '
-            f"postures, got {problem.max_replicates}"
-        )
-    indices = select_batch(
-        problem.candidates[None],
-        problem.k,
-        available=problem.available[None],
-        required=problem.required[None] if len(problem.required) else None,
-        decoding=decoding,
-        num=num,
-        seed=seed,
-        checkpoint=checkpoint,
-    )
-    return np.asarray(indices[0], dtype=np.int64)
-
-
-def _judge(problem: Problem, indices: NDArray[np.int64], method: str) -> float:
-    """log det S, or a ValueError where the selection is singular."""
-    log_det = problem.log_det(indices)
+    """Judge what a solver found; with ``reference="exact"`` also find the optimum."""
+    indices, log_det = found.indices, found.log_det
+    if log_det is None:
+        log_det = problem.log_det(indices)
     if np.isneginf(log_det):
         name = "indices" if method == "score" else "method"
         what = "" if method == "score" else f", which {method!r} returned"
         raise ValueError(
-            f"{name} must give an invertible information matrix, but the postures "
-            f"{indices.tolist()}{what} lie in one plane"
+            f"{name} must give an invertible information matrix, but that of "
+            f"{indices.tolist()}{what} is singular"
         )
-    return log_det
+    taken = time.perf_counter() - start
+    bound, proven = found.bound, found.proven
+    if reference == "exact" and not proven:
+        deadline = time.perf_counter() + (time_limit or TIME_LIMIT)
+        optimum = solve_exact(problem, deadline=deadline)
+        bound = optimum.bound if bound is None else min(bound, optimum.bound)
+        proven = optimum.proven and log_det >= optimum.bound - _PROVEN
+    subsets = found.alternatives or ((indices, log_det),)
+    return Selection(
+        indices=indices,
+        log_det=log_det,
+        method=found.method or method,
+        proven=proven,
+        seconds=taken,
+        problem=problem,
+        reason=found.reason,
+        seed=found.seed,
+        restarts=found.restarts,
+        nodes=found.nodes,
+        alternatives=tuple(Subset(*each) for each in subsets),
+        known_bound=bound,
+        **labels,
+    )
 
 
-def _check_reference(reference: str) -> None:
-    if reference not in _REFERENCES:
-        raise ValueError(
-            f"reference must be one of {', '.join(_REFERENCES)}, got {reference!r}"
-        )
+def _labels(
+    candidates: Any, names: Sequence[str] | None
+) -> tuple[tuple[str, ...] | None, tuple[str, ...] | None]:
+    """Names of the candidates and of their axes, from a data frame where it is one."""
+    if not hasattr(candidates, "to_numpy") or not hasattr(candidates, "columns"):
+        return None if names is None else tuple(names), None
+    axes = tuple(str(column) for column in candidates.columns)
+    rows = tuple(str(label) for label in getattr(candidates, "index", ()))
+    if names is None and rows and rows != tuple(map(str, range(len(rows)))):
+        return rows, axes
+    return None if names is None else tuple(names), axes
 
 
-def _check_time_limit(time_limit: Any) -> None:
-    if time_limit is None:
-        return
-    number = isinstance(time_limit, int | float | np.integer | np.floating)
-    if not number or not time_limit > 0.0:
-        raise ValueError(
-            f"time_limit must be a number above 0 in seconds, got {time_limit!r}"
-        )
-
-
-def _reference_bound(
-    problem: Problem, reference: str, time_limit: float | None
-) -> tuple[float, bool] | None:
-    """Upper bound and whether it is the optimum; None leaves it until it is read."""
-    if reference == "bound":
+def _checked_names(names: Sequence[str] | None, count: int) -> tuple[str, ...] | None:
+    if names is None:
         return None
-    deadline = None if time_limit is None else time.perf_counter() + time_limit
-    found = solve_exact(problem, deadline=deadline)
-    return found.bound, found.proven
-
-
-def _is_proven(log_det: float, bound: tuple[float, bool] | None) -> bool:
-    return bound is not None and bound[1] and log_det >= bound[0] - _PROVEN
+    given = tuple(names)
+    if len(given) != count or not all(isinstance(name, str) for name in given):
+        raise ValueError(
+            f"names must be {count} texts, one for each candidate, got {len(given)} of "
+            f"{', '.join(sorted({type(name).__name__ for name in given}))}"
+        )
+    return given

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.checks import axis_names
 from jaxcal.information.criteria import Criteria, criteria, d_efficiency
 from jaxcal.selection.problem import Problem
+
+if TYPE_CHECKING:
+    import pandas  # type: ignore[import-untyped]  # optional, and without types
 
 __all__ = ["BatchSelection", "Selection", "Subset"]
 
@@ -24,27 +28,45 @@ class Subset(NamedTuple):
     log_det: float  # natural log det S, in the candidates' unit
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Selection:
-    """The postures chosen, how, and how good they are.
+    """The candidates chosen, how, and how good they are; printing it shows a table.
 
     ``bound``, ``gap``, ``efficiency`` and ``criteria`` are computed when first read.
     """
 
     indices: Indices  # (k,) into the candidates, in the order picked
     log_det: float  # natural log det S, in the candidates' unit
-    method: str  # the solver, or "score" for a subset made elsewhere
+    method: str  # the solver that answered, or "score" for a subset made elsewhere
     proven: bool  # True: no selection is better by more than 1e-9
     seconds: float  # wall time of the solver
+    problem: Problem
+    reason: str = ""  # of auto, one sentence: why this answer is good enough
     seed: int | None = None  # where the solver draws at random
     restarts: int | None = None  # random starts of the exchange
     nodes: int | None = None  # branch-and-bound nodes, or subsets enumerated
     alternatives: tuple[Subset, ...] = ()  # the best subsets, best first
-    known_bound: float | None = dataclasses.field(default=None, repr=False)
-    problem: Problem | None = dataclasses.field(default=None, repr=False)
+    known_bound: float | None = None  # bound, where the solver gave one
+    names: tuple[str, ...] | None = None  # (M,) of the candidates, the caller's own
+    axes: tuple[str, ...] | None = None  # (n,) of the inputs, the caller's own
+
+    def __post_init__(self) -> None:
+        for indices in (self.indices, *(each.indices for each in self.alternatives)):
+            indices.flags.writeable = False
+
+    @property
+    def value(self) -> float:
+        """Of the criterion, D: ``log_det``."""
+        return self.log_det
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """(k,) names of the chosen; their indices where the caller gave none."""
+        chosen = self.indices.tolist()
+        return tuple(str(i) if self.names is None else self.names[i] for i in chosen)
 
     @cached_property
-    def bound(self) -> float | None:
+    def bound(self) -> float:
         """Upper bound on log det S of every selection allowed.
 
         The proven optimum where the solver or ``reference="exact"`` gave one, or where
@@ -52,41 +74,109 @@ class Selection:
         """
         if self.known_bound is not None:
             return max(self.known_bound, self.log_det)
-        if self.problem is None:
-            return None
         from jaxcal.selection.exact.exact import upper_bound
 
         return max(upper_bound(self.problem), self.log_det)
 
     @property
-    def gap(self) -> float | None:
+    def gap(self) -> float:
         """``bound - log_det``, zero where optimality is proven."""
-        return None if self.bound is None else self.bound - self.log_det
+        return self.bound - self.log_det
 
     @property
-    def efficiency(self) -> float | None:
+    def efficiency(self) -> float:
         """D-efficiency against ``bound``: at least this share of the best possible."""
-        if self.bound is None or self.problem is None:
-            return None
-        parameters = self.problem.num_outputs * self.problem.num_regressors
-        return d_efficiency(self.log_det, self.bound, parameters)
+        return d_efficiency(self.log_det, self.bound, self.problem.num_parameters)
 
     @cached_property
     def criteria(self) -> Criteria | None:
-        """D, A, I, E, G and O1 to O5; I and G over the available candidates."""
-        if self.problem is None:
-            return None
+        """D, A, I, E, G and O1 to O5; I and G over the available candidates.
+
+        None where blocks were given, not candidates.
+        """
         candidates = self.problem.candidates
-        return criteria(
-            candidates[self.indices],
-            candidates[self.problem.available],
-            self.problem.num_outputs,
+        if candidates is None:
+            return None
+        region = candidates[self.problem.available]
+        return criteria(candidates[self.indices], region, self.problem.num_outputs)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, text and lists, as a JSON file takes them."""
+        candidates = self.problem.candidates
+        chosen = None if candidates is None else candidates[self.indices].tolist()
+        return {
+            "indices": self.indices.tolist(),
+            "labels": list(self.labels),
+            "candidates": chosen,
+            "log_det": self.log_det,
+            "bound": self.bound,
+            "efficiency": self.efficiency,
+            "proven": self.proven,
+            "method": self.method,
+            "reason": self.reason,
+            "seconds": self.seconds,
+            "seed": self.seed,
+        }
+
+    def to_frame(self) -> pandas.DataFrame:
+        """The chosen candidates, a row each, under the caller's own labels.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        try:
+            import pandas
+        except ModuleNotFoundError as error:
+            raise ImportError(
+                "to_frame needs pandas, which is not installed: pip install pandas"
+            ) from error
+        columns = {"index": self.indices}
+        if self.problem.candidates is not None:
+            chosen = self.problem.candidates[self.indices]
+            columns |= dict(zip(self._axes(), chosen.T, strict=True))
+        return pandas.DataFrame(columns, index=list(self.labels))
+
+    def _axes(self) -> tuple[str, ...]:
+        assert self.problem.candidates is not None
+        return axis_names("names", self.axes, "u", self.problem.candidates.shape[1])
+
+    def __str__(self) -> str:
+        head = ["candidate"] + (["name"] if self.names is not None else [])
+        cells = [[str(i)] for i in self.indices.tolist()]
+        if self.names is not None:
+            cells = [[*row, name] for row, name in zip(cells, self.labels, strict=True)]
+        if self.problem.candidates is not None:
+            head += self._axes()
+            for row, i in zip(cells, self.indices, strict=True):
+                row += [f"{x:.6g}" for x in self.problem.candidates[i]]
+        widths = [max(map(len, column)) for column in zip(head, *cells, strict=True)]
+        lines = [
+            "  ".join(
+                cell.rjust(width) for cell, width in zip(row, widths, strict=True)
+            )
+            for row in (head, *cells)
+        ]
+        count = int(self.problem.available.sum())
+        best = "proven optimal" if self.proven else f"upper bound {self.bound:.6g}"
+        extra = "" if self.seed is None else f", seed {self.seed}"
+        lines = [
+            f"{len(self.indices)} of {count} candidates, method {self.method}",
+            *lines,
+            f"log det S     {self.log_det:.6g} ({best})",
+            f"D-efficiency  {self.efficiency:.6f}"
+            + ("" if self.proven else " or more"),
+            f"time          {1e3 * self.seconds:.3g} ms{extra}",
+        ]
+        return "\n".join(
+            lines + ([f"reason        {self.reason}"] if self.reason else [])
         )
+
+    __repr__ = __str__
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BatchSelection:
-    """One selection a candidate set."""
+    """One selection per candidate set."""
 
     indices: Indices  # (B, k)
     log_det: NDArray[np.float64]  # (B,) natural log det S

@@ -6,9 +6,8 @@ import math
 import time
 from collections.abc import Callable
 
-from rig.registers import RegisterMap, Write, decode, encode
-
-__all__ = ["ILLEGAL_ADDRESS", "ILLEGAL_VALUE", "DriveException", "SimDrive"]
+from rig.config.maps import RegisterMap
+from rig.config.registers import Writes, decode, encode
 
 ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 2, 3, 4
 STEP_S = 0.001
@@ -61,15 +60,15 @@ class SimDrive:
     def _known(self) -> dict[int, int]:
         m = self.map
         known = {m.status.address + i: 0 for i in range(m.status.count)}
-        reads = [m.position, *(read for _, read in m.identity)]
+        reads = [m.position, *m.identity.values()]
         if m.alarm:
             reads.append(m.alarm)
         for read in reads:
             known |= {read.address + i: 0 for i in range(read.count)}
-        frames = m.move + m.stop + m.enable + m.alarm_reset + m.comm_timeout + m.limits
-        for frame in frames:
+        tables = (m.move, m.stop, m.enable, m.alarm_reset, m.comm_timeout, m.limits)
+        for frame in [frame for table in tables if table for frame in table.write]:
             known |= {frame.address + i: 0 for i in range(frame.count)}
-        for _, read in m.identity[:1]:
+        for read in list(m.identity.values())[:1]:
             known[read.address + read.count - 1] = self._pulses_per_rev & 0xFFFF
         return known
 
@@ -147,7 +146,7 @@ class SimDrive:
             self._registers[address + i] = word
 
     def _status(self) -> int:
-        m, word = self.map, 0
+        m, word = self.map.status, 0
         if self.enabled and m.enabled:
             word |= sum(1 << bit for bit in m.enabled.set)
         if self.moving:
@@ -166,7 +165,8 @@ class SimDrive:
             raise DriveException(ILLEGAL_ADDRESS)
         m = self.map
         at = {address + i: word for i, word in enumerate(words)}
-        moves = at.get(m.trigger[0]) == m.trigger[1]
+        trigger = m.move.trigger
+        moves = at.get(trigger.address) == trigger.value
         before = dict(self._registers)
         self._registers |= at
         if moves:
@@ -175,23 +175,24 @@ class SimDrive:
             except DriveException:
                 self._registers = before
                 raise
-        elif self._is(m.stop[:1], address, words):
+        elif self._begins(m.stop, address, words):
             self.stops.append(self._clock())
             self._stopping = self.moving
             self.target = round(self.position)
-        elif self._is(m.alarm_reset[:1], address, words):
+        elif self._begins(m.alarm_reset, address, words):
             self.alarm = 0
-        elif self._is(m.enable[:1], address, words):
+        elif self._begins(m.enable, address, words):
             self.enabled = True
-        elif any(frame.address == address for frame in m.comm_timeout):
+        elif m.comm_timeout and address == m.comm_timeout.write[0].address:
             value = self._value(m.comm_timeout, "timeout")
-            self._comm_timeout = (value or 0) / m.comm_timeout_per_s
+            self._comm_timeout = (value or 0) / m.comm_timeout.per_s
 
-    def _is(self, frames: tuple[Write, ...], address: int, words: list[int]) -> bool:
-        return any(f.address == address and list(f.words) == words for f in frames)
+    def _begins(self, table: Writes | None, address: int, words: list[int]) -> bool:
+        first = table.write[0] if table else None
+        return bool(first and first.address == address and list(first.words) == words)
 
-    def _value(self, frames: tuple[Write, ...], name: str) -> int | None:
-        for frame in frames:
+    def _value(self, table: Writes, name: str) -> int | None:
+        for frame in table.write:
             found = frame.offset_of(name)
             if found:
                 address, kind = found
@@ -208,15 +209,13 @@ class SimDrive:
         assert target is not None  # the schema demands it
         if self._travel and not self._travel[0] <= target <= self._travel[1]:
             raise DriveException(ILLEGAL_VALUE)
-        speed = (self._value(m.move, "speed") or 1) / m.speed_per_unit
-        accel = float(self._value(m.move, "accel") or 1)
-        if m.accel_unit == "s_per_rev_per_s":
-            accel = m.accel_per_unit / accel
-        else:
-            accel /= m.accel_per_unit
-        per_rev = float(self._pulses_per_rev)
-        self._speed = speed * (per_rev if m.speed_unit == "rev_per_s" else 1.0)
-        self._accel = accel * (1.0 if m.accel_unit == "pulse_per_s2" else per_rev)
+        units, per_rev = m.units, float(self._pulses_per_rev)
+        speed = (self._value(m.move, "speed") or 1) / units.speed_per_unit
+        accel = (self._value(m.move, "accel") or 1) / units.accel_per_unit
+        if units.accel == "s_per_rev_per_s":
+            accel = 1.0 / accel
+        self._speed = speed * (per_rev if units.speed == "rev_per_s" else 1.0)
+        self._accel = accel * (1.0 if units.accel == "pulse_per_s2" else per_rev)
         self.executions.append((self._clock(), target))
         self.target, self.moving, self.done = target, True, False
         self._stopping = False

@@ -5,10 +5,9 @@ from __future__ import annotations
 import dataclasses
 import threading
 import time
+from typing import Any
 
-from rig.settings import AXIS_NAMES
-
-__all__ = ["BUS_KINDS", "KINDS", "PHASES", "FaultInjector", "FaultSpec", "parse_fault"]
+from rig.config.axis import AXIS_NAMES
 
 PHASES = ("zeroing", "moving", "settling", "measuring", "saving")
 BUS_KINDS = {
@@ -57,32 +56,22 @@ def parse_fault(text: str) -> FaultSpec:
     kind, _, when = head.partition("@")
     if kind not in KINDS:
         raise ValueError(f"unknown fault {kind!r}: have {', '.join(KINDS)}")
-    spec = FaultSpec(kind)
-    if when in PHASES:
-        spec = dataclasses.replace(spec, phase=when)
-    elif when:
-        try:
-            spec = dataclasses.replace(spec, after_s=float(when.removesuffix("s")))
-        except ValueError:
-            raise ValueError(
-                f"fault {text!r}: after @ comes one of {', '.join(PHASES)} or seconds"
-            ) from None
-    for option in options:
-        key, _, value = option.partition("=")
-        try:
-            if key == "count":
-                spec = dataclasses.replace(spec, count=int(value))
-            elif key == "seconds":
-                spec = dataclasses.replace(spec, seconds=float(value))
-            elif key == "axis":
-                spec = dataclasses.replace(spec, axis=AXIS_NAMES.index(value))
-            else:
-                raise ValueError
-        except ValueError:
-            raise ValueError(
-                f"fault {text!r}: options are count=N, seconds=S, axis=NAME"
-            ) from None
-    return spec
+    found: dict[str, Any] = {}
+    readers: dict[str, Any] = {"count": int, "seconds": float, "axis": AXIS_NAMES.index}
+    try:
+        if when in PHASES:
+            found["phase"] = when
+        elif when:
+            found["after_s"] = float(when.removesuffix("s"))
+        for option in options:
+            name, _, value = option.partition("=")
+            found[name] = readers[name](value)
+    except (KeyError, ValueError):
+        raise ValueError(
+            f"fault {text!r}: after @ comes one of {', '.join(PHASES)} or seconds; "
+            f"options are count=N, seconds=S, axis=NAME of {', '.join(AXIS_NAMES)}"
+        ) from None
+    return FaultSpec(kind, **found)
 
 
 class FaultInjector:

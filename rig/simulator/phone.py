@@ -12,57 +12,39 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rig.attitude import Array, matrix_to_euler
-from rig.settings import ImuSettings
+from rig.config.settings import ImuSettings
 from rig.simulator.faults import FaultInjector
-
-__all__ = ["Phone", "format_line", "matrix_to_quaternion"]
 
 
 def matrix_to_quaternion(matrix: Array) -> Array:
-    """(4,) x, y, z, w of a (3, 3) rotation, by the largest of the four."""
-    m = matrix
-    squares = np.array(
-        [
-            1 + m[0, 0] - m[1, 1] - m[2, 2],
-            1 - m[0, 0] + m[1, 1] - m[2, 2],
-            1 - m[0, 0] - m[1, 1] + m[2, 2],
-            1 + np.trace(m),
-        ]
-    )
-    rows = [
-        [squares[0], m[1, 0] + m[0, 1], m[0, 2] + m[2, 0], m[2, 1] - m[1, 2]],
-        [m[1, 0] + m[0, 1], squares[1], m[2, 1] + m[1, 2], m[0, 2] - m[2, 0]],
-        [m[0, 2] + m[2, 0], m[2, 1] + m[1, 2], squares[2], m[1, 0] - m[0, 1]],
-        [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], squares[3]],
-    ]
-    q = np.array(rows[int(np.argmax(squares))])
-    return q / np.linalg.norm(q)
+    """(4,) x, y, z, w of a (3, 3) rotation."""
+    return Rotation.from_matrix(matrix).as_quat()
 
 
 def format_line(
     settings: ImuSettings, matrix: Array, stamp_s: float, order: str
 ) -> str:
     """One line as the configured app would send it, without its end."""
-    width = settings.column_count or 1 + max(
-        *settings.columns, *(settings.quaternion or ()), settings.stamp_column or 0
-    )
+    used = (*settings.columns, *(settings.quaternion_columns or ()))
+    width = settings.column_count or 1 + max(*used, settings.stamp_column)
     fields = ["0.0"] * width
-    if settings.quaternion:
+    if settings.quaternion_columns:
         for column, value in zip(
-            settings.quaternion, matrix_to_quaternion(matrix), strict=True
+            settings.quaternion_columns, matrix_to_quaternion(matrix), strict=True
         ):
             fields[column] = f"{value:.9f}"
     else:
         angles = matrix_to_euler(matrix, order) * np.array(settings.signs)
         if settings.format == "hyperimu":
             angles[0] %= 360.0  # the azimuth runs from 0 to 360
-        if settings.angle_unit == "rad":
+        if settings.unit == "rad":
             angles = np.radians(angles)
         for column, value in zip(settings.columns, angles, strict=True):
             fields[column] = f"{value:.7f}"
-    if settings.stamp_column is not None:
+    if settings.stamp_column >= 0:
         fields[settings.stamp_column] = str(round(stamp_s * 1000))
     return settings.separator.join(fields)
 
@@ -141,7 +123,7 @@ class Phone:
 
     def _line(self) -> bytes:
         s, faults = self.settings, self._faults
-        order = s.order
+        order = str(s.order)
         if faults.take("imu_wrong_order"):
             order = "XYZ" if s.order != "XYZ" else "ZYX"
         matrix = self._attitude()
@@ -152,7 +134,7 @@ class Phone:
         text = format_line(s, matrix, time.time(), order)
         if faults.take("imu_nan"):
             fields = text.split(s.separator)
-            fields[(s.quaternion or s.columns)[0]] = "NaN"
+            fields[(s.quaternion_columns or s.columns)[0]] = "NaN"
             text = s.separator.join(fields)
         if faults.take("imu_columns"):
             text += f"{s.separator}1.0"

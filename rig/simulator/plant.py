@@ -9,10 +9,8 @@ from collections.abc import Callable
 import numpy as np
 
 from rig.attitude import Array, euler_to_matrix, small_rotation
-from rig.settings import RigConfig
+from rig.config.config import RigConfig
 from rig.simulator.drive import SimDrive
-
-__all__ = ["Plant", "Truth"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +87,7 @@ class Plant:
         """(3, 3) attitude of the phone in its world, as its sensors see it."""
         joints = self.joints()
         config = self._config
-        order = config.mechanism_order
+        order = config.mechanism.order
         sequence = [joints[config.letters.index(letter)] for letter in order]
         minutes = (self._clock() - self._start) / 60.0
         heading = self.truth.heading_deg + self.truth.drift_deg_per_min * minutes

@@ -19,8 +19,6 @@ import tty
 from rig.simulator.drive import DriveException, SimDrive
 from rig.simulator.faults import FaultInjector
 
-__all__ = ["ModbusServer", "crc16"]
-
 GATEWAY_SILENT = 11
 
 

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import threading
+from typing import Any
 
 from rig.attitude import Array
-from rig.settings import RigConfig
+from rig.config.config import RigConfig
 from rig.simulator.drive import SimDrive
 from rig.simulator.faults import FaultInjector, FaultSpec
 from rig.simulator.phone import Phone
 from rig.simulator.plant import Plant, Truth
 from rig.simulator.server import ModbusServer
-
-__all__ = ["Simulator"]
 
 
 class Simulator:
@@ -40,14 +38,14 @@ class Simulator:
         for axis, angle in zip(config.axes, jig, strict=True):
             travel = None
             if travel_deg is not None:
-                ends = sorted(axis.scale.to_pulses(end) for end in travel_deg)
+                ends = sorted(axis.to_pulses(end) for end in travel_deg)
                 travel = (ends[0], ends[1])
             position = 0.0
             if config.session.zero == "here":
-                position = float(axis.scale.to_pulses(float(angle)))
+                position = float(axis.to_pulses(float(angle)))
             self.drives.append(
                 SimDrive(
-                    axis.map, axis.scale.pulses_per_rev, position,
+                    axis.map, axis.pulses_per_rev, position,
                     speedup=speedup, travel=travel,
                 )
             )  # fmt: skip
@@ -64,24 +62,24 @@ class Simulator:
 
     def start(self, port: int = 0) -> RigConfig:
         """Serve the drives; the phone starts with ``start_phone``."""
-        bus = self.config.bus
+        bus: dict[str, Any] = {"transport": self.transport}
         if self.transport == "rtu":
-            bus = dataclasses.replace(
-                bus, transport="rtu", device=self.server.serve_pty(), parity="N"
-            )
+            bus |= {"device": self.server.serve_pty(), "parity": "N"}
         else:
             port = self.server.serve_tcp(port, rtu=self.transport == "rtu_tcp")
-            bus = dataclasses.replace(
-                bus, transport=self.transport, host="127.0.0.1", port=port
-            )
-        imu = dataclasses.replace(self.config.imu, host="127.0.0.1")
-        if imu.transport == "listen":
-            imu = dataclasses.replace(imu, port=0)
-        else:
+            bus |= {"host": "127.0.0.1", "port": port}
+        phone_port = 0
+        if self.config.imu.transport == "connect":
             self.start_phone(0)
             assert self.phone is not None
-            imu = dataclasses.replace(imu, port=self.phone.port)
-        return dataclasses.replace(self.config, bus=bus, imu=imu)
+            phone_port = self.phone.port
+        imu = {"host": "127.0.0.1", "port": phone_port}
+        return self.config.model_copy(
+            update={
+                "bus": self.config.bus.model_copy(update=bus),
+                "imu": self.config.imu.model_copy(update=imu),
+            }
+        )
 
     def start_phone(self, port: int) -> None:
         """Begin to send to the port the rig listens on; once only."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import pathlib
@@ -17,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from jaxcal.calibration.identify import Calibration, identify
+from jaxcal.calibration import Calibration, identify
 from jaxcal.information.regression import regression_matrix
 
 # A loaded machine is no failure.
@@ -344,6 +345,71 @@ def test_limits_are_kept_or_named(rng: np.random.Generator) -> None:
         found.command_for(wanted, [[np.nan, 1], [-1, 1], [-1, 1]])
 
 
+@pytest.mark.parametrize(
+    ("limits", "wanted", "axis"),
+    [
+        ([[0, np.inf]] * 3, [-5.0, 1.0, 1.0], "u_x"),
+        ([[-np.inf, 0]] * 3, [-5.0, 1.0, -1.0], "u_y"),
+        ([[-np.inf, np.inf], [-np.inf, 3], [0, np.inf]], [-9.0, 2.0, -1e-6], "u_z"),
+        ([[0, 1e300]] * 3, [1.0, 1.0, -5.0], "u_z"),
+    ],
+)
+def test_open_limits_do_not_hide_a_command_beyond_the_other_end(
+    limits: list[list[float]], wanted: list[float], axis: str
+) -> None:
+    found = identify(good * 4, good * 4)
+    with pytest.raises(ValueError, match=f"needs {axis} = .*, outside its limits"):
+        found.command_for(wanted, limits)
+    low, high = np.transpose(limits)
+    np.testing.assert_allclose(
+        found.command_for(wanted, limits, clip=True),
+        np.clip(wanted, low, high),
+        atol=1e-12,
+    )
+
+
+ends = st.one_of(st.just(np.inf), st.just(1e300), st.floats(0, 30))
+
+
+@given(seeds, st.lists(st.tuples(ends, ends), min_size=3, max_size=3), st.booleans())
+def test_a_command_within_limits_is_the_inverse_or_the_axis_is_named(
+    seed: int, widths: list[tuple[float, float]], at_limit: bool
+) -> None:
+    commands, measured = problem(seed, noise=0.0)
+    found = identify(commands, measured, noise_std=1e-12)
+    rng = np.random.default_rng(seed)
+    middle = rng.uniform(-5, 5, 3)
+    limits = np.array(
+        [[x - a, x + b] for x, (a, b) in zip(middle, widths, strict=True)]
+    )
+    needed = rng.uniform(-20, 20, 3)
+    if at_limit:  # an exact limit is within reach, whatever rounding says
+        needed = np.clip(needed, *np.clip(limits, -1e3, 1e3).T)
+    wanted = found.predict(needed)
+    beyond = (needed < limits[:, 0] - 1e-6) | (needed > limits[:, 1] + 1e-6)
+    if beyond.any():
+        with pytest.raises(ValueError, match="outside its limits") as caught:
+            found.command_for(wanted, limits)
+        assert any(f"needs u_{'xyz'[i]} = " in str(caught.value) for i in range(3))
+        return
+    try:
+        command = found.command_for(wanted, limits)
+    except ValueError as error:  # beyond by less than 1e-6
+        assert not at_limit and "outside its limits" in str(error)
+        return
+    assert (command >= limits[:, 0]).all() and (command <= limits[:, 1]).all()
+    np.testing.assert_allclose(found.predict(command), wanted, atol=1e-8)
+
+
+def test_what_no_finite_command_reaches_is_refused() -> None:
+    found = identify(good, good * 1e-5)
+    for limits in (None, [[0, np.inf]] * 3):
+        with pytest.raises(ValueError, match="finite commands"):
+            found.command_for([1e308, 0, 0], limits)
+    with pytest.raises(ValueError, match=r"limits of u_x .* got \(inf, inf\)"):
+        found.command_for([0, 0, 0], [[np.inf, np.inf]] * 3)
+
+
 def test_no_inverse_where_outputs_and_inputs_differ() -> None:
     commands, measured = problem(0, n=3, m=2)
     with pytest.raises(ValueError, match=r"as many outputs as inputs, .* \(2, 3\)"):
@@ -375,6 +441,88 @@ def test_units_do_not_make_a_sound_map_singular(rng: np.random.Generator) -> Non
     np.testing.assert_allclose(
         back / [1e5, 1, 1e-4], pulses / [1e5, 1, 1e-4], rtol=1e-9
     )
+
+
+# -- the result ------------------------------------------------------------------------
+
+
+def test_a_result_does_not_change_with_the_callers_arrays() -> None:
+    commands, measured = problem(4)
+    noise, weights = np.full(3, 0.1), np.ones(len(commands))
+    notes = {"device": ["ankle"]}
+    found = identify(commands, measured, noise_std=noise, weights=weights, notes=notes)
+    before = found.to_dict()
+    text = json.dumps(before)
+    for array in (commands, measured, noise, weights):
+        array *= 7.0
+    notes["device"].append("2")
+    assert json.dumps(found.to_dict()) == text
+    matrix = np.eye(3)
+    direct = dataclasses.replace(found, matrix=matrix, provenance=notes)
+    matrix[0, 0] = 9.0
+    notes["device"].append("3")
+    assert direct.matrix[0, 0] == 1.0
+    assert direct.provenance["device"] == ["ankle", "2"]
+    for name in ("matrix", "bias", "residuals", "noise_std", "slope_covariance"):
+        with pytest.raises(ValueError, match="read-only"):
+            getattr(direct, name)[0] = 0.0
+
+
+def test_a_calibration_prints_as_a_table() -> None:
+    commands, measured = problem(6)
+    names = {"input_names": ["pitch", "yaw", "roll"], "output_names": ["a", "b", "c"]}
+    found = identify(
+        commands, measured, **names, command_unit="pulse", measured_unit="deg"
+    )
+    lines = repr(found).splitlines()
+    assert str(found) == repr(found) == found.summary()
+    assert "10 measurements" in lines[0]
+    assert lines[1].split() == "meaning value 95 % interval unit".split()
+    ((low, high),) = found.confidence_intervals()[1:2]
+    row = lines[3]
+    assert row.split()[:4] == ["a12", "a", "per", "yaw"]
+    assert f"{found.matrix[0, 1]:.6g}" in row and row.endswith("deg/pulse")
+    assert f"{low:.6g}, " in row.replace("  ", " ") and f"{high:.6g}]" in row
+    assert lines[13].split()[:2] == ["bz", "c"] and lines[13].endswith(" deg")
+    assert "residual std" in lines[14] and "6 degrees of freedom" in lines[14]
+    assert max(map(len, lines[1:14])) <= 88
+    unknown = identify(commands[:4], measured[:4])
+    assert "interval" not in repr(unknown).splitlines()[1]
+    assert "unit" not in repr(unknown).splitlines()[1]
+
+
+def test_to_dict_is_the_file_and_from_dict_its_inverse(tmp_path: pathlib.Path) -> None:
+    found, path = saved(tmp_path)
+    assert found.to_dict() == json.loads(path.read_text())
+    assert Calibration.from_dict(found.to_dict()).to_dict() == found.to_dict()
+    with pytest.raises(ValueError, match='key "bias" is missing'):
+        Calibration.from_dict({k: v for k, v in found.to_dict().items() if k != "bias"})
+
+
+def test_to_frame_has_a_row_for_each_parameter() -> None:
+    pandas = pytest.importorskip("pandas")
+    commands, measured = problem(6, n=2, m=3)
+    found = identify(commands, measured, measured_unit="mm")
+    frame = found.to_frame()
+    assert isinstance(frame, pandas.DataFrame)
+    assert tuple(frame.index) == found.parameter_names
+    np.testing.assert_array_equal(frame["value"], found.parameters)
+    np.testing.assert_array_equal(frame[["low", "high"]], found.confidence_intervals())
+    assert frame.loc["a32", ["output", "input", "unit"]].tolist() == [
+        "y_z",
+        "u_2",
+        "mm",
+    ]
+    assert frame.loc["by", ["output", "input", "unit"]].tolist() == ["y_y", "", "mm"]
+    assert "low" not in identify(commands[:3], measured[:3]).to_frame()
+
+
+def test_to_frame_without_pandas_names_the_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match="pip install pandas"):
+        identify(*problem(6)).to_frame()
 
 
 # -- bad input -------------------------------------------------------------------------
@@ -545,6 +693,17 @@ def test_the_digest_tells_data_apart() -> None:
     assert same in digests
 
 
+def test_a_file_of_version_1_is_still_read() -> None:
+    found = Calibration.load(pathlib.Path(__file__).with_name("version_1.json"))
+    assert found.input_names == ("pitch", "yaw", "roll") and found.dof == 2
+    assert found.provenance["notes"] == {"device": "ankle 1"}
+    np.testing.assert_allclose(found.matrix, np.diag(SCALE), atol=0.05)
+    content = json.loads(pathlib.Path(__file__).with_name("version_1.json").read_text())
+    derived = content["derived"]
+    np.testing.assert_allclose(found.covariance, derived["covariance"], rtol=1e-9)
+    assert found.parameters.tolist() == derived["parameters"]
+
+
 def change(key: str, value: object) -> object:
     def apply(content: dict[str, object]) -> dict[str, object]:
         return {**content, key: value}
@@ -582,7 +741,7 @@ def remove(key: str) -> object:
         (change("noise_known", "yes"), '"noise_known" must be true or false'),
         (change("input_names", ["a"]), '"input_names" must hold 3 names'),
         (change("command_unit", 3), '"command_unit" must be text'),
-        (change("condition_number", "x"), '"condition_number" must be a number'),
+        (change("condition_number", "x"), '"condition_number" must hold numbers'),
     ],
 )
 def test_a_damaged_file_is_refused_by_key(
@@ -666,7 +825,7 @@ def test_a_killed_save_leaves_a_whole_file(tmp_path: pathlib.Path) -> None:
     _, path = saved(tmp_path)
     script = textwrap.dedent(
         f"""
-        from jaxcal.calibration.identify import Calibration
+        from jaxcal.calibration import Calibration
         found = Calibration.load({str(path)!r})
         print("ready", flush=True)
         while True:
@@ -687,7 +846,7 @@ def test_a_killed_save_leaves_a_whole_file(tmp_path: pathlib.Path) -> None:
 
 def test_importing_calibration_loads_neither_jax_nor_scipy() -> None:
     script = (
-        "import sys, jaxcal.calibration.identify; "
+        "import sys, jaxcal.calibration; "
         "print([m for m in ('jax', 'scipy', 'matplotlib') if m in sys.modules])"
     )
     out = subprocess.run(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import pathlib
 import re
@@ -13,6 +14,7 @@ import time
 import numpy as np
 import pytest
 
+from jaxcal.commands import evaluate as command
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import save_csv, save_npz
 from jaxcal.information.regression import regression_matrix
@@ -28,6 +30,24 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
         text=True,
         cwd=ROOT,
     )
+
+
+@dataclasses.dataclass
+class Done:
+    """How a command ended."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def call(capsys: pytest.CaptureFixture[str], *arguments: object) -> Done:
+    """The command in this process, which is quicker."""
+    try:
+        code = command.main([str(argument) for argument in arguments], "evaluate.py")
+    except SystemExit as leaving:
+        code = int(str(leaving.code))
+    return Done(code, *capsys.readouterr())
 
 
 def test_the_json_says_what_the_full_matrices_say(tmp_path: pathlib.Path) -> None:
@@ -62,7 +82,9 @@ def test_the_json_says_what_the_full_matrices_say(tmp_path: pathlib.Path) -> Non
     assert row["ratio_to_random"] == pytest.approx(ratio_of_means)
 
 
-def test_csv_with_a_mask_and_two_inputs(tmp_path: pathlib.Path) -> None:
+def test_csv_with_a_mask_and_two_inputs(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     rng = np.random.default_rng(0)
     mask = np.ones((3, 9), bool)
     mask[:, ::4] = False
@@ -70,7 +92,8 @@ def test_csv_with_a_mask_and_two_inputs(tmp_path: pathlib.Path) -> None:
         Dataset("x", rng.normal(size=(3, 9, 2)), available=mask), tmp_path / "d.csv"
     )
     out = tmp_path / "out.json"
-    done = run(
+    done = call(
+        capsys,
         *("--dataset", tmp_path / "d.csv", "--k", 3, "--json", out, "--indices"),
         *("--methods", "greedy,exchange,exact"),
     )
@@ -81,11 +104,14 @@ def test_csv_with_a_mask_and_two_inputs(tmp_path: pathlib.Path) -> None:
         assert not np.isin(row["indices"], [0, 4, 8]).any()
 
 
-def test_the_report_is_one_page_and_figures(tmp_path: pathlib.Path) -> None:
+def test_the_report_is_one_page_and_figures(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "metrics.csv").write_text("episodes,reward_mean\n16,-1\n32,-0.5\n")
-    done = run(
+    done = call(
+        capsys,
         *("--dataset", "dataset3", "--episodes", 5, "--methods", "random,exact"),
         *("--report", tmp_path / "report", "--run", folder),
     )
@@ -150,7 +176,10 @@ FLAT[1, :, 2] = 1.0
     ],
 )
 def test_every_error_is_one_line_and_code_2(
-    tmp_path: pathlib.Path, arguments: list[str], message: str
+    tmp_path: pathlib.Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    message: str,
 ) -> None:
     (tmp_path / "torn.npz").write_bytes(b"PK\x03\x04 torn")
     (tmp_path / "bad.csv").write_text("episode,candidate,u_x,u_y\n0,0,1,two\n")
@@ -160,7 +189,7 @@ def test_every_error_is_one_line_and_code_2(
     given = [argument.format(tmp=tmp_path) for argument in arguments]
     outputs = ["--json", tmp_path / "o.json"] if "--json" not in given else []
     methods = ["--methods", "greedy"] if "--methods" not in given else []
-    done = run(*methods, *outputs, *given)
+    done = call(capsys, *methods, *outputs, *given)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1, done.stderr
     assert done.stderr.startswith("evaluate.py: error: ")
@@ -169,12 +198,51 @@ def test_every_error_is_one_line_and_code_2(
     assert {path.name for path in tmp_path.iterdir()} == before
 
 
-def test_a_missing_checkpoint_is_one_line_and_code_2(tmp_path: pathlib.Path) -> None:
-    done = run(
+def test_a_missing_checkpoint_is_one_line_and_code_2(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done = call(
+        capsys,
         *("--episodes", 2, "--methods", "policy", "--checkpoint", tmp_path / "none"),
         *("--json", tmp_path / "o.json", "--report", tmp_path / "report"),
     )
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("package", "arguments", "says"),
+    [
+        ("tqdm", [], "evaluate needs tqdm"),
+        ("matplotlib", ["--report", "{tmp}/r"], "--report needs matplotlib"),
+        ("jinja2", ["--report", "{tmp}/r"], "--report needs jinja2"),
+        ("mujoco", ["--dataset", "dataset0"], "--dataset dataset0 needs mujoco"),
+    ],
+)
+def test_a_missing_extra_is_one_line_that_names_the_command(
+    tmp_path: pathlib.Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    package: str,
+    arguments: list[str],
+    says: str,
+) -> None:
+    for name in [name for name in sys.modules if name.partition(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+    importers = {
+        "tqdm": "jaxcal.progress",
+        "mujoco": "jaxcal.paper.twin.robot_model",
+    }
+    if package in importers:  # which is imported again, in vain
+        monkeypatch.delitem(sys.modules, importers[package], raising=False)
+    monkeypatch.setitem(sys.modules, package, None)
+    given = [argument.format(tmp=tmp_path) for argument in arguments]
+    done = call(capsys, "--methods", "greedy", "--episodes", 2, *given)
+    assert done.returncode == 2 and done.stdout == ""
+    assert done.stderr.splitlines() == [
+        f"evaluate.py: error: {says}, which is not installed: "
+        "pip install 'jaxcal[study]'"
+    ]
     assert list(tmp_path.iterdir()) == []
 
 

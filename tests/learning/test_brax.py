@@ -9,8 +9,7 @@ import pytest
 
 from jaxcal.learning.environments import selection as environment
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.training import checkpoint
-from jaxcal.learning.training.presets import PRESETS, with_values
+from jaxcal.learning.training import checkpoint, presets
 
 brax_env = pytest.importorskip("jaxcal.learning.environments.brax_env")
 
@@ -51,7 +50,8 @@ def test_reset_after_done_draws_new_candidates_and_nothing_is_truncated():
 def test_braxs_own_ppo_trains_it(tmp_path):
     from jaxcal.learning.training import brax_ppo
 
-    config = with_values(PRESETS["compact"], {"num_episodes": 20_000})
+    config = brax_ppo.adapted(presets.load("compact"))
+    config = presets.with_values(config, {"num_episodes": 20_000})
     lines: list[str] = []
     brax_ppo.train(config, tmp_path, lines.append, num_evals=3)
     values = [float(line.rsplit(" ", 1)[1]) for line in lines if "log det" in line]

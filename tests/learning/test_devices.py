@@ -19,11 +19,13 @@ BEGIN = """
 import json, sys
 import jax, jax.numpy as jnp, numpy as np
 from jaxcal.learning.runtime import devices
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies import networks
-from jaxcal.learning.training import ppo, presets
+from jaxcal.learning.training import optimiser, ppo, presets, rollout
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.training.ppo import PPOConfig, Task
+from jaxcal.learning.environments.task import Task
+from jaxcal.learning.training.config import PPOConfig
 out = {}
 
 def distance(one, other):
@@ -32,7 +34,7 @@ def distance(one, other):
 """
 
 TINY = """
-network = networks.build(NetworkConfig(width=8, encoder_rounds=1))
+network = build(NetworkConfig(width=8, encoder_rounds=1))
 task = Task(SelectionConfig(6, 3, 1, 1), random_starts=0.3, masked=0.2)
 config = PPOConfig(
     num_episodes=64 * 3, episodes_per_update=64, episodes_per_set=4,
@@ -47,10 +49,11 @@ config = dataclasses.replace(config, num_minibatches=2, num_epochs=2)
 
 COMPARE = """
 def run(mesh, num_updates):
-    state = devices.replicate(ppo.init(config, task, network), mesh)
+    state = devices.replicate(optimiser.init(config, task, network), mesh)
     rows, moments = [], None
+    update = ppo.updater(config, task, network, mesh)
     for _ in range(num_updates):
-        state, metrics = ppo.update(state, config, task, network, mesh)
+        state, metrics = update(state)
         rows.append(jax.tree.map(np.asarray, metrics))
         # Adam's moments after one step are the gradient and its square.
         moments = moments or jax.tree.map(np.asarray, state.opt_state)
@@ -75,12 +78,17 @@ out["whole"] = leaf.sharding.is_fully_replicated
 """
 
 PLAY = """
-params = ppo.init(config, task, network).params
-key = jax.random.key(1)
+params = optimiser.init(config, task, network).params
+keys = jax.random.split(jax.random.key(1), 3)
+
+def play(params, keys, mesh):
+    sets = devices.by_set(rollout.draw(task, 16, keys[0]), mesh)
+    return rollout.play(config, task, network, params, sets, keys[1], keys[2])[0]
+
 with jax.disable_jit():
-    plain, _ = ppo._play(config, task, network, params, key)
-play = jax.jit(lambda p, k: ppo._play(config, task, network, p, k, mesh)[0])
-shared = play(*devices.replicate((params, key), mesh))
+    plain = play(params, keys, None)
+given = devices.replicate((params, keys), mesh)
+shared = jax.jit(lambda params, keys: play(params, keys, mesh))(*given)
 out["same actions"] = float((plain.action == np.asarray(shared.action)).mean())
 out["log_prob"] = distance(plain.log_prob, shared.log_prob)
 out["advantage"] = distance(plain.advantage, shared.advantage)
@@ -134,7 +142,7 @@ def test_a_mesh_takes_the_devices_asked_for_and_names_what_does_not_divide() -> 
         out["many"] = error(lambda: devices.make_mesh(9))
         out["odd"] = error(lambda: devices.require_divisible(12, devices.make_mesh()))
         devices.require_divisible(16, devices.make_mesh())
-        paper = presets.PRESETS["paper"].ppo
+        paper = presets.load("paper").ppo
         devices.require_divisible(paper.sets_per_minibatch, devices.make_mesh())
         """,
     )
@@ -160,8 +168,8 @@ def test_eight_devices_play_what_uncompiled_code_plays() -> None:
 def test_the_papers_sixteen_episodes_are_shared_by_eight_devices() -> None:
     paper = """
     import dataclasses
-    preset = presets.PRESETS["paper"]
-    network = networks.build(dataclasses.replace(preset.network, width=16))
+    preset = presets.load("paper")
+    network = build(dataclasses.replace(preset.network, width=16))
     task, config = preset.tasks[0], preset.ppo
     """
     check_equal(python(BEGIN, paper, COMPARE))

@@ -267,9 +267,10 @@ from jaxcal.learning.runtime import devices, processes
 from jaxcal.learning.training import run as training
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.training.ppo import PPOConfig, Task
+from jaxcal.learning.environments.task import Task
+from jaxcal.learning.training.config import PPOConfig, TrainConfig
 
-CONFIG = training.TrainConfig(
+CONFIG = TrainConfig(
     network=NetworkConfig(width=8, encoder_rounds=1),
     ppo=PPOConfig(
         num_episodes=64 * 20, episodes_per_update=64, episodes_per_set=4,

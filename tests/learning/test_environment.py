@@ -117,13 +117,13 @@ def test_thousands_of_episodes_step_at_once_and_compile_once(key):
 
 def test_candidates_within_ranges_and_from_a_pool(key, rng):
     config = SelectionConfig(num_candidates=30)
-    draw = environment.uniform(config, (-20.0, -10.0, 0.0), (20.0, 10.0, 5.0))
+    draw = scenarios.uniform(config, (-20.0, -10.0, 0.0), (20.0, 10.0, 5.0))
     points, available = draw(key)
     assert bool(available.all())
     assert (np.asarray(points).min(0) >= [-20, -10, 0]).all()
     assert (np.asarray(points).max(0) <= [20, 10, 5]).all()
     pool = rng.normal(size=(40, 3)).astype(np.float32)
-    points, _ = environment.from_pool(config, pool)(key)
+    points, _ = scenarios.from_pool(config, pool)(key)
     rows = {tuple(row) for row in np.asarray(points)}
     assert len(rows) == 30 and rows <= {tuple(row) for row in pool}
 
@@ -145,9 +145,9 @@ def test_a_bad_configuration_is_named(values, named):
 def test_a_bad_pool_or_range_is_named():
     config = SelectionConfig()
     with pytest.raises(ValueError, match="pool must hold at least 50"):
-        environment.from_pool(config, jnp.zeros((10, 3)))
+        scenarios.from_pool(config, jnp.zeros((10, 3)))
     with pytest.raises(ValueError, match="low must be below high"):
-        environment.uniform(config, (0.0, 1.0, 0.0), (1.0, 1.0, 1.0))
+        scenarios.uniform(config, (0.0, 1.0, 0.0), (1.0, 1.0, 1.0))
 
 
 @pytest.mark.parametrize("shape", scenarios.SHAPES)

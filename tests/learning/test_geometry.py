@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jaxcal.information import regression
+from jaxcal.learning import small_matrices
 from jaxcal.learning.policies import geometry
 
 
@@ -25,7 +26,7 @@ def test_cholesky_is_numpys(rng):
     rows = rng.normal(size=(5, 9, 4)).astype(np.float32)
     gram = np.matrix_transpose(rows) @ rows
     np.testing.assert_allclose(
-        geometry.cholesky(jnp.asarray(gram)), np.linalg.cholesky(gram), rtol=2e-5
+        small_matrices.cholesky(jnp.asarray(gram)), np.linalg.cholesky(gram), rtol=2e-5
     )
 
 
@@ -141,12 +142,12 @@ def test_compiled_and_shared_over_a_mapped_axis_it_is_the_same(rng):
 def test_log_det_gram_is_that_of_the_regressors(rng):
     points = rng.uniform(size=(6, 5, 3)).astype(np.float32)
     np.testing.assert_allclose(
-        geometry.log_det_gram(jnp.asarray(points)),
+        small_matrices.log_det_gram(jnp.asarray(points)),
         regression.log_det_gram(points),
         rtol=1e-4,
     )
     flat = jnp.asarray(points).at[..., 2].set(0.5)
-    assert np.isfinite(np.asarray(geometry.log_det_gram(flat))).all()
+    assert np.isfinite(np.asarray(small_matrices.log_det_gram(flat))).all()
 
 
 @pytest.mark.parametrize("spanned", [False, True])
@@ -180,7 +181,7 @@ def test_log_det_gram_counts_only_the_rows_present(rng, k):
     postures = rng.uniform(size=(3, k, 3))
     present = np.ones((3, k), bool)
     present[0, 4:] = False
-    found = geometry.log_det_gram(jnp.asarray(postures, jnp.float32), present)
+    found = small_matrices.log_det_gram(jnp.asarray(postures, jnp.float32), present)
     for number in range(3):
         z = np.c_[postures[number][present[number]], np.ones(present[number].sum())]
         wanted = np.linalg.slogdet(z.T @ z)[1]

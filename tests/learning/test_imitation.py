@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from jaxcal.learning.environments.selection import SelectionConfig
+from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.training import checkpoint, imitation, ppo
+from jaxcal.learning.training import checkpoint, imitation, optimiser
 from jaxcal.learning.training import run as training
-from jaxcal.learning.training.ppo import PPOConfig, Task
-from jaxcal.learning.training.run import TrainConfig
+from jaxcal.learning.training.config import PPOConfig, TrainConfig
 
 PPO = PPOConfig(
     num_episodes=64 * 4,
@@ -28,11 +29,11 @@ PPO = PPOConfig(
     seed=3,
 )
 TASK = Task(
-    SelectionConfig(num_candidates=11, num_selected=5, reward_gain=True),
+    SelectionConfig(11, 5, 1, 1, reward_gain=True),
     masked=0.3,
     random_starts=0.5,
 )
-NETWORK = networks.build(NetworkConfig(width=8, encoder_rounds=1))
+NETWORK = build(NetworkConfig(width=8, encoder_rounds=1))
 
 
 def brute_force(candidates, available, given, k):
@@ -82,6 +83,25 @@ def test_a_lesson_is_the_same_whenever_it_is_asked_for(lesson):
     assert not np.array_equal(lesson.candidates, other.candidates)
 
 
+def test_lessons_share_no_key_with_the_weights_and_the_updates():
+    # In JAX 0.10 fold_in(key, i) is split(key)[i]: streams must be split apart first.
+    key = jax.random.key(PPO.seed)
+    np.testing.assert_array_equal(
+        jax.random.key_data(jax.random.split(key)[1]),
+        jax.random.key_data(jax.random.fold_in(key, 1)),
+    )
+    streams = optimiser.Keys.of(PPO.seed)
+    assert np.array_equal(
+        jax.random.key_data(optimiser.init(PPO, TASK, NETWORK).key),
+        jax.random.key_data(streams.updates),
+    )
+    for index in range(3):
+        drawn = imitation.draw(PPO, TASK, NETWORK, brute_force, index)
+        for used in (streams.weights, streams.updates):
+            sets, _ = imitation._drawn(jax.random.split(used, 4)[0], 64, TASK)
+            assert not np.array_equal(sets, drawn.candidates)
+
+
 @jax.jit
 def measured(params, lesson):
     attempt = imitation.follow(lesson, TASK, NETWORK, params)
@@ -90,22 +110,24 @@ def measured(params, lesson):
 
 @pytest.mark.slow
 def test_the_loss_is_that_of_the_definition(lesson):
-    state = ppo.init(PPO, TASK, NETWORK)
+    state = optimiser.init(PPO, TASK, NETWORK)
     total, metrics = measured(state.params, lesson)
-    view = NETWORK.look(lesson.candidates, lesson.available)
-    memory = networks.encode(NETWORK, state.params, view)
+    features = NETWORK.candidate_features(lesson.candidates, lesson.available)
+    memory = networks.encode(NETWORK, state.params, features)
     surprise, error, number = 0.0, 0.0, 0
     chosen = np.full((64, 5), -1)
     free, wanted = np.array(lesson.available), np.array(lesson.wanted)
     rows = np.arange(64)
     for count in range(3):
-        glance = NETWORK.look_at(view, jnp.asarray(chosen), jnp.asarray(free), count)
-        logits, value = networks.decode(NETWORK, state.params, memory, glance)
+        decision = NETWORK.decision_features(
+            features, jnp.asarray(chosen), jnp.asarray(free), count
+        )
+        logits, value = networks.decode(NETWORK, state.params, memory, decision)
         weights = np.exp(np.asarray(logits, float))
         share = weights / weights.sum(-1, keepdims=True)
         counted = count >= np.asarray(lesson.length)
         surprise -= np.log((share * wanted).sum(-1))[counted].sum()
-        gap = 0.1 * 3 * (np.asarray(value) - np.asarray(lesson.best))
+        gap = 0.1 * (np.asarray(value) - np.asarray(lesson.best))
         error += (gap**2)[counted].sum()
         number += counted.sum()
         best = (share * wanted).argmax(-1)
@@ -121,7 +143,7 @@ def test_the_loss_is_that_of_the_definition(lesson):
 
 @pytest.mark.slow
 def test_the_order_of_the_candidates_does_not_matter(lesson, rng):
-    state = ppo.init(PPO, TASK, NETWORK)
+    state = optimiser.init(PPO, TASK, NETWORK)
     order = rng.permutation(11)
     where = np.argsort(order)
     turned = dataclasses.replace(
@@ -142,13 +164,13 @@ def test_lessons_teach():
         PPO, num_episodes=64 * 40, imitation=1.0, learning_rate=5e-3
     )
     # Without the look-ahead it has to be learned what to choose.
-    network = networks.build(NetworkConfig(width=8, encoder_rounds=1, lookahead=1))
+    network = build(NetworkConfig(width=8, encoder_rounds=1, lookahead=1))
     task = Task(SelectionConfig(num_candidates=8))
-    state = ppo.init(config, task, network)
+    state = optimiser.init(config, task, network)
     losses = []
     for index in range(config.num_imitated):
         shown = imitation.draw(config, task, network, brute_force, index)
-        state, metrics = imitation.update(state, shown, config, task, network)
+        state, metrics = imitation.updater(config, task, network)(state, shown)
         losses.append(float(metrics["policy_loss"]))
     assert np.mean(losses[-5:]) < 0.85 * np.mean(losses[:5])
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import json
+import pathlib
 
 import jax
 import jax.numpy as jnp
@@ -10,21 +13,19 @@ import numpy as np
 import pytest
 
 from jaxcal.learning.policies import decoding, networks
+from jaxcal.learning.policies.build import build
+from jaxcal.learning.policies.features import remaining
 from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.training import checkpoint
+from jaxcal.paper.network import HEADS
 
 SMALL = NetworkConfig(width=8, encoder_rounds=1)
 CLOSE = NetworkConfig(width=8, encoder_rounds=1, close_up=True)
 
 
 def made(config, m=12, n=3, k=4, seed=0):
-    network = networks.build(config)
-    params = network.init(
-        jax.random.key(seed),
-        jnp.zeros((1, m, n)),
-        jnp.ones((1, m), bool),
-        jnp.full((1, k), -1),
-        jnp.ones((1, m), bool),
-    )["params"]
+    network = build(config)
+    params = networks.initial(network, jax.random.key(seed), m, n, k)
     # Every parameter away from its initial zero, so that nothing is hidden by one.
     noisy = jax.tree.map(lambda leaf: leaf + 0.1 * jnp.cos(jnp.arange(leaf.size)
                          .reshape(leaf.shape)), params)  # fmt: skip
@@ -34,34 +35,29 @@ def made(config, m=12, n=3, k=4, seed=0):
 def score(network, params, points, chosen, k=4):
     points = jnp.asarray(points, jnp.float32)
     batch, m, _ = points.shape
-    view = network.look(points, jnp.ones((batch, m), bool))
-    memory = network.apply({"params": params}, view, method="encode")
+    features = network.candidate_features(points, jnp.ones((batch, m), bool))
+    memory = networks.encode(network, params, features)
     picks = jnp.full((batch, k), -1).at[:, : len(chosen)].set(jnp.asarray(chosen, int))
     free = jnp.ones((batch, m), bool).at[:, jnp.asarray(chosen, int)].set(False)
-    glance = network.look_at(view, picks, free, len(chosen))
-    return network.apply({"params": params}, memory, glance, method="decode")
+    decision = network.decision_features(features, picks, free, len(chosen))
+    return networks.decode(network, params, memory, decision)
 
 
 def test_the_papers_network_has_its_size_and_its_share():
-    network = networks.build(NetworkConfig(kind="paper", width=768))
+    network = build(NetworkConfig(kind="paper", width=768))
     shapes = jax.eval_shape(
-        network.init,
-        jax.random.key(0),
-        jnp.zeros((1, 50, 3)),
-        jnp.ones((1, 50), bool),
-        jnp.full((1, 4), -1),
-        jnp.ones((1, 50), bool),
-    )["params"]
+        lambda: networks.initial(network, jax.random.key(0), 50, 3, 4)
+    )
     size = {name: sum(x.size for x in jax.tree.leaves(part)) for name, part in
             shapes.items()}  # fmt: skip
     total = sum(size.values())
-    heads = sum(size[name] for name in networks.PAPER_HEADS)
+    heads = sum(size[name] for name in HEADS)
     assert abs(total - 3.5e6) <= 0.03 * 3.5e6
     assert abs((1 - heads / total) - 0.71) <= 0.01
 
 
 @pytest.mark.parametrize(
-    ("k", "chosen"), [(4, []), (4, [3]), (4, [3, 7]), (7, [1, 2]), (7, [1, 2, 5, 8, 9])]
+    ("k", "chosen"), [(4, []), (4, [3, 7]), (7, [1, 2]), (7, [1, 2, 5, 8, 9])]
 )
 def test_compact_is_blind_to_affine_maps(rng, k, chosen):
     network, params = made(SMALL)
@@ -92,14 +88,8 @@ def test_permuting_the_candidates_permutes_the_logits(rng, config):
 @pytest.mark.parametrize("k", [4, 7])
 def test_a_network_can_begin_as_the_look_ahead_rule(rng, k):
     start = dataclasses.replace(CLOSE, initial_trust=4.0, initial_actor=0.0)
-    network = networks.build(start)
-    params = made(start)[0].init(
-        jax.random.key(0),
-        jnp.zeros((1, 12, 3)),
-        jnp.ones((1, 12), bool),
-        jnp.full((1, k), -1),
-        jnp.ones((1, 12), bool),
-    )["params"]
+    network = build(start)
+    params = networks.initial(network, jax.random.key(0), 12, 3, k)
     points = jnp.asarray(rng.uniform(size=(50, 12, 3)), jnp.float32)
     free = jnp.ones((50, 12), bool)
     nothing = jnp.zeros((50, 0), jnp.int32)
@@ -108,13 +98,77 @@ def test_a_network_can_begin_as_the_look_ahead_rule(rng, k):
     chosen = jnp.full((50, k), -1, jnp.int32)
     rule = jax.jit(  # without parameters every choice is the look-ahead's
         lambda: decoding.complete(
-            network, None, network.look(points, free), None, chosen, free, 0, None
+            network,
+            None,
+            network.candidate_features(points, free),
+            None,
+            chosen,
+            free,
+            0,
+            None,
         )
     )()
     # The members of one set tie; which of them comes first is rounding.
     reached = [decoding.log_det_of(points, picked) for picked in (own, rule)]
     np.testing.assert_allclose(*reached, atol=1e-4)
     assert (np.sort(own) == np.sort(rule)).all(axis=1).mean() > 0.9
+
+
+SHIPPED = json.loads((pathlib.Path(__file__).parent / "shipped_picks.json").read_text())
+
+
+@pytest.mark.parametrize(
+    ("name", "n", "mask", "how"),
+    [("k5", 3, 0.0, {}), ("n2k4first", 2, 0.2, {"decoding": "first", "num": 4})],
+)
+def test_the_shipped_policy_chooses_what_it_always_chose(name, n, mask, how):
+    policy, picks = checkpoint.load(), np.array(SHIPPED[name])
+    batch, k = picks.shape
+    rng = np.random.default_rng([20, n, k, 0])
+    sets = rng.uniform(size=(batch, 20, n)).astype(np.float32)
+    free = rng.uniform(size=(batch, 20)) >= mask
+    found = decoding.choose(
+        policy.network,
+        policy.params,
+        jnp.asarray(sets),
+        jnp.asarray(free),
+        jnp.zeros((batch, 0), jnp.int32),
+        jax.random.key(0),
+        k=k,
+        **how,
+    )
+    # The best of the last pair comes first; where they tie, rounding decides.
+    assert (np.sort(found) == np.sort(picks)).all(axis=1).mean() > 0.98
+
+
+@pytest.mark.parametrize(("k", "close"), [(4, False), (5, True)])
+def test_the_last_pair_is_the_best_one_unless_little_is_spanned(rng, k, close):
+    # Three inputs. At K = n + 2 the choices before the pair do not span the space: the
+    # pair is rated with a ridge beside them, which counts where they nearly coincide.
+    (network, params), m, batch = made(SMALL), 12, 300
+    points = rng.uniform(size=(batch, m, 3)).astype(np.float32)
+    if close:
+        points[:, : k - 2] = points[:, :1] + 0.03 * points[:, : k - 2]
+    found = decoding.choose(
+        network,
+        params,
+        jnp.asarray(points),
+        jnp.ones((batch, m), bool),
+        jnp.tile(jnp.arange(k - 2), (batch, 1)),
+        jax.random.key(0),
+        k=k,
+        num_required=k - 2,
+    )
+
+    def log_det(sets):
+        z = np.concatenate([sets.astype(float), np.ones((*sets.shape[:2], 1))], -1)
+        return np.linalg.slogdet(np.swapaxes(z, 1, 2) @ z)[1]
+
+    pairs = itertools.combinations(range(k - 2, m), 2)
+    best = np.max([log_det(points[:, [*range(k - 2), *p]]) for p in pairs], axis=0)
+    own = log_det(np.take_along_axis(points, np.asarray(found)[..., None], axis=1))
+    exact = best - own < 1e-4
+    assert 0.5 < exact.mean() < 0.95 if close else exact.all()
 
 
 @pytest.mark.parametrize("lookahead", [1, 3])
@@ -125,22 +179,24 @@ def test_a_loop_over_like_choices_chooses_as_if_written_out(rng, lookahead):
     free = jnp.asarray(rng.uniform(size=(50, 15)) < 0.8)
     free = free.at[:, :10].set(True)
     k = 9
-    view = network.look(points, free)
-    memory = networks.encode(network, params, view)
-    assert len(network.alike(view, k)) >= 4
+    features = network.candidate_features(points, free)
+    memory = networks.encode(network, params, features)
+    assert len(network.shares_program(features, k)) >= 4
     nothing = jnp.zeros((50, 0), jnp.int32)
     found = decoding.choose(
         network, params, points, free, nothing, jax.random.key(0), k=k
     )
     chosen, left = jnp.full((50, k), -1, jnp.int32), free
     for count in range(k):
-        if count in network.alike(view, k):
-            known = network.after(view, chosen, count)
-            traced = network.after(view, chosen, jnp.asarray(count))
-            for part in (0, 2, 3):
-                np.testing.assert_allclose(known[part], traced[part], atol=2e-5)
+        if count in network.shares_program(features, k):
+            known = remaining(features, chosen, count)
+            traced = remaining(features, chosen, jnp.asarray(count))
+            for part in ("vectors", "log_det", "progress"):
+                np.testing.assert_allclose(
+                    getattr(known, part), getattr(traced, part), atol=2e-5
+                )
         logits, _ = decoding.logits_at(
-            network, params, view, memory, chosen, left, count
+            network, params, features, memory, chosen, left, count
         )
         taken = logits.argmax(-1)
         chosen = chosen.at[:, count].set(taken)
@@ -152,12 +208,13 @@ def test_a_loop_over_like_choices_chooses_as_if_written_out(rng, lookahead):
 
 
 def test_a_close_up_tells_near_equal_look_aheads_apart(rng):
-    network = networks.build(CLOSE)
+    network = build(CLOSE)
     points = jnp.asarray(rng.uniform(size=(1, 12, 3)), jnp.float32)
-    view = network.look(points, jnp.ones((1, 12), bool))
-    plain = networks.build(SMALL).look(points, jnp.ones((1, 12), bool))
-    assert (np.asarray(view["features"])[..., :13] == plain["features"]).all()
-    shown, behind = np.asarray(view["features"])[0, :, 13:], view["ahead"][0, :, 3]
+    free = jnp.ones((1, 12), bool)
+    vectors = network.candidate_features(points, free).vectors
+    plain = build(SMALL).candidate_features(points, free).vectors
+    assert (np.asarray(vectors.columns)[..., :13] == plain.columns).all()
+    shown, behind = np.asarray(vectors.columns)[0, :, 13:], vectors.ahead[0, :, 3]
     best = int(np.argmax(behind))
     assert (shown[best] == 1.0).all() and shown.shape == (12, 3)
     for scale, column in zip((32.0, 256.0, 2048.0), shown.T, strict=True):
@@ -196,10 +253,11 @@ def test_a_masked_candidate_does_not_touch_the_others(rng):
     usable = jnp.ones((1, 12), bool).at[:, 9:].set(False)
 
     def logits(points):
-        view = network.look(points, usable)
-        memory = network.apply({"params": params}, view, method="encode")
-        glance = network.look_at(view, jnp.full((1, 4), -1), usable, 0)
-        return network.apply({"params": params}, memory, glance, method="decode")[0]
+        features = network.candidate_features(points, usable)
+        memory = networks.encode(network, params, features)
+        nothing = jnp.full((1, 4), -1)
+        decision = network.decision_features(features, nothing, usable, 0)
+        return networks.decode(network, params, memory, decision)[0]
 
     moved = points.at[:, 9:].set(50.0)
     np.testing.assert_allclose(logits(points)[:, :9], logits(moved)[:, :9], atol=1e-3)
@@ -224,13 +282,11 @@ def test_the_papers_scores_are_those_of_keys_that_are_written_out(rng):
     candidates = jnp.asarray(rng.uniform(size=(1, 20, 3)), jnp.float32)
     free = jnp.arange(20)[None] != 7
     chosen = jnp.array([[7, -1, -1, -1]])
-    view = network.look(candidates, free)
-    glance = network.look_at(view, chosen, free, 1)
-    poses = networks.encode(network, params, view)
-    logits, _ = networks.decode(network, params, poses, glance)
-    params, poses, context = jax.tree.map(
-        np.asarray, (params, poses, glance["context"])
-    )
+    features = network.candidate_features(candidates, free)
+    decision = network.decision_features(features, chosen, free, 1)
+    poses = networks.encode(network, params, features)
+    logits, _ = networks.decode(network, params, poses, decision)
+    params, poses, context = jax.tree.map(np.asarray, (params, poses, decision.context))
 
     def dense(name, rows):
         return rows @ params[name]["kernel"] + params[name]["bias"]

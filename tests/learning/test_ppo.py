@@ -11,10 +11,12 @@ import optax
 import pytest
 
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.policies import networks
+from jaxcal.learning.environments.task import Task
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.training import ppo
-from jaxcal.learning.training.ppo import PPOConfig, Task
+from jaxcal.learning.training import optimiser, ppo, rollout
+from jaxcal.learning.training.config import PPOConfig
+from jaxcal.learning.training.loss import surrogate
 
 SMALL = NetworkConfig(width=8, encoder_rounds=1)
 TINY = PPOConfig(
@@ -28,7 +30,7 @@ TINY = PPOConfig(
 
 def test_advantages_are_those_of_the_definition(rng):
     rewards, values = rng.normal(size=(2, 5, 3))
-    got = ppo.advantages(jnp.asarray(rewards), jnp.asarray(values), 0.9, 0.8)
+    got = rollout.advantages(jnp.asarray(rewards), jnp.asarray(values), 0.9, 0.8)
     deltas = rewards + 0.9 * np.vstack([values[1:], np.zeros((1, 3))]) - values
     for t in range(5):
         weights = (0.9 * 0.8) ** np.arange(5 - t)
@@ -37,7 +39,7 @@ def test_advantages_are_those_of_the_definition(rng):
 
 def test_undiscounted_advantages_are_return_less_value(rng):
     rewards, values = rng.normal(size=(2, 4, 2))
-    got = ppo.advantages(jnp.asarray(rewards), jnp.asarray(values), 1.0, 1.0)
+    got = rollout.advantages(jnp.asarray(rewards), jnp.asarray(values), 1.0, 1.0)
     returns = np.cumsum(rewards[::-1], axis=0)[::-1]
     np.testing.assert_allclose(got, returns - values, rtol=1e-5, atol=1e-6)
 
@@ -46,7 +48,7 @@ def test_undiscounted_advantages_are_return_less_value(rng):
 def test_clipping_is_that_of_optax(rng, size):
     grads = {"a": size * rng.normal(size=(7, 3)), "b": size * rng.normal(size=4)}
     grads = jax.tree.map(jnp.asarray, grads)
-    ours = ppo._clip_by_global_norm(0.5)
+    ours = optimiser._clip_by_global_norm(0.5)
     theirs = optax.clip_by_global_norm(0.5)
     got, _ = ours.update(grads, ours.init(grads))
     expected, _ = theirs.update(grads, theirs.init(grads))
@@ -54,35 +56,40 @@ def test_clipping_is_that_of_optax(rng, size):
         np.testing.assert_allclose(got[name], expected[name], rtol=1e-5)
 
 
-@pytest.mark.parametrize("kind", ["compact", "paper"])
-@pytest.mark.parametrize("k", [4, 6])
-def test_the_first_minibatch_sees_the_probabilities_that_played(kind, k):
+@pytest.mark.parametrize(("kind", "n", "k"), [("compact", 2, 3), ("compact", 1, 4),
+                                              ("paper", 1, 4)])  # fmt: skip
+def test_the_first_minibatch_sees_the_probabilities_that_played(kind, n, k):
     # Play and loss compute the same probabilities in differently compiled programs;
     # a difference here would silently make every gradient wrong.
-    env = SelectionConfig(num_candidates=12, num_selected=k)
+    env = SelectionConfig(12, k, n, n)
     task = Task(env, random_starts=0.5)
-    network = networks.build(dataclasses.replace(SMALL, kind=kind))
+    network = build(dataclasses.replace(SMALL, kind=kind))
     config = dataclasses.replace(TINY, episodes_per_update=512)
-    state = ppo.init(config, task, network)
-    rollout, _ = jax.jit(
-        lambda params: ppo._play(config, task, network, params, jax.random.key(1))
-    )(state.params)
+    state = optimiser.init(config, task, network)
+    keys = jax.random.split(jax.random.key(1), 3)
+
+    @jax.jit
+    def play(params):
+        sets = rollout.draw(task, 128, keys[0])
+        return rollout.play(config, task, network, params, sets, keys[1], keys[2])
+
+    played, _ = play(state.params)
     _, metrics = jax.jit(
-        lambda params: ppo._loss(params, rollout, jnp.float32(0), config, task, network)
+        lambda params: surrogate(params, played, jnp.float32(0), config, task, network)
     )(state.params)
     assert abs(float(metrics["kl"])) < 1e-6
 
 
 def test_update_compiles_once_and_changes_everything_it_should():
-    network = networks.build(SMALL)
-    task = Task(SelectionConfig(num_candidates=10))
-    state = ppo.init(TINY, task, network)
+    network = build(SMALL)
+    task = Task(SelectionConfig(8, 3, 2, 2))
+    state = optimiser.init(TINY, task, network)
     before = jax.tree.map(np.asarray, state.params)
-    sizes = []
+    update = ppo.updater(TINY, task, network)
+    assert ppo.updater(TINY, task, build(SMALL)) is update
     for _ in range(3):
-        state, metrics = ppo.update(state, TINY, task, network)
-        sizes.append(ppo.update._cache_size())
-    assert sizes[0] == sizes[2]
+        state, metrics = update(state)
+    assert update._cache_size() == 1
     assert int(state.num_updates) == 3
     assert metrics["rewards"].shape == (64,)
     moved = jax.tree.map(lambda a, b: bool((a != b).any()), before, state.params)
@@ -92,20 +99,48 @@ def test_update_compiles_once_and_changes_everything_it_should():
 
 def test_the_policy_learns_on_a_small_task():
     # Without the look ahead and the endgame, so that it must learn by itself.
-    network = networks.build(
-        dataclasses.replace(SMALL, lookahead=1, endgame=False, width=16)
-    )
+    network = build(dataclasses.replace(SMALL, lookahead=1, endgame=False, width=16))
     config = dataclasses.replace(
         TINY, num_episodes=512 * 40, episodes_per_update=512, learning_rate=5e-3
     )
-    task = Task(SelectionConfig(num_candidates=8))
-    state = ppo.init(config, task, network)
+    task = Task(SelectionConfig(8, 3, 2, 2))
+    state = optimiser.init(config, task, network)
     rewards = []
+    update = ppo.updater(config, task, network)
     for _ in range(config.num_updates):
-        state, metrics = ppo.update(state, config, task, network)
+        state, metrics = update(state)
         rewards.append(float(metrics["reward_mean"]))
     assert np.mean(rewards[-5:]) > np.mean(rewards[:3]) + 0.3
     assert float(metrics["value_loss"]) < 0.2
+
+
+def test_the_averaged_weights_owe_nothing_to_the_initial_ones(rng):
+    # A mean with weights decay^age that add up to one, from the first step on.
+    config = dataclasses.replace(
+        TINY, num_minibatches=1, num_epochs=1, average_decay=0.9, learning_rate=0.1
+    )
+    params = {"w": jnp.asarray(rng.normal(size=3) + 100.0, jnp.float32)}
+    state = optimiser.TrainState(
+        params=params,
+        average=params,
+        opt_state=optimiser.optimiser(config).init(params),
+        key=jax.random.key(0),
+        num_updates=jnp.zeros((), jnp.int32),
+    )
+    data, seen = jnp.asarray(rng.normal(size=(4, 3)), jnp.float32), []
+    for _ in range(4):
+        state, _ = optimiser.learn(
+            state,
+            config,
+            4,
+            lambda index: data[index],
+            lambda params, rows: (((params["w"][None] - rows) ** 2).sum(), {}),
+            jax.random.key(1),
+        )
+        seen.append(np.asarray(state.params["w"], np.float64))
+        ages = 0.9 ** np.arange(len(seen))[::-1]
+        expected = ages @ np.stack(seen) / ages.sum()
+        np.testing.assert_allclose(state.average["w"], expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -115,6 +150,7 @@ def test_the_policy_learns_on_a_small_task():
         ({"num_epochs": 0}, "num_epochs"),
         ({"learning_rate": 0.0}, "learning_rate"),
         ({"gae_lambda": 1.5}, "gae_lambda"),
+        ({"average_decay": 1.0}, "average_decay"),
         ({"seed": -1}, "seed"),
     ],
 )

@@ -18,13 +18,17 @@ import jax
 import numpy as np
 import pytest
 
+from jaxcal.commands import train as command
 from jaxcal.learning.environments.selection import SelectionConfig
+from jaxcal.learning.environments.task import Task
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.training import checkpoint, presets
+from jaxcal.learning.training import checkpoint, optimiser, presets
 from jaxcal.learning.training import run as training
 from jaxcal.learning.training.checkpoint import CheckpointError
-from jaxcal.learning.training.ppo import PPOConfig, Task
-from jaxcal.learning.training.run import TrainConfig, Validation
+from jaxcal.learning.training.config import PPOConfig, TrainConfig
+from jaxcal.learning.training.metrics import COLUMNS, MetricsTable
+from jaxcal.learning.training.run import Validation
 
 ROOT = pathlib.Path(__file__).parents[2]
 
@@ -39,8 +43,8 @@ CONFIG = TrainConfig(
         seed=3,
     ),
     tasks=(
-        Task(SelectionConfig(num_candidates=10)),
-        Task(SelectionConfig(num_candidates=8, num_selected=5, reward_gain=True)),
+        Task(SelectionConfig(8, 3, 2, 2)),
+        Task(SelectionConfig(6, 4, 2, 2, reward_gain=True)),
     ),
 )
 
@@ -80,7 +84,7 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished, tmp_path):
 def test_metrics_have_the_columns_that_figures_read(finished):
     folder, _ = finished
     header = (folder / "metrics.csv").read_text().splitlines()[0]
-    assert header == ",".join(training.COLUMNS)
+    assert header == ",".join(COLUMNS)
     assert any(p.name.startswith("events.out.tfevents") for p in folder.iterdir())
 
 
@@ -111,21 +115,17 @@ def test_a_checkpoint_names_its_configuration_seed_and_versions(finished):
 
 def test_validation_of_the_optimum_itself_is_one():
     rng = np.random.default_rng(0)
-    sets = rng.uniform(size=(6, 10, 3))
+    sets = rng.uniform(size=(6, 8, 2))
 
     from jaxcal.selection import exact_batch
 
-    best = np.asarray(exact_batch(sets, 4, num_outputs=1).log_det)
+    best = np.asarray(exact_batch(sets, 3, num_outputs=1).log_det)
     network = NetworkConfig(width=8, encoder_rounds=1)
-    state = training.ppo.init(CONFIG.ppo, CONFIG.tasks[0],
-                              training.networks.build(network))  # fmt: skip
-    ratio, hits = Validation(sets, best, 3).measure(
-        training.networks.build(network), state.params, 4
-    )
+    network = build(network)
+    state = optimiser.init(CONFIG.ppo, CONFIG.tasks[0], network)
+    ratio, hits = Validation(sets, best, 3).measure(network, state.params, 3)
     assert 0.0 <= ratio <= 1.0 and 0.0 <= hits <= 1.0
-    worse, none = Validation(sets, best + 1.0, 3).measure(
-        training.networks.build(network), state.params, 4
-    )
+    worse, none = Validation(sets, best + 1.0, 3).measure(network, state.params, 3)
     assert worse == pytest.approx(ratio * np.exp(-3.0), rel=1e-3) and none == 0.0
 
 
@@ -240,9 +240,9 @@ def test_killed_save_leaves_the_previous_checkpoint(finished, tmp_path):
         assert policy.step in (last, last + 1)
 
 
-@pytest.mark.parametrize("preset", sorted(presets.PRESETS))
+@pytest.mark.parametrize("preset", presets.names())
 def test_presets_survive_their_own_metadata(preset):
-    config = presets.PRESETS[preset]
+    config = presets.load(preset)
     meta = json.loads(json.dumps(config.as_meta()))
     again = TrainConfig.from_meta(meta)
     assert (again.network, again.ppo, again.tasks) == (
@@ -253,7 +253,7 @@ def test_presets_survive_their_own_metadata(preset):
 
 
 def test_the_paper_preset_is_table_2():
-    paper = presets.PRESETS["paper"]
+    paper = presets.load("paper")
     assert paper.ppo.episodes_per_update == 16
     assert paper.ppo.num_epochs == 10
     assert paper.ppo.num_episodes == 200_000
@@ -263,7 +263,7 @@ def test_the_paper_preset_is_table_2():
 
 def test_single_values_change_and_unknown_ones_are_named():
     config = presets.with_values(
-        presets.PRESETS["compact"], {"num_candidates": 20, "width": 16, "seed": 5}
+        presets.load("compact"), {"num_candidates": 20, "width": 16, "seed": 5}
     )
     assert config.tasks[0].environment.num_candidates == 20
     assert (config.network.width, config.ppo.seed) == (16, 5)
@@ -271,32 +271,104 @@ def test_single_values_change_and_unknown_ones_are_named():
         presets.with_values(config, {"wings": 2})
 
 
-def run_train(*arguments, cwd=ROOT, **options):
-    command = [sys.executable, str(ROOT / "train.py"), *map(str, arguments)]
-    return subprocess.run(
-        command, capture_output=True, text=True, cwd=cwd, timeout=300, **options
+def test_more_postures_than_parameters_are_paid_what_they_are_judged_by():
+    compact = presets.load("compact")
+    assert not compact.tasks[0].environment.reward_gain
+    eight = presets.with_values(compact, {"num_selected": 8})
+    assert eight.tasks[0].environment.reward_gain
+    asked = {"num_selected": 8, "reward_gain": False}  # the paper's own rule
+    assert not presets.with_values(compact, asked).tasks[0].environment.reward_gain
+    four = presets.with_values(eight, {"num_selected": 4})
+    assert not four.tasks[0].environment.reward_gain
+    for config in map(presets.load, presets.names()):
+        for task in config.tasks:
+            env = task.environment
+            assert env.reward_gain == (env.num_selected > env.num_inputs + 1)
+
+
+def test_a_field_in_which_the_tasks_differ_is_not_changed_in_one_of_them():
+    general = presets.load("general")
+    with pytest.raises(ValueError, match=r"num_selected cannot .* 12 tasks have 3, 4"):
+        presets.with_values(general, {"num_selected": 6})
+    scaled = presets.with_values(general, {"reward_scale": 0.5})
+    assert {task.environment.reward_scale for task in scaled.tasks} == {0.5}
+    assert len(scaled.tasks) == 12
+
+
+def test_an_unknown_network_or_preset_is_named():
+    with pytest.raises(ValueError, match="preset must be one of compact, general, pap"):
+        presets.load("large")
+    with pytest.raises(
+        ValueError, match=r"kind must be one of compact, paper, .*'big'"
+    ):
+        NetworkConfig(kind="big")
+
+
+def test_learning_finds_the_papers_network_without_importing_the_paper():
+    code = (
+        "import sys\n"
+        "from jaxcal.learning.policies.networks import NetworkConfig, build\n"
+        "from jaxcal.learning.training import presets\n"
+        "assert not any(name.startswith('jaxcal.paper') for name in sys.modules)\n"
+        "print(type(build(presets.load('paper').network)).__module__)"
     )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "jaxcal.paper.network\n", done.stderr
+
+
+def test_the_writer_of_events_hides_no_package(tmp_path, monkeypatch):
+    hidden = []
+
+    class Watch:
+        def find_spec(self, name, path=None, target=None):
+            hidden.append(sys.modules.get("torch", "absent") is None)
+
+    for name in [n for n in sys.modules if n.split(".")[0] == "tensorboardX"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(sys, "meta_path", [Watch(), *sys.meta_path])
+    MetricsTable(tmp_path, 0).close()
+    assert hidden and not any(hidden)
 
 
 SHORT = (
     "--episodes=128 --episodes-per-update=64 --episodes-per-set=4 --num-minibatches=2 "
-    "--width=8 --encoder-rounds=1 --num-candidates=10"
+    "--width=8 --encoder-rounds=1 --num-candidates=8"
 ).split()
+SMALL = [*SHORT, "--num-inputs=2", "--num-outputs=2", "--num-selected=3"]
 
 
-def test_train_command_trains_saves_and_refuses_to_overwrite(tmp_path):
+def train(*arguments):
+    """The command in this process; argparse leaves by SystemExit."""
+    try:
+        return command.main([str(argument) for argument in arguments], "train.py")
+    except SystemExit as leaving:
+        return leaving.code
+
+
+@pytest.fixture(autouse=True)
+def signals():
+    before = {n: signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def test_train_command_trains_saves_and_refuses_to_overwrite(tmp_path, capsys):
     out = tmp_path / "run"
-    first = run_train("--out", out, *SHORT)
-    assert first.returncode == 0, first.stderr
-    assert "ratio to exact" in first.stdout and "saved" in first.stdout
+    assert train("--out", out, "--export", tmp_path / "policy", *SMALL) == 0
+    said = capsys.readouterr().out
+    assert "ratio to exact" in said and "saved" in said
     assert checkpoint.load(out).step == 2
-    again = run_train("--out", out, *SHORT)
-    assert again.returncode == 2
-    assert again.stderr.startswith("train.py: --out") and "--resume" in again.stderr
-    clash = run_train("--out", out, "--resume", "--seed", "4")
-    assert clash.returncode == 2 and "--seed" in clash.stderr
-    done = run_train("--out", out, "--resume", "--no-validation")
-    assert done.returncode == 0, done.stderr
+    assert checkpoint.load(tmp_path / "policy").step == 2
+    assert train("--out", out, *SMALL) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("train.py: --out") and "--resume" in error
+    assert train("--out", out, "--resume", "--seed", "4") == 2
+    assert "--seed" in capsys.readouterr().err
+    assert train("--out", out, "--resume", "--no-validation") == 0
+
+
+BRAX = ["--trainer", "brax"]
 
 
 @pytest.mark.parametrize(
@@ -307,22 +379,93 @@ def test_train_command_trains_saves_and_refuses_to_overwrite(tmp_path):
         (["--seed", "one"], "argument --seed: invalid int value: 'one'"),
         (["--resume"], "does not exist"),
         (["--out", "/proc/nowhere/run"], "cannot write in /proc"),
+        (["--kind", "big"], "kind must be one of compact, paper, got 'big'"),
+        ([*BRAX, "--num-epochs", "3"], "does not read --num-epochs: leave it out"),
+        ([*BRAX, "--devices", "2", "--kind=paper"], "not read --devices, --kind"),
+        ([*BRAX, "--preset", "general"], "trains on one task, preset general has 12"),
+        ([*BRAX, "--resume"], "--resume works with --trainer jaxcal only"),
+        (["--candidates", "nowhere.csv"], "nowhere.csv"),
     ],
 )
-def test_train_command_refuses_in_one_line(arguments, says, tmp_path):
+def test_train_command_refuses_in_one_line(arguments, says, tmp_path, capsys):
     if "--out" not in arguments:
         arguments = [*arguments, "--out", str(tmp_path / "none")]
-    result = run_train(*arguments)
-    assert result.returncode == 2
-    assert says in result.stderr and result.stderr.count("\n") == 1
+    assert train(*arguments) == 2
+    error = capsys.readouterr().err
+    assert says in error and error.count("\n") == 1
     assert not (tmp_path / "none" / "checkpoint").exists()
+
+
+def test_brax_saves_what_it_used_and_keeps_what_is_asked_for():
+    brax_ppo = pytest.importorskip("jaxcal.learning.training.brax_ppo")
+    adapted = brax_ppo.adapted(presets.load("compact"))
+    assert (adapted.network.kind, adapted.network.width) == ("paper", 64)
+    assert adapted.ppo.learning_rate == 1e-3
+    asked = presets.with_values(adapted, {"learning_rate": 2e-3, "width": 32})
+    assert (asked.ppo.learning_rate, asked.network.width) == (2e-3, 32)
+    assert brax_ppo.adapted(presets.load("paper")).network.width == 768
+
+
+def test_help_says_what_every_number_is(capsys):
+    assert train("--help") == 0
+    text = capsys.readouterr().out
+    for name in presets.field_names() - {"num_episodes"}:
+        assert f"--{name.replace('_', '-')}" in text
+    assert "what to try first" in text and "[2; paper 10]" in text
+    for name in presets.names():
+        assert f"\n  {name} " in text
+
+
+def test_one_trains_on_ones_own_pool_and_resumes_with_it(tmp_path, rng, capsys):
+    pool = tmp_path / "mine.csv"
+    rows = 1e4 * rng.uniform(size=(20, 2)) + 5e4  # pulses
+    lines = ["pitch,yaw", *(f"{a:.3f},{b:.3f}" for a, b in rows)]
+    pool.write_text("\n".join(lines) + "\n")
+    out = tmp_path / "run"
+    assert train("--candidates", pool, "--out", out, *SHORT) == 0
+    assert "choose 3 of 8 from mine.csv" in capsys.readouterr().out
+    meta = checkpoint.load(out).meta
+    assert meta["tasks"][0]["given"]["name"] == "mine.csv"
+    assert meta["tasks"][0]["environment"]["num_inputs"] == 2
+    assert train("--resume", "--out", out) == 2
+    assert "trained on mine.csv" in capsys.readouterr().err
+    assert train("--resume", "--out", out, "--candidates", pool) == 0
+    pool.write_text("\n".join(lines[:-1]) + "\n")
+    assert train("--resume", "--out", out, "--candidates", pool) == 2
+    assert "give the same file" in capsys.readouterr().err
+    assert train("--candidates", pool, "--out", tmp_path / "b") == 2
+    assert "pool must hold at least 50 postures" in capsys.readouterr().err
+
+
+def test_ones_own_sets_are_drawn_as_they_are(tmp_path, rng, key):
+    sets, free = rng.uniform(-30, 30, size=(5, 7, 2)), rng.random((5, 7)) < 0.8
+    free[:, :4] = True
+    np.savez(tmp_path / "sets.npz", candidates=sets, available=free)
+    given = command._candidates(str(tmp_path / "sets.npz"))
+    low, high = sets[free].min(0), sets[free].max(0)
+    np.testing.assert_allclose(given.values, (sets - low) / (high - low), rtol=1e-5)
+    config = command._trained_on(presets.load("compact"), given, {})
+    task = config.tasks[0]
+    assert (task.environment.num_candidates, task.num_decisions) == (7, 3)
+    states = jax.vmap(task.reset)(jax.random.split(key, 40))
+    seen = set()
+    for points, mask in zip(states.candidates, states.available, strict=True):
+        which = int(np.argmin(abs(given.values - np.asarray(points)).sum((1, 2))))
+        np.testing.assert_array_equal(points, given.values[which])
+        np.testing.assert_array_equal(mask, free[which])
+        seen.add(which)
+    assert len(seen) == 5
+    with pytest.raises(ValueError, match="--num-candidates must be 7, as in"):
+        command._trained_on(presets.load("compact"), given, {"num_candidates": 9})
+    with pytest.raises(ValueError, match="one task"):
+        command._trained_on(presets.load("general"), given, {})
 
 
 def test_ctrl_c_saves_and_resume_goes_on(tmp_path):
     out = tmp_path / "run"
     process = subprocess.Popen(
         [sys.executable, str(ROOT / "train.py"), "--out", str(out), "--no-validation",
-         *SHORT, "--episodes=6400000"],
+         *SMALL, "--episodes=6400000"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

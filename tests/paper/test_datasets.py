@@ -22,9 +22,7 @@ from jaxcal.evaluation.dataset_files import (
     save_csv_parts,
     save_npz,
 )
-from jaxcal.paper.datasets import record
-from jaxcal.paper.datasets.dataset_command import main
-from jaxcal.paper.datasets.datasets import (
+from jaxcal.paper.datasets import (
     BIAS_DEG,
     EPISODES,
     NAMES,
@@ -32,10 +30,13 @@ from jaxcal.paper.datasets.datasets import (
     RANGES,
     RECORDED,
     SCALE,
+    SHIPPED,
     chunks,
     make_dataset,
+    read_pool,
+    record,
 )
-from jaxcal.paper.datasets.recordings import SHIPPED, read_pool
+from jaxcal.paper.datasets.__main__ import main
 
 # A loaded machine is no failure.
 settings.register_profile("patient", deadline=None)
@@ -398,18 +399,23 @@ def test_the_command_refuses_by_one_line(
     for arguments, message in (
         ([folder, "dataset7"], "NAME must be one of dataset0"),
         ([folder, "--formats", "npz,xls"], "--formats must be npz, csv or both"),
-        ([folder, "--episodes", "0"], "--episodes must be at least 1, got 0"),
+        (
+            [folder, "--episodes", "0"],
+            "--episodes: must be a whole number of at least 1, got '0'",
+        ),
+        (
+            [folder, "--seed", "-1", "dataset2"],
+            "--seed: must be a whole number of at least 0, got '-1'",
+        ),
     ):
         with pytest.raises(SystemExit) as caught:
             main(["--out", *arguments])
         assert caught.value.code == 2
-        assert message in capsys.readouterr().err
-    for arguments, message in (
-        ([folder, "--seed", "-1", "dataset2"], "seed must not be negative, got -1"),
-        ([folder, "--recordings", folder, "dataset4"], "dataset4.csv: No such file"),
-    ):
-        assert main(["--out", *arguments]) == 2
-        assert message in capsys.readouterr().err
+        error = capsys.readouterr().err
+        assert message in error and error.count("\n") == 1
+        assert not (tmp_path / "d").exists()
+    assert main(["--out", folder, "--recordings", folder, "dataset4"]) == 2
+    assert "dataset4.csv: No such file" in capsys.readouterr().err
     (tmp_path / "file").touch()
     assert main(["--out", str(tmp_path / "file"), "dataset2"]) == 2
     assert "is not a folder" in capsys.readouterr().err

@@ -19,16 +19,18 @@ from PIL import Image
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from jaxcal.paper.datasets.dataset_command import write_datasets
-from jaxcal.paper.datasets.datasets import BIAS_DEG, SCALE, make_dataset
+from jaxcal.paper.datasets import BIAS_DEG, SCALE, make_dataset
+from jaxcal.paper.datasets.__main__ import write_datasets
 from jaxcal.paper.reproduce import main
 
 ROOT = pathlib.Path(__file__).parents[2]
 
+pytestmark = pytest.mark.xdist_group("report")  # one report, made by one worker
+
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "jaxcal.paper.reproduce", *map(str, arguments)],
+        [sys.executable, "-m", "jaxcal.paper", *map(str, arguments)],
         capture_output=True,
         text=True,
         cwd=ROOT,
@@ -92,23 +94,34 @@ def test_the_page_is_one_file_that_opens_offline(
 ) -> None:
     page = (report / "index.html").read_text()
     figures = [f for e in document["exhibits"].values() for f in e["figures"]]
-    assert page.count("src='data:image/svg+xml;base64,") == len(figures)
+    assert page.count('src="data:image/svg+xml;base64,') == len(figures)
     pictures = document["exhibits"]["robot"]["pictures"]
     assert pictures == ["robot.png", "robot.gif"]
     for name in pictures:
         held = base64.b64encode((report / "figures" / name).read_bytes()).decode()
-        assert f"src='data:image/{name[-3:]};base64,{held}'" in page
+        assert f'src="data:image/{name[-3:]};base64,{held}"' in page
     assert page.count("src=") == len(figures) + 2 and "<script" not in page
     assert not re.search(r"(href|src)=['\"](https?:)?//", page)
     assert "@media print" in page
     for claim in document["claims"]:
         assert f">{claim['verdict']}</span>" in page
     for key in document["exhibits"]:
-        assert f"id='{key}'" in page
-    for link in re.findall(r"href='#([^']+)'", page):
-        assert f"id='{link}'" in page
-    for link in re.findall(r"href='((?:data|figures)/[^']+)'", page):
+        assert f'id="{key}"' in page
+    for link in re.findall(r'href="#([^"]+)"', page):
+        assert f'id="{link}"' in page
+    for link in re.findall(r'href="((?:data|figures)/[^"]+)"', page):
         assert (report / link).is_file()
+
+
+def test_no_figure_is_cut_off_at_its_edges(
+    report: pathlib.Path, document: dict[str, Any]
+) -> None:
+    for exhibit in document["exhibits"].values():
+        for name in exhibit["figures"]:
+            with Image.open(report / "figures" / f"{name}.png") as image:
+                drawn = np.asarray(image.convert("L")) < 250
+            edges = (drawn[0], drawn[-1], drawn[:, 0], drawn[:, -1])
+            assert not any(edge.any() for edge in edges), name
 
 
 def test_the_robot_is_shown_still_and_moving(

@@ -10,15 +10,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.typing import NDArray
 from scipy import stats
 
 from jaxcal.calibration.identify import identify
 from jaxcal.evaluation.parameters import least_squares, predict
-from jaxcal.paper.datasets.datasets import make_dataset
+from jaxcal.paper.datasets import make_dataset
 from jaxcal.paper.exhibits import pictures
+from jaxcal.paper.exhibits.columns import as_csv
 from jaxcal.paper.exhibits.devices import Device
-from jaxcal.paper.exhibits.exhibit import Settings, as_csv
 from jaxcal.paper.exhibits.intervals import (
     bootstrap_interval,
     mean_interval,
@@ -28,10 +29,12 @@ from jaxcal.paper.exhibits.intervals import (
 )
 from jaxcal.paper.exhibits.material import Material
 from jaxcal.paper.exhibits.selection import variance_table
+from jaxcal.paper.exhibits.settings import Settings
 from jaxcal.paper.exhibits.training import exhibits, kept_runs, plateau
 from jaxcal.paper.training_runs import FORMAT
 from jaxcal.paper.twin import robot_pictures
 from jaxcal.paper.twin.robot import RobotConfig
+from jaxcal.plots import as_bytes
 
 Array = NDArray[np.float64]
 
@@ -147,7 +150,7 @@ def test_recordings_can_be_given(tmp_path: pathlib.Path) -> None:
     expected = [0.5, 0, 0, 0, 0.6, 0, 0, 0, 0.7, 1, 2, 3]
     np.testing.assert_allclose(found, np.tile(expected, (100, 1)), atol=1e-9)
     assert given.about_overlap("dataset4") == ""  # 5,000 are used as they stand
-    assert str(tmp_path) in given.about_recordings()
+    assert str(tmp_path) in given.settings.about_recordings
     assert "500 postures" in Material(Settings()).about_overlap("dataset4")
 
 
@@ -157,7 +160,7 @@ def test_the_robot_is_drawn_where_mujoco_cannot(
     def fail(*_: object) -> None:
         raise ImportError("no EGL here")
 
-    monkeypatch.setattr(robot_pictures, "_MujocoScene", fail)
+    monkeypatch.setattr(robot_pictures, "_renderer", fail)
     render = functools.partial(robot_pictures.render, size=(120, 90))
     monkeypatch.setattr(pictures, "render", render)
 
@@ -220,6 +223,18 @@ def _keep(
 def _shown(studies: pathlib.Path) -> dict[str, object]:
     found = exhibits(Material(Settings(studies=studies)))
     return {exhibit.key: exhibit for exhibit in found}
+
+
+@pytest.mark.parametrize("kind", ["svg", "png"])
+def test_no_label_of_figure_2_is_cut_off(kind: str) -> None:
+    figures = [f for e in exhibits(Material(Settings())) for f in e.figures.items()]
+    assert [name for name, _ in figures] == ["figure_2_seeds", "figure_2_paper"]
+    for name, figure in figures:
+        as_bytes(figure, kind)  # the first drawing of a new figure, as in the report
+        inside = figure.get_tightbbox(FigureCanvasAgg(figure).get_renderer())
+        width, height = figure.get_size_inches()
+        assert 0 <= inside.x0 and inside.x1 <= width, name
+        assert 0 <= inside.y0 and inside.y1 <= height, name
 
 
 def test_plateau_of_an_exponential(tmp_path: pathlib.Path) -> None:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
-
 import jax
 import mujoco
 import numpy as np
 import pytest
 
 from jaxcal.paper.twin.robot import ORDERS, RobotConfig, joint_angles, measure, read_out
-from jaxcal.paper.twin.robot_model import load_model, model_xml, simulate, trajectory
-from jaxcal.paper.twin.robot_parts import parts_of
+from jaxcal.paper.twin.robot_model import load_model, simulate, trajectory
 
 
 def groups(seed: int = 0, count: int = 2, length: int = 15) -> np.ndarray:
@@ -93,25 +90,29 @@ def test_trajectory_ends_where_the_posture_is_read() -> None:
     np.testing.assert_allclose(path[20::20], simulate(config, commands)[0], atol=1e-9)
 
 
-def test_nothing_touches_and_looks_weigh_nothing() -> None:
+def test_nothing_touches_and_parts_weigh_nothing() -> None:
     model = load_model(RobotConfig(backlash_deg=1.0))
     assert not model.geom_contype.any() and not model.geom_conaffinity.any()
     assert model.nq == 6 and model.nu == 3
     load = RobotConfig().load_kg
     np.testing.assert_allclose(model.body("link3").mass, load)
+    np.testing.assert_allclose(model.body_mass[1:3], 0.5)
 
 
 @pytest.mark.parametrize("order", ORDERS)
-def test_every_part_is_drawn_on_its_link(order: str) -> None:
-    config = RobotConfig(mechanism_order=order)
-    root = ElementTree.fromstring(model_xml(config)).find("worldbody")
-    assert root is not None
-    parts = parts_of(order)
-    assert len(list(root.iter("geom"))) == len(parts)
-    assert {part.link for part in parts} == {0, 1, 2, 3}
-    axes = [joint.get("axis") for joint in root.iter("joint") if joint.get("axis")]
-    letters = ["XYZ"["1 0 0,0 1 0,0 0 1".split(",").index(str(a))] for a in axes]
-    assert "".join(letters) == order
+def test_every_link_turns_about_its_axis_and_carries_its_parts(order: str) -> None:
+    model = load_model(RobotConfig(mechanism_order=order))
+    # Stand, two rings of 36 rods, three axes with two bearings and a motor, foot.
+    upright, inner = order[0] == "Y", order[2]
+    assert np.bincount(model.geom_bodyid).tolist() == [
+        1 + (1 if upright else 2) + 1,
+        36 + 2 + 1,
+        36 + 2 + 1,
+        2 + 4 + {"X": 2, "Y": 2, "Z": 4}[inner],
+    ]
+    np.testing.assert_array_equal(model.body_parentid, [0, 0, 1, 2])
+    turned = np.eye(3)[["XYZ".index(letter) for letter in order]]
+    np.testing.assert_array_equal(model.jnt_axis, turned)
 
 
 def test_mujoco_is_not_the_release_that_solves_wrongly() -> None:

@@ -46,7 +46,10 @@ def test_thinning_keeps_moments_and_last_values(rng: np.random.Generator) -> Non
         (["--preset", "best"], "--preset must be one of compact, general, paper"),
         (["--preset", "compact", "--seeds", "x"], "a number of seeds or a list"),
         (["--preset", "compact", "--seeds", "1,-2"], "a number of seeds or a list"),
-        (["--preset", "compact", "--episodes", "0"], "--episodes must be at least 1"),
+        (
+            ["--preset", "compact", "--episodes", "0"],
+            "--episodes: must be a whole number of at least 1, got '0'",
+        ),
         (["--collect", "{tmp}", "--seeds", "3"], "go with --preset"),
         (["--collect", "{tmp}"], "holds no metrics.csv"),
     ],
@@ -103,4 +106,4 @@ def test_the_command_trains_keeps_and_does_not_train_again(
     rewards = np.load(kept / "last_rewards.npy")
     assert rewards.shape == (1000,)
     again = subprocess.run([*given, *folders], capture_output=True, text=True, cwd=ROOT)
-    assert again.returncode == 0 and "finished before" in again.stdout
+    assert again.returncode == 0 and "already finished" in again.stdout

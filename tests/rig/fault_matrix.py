@@ -18,7 +18,9 @@ import time
 
 import numpy as np
 from harness import (
+    HASTY,
     HOST_FAULTS,
+    changed,
     fast_config,
     fast_text,
     in_the_middle,
@@ -27,8 +29,8 @@ from harness import (
 )
 
 from rig.config import parse_config
-from rig.journal import read_journal
-from rig.session import Run
+from rig.outputs.journal import read_journal
+from rig.session.run import Run
 from rig.simulator import Simulator, parse_fault
 
 PHASES = ("zeroing", "moving", "settling", "measuring", "saving")
@@ -118,7 +120,7 @@ def check_invariants(folder: pathlib.Path, sim: Simulator, alive: bool, deaf: bo
         ran = [target for _, target in drive.executions]
         rest = iter(asked)
         missing = [target for target in ran if target not in rest]
-        assert not missing, f"{axis} ran moves twice or unasked: {missing}"
+        assert not missing, f"{axis} ran moves twice or without a command: {missing}"
     if not alive:
         return
     if deaf:  # the drives cannot say that they were told: the journal does
@@ -138,12 +140,12 @@ def run_cell(
     """Run one cell of the matrix; raises AssertionError where a promise is broken."""
     if fault in HOST_FAULTS:
         return _host_cell(fault, phase, truth, folder)
-    config = fast_config()
     said: list[str] = []
     spec = parse_fault(fault)
+    hasty = fast_config(HASTY)
     done: list[bool] = []
 
-    with simulator(config) as sim:
+    with simulator(fast_config()) as sim:
 
         def listen(run: Run, entered: str) -> None:
             if entered == phase and not done and in_the_middle(run, entered):
@@ -152,7 +154,10 @@ def run_cell(
                 sim.enter(entered)
 
         served = sim.start()
-        code = first = session(served, folder, sim, said, [listen])
+        bus = changed(served.bus, timeout_s=hasty.bus.timeout_s)
+        imu = changed(served.imu, stale_s=hasty.imu.stale_s)
+        spoilt = changed(served, bus=bus, imu=imu)
+        code = first = session(spoilt, folder, sim, said, [listen])
         assert done, f"the session never entered {phase}"
         reason = next((s for s in reversed(said) if s.startswith("fault:")), "")
         check_invariants(folder, sim, alive=True, deaf=spec.kind in DEAF)

@@ -1,21 +1,17 @@
 """Configuration and maps: every fault at once, and all that ships is valid."""
 
-import dataclasses
+import pathlib
 import tomllib
 
+import pydantic
 import pytest
+from reference import configuration_table, register_map_table
 
-from rig.config import EXAMPLES, ConfigError, load_config, parse_config
-from rig.registers import (
-    MAP_FOLDER,
-    MapError,
-    available_maps,
-    decode,
-    encode,
-    load_map,
-    parse_map,
-)
-from rig.units import Scale
+from rig.config import ConfigError, load_config, parse_config
+from rig.config.axis import Scale
+from rig.config.files import EXAMPLES
+from rig.config.maps import MAP_FOLDER, MapError, available_maps, load_map, parse_map
+from rig.config.registers import decode, encode
 
 EXAMPLE_TEXT = (EXAMPLES / "simulate.toml").read_text()
 
@@ -30,9 +26,10 @@ def test_every_map_that_ships_keeps_the_schema(name):
     loaded = load_map(name)
     assert loaded.name == name
     assert loaded.stop and loaded.move
-    written = {f.address + i for f in loaded.move for i in range(f.count)}
-    assert loaded.trigger[0] in written
-    names = {w[0] for f in loaded.move for w in f.words if not isinstance(w, int)}
+    frames = loaded.move.write
+    written = {f.address + i for f in frames for i in range(f.count)}
+    assert loaded.move.trigger.address in written
+    names = {w[0] for f in frames for w in f.words if not isinstance(w, int)}
     assert {"position", "speed", "accel"} <= names
 
 
@@ -99,7 +96,7 @@ def test_a_session_range_outside_the_limits_is_refused():
 
 def test_an_overshoot_shrinks_the_default_ranges_and_binds_given_ones():
     text = EXAMPLE_TEXT.replace("[motion]", "[motion]\napproach_overshoot_deg = 2")
-    assert parse_config(text).session.ranges[0] == (-18.0, 20.0)
+    assert parse_config(text).ranges[0] == (-18.0, 20.0)
     with pytest.raises(ConfigError, match="overshoot"):
         parse_config(text + "\n[session]\nyaw_range_deg = [-20, 20]\n")
 
@@ -130,8 +127,9 @@ def test_pulses_are_rounded_first_and_the_angle_follows_from_them():
     scale = Scale(pulses_per_rev=1000, reduction=7.5, direction=-1)
     pulses = scale.to_pulses(10.01)
     assert pulses == round(-1000 * 7.5 * 10.01 / 360)
-    assert scale.rounded_deg(10.01) == pytest.approx(360 * -pulses / (1000 * 7.5))
-    assert scale.to_pulses(scale.rounded_deg(10.01)) == pulses
+    rounded = scale.to_deg(pulses)
+    assert rounded == pytest.approx(360 * -pulses / (1000 * 7.5))
+    assert scale.to_pulses(rounded) == pulses
 
 
 @pytest.mark.parametrize("order", ["big", "little"])
@@ -185,5 +183,56 @@ def test_a_map_beside_the_configuration_needs_no_code(tmp_path):
 
 def test_configuration_is_frozen():
     config = parse_config(EXAMPLE_TEXT)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        config.mechanism_order = "XYZ"
+    for table, key in ((config, "output"), (config.mechanism, "order")):
+        with pytest.raises(pydantic.ValidationError, match="frozen"):
+            setattr(table, key, "XYZ")
+
+
+def test_an_unknown_key_names_the_nearest_known_one():
+    text = EXAMPLE_TEXT.replace("window_s = 0.2", "windows_s = 0.2")
+    with pytest.raises(ConfigError) as caught:
+        parse_config(text.replace("pulses_per_rev = 10000", "pulse_per_rev = 1", 1))
+    faults = "\n".join(caught.value.faults)
+    assert "settle.windows_s: unknown key; did you mean window_s?" in faults
+    assert ".pulse_per_rev: unknown key; did you mean pulses_per_rev?" in faults
+    assert ".pulses_per_rev: missing; a whole number in [1, 100000000]" in faults
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ("unit = 3", "unit = true", "axes.roll.unit: must be a whole number"),
+        ("unit = 3", "unit = 3.0", "axes.roll.unit: must be a whole number"),
+        ("reduction = 10", "reduction = inf", "axes.pitch.reduction: must be a number"),
+        ("window_s = 0.2", 'window_s = "0.2"', "settle.window_s: must be a number in"),
+        ("column_count = 4", "signs = [1, 0, 1]", r"imu.signs\[1\]: must be 1 or -1"),
+        ("column_count = 4", "columns = [1, 2]", "imu.columns"),
+        ("column_count = 4", 'separator = "1"', "imu.separator: must be one character"),
+        ("[imu]", "[imu]\nmounting_deg = [0, 0, nan]", r"imu.mounting_deg\[2\]"),
+        ('host = "127.0.0.1"\nport = 5020', "port = 5020", "bus.host: missing"),
+        ('format = "hyperimu"', 'format = "lines"', "imu.order: missing"),
+    ],
+)
+def test_nothing_is_converted_in_silence(old, new, says):
+    with pytest.raises(ConfigError, match=says):
+        parse_config(EXAMPLE_TEXT.replace(old, new, 1))
+
+
+GOLDEN = {
+    "applied_motion": "0c4feedd22a0",
+    "generic": "f9e9b5c368d0",
+    "leadshine_pr": "b44aa4d170aa",
+    "oriental_az": "c7934a5f0dee",
+    "simulate": "4821a105dec4",
+}
+
+
+@pytest.mark.parametrize("name", sorted(GOLDEN))
+def test_fingerprints_stay_those_of_run_folders_of_version_1(name):
+    assert load_config(EXAMPLES / f"{name}.toml").fingerprint()[:12] == GOLDEN[name]
+
+
+def test_the_reference_tables_of_the_docs_are_those_of_the_schema():
+    page = (pathlib.Path(__file__).parents[2] / "docs" / "rig.md").read_text()
+    for table in (configuration_table(), register_map_table()):
+        assert table in page, "run: python tests/rig/reference.py docs/rig.md"

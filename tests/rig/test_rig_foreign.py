@@ -209,8 +209,8 @@ def connected(port, closing):
 @pytest.mark.parametrize(
     ("phone", "settings", "rate"),
     [
-        pytest.param(line_phone, LINES + QUICK, 50, id="lines"),
-        pytest.param(hyper_phone, HYPERIMU + QUICK, 50, id="hyperimu"),
+        pytest.param(line_phone, LINES + QUICK, 200, id="lines"),
+        pytest.param(hyper_phone, HYPERIMU + QUICK, 200, id="hyperimu"),
         pytest.param(wrapping_phone, LINES, 50, id="wraps", marks=pytest.mark.slow),
         pytest.param(line_phone, LINES, 10, id="10 Hz", marks=pytest.mark.slow),
         pytest.param(

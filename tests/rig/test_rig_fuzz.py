@@ -5,7 +5,6 @@ numbers, read by another grammar, into the same rotation; a Modbus value is righ
 its bytes stand in the reply behind the header (and before the CRC) they must have.
 """
 
-import dataclasses
 import json
 import random
 import re
@@ -13,15 +12,15 @@ import resource
 
 import numpy as np
 import pytest
-from harness import fast_config
+from harness import changed, fast_config
 from scipy.spatial.transform import Rotation
 
-from rig.bus import Bus, BusError
-from rig.settings import BusSettings
+from rig.config.settings import BusSettings
+from rig.device.bus import Bus, BusError
+from rig.device.stream import MAX_LINE, LineSplitter, Parser, StreamFault
 from rig.simulator.server import crc16
-from rig.stream import MAX_LINE, LineSplitter, Parser, StreamFault
 
-IMU = dataclasses.replace(fast_config().imu, max_jump_deg=180.0)
+IMU = changed(fast_config().imu, max_jump_deg=180.0)
 FIELD = re.compile(r"[ \t]*[+-]?[0-9]+([.][0-9]+)?([eE][+-]?[0-9]+)?[ \t]*")
 SIZES = [
     pytest.param(20_000, id="quick"),
@@ -178,7 +177,11 @@ class Replies:
 def test_mutated_modbus_replies(framer, count):
     rng = random.Random(count)
     transport = "tcp" if framer == "socket" else "rtu_tcp"
-    bus = Bus(BusSettings(transport, "x", 1, timeout_s=0.01, read_retries=0))
+    bus = Bus(
+        BusSettings(
+            transport=transport, host="x", port=1, timeout_s=0.01, read_retries=0
+        )
+    )
     replies = Replies(framer)
     bus._client = replies.client
     reads = writes = 0

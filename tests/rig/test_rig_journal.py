@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from rig.journal import Journal, JournalError, read_journal
+from rig.outputs.journal import Journal, JournalError, read_journal
 
 
 def test_records_survive_and_are_numbered(tmp_path):
@@ -81,7 +81,7 @@ def test_a_full_disk_leaves_whole_lines(tmp_path, monkeypatch):
 def test_sigkill_at_any_moment_leaves_a_readable_journal(tmp_path):
     program = (
         "import pathlib, sys\n"
-        "from rig.journal import Journal\n"
+        "from rig.outputs.journal import Journal\n"
         "j = Journal(pathlib.Path(sys.argv[1]))\n"
         "print('ready', flush=True)\n"
         "n = len(j.records)\n"

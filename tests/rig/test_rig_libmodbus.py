@@ -21,11 +21,11 @@ from harness import fast_text
 from scipy.spatial.transform import Rotation
 
 from rig.__main__ import main
-from rig.bus import Bus, BusError
 from rig.config import parse_config
-from rig.drives import Drive
-from rig.settings import BusSettings
-from rig.stop import stop_all
+from rig.config.settings import BusSettings
+from rig.device.bus import Bus, BusError
+from rig.device.drives import Drive
+from rig.guard.stop import stop_all
 
 SOURCE = pathlib.Path(__file__).with_name("libmodbus_slave.c")
 MATRIX = np.array([[0.95, 0.03, -0.02], [0.01, 1.04, 0.02], [-0.015, 0.01, 0.9]])
@@ -162,7 +162,7 @@ def test_one_drive_over_rtu_on_a_pseudo_terminal(program):
     for thread in threads:
         thread.start()
     axis = parse_config(fast_text()).axes[0]
-    settings = BusSettings("rtu", device=os.ttyname(ours[1]), timeout_s=0.5)
+    settings = BusSettings(transport="rtu", device=os.ttyname(ours[1]), timeout_s=0.5)
     try:
         with (
             Slave(program, "rtu", os.ttyname(theirs[1])) as slave,

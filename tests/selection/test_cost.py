@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import jaxcal
 from jaxcal.information.regression import log_det_gram
-from jaxcal.selection.fastest.fastest import (
+from jaxcal.selection.fastest import (
     Motion,
     fastest_tour,
     pareto_figure,
@@ -243,14 +243,23 @@ def test_the_figure_holds_every_point(rng):
         ({"least_efficiency": 0.0}, r"least_efficiency must be in \(0, 1\], got 0"),
         (
             {"method": "magic"},
-            "method must be one of exact, heuristic, policy, lookahead, got 'magic'",
+            "method must be one of exact, heuristic, lookahead, got 'magic'",
         ),
         ({"k": 13, "method": "exact"}, "k must be at most 12 with exact, got 13"),
         ({"motion": 20.0}, "motion must be a Motion, got 20.0"),
         ({"k": 3}, "k must be at least 4"),
         ({"start": np.zeros(2)}, r"start must have shape \(3,\), got \(2,\)"),
-        ({"time_limit": -1}, "time_limit must be above 0 seconds, got -1"),
+        ({"time_limit": -1}, "time_limit must be a number above 0 in seconds, got -1"),
         ({"motion": Motion((1.0, 2.0), (1.0,))}, "motion.speed must hold 1 or 3"),
+        ({"num": 4}, 'num is not an option of method "exact" .it is of lookahead.'),
+        (
+            {"method": "lookahead", "seed": 1},
+            'seed is not an option of method "lookahead" .it is of exact, heuristic.',
+        ),
+        (
+            {"method": "heuristic", "num": 2},
+            'num is not an option of method "heuristic"',
+        ),
     ],
 )
 def test_bad_requests_name_argument_rule_and_value(rng, change, message):
@@ -275,7 +284,7 @@ def test_a_motion_is_checked_once(values, message):
 def test_cost_loads_neither_jax_nor_matplotlib():
     code = (
         "import sys, numpy\n"
-        "from jaxcal.selection.fastest.fastest import Motion, select_fastest\n"
+        "from jaxcal.selection.fastest import Motion, select_fastest\n"
         "c = numpy.random.default_rng(0).random((9, 3))\n"
         "select_fastest(c, motion=Motion((1.0,), (1.0,)))\n"
         "print(sorted({'jax', 'matplotlib'} & set(sys.modules)))"

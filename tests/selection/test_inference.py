@@ -19,6 +19,7 @@ from jaxcal.extras import MissingExtraError
 from jaxcal.information.regression import log_det_gram
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies import decoding, networks
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.checkpoint_folder import default_folder
@@ -111,20 +112,22 @@ def test_the_scores_are_those_of_jax_in_double_precision(rng, key, config, n, k,
     else:
         points = jnp.zeros((1, 14, n)), jnp.ones((1, 14), bool)
         chosen = jnp.full((1, k), -1)
-        init = networks.build(config).init(key, *points, chosen, points[1])
+        init = build(config).init(key, *points, chosen, points[1])
         scale = np.random.default_rng(1)
         params = jax.tree.map(
             lambda leaf: np.float32(leaf + 0.3 * scale.normal(size=leaf.shape)),
             init["params"],
         )
-    network = networks.build(config)
+    network = build(config)
     chosen = np.full((5, k), -1)
     chosen[:, :made] = np.arange(made)
     free = available.copy()
     free[:, :made] = False
     with jax.enable_x64(True):
         double = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
-        view = network.look(jnp.asarray(whitened(problems)), jnp.asarray(available))
+        view = network.candidate_features(
+            jnp.asarray(whitened(problems)), jnp.asarray(available)
+        )
         memory = networks.encode(network, double, view)
         given = view, memory, jnp.asarray(chosen, jnp.int32), jnp.asarray(free)
         logits, _ = decoding.logits_at(network, double, *given, made)
@@ -173,7 +176,7 @@ def test_of_many_candidates_the_512_of_largest_gain_are_starts(rng):
 
 def test_samples_are_drawn_from_the_policy(rng):
     config = NetworkConfig(width=4, encoder_rounds=1, endgame=False)
-    network = networks.build(config)
+    network = build(config)
     problems, _, available, _ = drawn(rng, 1, 6, 2, 3)
     begin = jnp.zeros((1, 6, 2)), jnp.ones((1, 6), bool), jnp.full((1, 3), -1)
     params = network.init(jax.random.key(0), *begin, begin[1])["params"]
@@ -246,7 +249,7 @@ def test_a_folder_without_the_weights_file_gives_the_same_answer(
 def papers(tmp_path_factory):
     """A checkpoint of the paper's network, not trained."""
     config = NetworkConfig(kind="paper", width=16)
-    network = networks.build(config)
+    network = build(config)
     points = jnp.zeros((1, 10, 3)), jnp.ones((1, 10), bool), jnp.full((1, 4), -1)
     params = network.init(jax.random.key(0), *points, points[1])["params"]
     environment = dataclasses.asdict(SelectionConfig(num_candidates=10))

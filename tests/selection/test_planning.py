@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 import jaxcal
 from jaxcal.information.criteria import criteria
-from jaxcal.selection.plan import plan, plan_figure
+from jaxcal.plots.selection import plan_figure
+from jaxcal.selection.plan import plan
 
 
 def value_of(candidates, indices, criterion, region=None):
@@ -207,7 +208,7 @@ def test_out_of_reach_names_the_best_achievable(rng):
         ({"noise_std": [1.0, 2.0], "num_outputs": 3}, "noise_std must be one number"),
         ({"target_accuracy": -1.0}, "target_accuracy must be positive, got -1"),
         ({"target_accuracy": np.nan}, "target_accuracy must be finite"),
-        ({"time_limit": 0}, "time_limit must be above 0"),
+        ({"time_limit": 0}, "time_limit must be a number above 0 in seconds"),
         ({"max_k": 3}, "max_k must be at least 4, got 3"),
         ({"max_k": 13}, "max_k must not exceed the 12 measurements allowed, got 13"),
         ({"more": -1}, "more must be at least 0, got -1"),
@@ -230,11 +231,33 @@ def test_bad_requests_name_argument_rule_and_value(rng, change, message):
 def test_the_table_and_the_figure_show_every_row(rng):
     found = plan(rng.random((15, 3)), target_accuracy=0.9, noise_std=1.0, more=2)
     lines = found.table().splitlines()
+    assert str(found) == found.table()
     assert len(lines) == len(found.rows) + 3
     assert sum(line.endswith("<-") for line in lines) == 1
     axes = plan_figure(found).axes[0]
     assert len(axes.lines[0].get_xdata()) == len(found.rows)
     assert "standard error" in axes.get_ylabel()
+
+
+def test_a_masked_candidate_may_hold_anything(rng):
+    candidates = rng.random((15, 3))
+    wanted = {"target_accuracy": 0.9, "noise_std": 1.0}
+    available = np.arange(15) != 4
+    plain = plan(candidates, available=available, **wanted)
+    candidates[4] = np.nan
+    odd = plan(candidates, available=available, **wanted)
+    assert odd.indices.tolist() == plain.indices.tolist()
+
+
+def test_a_plan_keeps_its_own_levels(rng):
+    noise, target = np.array([0.1, 0.1, 1.0]), np.array([0.9, 0.9, 0.9])
+    found = plan(rng.random((15, 3)), target_accuracy=target, noise_std=noise)
+    table = found.table()
+    noise[:] = 7.0
+    target[:] = 7.0
+    assert found.table() == table
+    with pytest.raises(ValueError, match="read-only"):
+        found.noise_std[0] = 2.0
 
 
 def test_planning_loads_neither_jax_nor_matplotlib():

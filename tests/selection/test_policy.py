@@ -24,9 +24,9 @@ def optimum(sets, k, **options):
     return np.asarray(exact_batch(sets, k, num_outputs=1, **options).log_det)
 
 
-def test_select_uses_the_shipped_policy(rng):
+def test_select_uses_the_shipped_policy_when_asked(rng):
     candidates = rng.uniform(size=(50, 3))
-    chosen = jaxcal.select(candidates, 4, "policy")
+    chosen = jaxcal.select(candidates, method="policy")
     assert chosen.method == "policy"
     assert len(set(chosen.indices.tolist())) == 4
     rows = jaxcal.regression_matrix(candidates[chosen.indices])
@@ -136,8 +136,8 @@ def test_the_shipped_checkpoint_says_how_it_was_made():
 
 def test_importing_jaxcal_loads_nothing_heavy():
     code = (
-        "import sys, jaxcal, jaxcal.calibration.identify, jaxcal.selection\n"
-        "import jaxcal.information.regression, jaxcal.selection.policy\n"
+        "import sys, jaxcal, jaxcal.calibration, jaxcal.information, jaxcal.selection\n"
+        "import jaxcal.selection.policy\n"
         "heavy = {'jax', 'brax', 'mujoco', 'matplotlib', 'flax', 'orbax', 'numba'}\n"
         "print(sorted(heavy & set(sys.modules)))"
     )

@@ -1,5 +1,6 @@
 """What every method promises, whatever it picks: rules, records and refusals."""
 
+import json
 import subprocess
 import sys
 
@@ -27,6 +28,10 @@ def uniform(seed, m=20, n=3):
     return np.random.default_rng(seed).random((m, n))
 
 
+def seeded(method, seed):
+    return {} if method == "greedy" else {"seed": seed}
+
+
 def log_det_of(candidates, indices, m=3):
     z = np.c_[candidates, np.ones(len(candidates))][indices]
     return np.linalg.slogdet(np.kron(z.T @ z, np.eye(m)))[1]
@@ -45,6 +50,7 @@ def test_a_selection_says_what_it_is_worth(method, k):
     assert found.gap == found.bound - found.log_det
     assert found.efficiency == pytest.approx(np.exp(-found.gap / 12))
     assert found.proven == (method == "exact")
+    assert found.value == found.log_det
     assert found.seconds > 0
     assert found.criteria == criteria(candidates[found.indices], candidates)
     assert found.alternatives[0].log_det == found.log_det
@@ -65,7 +71,7 @@ def test_rules_are_kept_by_every_method(method, k, cap):
             available=available,
             required=required,
             max_replicates=cap,
-            seed=seed,
+            **seeded(method, seed),
         )
         assert available[found.indices].all()
         assert set(required.tolist()) <= set(found.indices.tolist())
@@ -80,7 +86,7 @@ def test_no_method_is_singular_on_grids_and_duplicates(method, k):
     heap = np.concatenate([np.tile(grid[:2], (60, 1)), grid[[2, 6, 18]]])
     for candidates in (grid, heap):
         for seed in range(10):
-            found = select(candidates, k, method, seed=seed)
+            found = select(candidates, k, method, **seeded(method, seed))
             assert np.isfinite(found.log_det)
 
 
@@ -227,12 +233,29 @@ def test_unknown_methods_are_answered_with_the_list():
         select(uniform(0), 4, "best")
     with pytest.raises(ValueError, match="method must be one of"):
         select(uniform(0), 4, None)
-    assert METHODS == ("random", "greedy", "exchange", "exact", "policy")
+    assert METHODS == ("random", "greedy", "exchange", "exact", "policy", "auto")
 
 
 def test_what_only_one_method_can_do_is_refused_by_the_others():
-    with pytest.raises(ValueError, match='best must be 1 unless method is "exact"'):
-        select(uniform(0), 4, "greedy", best=2)
+    with pytest.raises(
+        ValueError,
+        match=r'restarts is not an option of method "greedy" \(it is of exchange, '
+        r"exact, auto\)",
+    ):
+        select(uniform(0), 4, "greedy", restarts=5)
+    for method, option in [
+        ("greedy", {"seed": 1}),
+        ("random", {"time_limit": 1.0}),
+        ("exchange", {"best": 2}),
+        ("exact", {"num": 4}),
+        ("policy", {"restarts": 7}),
+        ("auto", {"checkpoint": "runs/a"}),
+        ("auto", {"decoding": "samples"}),
+        ("exact", {"least_efficiency": 0.9}),
+    ]:
+        with pytest.raises(ValueError, match=f"{next(iter(option))} is not an option"):
+            select(uniform(0), 4, method, **option)
+    select(uniform(0), 4, "greedy", reference="exact", time_limit=5)  # both are read
     with pytest.raises(ValueError, match="max_replicates must be 1 with method"):
         select(uniform(0), 4, "policy", max_replicates=2)
 
@@ -243,15 +266,15 @@ def test_flat_candidates_name_the_missing_direction(method, scale):
     flat = uniform(0) * scale
     flat[:, 2] = flat[:, 0]
     with pytest.raises(
-        ValueError, match=r"one plane.*\(0.7071, 0, -0.7071\)|-0.7071, 0"
+        ValueError, match=r"one plane; .* never excited: \(\+0.7071 u_x -0.7071 u_z\)"
     ):
         select(flat, 4, method)
     flat[:, 2] = 7.0
-    with pytest.raises(ValueError, match=r"missing direction \(0, 0, 1\)"):
+    with pytest.raises(ValueError, match=r"the direction never excited: u_z"):
         select(flat, 4, method)
     with pytest.raises(ValueError, match="lie in one plane"):
         select(np.ones((9, 3)) * scale, 4, method)
-    with pytest.raises(ValueError, match=r"on one line.*missing direction"):
+    with pytest.raises(ValueError, match=r"on one line; .*direction never excited"):
         select(np.c_[np.arange(9), 2 * np.arange(9)] * scale, 4, method)
 
 
@@ -259,7 +282,7 @@ def test_flat_among_the_available_is_flat():
     candidates = uniform(0)
     candidates[5:, 1] = 0.3
     select(candidates, 4, "exact")
-    with pytest.raises(ValueError, match=r"15 available.*\(0, 1, 0\)"):
+    with pytest.raises(ValueError, match=r"15 available ones lie.* u_y"):
         select(candidates, 4, "exact", available=np.arange(20) >= 5)
 
 
@@ -303,7 +326,7 @@ def test_batches_name_the_set_that_is_wrong():
     candidates = np.random.default_rng(0).random((3, 9, 3))
     candidates[1, :, 0] = 2.0
     for batch in BATCHES:
-        with pytest.raises(ValueError, match=r"in set 1 lie in one plane.*\(1, 0, 0\)"):
+        with pytest.raises(ValueError, match=r"in set 1 lie in one plane.* u_x"):
             batch(candidates, 4)
         with pytest.raises(ValueError, match=r"candidates must have shape \(B, M, n\)"):
             batch(candidates[0], 4)
@@ -329,17 +352,121 @@ def test_whitened_rows_are_orthonormal_over_the_available():
     problem = make_problem(uniform(0) * [1, 50, 1e4] + 1e5, 4, available=available)
     np.testing.assert_allclose(problem.rows.T @ problem.rows, np.eye(4), atol=1e-9)
     assert not problem.rows[~available].any()
+    assert problem.blocks.shape == (20, 1, 4) and problem.multiplicity == 3
+
+
+def test_a_masked_candidate_may_be_nan():
+    candidates = uniform(0)
+    available = np.arange(20) != 7
+    plain = {m: select(candidates, 6, m, available=available) for m in SOLVERS}
+    candidates[7] = np.nan
+    for method in SOLVERS:
+        found = select(candidates, 6, method, available=available)
+        np.testing.assert_array_equal(found.indices, plain[method].indices)
+        assert found.log_det == plain[method].log_det
+        assert found.criteria == plain[method].criteria
+    with pytest.raises(
+        ValueError, match=r"candidates must be finite, got nan at \(7, 0"
+    ):
+        select(candidates, 6, available=np.arange(20) != 8)
+
+
+def test_a_result_does_not_change_with_the_callers_arrays():
+    candidates, available = uniform(0), np.arange(20) > 2
+    found = select(candidates, 6, "greedy", available=available)
+    expected = select(candidates.copy(), 6, "greedy", available=available.copy())
+    candidates[:] = 7.0
+    available[:] = False
+    assert found.bound == expected.bound
+    assert found.criteria == expected.criteria
+    assert str(found).splitlines()[1:5] == str(expected).splitlines()[1:5]
+    for array in (found.indices, found.problem.candidates, found.problem.blocks):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0
+
+
+def test_the_fewest_that_identify_are_the_default():
+    assert len(select(uniform(0)).indices) == 4
+    assert len(select(uniform(0, n=2)).indices) == 3
+
+
+def test_a_generator_may_be_the_seed():
+    one, two = (
+        select(uniform(0), 6, "random", seed=np.random.default_rng(3)) for _ in range(2)
+    )
+    np.testing.assert_array_equal(one.indices, two.indices)
+    same = select(uniform(0), 6, "random", seed=one.seed)
+    np.testing.assert_array_equal(one.indices, same.indices)
+    assert select(uniform(0), 6, "exchange", seed=np.random.default_rng(0)).seed > 0
+
+
+def test_a_selection_prints_as_a_table_with_the_callers_labels():
+    names = [f"pose {i}" for i in range(20)]
+    found = select(uniform(0) * 40, 4, names=names)
+    first = found.indices[0]
+    lines = repr(found).splitlines()
+    assert lines[0] == "4 of 20 candidates, method exact"
+    assert lines[1].split() == ["candidate", "name", "u_x", "u_y", "u_z"]
+    assert lines[2].split()[:3] == [str(first), "pose", str(first)]
+    assert f"{found.problem.candidates[first, 0]:.6g}" in lines[2]
+    assert "proven optimal" in str(found) and "reason" in str(found)
+    assert "or more" in str(select(uniform(0), 6, "random"))
+    plain = json.loads(json.dumps(found.to_dict()))
+    assert plain["indices"] == found.indices.tolist()
+    assert plain["labels"] == [names[i] for i in found.indices]
+    assert plain["candidates"] == found.problem.candidates[found.indices].tolist()
+    assert (plain["proven"], plain["efficiency"]) == (True, 1.0)
+    with pytest.raises(ValueError, match="names must be 20 texts, one for each cand"):
+        select(uniform(0), names=["a", "b"])
+
+
+class Frame:
+    """As much of a data frame as is read."""
+
+    def __init__(self, values):
+        self.values = values
+        self.columns = ["pitch", "yaw", "roll"]
+        self.index = [f"p{i}" for i in range(len(values))]
+
+    def to_numpy(self):
+        return self.values
+
+    def __array__(self, dtype=None, copy=None):
+        return np.asarray(self.values, dtype=dtype)
+
+
+def test_a_data_frame_keeps_its_labels(monkeypatch):
+    found = select(Frame(uniform(0)), 4)
+    assert found.labels == tuple(f"p{i}" for i in found.indices)
+    assert str(found).splitlines()[1].split()[2:] == ["pitch", "yaw", "roll"]
+    assert score(Frame(uniform(0)), found.indices).labels == found.labels
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ImportError, match=r"to_frame needs pandas, .* pip install"):
+        found.to_frame()
+
+
+def test_to_frame_is_a_row_for_each_chosen():
+    pandas = pytest.importorskip("pandas")
+    given = pandas.DataFrame(uniform(0), columns=["a", "b", "c"]).rename("p{}".format)
+    found = select(given, 4)
+    frame = found.to_frame()
+    assert list(frame.columns) == ["index", "a", "b", "c"]
+    np.testing.assert_array_equal(frame[["a", "b", "c"]], given.loc[frame.index])
 
 
 def test_names_are_exported_lazily():
     assert jaxcal.select is select
     code = (
         "import sys, numpy as np, jaxcal\n"
-        "jaxcal.select(np.random.default_rng(0).random((50, 3)), 4, 'exact')\n"
-        "jaxcal.select(np.random.default_rng(0).random((50, 3)), 8, 'greedy').bound\n"
-        "print(sorted({'numba', 'jax', 'brax', 'matplotlib'} & set(sys.modules)))"
+        "X = np.random.default_rng(0).random((50, 3))\n"
+        "names = {'numba', 'jax', 'brax', 'matplotlib', 'pandas'}\n"
+        "jaxcal.select(X, 4, 'exact'), jaxcal.select(X).bound\n"
+        "jaxcal.select(X, 4, 'greedy').bound, jaxcal.select(X, 8, 'random')\n"
+        "print(sorted(names & set(sys.modules)))\n"
+        "jaxcal.select(X, 8)\n"
+        "print(sorted(names & set(sys.modules)))"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
-    assert done.stdout.strip() == "[]"
+    assert done.stdout.splitlines() == ["[]", "['numba']"]

@@ -5,7 +5,13 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-from jaxcal.learning.policies import geometry
+from jaxcal.learning.small_matrices import (
+    cholesky_pivots,
+    picked,
+    row_dot,
+    row_parts,
+    row_sum,
+)
 
 __all__ = ["context_features"]
 
@@ -23,13 +29,8 @@ def context_features(candidates: jax.Array, chosen: jax.Array) -> jax.Array:
         regressors with a ridge of 0.01: log-determinant, trace, and the log ratio of
         the least to the largest Cholesky pivot, each scaled to order one.
     """
-    row_parts, row_sum, row_dot = (
-        geometry.row_parts,
-        geometry.row_sum,
-        geometry.row_dot,
-    )
     n, total = candidates.shape[-1], chosen.shape[-1]
-    postures = geometry.picked(candidates, chosen)
+    postures = picked(candidates, chosen)
     present = row_parts((chosen >= 0).astype(candidates.dtype))
     rows = [row_parts(postures[..., j]) for j in range(n)]
     rows = [[x * w for x, w in zip(row, present, strict=True)] for row in rows]
@@ -46,7 +47,7 @@ def context_features(candidates: jax.Array, chosen: jax.Array) -> jax.Array:
     gram = [[row_dot(z[i], z[j]) for j in range(i + 1)] for i in range(p)]
     for i in range(p):
         gram[i][i] = gram[i][i] + 0.01
-    pivots = [jnp.log(pivot) for pivot in geometry.cholesky_pivots(gram)]
+    pivots = [jnp.log(pivot) for pivot in cholesky_pivots(gram)]
     trace = sum(gram[i][i] for i in range(p))
     least, largest = pivots[0], pivots[0]
     for pivot in pivots[1:]:

@@ -20,26 +20,23 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 
 from jaxcal.learning.environments import randomness
 from jaxcal.learning.environments.observation import context_features
-from jaxcal.learning.policies import geometry
-from jaxcal.learning.policies.networks import Network, View
+from jaxcal.learning.settings import require, setting
+from jaxcal.learning.small_matrices import log_det_gram, picked
 
 __all__ = [
     "Candidates",
     "SelectionConfig",
     "SelectionState",
-    "from_pool",
-    "look",
     "observe",
     "reset",
     "reset_from",
     "start",
     "step",
-    "uniform",
+    "unit_cube",
 ]
 
 Candidates = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
@@ -50,26 +47,24 @@ Candidates = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
 class SelectionConfig:
     """What an episode is."""
 
-    num_candidates: int = 50  # postures offered per episode
-    num_selected: int = 4  # postures chosen; n + 1 identify every parameter
-    num_inputs: int = 3  # commanded axes
-    num_outputs: int = 3  # measured axes; they multiply the log-determinant
-    reward_scale: float = 0.1  # reward per unit of log det S (paper: 1/10)
-    reward_gain: bool = False  # pay the increase of log det S since the last payment
+    num_candidates: int = setting(50, "postures offered per episode")
+    num_selected: int = setting(4, "postures chosen; num_inputs + 1 identify the model")
+    num_inputs: int = setting(3, "commanded axes")
+    num_outputs: int = setting(3, "measured axes; they multiply the log-determinant")
+    reward_scale: float = setting(
+        0.1, "reward per unit of log det S (the paper's 1/10)"
+    )
+    reward_gain: bool = setting(
+        False, "pay the increase of log det S; on where num_selected > num_inputs + 1"
+    )
 
     def __post_init__(self) -> None:
-        for name in ("num_inputs", "num_outputs"):
-            if getattr(self, name) < 1:
-                raise ValueError(
-                    f"{name} must be at least 1, got {getattr(self, name)}"
-                )
-        if not self.num_regressors <= self.num_selected < self.num_candidates:
-            raise ValueError(
-                f"num_selected must be in [{self.num_regressors}, "
-                f"{self.num_candidates}), got {self.num_selected}"
-            )
-        if not self.reward_scale > 0:
-            raise ValueError(f"reward_scale must be positive, got {self.reward_scale}")
+        require(self, "at least 1", lambda v: v >= 1, "num_inputs", "num_outputs")
+        least, most = self.num_regressors, self.num_candidates
+        require(
+            self, f"in [{least}, {most})", lambda v: least <= v < most, "num_selected"
+        )
+        require(self, "positive", lambda v: v > 0, "reward_scale")
 
     @property
     def num_regressors(self) -> int:
@@ -94,51 +89,6 @@ class SelectionState:
     key: jax.Array  # () PRNG key of the next episode
 
 
-def uniform(
-    config: SelectionConfig,
-    low: tuple[float, ...] | None = None,
-    high: tuple[float, ...] | None = None,
-) -> Candidates:
-    """Candidates uniform between ``low`` and ``high``, per axis; [0, 1] by default."""
-    lower = np.asarray(low if low is not None else (0.0,) * config.num_inputs)
-    upper = np.asarray(high if high is not None else (1.0,) * config.num_inputs)
-    if lower.shape != (config.num_inputs,) or upper.shape != (config.num_inputs,):
-        raise ValueError(
-            f"low and high must hold {config.num_inputs} numbers, "
-            f"got {lower.shape} and {upper.shape}"
-        )
-    if not (lower < upper).all():
-        raise ValueError(f"low must be below high on every axis, got {low} and {high}")
-    shape = (config.num_candidates, config.num_inputs)
-
-    def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        unit = randomness.uniform(key, shape)
-        points = jnp.float32(lower)[None, :] + unit * jnp.float32(upper - lower)[None]
-        return points, jnp.ones(shape[0], bool)
-
-    return draw
-
-
-def from_pool(config: SelectionConfig, pool: jax.Array) -> Candidates:
-    """Candidates drawn without replacement from a pool (N, n) of recorded postures."""
-    pool = jnp.asarray(pool, jnp.float32)
-    if pool.ndim != 2 or pool.shape[1] != config.num_inputs:
-        raise ValueError(
-            f"pool must have shape (N, {config.num_inputs}), got {pool.shape}"
-        )
-    if pool.shape[0] < config.num_candidates:
-        raise ValueError(
-            f"pool must hold at least {config.num_candidates} postures, "
-            f"got {pool.shape[0]}"
-        )
-
-    def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        index = jax.random.permutation(key, pool.shape[0])[: config.num_candidates]
-        return pool[index], jnp.ones(config.num_candidates, bool)
-
-    return draw
-
-
 def start(
     candidates: jax.Array, available: jax.Array, config: SelectionConfig, key: jax.Array
 ) -> SelectionState:
@@ -156,16 +106,23 @@ def start(
 def reset(
     key: jax.Array, config: SelectionConfig, draw: Candidates | None = None
 ) -> SelectionState:
-    """A new episode with fresh candidates (uniform in [0, 1] unless ``draw`` is given).
+    """A new episode with fresh candidates.
 
     Args:
         key: () PRNG key.
         config: sizes and reward.
-        draw: where candidates come from: ``uniform``, ``from_pool`` or your own.
+        draw: where candidates come from (``scenarios`` has several); uniform in [0, 1]
+            on every axis when None.
     """
     key_draw, key_next = randomness.split(key)
-    candidates, available = (draw or uniform(config))(key_draw)
+    candidates, available = (draw or unit_cube(config))(key_draw)
     return start(candidates, available, config, key_next)
+
+
+def unit_cube(config: SelectionConfig) -> Candidates:
+    """Candidates uniform in [0, 1] on every axis, all available."""
+    shape = (config.num_candidates, config.num_inputs)
+    return lambda key: (randomness.uniform(key, shape), jnp.ones(shape[0], bool))
 
 
 def reset_from(
@@ -197,8 +154,8 @@ def step(
     done = count >= config.num_selected
     pays = (count % p == 0) | done
 
-    postures = geometry.picked(state.candidates, chosen)
-    value = config.num_outputs * geometry.log_det_gram(postures, chosen >= 0)
+    postures = picked(state.candidates, chosen)
+    value = config.num_outputs * log_det_gram(postures, chosen >= 0)
 
     before = state.paid if config.reward_gain else jnp.zeros_like(value)
     reward = jnp.where(pays, config.reward_scale * (value - before), 0.0)
@@ -210,11 +167,6 @@ def step(
         paid=jnp.where(pays, value, state.paid),
     )
     return state, reward, done
-
-
-def look(network: Network, state: SelectionState) -> View:
-    """The network's view of a batch of sets."""
-    return network.look(state.candidates, state.available)
 
 
 def observe(state: SelectionState, config: SelectionConfig) -> jax.Array:

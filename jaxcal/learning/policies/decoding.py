@@ -11,16 +11,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jax.sharding import Mesh, PartitionSpec
 
-from jaxcal.learning.policies import geometry, networks
+from jaxcal.learning.policies import networks
 from jaxcal.learning.policies.networks import Network
+from jaxcal.learning.small_matrices import log_det_gram
 
 __all__ = [
     "DECODINGS",
     "choose",
-    "choose_on_devices",
     "complete",
     "log_det_of",
     "logits_at",
@@ -31,15 +29,13 @@ DECODINGS = ("greedy", "samples", "first")
 
 def log_det_of(candidates: jax.Array, indices: jax.Array) -> jax.Array:
     """(...,) log det(Z.T Z) of the subsets ``indices`` (..., K) of (..., M, n)."""
-    return geometry.log_det_gram(
-        jnp.take_along_axis(candidates, indices[..., None], axis=-2)
-    )
+    return log_det_gram(jnp.take_along_axis(candidates, indices[..., None], axis=-2))
 
 
 def complete(
     network: Network,
     params: Any,
-    view: Any,
+    features: Any,
     memory: Any,
     chosen: jax.Array,
     available: jax.Array,
@@ -52,7 +48,7 @@ def complete(
     def next_one(position: Any, carry: Any) -> Any:
         chosen, available, key = carry
         logits, _ = logits_at(
-            network, params, view, memory, chosen, available, position
+            network, params, features, memory, chosen, available, position
         )
         if key is None:
             action = jnp.argmax(logits, axis=-1)
@@ -64,11 +60,11 @@ def complete(
 
     # Written out, except where many choices are the same program: K = 50 would
     # otherwise take minutes to compile.
-    alike = network.alike(view, k)
+    shared = network.shares_program(features, k)
     carry = (chosen, available, key)
     position = first
     while position < k:
-        end = alike.stop if position in alike else position + 1
+        end = shared.stop if position in shared else position + 1
         if end == position + 1:
             carry = next_one(position, carry)
         else:
@@ -80,7 +76,7 @@ def complete(
 def logits_at(
     network: Network,
     params: Any,
-    view: Any,
+    features: Any,
     memory: Any,
     chosen: jax.Array,
     available: jax.Array,
@@ -89,15 +85,15 @@ def logits_at(
     """(B, M) logits and (B,) value of the decision after ``count`` choices.
 
     Without ``params`` every choice is the look-ahead's. ``count`` may be traced where
-    it is one of ``network.alike``.
+    it is in ``network.shares_program``.
     """
-    glance = network.look_at(view, chosen, available, count)
+    decision = network.decision_features(features, chosen, available, count)
     last = isinstance(count, int) and (
         chosen.shape[-1] - count <= network.num_unlearned
     )
     if params is None or last:
-        return network.finish(glance)
-    return networks.decode(network, params, memory, glance)
+        return network.finish(decision)
+    return networks.decode(network, params, memory, decision)
 
 
 @functools.partial(
@@ -140,16 +136,18 @@ def choose(
     chosen = chosen.at[:, :num_required].set(required.astype(jnp.int32))
     usable = available.at[rows, required].set(True)
     free = available.at[rows, required].set(False)
-    view = network.look(candidates, usable)
-    memory = networks.encode(network, params, view)
-    finish = functools.partial(complete, network, params, view, memory)
+    features = network.candidate_features(candidates, usable)
+    memory = networks.encode(network, params, features)
+    finish = functools.partial(complete, network, params, features, memory)
     if decoding == "greedy" or num_required == k:
         return finish(chosen, free, num_required, None)
     if decoding == "samples":
         keys = jax.random.split(key, num)
         tries = jax.vmap(lambda key: finish(chosen, free, num_required, key))(keys)
     else:
-        logits, _ = logits_at(network, params, view, memory, chosen, free, num_required)
+        logits, _ = logits_at(
+            network, params, features, memory, chosen, free, num_required
+        )
         _, firsts = jax.lax.top_k(logits, min(num, m))
         # With fewer than num candidates left the list ends in masked ones: repeat the
         # best instead of choosing what is not available.
@@ -165,73 +163,3 @@ def choose(
     values = jax.vmap(lambda tried: log_det_of(candidates, tried))(tries)
     best = jnp.argmax(values, axis=0)
     return jnp.take_along_axis(tries, best[None, :, None], axis=0)[0]
-
-
-def choose_on_devices(
-    network: Network,
-    params: Any,
-    candidates: jax.Array,
-    available: jax.Array,
-    required: jax.Array,
-    keys: jax.Array,
-    *,
-    k: int,
-    num_required: int = 0,
-    decoding: str = "greedy",
-    num: int = 16,
-) -> jax.Array:
-    """``choose`` on the first devices of this process at once, an equal share on each.
-
-    Every device runs the program that a single one would run on its share, so what is
-    chosen does not depend on their number; the order of the last two postures, equal in
-    all but rounding, may.
-
-    Args:
-        network, params: see ``choose``.
-        candidates, available, required: see ``choose``; D B sets for D devices.
-        keys: (D,) PRNG keys, one a device.
-        k, num_required, decoding, num: see ``choose``.
-
-    Returns:
-        (D B, k) int32.
-    """
-    run = _on_devices(network, len(keys), k, num_required, decoding, num)
-    return run(params, candidates, available, required, keys)
-
-
-@functools.lru_cache(maxsize=32)
-def _on_devices(
-    network: Network, number: int, k: int, num_required: int, decoding: str, num: int
-) -> Any:
-    mesh = Mesh(np.asarray(jax.local_devices()[:number]), ("sets",))
-
-    def share(
-        params: Any,
-        candidates: jax.Array,
-        available: jax.Array,
-        required: jax.Array,
-        keys: jax.Array,
-    ) -> jax.Array:
-        return choose(
-            network,
-            params,
-            candidates,
-            available,
-            required,
-            keys[0],
-            k=k,
-            num_required=num_required,
-            decoding=decoding,
-            num=num,
-        )
-
-    cut = PartitionSpec("sets")
-    return jax.jit(
-        jax.shard_map(
-            share,
-            mesh=mesh,
-            in_specs=(PartitionSpec(), cut, cut, cut, cut),
-            out_specs=cut,
-            check_vma=False,
-        )
-    )

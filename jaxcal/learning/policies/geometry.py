@@ -4,9 +4,7 @@ The best subset does not change under an affine map of the commands, so the poli
 works on whitened regressors ``x_i`` (mean over the candidates of ``x x.T`` is the
 identity; ``x_i . x_j / M`` is the hat matrix). What a choice does to the remaining
 candidates is a projection: the chosen direction leaves every ``x_i``, and the squared
-length of what is left is the gain. All functions broadcast over leading axes and use
-no library factorisation: for matrices of 3 to 5 rows unrolled arithmetic is faster on a
-batch, the same on every backend, and has a gradient.
+length of what is left is the gain. All functions broadcast over leading axes.
 """
 
 from __future__ import annotations
@@ -14,94 +12,21 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from jaxcal.learning.small_matrices import cholesky, solve_lower
+
 __all__ = [
-    "cholesky",
-    "cholesky_pivots",
-    "log_det_gram",
     "log_det_lengths",
     "lookahead",
     "normalised_by",
     "num_starts",
-    "picked",
-    "plus_ridge",
     "projected",
-    "row_dot",
-    "row_parts",
-    "row_sum",
-    "solve_lower",
     "whiten",
 ]
 
-_TINY = 1e-12  # below any squared length that float32 commands in [0, 1] can show
 _ALL_START = 1024  # candidates up to which every one is looked ahead from
 _STARTS = 512  # of more candidates, those of largest gain that are
-_UNROLLED_ROWS = 16  # rows up to which sums over them are written out
+_LOWEST = -30.0  # log-volume of a candidate that is not active or no start
 _LEAST_GAIN = 1e-5  # of a whitened vector: below it float32 shows the rounding of zero
-
-
-def cholesky(matrix: jax.Array) -> jax.Array:
-    """Lower Cholesky factor of small symmetric positive definite matrices.
-
-    Args:
-        matrix: (..., p, p). Pivots are kept positive, so the result is finite.
-
-    Returns:
-        (..., p, p) lower triangular.
-    """
-    p = matrix.shape[-1]
-    rows = [[matrix[..., i, j] for j in range(i + 1)] for i in range(p)]
-    lower = _factored(rows)
-    zero = jnp.zeros_like(matrix[..., 0, 0])
-    return jnp.stack(
-        [jnp.stack(row + [zero] * (p - len(row)), axis=-1) for row in lower], axis=-2
-    )
-
-
-def cholesky_pivots(rows: list[list[jax.Array]]) -> list[jax.Array]:
-    """Diagonal of the lower factor of a matrix held as rows of its lower triangle."""
-    return [row[-1] for row in _factored(rows)]
-
-
-def _factored(rows: list[list[jax.Array]]) -> list[list[jax.Array]]:
-    """Lower Cholesky factor, entry by entry; pivots are kept positive."""
-    lower: list[list[jax.Array]] = []
-    for i, row in enumerate(rows):
-        done: list[jax.Array] = []
-        for j, value in enumerate(row):
-            above = done if i == j else lower[j]
-            for k in range(j):
-                value = value - done[k] * above[k]
-            if i == j:
-                done.append(jnp.sqrt(jnp.maximum(value, _TINY)))
-            else:
-                done.append(value / lower[j][j])
-        lower.append(done)
-    return lower
-
-
-def plus_ridge(matrix: jax.Array, ridge: float) -> jax.Array:
-    """(..., p, p) with ``ridge`` added to the diagonal."""
-    eye = jnp.eye(matrix.shape[-1], dtype=matrix.dtype)
-    return matrix + ridge * jnp.broadcast_to(eye, matrix.shape)
-
-
-def solve_lower(lower: jax.Array, rows: jax.Array) -> jax.Array:
-    """Rows ``r`` of the solution of ``lower @ r = row``, by forward substitution.
-
-    Args:
-        lower: (..., p, p) lower triangular.
-        rows: (..., M, p) right-hand sides, one a row.
-
-    Returns:
-        (..., M, p).
-    """
-    out: list[jax.Array] = []
-    for j in range(lower.shape[-1]):
-        value = rows[..., j]
-        for i, known in enumerate(out):
-            value = value - lower[..., j, i][..., None] * known
-        out.append(value / lower[..., j, j][..., None])
-    return jnp.stack(out, axis=-1)
 
 
 def whiten(candidates: jax.Array, usable: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -189,17 +114,14 @@ def normalised_by(
         "...ci,...cj->...ij", chosen, chosen, precision=jax.lax.Precision.HIGHEST
     )
     gram = jnp.broadcast_to(gram, (*x.shape[:-2], p, p))
-    lower = cholesky(plus_ridge(gram, max(ridge, 1e-6)))
+    eye = jnp.eye(p, dtype=x.dtype)
+    lower = cholesky(gram + max(ridge, 1e-6) * jnp.broadcast_to(eye, gram.shape))
     log_det = 2.0 * jnp.log(jnp.diagonal(lower, axis1=-2, axis2=-1)).sum(-1)
     return solve_lower(lower, x), log_det
 
 
 def lookahead(
-    y: jax.Array,
-    spanned: bool,
-    active: jax.Array,
-    depth: int,
-    tolls: jax.Array | None = None,
+    y: jax.Array, spanned: bool, active: jax.Array, depth: int
 ) -> list[jax.Array]:
     """How far each candidate leads when the choices after it are greedy.
 
@@ -210,8 +132,6 @@ def lookahead(
             False where by ``|y_i|^2``.
         active: (..., M) bool.
         depth: choices to look at, that candidate included; at least 1.
-        tolls: (..., M, M) what choosing j right after i costs, in logarithms; greedy
-            is then by the gain less the toll, and the values are less the tolls.
 
     Returns:
         ``depth`` arrays (..., M): the log of the factor by which the determinant grows
@@ -225,7 +145,7 @@ def lookahead(
     base = 1.0 if spanned else 0.0
     square = (y * y).sum(-1)
     first = jnp.log(jnp.maximum(base + square, _LEAST_GAIN))
-    values = [jnp.where(active, first, -30.0)]
+    values = [jnp.where(active, first, _LOWEST)]
     if depth == 1:
         return values
     # For every start i (axis -2): the gains of all j (axis -1) after its choices.
@@ -244,11 +164,6 @@ def lookahead(
     gains = jnp.broadcast_to(square[..., None, :], shape)
     rest = jnp.broadcast_to(active[..., None, :], shape) & ~itself
     along: list[tuple[jax.Array, jax.Array]] = []  # directions, and how far they shrink
-    every = leave = None  # leave: tolls from the newest choice of each start
-    if tolls is not None:
-        every = leave = jnp.broadcast_to(tolls, (*square.shape, m))
-        if number < m:
-            leave = jnp.take_along_axis(every, starts[..., None], axis=-2)
     for _ in range(1, depth):
         size = jnp.maximum((picked * picked).sum(-1), _LEAST_GAIN)
         unit = picked * jax.lax.rsqrt(size)[..., None]
@@ -263,22 +178,15 @@ def lookahead(
             "...ip,...jp->...ij", back, y, precision=jax.lax.Precision.HIGHEST
         )
         gains = gains - inner * inner * (1.0 - keep * keep)[..., None]
-        if every is None or leave is None:
-            ranked = jnp.where(rest, gains, -1.0)
-            best = jnp.argmax(ranked, axis=-1)
-            gain = jnp.maximum(ranked.max(-1), 0.0)
-            step = jnp.log(jnp.maximum(base + gain, _LEAST_GAIN))
-        else:
-            grown = jnp.log(jnp.maximum(base + gains, _LEAST_GAIN))
-            ranked = jnp.where(rest, grown - leave, -1e9)
-            best = jnp.argmax(ranked, axis=-1)
-            step = jnp.maximum(ranked.max(-1), -30.0)
-            leave = jnp.take_along_axis(every, best[..., None], axis=-2)
+        ranked = jnp.where(rest, gains, -1.0)
+        best = jnp.argmax(ranked, axis=-1)
+        gain = jnp.maximum(ranked.max(-1), 0.0)
+        step = jnp.log(jnp.maximum(base + gain, _LEAST_GAIN))
         which = jax.nn.one_hot(best, m, dtype=bool)
         rest = rest & ~which
-        reached = jnp.where(start_active, reached + step, -30.0)
+        reached = jnp.where(start_active, reached + step, _LOWEST)
         if number < m:
-            nothing = jnp.full_like(values[0], -30.0)
+            nothing = jnp.full_like(values[0], _LOWEST)
             values.append(
                 jnp.put_along_axis(nothing, starts, reached, axis=-1, inplace=False)
             )
@@ -306,18 +214,6 @@ def num_starts(num_candidates: int) -> int:
     return num_candidates if num_candidates <= _ALL_START else _STARTS
 
 
-def picked(candidates: jax.Array, chosen: jax.Array) -> jax.Array:
-    """(..., K, n) postures that were chosen; the first one where nothing is yet.
-
-    Args:
-        candidates: (..., M, n).
-        chosen: (..., K) int, -1 where nothing is chosen.
-    """
-    # Everybody gathers alike, so that a program that needs them twice gathers once.
-    index = jnp.maximum(chosen, 0)[..., None]
-    return jnp.take_along_axis(candidates, index, axis=-2, mode="clip")
-
-
 def log_det_lengths(chosen: jax.Array) -> jax.Array:
     """Log of the squared volume that up to p chosen vectors span.
 
@@ -338,63 +234,3 @@ def log_det_lengths(chosen: jax.Array) -> jax.Array:
         total = total + jnp.log(square)
         basis.append([a * jax.lax.rsqrt(square) for a in v])
     return total
-
-
-def log_det_gram(
-    postures: jax.Array, present: jax.Array | None = None, floor: float = 1e-18
-) -> jax.Array:
-    """Log-determinant of ``Z.T @ Z`` by Gram-Schmidt about the centroid.
-
-    Args:
-        postures: (..., K, n) commands, K > n.
-        present: (..., K) bool, the rows that count; all of them by default. At least
-            one must.
-        floor: least squared column length, relative to its share before projection;
-            it keeps the value finite where the postures lie in one plane.
-
-    Returns:
-        (...,) natural log.
-    """
-    if present is None:
-        present = jnp.ones(postures.shape[:-1], bool)
-    weight = row_parts(present.astype(postures.dtype))
-    number = row_sum(weight)
-    value = jnp.log(number)
-    basis: list[list[jax.Array]] = []
-    for j in range(postures.shape[-1]):
-        column = row_parts(postures[..., j])
-        kept = [x * w for x, w in zip(column, weight, strict=True)]
-        mean = row_sum(kept) / number
-        v = [(x - mean) * w for x, w in zip(column, weight, strict=True)]
-        for e in basis:
-            along = row_dot(v, e)
-            v = [x - along * y for x, y in zip(v, e, strict=True)]
-        square = row_dot(v, v)
-        factor = jax.lax.rsqrt(jnp.maximum(square, floor))
-        basis.append([x * factor for x in v])
-        value = value + jnp.log(jnp.maximum(square, floor))
-    return value[..., 0]
-
-
-def row_parts(column: jax.Array) -> list[jax.Array]:
-    """A column (..., K) as K arrays (..., 1) where K is small, else as it is.
-
-    A compiled loop runs over the last axis that is long: one over the batch is several
-    times faster than one over four rows, and long columns would be long programs.
-    """
-    k = column.shape[-1]
-    size = 1 if k <= _UNROLLED_ROWS else k
-    return [column[..., i : i + size] for i in range(0, k, size)]
-
-
-def row_sum(parts: list[jax.Array]) -> jax.Array:
-    """(..., 1) sum of a column held as ``row_parts``."""
-    total = parts[0]
-    for part in parts[1:]:
-        total = total + part
-    return total if total.shape[-1] == 1 else total.sum(-1, keepdims=True)
-
-
-def row_dot(a: list[jax.Array], b: list[jax.Array]) -> jax.Array:
-    """(..., 1) inner product of two columns held as ``row_parts``."""
-    return row_sum([x * y for x, y in zip(a, b, strict=True)])

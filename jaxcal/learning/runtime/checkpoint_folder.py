@@ -15,7 +15,7 @@ def default_folder(name: str = "default") -> pathlib.Path:
     """A checkpoint that ships: inside the installed package, or in the repository.
 
     Args:
-        name: "default", or "travel" for the policy that knows what time is worth.
+        name: "default", the only one.
     """
     package = pathlib.Path(__file__).resolve().parents[2]
     inside = package / "checkpoints" / name

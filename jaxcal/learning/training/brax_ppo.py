@@ -10,9 +10,10 @@ availability in that observation.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import pathlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 import jax
@@ -23,14 +24,55 @@ from brax.training.agents.ppo import train as brax_train
 from brax.training.networks import FeedForwardNetwork
 
 from jaxcal.learning.environments.brax_env import SelectionEnv, wrap_fresh
-from jaxcal.learning.environments.scenarios import mixture
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.settings import settings_of
 from jaxcal.learning.training import checkpoint
-from jaxcal.learning.training.run import TrainConfig
+from jaxcal.learning.training.config import TrainConfig
 
-__all__ = ["MaskedCategorical", "train"]
+__all__ = ["READ", "MaskedCategorical", "adapted", "require_read", "train"]
+
+READ = (
+    "num_episodes",
+    "learning_rate",
+    "entropy_start",
+    "discount",
+    "gae_lambda",
+    "clip_range",
+    "max_grad_norm",
+    "seed",
+)  # fields of PPOConfig that brax is given; beside them the network's width
+_WIDTH = 64  # of the network, where the preset has another kind
+_FASTEST = 1e-3  # learning rate; brax's updates diverge at the compact preset's 2e-3
+
+
+def adapted(config: TrainConfig) -> TrainConfig:
+    """A preset as brax trains it: another architecture, a learning rate it bears."""
+    width = config.network.width if config.network.kind == "paper" else _WIDTH
+    rate = min(config.ppo.learning_rate, _FASTEST)
+    return dataclasses.replace(
+        config,
+        network=NetworkConfig(kind="paper", width=width),
+        ppo=dataclasses.replace(config.ppo, learning_rate=rate),
+    )
+
+
+def require_read(given: Collection[str]) -> None:
+    """Refuse values that brax's trainer would not read.
+
+    Args:
+        given: names of fields that the user set.
+
+    Raises:
+        ValueError: naming them.
+    """
+    read = {*READ, "width", *(field.name for field in settings_of(SelectionConfig))}
+    unread = sorted(set(given) - read)
+    if unread:
+        flags = ", ".join("--" + name.replace("_", "-") for name in unread)
+        raise ValueError(f"--trainer brax does not read {flags}: leave it out")
 
 
 class _Categorical:
@@ -75,39 +117,26 @@ class MaskedCategorical(distribution.ParametricDistribution):
 
 
 def _make_networks(
-    env: SelectionConfig, width: int
+    env: SelectionConfig, config: NetworkConfig
 ) -> Callable[..., brax_networks.PPONetworks]:
-    """The paper's network read from the observation, for the policy and the value."""
-    network = networks.build(NetworkConfig(kind="paper", width=width))
+    """A network read from the observation, for the policy and the value."""
+    network = build(config)
     m, n = env.num_candidates, env.num_inputs
 
-    def read(params: Any, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
-        lead = observation.shape[:-1]
-        candidates = observation[..., : n * m].reshape(*lead, m, n)
-        available = observation[..., n * m : (n + 1) * m] > 0.5
-        glance = {"context": observation[..., (n + 1) * m :], "active": available}
-        memory = networks.encode(network, params, network.look(candidates, available))
-        return networks.decode(network, params, memory, glance)
-
-    def init(key: jax.Array) -> Any:
-        return network.init(
-            key,
-            jnp.zeros((1, m, n)),
-            jnp.ones((1, m), bool),
-            jnp.full((1, env.num_selected), -1, jnp.int32),
-            jnp.ones((1, m), bool),
-        )["params"]
+    def read(part: int) -> FeedForwardNetwork:
+        return FeedForwardNetwork(
+            init=lambda key: networks.initial(network, key, m, n, env.num_selected),
+            apply=lambda _, params, observation: network.apply(
+                {"params": params}, observation, m, n, method="from_observation"
+            )[part],
+        )
 
     def factory(
         observation_size: Any, action_size: int, preprocess_observations_fn: Any = None
     ) -> brax_networks.PPONetworks:
         return brax_networks.PPONetworks(
-            policy_network=FeedForwardNetwork(
-                init=init, apply=lambda _, params, obs: read(params, obs)[0]
-            ),
-            value_network=FeedForwardNetwork(
-                init=init, apply=lambda _, params, obs: read(params, obs)[1]
-            ),
+            policy_network=read(0),
+            value_network=read(1),
             parametric_action_distribution=MaskedCategorical(action_size),
         )
 
@@ -140,9 +169,10 @@ def train(
 ) -> Any:
     """Train with ``brax.training.agents.ppo.train`` and save a checkpoint.
 
+    The checkpoint's configuration holds what brax was given and nothing else.
+
     Args:
-        config: environment, budget, seed and learning rate; the network is the paper's
-            architecture, 64 wide for the compact preset.
+        config: from ``adapted``; of ``ppo`` the fields ``READ`` are used.
         folder: of the run.
         say: takes a line of progress.
         num_evals: how often brax reports.
@@ -151,10 +181,27 @@ def train(
     Returns:
         The policy's parameters.
     """
-    env = config.tasks[0].environment
-    width = config.network.width if config.network.kind == "paper" else 64
-    factory = _make_networks(env, width)
-    draw = mixture(env, config.tasks[0].shapes, config.tasks[0].masked)
+    task, ppo = config.tasks[0], config.ppo
+    env = task.environment
+    given = {
+        "num_timesteps": ppo.num_episodes * env.num_selected,
+        "num_envs": 256,
+        "num_eval_envs": 256,
+        "episode_length": env.num_selected,
+        "unroll_length": env.num_selected,
+        "batch_size": 64,
+        "num_minibatches": 16,
+        "num_updates_per_batch": 4,
+        "learning_rate": ppo.learning_rate,
+        "entropy_cost": ppo.entropy_start,
+        "discounting": ppo.discount,
+        "gae_lambda": ppo.gae_lambda,
+        "clipping_epsilon": ppo.clip_range,
+        "max_grad_norm": ppo.max_grad_norm,
+        "normalize_observations": False,
+        "seed": ppo.seed,
+        "num_evals": num_evals,
+    }
     begun = time.perf_counter()
 
     def progress(steps: int, metrics: dict[str, Any]) -> None:
@@ -167,40 +214,28 @@ def train(
     say("brax is compiling (about half a minute) ...")
     with _replicated(), jax.numpy_rank_promotion("allow"):
         _, params, _ = brax_train.train(
-            environment=SelectionEnv(env, draw),
-            num_timesteps=config.ppo.num_episodes * env.num_selected,
+            environment=SelectionEnv(env, task.draw),
             wrap_env_fn=wrap_fresh,
-            num_envs=256,
-            num_eval_envs=256,
-            episode_length=env.num_selected,
-            unroll_length=env.num_selected,
-            batch_size=64,
-            num_minibatches=16,
-            num_updates_per_batch=4,
-            learning_rate=min(config.ppo.learning_rate, 1e-3),
-            entropy_cost=config.ppo.entropy_start,
-            discounting=config.ppo.discount,
-            gae_lambda=config.ppo.gae_lambda,
-            clipping_epsilon=config.ppo.clip_range,
-            max_grad_norm=config.ppo.max_grad_norm,
-            normalize_observations=False,
-            network_factory=factory,
-            seed=config.ppo.seed,
-            num_evals=num_evals,
+            network_factory=_make_networks(env, config.network),
             progress_fn=progress,
             policy_params_fn=lambda step, _, params: watch(step, params[1]),
+            **given,
         )
     policy = params[1]
+    kept = config.network
     meta = config.as_meta() | {
-        "network": {"kind": "paper", "width": width},
+        "network": {"kind": kept.kind, "width": kept.width},
+        "ppo": {name: getattr(ppo, name) for name in READ},
+        "tasks": [task.as_meta()],
         "trainer": "brax",
-        "seed": config.ppo.seed,
+        "brax": given,
+        "seed": ppo.seed,
         "progress": {
-            "episodes": config.ppo.num_episodes,
+            "episodes": ppo.num_episodes,
             "seconds": time.perf_counter() - begun,
             "device": jax.devices()[0].device_kind,
         },
     }
     root = pathlib.Path(folder) / "checkpoint"
-    checkpoint.save(root, config.ppo.num_episodes, policy, meta)
+    checkpoint.save(root, ppo.num_episodes, policy, meta)
     return policy

@@ -31,7 +31,9 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from jaxcal.learning.policies.networks import Network, NetworkConfig, build
+from jaxcal.learning.policies import networks
+from jaxcal.learning.policies.build import build
+from jaxcal.learning.policies.networks import Network, NetworkConfig
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.checkpoint_folder import (
     CheckpointError,
@@ -248,13 +250,8 @@ def _check_weights(
             f"checkpoint {path} does not say what it was trained on: no {error}"
         ) from error
     expected = jax.eval_shape(
-        network.init,
-        jax.random.key(0),
-        jax.ShapeDtypeStruct((1, m, n), np.float32),
-        jax.ShapeDtypeStruct((1, m), bool),
-        jax.ShapeDtypeStruct((1, k), np.int32),
-        jax.ShapeDtypeStruct((1, m), bool),
-    )["params"]
+        lambda: networks.initial(network, jax.random.key(0), m, n, k)
+    )
     wanted = {
         jax.tree_util.keystr(name, simple=True, separator="."): leaf.shape
         for name, leaf in jax.tree_util.tree_leaves_with_path(expected)

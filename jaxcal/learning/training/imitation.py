@@ -9,7 +9,6 @@ Episodes that begin with given postures want the best completion of those.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -21,12 +20,13 @@ import numpy as np
 from flax import struct
 from jax.sharding import Mesh
 
-from jaxcal.learning.environments import scenarios
 from jaxcal.learning.policies import networks
 from jaxcal.learning.policies.networks import Network
-from jaxcal.learning.runtime import devices
-from jaxcal.learning.training import ppo
-from jaxcal.learning.training.ppo import PPOConfig, Task, TrainState
+from jaxcal.learning.training import rollout, update
+from jaxcal.learning.training.config import PPOConfig
+from jaxcal.learning.training.optimiser import Keys, Metrics
+from jaxcal.learning.training.rules import Rules
+from jaxcal.learning.training.update import Update
 
 __all__ = [
     "Attempt",
@@ -36,7 +36,7 @@ __all__ = [
     "draw",
     "follow",
     "loss",
-    "update",
+    "updater",
 ]
 
 Teacher = Callable[
@@ -59,15 +59,14 @@ class Lesson:
 
 
 def draw(
-    config: PPOConfig, task: Task, network: Network, teacher: Teacher, index: int
+    config: PPOConfig, task: Rules, network: Network, teacher: Teacher, index: int
 ) -> Lesson:
     """The lesson of update ``index``: the same whenever it is asked for."""
-    env = task.environment
     num_sets = config.episodes_per_update
-    key = jax.random.fold_in(jax.random.key(config.seed), index)
+    key = jax.random.fold_in(Keys.of(config.seed).lessons, index)
     key_sets, key_share, key_length, key_given = jax.random.split(key, 4)
     candidates, available = _drawn(key_sets, num_sets, task)
-    learned = env.num_selected - network.num_unlearned
+    learned = task.num_decisions - network.num_unlearned
     begun = jax.random.uniform(key_share, (num_sets,)) < task.random_starts
     length = jax.random.randint(key_length, (num_sets,), 1, max(learned, 2))
     lengths = np.asarray(jnp.where(begun, length, 0))
@@ -80,7 +79,7 @@ def draw(
     for count in np.unique(lengths):
         rows = np.flatnonzero(lengths == count)
         indices, values = teacher(
-            points[rows], free[rows], given[rows, :count], env.num_selected
+            points[rows], free[rows], given[rows, :count], task.num_decisions
         )
         wanted[rows[:, None], indices] = True
         best[rows] = values
@@ -89,9 +88,9 @@ def draw(
 
 
 @functools.partial(jax.jit, static_argnames=("num_sets", "task"))
-def _drawn(key: jax.Array, num_sets: int, task: Task) -> tuple[jax.Array, jax.Array]:
-    source = scenarios.mixture(task.environment, task.shapes, task.masked)
-    return jax.vmap(source)(jax.random.split(key, num_sets))
+def _drawn(key: jax.Array, num_sets: int, task: Rules) -> tuple[jax.Array, jax.Array]:
+    sets = rollout.draw(task, num_sets, key)
+    return sets.candidates, sets.available
 
 
 class Lessons:
@@ -121,35 +120,34 @@ class Lessons:
 class Attempt:
     """Lessons followed by the policy: B sets, T learned decisions."""
 
-    view: Any  # leaves (B, ...): the geometry of the sets
-    glance: Any  # leaves (B, T, ...): the geometry of the decisions
+    features: Any  # leaves (B, ...): of the candidate sets
+    decisions: Any  # leaves (B, T, ...): of the decisions
     wanted: jax.Array  # (B, T, M) bool, what would be right
     counted: jax.Array  # (B, T) 1 where the policy has the choice, 0 where it is given
     best: jax.Array  # (B,) log det(Z.T Z) of what is wanted
 
 
-def follow(lesson: Lesson, task: Task, network: Network, params: Any) -> Attempt:
+def follow(lesson: Lesson, task: Rules, network: Network, params: Any) -> Attempt:
     """Go through a lesson, each time choosing what the policy likes of the wanted."""
-    env = task.environment
-    view = network.look(lesson.candidates, lesson.available)
-    memory = networks.encode(network, params, view)
-    chosen = jnp.full((len(lesson.best), env.num_selected), -1, jnp.int32)
+    features = network.candidate_features(lesson.candidates, lesson.available)
+    memory = networks.encode(network, params, features)
+    chosen = jnp.full((len(lesson.best), task.num_decisions), -1, jnp.int32)
     free, wanted = lesson.available, lesson.wanted
-    glances, wants, counts = [], [], []
-    for count in range(env.num_selected - network.num_unlearned):
-        glance = network.look_at(view, chosen, free, count)
-        logits, _ = networks.decode(network, params, memory, glance)
-        glances.append(glance)
+    decisions, wants, counts = [], [], []
+    for count in range(task.num_decisions - network.num_unlearned):
+        seen = network.decision_features(features, chosen, free, count)
+        logits, _ = networks.decode(network, params, memory, seen)
+        decisions.append(seen)
         wants.append(wanted)
         counts.append((count >= lesson.length).astype(logits.dtype))
         favourite = jnp.argmax(networks.mask_logits(logits, wanted), axis=-1)
         action = jnp.where(count < lesson.length, lesson.given[:, count], favourite)
         chosen = chosen.at[:, count].set(action.astype(jnp.int32))
-        taken = jax.nn.one_hot(action, env.num_candidates, dtype=bool)
+        taken = jax.nn.one_hot(action, free.shape[-1], dtype=bool)
         free, wanted = free & ~taken, wanted & ~taken
     return Attempt(
-        view=view,
-        glance=jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *glances),
+        features=features,
+        decisions=jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *decisions),
         wanted=jnp.stack(wants, axis=1),
         counted=jnp.stack(counts, axis=1),
         best=lesson.best,
@@ -157,21 +155,20 @@ def follow(lesson: Lesson, task: Task, network: Network, params: Any) -> Attempt
 
 
 def loss(
-    params: Any, attempt: Attempt, config: PPOConfig, task: Task, network: Network
-) -> tuple[jax.Array, dict[str, jax.Array]]:
+    params: Any, attempt: Attempt, config: PPOConfig, task: Rules, network: Network
+) -> tuple[jax.Array, Metrics]:
     """Cross-entropy to the wanted postures, and the value's error, of an attempt.
 
     Returns:
-        The loss, and metrics named as those of ``ppo.update``.
+        The loss, and metrics named as those of PPO.
     """
-    env = task.environment
-    memory = networks.encode(network, params, attempt.view)
+    memory = networks.encode(network, params, attempt.features)
     decode = jax.vmap(
-        lambda glance: networks.decode(network, params, memory, glance),
+        lambda seen: networks.decode(network, params, memory, seen),
         in_axes=1,
         out_axes=1,
     )
-    logits, value = decode(attempt.glance)
+    logits, value = decode(attempt.decisions)  # (B, T, M), (B, T)
     log_probs = jax.nn.log_softmax(logits)
     hopes = networks.mask_logits(log_probs, attempt.wanted)
     number = jnp.maximum(attempt.counted.sum(), 1.0)
@@ -179,39 +176,30 @@ def loss(
     def mean(array: jax.Array) -> jax.Array:
         return (array * attempt.counted).sum() / number
 
-    scale = env.reward_scale * env.num_outputs
     limit = config.value_error_limit
-    error = jnp.clip(scale * (value - attempt.best[:, None]), -limit, limit)
+    error = task.value_scale * (value - attempt.best[:, None])
     metrics = {
         "policy_loss": -mean(jax.nn.logsumexp(hopes, axis=-1)),
-        "value_loss": mean(error**2),
+        "value_loss": mean(jnp.clip(error, -limit, limit) ** 2),
         "entropy": mean(-(jnp.exp(log_probs) * log_probs).sum(-1)),
     }
     total = metrics["policy_loss"] + config.value_coefficient * metrics["value_loss"]
     return total, metrics
 
 
-@functools.partial(
-    jax.jit,
-    static_argnames=("config", "task", "network", "mesh"),
-    donate_argnames=("state",),
-)
-def update(
-    state: TrainState,
-    lesson: Lesson,
-    config: PPOConfig,
-    task: Task,
-    network: Network,
-    mesh: Mesh | None = None,
-) -> tuple[TrainState, dict[str, jax.Array]]:
-    """Epochs of minibatches over one lesson; see ``ppo.update``."""
-    key, key_epochs = jax.random.split(state.key)
-    attempt = follow(devices.by_set(lesson, mesh), task, network, state.params)
-    attempt = devices.everywhere(attempt, mesh)
+@functools.lru_cache(maxsize=32)
+def updater(
+    config: PPOConfig, task: Rules, network: Network, mesh: Mesh | None = None
+) -> Update:
+    """An update: state, given up, and a ``Lesson`` -> the next state and metrics."""
 
-    def of_batch(params: Any, batch: Attempt) -> tuple[jax.Array, dict[str, jax.Array]]:
-        return loss(params, batch, config, task, network)
+    def gather(params: Any, lesson: Lesson, key: jax.Array) -> tuple[Attempt, Metrics]:
+        return follow(lesson, task, network, params), {}
 
-    state, metrics = ppo.learn(state, config, attempt, of_batch, key_epochs, mesh)
-    state = dataclasses.replace(state, key=key)
-    return devices.everywhere((state, metrics), mesh)
+    return update.jitted(
+        config,
+        mesh,
+        draw=lambda key, lesson: lesson,
+        gather=gather,
+        loss=lambda params, batch, done: loss(params, batch, config, task, network),
+    )

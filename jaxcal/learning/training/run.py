@@ -1,102 +1,38 @@
 """The training run: updates in a loop, and everything a person or a crash needs.
 
-A run folder holds ``metrics.csv`` (a row an update), ``last_rewards.npy`` (the rewards
-of the last 1,000 episodes), TensorBoard event files and ``checkpoint/``. The loop is on
-the host, over jitted updates, so that progress is printed while it runs and a signal
-stops it between two updates.
+A run folder holds ``metrics.csv`` (a row for each update), ``last_rewards.npy`` (the
+rewards of the last 1,000 episodes), TensorBoard event files and ``checkpoint/``. The
+loop is on the host, over jitted updates, so that progress is printed while it runs and
+a signal stops it between two updates.
 """
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import functools
-import os
 import pathlib
-import sys
 import time
 from collections.abc import Callable
-from dataclasses import field
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from jaxcal.files import atomic_write
-from jaxcal.learning.environments import selection as environment
-from jaxcal.learning.environments import travel
-from jaxcal.learning.policies import decoding, networks
-from jaxcal.learning.policies.networks import Network, NetworkConfig
+from jaxcal.learning.policies import decoding
+from jaxcal.learning.policies.build import build
+from jaxcal.learning.policies.networks import Network
 from jaxcal.learning.runtime import devices
 from jaxcal.learning.runtime.processes import losing_a_process
-from jaxcal.learning.training import checkpoint, imitation, ppo
-from jaxcal.learning.training.ppo import PPOConfig, Task
+from jaxcal.learning.training import checkpoint, imitation, optimiser, ppo
+from jaxcal.learning.training.config import TrainConfig
+from jaxcal.learning.training.metrics import MetricsTable
+from jaxcal.learning.training.optimiser import TrainState
 
-__all__ = ["COLUMNS", "Report", "TrainConfig", "Validation", "train"]
+__all__ = ["Report", "Validation", "train"]
 
-COLUMNS = (
-    "update",
-    "episodes",
-    "seconds",
-    "reward_mean",
-    "reward_std",
-    "log_det_mean",
-    "ratio_to_exact",
-    "hit_rate",
-    "entropy",
-    "policy_loss",
-    "value_loss",
-    "kl",
-    "learning_rate",
-)
 _LAST = 1000  # episodes whose rewards are kept
-
-
-@dataclasses.dataclass(frozen=True)
-class TrainConfig:
-    """A whole run: what, with what, and how often to look."""
-
-    preset: str = "compact"
-    network: NetworkConfig = field(default_factory=NetworkConfig)
-    ppo: PPOConfig = field(default_factory=PPOConfig)
-    tasks: tuple[Task, ...] = field(default=(Task(),))  # update u: tasks[u % len]
-    validate_every: float = 15.0  # seconds between looks at the validation set
-    save_every: float = 60.0  # seconds between checkpoints
-
-    def task_of(self, update: int) -> Task:
-        """What update number ``update``, from 0, trains on."""
-        return self.tasks[update % len(self.tasks)]
-
-    def as_meta(self) -> dict[str, Any]:
-        """Plain JSON values; ``from_meta`` reads them back."""
-        return {
-            "preset": self.preset,
-            "network": dataclasses.asdict(self.network),
-            "ppo": dataclasses.asdict(self.ppo),
-            "tasks": [dataclasses.asdict(task) for task in self.tasks],
-        }
-
-    @staticmethod
-    def from_meta(meta: dict[str, Any]) -> TrainConfig:
-        """The configuration a checkpoint was trained with."""
-        timed = meta["network"]["kind"] == "travel"
-        rules = travel.TravelConfig if timed else environment.SelectionConfig
-        tasks = tuple(
-            Task(
-                environment=rules(**task["environment"]),
-                shapes=tuple(task["shapes"]),
-                masked=task["masked"],
-                random_starts=task["random_starts"],
-            )
-            for task in meta["tasks"]
-        )
-        return TrainConfig(
-            preset=meta["preset"],
-            network=NetworkConfig(**meta["network"]),
-            ppo=PPOConfig(**meta["ppo"]),
-            tasks=tasks,
-        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,22 +42,23 @@ class Validation:
     candidates: np.ndarray  # (B, M, n)
     best: np.ndarray  # (B,) log det(Z.T Z) of the optimum
     num_outputs: int
+    available: np.ndarray | None = None  # (B, M) bool; all when None
 
     def measure(self, network: Network, params: Any, k: int) -> tuple[float, float]:
         """Mean det S / det S* and the share of optima hit, by greedy decoding."""
         batch, m, _ = self.candidates.shape
+        free = np.ones((batch, m), bool) if self.available is None else self.available
+        candidates = jnp.asarray(self.candidates, jnp.float32)
         indices = decoding.choose(
             network,
             params,
-            jnp.asarray(self.candidates, jnp.float32),
-            jnp.ones((batch, m), bool),
+            candidates,
+            jnp.asarray(free),
             jnp.zeros((batch, 0), jnp.int32),
             jax.random.key(0),
             k=k,
         )
-        picked = jnp.asarray(self.candidates, jnp.float32)
-        value = np.asarray(decoding.log_det_of(picked, indices))
-        gap = value - self.best
+        gap = np.asarray(decoding.log_det_of(candidates, indices)) - self.best
         # float32 values against a float64 optimum: equal to a few units in the last
         # place counts as hit; evaluate.py compares in float64.
         return (
@@ -154,7 +91,7 @@ def train(
     num_updates: int | None = None,
     num_devices: int | None = None,
     teacher: imitation.Teacher | None = None,
-) -> Any:
+) -> TrainState:
     """Train until the budget is spent or ``should_stop`` says so, and save.
 
     All devices take part. In a job of several processes each calls this with the same
@@ -172,7 +109,7 @@ def train(
         teacher: whom the first ``config.ppo.num_imitated`` updates imitate.
 
     Returns:
-        The ``TrainState`` after the last update.
+        The state after the last update.
 
     Raises:
         CheckpointError: nothing to resume from, or damaged.
@@ -181,102 +118,171 @@ def train(
         OSError: the folder cannot be written.
         LostProcessError: another process of the job is gone.
     """
-    if teacher is None and config.ppo.num_imitated:
-        raise ValueError(
-            f"teacher must be given for the {config.ppo.num_imitated} updates that "
-            "imitate, got None"
-        )
-    root = pathlib.Path(folder)
     mesh = devices.make_mesh(num_devices)
     devices.require_divisible(config.ppo.sets_per_minibatch, mesh)
-    first = devices.is_first()
-    network = networks.build(config.network)
+    network = build(config.network)
+    last = config.ppo.num_updates if num_updates is None else num_updates
+    updates = _Updates(config, network, mesh, teacher, last)
+    root = pathlib.Path(folder)
     state, before, recent = devices.on_first(
         lambda: _begin(root, config, network, resume)
     )
     state = devices.replicate(state, mesh)
     done = int(state.num_updates)
-    table = _Table(root, done) if first else None
-    last = config.ppo.num_updates if num_updates is None else num_updates
-    begun = time.perf_counter()
-    looked = saved = begun
-    mark_time, mark_update = begun, done
-    k = config.tasks[0].environment.num_selected
-    imitated = min(config.ppo.num_imitated, last)
-    lessons = imitation.Lessons(
-        functools.partial(_lesson, config, network, teacher), imitated
-    )
+    diary = None
+    if devices.is_first():
+        diary = _Diary(root, config, network, validation, report, last, done, before)
+        diary.recent = recent
     try:
         while done < last and not devices.any_process(should_stop()):
-            task = config.task_of(done)
             with losing_a_process():
-                if done < imitated:
-                    lesson = devices.replicate(lessons.at(done), mesh)
-                    state, metrics = imitation.update(
-                        state, lesson, config.ppo, task, network, mesh
-                    )
-                    rewards = np.zeros(0, np.float32)
-                else:
-                    state, metrics = ppo.update(state, config.ppo, task, network, mesh)
-                    rewards = np.asarray(metrics.pop("rewards"))
+                state, metrics = updates.run(state, done)
+                rewards = np.asarray(metrics.pop("rewards", ()), np.float32)
                 row = {name: float(value) for name, value in metrics.items()}
             done += 1
-            if table is None:
-                continue
-            if task == config.tasks[0]:
-                recent = np.concatenate([recent, rewards])[-_LAST:]
-            now = time.perf_counter()
-            row |= {
-                "update": done,
-                "episodes": done * config.ppo.episodes_per_update,
-                "seconds": before + now - begun,
-                "learning_rate": ppo.learning_rate(config.ppo, done),
-            }
-            look = done in (1, last) or now - looked > config.validate_every
-            if look and validation is not None:
-                average = devices.local(state.average)
-                ratio, hits = validation.measure(network, average, k)
-                row |= {"ratio_to_exact": ratio, "hit_rate": hits}
-            table.add(row)
-            if look:
-                looked = now = time.perf_counter()
-                rate = (done - mark_update) / max(now - mark_time, 1e-9)
-                report(
-                    Report(
-                        update=done,
-                        num_updates=last,
-                        episodes=done * config.ppo.episodes_per_update,
-                        seconds=before + now - begun,
-                        episodes_per_second=rate * config.ppo.episodes_per_update,
-                        eta=(last - done) / rate,
-                        metrics=row,
-                    )
-                )
-                mark_time, mark_update = now, done
-            if now - saved > config.save_every:
-                saved = now
-                _save(root, config, state, done, before + now - begun, recent)
+            if diary is not None:
+                diary.note(state, done, row, rewards)
     finally:
-        lessons.close()
-        if table is not None:
-            table.close()
-    if first:
-        _save(root, config, state, done, before + time.perf_counter() - begun, recent)
+        updates.close()
+        if diary is not None:
+            diary.close()
+    if diary is not None:
+        diary.save(state, done)
     return state
 
 
-def _lesson(
-    config: TrainConfig, network: Network, teacher: Any, index: int
-) -> imitation.Lesson:
-    return imitation.draw(config.ppo, config.task_of(index), network, teacher, index)
+class _Updates:
+    """The jitted update of every number: imitation first, then PPO."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        network: Network,
+        mesh: Mesh | None,
+        teacher: imitation.Teacher | None,
+        last: int,
+    ) -> None:
+        if teacher is None and config.ppo.num_imitated:
+            raise ValueError(
+                f"teacher must be given for the {config.ppo.num_imitated} updates that "
+                "imitate, got None"
+            )
+        self._config, self._network, self._mesh = config, network, mesh
+        self._imitated = min(config.ppo.num_imitated, last)
+
+        def prepare(index: int) -> imitation.Lesson:
+            task = config.task_of(index)
+            return imitation.draw(config.ppo, task, network, teacher, index)  # type: ignore[arg-type]  # a teacher is there where a lesson is asked for
+
+        self._lessons = imitation.Lessons(prepare, self._imitated)
+
+    def run(self, state: TrainState, done: int) -> tuple[TrainState, dict[str, Any]]:
+        """Update number ``done``, from 0; the state is given up."""
+        args = self._config.ppo, self._config.task_of(done), self._network, self._mesh
+        if done >= self._imitated:
+            return ppo.updater(*args)(state)
+        lesson = devices.replicate(self._lessons.at(done), self._mesh)
+        return imitation.updater(*args)(state, lesson)
+
+    def close(self) -> None:
+        """Stop preparing lessons."""
+        self._lessons.close()
+
+
+class _Diary:
+    """What the first process writes and says of a run: rows, reports, checkpoints."""
+
+    def __init__(
+        self,
+        root: pathlib.Path,
+        config: TrainConfig,
+        network: Network,
+        validation: Validation | None,
+        report: Callable[[Report], None],
+        last: int,
+        done: int,
+        before: float,
+    ) -> None:
+        self._root, self._config, self._network = root, config, network
+        self._validation, self._report, self._last = validation, report, last
+        self._before = before  # seconds of earlier sittings
+        self._table = MetricsTable(root, done)
+        self._begun = self._looked = self._saved = self._mark_time = time.perf_counter()
+        self._mark_update = done
+        self.recent = np.zeros(0, np.float32)  # the last rewards of the first task
+
+    def note(
+        self, state: TrainState, done: int, row: dict[str, float], rewards: np.ndarray
+    ) -> None:
+        """Keep the metrics of update ``done``; look and save where it is time to."""
+        config = self._config
+        if config.task_of(done - 1) == config.tasks[0]:
+            self.recent = np.concatenate([self.recent, rewards])[-_LAST:]
+        now = time.perf_counter()
+        row |= {
+            "update": done,
+            "episodes": done * config.ppo.episodes_per_update,
+            "seconds": self._seconds(now),
+            "learning_rate": optimiser.learning_rate(config.ppo, done),
+        }
+        look = done in (1, self._last) or now - self._looked > config.validate_every
+        if look and self._validation is not None:
+            average, k = devices.local(state.average), config.tasks[0].num_decisions
+            ratio, hits = self._validation.measure(self._network, average, k)
+            row |= {"ratio_to_exact": ratio, "hit_rate": hits}
+        self._table.add(row)
+        if look:
+            self._looked = self._say(done, row)
+        if now - self._saved > config.save_every:
+            self._saved = now
+            self.save(state, done)
+
+    def _say(self, done: int, row: dict[str, float]) -> float:
+        now = time.perf_counter()
+        rate = (done - self._mark_update) / max(now - self._mark_time, 1e-9)
+        self._report(
+            Report(
+                update=done,
+                num_updates=self._last,
+                episodes=int(row["episodes"]),
+                seconds=self._seconds(now),
+                episodes_per_second=rate * self._config.ppo.episodes_per_update,
+                eta=(self._last - done) / rate,
+                metrics=row,
+            )
+        )
+        self._mark_time, self._mark_update = now, done
+        return now
+
+    def _seconds(self, now: float) -> float:
+        return self._before + now - self._begun
+
+    def save(self, state: TrainState, done: int) -> None:
+        """Write a checkpoint of update ``done``."""
+        with atomic_write(self._root / "last_rewards.npy") as file:
+            np.save(file, self.recent)
+        progress = {
+            "updates": done,
+            "episodes": done * self._config.ppo.episodes_per_update,
+            "seconds": self._seconds(time.perf_counter()),
+            "device": jax.devices()[0].device_kind,
+        }
+        meta = self._config.as_meta()
+        meta |= {"seed": self._config.ppo.seed, "progress": progress}
+        state = devices.local(state)
+        checkpoint.save(self._root / "checkpoint", done, state.average, meta, state)
+
+    def close(self) -> None:
+        """Bring the metrics to the disk."""
+        self._table.close()
 
 
 def _begin(
     root: pathlib.Path, config: TrainConfig, network: Network, resume: bool
-) -> tuple[Any, float, np.ndarray]:
+) -> tuple[TrainState, float, np.ndarray]:
     """The state to start from, seconds already trained, the last rewards."""
     root.mkdir(parents=True, exist_ok=True)
-    state = ppo.init(config.ppo, config.tasks[0], network)
+    state = optimiser.init(config.ppo, config.tasks[0], network)
     recent = np.zeros(0, np.float32)
     if not resume:
         return state, 0.0, recent
@@ -284,85 +290,3 @@ def _begin(
     if (root / "last_rewards.npy").exists():
         recent = np.load(root / "last_rewards.npy")
     return state, float(meta["progress"]["seconds"]), recent
-
-
-def _save(
-    root: pathlib.Path,
-    config: TrainConfig,
-    state: Any,
-    done: int,
-    seconds: float,
-    recent: np.ndarray,
-) -> None:
-    with atomic_write(root / "last_rewards.npy") as file:
-        np.save(file, recent)
-    progress = {
-        "updates": done,
-        "episodes": done * config.ppo.episodes_per_update,
-        "seconds": seconds,
-        "device": jax.devices()[0].device_kind,
-    }
-    meta = config.as_meta() | {"seed": config.ppo.seed, "progress": progress}
-    state = devices.local(state)
-    checkpoint.save(root / "checkpoint", done, state.average, meta, state)
-
-
-def _summary_writer() -> Any:
-    """tensorboardX's writer, without PyTorch.
-
-    It loads PyTorch where that is installed, more than a second that scalars do not
-    need.
-    """
-    unloaded = "torch" not in sys.modules
-    if unloaded:
-        sys.modules["torch"] = None  # type: ignore[assignment]  # reads as not installed
-    try:
-        from tensorboardX import SummaryWriter
-    finally:
-        if unloaded:
-            del sys.modules["torch"]
-    return SummaryWriter
-
-
-class _Table:
-    """metrics.csv and TensorBoard events, a row an update, flushed as they come."""
-
-    def __init__(self, root: pathlib.Path, done: int) -> None:
-        path = root / "metrics.csv"
-        kept = _rows_until(path, done) if done else []
-        with atomic_write(path) as file:
-            lines = [",".join(COLUMNS), *kept]
-            file.write(("\n".join(lines) + "\n").encode())
-        self._file = path.open("a", newline="")
-        self._writer = csv.DictWriter(self._file, COLUMNS, extrasaction="ignore")
-        self._events = _summary_writer()(str(root), flush_secs=30)
-
-    def add(self, row: dict[str, float]) -> None:
-        self._writer.writerow(row)
-        self._file.flush()
-        for name, value in row.items():
-            if name not in ("update", "episodes"):
-                self._events.add_scalar(name, value, row["update"])
-
-    def close(self) -> None:
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        self._file.close()
-        self._events.close()
-
-
-def _rows_until(path: pathlib.Path, done: int) -> list[str]:
-    """Rows of a metrics file up to an update; later ones were never saved."""
-    if not path.exists():
-        return []
-    lines = path.read_text().splitlines()[1:]
-    kept = []
-    for line in lines:
-        first = line.split(",", 1)[0]
-        if (
-            first.isdigit()
-            and int(first) <= done
-            and line.count(",") + 1 == len(COLUMNS)
-        ):
-            kept.append(line)
-    return kept

@@ -5,27 +5,32 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import importlib.metadata
+import json
 import pathlib
 import platform
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.paper.datasets import datasets
-from jaxcal.paper.datasets.datasets import (
+from jaxcal.paper.constants import (
+    AXES,
     BIAS_DEG,
     NOISE_STD_DEG,
     NUM_CANDIDATES,
     RECORDED,
     SCALE,
 )
+from jaxcal.paper.datasets import dataset0_robot
+from jaxcal.paper.datasets.recordings import SHIPPED
 
 __all__ = ["card_of", "digest_of", "page_of"]
 
-_AXES = ("pitch", "yaw", "roll")
 _WHAT = {
     "dataset0": "the ideal robot of Table 1 driven open loop in MuJoCo, 50 postures of "
-    "one second a group, read at the end of each second",
+    "one second per group, read at the end of each second",
     "dataset1": "commands for training",
     "dataset2": "commands for evaluation",
     "dataset3": "y = diag(scale) u + bias of Table 1, with noise",
@@ -40,7 +45,7 @@ def card_of(
     *,
     recordings: pathlib.Path | str | None = None,
 ) -> dict[str, Any]:
-    """Everything somebody needs who finds the files without us.
+    """Everything a reader of the files needs, without jaxcal.
 
     Args:
         dataset: one of the paper's, or its first chunk where it is written in chunks.
@@ -49,50 +54,34 @@ def card_of(
     """
     name = dataset.name
     assert dataset.ranges is not None
-    low, high = dataset.ranges.low.tolist(), dataset.ranges.high.tolist()
+    ends = zip(dataset.ranges.low.tolist(), dataset.ranges.high.tolist(), strict=True)
+    normalised = "1; command in degrees = low + value * (high - low)"
+    arrays = {"candidates": _array(dataset.candidates, normalised, "u")}
+    if dataset.measured is not None:
+        arrays["measured"] = _array(dataset.measured, "degrees", "y")
+    packages = ("jaxcal", "numpy", "mujoco")
     card: dict[str, Any] = {
         "schema": 1,
         "name": name,
         "what": _WHAT[name],
         "episodes": dataset.num_episodes,
         "candidates_per_episode": dataset.num_candidates,
-        "arrays": {
-            "candidates": {
-                "shape": list(dataset.candidates.shape),
-                "dtype": "float64",
-                "unit": "1; command in degrees = low + value * (high - low)",
-                "axes": list(_AXES),
-                "csv_columns": ["u_x", "u_y", "u_z"],
-            }
-        },
-        "ranges_deg": {a: [low[i], high[i]] for i, a in enumerate(_AXES)},
+        "arrays": arrays,
+        "ranges_deg": dict(zip(AXES, map(list, ends), strict=True)),
         "distribution": "uniform within the ranges, independent",
         "seed": dataset.seed,
         "files": dict(files),
-        "command": f"python -m jaxcal.paper.datasets.datasets --out DIR --seed {dataset.seed} "
+        "command": f"python -m jaxcal.paper.datasets --out DIR --seed {dataset.seed} "
         f"{name}",
-        "made_with": {
-            package: importlib.metadata.version(package)
-            for package in ("jaxcal", "numpy", "mujoco")
-        }
+        "made_with": {p: importlib.metadata.version(p) for p in packages}
         | {"python": platform.python_version()},
     }
-    if dataset.measured is not None:
-        card["arrays"]["measured"] = {
-            "shape": list(dataset.measured.shape),
-            "dtype": "float64",
-            "unit": "degrees",
-            "axes": list(_AXES),
-            "csv_columns": ["y_x", "y_y", "y_z"],
-        }
     if name in ("dataset0", "dataset3"):
-        card["noise"] = {
-            "kind": "white Gaussian on every output",
-            "std_deg": NOISE_STD_DEG,
-        }
+        kind = "white Gaussian on every output"
+        card["noise"] = {"kind": kind, "std_deg": NOISE_STD_DEG}
         card["truth"] = {
-            "scale": dict(zip(_AXES, SCALE.tolist(), strict=True)),
-            "bias_deg": dict(zip(_AXES, BIAS_DEG.tolist(), strict=True)),
+            "scale": dict(zip(AXES, SCALE.tolist(), strict=True)),
+            "bias_deg": dict(zip(AXES, BIAS_DEG.tolist(), strict=True)),
         }
     if name == "dataset0":
         card["simulation"] = _simulation()
@@ -101,25 +90,32 @@ def card_of(
     return card
 
 
+def _array(values: NDArray[np.float64], unit: str, letter: str) -> dict[str, Any]:
+    return {
+        "shape": list(values.shape),
+        "dtype": "float64",
+        "unit": unit,
+        "axes": list(AXES),
+        "csv_columns": [f"{letter}_{axis}" for axis in "xyz"],
+    }
+
+
 def _simulation() -> dict[str, Any]:
     from jaxcal.paper.twin.robot_model import HOLD_S, timestep_of
 
+    robot = dataset0_robot()
     return {
         "engine": "mujoco",
         "sample_rate_hz": 1.0 / HOLD_S,
         "seconds_per_episode": NUM_CANDIDATES * HOLD_S,
-        "timestep_s": timestep_of(datasets.dataset0_robot()),
-        "robot": dataclasses.asdict(datasets.dataset0_robot()),
+        "timestep_s": timestep_of(robot),
+        "robot": dataclasses.asdict(robot),
     }
 
 
 def _recording(
     name: str, dataset: Dataset, recordings: pathlib.Path | str | None
 ) -> dict[str, Any]:
-    import json
-
-    from jaxcal.paper.datasets.recordings import SHIPPED
-
     folder = SHIPPED if recordings is None else pathlib.Path(recordings)
     source: dict[str, Any] = {
         "file": "shipped with jaxcal" if recordings is None else str(folder),
@@ -144,7 +140,7 @@ def page_of(cards: list[dict[str, Any]]) -> str:
         "",
         "Commands (`u_x`, `u_y`, `u_z`: pitch, yaw, roll) are normalised to [0, 1]; "
         "readings (`y_x`, `y_y`, `y_z`) are in degrees. `NAME.npz` holds `candidates`, "
-        "`measured`, `low` and `high`; `NAME.csv` the same, a posture a line; "
+        "`measured`, `low` and `high`; `NAME.csv` the same, one posture per line; "
         "`NAME.json` every number of this page.",
         "",
         "| name | episodes | postures | numbers each | noise | seed | what |",
@@ -167,6 +163,6 @@ def page_of(cards: list[dict[str, Any]]) -> str:
             for axis, (low, high) in card["ranges_deg"].items()
         )
         lines.append(f"- {card['name']}: {ranges}")
-    lines += ["", "Made again by:", "", "```bash"]
+    lines += ["", "Commands that make them:", "", "```bash"]
     lines += [card["command"] for card in cards]
     return "\n".join([*lines, "```", ""])

@@ -1,4 +1,4 @@
-"""The paper's Datasets 0 to 5 (Table 3), each by seed.
+"""Datasets 0 to 5 of the paper's Table 3, each by seed.
 
 ==========  ========  ==  ===  ========================================================
 name        episodes   M  dim  for
@@ -14,74 +14,46 @@ dataset5           1  50    6  recorded on the rig, in a session of its own
 Commands are uniform within ``RANGES`` and stored normalised to [0, 1], as in the paper.
 The outputs of dataset3 are ``y = diag(scale) u + bias`` (Table 1) of the commands in
 degrees, with white Gaussian noise of ``NOISE_STD_DEG`` on every output; those of
-dataset0 are what the robot of ``jaxcal.paper.twin.robot_model`` reads after a second at each
-posture, with the same noise. ``jaxcal.paper.datasets.recordings`` reads what dataset4 and
-dataset5 are made from.
+dataset0 are what the robot of ``jaxcal.paper.twin.robot_model`` reads after a second at
+each posture, with the same noise. ``recordings`` reads what 4 and 5 are made from.
 
 Every block of 1,000 episodes of every simulated dataset (every group of dataset0) has a
 random stream of its own, spawned from the seed, the dataset's number and the block's.
 So no dataset shares candidates with another, and asking for fewer episodes gives the
-first of them. Training draws from JAX's generator, which is a different one altogether.
-
-``python -m jaxcal.paper.datasets.datasets --out DIR`` writes them all, with a data card.
+first of them. Training draws from JAX's generator, a different generator.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import pathlib
-import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jaxcal.candidates import JointRanges, uniform_candidates
+from jaxcal.candidates import uniform_candidates
 from jaxcal.evaluation.dataset import Dataset
+from jaxcal.paper.constants import (
+    BIAS_DEG,
+    BLOCK,
+    DRAWN,
+    EPISODES,
+    NAMES,
+    NOISE_STD_DEG,
+    NUM_CANDIDATES,
+    RANGES,
+    RECORDED,
+    SCALE,
+)
+from jaxcal.paper.datasets.recordings import recorded_dataset
 
 if TYPE_CHECKING:
     from jaxcal.paper.twin.robot import RobotConfig
 
-__all__ = [
-    "BIAS_DEG",
-    "BLOCK",
-    "DRAWN",
-    "EPISODES",
-    "NAMES",
-    "NOISE_STD_DEG",
-    "NUM_CANDIDATES",
-    "RANGES",
-    "RECORDED",
-    "SCALE",
-    "chunks",
-    "dataset0_robot",
-    "drawn",
-    "make_dataset",
-]
+__all__ = ["DRAWN", "chunks", "dataset0_robot", "drawn", "make_dataset"]
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Progress = Callable[[str, int, int], None]
-
-NAMES = tuple(f"dataset{number}" for number in range(6))
-DRAWN = ("dataset1", "dataset2", "dataset3")
-RECORDED = ("dataset4", "dataset5")
-NUM_CANDIDATES = 50
-SCALE = np.array([0.43, 0.71, 0.87])  # pitch, yaw, roll; Table 1 lists roll before yaw
-BIAS_DEG = np.array([3.1, -5.8, 2.41])
-NOISE_STD_DEG = 0.1
-RANGES = JointRanges([-20.0] * 3, [20.0] * 3, ("pitch", "yaw", "roll"))  # degrees
-
-EPISODES = {
-    "dataset0": 200,
-    "dataset1": 200_000,
-    "dataset2": 1_000,
-    "dataset3": 100,
-    "dataset4": 100,
-    "dataset5": 1,
-}
-BLOCK = 1_000  # episodes that share a stream
 
 
 def make_dataset(
@@ -103,17 +75,10 @@ def make_dataset(
         episodes: the first so many; all when not given.
         recordings: folder of dataset4.csv and dataset5.csv; the shipped one when not
             given.
-        progress: told how far a simulation is.
+        progress: told how many episodes of how many are made.
     """
-    blocks = list(
-        chunks(name, seed, episodes, recordings=recordings, progress=progress)
-    )
-    measured = [block.measured for block in blocks if block.measured is not None]
-    return dataclasses.replace(
-        blocks[0],
-        candidates=np.concatenate([block.candidates for block in blocks]),
-        measured=np.concatenate(measured) if measured else None,
-    )
+    parts = list(chunks(name, seed, episodes, recordings=recordings, progress=progress))
+    return _joined(parts)
 
 
 def chunks(
@@ -131,7 +96,7 @@ def chunks(
         seed: of the streams, 0 or greater.
         episodes: the first so many; all when not given.
         recordings: folder of recordings; the shipped one when not given.
-        progress: told how far a simulation is.
+        progress: told how many episodes of how many are made.
 
     Raises:
         OSError: a recording cannot be read.
@@ -148,24 +113,35 @@ def chunks(
             f"episodes must be in [1, {EPISODES[name]}] for {name}, got {total}"
         )
     if name in RECORDED:
-        from jaxcal.paper.datasets.recordings import recorded_dataset
-
         whole = recorded_dataset(
             name, EPISODES[name], NUM_CANDIDATES, seed, folder=recordings
         )
         return iter([whole.first(total)])
     if name == "dataset0":
         return _groups(seed, total, progress)
-    return _blocks(name, seed, total)
+    return _blocks(name, seed, total, progress)
 
 
-def _blocks(name: str, seed: int, total: int) -> Iterator[Dataset]:
+def _joined(parts: list[Dataset]) -> Dataset:
+    measured = [part.measured for part in parts if part.measured is not None]
+    return dataclasses.replace(
+        parts[0],
+        candidates=np.concatenate([part.candidates for part in parts]),
+        measured=np.concatenate(measured) if measured else None,
+    )
+
+
+def _blocks(
+    name: str, seed: int, total: int, progress: Progress | None
+) -> Iterator[Dataset]:
     for begin in range(0, total, BLOCK):
+        if progress is not None:
+            progress(f"draw {name}", begin, total)
         yield drawn(name, seed, begin, min(begin + BLOCK, total))
 
 
 def drawn(name: str, seed: int, begin: int, end: int) -> Dataset:
-    """Episodes of a drawn dataset, which goes on beyond its size in the paper.
+    """Episodes of a drawn dataset, of any length: the paper's size is not a limit.
 
     Args:
         name: one of ``DRAWN``.
@@ -182,15 +158,8 @@ def drawn(name: str, seed: int, begin: int, end: int) -> Dataset:
         if name == "dataset3":
             measured = RANGES.denormalise(candidates) * SCALE + BIAS_DEG
             measured += noise.normal(0.0, NOISE_STD_DEG, measured.shape)
-        parts.append((candidates, measured))
-    outputs = [measured for _, measured in parts if measured is not None]
-    return Dataset(
-        name,
-        np.concatenate([candidates for candidates, _ in parts]),
-        np.concatenate(outputs) if outputs else None,
-        ranges=RANGES,
-        seed=seed,
-    )
+        parts.append(Dataset(name, candidates, measured, ranges=RANGES, seed=seed))
+    return _joined(parts)
 
 
 def _streams(
@@ -224,9 +193,3 @@ def dataset0_robot() -> RobotConfig:
         scale=(SCALE[0], SCALE[1], SCALE[2]),
         bias_deg=(BIAS_DEG[0], BIAS_DEG[1], BIAS_DEG[2]),
     )
-
-
-if __name__ == "__main__":
-    from jaxcal.paper.datasets.dataset_command import main
-
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""``python -m jaxcal.paper.datasets.record``: Datasets 4 and 5 recorded against the simulator.
+"""``python -m jaxcal.paper.datasets.record``: record Datasets 4 and 5 in simulation.
 
 Runs ``python -m rig collect --simulate`` twice, in processes of their own: the rig's
 whole path from the plan to the settled reading, over Modbus and TCP on loopback, with
@@ -9,7 +9,6 @@ the postures come out the same again, the last digits of the readings do not.
 
 from __future__ import annotations
 
-import argparse
 import datetime
 import hashlib
 import json
@@ -21,7 +20,8 @@ import tempfile
 import time
 
 from jaxcal.files import atomic_write, require_writable_folder, write_text
-from jaxcal.paper.datasets.datasets import RANGES
+from jaxcal.paper import command
+from jaxcal.paper.constants import AXES, RANGES
 
 __all__ = ["main", "record"]
 
@@ -68,7 +68,7 @@ def record(name: str, folder: pathlib.Path, count: int | None = None) -> pathlib
     path = folder / f"{name}.csv"
     with atomic_write(path) as file:
         file.write(data)
-    low, high = RANGES.low.tolist(), RANGES.high.tolist()
+    ends = zip(RANGES.low.tolist(), RANGES.high.tolist(), strict=True)
     card = {
         "schema": 1,
         "name": name,
@@ -83,9 +83,7 @@ def record(name: str, folder: pathlib.Path, count: int | None = None) -> pathlib
         "columns": "u_deg_*: command of the whole pulses sent; y_deg_*: mean of "
         "`samples` settled readings against the zero posture; "
         "std_deg_*: of one reading",
-        "ranges_deg": {
-            axis: [low[i], high[i]] for i, axis in enumerate(("pitch", "yaw", "roll"))
-        },
+        "ranges_deg": dict(zip(AXES, map(list, ends), strict=True)),
         "recorded": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "seconds": round(seconds, 1),
         "python": platform.python_version(),
@@ -96,11 +94,10 @@ def record(name: str, folder: pathlib.Path, count: int | None = None) -> pathlib
 
 
 def _rig(*arguments: str, capture: bool = False) -> str:
-    command = [sys.executable, "-m", "rig", *arguments]
+    """Run a command of the rig; what it printed, if that is wanted."""
     done = subprocess.run(
-        command,
+        [sys.executable, "-m", "rig", *arguments],
         stdout=subprocess.PIPE if capture else None,
-        text=True,
         encoding="utf-8",
         check=False,
     )
@@ -113,11 +110,10 @@ def _rig(*arguments: str, capture: bool = False) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Record; the exit code."""
-    parser = argparse.ArgumentParser(
+    parser = command.Parser(
         prog="python -m jaxcal.paper.datasets.record",
         description="Record Datasets 4 and 5 through the rig against its simulator "
         "(550 postures, about three and a half minutes).",
-        allow_abbrev=False,
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help="dataset4, dataset5")
     parser.add_argument("--out", type=pathlib.Path, required=True, metavar="DIR")
@@ -125,21 +121,14 @@ def main(arguments: list[str] | None = None) -> int:
     for name in options.names:
         if name not in SESSIONS:
             parser.error(f"NAME must be one of {', '.join(SESSIONS)}, got {name!r}")
-    try:
+
+    def write() -> None:
         require_writable_folder(options.out)
         options.out.mkdir(parents=True, exist_ok=True)
         for name in options.names or SESSIONS:
             print(f"saved: {record(name, options.out)}")
-    except KeyboardInterrupt:
-        print("record: interrupted", file=sys.stderr)
-        return 130
-    except OSError as error:
-        print(f"record: error: {error}", file=sys.stderr)
-        return 2
-    except RuntimeError as error:
-        print(f"record: error: {error}", file=sys.stderr)
-        return 3
-    return 0
+
+    return command.run(write, "record", "files already named are complete")
 
 
 if __name__ == "__main__":

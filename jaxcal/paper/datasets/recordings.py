@@ -1,13 +1,13 @@
 """Datasets 4 and 5: what the rig recorded, as a pool of postures and draws from it.
 
-A recording is the ``pairs.csv`` that ``python -m rig collect`` writes: a posture a
+A recording is the ``pairs.csv`` that ``python -m rig collect`` writes: one posture per
 line, commands under ``u_deg_pitch, u_deg_yaw, u_deg_roll`` and what the phone read
 under ``y_deg_...``; other columns may stand beside them. A folder of recordings holds
 ``dataset4.csv`` and ``dataset5.csv``, and beside each, optionally, a data card
 ``dataset4.json`` whose ``ranges_deg`` say what [0, 1] stands for.
 
 The paper recorded 550 postures and speaks of 100 x 50 and 1 x 50. So dataset4 is drawn
-from its pool, 50 of 500 an episode, by seed; a recording with all 5,000 is used as it
+from its pool, 50 of 500 per episode, by seed; a recording with all 5,000 is used as it
 stands. Dataset5 is the first 50 postures of its own session.
 """
 
@@ -19,21 +19,20 @@ import io
 import json
 import os
 import pathlib
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges, draw_from_pool
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.paper.datasets.datasets import RANGES
+from jaxcal.paper.constants import AXES, RANGES
 
 __all__ = ["SHIPPED", "read_pool", "recorded_dataset"]
 
 Array = NDArray[np.float64]
 
 SHIPPED = pathlib.Path(__file__).parent / "data"
-_AXES = ("pitch", "yaw", "roll")
 
 
 def recorded_dataset(
@@ -88,8 +87,8 @@ def read_pool(
     """A recording in the order in which it was made.
 
     Returns:
-        (N, 3) commands and (N, 3) readings in degrees, the ranges that [0, 1] shall
-        stand for, and the SHA-256 of the file.
+        (N, 3) commands and (N, 3) readings in degrees, the ranges that [0, 1]
+        stands for, and the SHA-256 of the file.
 
     Raises:
         OSError: it cannot be read.
@@ -124,17 +123,19 @@ def _table(data: bytes) -> Array:
     if not rows:
         raise ValueError("the file is empty")
     header = [name.strip() for name in rows[0][1]]
-    wanted = [f"{what}_deg_{axis}" for what in "uy" for axis in _AXES]
+    wanted = [f"{what}_deg_{axis}" for what in "uy" for axis in AXES]
     for name in wanted:
         if header.count(name) != 1:
             how = "missing" if name not in header else "there twice"
             raise ValueError(f'line 1: column "{name}" is {how}')
-    places = [header.index(name) for name in wanted]
     values = []
     for line, row in rows[1:]:
         if len(row) != len(header):
-            _fail(line, f"{len(row)} cells, {len(header)} in the header")
-        values.append([_number(line, header[i], row[i]) for i in places])
+            raise ValueError(
+                f"line {line}: {len(row)} cells, {len(header)} in the header"
+            )
+        cells = dict(zip(header, row, strict=True))
+        values.append([_number(line, name, cells[name]) for name in wanted])
     if not values:
         raise ValueError("no postures below the header")
     return np.array(values)
@@ -146,12 +147,8 @@ def _number(line: int, name: str, cell: str) -> float:
     except ValueError:
         value = np.nan
     if not np.isfinite(value):
-        _fail(line, f'"{name}" must be a finite number, got {cell!r}')
+        raise ValueError(f'line {line}: "{name}" must be a finite number, got {cell!r}')
     return value
-
-
-def _fail(line: int, problem: str) -> NoReturn:
-    raise ValueError(f"line {line}: {problem}")
 
 
 def _ranges_beside(recording: pathlib.Path) -> JointRanges:
@@ -166,9 +163,9 @@ def _ranges_beside(recording: pathlib.Path) -> JointRanges:
         named = document.get("ranges_deg")
         if named is None:
             return RANGES
-        low, high = zip(*(named[axis] for axis in _AXES), strict=True)
-        return JointRanges(low, high, _AXES)
+        low, high = zip(*(named[axis] for axis in AXES), strict=True)
+        return JointRanges(low, high, AXES)
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(
-            f'{card}: "ranges_deg" must give [low, high] of {", ".join(_AXES)}: {error}'
+            f'{card}: "ranges_deg" must give [low, high] of {", ".join(AXES)}: {error}'
         ) from None

@@ -1,4 +1,4 @@
-"""Devices that are not quite still: white noise, a wandering bias, gross errors."""
+"""Simulated devices with white noise, a drifting bias and gross errors."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.paper.datasets.datasets import BIAS_DEG, NOISE_STD_DEG, SCALE
+from jaxcal.paper.datasets import BIAS_DEG, NOISE_STD_DEG, SCALE
 
 __all__ = ["Device", "pick", "rms"]
 
@@ -31,7 +31,7 @@ class Device:
         Args:
             commands: (..., N, 3) degrees, in the order they are measured.
             rng: of everything random.
-            start: (..., 3) degrees by which the bias is off when it begins.
+            start: (..., 3) degrees by which the bias is off at the start.
 
         Returns:
             (..., N, 3) measured, and (..., 3) by how much the bias is off at the end.
@@ -42,8 +42,8 @@ class Device:
             walk = walk + start[..., None, :]
         noise = rng.normal(0.0, self.noise_std_deg, shape)
         gross = rng.normal(0.0, self.outlier_std_deg, shape)
-        struck = rng.random((*shape[:-1], 1)) < self.outlier_share
-        measured = self.true_outputs(commands) + walk + noise + gross * struck
+        outlier = rng.random((*shape[:-1], 1)) < self.outlier_share
+        measured = self.true_outputs(commands) + walk + noise + gross * outlier
         return measured, walk[..., -1, :]
 
     @staticmethod

@@ -2,78 +2,21 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
+import functools
 import pathlib
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import field
 from typing import Any, Literal
 
-import numpy as np
 from matplotlib.figure import Figure
 
-__all__ = [
-    "STUDIES",
-    "Claim",
-    "Columns",
-    "Exhibit",
-    "Settings",
-    "Verdict",
-    "as_csv",
-]
+from jaxcal.paper.exhibits.columns import Columns
 
-STUDIES = pathlib.Path(__file__).resolve().parents[3] / "studies"
-"""Where the repository keeps training runs"""
+__all__ = ["Claim", "Exhibit", "Verdict"]
 
-Columns = Mapping[str, Sequence[Any] | np.ndarray]
 Verdict = Literal["agrees", "agrees in part", "disagrees", "not comparable"]
-
-
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """How much to compute; everything random hangs on ``seed``."""
-
-    seed: int = 0
-    quick: bool = False
-    data: pathlib.Path | None = None  # real recordings in place of Datasets 4 and 5
-    studies: pathlib.Path = STUDIES  # kept training runs
-
-    @property
-    def recorded(self) -> str:
-        """What Datasets 4 and 5 are, for titles."""
-        return "rig's simulator" if self.data is None else "rig recordings"
-
-    @property
-    def episodes(self) -> int:
-        """Of dataset2."""
-        return 200 if self.quick else 1_000
-
-    @property
-    def groups(self) -> int:
-        """Of dataset0."""
-        return 40 if self.quick else 200
-
-    @property
-    def random_draws(self) -> int:
-        """Random selections an episode."""
-        return 30 if self.quick else 100
-
-    @property
-    def resamples(self) -> int:
-        """Of a bootstrap."""
-        return 400 if self.quick else 2_000
-
-    @property
-    def repeats(self) -> int:
-        """Simulated devices, or histories of one, in the accuracy studies."""
-        return 100 if self.quick else 500
-
-    def rng(self, *stream: int) -> np.random.Generator:
-        """A stream of its own for each use."""
-        return np.random.default_rng(
-            np.random.SeedSequence(self.seed, spawn_key=stream)
-        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,6 +36,42 @@ class Exhibit:
     pictures: Mapping[str, bytes] = field(default_factory=dict)  # PNG, GIF, by file
     notice: str = ""  # for the terminal: what had to be done otherwise
 
+    @classmethod
+    def from_texts(
+        cls, section: str, words: Mapping[str, Any], **fields: Any
+    ) -> Exhibit:
+        """An exhibit with the texts of a section of texts.toml.
+
+        Args:
+            section: its name; the key too, where ``fields`` gives none.
+            words: what its texts cite beside the numbers of the exhibit.
+            fields: of the exhibit.
+        """
+        texts = dict(_texts()[section])
+        texts.pop("missing", None)
+        filled = _filled(texts, {**fields.get("numbers", {}), **words})
+        return cls(**{"key": section, **filled, **fields})
+
+    @classmethod
+    def missing(cls, section: str, **numbers: Any) -> Exhibit:
+        """An exhibit whose kept runs are not there: how to make them."""
+        texts = _texts()[section]
+        texts = {name: texts[name] for name in ("title", "paper")} | {
+            "ours": texts["missing"]
+        }
+        return cls(
+            key=section,
+            caption="",
+            verdict="not comparable",
+            numbers=numbers,
+            **_filled(texts, numbers),
+        )
+
+    @property
+    def tables(self) -> dict[str, Columns]:
+        """The data by the name of its CSV file."""
+        return {f"{self.key}_{name}.csv": rows for name, rows in self.data.items()}
+
 
 @dataclasses.dataclass(frozen=True)
 class Claim:
@@ -103,20 +82,38 @@ class Claim:
     paper: str  # its figure
     ours: str
     verdict: Verdict
-    where: str  # key of the exhibit with the evidence, "" where it is a proof
+    where: str  # key of the exhibit with the evidence
+
+    @classmethod
+    def from_texts(
+        cls,
+        section: str,
+        exhibit: Exhibit,
+        verdict: Verdict | None,
+        key: str = "",
+        **words: Any,
+    ) -> Claim:
+        """A claim with the texts of ``claims.section`` of texts.toml.
+
+        Args:
+            section: its name; the key too, where none is given.
+            exhibit: with the evidence, whose numbers the texts cite.
+            verdict: "not comparable" when None.
+            key: of the claim.
+            words: what else its texts cite.
+        """
+        known = {**exhibit.numbers, **words}
+        filled = _filled(_texts()["claims"][section], known)
+        verdict = verdict or "not comparable"
+        return cls(key=key or section, verdict=verdict, where=exhibit.key, **filled)
 
 
-def as_csv(columns: Columns) -> str:
-    """Columns of equal length as text, numbers with twelve digits."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    for row in zip(*columns.values(), strict=True):
-        writer.writerow([_cell(value) for value in row])
-    return text.getvalue()
+@functools.cache
+def _texts() -> dict[str, Any]:
+    path = pathlib.Path(__file__).parent / "texts.toml"
+    return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
-def _cell(value: Any) -> str:
-    if isinstance(value, (float, np.floating)):
-        return "" if np.isnan(value) else f"{value:.12g}"
-    return str(value)
+def _filled(texts: Mapping[str, str], known: Mapping[str, Any]) -> dict[str, Any]:
+    """Texts on one line each, with the numbers in place of their names."""
+    return {k: " ".join(text.split()).format_map(known) for k, text in texts.items()}

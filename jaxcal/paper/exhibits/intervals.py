@@ -14,19 +14,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import stats
 
 __all__ = [
     "Interval",
     "Paired",
-    "bootstrap",
     "bootstrap_interval",
     "mean_interval",
     "median_interval",
     "paired",
     "share_interval",
 ]
-
-Array = NDArray[np.float64]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,31 +49,25 @@ def mean_interval(values: ArrayLike, most: float = np.inf) -> Interval:
     """Mean of independent values, with Student's t.
 
     Args:
-        values: (E,) one an episode, at least two.
+        values: (E,) one per episode, at least two.
         most: the largest value there can be; the interval ends there.
     """
-    from scipy import stats
-
     sample = np.asarray(values, dtype=np.float64)
-    mean = float(sample.mean())
-    error = float(sample.std(ddof=1)) / np.sqrt(len(sample))
-    half = float(stats.t.ppf(0.975, len(sample) - 1)) * error
-    return Interval(mean, mean - half, min(mean + half, most), len(sample))
+    mean, count = float(sample.mean()), len(sample)
+    half = float(stats.t.ppf(0.975, count - 1) * stats.sem(sample))
+    return Interval(mean, mean - half, min(mean + half, most), count)
 
 
 def median_interval(values: ArrayLike) -> Interval:
     """Median of independent values, between two order statistics.
 
     Args:
-        values: (E,) one an episode, at least six.
+        values: (E,) one per episode, at least six.
     """
-    from scipy import stats
-
-    sample = np.sort(np.asarray(values, dtype=np.float64))
-    n = len(sample)
-    below = max(int(stats.binom.ppf(0.025, n, 0.5)), 1)
+    sample = np.asarray(values, dtype=np.float64)
+    ends = stats.quantile_test(sample).confidence_interval(0.95)
     return Interval(
-        float(np.median(sample)), float(sample[below - 1]), float(sample[n - below]), n
+        float(np.median(sample)), float(ends.low), float(ends.high), len(sample)
     )
 
 
@@ -86,40 +78,9 @@ def share_interval(hits: ArrayLike) -> Interval:
         hits: (E,) bool.
     """
     sample = np.asarray(hits, dtype=bool)
-    n, share, z = len(sample), float(sample.mean()), 1.959963984540054
-    centre = (share + z**2 / (2 * n)) / (1 + z**2 / n)
-    spread = share * (1 - share) / n + z**2 / (4 * n**2)
-    half = z * float(np.sqrt(spread)) / (1 + z**2 / n)
-    return Interval(share, max(centre - half, 0.0), min(centre + half, 1.0), n)
-
-
-def bootstrap(
-    statistic: Callable[..., Any],
-    samples: tuple[NDArray[Any], ...],
-    rng: np.random.Generator,
-    resamples: int = 2_000,
-) -> tuple[Array, Array, Array]:
-    """A statistic of whole episodes with its percentile interval.
-
-    Args:
-        statistic: of arrays like ``samples``; a number or an array.
-        samples: each (E, ...); the same episodes are drawn from all.
-        rng: of the draws.
-        resamples: how many.
-
-    Returns:
-        The statistic of the samples, lower and upper end, each of its shape.
-    """
-    count = len(samples[0])
-    if any(len(sample) != count for sample in samples):
-        raise ValueError("samples must hold the same episodes")
-    value = np.asarray(statistic(*samples), dtype=np.float64)
-    draws = np.empty((resamples, *value.shape))
-    for i in range(resamples):
-        again = rng.integers(0, count, count)
-        draws[i] = statistic(*(sample[again] for sample in samples))
-    low, high = np.quantile(draws, [0.025, 0.975], axis=0)
-    return value, low, high
+    found = stats.binomtest(int(sample.sum()), len(sample))
+    ends = found.proportion_ci(0.95, "wilson")
+    return Interval(found.statistic, float(ends.low), float(ends.high), len(sample))
 
 
 def bootstrap_interval(
@@ -128,9 +89,27 @@ def bootstrap_interval(
     rng: np.random.Generator,
     resamples: int = 2_000,
 ) -> Interval:
-    """``bootstrap`` of a single number."""
-    value, low, high = bootstrap(statistic, samples, rng, resamples)
-    return Interval(float(value), float(low), float(high), len(samples[0]))
+    """A number computed from whole episodes, with its percentile interval.
+
+    Args:
+        statistic: of arrays like ``samples``.
+        samples: each (E, ...); the same episodes are drawn from all.
+        rng: of the draws.
+        resamples: how many.
+    """
+    count = len(samples[0])
+    if any(len(sample) != count for sample in samples):
+        raise ValueError("samples must hold the same episodes")
+    ends = stats.bootstrap(
+        (np.arange(count),),
+        lambda drawn: statistic(*(sample[drawn] for sample in samples)),
+        vectorized=False,
+        n_resamples=resamples,
+        method="percentile",
+        rng=rng,
+    ).confidence_interval
+    value = float(statistic(*samples))
+    return Interval(value, float(ends.low), float(ends.high), count)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,7 +129,7 @@ class Paired:
 def paired(
     a: ArrayLike, b: ArrayLike, rng: np.random.Generator, resamples: int = 2_000
 ) -> Paired:
-    """Compare two values an episode.
+    """Compare two values per episode.
 
     Args:
         a: (E,) of one method.

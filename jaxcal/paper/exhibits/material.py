@@ -9,8 +9,8 @@ from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.methods import Progress, evaluate
 from jaxcal.evaluation.parameters import least_squares
 from jaxcal.evaluation.results import Evaluation, MethodResult
-from jaxcal.paper.datasets.datasets import make_dataset
-from jaxcal.paper.exhibits.exhibit import Settings
+from jaxcal.paper.datasets import make_dataset
+from jaxcal.paper.exhibits.settings import Settings
 
 __all__ = ["METHODS", "Material", "commands_deg"]
 
@@ -31,22 +31,26 @@ class Material:
 
     def __init__(self, settings: Settings, progress: Progress | None = None) -> None:
         self.settings = settings
-        self.progress: Progress = progress or (lambda *_: None)
+        self.stage = ""  # what the report is at, in front of every task
+        self._progress = progress
         self._datasets: dict[str, Dataset] = {}
         self._evaluations: dict[str, Evaluation] = {}
+
+    def progress(self, task: str, done: int, total: int) -> None:
+        """Tell how far a task is."""
+        if self._progress is not None:
+            self._progress(f"{self.stage}{task}", done, total)
 
     def dataset(self, name: str) -> Dataset:
         """One of the paper's datasets, at the size of these settings."""
         if name not in self._datasets:
-            episodes = {
-                "dataset0": self.settings.groups,
-                "dataset2": self.settings.episodes,
-            }
+            settings = self.settings
+            episodes = {"dataset0": settings.groups, "dataset2": settings.episodes}
             self._datasets[name] = make_dataset(
                 name,
-                self.settings.seed,
+                settings.seed,
                 episodes.get(name),
-                recordings=self.settings.data,
+                recordings=settings.data,
                 progress=self.progress,
             )
         return self._datasets[name]
@@ -60,40 +64,34 @@ class Material:
                 METHODS,
                 random_draws=self.settings.random_draws,
                 seed=self.settings.seed,
-                progress=lambda task, done, total: self.progress(
-                    f"{name}: {task}", done, total
+                progress=lambda task, *counts: self.progress(
+                    f"{name}: {task}", *counts
                 ),
             )
         return self._evaluations[name]
-
-    def about_overlap(self, name: str) -> str:
-        """A caution where the episodes of a dataset share postures; else nothing."""
-        sets = self.dataset(name).candidates
-        distinct = len(np.unique(sets.reshape(-1, sets.shape[-1]), axis=0))
-        total = sets.shape[0] * sets.shape[1]
-        if distinct == total:
-            return ""
-        return (
-            f" The episodes are draws from {distinct:,} postures and overlap: "
-            "intervals over them say nothing about another recording."
-        )
-
-    def about_recordings(self) -> str:
-        """Where Datasets 4 and 5 come from, in a sentence."""
-        if self.settings.data is not None:
-            return f"Datasets 4 and 5: recordings given as --data {self.settings.data}."
-        return (
-            "Datasets 4 and 5: shipped recordings, made by the rig's own code against "
-            "its simulator (play, noise, a heading that drifts), not on a device."
-        )
 
     def result(self, name: str, method: str) -> MethodResult:
         """What one method chose on a dataset."""
         found = self.evaluation(name).results
         return next(result for result in found if result.method == method)
 
-    def all_parameters(self, name: str) -> Array:
-        """(E, 12) identified from every candidate of an episode."""
+    def measured(self, name: str) -> tuple[Array, Array]:
+        """(E, M, 3) commands and (E, M, 3) readings of a dataset, in degrees."""
         data = self.dataset(name)
         assert data.measured is not None
-        return least_squares(commands_deg(data), data.measured)
+        return commands_deg(data), data.measured
+
+    def about_overlap(self, name: str) -> str:
+        """A caution where the episodes of a dataset share postures; else nothing."""
+        sets = self.dataset(name).candidates
+        distinct = len(np.unique(sets.reshape(-1, sets.shape[-1]), axis=0))
+        if distinct == sets.shape[0] * sets.shape[1]:
+            return ""
+        return (
+            f" The episodes are draws from {distinct:,} postures and overlap: "
+            "intervals over them say nothing about another recording."
+        )
+
+    def all_parameters(self, name: str) -> Array:
+        """(E, 12) identified from every candidate of an episode."""
+        return least_squares(*self.measured(name))

@@ -8,7 +8,7 @@ import tempfile
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.paper.datasets.datasets import dataset0_robot
+from jaxcal.paper.datasets import dataset0_robot
 from jaxcal.paper.exhibits.exhibit import Exhibit
 from jaxcal.paper.exhibits.material import Material, commands_deg
 from jaxcal.paper.twin.robot import read_out
@@ -34,23 +34,9 @@ def exhibits(material: Material) -> list[Exhibit]:
     drawn_by, pictures = _draw(postures, four[0], material)
     apart = np.abs(simulate(robot, postures) - np.asarray(read_out(robot, postures)))
     return [
-        Exhibit(
-            key="robot",
-            title="The simulated robot",
-            caption=(
-                "Table 1 imposed on three drives (orange: pitch, blue: yaw, green: "
-                "roll), each carrying the next; the phone on the foot's plate reads "
-                "the attitude. Still: the first posture that the policy chooses of "
-                f"dataset3's first candidate set. Film: {way}. Numbers in them: the "
-                "command, and what the phone reads once the robot is at rest. "
-                + drawn_by
-            ),
-            paper="A 3-DOF ankle rehabilitation robot, driven open loop.",
-            ours=(
-                "Its dimensions are ours: only the order of the axes and Table 1 enter "
-                "the numbers. In the film's postures, once at rest, MuJoCo and the "
-                f"closed form read the same within {apart.max():.0e}°."
-            ),
+        Exhibit.from_texts(
+            "robot",
+            {"way": way, "drawn_by": drawn_by},
             numbers={"largest_difference_deg": float(apart.max())},
             pictures=pictures,
             notice="" if "by MuJoCo" in drawn_by else drawn_by,

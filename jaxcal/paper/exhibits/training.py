@@ -21,8 +21,8 @@ from jaxcal.evaluation.training_figure import (
     training_curves,
 )
 from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict
-from jaxcal.paper.exhibits.figures_training import curves_over_seeds
-from jaxcal.paper.exhibits.intervals import Interval, mean_interval
+from jaxcal.paper.exhibits.figures.training import curves_over_seeds
+from jaxcal.paper.exhibits.intervals import mean_interval
 from jaxcal.paper.exhibits.material import Material
 
 __all__ = ["Run", "exhibits", "kept_runs", "plateau"]
@@ -117,25 +117,8 @@ def plateau(run: Run) -> dict[str, float]:
 
 
 def _seeds(runs: list[Run], paper: Run | None) -> Exhibit:
-    title = "Figure 2: training, the compact preset over its seeds"
-    said = (
-        "Reward rises and becomes steadier, and settles within 200,000 episodes; "
-        "narrow distribution over the last 1,000 episodes."
-    )
     if len(runs) < 2:
-        return Exhibit(
-            key="figure_2",
-            title=title,
-            caption="",
-            paper=said,
-            ours=(
-                f"Not here: studies/{SEEDS_FOLDER} holds {len(runs)} kept run(s). Make "
-                "them with python -m jaxcal.paper.training_runs --preset compact "
-                f"--seeds 5 --out studies/{SEEDS_FOLDER}"
-            ),
-            verdict="not comparable",
-            numbers={"seeds": len(runs)},
-        )
+        return Exhibit.missing("figure_2", seeds=len(runs))
     grid = np.linspace(
         max(run.metrics["episodes"][0] for run in runs),
         min(run.metrics["episodes"][-1] for run in runs),
@@ -170,32 +153,21 @@ def _seeds(runs: list[Run], paper: Run | None) -> Exhibit:
             f" On 1,000 unseen sets det S / det S* is {numbers['ratio_to_exact']:.4f} "
             f"and the optimum is hit in {numbers['hit_rate']:.3f}."
         )
-    settled: Interval = numbers["plateau_episode"]
-    rewards = {f"seed {run.summary['seed']}": run.rewards for run in runs} | (
-        {"paper's network": paper.rewards} if paper else {}
-    )
-    return Exhibit(
-        key="figure_2",
-        title=title,
-        caption=(
-            f"{len(runs)} seeds, {_range(numbers['episodes'])} episodes each. (a) mean "
-            "reward of an update; band: 95 % of the mean over seeds, Student's t. (b) "
-            "reward of the last 1,000 episodes; box: quartiles, whiskers: 5 to 95 %. "
-            "(c) det S / det S* of greedy decoding on fixed unseen sets while training."
-        ),
-        paper=said,
-        ours=(
-            f"{_count(runs)}Within 5 % of the final level from episode "
-            f"{settled.value:,.0f} "
-            f"[{settled.low:,.0f}, {settled.high:,.0f}] on; the last 1,000 rewards are "
-            f"{numbers['last_1000_reward_mean']:.4f} with a standard deviation of "
-            f"{numbers['last_1000_reward_std']:.4f}.{text}"
-        ),
+    rewards = {f"seed {run.summary['seed']}": run.rewards for run in runs}
+    rewards |= {"paper's network": paper.rewards} if paper else {}
+    least, most = min(numbers["episodes"]), max(numbers["episodes"])
+    length = f"{most:,}" if least == most else f"{least:,} to {most:,}"
+    return Exhibit.from_texts(
+        "figure_2",
+        {"range": length, "caution": _caution(runs), "measured": text},
         verdict=_converges(runs, flat),
         figures={"figure_2_seeds": curves_over_seeds(runs, columns, rewards, paper)},
         data={
             "reward": columns,
-            "last_rewards": _ragged(rewards),
+            "last_rewards": {
+                "run": [name for name, values in rewards.items() for _ in values],
+                "reward": np.concatenate(list(rewards.values())),
+            },
         },
         numbers=numbers,
     )
@@ -217,84 +189,8 @@ def _converges(runs: list[Run], flat: list[dict[str, float]]) -> Verdict:
     return "agrees in part"
 
 
-def _paper(runs: list[Run]) -> Exhibit:
-    title = "Figure 2 with the paper's own network and schedule"
-    said = (
-        "A 3.5 M-parameter network converges within 200,000 episodes of 4 decisions, "
-        "an update every 16."
-    )
-    if not runs:
-        return Exhibit(
-            key="figure_2_paper",
-            title=title,
-            caption="",
-            paper=said,
-            ours=(
-                f"Not here: there is no studies/{PAPER_FOLDER}/metrics.csv. Train it "
-                "with python train.py --preset paper, then python -m "
-                "jaxcal.paper.training_runs --collect runs/paper --out "
-                f"studies/{PAPER_FOLDER}"
-            ),
-            verdict="not comparable",
-            numbers={"present": False},
-        )
-    run = runs[0]
-    held, flat = run.summary, plateau(run)
-    planned = held["planned_episodes"] or CLAIMED
-    finished = _finished(run)
-    numbers: dict[str, Any] = {"present": True, "finished": finished, **held, **flat}
-    numbers["last_reward_mean"] = float(run.rewards.mean())
-    numbers["last_reward_std"] = float(run.rewards.std())
-    good = held["dataset2"]
-    ratio = run.metrics.get("ratio_to_exact", np.array([np.nan]))
-    known = ratio[np.isfinite(ratio)]
-    hours = "" if held["seconds"] is None else f" in {held['seconds'] / 3600:.2f} h"
-    parts = [f"{held['episodes']:,} of {planned:,} episodes{hours}"]
-    parts[0] += "." if finished else ": not finished, so this is how far it went."
-    parts.append(
-        f"Reward {numbers['last_reward_mean']:.4f}, standard deviation "
-        f"{numbers['last_reward_std']:.4f} ({run.rewards_are}); within 5 % "
-        f"of the final level from episode {flat['episode']:,.0f}; the last tenth "
-        f"brings {flat['last_tenth']:.1%} of the whole rise."
-    )
-    if good is not None:
-        parts.append(
-            f"det S / det S* {good['ratio_to_exact']:.4f}, optimum hit in "
-            f"{good['hit_rate']:.3f} of {good['episodes']:,} unseen sets."
-        )
-    elif known.size:
-        parts.append(f"det S / det S* {known[-1]:.4f} on the validation sets.")
-    figure = training_curves(run.folder)
-    figure.suptitle("Training of the paper's network", fontsize=10)
-    return Exhibit(
-        key="figure_2_paper",
-        title=title,
-        caption=(
-            "One run, one seed"
-            + (
-                ""
-                if held["parameters"] is None
-                else f", {held['parameters']:,} weights"
-            )
-            + ". (a) mean reward of an update with the spread of single episodes, (b) "
-            f"{run.rewards_are}, (c) smoothed curve and validation."
-        ),
-        paper=said,
-        ours=" ".join(parts),
-        verdict=_converges([run], [flat]),
-        figures={"figure_2_paper": figure},
-        data={"metrics": run.metrics, "last_rewards": {"reward": run.rewards}},
-        numbers=numbers,
-    )
-
-
-def _range(counts: list[int]) -> str:
-    least, most = min(counts), max(counts)
-    return f"{most:,}" if least == most else f"{least:,} to {most:,}"
-
-
-def _count(runs: list[Run]) -> str:
-    """A caution where the runs are shorter than the claim or cut off; else nothing."""
+def _caution(runs: list[Run]) -> str:
+    """Where the runs are shorter than the claim or cut off; else nothing."""
     parts = []
     short = [r for r in runs if r.summary["episodes"] < CLAIMED]
     if short:
@@ -305,9 +201,44 @@ def _count(runs: list[Run]) -> str:
     return ", ".join(parts) + ". " if parts else ""
 
 
-def _ragged(samples: dict[str, Array]) -> dict[str, Any]:
-    """Samples of different length, one below the other."""
-    return {
-        "run": [name for name, values in samples.items() for _ in values],
-        "reward": np.concatenate(list(samples.values())),
-    }
+def _paper(runs: list[Run]) -> Exhibit:
+    if not runs:
+        return Exhibit.missing("figure_2_paper", present=False)
+    run = runs[0]
+    held, flat, finished = run.summary, plateau(run), _finished(run)
+    took = "" if held["seconds"] is None else f" in {held['seconds'] / 3600:.2f} h"
+    took += "." if finished else ": not finished, so this is how far it went."
+    good, measured = held["dataset2"], ""
+    ratio = run.metrics.get("ratio_to_exact", np.array([np.nan]))
+    known = ratio[np.isfinite(ratio)]
+    if good is not None:
+        measured = (
+            f" det S / det S* {good['ratio_to_exact']:.4f}, optimum hit in "
+            f"{good['hit_rate']:.3f} of {good['episodes']:,} unseen sets."
+        )
+    elif known.size:
+        measured = f" det S / det S* {known[-1]:.4f} on the validation sets."
+    size = held["parameters"]
+    figure = training_curves(run.folder)
+    figure.suptitle("Training of the paper's network", fontsize=10)
+    return Exhibit.from_texts(
+        "figure_2_paper",
+        {
+            "planned": held["planned_episodes"] or CLAIMED,
+            "took": took,
+            "measured": measured,
+            "weights": "" if size is None else f", {size:,} weights",
+            "rewards_are": run.rewards_are,
+        },
+        verdict=_converges([run], [flat]),
+        figures={"figure_2_paper": figure},
+        data={"metrics": run.metrics, "last_rewards": {"reward": run.rewards}},
+        numbers={
+            "present": True,
+            "finished": finished,
+            **held,
+            **flat,
+            "last_reward_mean": float(run.rewards.mean()),
+            "last_reward_std": float(run.rewards.std()),
+        },
+    )

@@ -7,7 +7,7 @@ end-effector reads the attitude relative to the base as three Euler angles.
 
 With the phone straight and read in the order in which the axes stand, the reading *is*
 the joint angles and the robot is exactly ``y = A u + b`` with A diagonal. Another
-order, a phone mounted askew, play or a bent mechanism are what a real device adds, and
+order, a misaligned phone, play or a compliant mechanism are what a real device adds;
 each is one field of ``RobotConfig``. docs/robot.md says what each does to A and b.
 
 ``jaxcal.paper.twin.robot_model`` is the same robot in MuJoCo, with its dynamics.
@@ -43,6 +43,10 @@ PerAxis = float | tuple[float, float, float]
 
 GRAVITY = 9.81  # m/s^2, along -y
 _NEWTON_STEPS = 6  # of the sag; it converges quadratically
+_PER_AXIS = (
+    *("backlash_deg", "compliance_deg_per_nm"),
+    *("noise_std_deg", "drift_std_deg"),
+)
 _MAX_SLENDERNESS = 0.5  # compliance x weight x arm, rad; far from buckling (1)
 
 
@@ -51,8 +55,8 @@ class RobotConfig:
     """What the robot is. The defaults are an ideal one with the paper's Table 1.
 
     Triples are pitch, yaw, roll, or x, y, z. ``mounting_deg`` is the attitude of the
-    phone on the end-effector that nobody told the read-out about, turned in the order
-    XYZ. Play is that of the joint, in joint degrees: the gap between its two stops.
+    phone on the end-effector, unknown to the read-out, turned in the order XYZ. Play is
+    the gap between the two stops of a joint, in joint degrees.
     """
 
     scale: tuple[float, float, float] = (0.43, 0.71, 0.87)
@@ -76,12 +80,7 @@ class RobotConfig:
             if np.shape(value) != (3,) or not np.isfinite(value).all():
                 raise ValueError(f"{name} must be three finite numbers, got {value!r}")
             object.__setattr__(self, name, tuple(float(v) for v in value))
-        for name in (
-            "backlash_deg",
-            "compliance_deg_per_nm",
-            "noise_std_deg",
-            "drift_std_deg",
-        ):
+        for name in _PER_AXIS:
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape not in ((), (3,)) or not (value >= 0).all():
                 raise ValueError(
@@ -111,9 +110,9 @@ class RobotConfig:
 
 
 def read_out(config: RobotConfig, commands_deg: ArrayLike | jax.Array) -> Any:
-    """What the phone reads once all is settled, without play, drift and noise.
+    """What the phone reads at rest, without play, drift and noise.
 
-    Differentiable, and fit for ``jit`` and ``vmap``, where it is given JAX arrays.
+    Given JAX arrays it is differentiable and works under ``jit`` and ``vmap``.
 
     Args:
         config: the robot.
@@ -134,10 +133,7 @@ def joint_angles(config: RobotConfig, commands_deg: ArrayLike | jax.Array) -> An
         commands_deg: (..., 3) pitch, yaw, roll in degrees.
     """
 
-    def joints(commands: jax.Array) -> jax.Array:
-        return _each(lambda u: _bent(config, _driven(config, u)), commands)
-
-    return _in_its_precision(joints, commands_deg)
+    return _in_its_precision(functools.partial(_joint_angles, config), commands_deg)
 
 
 def measure(
@@ -177,7 +173,7 @@ def measure(
 def bias_drift(
     config: RobotConfig, session: int | Sequence[int] | NDArray[np.int64]
 ) -> Array:
-    """(..., 3) degrees by which the bias has wandered when a session begins.
+    """(..., 3) degrees by which the bias has drifted at the start of a session.
 
     A random walk from zero in session 0; the same for the same ``drift_seed``.
     """
@@ -268,9 +264,13 @@ def _each(function: Any, rows: jax.Array) -> jax.Array:
     return flat.reshape(rows.shape)
 
 
+def _joint_angles(config: RobotConfig, commands: jax.Array) -> jax.Array:
+    return _each(lambda u: _bent(config, _driven(config, u)), commands)
+
+
 @functools.partial(jax.jit, static_argnums=0)
 def _read_out(config: RobotConfig, commands: jax.Array) -> jax.Array:
-    return _each(lambda u: _seen(config, _bent(config, _driven(config, u))), commands)
+    return _each(lambda q: _seen(config, q), _joint_angles(config, commands))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -285,7 +285,7 @@ def _measure(
     loose = jax.vmap(play, (0, None, None))(rows, gap, start).reshape(driven.shape)
     read = _each(lambda q: _seen(config, _bent(config, q)), loose + drift)
     level = jnp.asarray(config.per_axis("noise_std_deg"), dtype)
-    return read + _each(lambda row: level * row, noise)
+    return read + jnp.broadcast_to(level, noise.shape) * noise
 
 
 def _in_its_precision(function: Any, commands_deg: ArrayLike | jax.Array) -> Any:
@@ -297,12 +297,3 @@ def _in_its_precision(function: Any, commands_deg: ArrayLike | jax.Array) -> Any
     commands = numbers("commands", commands_deg)
     with jax.enable_x64(True):
         return np.array(function(jnp.asarray(commands)), dtype=np.float64)
-
-
-def __getattr__(name: str) -> Any:
-    """``render`` and ``animate``, which load MuJoCo or matplotlib, on first use."""
-    if name in ("render", "animate"):
-        from jaxcal.paper.twin import robot_pictures
-
-        return getattr(robot_pictures, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

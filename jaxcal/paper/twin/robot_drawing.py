@@ -1,19 +1,16 @@
-"""The robot drawn by matplotlib: for machines where MuJoCo cannot draw.
+"""The robot drawn by matplotlib, for machines where MuJoCo cannot draw.
 
-The same parts as MuJoCo's, in the same perspective, turned by our own kinematics;
-every face is a polygon, and far ones are painted first.
+The boxes and rods of the compiled scene, in the perspective of its camera: every face
+is a polygon, and far ones are painted first.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-from jaxcal.paper.twin.robot import RobotConfig
-from jaxcal.paper.twin.robot_parts import EYE_M, FIELD_DEG, Part, parts_of, view_axes
 
 __all__ = ["Drawing"]
 
@@ -21,55 +18,80 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 _PATCH_M = 0.04  # large faces are cut up, so that sorting by depth works
-_LAYER_M = 0.015
+_LAYER_M = 0.015  # boxes of the last link lie flat on one another
+_LIGHT = np.array([0.35, 0.85, 0.40])
 
 
 class Drawing:
-    """A figure to draw one robot on, as often as wanted."""
+    """Draws one model as ``mujoco.Renderer`` does: the same three methods.
 
-    def __init__(self, config: RobotConfig, width: int, height: int) -> None:
+    Args:
+        model: ``mujoco.MjModel`` whose geoms are boxes and capsules.
+        width: pixels.
+        height: pixels.
+    """
+
+    def __init__(self, model: Any, width: int, height: int) -> None:
+        import mujoco
         from matplotlib.figure import Figure
 
-        self._order = config.mechanism_order
-        self._parts = parts_of(self._order)
-        self._height = height
         self._figure = Figure(figsize=(width / 100.0, height / 100.0), dpi=100)
         self._axes = self._figure.add_axes((0.0, 0.0, 1.0, 1.0))
         self._aspect = width / height
+        self._zoom = 1.0 / np.tan(np.radians(model.cam_fovy[0]) / 2.0)
+        corners, geoms = [], []
+        for geom in range(model.ngeom):
+            box = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX
+            faces = (_box_faces if box else _rod_faces)(model.geom_size[geom])
+            corners.append(faces)
+            geoms.append(np.full(len(faces), geom))
+        self._corners = np.concatenate(corners)  # (F, 4, 3) in the frames of the geoms
+        self._geom = np.concatenate(geoms)  # (F,) index of the geom of each face
+        normals = np.cross(
+            self._corners[:, 1] - self._corners[:, 0],
+            self._corners[:, 2] - self._corners[:, 1],
+        )
+        outward = np.sign((normals * self._corners[:, 0]).sum(axis=1, keepdims=True))
+        length = np.linalg.norm(normals, axis=1, keepdims=True)
+        self._normals = normals * outward / length  # (F, 3)
+        self._colours = model.geom_rgba[self._geom, :3].astype(np.float64)
+        flat = (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX) & (model.geom_bodyid == 3)
+        self._layer = _LAYER_M * (np.cumsum(flat) * flat)[self._geom]
 
-    def picture(self, joints_deg: Array) -> Image:
-        """(height, width, 3) of the robot at joint angles (3,) in degrees."""
+    def update_scene(self, data: Any, camera: str) -> None:
+        """Take the state of ``mujoco.MjData``; there is one camera only."""
+        self._data = data
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def render(self) -> Image:
+        """(height, width, 3) of the model in that state."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.collections import PolyCollection
 
-        faces, colours, depths = [], [], []
-        turns = _link_rotations(self._order, joints_deg)
-        layer = 0.0  # phone and screen lie flat on what comes before them
-        for part in self._parts:
-            flat = part.link == 3 and part.kind == "box"
-            layer = layer + _LAYER_M if flat else 0.0
-            middle = (
-                (np.array(part.start) + np.array(part.end)) / 2.0 @ turns[part.link].T
-            )
-            for corners, colour in _faces(part):
-                placed = corners @ turns[part.link].T
-                if not _faces_us(placed, middle):
-                    continue
-                points, depth = self._project(placed)
-                faces.append(points)
-                colours.append(_lit(placed, colour))
-                depths.append(depth.mean() - layer)
-        far_first = np.argsort(depths)[::-1]
+        data = self._data
+        turns = data.geom_xmat.reshape(-1, 3, 3)[self._geom]
+        corners = self._corners @ np.matrix_transpose(turns)
+        corners += data.geom_xpos[self._geom][:, None]
+        normals = np.einsum("fij,fj->fi", turns, self._normals)
+        eye, camera = data.cam_xpos[0], data.cam_xmat[0].reshape(3, 3)
+        seen = ((eye - corners[:, 0]) * normals).sum(axis=1) > 0.0
+        placed = (corners[seen] - eye) @ camera  # to the right, up, backwards
+        depth = -placed[..., 2]
+        points = placed[..., :2] / depth[..., None] * self._zoom
+        bright = 0.55 + 0.45 * np.abs(normals[seen] @ _LIGHT)
+        colours = np.minimum(bright[:, None] * self._colours[seen], 1.0)
+        far_first = np.argsort(self._layer[seen] - depth.mean(axis=1))
         axes = self._axes
         axes.clear()
         axes.set_axis_off()
-        axes.set_xlim(-self._aspect, self._aspect)
-        axes.set_ylim(-1.0, 1.0)
+        axes.set(xlim=(-self._aspect, self._aspect), ylim=(-1.0, 1.0))
         axes.add_collection(
             PolyCollection(
-                [faces[i] for i in far_first],
-                facecolors=[colours[i] for i in far_first],
-                edgecolors=[colours[i] for i in far_first],
+                points[far_first],
+                facecolors=colours[far_first],
+                edgecolors=colours[far_first],
                 linewidths=0.4,
             )
         )
@@ -77,79 +99,35 @@ class Drawing:
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
-    def _project(self, points: Array) -> tuple[Array, Array]:
-        right, up, back = view_axes()
-        seen = (points - EYE_M) @ np.stack([right, up, back]).T
-        depth = -seen[:, 2]
-        scale = 1.0 / np.tan(np.radians(FIELD_DEG) / 2.0)
-        return seen[:, :2] / depth[:, None] * scale, depth
 
-    def close(self) -> None:
-        """Let go of the figure."""
-        self._figure.clear()
-
-
-def _link_rotations(order: str, joints_deg: Array) -> list[Array]:
-    """(3, 3) of the stand and of the links behind one, two and three axes."""
-    turned = np.eye(3)
-    turns = [turned]
-    for letter in order:
-        axis = "XYZ".index(letter)
-        angle = np.radians(joints_deg[axis])
-        step = np.eye(3)
+def _box_faces(half: Array) -> Array:
+    """(F, 4, 3) patches of a box with half sides (3,) about its centre."""
+    faces = []
+    for axis in range(3):
         j, k = (axis + 1) % 3, (axis + 2) % 3
-        step[j, j] = step[k, k] = np.cos(angle)
-        step[k, j], step[j, k] = np.sin(angle), -np.sin(angle)
-        turned = turned @ step
-        turns.append(turned)
-    return turns
+        for a, b in itertools.pairwise(_cuts(half[j])):
+            for c, d in itertools.pairwise(_cuts(half[k])):
+                patch = np.empty((4, 3))
+                patch[:, j], patch[:, k] = (a, b, b, a), (c, c, d, d)
+                for side in (-half[axis], half[axis]):
+                    patch[:, axis] = side
+                    faces.append(patch.copy())
+    return np.array(faces)
 
 
-def _faces(part: Part) -> Iterator[tuple[Array, tuple[float, float, float]]]:
-    """Corners (4, 3) of every face; a rod is a prism of eight sides."""
-    start, end = np.array(part.start), np.array(part.end)
-    if part.kind == "box":
-        low, high = np.minimum(start, end), np.maximum(start, end)
-        for axis in range(3):
-            j, k = (axis + 1) % 3, (axis + 2) % 3
-            cuts_j, cuts_k = (_cuts(low[i], high[i]) for i in (j, k))
-            for side in (low[axis], high[axis]):
-                for a, b in itertools.pairwise(cuts_j):
-                    for c, d in itertools.pairwise(cuts_k):
-                        corners = np.empty((4, 3))
-                        corners[:, axis] = side
-                        corners[:, j] = (a, b, b, a)
-                        corners[:, k] = (c, c, d, d)
-                        yield corners, part.colour
-        return
-    along = end - start
-    along /= np.linalg.norm(along)
-    first = np.cross(along, np.eye(3)[int(np.argmin(np.abs(along)))])
-    first *= part.radius / np.linalg.norm(first)
-    second = np.cross(along, first)
+def _cuts(half: float) -> Array:
+    return np.linspace(-half, half, 1 + max(1, round(2.0 * half / _PATCH_M)))
+
+
+def _rod_faces(size: Array) -> Array:
+    """(14, 4, 3) faces of a prism of eight sides along z: radius, half length."""
     turns = np.linspace(0.0, 2.0 * np.pi, 9)
-    round_it = np.cos(turns)[:, None] * first + np.sin(turns)[:, None] * second
-    for one, two in itertools.pairwise(round_it):
-        yield np.stack([start + one, start + two, end + two, end + one]), part.colour
-    for place in (start, end):
-        yield place + round_it[:-1], part.colour
+    low = np.stack([np.cos(turns), np.sin(turns), np.full(9, -1.0)], axis=1)
+    low *= [size[0], size[0], size[1]]
+    high = low * [1.0, 1.0, -1.0]
+    sides = np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1)
+    ends = [end[cut] for end in (low, high) for cut in _CAP]
+    return np.concatenate([sides, ends])
 
 
-def _cuts(low: float, high: float) -> Array:
-    return np.linspace(low, high, 1 + max(1, round((high - low) / _PATCH_M)))
-
-
-def _faces_us(corners: Array, middle: Array) -> bool:
-    """Whether the outside of a face is seen; the parts are convex."""
-    normal = np.cross(corners[1] - corners[0], corners[2] - corners[1])
-    outward = normal if normal @ (corners[0] - middle) > 0.0 else -normal
-    return bool(outward @ (EYE_M - corners[0]) > 0.0)
-
-
-def _lit(corners: Array, colour: Sequence[float]) -> tuple[float, float, float]:
-    normal = np.cross(corners[1] - corners[0], corners[2] - corners[1])
-    length = np.linalg.norm(normal)
-    light = np.array([0.35, 0.85, 0.40])
-    bright = 0.55 + 0.45 * abs(float(normal @ light)) / max(float(length), 1e-12)
-    red, green, blue = (min(1.0, bright * value) for value in colour)
-    return red, green, blue
+_CAP = ([0, 1, 2, 3], [0, 3, 4, 7], [4, 5, 6, 7])  # an octagon by its corners

@@ -5,8 +5,8 @@ and, where there is play, a second hinge between two stops behind it, dragged ag
 friction. Where the joints comply, the servo's stiffness is the joint's and gravity
 acts; a robot that does not comply has a servo of ``STIFFNESS`` and no gravity, because
 an infinitely stiff joint does not sag. What the phone reads is computed from the
-attitude MuJoCo gives, by scipy: nothing is shared with ``jaxcal.paper.twin.robot`` but its
-configuration, so each is a test of the other.
+attitude MuJoCo gives, by scipy: nothing is shared with ``jaxcal.paper.twin.robot`` but
+its configuration, so each is a test of the other.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers
 from jaxcal.paper.twin.robot import GRAVITY, RobotConfig
-from jaxcal.paper.twin.robot_parts import EYE_M, FIELD_DEG, Part, parts_of, view_axes
+from jaxcal.paper.twin.robot_parts import add_parts, add_view
 
 __all__ = [
     "HOLD_S",
     "load_model",
-    "model_xml",
+    "pose",
+    "scene",
     "simulate",
     "timestep_of",
     "trajectory",
@@ -33,11 +34,10 @@ __all__ = [
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 
-HOLD_S = 1.0  # a posture: the paper samples at 1 Hz
+HOLD_S = 1.0  # per posture: the paper samples at 1 Hz
 STIFFNESS = 200.0  # Nm/rad, of the servo of a joint that does not comply
 _ARMATURE = 0.02  # kg m^2, of a motor behind its gear
 _INERTIA = 0.03  # about what a servo moves, for its damping
-_LINK = '<inertial pos="0 0 0" mass="0.5" diaginertia="2e-3 2e-3 2e-3"/>'
 _RAMP_S = 0.03  # time constant of a drive on its way to a new command
 _DRAG = 8.0  # Nm s/rad, of a loose joint against the link before
 
@@ -47,52 +47,90 @@ def timestep_of(config: RobotConfig) -> float:
     return 0.005 if config.per_axis("backlash_deg").any() else 0.01
 
 
-def model_xml(config: RobotConfig, timestep_s: float | None = None) -> str:
-    """The robot as an MJCF document."""
-    timestep_s = timestep_s or timestep_of(config)
-    bodies, closing = "", ""
-    parts = parts_of(config.mechanism_order)
+def scene(config: RobotConfig, timestep_s: float | None = None) -> Any:
+    """The robot as a ``mujoco.MjSpec``, which can still be changed."""
+    import mujoco
+
+    spec = mujoco.MjSpec()
+    spec.modelname = "ankle robot"
+    spec.compiler.degree = False
+    spec.option.timestep = timestep_s or timestep_of(config)
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    heavy = config.per_axis("compliance_deg_per_nm").any()
+    spec.option.gravity = [0.0, -GRAVITY if heavy else 0.0, 0.0]
+    shape = spec.default.geom  # what is seen has no mass and touches nothing
+    shape.contype, shape.conaffinity, shape.mass = 0, 0, 0.0
+    bodies = [spec.worldbody]
+    for letter in config.mechanism_order:
+        bodies.append(_add_link(bodies[-1], letter, config))
+    bodies[3].ipos, bodies[3].inertia = config.load_offset_m, [4e-3] * 3
+    bodies[3].mass = max(config.load_kg, 1e-3)
+    bodies[3].add_site(name="phone", quat=_quaternion(config), rgba=[0.0] * 4)
+    _add_servos(spec, config)
+    add_view(spec)
+    add_parts(bodies, config.mechanism_order)
+    return spec
+
+
+def _add_link(parent: Any, letter: str, config: RobotConfig) -> Any:
+    """The body behind one axis: a driven hinge and, with play, a loose one."""
+    axis = "XYZ".index(letter)
+    number = config.mechanism_order.index(letter) + 1
+    body = parent.add_body(name=f"link{number}", mass=0.5, inertia=[2e-3] * 3)
+    body.explicitinertial = True
+    body.add_joint(name=letter, axis=np.eye(3)[axis], armature=_ARMATURE)
+    half = np.radians(config.per_axis("backlash_deg")[axis]) / 2.0
+    if half > 0.0:
+        body.add_joint(
+            name=f"{letter}_play",
+            axis=np.eye(3)[axis],
+            armature=1e-3,
+            limited=True,
+            range=[-half, half],
+            solref_limit=[-20000.0, -200.0],
+            solimp_limit=[0.99, 0.9999, 1e-5, 0.5, 2.0],
+        )
+    return body
+
+
+def _add_servos(spec: Any, config: RobotConfig) -> None:
+    """Motors in the order pitch, yaw, roll: torque = kp (s u + b - q) - kv q'.
+
+    A loose joint is held back by its angle against the link before, damped.
+    """
+    import mujoco
+
+    compliance = np.radians(config.per_axis("compliance_deg_per_nm"))
     gaps = config.per_axis("backlash_deg")
-    for link, letter in enumerate(config.mechanism_order, start=1):
-        axis = "XYZ".index(letter)
-        vector = " ".join("1" if i == axis else "0" for i in range(3))
-        bodies += (
-            f'<body name="link{link}">{_load(config) if link == 3 else _LINK}'
-            f'<joint name="{letter}" axis="{vector}" armature="{_ARMATURE}"/>'
+    for axis, letter in enumerate("XYZ"):
+        kp = 1.0 / compliance[axis] if compliance[axis] > 0.0 else STIFFNESS
+        kv = 2.0 * np.sqrt(kp * _INERTIA)
+        offset = kp * np.radians(config.bias_deg[axis])
+        spec.add_actuator(
+            name=letter,
+            target=letter,
+            trntype=mujoco.mjtTrn.mjTRN_JOINT,
+            dyntype=mujoco.mjtDyn.mjDYN_FILTEREXACT,
+            biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+            dynprm=_padded(_RAMP_S),
+            gainprm=_padded(kp * config.scale[axis]),
+            biasprm=_padded(offset, -kp, -kv),
         )
         if gaps[axis] > 0.0:
-            half = np.radians(gaps[axis]) / 2.0
-            bodies += (
-                f'<joint name="{letter}_play" axis="{vector}" armature="1e-3" '
-                f'limited="true" range="{-half:.17g} {half:.17g}" '
-                'solreflimit="-20000 -200" solimplimit="0.99 0.9999 1e-5"/>'
-            )
-        bodies += _geometry(parts, link)
-        closing += "</body>"
-    phone = " ".join(f"{value:.17g}" for value in _quaternion(config))
-    return f"""<mujoco model="ankle robot">
-<compiler angle="radian" autolimits="false"/>
-<option timestep="{timestep_s}" integrator="implicitfast"
- gravity="0 {-GRAVITY if config.per_axis("compliance_deg_per_nm").any() else 0.0} 0"/>
-<visual><headlight ambient="0.4 0.4 0.4" diffuse="0.3 0.3 0.3"/>
-<global offwidth="1280" offheight="960"/>
-<quality offsamples="4" shadowsize="2048"/></visual>
-<asset><texture type="skybox" builtin="flat" rgb1="1 1 1" rgb2="1 1 1"
- width="32" height="32"/></asset>
-<default><geom contype="0" conaffinity="0" mass="0"/></default>
-<worldbody>{_camera()}<light pos="0.6 1.5 0.9" dir="-0.4 -1 -0.6"
- diffuse="0.5 0.5 0.5"/>{_geometry(parts, 0)}
-{bodies}<site name="phone" quat="{phone}"/>{closing}</worldbody>
-<tendon>{_drags(gaps)}</tendon>
-<actuator>{_servos(config)}</actuator>
-</mujoco>"""
+            drag = spec.add_tendon(name=f"{letter}_drag")
+            drag.damping[0] = _DRAG
+            drag.wrap_joint(letter, 1.0)
+            drag.wrap_joint(f"{letter}_play", 1.0)
+
+
+def _padded(*values: float) -> list[float]:
+    """MuJoCo takes ten parameters of an actuator."""
+    return [*values, *[0.0] * (10 - len(values))]
 
 
 def load_model(config: RobotConfig, timestep_s: float | None = None) -> Any:
     """The compiled ``mujoco.MjModel``."""
-    import mujoco
-
-    return mujoco.MjModel.from_xml_string(model_xml(config, timestep_s))
+    return scene(config, timestep_s).compile()
 
 
 def simulate(
@@ -133,7 +171,7 @@ def simulate(
     for number, group in enumerate(groups):
         if progress is not None:
             progress("simulate the robot", number * len(group), groups[..., 0].size)
-        _rest(model, data, config)
+        pose(model, data, config.bias_deg)
         for row, command in enumerate(group):
             data.ctrl[:] = command
             mujoco.mj_step(model, data, nstep=steps)
@@ -170,7 +208,7 @@ def trajectory(
     steps = _steps(1.0 / frames_per_s, timestep_s)
     model = load_model(config, timestep_s)
     data = mujoco.MjData(model)
-    _rest(model, data, config)
+    pose(model, data, config.bias_deg)
     loose = config.per_axis("backlash_deg")
     frames = [_links(data, loose)]
     for command in np.radians(commands.reshape(-1, 3)):
@@ -190,12 +228,13 @@ def _steps(seconds: float, timestep_s: float) -> int:
     return round(seconds / timestep_s)
 
 
-def _rest(model: Any, data: Any, config: RobotConfig) -> None:
+def pose(model: Any, data: Any, joints_deg: ArrayLike) -> None:
+    """Put the robot at rest at joint angles (3,) about x, y and z in degrees."""
     import mujoco
 
     mujoco.mj_resetData(model, data)
-    for axis, letter in enumerate("XYZ"):
-        data.joint(letter).qpos[:] = np.radians(config.bias_deg[axis])
+    for letter, angle in zip("XYZ", np.radians(joints_deg), strict=True):
+        data.joint(letter).qpos[:] = angle
     mujoco.mj_forward(model, data)
 
 
@@ -225,63 +264,3 @@ def _quaternion(config: RobotConfig) -> Array:
 
     turn = Rotation.from_euler("XYZ", config.mounting_deg, degrees=True)
     return turn.as_quat()[[3, 0, 1, 2]]
-
-
-def _load(config: RobotConfig) -> str:
-    """Foot and plate: a mass with its own inertia, away from where the axes meet."""
-    place = " ".join(f"{value:.17g}" for value in config.load_offset_m)
-    mass = max(config.load_kg, 1e-3)
-    return f'<inertial pos="{place}" mass="{mass:.17g}" diaginertia="4e-3 4e-3 4e-3"/>'
-
-
-def _servos(config: RobotConfig) -> str:
-    """Motors in the order pitch, yaw, roll: torque = kp (s u + b - q) - kv q'."""
-    lines = ""
-    compliance = np.radians(config.per_axis("compliance_deg_per_nm"))
-    for axis, letter in enumerate("XYZ"):
-        kp = 1.0 / compliance[axis] if compliance[axis] > 0.0 else STIFFNESS
-        kv = 2.0 * np.sqrt(kp * _INERTIA)
-        gain = kp * config.scale[axis]
-        offset = kp * np.radians(config.bias_deg[axis])
-        lines += (
-            f'<general name="{letter}" joint="{letter}" dyntype="filterexact" '
-            f'dynprm="{_RAMP_S}" biastype="affine" '
-            f'gainprm="{gain:.17g}" biasprm="{offset:.17g} {-kp:.17g} {-kv:.17g}"/>'
-        )
-    return lines
-
-
-def _drags(gaps: Array) -> str:
-    """What holds a loose joint back: its angle against the link before, damped."""
-    return "".join(
-        f'<fixed name="{letter}_drag" damping="{_DRAG}"><joint joint="{letter}" '
-        f'coef="1"/><joint joint="{letter}_play" coef="1"/></fixed>'
-        for letter, gap in zip("XYZ", gaps, strict=True)
-        if gap > 0.0
-    )
-
-
-def _camera() -> str:
-    right, up, _ = view_axes()
-    place = " ".join(f"{value:g}" for value in EYE_M)
-    axes = " ".join(f"{value:.9g}" for value in (*right, *up))
-    return f'<camera name="view" pos="{place}" xyaxes="{axes}" fovy="{FIELD_DEG:g}"/>'
-
-
-def _geometry(parts: list[Part], link: int) -> str:
-    """What is seen of a link; it has no mass and touches nothing."""
-    lines = ""
-    for part in parts:
-        if part.link != link:
-            continue
-        rgba = " ".join(f"{value:g}" for value in (*part.colour, 1.0))
-        start, end = np.array(part.start), np.array(part.end)
-        if part.kind == "rod":
-            ends = " ".join(f"{value:g}" for value in (*start, *end))
-            shape = f'type="capsule" size="{part.radius:g}" fromto="{ends}"'
-        else:
-            middle = " ".join(f"{value:g}" for value in (start + end) / 2)
-            size = " ".join(f"{value:g}" for value in np.abs(end - start) / 2)
-            shape = f'type="box" pos="{middle}" size="{size}"'
-        lines += f'<geom {shape} rgba="{rgba}"/>'
-    return lines

@@ -1,4 +1,4 @@
-"""What the robot looks like: boxes and rods, used by MuJoCo and by our own drawing.
+"""What the robot looks like: boxes and rods without mass, on the links of a scene.
 
 A gimbal for any order of the axes: ring i lies in the plane of its own axis and of the
 next one, so both have their bearings on it. The foot's plate hangs in the innermost
@@ -7,12 +7,14 @@ ring; the phone is strapped across it.
 
 from __future__ import annotations
 
-import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["AXIS_COLOURS", "EYE_M", "FIELD_DEG", "Part", "parts_of", "view_axes"]
+__all__ = ["AXIS_COLOURS", "add_parts", "add_view"]
 
 Array = NDArray[np.float64]
 Colour = tuple[float, float, float]
@@ -26,120 +28,126 @@ AXIS_COLOURS: dict[str, Colour] = {
     "Y": (0.0, 0.45, 0.70),  # yaw
     "Z": (0.0, 0.62, 0.45),  # roll
 }
-EYE_M = np.array([0.68, 0.46, 0.88])  # of whoever looks at it
-FIELD_DEG = 38.0  # from the upper edge of the picture to the lower
+_EYE_M = np.array([0.68, 0.46, 0.88])  # of the camera
 _TARGET_M = np.array([0.0, -0.11, 0.0])
+_FIELD_DEG = 38.0  # from the upper edge of the picture to the lower
 _STEEL: Colour = (0.45, 0.47, 0.50)
 _PLATE: Colour = (0.75, 0.77, 0.80)
 _PHONE: Colour = (0.10, 0.10, 0.12)
 _SCREEN: Colour = (0.35, 0.65, 0.95)
 
 
-@dataclasses.dataclass(frozen=True)
-class Part:
-    """A rod from ``start`` to ``end``, or a box between two opposite corners."""
+def add_view(spec: Any) -> None:
+    """A camera named ``view``, a light and a white sky. The world's y axis is up."""
+    import mujoco
+    from scipy.spatial.transform import Rotation
 
-    link: int  # 0 stands on the floor, 1 to 3 turn with that axis
-    kind: str  # rod, box
-    start: tuple[float, float, float]  # metres, from the ankle, in the link's frame
-    end: tuple[float, float, float]
-    radius: float  # metres, of a rod
-    colour: Colour
-
-
-def parts_of(mechanism_order: str) -> list[Part]:
-    """Every part of a robot whose axes stand in this order from the base outwards."""
-    axes = [np.eye(3)["XYZ".index(letter)] for letter in mechanism_order]
-    colours = [AXIS_COLOURS[letter] for letter in mechanism_order]
-    parts = _stand(axes[0])
-    for link in (1, 2):
-        parts += _ring(link, axes[link - 1], axes[link])
-    for link in (1, 2, 3):
-        inner, outer = _RING_RADII_M[link - 1], _RING_RADII_M[link - 1] + 0.045
-        for side in (-1.0, 1.0):
-            reach = inner + 0.012
-            parts.append(
-                _rod(
-                    link,
-                    side * (inner - 0.035) * axes[link - 1],
-                    side * reach * axes[link - 1],
-                    0.007,
-                    colours[link - 1],
-                )
-            )
-        # The motor, carried by the link before; of an upright first axis on its column.
-        end = -axes[0] if link == 1 and abs(axes[0][1]) > 0.5 else axes[link - 1]
-        parts.append(
-            _rod(link - 1, (inner + 0.012) * end, outer * end, 0.022, colours[link - 1])
-        )
-    return parts + _foot(axes[2])
-
-
-def view_axes() -> tuple[Array, Array, Array]:
-    """Right, up and backwards of the camera, each (3,), in the world (y is up)."""
-    back = (EYE_M - _TARGET_M) / np.linalg.norm(EYE_M - _TARGET_M)
+    back = (_EYE_M - _TARGET_M) / np.linalg.norm(_EYE_M - _TARGET_M)
     right = np.cross([0.0, 1.0, 0.0], back)
     right /= np.linalg.norm(right)
-    return right, np.cross(back, right), back
+    turned = Rotation.from_matrix(np.stack([right, np.cross(back, right), back], 1))
+    spec.worldbody.add_camera(
+        name="view", pos=_EYE_M, quat=turned.as_quat()[[3, 0, 1, 2]], fovy=_FIELD_DEG
+    )
+    spec.worldbody.add_light(
+        pos=[0.6, 1.5, 0.9], dir=[-0.4, -1.0, -0.6], diffuse=[0.5] * 3
+    )
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+        rgb1=[1.0] * 3,
+        rgb2=[1.0] * 3,
+        width=32,
+        height=32,
+    )
+    visual = spec.visual
+    visual.headlight.ambient, visual.headlight.diffuse = [0.4] * 3, [0.3] * 3
+    visual.global_.offwidth, visual.global_.offheight = 1280, 960
+    visual.quality.offsamples, visual.quality.shadowsize = 4, 2048
 
 
-def _rod(link: int, start: Array, end: Array, radius: float, colour: Colour) -> Part:
-    return Part(link, "rod", _triple(start), _triple(end), radius, colour)
+def add_parts(bodies: Sequence[Any], mechanism_order: str) -> None:
+    """Add every part of the robot to its link.
+
+    Args:
+        bodies: the world, then the links behind the first, second and third axis
+            (``MjsBody``); coordinates are in metres from the ankle.
+        mechanism_order: the axes from the base outwards, such as "YXZ".
+    """
+    axes = [np.eye(3)["XYZ".index(letter)] for letter in mechanism_order]
+    _add_stand(bodies[0], axes[0])
+    for link in (1, 2):
+        _add_ring(bodies[link], link, axes[link - 1], axes[link])
+    for link, (axis, letter) in enumerate(zip(axes, mechanism_order, strict=True), 1):
+        inner, colour = _RING_RADII_M[link - 1], AXIS_COLOURS[letter]
+        reach = inner + 0.012
+        for side in (-axis, axis):
+            _rod(bodies[link], (inner - 0.035) * side, reach * side, 0.007, colour)
+        # The motor, carried by the link before; that of an upright first axis sits on
+        # the column below.
+        end = -axis if link == 1 and axis[1] > 0.5 else axis
+        _rod(bodies[link - 1], reach * end, (inner + 0.045) * end, 0.022, colour)
+    _add_foot(bodies[3], axes[2])
 
 
-def _box(link: int, low: ArrayLike, high: ArrayLike, colour: Colour) -> Part:
-    return Part(link, "box", _triple(low), _triple(high), 0.0, colour)
+def _rod(body: Any, start: Array, end: Array, radius: float, colour: Colour) -> None:
+    import mujoco
+
+    body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+        fromto=[*start, *end],
+        size=[radius, 0.0, 0.0],
+        rgba=[*colour, 1.0],
+    )
 
 
-def _triple(values: ArrayLike) -> tuple[float, float, float]:
-    x, y, z = (round(float(v), 6) for v in np.asarray(values))
-    return x, y, z
+def _box(body: Any, low: ArrayLike, high: ArrayLike, colour: Colour) -> None:
+    import mujoco
+
+    first, second = np.asarray(low), np.asarray(high)
+    body.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        pos=(first + second) / 2.0,
+        size=np.abs(second - first) / 2.0,
+        rgba=[*colour, 1.0],
+    )
 
 
-def _ring(link: int, first: Array, second: Array) -> list[Part]:
-    """Round the bearing of its own axis outside and that of the next one inside."""
-    wide, narrow = _RING_RADII_M[link - 1], _RING_RADII_M[link]
-    turns = np.linspace(0.0, 2.0 * np.pi, _RING_RODS + 1)
-    way = [
-        (wide - 0.017) * np.cos(t) * first + (narrow + 0.017) * np.sin(t) * second
-        for t in turns
-    ]
-    return [_rod(link, way[i], way[i + 1], 0.008, _STEEL) for i in range(_RING_RODS)]
+def _add_ring(body: Any, link: int, first: Array, second: Array) -> None:
+    """Outside the bearing of the link's own axis, inside that of the next one."""
+    wide, narrow = _RING_RADII_M[link - 1] - 0.017, _RING_RADII_M[link] + 0.017
+    turns = np.linspace(0.0, 2.0 * np.pi, _RING_RODS + 1)[:, None]
+    points = wide * np.cos(turns) * first + narrow * np.sin(turns) * second
+    for start, end in itertools.pairwise(points):
+        _rod(body, start, end, 0.008, _STEEL)
 
 
-def _stand(axis: Array) -> list[Part]:
+def _add_stand(world: Any, axis: Array) -> None:
     """A floor plate, and a post under each bearing of the first axis."""
     floor = np.array([0.0, _FLOOR_M, 0.0])
     x, z = _FLOOR_HALF_M
-    parts = [_box(0, (-x, _FLOOR_M - 0.02, -z), (x, _FLOOR_M, z), _PLATE)]
-    reach = _RING_RADII_M[0] + 0.03
-    if abs(axis[1]) > 0.5:  # upright: one column from below, the motor hangs there
-        return [*parts, _rod(0, floor, -reach * axis + [0, 0.01, 0], 0.02, _STEEL)]
-    for side in (-1.0, 1.0):
-        bearing = side * reach * axis
-        foot = bearing * [1.0, 0.0, 1.0] + floor
-        parts.append(_rod(0, foot, bearing, 0.012, _STEEL))
-    return parts
+    _box(world, (-x, _FLOOR_M - 0.02, -z), (x, _FLOOR_M, z), _PLATE)
+    bearing = (_RING_RADII_M[0] + 0.03) * axis
+    if axis[1] > 0.5:  # upright: one column from below, which carries the motor
+        _rod(world, floor, -bearing + [0.0, 0.01, 0.0], 0.02, _STEEL)
+        return
+    for side in (-bearing, bearing):
+        _rod(world, side * [1.0, 0.0, 1.0] + floor, side, 0.012, _STEEL)
 
 
-def _foot(axis: Array) -> list[Part]:
+def _add_foot(body: Any, axis: Array) -> None:
     """The plate with its heel cup, hung from the innermost axis, and the phone."""
-    reach = _RING_RADII_M[2] - 0.035
-    parts = [
-        _box(3, (-0.05, -0.06, -0.09), (0.05, -0.05, 0.13), _PLATE),
-        _box(3, (-0.05, -0.05, -0.09), (0.05, 0.0, -0.08), _PLATE),
-        _box(3, (-0.036, -0.05, 0.0), (0.036, -0.041, 0.12), _PHONE),
-        _box(3, (-0.031, -0.041, 0.006), (0.031, -0.0395, 0.114), _SCREEN),
-    ]
-    sides = [(-1.0, 1.0), (1.0,), (-1.0, 1.0)][int(np.argmax(np.abs(axis)))]
-    for side in sides:
-        bearing = side * reach * axis
-        corner = np.array([0.05, -0.055, 0.0]) * [1 if axis[0] == 0 else side, 1, 1]
-        if abs(axis[0]) < 0.5:
-            for lateral in (-1.0, 1.0):
-                edge = corner * [lateral, 1.0, 1.0]
-                edge[2] = side * 0.085 if abs(axis[2]) > 0.5 else 0.0
-                parts.append(_rod(3, edge, bearing, 0.006, _PLATE))
-        else:
-            parts.append(_rod(3, corner, bearing, 0.006, _PLATE))
-    return parts
+    _box(body, (-0.05, -0.06, -0.09), (0.05, -0.05, 0.13), _PLATE)
+    _box(body, (-0.05, -0.05, -0.09), (0.05, 0.0, -0.08), _PLATE)
+    _box(body, (-0.036, -0.05, 0.0), (0.036, -0.041, 0.12), _PHONE)
+    _box(body, (-0.031, -0.041, 0.006), (0.031, -0.0395, 0.114), _SCREEN)
+    about = int(np.argmax(axis))
+    for side in ((-1.0, 1.0), (1.0,), (-1.0, 1.0))[about]:
+        bearing = side * (_RING_RADII_M[2] - 0.035) * axis
+        if about == 0:
+            _rod(body, np.array([side * 0.05, -0.055, 0.0]), bearing, 0.006, _PLATE)
+            continue
+        for x in (-0.05, 0.05):
+            edge = np.array([x, -0.055, side * 0.085 if about == 2 else 0.0])
+            _rod(body, edge, bearing, 0.006, _PLATE)

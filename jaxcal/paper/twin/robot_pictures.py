@@ -1,17 +1,17 @@
-"""A picture and a short film of the robot: MuJoCo without a screen, or our own drawing.
+"""A picture and a short film of the robot, by MuJoCo or, without OpenGL, by matplotlib.
 
-MuJoCo draws through EGL where the machine has it. Where it has not, matplotlib draws
-the same parts, turned by the same angles; what drew is returned and printed, never
-hidden. Files are written by pillow, so no encoder is needed.
+``mujoco.Renderer`` draws where there is EGL or OSMesa, which need no screen. Where
+there is neither, matplotlib draws the same scene; what drew is returned and printed.
+Files are written by pillow, so no encoder is needed.
 
 ``python -m jaxcal.paper.twin.robot_pictures DIR`` writes robot.png and robot.gif.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
-import ctypes
+import ctypes.util
+import importlib
 import io
 import itertools
 import os
@@ -23,15 +23,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.progress import Progress as Reporter
 from jaxcal.files import atomic_write
+from jaxcal.paper import command
 from jaxcal.paper.twin.robot import RobotConfig, joint_angles, read_out
+from jaxcal.paper.twin.robot_drawing import Drawing
+from jaxcal.paper.twin.robot_model import load_model, pose, trajectory
 from jaxcal.paper.twin.robot_parts import AXIS_COLOURS
+from jaxcal.progress import Progress
 
 __all__ = ["BACKENDS", "animate", "draw", "main", "render"]
 
 Array = NDArray[np.float64]
-Progress = Callable[[str, int, int], None]
+Report = Callable[[str, int, int], None]
 Image = NDArray[np.uint8]
 """(height, width, 3)"""
 
@@ -48,7 +51,7 @@ TOUR_DEG = (  # what the film goes through: each axis alone, then all of them
     (-15.0, -10.0, 14.0),
 )
 _FRAMES_PER_S = 10.0
-_MOVE_S, _REST_S = 0.7, 0.3  # of the film, a posture
+_MOVE_S, _REST_S = 0.7, 0.3  # of the film, per posture
 _PALETTE, _PALETTE_FRAMES = 96, 8  # colours of a GIF, frames they are taken from
 
 
@@ -74,12 +77,12 @@ def render(
 
     Raises:
         OSError: the file cannot be written.
-        RuntimeError: mujoco was asked for and there is no EGL.
+        RuntimeError: mujoco was asked for and cannot draw here.
     """
-    command = np.asarray(commands_deg, dtype=np.float64).reshape(1, 3)
+    command_deg = np.asarray(commands_deg, dtype=np.float64).reshape(1, 3)
     with draw(config, size, backend) as (name, picture):
-        image = picture(np.asarray(joint_angles(config, command))[0])
-    _save(path, [_captioned(config, image, command[0])], 0)
+        image = picture(np.asarray(joint_angles(config, command_deg))[0])
+    _save(path, [_captioned(config, image, command_deg[0])], 0)
     return name
 
 
@@ -90,37 +93,28 @@ def animate(
     *,
     size: tuple[int, int] = (480, 360),
     backend: str = "auto",
-    progress: Progress | None = None,
+    progress: Report | None = None,
 ) -> str:
-    """Write a film of the robot on its way through postures, as MuJoCo moves it.
+    """Write a film of the robot moving through postures, simulated by MuJoCo.
 
     Args:
         config: the robot.
         path: of the GIF.
-        commands_deg: (N, 3) pitch, yaw, roll in degrees, a second each.
-        size: width and height in pixels, at most 1280 x 960.
-        backend: mujoco, matplotlib, or auto: the first that works.
+        commands_deg: (N, 3) pitch, yaw, roll in degrees, one second each.
+        size: as ``backend`` and what is returned and raised, see ``render``.
+        backend: mujoco, matplotlib or auto.
         progress: told how many frames of how many are drawn.
-
-    Returns:
-        What drew it: mujoco or matplotlib.
-
-    Raises:
-        OSError: the file cannot be written.
-        RuntimeError: mujoco was asked for and there is no EGL.
     """
-    from jaxcal.paper.twin.robot_model import trajectory
-
     way = _smooth(np.asarray(commands_deg, dtype=np.float64).reshape(-1, 3))
     links = trajectory(
         config, way, hold_s=1.0 / _FRAMES_PER_S, frames_per_s=_FRAMES_PER_S
     )[1:]
     with draw(config, size, backend) as (name, picture):
         frames: list[Any] = []
-        for angles, command in zip(links, way, strict=True):
+        for angles, command_deg in zip(links, way, strict=True):
             if progress is not None:
                 progress("draw the film", len(frames), len(way))
-            frames.append(_captioned(config, picture(angles), command))
+            frames.append(_captioned(config, picture(angles), command_deg))
     _save(path, frames, round(1000.0 / _FRAMES_PER_S))
     return name
 
@@ -128,8 +122,10 @@ def animate(
 @contextlib.contextmanager
 def draw(
     config: RobotConfig, size: tuple[int, int], backend: str = "auto"
-) -> Iterator[tuple[str, Any]]:
-    """A function from joint angles (3,) in degrees to an image, and what draws it."""
+) -> Iterator[tuple[str, Callable[[ArrayLike], Image]]]:
+    """What draws, and a function from joint angles (3,) in degrees to an image."""
+    import mujoco
+
     if backend not in BACKENDS:
         raise ValueError(
             f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}"
@@ -137,105 +133,60 @@ def draw(
     width, height = size
     if not (1 <= width <= 1280 and 1 <= height <= 960):
         raise ValueError(f"size must be within 1280 x 960 pixels, got {size}")
-    if backend != "matplotlib":
-        scene = None
-        try:
-            scene = _MujocoScene(config, width, height)
-        except Exception as error:  # drivers fail in every way there is
-            if backend == "mujoco":
-                raise RuntimeError(f"MuJoCo cannot draw here: {_why(error)}") from None
-        if scene is not None:
-            try:
-                yield "mujoco", scene.picture
-            finally:
-                scene.close()
-            return
-    from jaxcal.paper.twin.robot_drawing import Drawing
-
-    drawing = Drawing(config, width, height)
+    model = load_model(config)
+    data = mujoco.MjData(model)
     try:
-        yield "matplotlib", drawing.picture
-    finally:
-        drawing.close()
+        if backend == "matplotlib":
+            raise RuntimeError("not asked for")
+        canvas, name = _renderer(model, width, height), "mujoco"
+    except Exception as error:  # drivers fail in many ways
+        if backend == "mujoco":
+            why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+            raise RuntimeError(f"MuJoCo cannot draw here: {why}") from None
+        canvas, name = Drawing(model, width, height), "matplotlib"
+
+    def picture(joints_deg: ArrayLike) -> Image:
+        pose(model, data, joints_deg)
+        canvas.update_scene(data, "view")
+        return canvas.render()
+
+    with contextlib.closing(canvas):
+        yield name, picture
 
 
-def _why(error: Exception) -> str:
-    """What is missing, in words; of a broken driver, its own."""
-    try:
-        ctypes.CDLL("libEGL.so.1")
-    except OSError:
-        return "there is no EGL library (Debian: libegl1 and libgl1-mesa-dri)"
-    return " ".join(str(error).split()).rstrip(".") or type(error).__name__
+def _renderer(model: Any, width: int, height: int) -> Any:
+    """A ``mujoco.Renderer`` that needs no screen.
 
+    MuJoCo chooses its OpenGL library when it is imported, by MUJOCO_GL; on Linux
+    without that variable it would open a window. There EGL or OSMesa is used for this
+    renderer alone, and the environment is left as it was.
+    """
+    import mujoco
 
-# -- MuJoCo ----------------------------------------------------------------------------
-
-
-class _MujocoScene:
-    """MuJoCo's renderer on an EGL context of its own, without its global switches."""
-
-    def __init__(self, config: RobotConfig, width: int, height: int) -> None:
-        import mujoco
-
-        from jaxcal.paper.twin.robot_model import load_model
-
-        platform = os.environ.get("PYOPENGL_PLATFORM")
-        try:
-            from mujoco.egl import GLContext  # names its platform in the environment
-        finally:
-            if platform is None:
-                os.environ.pop("PYOPENGL_PLATFORM", None)
-        self._mujoco = mujoco
-        self._model = load_model(config)
-        self._model.vis.global_.offwidth = width
-        self._model.vis.global_.offheight = height
-        self._data = mujoco.MjData(self._model)
-        self._gl = GLContext(width, height)
-        try:
-            self._gl.make_current()
-            self._context = mujoco.MjrContext(
-                self._model, mujoco.mjtFontScale.mjFONTSCALE_100
-            )
-        except BaseException:
-            self._gl.free()
-            raise
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
-        self._scene = mujoco.MjvScene(self._model, maxgeom=1000)
-        self._option = mujoco.MjvOption()
-        self._option.sitegroup[:] = 0
-        self._camera = mujoco.MjvCamera()
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._camera.fixedcamid = self._model.camera("view").id
-        self._viewport = mujoco.MjrRect(0, 0, width, height)
-
-    def picture(self, joints_deg: Array) -> Image:
-        mujoco = self._mujoco
-        for axis, letter in enumerate("XYZ"):
-            self._data.joint(letter).qpos[:] = np.radians(joints_deg[axis])
-        mujoco.mj_forward(self._model, self._data)
-        mujoco.mjv_updateScene(
-            self._model,
-            self._data,
-            self._option,
-            None,
-            self._camera,
-            mujoco.mjtCatBit.mjCAT_ALL.value,
-            self._scene,
+    if os.environ.get("MUJOCO_GL") or not sys.platform.startswith("linux"):
+        return mujoco.Renderer(model, height, width)
+    found = (name for name in ("EGL", "OSMesa") if ctypes.util.find_library(name))
+    library = next(found, None)
+    if library is None:
+        raise RuntimeError(
+            "there is no EGL or OSMesa library (Debian: libegl1 and libgl1-mesa-dri)"
         )
-        mujoco.mjr_render(self._viewport, self._scene, self._context)
-        image = np.empty((self._viewport.height, self._viewport.width, 3), np.uint8)
-        mujoco.mjr_readPixels(image, None, self._viewport, self._context)
-        return image[::-1]
-
-    def close(self) -> None:
-        self._context.free()
-        self._gl.free()
+    chosen = sys.modules[mujoco.Renderer.__module__].gl_context  # where it looks
+    before, platform = chosen.GLContext, os.environ.get("PYOPENGL_PLATFORM")
+    try:
+        backend = importlib.import_module(f"mujoco.{library.lower()}")
+        chosen.GLContext = backend.GLContext
+        return mujoco.Renderer(model, height, width)
+    finally:
+        chosen.GLContext = before
+        if platform is None:
+            os.environ.pop("PYOPENGL_PLATFORM", None)
 
 
 # -- captions and files ----------------------------------------------------------------
 
 
-def _captioned(config: RobotConfig, image: Image, command: Array) -> Any:
+def _captioned(config: RobotConfig, image: Image, command_deg: Array) -> Any:
     """A pillow image that says what was commanded and what the phone reads."""
     from PIL import Image as Pillow
     from PIL import ImageDraw, ImageFont
@@ -244,15 +195,12 @@ def _captioned(config: RobotConfig, image: Image, command: Array) -> Any:
     pen = ImageDraw.Draw(picture)
     size = max(11, picture.height // 30)
     font = ImageFont.load_default(size)
-    read = np.asarray(read_out(config, command))
+    read = np.asarray(read_out(config, command_deg))
     rows = [("axis", "command", "phone", (60, 60, 60))]
-    for i, (name, letter) in enumerate(
-        zip(("pitch", "yaw", "roll"), "XYZ", strict=True)
-    ):
+    names = ("pitch", "yaw", "roll")
+    for name, letter, told, seen in zip(names, "XYZ", command_deg, read, strict=True):
         red, green, blue = (round(255 * value) for value in AXIS_COLOURS[letter])
-        rows.append(
-            (name, f"{command[i]:+.1f}°", f"{read[i]:+.1f}°", (red, green, blue))
-        )
+        rows.append((name, f"{told:+.1f}°", f"{seen:+.1f}°", (red, green, blue)))
     for line, (name, told, reached, colour) in enumerate(rows):
         y = size * (0.6 + 1.35 * line)
         pen.text((0.7 * size, y), name, colour, font)
@@ -263,20 +211,14 @@ def _captioned(config: RobotConfig, image: Image, command: Array) -> Any:
 
 
 def _save(path: str | os.PathLike[str], frames: list[Any], frame_ms: int) -> None:
+    """One frame as a PNG, several as a GIF that repeats."""
     buffer = io.BytesIO()
     if frame_ms == 0:
         frames[0].save(buffer, "PNG", optimize=True)
     else:
-        few = _in_one_palette(frames)
-        few[0].save(
-            buffer,
-            "GIF",
-            save_all=True,
-            append_images=few[1:],
-            duration=frame_ms,
-            loop=0,
-            optimize=False,
-        )
+        first, *rest = _in_one_palette(frames)
+        film = {"save_all": True, "append_images": rest, "duration": frame_ms}
+        first.save(buffer, "GIF", loop=0, optimize=False, **film)
     with atomic_write(path) as file:
         file.write(buffer.getvalue())
 
@@ -299,37 +241,33 @@ def _smooth(postures_deg: Array) -> Array:
     stops = np.concatenate([np.zeros((1, 3)), postures_deg, np.zeros((1, 3))])
     t = np.linspace(0.0, 1.0, round(_MOVE_S * _FRAMES_PER_S) + 1)[1:]
     bend = t**3 * (10.0 - 15.0 * t + 6.0 * t**2)
-    way = []
-    for start, end in itertools.pairwise(stops):
-        way.append(start + bend[:, None] * (end - start))
-        way.append(np.repeat(end[None], round(_REST_S * _FRAMES_PER_S), axis=0))
-    return np.concatenate(way)
+    bend = np.append(bend, np.ones(round(_REST_S * _FRAMES_PER_S)))
+    pairs = itertools.pairwise(stops)
+    return np.concatenate([start + np.outer(bend, end - start) for start, end in pairs])
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Write both; the exit code."""
-    parser = argparse.ArgumentParser(
+    parser = command.Parser(
         prog="python -m jaxcal.paper.twin.robot_pictures",
         description="Write robot.png and robot.gif, a picture and a film of the robot.",
     )
     parser.add_argument("folder", type=pathlib.Path, metavar="DIR")
     parser.add_argument("--backend", choices=BACKENDS, default="auto")
     options = parser.parse_args(arguments)
-    config = RobotConfig(mechanism_order="YXZ", read_out_order="YXZ")
-    progress = Reporter()
-    try:
+
+    def write() -> None:
+        config = RobotConfig(mechanism_order="YXZ", read_out_order="YXZ")
         options.folder.mkdir(parents=True, exist_ok=True)
         path = options.folder / "robot.png"
         name = render(config, path, backend=options.backend)
         print(f"saved: {path}, drawn by {name}", flush=True)
-        path = options.folder / "robot.gif"
+        path, progress = options.folder / "robot.gif", Progress()
         name = animate(config, path, backend=options.backend, progress=progress)
         progress.clear()
         print(f"saved: {path}, drawn by {name}")
-    except (OSError, RuntimeError) as error:
-        print(f"robot_pictures: error: {error}", file=sys.stderr)
-        return 2
-    return 0
+
+    return command.run(write, "robot_pictures", "files already named are complete")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,16 @@
-"""Compiled branch and bound; :mod:`jaxcal.selection.exact.branch_and_bound` is its front.
+"""Compiled branch and bound; ``jaxcal.selection.exact.branch_and_bound`` is its front.
 
 A node bounds the count of every candidate, ``low_i <= c_i <= high_i``, sum k. Its
-relaxation is climbed by moving weight between two candidates at a time; any point on
-the way gives a true bound (see :mod:`jaxcal.information.relaxation`), whose linear
-maximum is taken through one multiplier ``cut``:
+relaxation lets counts be real numbers; it is climbed by moving weight between two
+candidates at a time. Any point on the way, with information M0 = P + sum c_i B_i.T B_i
+and W its inverse, gives a true bound, by concavity and a scaling of W:
 
-    a = k cut + sum of max(low_i (d_i - cut), high_i (d_i - cut)),  d_i leverage.
+    log det M(c) <= log det M0 + p log(a / p),   a = max over c of trace(W M(c)),
+
+which is tight at the relaxed optimum. With d_i = trace(B_i W B_i.T), the leverage,
+``a`` is taken through one multiplier ``cut``:
+
+    a = trace(W P) + k cut + sum of max(low_i (d_i - cut), high_i (d_i - cut)).
 
 Forcing one count away from the side the multiplier puts it on costs |d_i - cut| a unit,
 which tightens ``low`` and ``high`` wherever the bound then falls to the incumbent.
@@ -16,13 +21,22 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from jaxcal.information.linear_algebra import add_outer, factor, gram_of
+from jaxcal.information.linear_algebra import (
+    add_block,
+    block_cross,
+    block_products,
+    factor,
+    gram_of,
+    row_cross,
+    row_products,
+)
 
-__all__ = ["offer", "offer_swaps", "process", "search"]
+__all__ = ["offer", "offer_swaps", "process", "relax", "search"]
 
 _WHOLE = 1e-9  # a count this near a whole number is that number
 _SOLVED = 1e-11  # spread of leverages that may move at the relaxed optimum
 _MAX_STEPS = 4000
+_SHARE = 0.05  # see relax: solving a node further rarely closes it
 
 
 @njit(cache=True, nogil=True)
@@ -52,60 +66,73 @@ def offer(counts, log_det, best_counts, best_values):
 
 
 @njit(cache=True, nogil=True)
-def offer_swaps(rows, low, high, counts, best_counts, best_values):
-    """Offer every selection one swap away from ``counts``."""
-    num_rows, p = rows.shape
+def offer_swaps(blocks, prior, low, high, counts, best_counts, best_values):
+    """Offer every selection one swap away from ``counts`` (M,)."""
+    num_blocks, _, p = blocks.shape
     gram = np.empty((p, p))
     inverse = np.empty((p, p))
-    for i in range(num_rows):
+    for i in range(num_blocks):
         if counts[i] > low[i]:
             counts[i] -= 1
-            for j in range(num_rows):
+            for j in range(num_blocks):
                 if j != i and counts[j] < high[j]:
                     counts[j] += 1
-                    gram_of(rows, counts, gram)
+                    gram_of(blocks, counts, prior, gram)
                     offer(counts, factor(gram, inverse), best_counts, best_values)
                     counts[j] -= 1
             counts[i] += 1
 
 
 @njit(cache=True, nogil=True)
-def _leverages(columns, inverse, leverage):
-    p, num_rows = columns.shape
-    for j in range(num_rows):
+def _leverages(columns, inverse, products, leverage, curvature):
+    """Fill leverage (M,), trace(B_j V B_j.T), and for q > 1 its curvature (M,).
+
+    ``curvature_j`` is the squared Frobenius norm of B_j V B_j.T; ``products`` is work
+    space (q, q, M).
+    """
+    q = len(columns)
+    if q == 1:
+        row_products(columns[0], columns[0], inverse, True, leverage)
+        return
+    block_products(columns, inverse, products)
+    for j in range(len(leverage)):
         leverage[j] = 0.0
-    for a in range(p):
-        for b in range(a + 1):
-            w = inverse[a, b] if a == b else 2.0 * inverse[a, b]
-            for j in range(num_rows):
-                leverage[j] += w * columns[a, j] * columns[b, j]
+        curvature[j] = 0.0
+        for r in range(q):
+            leverage[j] += products[r, r, j]
+            curvature[j] += products[r, r, j] ** 2
+            for s in range(r):
+                curvature[j] += 2.0 * products[r, s, j] ** 2
 
 
 @njit(cache=True, nogil=True)
-def _apply(columns, inverse, x, out):
-    """``out_j = x_j.T inverse x``."""
-    p, num_rows = columns.shape
-    for j in range(num_rows):
+def _cross_squares(columns, inverse, block, products, out):
+    """out_j = squared Frobenius norm of ``block inverse B_j.T``; products as above."""
+    q = len(columns)
+    if q == 1:
+        row_cross(columns[0], inverse, block, 0, out)
+        for j in range(len(out)):
+            out[j] *= out[j]
+        return
+    block_cross(columns, inverse, block, products)
+    for j in range(len(out)):
         out[j] = 0.0
-    for a in range(p):
-        total = 0.0
-        for b in range(p):
-            total += inverse[a, b] * x[b]
-        for j in range(num_rows):
-            out[j] += total * columns[a, j]
+        for r in range(q):
+            for s in range(q):
+                out[j] += products[r, s, j] ** 2
 
 
 @njit(cache=True, nogil=True)
-def _balance(rows, low, high, c, k, leverage):
+def _balance(low, high, c, k, leverage):
     """Move c into its bounds and back to sum k, keeping it near where it was."""
-    num_rows = len(c)
+    num_blocks = len(c)
     total = 0.0
-    for i in range(num_rows):
+    for i in range(num_blocks):
         c[i] = min(max(c[i], float(low[i])), float(high[i]))
         total += c[i]
     while abs(total - k) > 1e-12:
         best = -1
-        for i in range(num_rows):
+        for i in range(num_blocks):
             if total < k:
                 if c[i] < high[i] and (best < 0 or leverage[i] > leverage[best]):
                     best = i
@@ -155,28 +182,41 @@ def _linear_maximum(low, high, leverage, up, down, k):
 
 
 @njit(cache=True, nogil=True)
-def _relax(rows, columns, low, high, c, k, goal, gram, inverse, leverage, cross):
+def relax(
+    blocks, columns, prior, low, high, c, k, goal, share, gram, inverse, work
+):  # fmt: skip
     """Climb the relaxation of a node until it is pruned, or solved well enough.
+
+    Args:
+        blocks, columns, prior: (M, q, p), (q, p, M), (p, p).
+        low, high, c: (M,) bounds, and the weights to start from, changed in place.
+        k: selections in all.
+        goal: a bound at or below it ends the climb.
+        share: so does a bound this share of its distance to the goal from solved.
+        gram, inverse: (p, p) work space.
+        work: (3, M); the first row holds the leverages afterwards.
 
     Returns:
         log det of the matrix the bound is taken at, the linear maximum a, and the
         multiplier behind it; the bound is ``log det + p log(a / p)``. log det is -inf
         where every selection of the node is singular.
     """
-    num_rows, p = rows.shape
-    gram_of(rows, c, gram)
+    num_blocks, q, p = blocks.shape
+    leverage, curvature, cross = work[0], work[1], work[2]
+    products = np.empty((q, q, num_blocks))
+    gram_of(blocks, c, prior, gram)
     value = factor(gram, inverse)
     if not value > -np.inf:
         _spread(low, high, c, k)
-        gram_of(rows, c, gram)
+        gram_of(blocks, c, prior, gram)
         value = factor(gram, inverse)
         if not value > -np.inf:
             return value, 0.0, 0.0
-    _leverages(columns, inverse, leverage)
     most, cut = 0.0, 0.0
     for step_number in range(_MAX_STEPS):
+        _leverages(columns, inverse, products, leverage, curvature)
         up, down = -1, -1
-        for i in range(num_rows):
+        for i in range(num_blocks):
             if c[i] < high[i] and (up < 0 or leverage[i] > leverage[up]):
                 up = i
             if c[i] > low[i] and (down < 0 or leverage[i] < leverage[down]):
@@ -184,17 +224,23 @@ def _relax(rows, columns, low, high, c, k, goal, gram, inverse, leverage, cross)
         solved = up < 0 or down < 0 or leverage[up] - leverage[down] <= _SOLVED
         if solved or step_number % 4 == 0 or step_number == _MAX_STEPS - 1:
             most, cut = _linear_maximum(low, high, leverage, up, down, k)
+            most += _trace(inverse, prior)
             gap = p * np.log(most / p)
-            if solved or gap <= max(goal - value, 1e-11, 0.05 * (value - goal)):
+            if solved or gap <= max(goal - value, 1e-11, share * (value - goal)):
                 break
-        _apply(columns, inverse, rows[up], cross)
+        _cross_squares(columns, inverse, blocks[up], products, cross)
         best, best_gain, best_step = -1, 0.0, 0.0
         rise = high[up] - c[up]
-        for j in range(num_rows):
+        for j in range(num_blocks):
             fall = c[j] - low[j]
             slope = leverage[up] - leverage[j]
             if fall > 0.0 and slope > 0.0:
-                curve = leverage[up] * leverage[j] - cross[j] * cross[j]
+                # One reading: det grows by 1 + step slope - step^2 curve, exactly.
+                # More: the same to second order of log det, held to below.
+                if q == 1:
+                    curve = leverage[up] * leverage[j] - cross[j]
+                else:
+                    curve = 0.5 * (curvature[up] - 2.0 * cross[j] + curvature[j])
                 step = min(rise, fall)
                 if 2.0 * curve * step > slope:
                     step = slope / (2.0 * curve)
@@ -203,40 +249,57 @@ def _relax(rows, columns, low, high, c, k, goal, gram, inverse, leverage, cross)
                     best, best_gain, best_step = j, gain, step
         if best < 0:
             most, cut = _linear_maximum(low, high, leverage, up, down, k)
+            most += _trace(inverse, prior)
             break
         fall = c[best] - low[best]
+        before, moved = value, 0.0
+        while True:
+            add_block(gram, blocks, up, best_step - moved)
+            add_block(gram, blocks, best, moved - best_step)
+            moved = best_step
+            value = factor(gram, inverse)
+            if q == 1 or value >= before or best_step < 1e-12:
+                break
+            best_step *= 0.5
         c[up] = float(high[up]) if best_step == rise else c[up] + best_step
         c[best] = float(low[best]) if best_step == fall else c[best] - best_step
-        add_outer(gram, rows[up], best_step)
-        add_outer(gram, rows[best], -best_step)
-        value = factor(gram, inverse)
-        _leverages(columns, inverse, leverage)
     return value, most, cut
 
 
 @njit(cache=True, nogil=True)
+def _trace(inverse, prior):
+    """``trace(inverse prior)`` of symmetric matrices."""
+    total = 0.0
+    for a in range(len(prior)):
+        for b in range(len(prior)):
+            total += inverse[a, b] * prior[a, b]
+    return total
+
+
+@njit(cache=True, nogil=True)
 def process(
-    rows, columns, low, high, c, k, slack, best_counts, best_values, gram, inverse, work
-):
+    blocks, columns, prior, low, high, c, k, slack,
+    best_counts, best_values, gram, inverse, work,
+):  # fmt: skip
     """Solve, tighten and, where settled, close one node.
 
     Args:
-        rows, columns: (M, p) and (p, M).
+        blocks, columns, prior: (M, q, p), (q, p, M), (p, p).
         low, high, c: (M,) bounds and starting weights, changed in place.
         k: selections in all.
         slack: a bound this far above the incumbent still closes the node.
         best_counts, best_values: (best, M) and (best,) incumbents, changed in place.
-        gram, inverse, work: (p, p), (p, p), (2, M) work space.
+        gram, inverse, work: (p, p), (p, p), (3, M) work space.
 
     Returns:
         The node's upper bound (-inf when closed) and the candidate to branch on.
     """
-    num_rows, p = rows.shape
-    leverage = work[1]
+    num_blocks, _, p = blocks.shape
+    leverage = work[0]
     last = len(best_values) - 1
     goal = best_values[last] + slack
-    value, most, cut = _relax(
-        rows, columns, low, high, c, k, goal, gram, inverse, leverage, work[0]
+    value, most, cut = relax(
+        blocks, columns, prior, low, high, c, k, goal, _SHARE, gram, inverse, work
     )
     if not value > -np.inf:
         return -np.inf, -1
@@ -247,7 +310,7 @@ def process(
     needed = p * np.exp((goal - value) / p)
     total_low = 0
     total_high = 0
-    for i in range(num_rows):
+    for i in range(num_blocks):
         if low[i] < high[i]:
             slope = leverage[i] - cut
             if abs(slope) > 0.0:
@@ -263,12 +326,12 @@ def process(
         return -np.inf, -1
     settled = total_low == k or total_high == k
     if settled:
-        for i in range(num_rows):
+        for i in range(num_blocks):
             c[i] = low[i] if total_low == k else high[i]
     whole = True
     branch = -1
     score = -1.0
-    for i in range(num_rows):
+    for i in range(num_blocks):
         away = abs(c[i] - np.round(c[i]))
         if away > _WHOLE:
             whole = False
@@ -279,13 +342,13 @@ def process(
                 score = this
                 branch = i
     if whole:
-        counts = np.empty(num_rows, dtype=np.int64)
+        counts = np.empty(num_blocks, dtype=np.int64)
         total = 0
-        for i in range(num_rows):
+        for i in range(num_blocks):
             counts[i] = np.int64(np.round(c[i]))
             total += counts[i]
         if total == k:
-            gram_of(rows, counts, gram)
+            gram_of(blocks, counts, prior, gram)
             offer(counts, factor(gram, inverse), best_counts, best_values)
     if settled or bound <= best_values[last] + slack:
         return -np.inf, -1
@@ -294,13 +357,13 @@ def process(
 
 @njit(cache=True, nogil=True)
 def search(
-    rows, columns, k, slack, lows, highs, weights, bounds, size,
+    blocks, columns, prior, k, slack, lows, highs, weights, bounds, size,
     best_counts, best_values, widest, node_limit,
 ):  # fmt: skip
     """Branch until no open node is left, the room is full or the nodes are spent.
 
     Args:
-        rows, columns: (M, p) and (p, M).
+        blocks, columns, prior: (M, q, p), (q, p, M), (p, p).
         k: selections in all.
         slack: see :func:`process`.
         lows, highs, weights, bounds: (room, M) x 3 and (room,) open nodes.
@@ -312,15 +375,15 @@ def search(
     Returns:
         Open nodes left and nodes processed.
     """
-    num_rows, p = rows.shape
+    num_blocks, _, p = blocks.shape
     room = len(bounds)
     gram = np.empty((p, p))
     inverse = np.empty((p, p))
-    work = np.empty((2, num_rows))
-    low = np.empty(num_rows, dtype=np.int64)
-    high = np.empty(num_rows, dtype=np.int64)
-    c = np.empty(num_rows)
-    leverage = np.empty(num_rows)
+    work = np.empty((3, num_blocks))
+    low = np.empty(num_blocks, dtype=np.int64)
+    high = np.empty(num_blocks, dtype=np.int64)
+    c = np.empty(num_blocks)
+    leverage = np.empty(num_blocks)
     last = len(best_values) - 1
     nodes = 0
     while size > 0 and nodes < node_limit and size + 2 <= room:
@@ -343,13 +406,13 @@ def search(
             continue
         nodes += 1
         bound, branch = process(
-            rows, columns, low, high, c, k, slack,
+            blocks, columns, prior, low, high, c, k, slack,
             best_counts, best_values, gram, inverse, work,
         )  # fmt: skip
         if branch < 0:
             continue
         bound = min(bound, parent)
-        leverage[:] = work[1]
+        leverage[:] = work[0]
         split = np.int64(np.floor(c[branch] + _WHOLE))
         split = min(max(split, low[branch]), high[branch] - 1)
         for side in range(2):
@@ -361,6 +424,6 @@ def search(
                 highs[size, branch] = split
             else:
                 lows[size, branch] = split + 1
-            if _balance(rows, lows[size], highs[size], weights[size], k, leverage):
+            if _balance(lows[size], highs[size], weights[size], k, leverage):
                 size += 1
     return size, nodes

@@ -1,8 +1,8 @@
 """The proven optimum, by whichever proof is cheaper.
 
-k = n + 1: the absolute determinant is convex in each posture, so only vertices of the
-convex hull matter, and :mod:`jaxcal.selection.exact.volume` enumerates them without numba.
-Everything else (more postures, hulls too large to enumerate, many inputs) goes to
+k = n + 1 affine postures: the absolute determinant is convex in each posture, so only
+vertices of the convex hull matter, and :mod:`jaxcal.selection.exact.volume` finds the
+largest volume. Everything else (more postures, blocks, priors, many runners-up) goes to
 branch and bound, started from the exchange. The runner-up need not lie on the hull, so
 ``best`` > 1 does without it.
 """
@@ -10,29 +10,29 @@ branch and bound, started from the exchange. The runner-up need not lie on the h
 from __future__ import annotations
 
 import dataclasses
+import functools
+import time
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.information.regression import log_det_information
-from jaxcal.information.relaxation import relaxed_bound
-from jaxcal.selection.exact.branch_and_bound import branch_and_bound
+from jaxcal.selection.exact.branch_and_bound import branch_and_bound, relaxed_bound
 from jaxcal.selection.exact.volume import enumeration_cost, largest_volumes
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.greedy import greedy_indices
-from jaxcal.selection.problem import Problem
+from jaxcal.selection.problem import Problem, log_dets, make_block_problem
+from jaxcal.selection.solver import Found, in_threads
 
-__all__ = ["STARTING_RESTARTS", "ExactResult", "solve_exact", "upper_bound"]
+__all__ = ["STARTING_RESTARTS", "ExactResult", "solve", "solve_exact", "upper_bound"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-STARTING_RESTARTS = (
-    30  # of the exchange: enough to start from, the search does the rest
-)
+STARTING_RESTARTS = 30  # of the exchange: the search does the rest
+TIME_LIMIT = 10.0  # seconds of one search where none is given
 
 _CHEAP = 3e7  # multiplications of an enumeration: about 20 ms
-_CONVEX_POSITION = 3e10  # those of 500 points on a sphere, some seconds
 _LARGEST_HULL_DIMENSION = 4  # qhull's facets grow as M^(n // 2)
 
 
@@ -47,82 +47,145 @@ class ExactResult:
     proven: bool
 
 
+def solve(
+    problem: Problem,
+    *,
+    seed: int,
+    restarts: int | None,
+    time_limit: float | None,
+    best: int,
+) -> Found:
+    """The solver "exact"; 10 s where no time limit is given."""
+    deadline = time.perf_counter() + (time_limit or TIME_LIMIT)
+    restarts = restarts or STARTING_RESTARTS
+    found = solve_exact(problem, best, deadline, restarts, seed)
+    return as_found(found, seed=seed, restarts=restarts)
+
+
+def solve_many(
+    problems: list[Problem], *, time_limit: float | None = None
+) -> list[Found]:
+    """One by one, in ``time_limit`` seconds for them all; no limit when None."""
+    deadline = None if time_limit is None else time.perf_counter() + time_limit
+    compiled = problems[0].k != problems[0].num_regressors
+    return in_threads(
+        problems, lambda p: as_found(solve_exact(p, deadline=deadline)), compiled
+    )
+
+
+def as_found(result: ExactResult, **record: Any) -> Found:
+    """What the protocol wants to know."""
+    return Found(
+        indices=result.subsets[0],
+        log_det=float(result.log_dets[0]),
+        bound=result.bound,
+        proven=result.proven,
+        nodes=result.nodes,
+        alternatives=tuple(zip(result.subsets, result.log_dets.tolist(), strict=True)),
+        **record,
+    )
+
+
 def solve_exact(
     problem: Problem,
     best: int = 1,
     deadline: float | None = None,
     restarts: int = STARTING_RESTARTS,
     seed: int = 0,
+    enough: float = 0.0,
 ) -> ExactResult:
-    """The ``best`` selections, or the best found by ``deadline`` and an honest bound.
+    """The ``best`` selections, or the best found by ``deadline`` and a true bound.
 
     Args:
         problem: what to choose from.
         best: how many selections to prove.
         deadline: ``time.perf_counter()`` at which to stop.
         restarts, seed: of the exchange that starts branch and bound.
+        enough: gap in log det S at which to stop, unless the proof is cheap.
     """
-    if problem.k == problem.num_regressors:
+    if problem.simplex:
         pool = _pool(problem, hull=best == 1)
         free = problem.k - len(problem.required)
-        if enumeration_cost(len(pool), free) <= _most_multiplications(free, best):
+        cost = enumeration_cost(len(pool), free)
+        if best == 1 or cost <= _CHEAP:
+            if enough and cost > _CHEAP:  # the relaxation may do without
+                start = np.sort(exchange_indices(problem, restarts, seed))
+                relaxed = _relaxed(problem, start)
+                result = _result(problem, [start], best, relaxed, 1)
+                if result.bound - result.log_dets[0] <= enough:
+                    return result
             return _enumerate(problem, pool, best, deadline)
+    if deadline is not None and not _load.cache_info().currsize:
+        deadline += _load()
     start = exchange_indices(problem, restarts, seed)
     groups = _groups(problem, merge=best == 1)
     first = np.array([members[0] for members in groups])
-    result = branch_and_bound(
-        problem.rows[first],
+    found = branch_and_bound(
+        problem.blocks[first],
+        problem.prior.copy(),
         _sums(problem.lower, groups),
         np.minimum(_sums(problem.upper, groups), problem.k),
-        _sums(np.bincount(start, minlength=len(problem.rows)), groups),
+        _sums(np.bincount(start, minlength=len(problem.blocks)), groups),
         best,
         deadline,
+        enough / problem.multiplicity,
     )
-    subsets = [_expand(problem, groups, counts) for counts in result.counts]
-    bound = None if result.proven else result.bound
-    return _result(problem, subsets, best, bound, result.nodes)
+    subsets = [_expand(problem, groups, counts) for counts in found.counts]
+    bound = None if found.proven else found.bound
+    return _result(problem, subsets, best, bound, found.nodes)
+
+
+@functools.cache
+def _load() -> float:
+    """Compile or load the search; seconds it took, which no time limit should count."""
+    begun = time.perf_counter()
+    solve_exact(make_block_problem(np.eye(2)[[0, 1, 0, 1], None], 3), best=9)
+    return time.perf_counter() - begun
 
 
 def upper_bound(problem: Problem) -> float:
-    """Upper bound on log det S without numba: the optimum where that is cheap."""
-    p = problem.num_regressors
-    if problem.k == p:
+    """Upper bound on log det S: the optimum where that is cheap, or the relaxation."""
+    if problem.simplex:
         pool = _pool(problem, hull=True)
         free = problem.k - len(problem.required)
         if enumeration_cost(len(pool), free) <= _CHEAP:
             return _enumerate(problem, pool, 1, None).bound
+    relaxed = _relaxed(problem, greedy_indices(problem))
+    return problem.multiplicity * (relaxed + problem.log_scale)
+
+
+def _relaxed(problem: Problem, start: Indices) -> float:
+    """Upper bound on the whitened log det, from a selection (k,) to climb from."""
     keep = np.flatnonzero(problem.available)
-    start = np.searchsorted(keep, greedy_indices(problem))
-    relaxed = relaxed_bound(
-        problem.rows[keep], problem.lower[keep], problem.upper[keep], start
+    counts = np.bincount(start, minlength=len(problem.blocks))
+    return relaxed_bound(
+        problem.blocks[keep],
+        problem.prior.copy(),
+        problem.lower[keep],
+        problem.upper[keep],
+        counts[keep],
     )
-    return problem.num_outputs * (relaxed + problem.log_scale)
-
-
-def _most_multiplications(free: int, best: int) -> float:
-    """Cost up to which enumeration is tried before branch and bound.
-
-    With up to three inputs a large hull means postures in convex position (a sphere),
-    where every relaxation is nearly flat and enumeration is the faster proof.
-    """
-    return _CONVEX_POSITION if free <= 4 and best == 1 else _CHEAP
 
 
 def _pool(problem: Problem, hull: bool) -> Indices:
-    """Candidates that may join the required ones in an optimum with k = n + 1."""
+    """Candidates that may join the required ones in an optimum with k = p."""
     usable = problem.available.copy()
     usable[problem.required] = False
     pool = np.flatnonzero(usable)
     n = problem.num_regressors - 1
     if not hull or n > _LARGEST_HULL_DIMENSION or len(pool) <= n + 2:
         return pool
+    # Whitened postures lie in the plane of height x @ ones_at = 1: turned so that it is
+    # the last axis, the other axes are coordinates in that plane.
+    rows = problem.rows
+    ones_at = rows.sum(axis=0)
+    points = rows[pool] @ np.linalg.qr(ones_at[:, None], mode="complete")[0][:, 1:]
     if n == 1:
-        height = problem.rows[pool, 0]
-        return pool[np.unique([height.argmin(), height.argmax()])]
+        return pool[np.unique([points.argmin(), points.argmax()])]
     from scipy.spatial import ConvexHull, QhullError
 
     try:
-        return pool[ConvexHull(problem.rows[pool, :n]).vertices]
+        return pool[ConvexHull(points).vertices]
     except QhullError:  # flat without the required ones: every candidate stays in
         return pool
 
@@ -143,16 +206,12 @@ def _enumerate(
     ]
     if found.complete:
         return _result(problem, subsets, best, None, found.examined)
-    # Out of time: whatever greedy has, if that is better, and the relaxation's bound.
+    # Out of time: whatever greedy has, if that is better, and the sharper bound.
     greedy = np.sort(greedy_indices(problem))
-    keep = np.flatnonzero(problem.available)
-    relaxed = relaxed_bound(
-        problem.rows[keep],
-        problem.lower[keep],
-        problem.upper[keep],
-        np.searchsorted(keep, greedy),
-    )
-    return _result(problem, [*subsets, greedy], best, relaxed, found.examined)
+    # log det(X_s.T X_s) is twice the log of the volume, beside that of ``required``.
+    fixed = np.linalg.slogdet(required @ required.T)[1] if len(required) else 0.0
+    bound = min(_relaxed(problem, greedy), fixed + 2.0 * float(np.log(found.bound)))
+    return _result(problem, [*subsets, greedy], best, bound, found.examined)
 
 
 def _result(
@@ -164,23 +223,21 @@ def _result(
 ) -> ExactResult:
     """Values in the caller's unit, singular subsets left out, best first.
 
-    ``relaxed`` is an upper bound on log det(X_s.T X_s), None where the first is proven.
+    ``relaxed`` bounds the whitened log det from above; None where the first is proven.
     """
     chosen = np.stack(subsets)
-    values = np.atleast_1d(
-        log_det_information(problem.candidates[chosen], problem.num_outputs)
-    )
+    values = log_dets([problem], chosen[None])[0]
     order = np.argsort(-values, kind="stable")[:best]
     order = order[np.isfinite(values[order])]
     if not order.size:
         raise ValueError(
-            "candidates must allow an invertible selection, but the best of them, "
-            f"{chosen[0].tolist()}, lies in one plane"
+            f"{problem.subject} must allow an invertible selection, but the best, "
+            f"{chosen[0].tolist()}, is singular"
         )
     top = float(values[order[0]])
     bound = top
     if relaxed is not None:
-        bound = max(top, problem.num_outputs * (relaxed + problem.log_scale))
+        bound = max(top, problem.multiplicity * (relaxed + problem.log_scale))
     return ExactResult(chosen[order], values[order], bound, nodes, relaxed is None)
 
 
@@ -188,7 +245,8 @@ def _groups(problem: Problem, merge: bool) -> list[Indices]:
     """Available candidates, equal ones together where ``merge``: fewer branches."""
     keep = np.flatnonzero(problem.available)
     if merge:
-        _, label = np.unique(problem.candidates[keep], axis=0, return_inverse=True)
+        flat = problem.raw[keep].reshape(len(keep), -1)
+        _, label = np.unique(flat, axis=0, return_inverse=True)
         order = np.argsort(label, kind="stable")
         ends = np.flatnonzero(np.diff(label[order])) + 1
         if len(ends) + 1 < len(keep):

@@ -61,6 +61,7 @@ def to_unit_range(problem: Problem) -> NDArray[np.float32]:
     Those of a set that lies in [0, 1] are left as they are; others are mapped axis by
     axis, the least available one to 0 and the largest to 1. 0 where masked.
     """
+    assert problem.candidates is not None  # blocks are refused before
     usable = problem.candidates[problem.available]
     low, high = usable.min(axis=0), usable.max(axis=0)
     if low.min() >= 0.0 and high.max() <= 1.0:

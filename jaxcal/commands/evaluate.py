@@ -1,0 +1,269 @@
+"""``python evaluate.py`` and ``jaxcal evaluate``: parse, evaluate, print, write."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import pathlib
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, NoReturn
+
+from jaxcal.extras import MissingExtraError, needs
+
+if TYPE_CHECKING:
+    from jaxcal.evaluation.catalogue import Catalogue
+    from jaxcal.evaluation.results import Evaluation, Summary
+    from jaxcal.progress import Progress
+
+__all__ = ["main"]
+
+EXIT_OK = 0
+EXIT_ERROR = 2
+EXIT_INTERRUPTED = 130
+EXIT_TERMINATED = 143
+
+
+def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> int:
+    """Evaluate, print, write.
+
+    Args:
+        argv: the command line; that of the process when None.
+        prog: what was typed before it, for messages and the record.
+
+    Returns:
+        The exit code.
+    """
+    from jaxcal.learning.runtime import processes
+    from jaxcal.paper.datasets.catalogue import CATALOGUE
+
+    given = list(sys.argv[1:] if argv is None else argv)
+    command = ["python", prog] if prog.endswith(".py") else prog.split()
+    advice = "finished parts stay: start every process again"
+
+    def work() -> int:
+        return _alone(given, CATALOGUE, command, prog)
+
+    return processes.run_job(prog, given, work, advice)
+
+
+def _alone(
+    given: list[str], catalogue: Catalogue, command: Sequence[str], program: str
+) -> int:
+    """The command in this process, which may be one of several."""
+    from jaxcal.commands.evaluate_arguments import parser
+
+    options = parser(program, " ".join(command)).parse_args(given)
+    options.command = [*command, *given]
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        return _run(options, catalogue)
+    except KeyboardInterrupt as stop:
+        terminated = isinstance(stop, _Terminated)
+        kept = "nothing was written"
+        if options.stream is not None:
+            kept = "finished parts are kept; the same command goes on"
+        how = "terminated" if terminated else "interrupted"
+        print(f"{program}: {how}, {kept}", file=sys.stderr)
+        return EXIT_TERMINATED if terminated else EXIT_INTERRUPTED
+    except (ValueError, OSError, MissingExtraError) as error:
+        print(f"{program}: error: {_one_line(error)}", file=sys.stderr)
+        return EXIT_ERROR
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM, which ends the command as Ctrl-C does."""
+
+
+def _terminate(number: int, frame: object) -> NoReturn:
+    raise _Terminated
+
+
+def _run(options: argparse.Namespace, catalogue: Catalogue) -> int:
+    with needs("study", "evaluate"):
+        from jaxcal.progress import Progress
+    from jaxcal.evaluation.methods import POLICIES, check_methods
+    from jaxcal.evaluation.report import json_document, text_table, write_report
+    from jaxcal.files import write_text
+
+    options.methods = check_methods([m for m in options.methods.split(",") if m])
+    if options.checkpoint:
+        if not set(options.methods) & set(POLICIES):
+            raise ValueError(
+                "--checkpoint is given, but no policy is among --methods "
+                f"{','.join(options.methods)}"
+            )
+        with needs("policy", "--checkpoint"):  # it may need JAX
+            from jaxcal.learning.runtime import cache
+        cache.keep_compiled_programs()
+    _check_outputs(options)
+    options.checkpoint = list(dict.fromkeys(options.checkpoint)) or [None]
+    options.dataset = list(dict.fromkeys(options.dataset)) or ["dataset2"]
+    many = len(options.checkpoint) > 1
+    summaries: list[Summary] = []
+    whole: list[Evaluation] = []
+    evaluated = _whole if options.stream is None else _streamed
+    progress = Progress(quiet=options.quiet)
+    try:
+        for summary, evaluation in evaluated(options, catalogue, progress):
+            progress.clear()
+            if summaries:
+                print()
+            print(text_table(summary, many=many), flush=True)
+            summaries.append(summary)
+            whole += [] if evaluation is None else [evaluation]
+    finally:
+        progress.clear()
+    if options.report is not None:
+        runs = _run_folders(options.run, options.checkpoint)
+        number = write_report(
+            options.report, whole, runs, command=options.command, many=many
+        )
+        print(f"saved: {options.report}/index.html and {number} figures")
+    if options.json is not None and summaries:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        write_text(options.json, json_document(summaries, command=options.command))
+        print(f"saved: {options.json}")
+    return EXIT_OK
+
+
+def _whole(
+    options: argparse.Namespace, catalogue: Catalogue, progress: Progress
+) -> Iterator[tuple[Summary, Evaluation]]:
+    """Every dataset, read or made before the first is evaluated."""
+    from jaxcal.evaluation.methods import evaluate
+
+    if _process()[1] > 1:
+        raise ValueError("several processes can share an evaluation with --stream only")
+    datasets = [
+        catalogue.load(
+            name,
+            options.seed,
+            options.episodes,
+            recordings=options.recordings,
+            progress=progress,
+        )
+        for name in options.dataset
+    ]
+    for dataset in datasets:
+        found = evaluate(
+            dataset,
+            options.k,
+            options.methods,
+            options.checkpoint,
+            num=options.num,
+            random_draws=options.draws,
+            seed=options.seed,
+            time_limit=options.time_limit,
+            progress=progress,
+        )
+        yield found.summarise(indices=options.indices), found
+
+
+def _streamed(
+    options: argparse.Namespace, catalogue: Catalogue, progress: Progress
+) -> Iterator[tuple[Summary, None]]:
+    """One dataset in parts; of several processes the first has the totals."""
+    from jaxcal.evaluation.stream import Plan, evaluate_stream, open_folder
+
+    refused = {
+        "--report": options.report is not None,
+        "--indices": options.indices,
+        "--time-limit": options.time_limit is not None,
+    }
+    for flag in [flag for flag, given in refused.items() if given]:
+        raise ValueError(f"{flag} needs every episode at once and --stream keeps none")
+    if len(options.dataset) > 1:
+        raise ValueError(
+            f"--stream takes one dataset, got {', '.join(options.dataset)}"
+        )
+    if options.episodes is None:
+        raise ValueError("--stream needs --episodes")
+    plan = Plan(
+        catalogue,
+        options.dataset[0],
+        seed=options.seed,
+        k=options.k,
+        methods=options.methods,
+        checkpoints=tuple(options.checkpoint),
+        num=options.num,
+        draws=options.draws,
+    )
+    process = _process()
+    if process[1] == 1:
+        open_folder(plan, options.stream)
+    else:
+        from jaxcal.learning.runtime import devices
+
+        devices.on_first(lambda: open_folder(plan, options.stream))
+    if not (options.stream / "stream.json").exists():
+        raise ValueError(
+            f"--stream {options.stream} must be a folder that all processes see; "
+            f"process {process[0]} does not"
+        )
+    found = evaluate_stream(
+        plan,
+        options.episodes,
+        options.stream,
+        workers=options.workers,
+        process=process,
+        progress=progress,
+    )
+    if process[0] == 0:
+        yield found, None
+
+
+def _process() -> tuple[int, int]:
+    """Which process this is, and of how many; one that holds no JAX is alone."""
+    if "jax" not in sys.modules:
+        return 0, 1
+    import jax
+
+    if not jax.distributed.is_initialized():
+        return 0, 1
+    return jax.process_index(), jax.process_count()
+
+
+def _check_outputs(options: argparse.Namespace) -> None:
+    """Refuse outputs that cannot be written before anything is computed."""
+    from jaxcal.files import require_writable_folder
+
+    if options.json is not None:
+        if options.json.is_dir():
+            raise ValueError(f"--json must be a file, {options.json} is a folder")
+        require_writable_folder(options.json.parent)
+    if options.report is not None:
+        with needs("study", "--report"):
+            importlib.import_module("jinja2")
+            importlib.import_module("matplotlib")
+    for folder in (options.report, options.stream):
+        if folder is not None:
+            require_writable_folder(folder)
+    if options.workers is not None and options.stream is None:
+        raise ValueError("--workers needs --stream")
+    for folder in options.run:
+        if not (folder / "metrics.csv").is_file():
+            raise ValueError(f"--run {folder} holds no metrics.csv")
+        if options.report is None:
+            raise ValueError("--run draws training curves and needs --report")
+
+
+def _run_folders(
+    given: list[pathlib.Path], checkpoints: list[str | None]
+) -> list[pathlib.Path]:
+    """Run folders named, and those the checkpoints lie in."""
+    found = list(given)
+    for checkpoint in filter(None, checkpoints):
+        folder = pathlib.Path(checkpoint)
+        near = [folder, *folder.resolve().parents[:2]]
+        found += [place for place in near if (place / "metrics.csv").is_file()][:1]
+    return list({place.resolve(): place for place in found}.values())
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split()) or type(error).__name__

@@ -1,0 +1,162 @@
+"""The flags of ``evaluate``, and what ``--help`` says."""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+import sys
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+from jaxcal.evaluation.methods import DEFAULT_METHODS
+from jaxcal.learning.runtime import processes
+
+__all__ = ["parser"]
+
+_DESCRIPTION = """\
+Let every method choose K postures in every episode of a dataset, and compare the
+determinant of the information matrix S with that of the best choice there is (S*).
+
+columns:
+  mean, median det S  larger is better; in the unit of the dataset's commands
+  det S/det S*        mean over the episodes; 1 is optimal
+  hit rate            share of episodes in which the optimum itself was found
+  D-eff.              mean of (det S/det S*)^(1/p), p parameters (12 for 3 x 3)
+  x random            mean det S over that of random selection, the paper's measure
+  time each           seconds a selection, averaged over the batch, compilation left out
+"""
+
+_EPILOG = """\
+methods:
+  policy              the trained network, likeliest posture at every step
+  policy:samples      the best of --num sampled passes
+  policy:first        each of the --num likeliest first postures, completed; the best
+  policy:exchange     policy, then Fedorov exchange from what it chose
+  policy:all          all four
+  random              --draws selections an episode, all counted
+  greedy              the posture that adds most, K times
+  exchange            Fedorov exchange with random restarts
+  exact               the proven optimum
+  auto                what select does by default: the cheapest way to a proven
+                      D-efficiency of 0.999; not among the methods run by default
+
+datasets:
+  dataset0 to 5       the paper's, made from --seed (200, 200,000, 1,000, 100, 100 and
+                      1 episodes); 4 and 5 from --recordings, or those that ship
+  FILE.npz            candidates (episodes, M, n); optional measured, available
+  FILE.csv            episode,candidate,u_x,u_y,u_z[,y_x,y_y,y_z]
+
+examples:
+  {program}
+      the shipped policy and every baseline on 1,000 unseen sets of 50 postures
+  {program} --checkpoint runs/a runs/b --methods policy,exact --json out.json
+      two trainings side by side, the numbers for a script
+  {program} --dataset dataset3 mine.npz --report report
+      figures and report/index.html; dataset3 holds outputs, so parameters too
+  {program} --methods random,greedy,exact --k 8 --episodes 100
+      eight of fifty postures; loads no JAX
+  {program} --stream runs/ten_million --episodes 10000000
+      any number of episodes in constant memory; the same command resumes where it
+      stopped; under srun, or with --coordinator, many processes share the work
+"""
+
+
+class _Parser(argparse.ArgumentParser):
+    """Reports an error in one line, without the usage."""
+
+    def error(self, message: str) -> NoReturn:
+        print(f"{self.prog}: error: {message}; see --help", file=sys.stderr)
+        sys.exit(2)
+
+
+def parser(program: str, typed: str) -> argparse.ArgumentParser:
+    """The parser.
+
+    Args:
+        program: begins every message.
+        typed: the command in the examples.
+    """
+    out = _Parser(
+        prog=program,
+        description=_DESCRIPTION,
+        epilog=_EPILOG.format(program=typed),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    add = out.add_argument
+    several: dict[str, Any] = {"nargs": "+", "action": "extend", "default": []}
+    folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
+    natural, index = _at_least(1), _at_least(0)
+    add(
+        "--checkpoint",
+        metavar="DIR",
+        help="trained policies; the shipped one",
+        **several,
+    )
+    add("--dataset", metavar="NAME|FILE", help="datasets; dataset2", **several)
+    add("--recordings", help="of dataset4.csv and dataset5.csv, by the rig", **folder)
+    add(
+        "--methods",
+        default=",".join(DEFAULT_METHODS),
+        metavar="LIST",
+        help="comma separated; all but auto",
+    )
+    add("--k", type=natural, default=4, help="postures to choose; 4")
+    add("--episodes", type=natural, metavar="N", help="at most the first N of each")
+    add("--seed", type=index, default=0, metavar="S", help="of datasets and draws; 0")
+    add("--num", type=natural, default=16, help="tries of policy:samples and :first")
+    add("--draws", type=natural, default=100, help="random selections an episode; 100")
+    add(
+        "--time-limit",
+        type=_seconds,
+        metavar="SECONDS",
+        help="of the exact solver, a dataset; what it cannot prove is bounded",
+    )
+    add("--json", type=pathlib.Path, metavar="FILE", help="write every number")
+    add("--indices", action="store_true", help="and the postures chosen, in the JSON")
+    add("--report", help="write figures and index.html", **folder)
+    add(
+        "--run",
+        help="training runs to draw curves of; those of --checkpoint are found",
+        **several,
+        **folder,
+    )
+    add(
+        "--stream",
+        help="evaluate in parts kept in DIR: any number of --episodes, resumable",
+        **folder,
+    )
+    add(
+        "--workers",
+        type=natural,
+        metavar="N",
+        help="processes of --stream; one for each core",
+    )
+    add("--quiet", action="store_true", help="no progress")
+    processes.add_arguments(out)
+    return out
+
+
+def _at_least(least: int) -> Callable[[str], int]:
+    def parse(text: str) -> int:
+        try:
+            number = int(text)
+        except ValueError:
+            number = least - 1
+        if number < least:
+            raise argparse.ArgumentTypeError(
+                f"must be a whole number of at least {least}, got {text!r}"
+            )
+        return number
+
+    return parse
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"must be seconds above 0, got {text!r}")
+    return value

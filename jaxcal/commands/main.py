@@ -1,0 +1,95 @@
+"""``jaxcal COMMAND``: parse, run, and say in one line what was wrong."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import os
+import sys
+from typing import NoReturn
+
+from jaxcal.extras import MissingExtraError
+
+__all__ = ["main"]
+
+_HERE = {  # command: one line of help
+    "select": "choose the few rows of a table worth measuring",
+    "score": "judge a choice made elsewhere",
+    "plan": "how many measurements a wanted accuracy takes",
+    "identify": "fit y = A u + b to measurements and save the calibration",
+    "predict": "where a calibrated machine goes for given commands",
+    "command": "what to command to reach given outputs",
+}
+_WHOLE = {  # commands that parse their own arguments
+    "train": "train a policy (train.py)",
+    "evaluate": "compare methods with the proven optimum (evaluate.py)",
+}
+_EPILOG = """\
+examples:
+  jaxcal select candidates.csv -k 4                 the four rows to measure
+  jaxcal select candidates.csv -k 6 --csv > plan.csv
+  jaxcal identify measured.csv --out calibration.json
+  jaxcal command calibration.json targets.csv --limits=-20,20
+  jaxcal COMMAND --help                             options of one command
+
+Tables are CSV (with or without a header) or .npz; - is standard input."""
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}; see --help\n")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command.
+
+    Returns:
+        The exit code: 0, or 2 where something given was wrong.
+    """
+    given = sys.argv[1:] if argv is None else argv
+    if given and given[0] in _WHOLE:
+        module = importlib.import_module(f"jaxcal.commands.{given[0]}")
+        return int(module.main(given[1:], prog=f"jaxcal {given[0]}"))
+    arguments = _parser(given).parse_args(given)
+    module = importlib.import_module(f"jaxcal.commands.{arguments.command}")
+    try:
+        code = int(module.run(arguments))
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:  # the reader of a pipe, such as head, has left
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except (ValueError, OSError, MissingExtraError) as error:
+        print(f"jaxcal {arguments.command}: {error}", file=sys.stderr)
+        return 2
+
+
+def _parser(given: list[str]) -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="jaxcal",
+        description="Which few measurements to make, and the calibration that follows.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    from jaxcal import __version__
+
+    parser.add_argument("--version", action="version", version=f"jaxcal {__version__}")
+    commands = parser.add_subparsers(
+        dest="command", metavar="COMMAND", required=True, parser_class=_Parser
+    )
+    for name, line in (_HERE | _WHOLE).items():
+        module = None
+        if name in given and name in _HERE:  # only the one that runs is imported
+            module = importlib.import_module(f"jaxcal.commands.{name}")
+        command = commands.add_parser(
+            name,
+            help=line,
+            description=line[0].upper() + line[1:] + ".",
+            epilog=getattr(module, "EPILOG", None),
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        if module is not None:
+            module.add_arguments(command)
+    return parser

@@ -1,0 +1,259 @@
+"""Tables in and out of the commands: CSV, .npz, JSON, ``-`` for standard input."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import json
+import pathlib
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.checks import axis_letter
+from jaxcal.files import write_text
+
+__all__ = ["Frame", "Table", "read_table", "write_json", "write_rows"]
+
+Array = NDArray[np.float64]
+
+_NPZ_COLUMNS = {"candidates": "u", "commands": "u", "measured": "y"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """As much of a data frame as ``select`` reads: numbers with their names."""
+
+    values: Array  # (N, n)
+    columns: tuple[str, ...]
+    index: tuple[str, ...]  # names of the rows; empty where there are none
+
+    def to_numpy(self) -> Array:
+        """(N, n)."""
+        return self.values
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
+        return np.array(self.values, dtype=dtype)
+
+
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """Rows of numbers under names, and columns of text beside them."""
+
+    source: str  # the file's name, for messages
+    names: tuple[str, ...]  # of the numeric columns
+    values: Array  # (N, len(names)), NaN where a cell is empty
+    labels: dict[str, list[str]]  # columns that hold text, each of length N
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def columns(self, wanted: Sequence[str]) -> Array:
+        """(N, len(wanted)) the named columns, in that order."""
+        for name in wanted:
+            if name in self.labels:
+                cell = next(c for c in self.labels[name] if not _is_number(c))
+                raise ValueError(
+                    f"{self.source}: column {name!r} must hold numbers, got {cell!r}"
+                )
+            if name not in self.names:
+                known = ", ".join(self.names)
+                raise ValueError(
+                    f"{self.source}: there is no column {name!r}; columns: {known}"
+                )
+        return self.values[:, [self.names.index(name) for name in wanted]]
+
+    def frame(self, wanted: Sequence[str]) -> Frame:
+        """The named columns, with the first column of text as the rows' names."""
+        rows = next(iter(self.labels.values()), [])
+        return Frame(self.columns(wanted), tuple(wanted), tuple(rows))
+
+    def inputs(self, chosen: str | None) -> tuple[str, ...]:
+        """Columns of commands: those chosen, else ``u_...``, else all but outputs."""
+        if chosen is not None:
+            return split_names(chosen)
+        marked = tuple(name for name in self.names if name.startswith("u_"))
+        special = {"available", "episode", "candidate", "index"}
+        return marked or tuple(
+            name
+            for name in self.names
+            if name not in special and not name.startswith("y_")
+        )
+
+    def outputs(self, chosen: str | None) -> tuple[str, ...]:
+        """Columns of measurements: those chosen, else ``y_...``."""
+        if chosen is not None:
+            return split_names(chosen)
+        marked = tuple(name for name in self.names if name.startswith("y_"))
+        if not marked:
+            raise ValueError(
+                f"{self.source}: no column begins with y_; name the measured columns "
+                f"with --outputs (columns: {', '.join(self.names)})"
+            )
+        return marked
+
+    def available(self) -> NDArray[np.bool_] | None:
+        """(N,) True where the column ``available`` is 1; None without that column."""
+        if "available" not in (*self.names, *self.labels):
+            return None
+        mask = self.columns(["available"])[:, 0]
+        if not np.isin(mask, (0.0, 1.0)).all():
+            where = int(np.flatnonzero(~np.isin(mask, (0.0, 1.0)))[0])
+            raise ValueError(
+                f"{self.source}: available must be 0 or 1, got {mask[where]:g} in row "
+                f"{where}"
+            )
+        return mask == 1.0
+
+
+def split_names(text: str) -> tuple[str, ...]:
+    """Names separated by commas."""
+    return tuple(name.strip() for name in text.split(",") if name.strip())
+
+
+def read_table(path: str) -> Table:
+    """Read a .csv (comma, semicolon or tab; header optional) or .npz; ``-`` is stdin.
+
+    A .npz holds one array (N, n), or ``candidates`` or ``commands`` (N, n) and
+    optionally ``measured`` (N, m) and ``available`` (N,).
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: naming the file and what is wrong in it.
+    """
+    if path == "-":
+        return _from_csv("standard input", sys.stdin.read())
+    data = pathlib.Path(path).read_bytes()
+    if path.lower().endswith(".npz"):
+        return _from_npz(path, data)
+    try:
+        return _from_csv(path, data.decode("utf-8-sig"))
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise ValueError(f"{path}: line {line} is not UTF-8 text") from None
+
+
+def _from_csv(source: str, text: str) -> Table:
+    first = text.partition("\n")[0]
+    delimiter = max(",;\t", key=first.count)
+    rows = [
+        (number, [cell.strip() for cell in row])
+        for number, row in enumerate(csv.reader(io.StringIO(text), delimiter=delimiter))
+        if any(cell.strip() for cell in row)
+    ]
+    if not rows:
+        raise ValueError(f"{source}: the table is empty")
+    header = rows[0][1]
+    if all(_is_number(cell) for cell in header):
+        count = len(header)
+        header = [f"u_{axis_letter(i, count)}" for i in range(count)]
+    else:
+        rows = rows[1:]
+    if not rows:
+        raise ValueError(f"{source}: there are no rows below the header")
+    twice = [name for name in header if header.count(name) > 1]
+    if twice:
+        raise ValueError(f"{source}: column {twice[0]!r} comes twice")
+    for number, row in rows:
+        if len(row) != len(header):
+            raise ValueError(
+                f"{source}: line {number + 1} has {len(row)} cells, the first has "
+                f"{len(header)}"
+            )
+    cells = {name: [row[i] for _, row in rows] for i, name in enumerate(header)}
+    names = tuple(
+        name
+        for name, column in cells.items()
+        if all(_is_number(cell) or not cell for cell in column)
+    )
+    numbers = [[float(c) if c else np.nan for c in cells[name]] for name in names]
+    values = np.array(numbers, dtype=np.float64).reshape(len(names), len(rows)).T
+    labels = {name: column for name, column in cells.items() if name not in names}
+    return Table(source, names, values, labels)
+
+
+def _from_npz(source: str, data: bytes) -> Table:
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except Exception as error:  # zipfile, zlib and numpy each raise their own
+        raise ValueError(f"{source}: not a readable .npz file ({error})") from None
+    if len(arrays) == 1:
+        arrays = {"candidates": next(iter(arrays.values()))}
+    names: list[str] = []
+    columns: list[Array] = []
+    for key, array in arrays.items():
+        if key in ("low", "high"):
+            continue
+        if key == "available":
+            table = np.asarray(array, dtype=np.float64).reshape(-1, 1)
+            names.append("available")
+        elif key in _NPZ_COLUMNS:
+            table = _matrix(source, key, array)
+            count = table.shape[1]
+            letter = _NPZ_COLUMNS[key]
+            names += [f"{letter}_{axis_letter(i, count)}" for i in range(count)]
+        else:
+            known = ", ".join((*_NPZ_COLUMNS, "available"))
+            raise ValueError(f"{source}: unknown key {key!r}; keys: {known}")
+        columns.append(table)
+    lengths = {len(table) for table in columns}
+    if len(lengths) != 1:
+        raise ValueError(f"{source}: the arrays must have equal lengths, got {lengths}")
+    return Table(source, tuple(names), np.concatenate(columns, axis=1), {})
+
+
+def _matrix(source: str, key: str, array: NDArray[Any]) -> Array:
+    if array.dtype.kind not in "iuf":
+        raise ValueError(f"{source}: {key} must hold numbers, got {array.dtype}")
+    if array.ndim == 3 and len(array) == 1:
+        array = array[0]
+    if array.ndim != 2 or 0 in array.shape:
+        raise ValueError(
+            f"{source}: {key} must have shape (N, axes), got {array.shape}"
+            + ("; evaluate takes many sets" if array.ndim == 3 else "")
+        )
+    return array.astype(np.float64)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def write_rows(
+    out: str | None, names: Sequence[str], rows: Sequence[Sequence[Any]]
+) -> None:
+    """Write rows as CSV to a file, atomically, or to standard output."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(names)
+    writer.writerows(rows)
+    _emit(out, text.getvalue())
+
+
+def write_json(out: str | None, document: Any) -> None:
+    """Write a JSON document to a file, atomically, or to standard output."""
+    _emit(out, json.dumps(document, indent=1, default=_plain) + "\n")
+
+
+def _emit(out: str | None, text: str) -> None:
+    if out is None or out == "-":
+        sys.stdout.write(text)
+    else:
+        write_text(out, text)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"cannot write {type(value).__name__} as JSON")

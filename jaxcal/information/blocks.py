@@ -1,0 +1,213 @@
+"""Information blocks: their log det, the rule of singularity, and whitening.
+
+Measuring candidate i adds ``B_i.T @ B_i`` to the information, B_i a block (q, p): q
+readings, p parameters. A prior of precision P comes as a root (r, p) with
+``root.T @ root = P``, which is one more block. An affine posture is the block [u, 1].
+
+Columns that are the same in every block (the ones that multiply a bias) are used to
+centre the other columns: a linear map of the parameters with determinant one, exact to
+the last place of the numbers given, so encoder pulses far from zero keep their digits.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "log_det_blocks",
+    "missing_directions",
+    "null_directions",
+    "prior_root",
+    "rank_of_blocks",
+    "rank_rule",
+    "whiten",
+]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_EPS = float(np.finfo(np.float64).eps)
+
+
+def rank_rule(
+    columns: Array, largest: Array, count: int | None = None
+) -> tuple[NDArray[np.int64], Array]:
+    """Rank and log det of ``columns.T @ columns``: the one rule of what is singular.
+
+    Numbers are exact to half a unit in the last place of their size, not of their
+    spread: a direction no wider than that is rounding, not information.
+
+    Args:
+        columns: (..., R, p) stacked blocks, centred.
+        largest: (..., p) largest entry of each column before centring.
+        count: rows that rounding errors add up over; R when not given.
+
+    Returns:
+        (...,) rank, and (...,) natural log det, -inf where the rank is below p.
+    """
+    num_rows, p = columns.shape[-2:]
+    norms, flat, rounding = _norms(columns, largest, count or num_rows)
+    scaled = np.where(flat, 0.0, columns / np.where(flat, 1.0, norms))
+    singular = np.linalg.svd(scaled, compute_uv=False)
+    rank = (singular > rounding[..., None]).sum(axis=-1)
+    with np.errstate(divide="ignore"):
+        value = 2.0 * (np.log(singular).sum(axis=-1) + np.log(norms).sum(axis=(-1, -2)))
+    return rank, np.where(rank == p, value, -np.inf)
+
+
+def _norms(columns: Array, largest: Array, count: int) -> tuple[Array, Mask, Array]:
+    """Column norms (..., 1, p), which are mere rounding, and the tolerance (...,)."""
+    norms = np.sqrt((columns * columns).sum(axis=-2, keepdims=True))
+    resolution = _EPS * max(count, 1)
+    widths = largest[..., None, :]
+    flat = norms <= resolution * widths
+    rounding = (widths / np.where(flat, np.inf, norms)).max(axis=(-1, -2))
+    return norms, flat, resolution * np.maximum(8.0, rounding)
+
+
+def null_directions(columns: Array, largest: Array) -> list[Array]:
+    """Directions (p,) of which ``columns`` (R, p) say nothing by the rule above.
+
+    Axes that no row moves come first, then a basis of the rest of the null space.
+    """
+    p = columns.shape[1]
+    norms, flat, tolerance = _norms(columns, largest, len(columns))
+    norms, flat = norms[0], flat[0]
+    scaled = np.where(flat, 0.0, columns / np.where(flat, 1.0, norms))
+    _, singular, right = np.linalg.svd(scaled)
+    singular = np.concatenate([singular, np.zeros(max(0, p - len(singular)))])
+    null = [np.eye(p)[i] for i in np.flatnonzero(flat)]
+    free = right[singular <= tolerance][:, ~flat]
+    if free.size:
+        basis, size, _ = np.linalg.svd(free.T, full_matrices=False)
+        for vector in basis.T[size > 0.5]:
+            direction = np.zeros(p)
+            direction[~flat] = vector / norms[~flat]
+            null.append(direction)
+    return null
+
+
+def prior_root(precision: Array) -> Array:
+    """(r, p) root of a precision (p, p) of rank r, ``root.T @ root = precision``.
+
+    Raises:
+        ValueError: it is not symmetric or not positive semidefinite.
+    """
+    p = len(precision)
+    size = np.sqrt(np.abs(np.diagonal(precision)))
+    scale = np.where(size > 0.0, size, 1.0)
+    unit = precision / scale[:, None] / scale
+    tolerance = 1e-9 * p
+    if np.abs(unit - unit.T).max(initial=0.0) > tolerance:
+        raise ValueError(
+            "prior must be a symmetric precision matrix, got one that is not"
+        )
+    values, vectors = np.linalg.eigh((unit + unit.T) / 2.0)
+    if values.min(initial=0.0) < -tolerance:
+        raise ValueError(
+            "prior must be a positive semidefinite precision matrix, got eigenvalue "
+            f"{values.min():.3g} in units of its diagonal"
+        )
+    keep = values > 8.0 * _EPS * p
+    return np.sqrt(values[keep])[:, None] * vectors.T[keep] * scale
+
+
+def _stack(blocks: Array, usable: Mask | None, root: Array) -> tuple[Array, Array]:
+    """Centred rows (..., N q + r, p) of blocks and prior, and the largest entries."""
+    *batch, count, q, p = blocks.shape
+    number = count
+    first = blocks[..., :1, :, :]
+    same = blocks == first
+    if usable is not None:
+        weight = usable[..., None, None]
+        blocks = np.where(weight, blocks, 0.0)
+        number = usable.sum(axis=-1)[..., None, None]
+        at = usable.argmax(axis=-1)[..., None, None, None]
+        first = np.take_along_axis(blocks, at, axis=-3)
+        same = (blocks == first) | ~weight
+    same = same.all(axis=(-3, -2))[..., None, :]
+    constant = np.where(same, first[..., 0, :, :], 0.0)
+    mean = np.where(same, 0.0, blocks.sum(axis=-3) / number)
+    if q == 1:
+        square = (constant * constant).sum(axis=-1, keepdims=True)
+        inverse = np.matrix_transpose(constant) / np.where(square > 0.0, square, 1.0)
+    else:
+        inverse = np.linalg.pinv(constant)
+    shift = inverse @ mean
+    centred = blocks - (constant @ shift)[..., None, :, :]
+    if usable is not None:
+        centred *= weight
+    rows = centred.reshape(*batch, count * q, p)
+    largest = np.abs(blocks).max(axis=(-3, -2))
+    if len(root):
+        moved = root - root @ shift
+        rows = np.concatenate([rows, np.broadcast_to(moved, (*batch, *root.shape))], -2)
+        largest = np.maximum(largest, np.abs(root).max(axis=0))
+    return rows, largest
+
+
+def log_det_blocks(blocks: Array, root: Array) -> Array:
+    """``log det(root.T @ root + sum of B_i.T @ B_i)`` of blocks measured together.
+
+    Args:
+        blocks: (..., N, q, p).
+        root: (r, p) of the prior precision, r = 0 without one.
+
+    Returns:
+        (...,) natural log; -inf where singular.
+    """
+    rows, largest = _stack(blocks, None, root)
+    return rank_rule(rows, largest, blocks.shape[-3])[1]
+
+
+def rank_of_blocks(blocks: Array, root: Array) -> NDArray[np.int64]:
+    """(...,) rank of the information of blocks (..., N, q, p) measured together."""
+    rows, largest = _stack(blocks, None, root)
+    return rank_rule(rows, largest, blocks.shape[-3])[0]
+
+
+def missing_directions(blocks: Array, root: Array) -> list[Array]:
+    """Directions (p,) that neither blocks (N, q, p) nor the prior say anything of."""
+    return null_directions(*_stack(blocks, None, root))
+
+
+def whiten(
+    blocks: Array, usable: Mask, root: Array
+) -> tuple[Array, Array, Array, NDArray[np.int64]]:
+    """Blocks in coordinates where everything measured at once has information I.
+
+    With T = prior + sum of the usable ``B_i.T @ B_i`` = R.T R the whitened block is
+    ``B_i R^-1``, and log det of any selection is its whitened log det plus log det T. A
+    linear map of the parameters rotates the whitened blocks and nothing else.
+
+    Args:
+        blocks: (S, M, q, p) of S sets.
+        usable: (S, M) which count.
+        root: (r, p) of the prior precision.
+
+    Returns:
+        Whitened blocks (S, M, q, p), zero where not usable; the prior's precision
+        (S, p, p) in the same coordinates; log det T (S,); the sets that are singular.
+    """
+    num_sets, count, q, p = blocks.shape
+    rows, largest = _stack(blocks, None if usable.all() else usable, root)
+    scale = np.abs(rows).max(axis=1, keepdims=True)
+    orthonormal, r = np.linalg.qr(rows / np.where(scale == 0.0, 1.0, scale))
+    pivots = np.abs(np.diagonal(r, axis1=1, axis2=2))
+    # A cheap test first: only a set that looks nearly singular pays for the rule.
+    doubtful = (scale[:, 0] < 1e-6 * largest).any(axis=1)
+    if pivots.shape[1] < p:
+        return blocks, blocks, np.zeros(num_sets), np.arange(num_sets)
+    doubtful |= (pivots < 1e-6).any(axis=1)
+    doubtful |= usable.sum(axis=1) * q + len(root) < p
+    at = np.flatnonzero(doubtful)
+    if at.size:
+        at = at[np.isneginf(rank_rule(rows[at], largest[at], count)[1])]
+    with np.errstate(divide="ignore"):
+        log_scale = 2.0 * np.log(pivots * scale[:, 0]).sum(axis=1)
+    white = orthonormal[:, : count * q].reshape(num_sets, count, q, p)
+    if not usable.all():  # zero but for rounding
+        white = white * usable[..., None, None]
+    of_prior = orthonormal[:, count * q :]
+    return white, np.matrix_transpose(of_prior) @ of_prior, log_scale, at

@@ -1,0 +1,119 @@
+"""What is trained on: an episode of selection and where its candidates come from.
+
+A ``Task`` is all that the trainer knows of an environment: how to begin, how to step,
+and what a decision pays (``training.rollout.Rules`` says what it needs). Another
+environment is another class with these methods.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import field
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxcal.learning.environments import scenarios, selection
+from jaxcal.learning.environments.selection import (
+    Candidates,
+    SelectionConfig,
+    SelectionState,
+)
+
+__all__ = ["GivenCandidates", "Task"]
+
+
+@dataclasses.dataclass(frozen=True)
+class GivenCandidates:
+    """The user's own candidates, known by their digest; a checkpoint holds no copy."""
+
+    name: str  # of the file, for messages
+    sha256: str  # of the file
+    # (B, M, n) sets, or (1, N, n): a pool that every episode draws its M from. None
+    # where only the digest is known.
+    values: np.ndarray | None = field(default=None, compare=False, repr=False)
+    available: np.ndarray | None = field(default=None, compare=False, repr=False)
+
+    def source(self, config: SelectionConfig) -> Candidates:
+        """Draws candidates for an episode."""
+        if self.values is None:
+            raise ValueError(
+                f"this run was trained on {self.name}: give the file again with "
+                "--candidates"
+            )
+        if len(self.values) > 1:
+            return scenarios.from_sets(config, self.values, self.available)
+        mask = None if self.available is None else self.available[0]
+        return scenarios.from_pool(config, self.values[0], mask)
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """An environment and where its candidates come from."""
+
+    environment: SelectionConfig = field(default_factory=SelectionConfig)
+    shapes: tuple[str, ...] = ("uniform",)  # see scenarios.SHAPES
+    masked: float = 0.0  # greatest share of candidates masked
+    random_starts: float = 0.0  # share of episodes begun with random choices
+    given: GivenCandidates | None = None  # instead of shapes and masked
+
+    @property
+    def draw(self) -> Candidates:
+        """key -> (M, n) candidates and (M,) available."""
+        if self.given is not None:
+            return self.given.source(self.environment)
+        return scenarios.mixture(self.environment, self.shapes, self.masked)
+
+    @property
+    def num_decisions(self) -> int:
+        """K, choices of an episode."""
+        return self.environment.num_selected
+
+    @property
+    def value_scale(self) -> float:
+        """Reward for a unit of the log det(Z.T Z) that a network predicts."""
+        return self.environment.reward_scale * self.environment.num_outputs
+
+    def reset(self, key: jax.Array) -> SelectionState:
+        """A new episode with fresh candidates."""
+        return selection.reset(key, self.environment, self.draw)
+
+    def step(
+        self, state: SelectionState, action: jax.Array
+    ) -> tuple[SelectionState, jax.Array, jax.Array]:
+        """Choose one posture: the next state, () reward, () bool done."""
+        return selection.step(state, action, self.environment)
+
+    def paid(self, state: SelectionState) -> jax.Array:
+        """() reward received already of the final value; 0 if each payment is whole."""
+        config = self.environment
+        return config.reward_scale * state.paid * float(config.reward_gain)
+
+    def outcome(self, state: SelectionState) -> jax.Array:
+        """() log det S of a finished episode."""
+        return state.paid
+
+    def as_meta(self) -> dict[str, Any]:
+        """Plain JSON values; ``from_meta`` reads them back."""
+        meta = {
+            "environment": dataclasses.asdict(self.environment),
+            "shapes": list(self.shapes),
+            "masked": self.masked,
+            "random_starts": self.random_starts,
+        }
+        if self.given is not None:
+            meta["given"] = {"name": self.given.name, "sha256": self.given.sha256}
+        return meta
+
+    @staticmethod
+    def from_meta(meta: dict[str, Any]) -> Task:
+        """The task that ``as_meta`` described; of given candidates only the digest."""
+        given = meta.get("given")
+        return Task(
+            environment=SelectionConfig(**meta["environment"]),
+            shapes=tuple(meta["shapes"]),
+            masked=meta["masked"],
+            random_starts=meta["random_starts"],
+            given=None if given is None else GivenCandidates(**given),
+        )

@@ -1,0 +1,179 @@
+"""The compact network: invariant, for any M, K and n; docs/policy.md describes it."""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from jaxcal.learning.policies import features as geometry
+from jaxcal.learning.policies.features import (
+    CandidateFeatures,
+    DecisionFeatures,
+    VectorFeatures,
+)
+from jaxcal.learning.policies.networks import NetworkConfig, mask_logits
+
+__all__ = ["CompactNetwork"]
+
+_SHARP = 60.0  # inverse temperature of the choices that need no learning
+
+
+class _Round(nn.Module):
+    """One round of messages among the active candidates, then a residual MLP.
+
+    The message to candidate i is a linear attention with the kernel (x_i . x_j)^2:
+    ``sum_j (x_i . x_j)^2 v_j``, computed through the second moments of the whole set,
+    so that the cost grows with M and not with M squared.
+    """
+
+    config: NetworkConfig
+
+    @nn.compact
+    def __call__(self, h: jax.Array, vectors: VectorFeatures) -> jax.Array:
+        """(..., M, width) from (..., M, width)."""
+        width = self.config.width
+        active = vectors.active[..., None].astype(h.dtype)
+        u = nn.LayerNorm(name="norm")(h)
+        parts = [u]
+        if self.config.messages:
+            v = nn.Dense(width, use_bias=False, name="send")(u) * active
+            total = jnp.einsum("...mf,...mw->...fw", vectors.moments, v)
+            parts.append(jnp.einsum("...mf,...fw->...mw", vectors.moments, total))
+        number = jnp.maximum(active.sum(-2, keepdims=True), 1.0)
+        mean = (u * active).sum(-2, keepdims=True) / number
+        inner = nn.Dense(2 * width, name="mix")(jnp.concatenate(parts, axis=-1))
+        pooled = nn.Dense(2 * width, use_bias=False, name="pool")(mean)
+        out = nn.Dense(width, name="out")(nn.relu(inner + pooled))
+        return h + out * active
+
+
+class CompactNetwork(nn.Module):
+    """Permutation-equivariant, affine-invariant, for any M, K and n.
+
+    It sees the candidates only through inner products of whitened regressors, so no
+    affine map of the commands and no order of the candidates can change the pick.
+
+    The last two choices are the look-ahead's (``endgame``): the best pair given what
+    was chosen before, then the largest gain. At K = n + 2 the choices before the pair
+    do not span the space and it is rated with the ridge of ``features`` beside them: it
+    may be second best where those choices nearly coincide (docs/policy.md).
+    """
+
+    config: NetworkConfig
+
+    def setup(self) -> None:
+        config = self.config
+        self.embed = nn.Dense(config.width)
+        self.encoder = [_Round(config) for _ in range(config.encoder_rounds)]
+        self.join = nn.Dense(config.width)
+        self.decoder = [_Round(config) for _ in range(config.decoder_rounds)]
+        self.final_norm = nn.LayerNorm()
+        self.actor = nn.Dense(
+            1,
+            use_bias=False,
+            kernel_init=nn.initializers.orthogonal(config.initial_actor),
+        )
+        trust = nn.initializers.constant(config.initial_trust)
+        self.trust = self.param("trust", trust, ())
+        self.critic_hidden = nn.Dense(config.width)
+        self.critic = nn.Dense(1, kernel_init=nn.initializers.orthogonal(0.1))
+
+    @property
+    def num_unlearned(self) -> int:
+        """Choices at the end of an episode that are made without the network."""
+        return min(self.config.lookahead, 2) if self.config.endgame else 0
+
+    def candidate_features(
+        self, candidates: jax.Array, usable: jax.Array
+    ) -> CandidateFeatures:
+        """The geometry of sets; see ``networks.Network`` for the arguments."""
+        config = self.config
+        return geometry.candidate_features(
+            candidates, usable, config.lookahead, config.close_up
+        )
+
+    def decision_features(
+        self,
+        features: CandidateFeatures,
+        chosen: jax.Array,
+        available: jax.Array,
+        count: int | jax.Array,
+    ) -> DecisionFeatures:
+        """The geometry of a decision; see ``networks.Network`` for the arguments."""
+        config = self.config
+        return geometry.decision_features(
+            features, chosen, available, count, config.lookahead, config.close_up
+        )
+
+    def shares_program(self, features: CandidateFeatures, k: int) -> range:
+        """Counts of choices made, out of K, after which the next is the same program:
+        the chosen span the space, and the look-ahead is not cut short by the end."""
+        p = features.whitened.shape[-1]
+        ahead = max(self.config.lookahead, self.num_unlearned + 1)
+        return range(p, k - ahead + 1) if k > p else range(0)
+
+    def encode(self, features: CandidateFeatures) -> jax.Array:
+        """Embed a set: (..., M, width)."""
+        columns, active = features.vectors.columns, features.vectors.active
+        size = jnp.log(jnp.maximum(active.sum(-1).astype(columns.dtype), 1.0) / 50.0)
+        dimension = jnp.full_like(size, features.whitened.shape[-1] / 4.0 - 1.0)
+        scalars = jnp.stack([size / 3.0, dimension], axis=-1)[..., None, :]
+        scalars = jnp.broadcast_to(scalars, (*columns.shape[:-1], 2))
+        h = self.embed(jnp.concatenate([columns, scalars], axis=-1))
+        h = h * active[..., None]
+        for layer in self.encoder:
+            h = layer(h, features.vectors)
+        return h
+
+    def decode(
+        self, memory: jax.Array, decision: DecisionFeatures
+    ) -> tuple[jax.Array, jax.Array]:
+        """Score the next choice.
+
+        Returns:
+            (..., M) masked logits and (...,) value, in units of log det(Z.T Z).
+        """
+        h, vectors = memory, decision.vectors
+        columns, active = vectors.columns, vectors.active
+        lead = columns.shape[:-1]
+        mean = jnp.einsum("...m,...mw->...w", decision.chosen, h)
+        state = jnp.concatenate([mean, decision.progress], axis=-1)[..., None, :]
+        state = jnp.broadcast_to(state, (*lead, state.shape[-1]))
+        h = jnp.broadcast_to(h, (*lead, h.shape[-1]))
+        g = self.join(jnp.concatenate([h, columns, state], axis=-1))
+        g = g * active[..., None]
+        for layer in self.decoder:
+            g = layer(g, vectors)
+        g = self.final_norm(g)
+        # How far to believe the greedy look ahead is learned.
+        rule = 20.0 * vectors.ahead[..., 3]
+        if self.config.close_up:
+            rule = rule + geometry.close_up_of(vectors.ahead[..., 3]).sum(-1)
+        logits = self.actor(g)[..., 0] + self.trust * rule
+        logits = mask_logits(logits, active)
+        weight = active[..., None].astype(g.dtype)
+        number = jnp.maximum(weight.sum(-2), 1.0)
+        pooled = jnp.concatenate(
+            [(g * weight).sum(-2) / number, (g - 1e3 * (1.0 - weight)).max(-2)], axis=-1
+        )
+        value = self.critic(nn.relu(self.critic_hidden(pooled)))[..., 0]
+        return logits, decision.reached + value
+
+    def finish(self, decision: DecisionFeatures) -> tuple[jax.Array, jax.Array]:
+        """Logits and value of a choice that needs no network (``num_unlearned``)."""
+        vectors = decision.vectors
+        logits = mask_logits(_SHARP * vectors.ahead[..., 3], vectors.active)
+        return logits, decision.reached
+
+    def __call__(
+        self,
+        candidates: jax.Array,
+        usable: jax.Array,
+        chosen: jax.Array,
+        available: jax.Array,
+    ) -> tuple[jax.Array, jax.Array]:
+        """The first decision; flax makes the parameters with it."""
+        features = self.candidate_features(candidates, usable)
+        decision = self.decision_features(features, chosen, available, 0)
+        return self.decode(self.encode(features), decision)

@@ -1,0 +1,203 @@
+"""What a compact policy is shown: geometry of a candidate set and of a decision.
+
+Nothing here has parameters, so training computes it once for a decision and not in
+every epoch. Shapes: M candidates, n inputs, p = n + 1, K choices; leading axes ``...``.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxcal.learning.policies import geometry
+
+__all__ = [
+    "CandidateFeatures",
+    "DecisionFeatures",
+    "Remaining",
+    "VectorFeatures",
+    "candidate_features",
+    "close_up_of",
+    "decision_features",
+    "remaining",
+]
+
+_FLOOR = -8.0  # least log-volume, relative to the best, that a feature can show
+_RIDGE = 0.01  # of the mean square of a whitened coordinate, which is one
+_CLOSE = (32.0, 256.0, 2048.0)  # scales at which near-equal look-aheads differ
+
+
+class VectorFeatures(NamedTuple):
+    """What the network reads of one vector a candidate, and of all of them together."""
+
+    columns: jax.Array  # (..., M, 13), with close-ups (..., M, 16)
+    moments: jax.Array  # (..., M, p (p + 1) / 2) products of coordinates, scaled so
+    # that messages keep their size whatever M is
+    active: jax.Array  # (..., M) bool, which candidates count
+    ahead: jax.Array  # (..., M, 4) log-volume after 1, 2, 3 and all greedy choices that
+    # begin with this candidate, relative to the best candidate's
+    best: jax.Array  # (..., 4) that of the best candidate
+
+
+class CandidateFeatures(NamedTuple):
+    """A candidate set before any choice."""
+
+    vectors: VectorFeatures  # of the whitened regressors
+    whitened: jax.Array  # (..., M, p) regressors with mean x x.T = I
+    offset: jax.Array  # (...,) log det(Z_s.T Z_s) less that of the whitened subset
+
+
+class DecisionFeatures(NamedTuple):
+    """One decision: what is left of a set after some choices."""
+
+    vectors: VectorFeatures  # of what is left of the regressors
+    chosen: jax.Array  # (..., M) 1 / count where chosen already, else 0
+    reached: jax.Array  # (...,) log det(Z.T Z) of the best look-ahead to the end
+    progress: jax.Array  # (..., 7) one of the last three choices, 1 / left, count / p,
+    # left / p, whether K > p
+
+
+class Remaining(NamedTuple):
+    """What is left of a set after ``count`` choices."""
+
+    vectors: jax.Array  # (..., M, p) conditional vectors; their size is the gain
+    spanned: bool  # whether a choice multiplies det by 1 + |y|^2, else by |y|^2
+    log_det: jax.Array  # (...,) log det(Z.T Z) of the chosen
+    progress: jax.Array  # (..., 7) as in DecisionFeatures
+    chosen: jax.Array  # (..., c, M) one-hot choices; c = count, K where that is traced
+
+
+def candidate_features(
+    candidates: jax.Array, usable: jax.Array, lookahead: int, close_up: bool
+) -> CandidateFeatures:
+    """The geometry of a set.
+
+    Args:
+        candidates: (..., M, n) commands in any unit.
+        usable: (..., M) bool, available or already chosen.
+        lookahead: most greedy choices ahead that a feature shows.
+        close_up: whether to add the columns that tell near-equal look-aheads apart.
+    """
+    whitened, offset = geometry.whiten(candidates, usable)
+    depth = min(lookahead, whitened.shape[-1])
+    vectors = _vector_features(whitened, False, usable, depth, close_up)
+    return CandidateFeatures(vectors, whitened, offset)
+
+
+def decision_features(
+    features: CandidateFeatures,
+    chosen: jax.Array,
+    available: jax.Array,
+    count: int | jax.Array,
+    lookahead: int,
+    close_up: bool,
+) -> DecisionFeatures:
+    """The geometry of a decision.
+
+    Args:
+        features: of the set.
+        chosen: (..., K) int, of which the first ``count`` are chosen, the rest -1.
+        available: (..., M) bool.
+        count: choices made, the same for the whole batch. Traced only where the chosen
+            span the space and the look-ahead is not cut short by the end.
+        lookahead, close_up: see ``candidate_features``.
+    """
+    left = remaining(features, chosen, count)
+    depth = lookahead
+    if isinstance(count, int):
+        depth = min(depth, chosen.shape[-1] - count)
+    vectors = _vector_features(left.vectors, left.spanned, available, depth, close_up)
+    return DecisionFeatures(
+        vectors,
+        chosen=left.chosen.sum(-2) / jnp.maximum(count, 1),
+        reached=left.log_det + vectors.best[..., 3],
+        progress=left.progress,
+    )
+
+
+def remaining(
+    features: CandidateFeatures, chosen: jax.Array, count: int | jax.Array
+) -> Remaining:
+    """What is left of a set after ``count`` choices; see ``decision_features``."""
+    x = features.whitened
+    p, total = x.shape[-1], chosen.shape[-1]
+    left = total - count
+    known = isinstance(count, int)
+    shown = chosen[..., :count] if isinstance(count, int) else chosen
+    which = jax.nn.one_hot(shown, x.shape[-2], dtype=x.dtype)
+    picked = jnp.einsum(
+        "...km,...mp->...kp", which, x, precision=jax.lax.Precision.HIGHEST
+    )
+    if total == p:
+        # Every choice is a new direction: exact projections.
+        y, spanned = geometry.projected(x, picked), False
+        so_far = geometry.log_det_lengths(picked)
+    else:
+        # The metric of the chosen; until they span the space, with a ridge small
+        # beside what a posture contributes.
+        ridge = _RIDGE if known and count < p else 0.0
+        y, so_far = geometry.normalised_by(x, picked, ridge)
+        spanned = True
+    numbers = [
+        jnp.asarray(number, x.dtype)
+        for number in (
+            left == 1,
+            left == 2,
+            left == 3,
+            1.0 / left,
+            count / p,
+            jnp.minimum(left / p, 3.0),
+            total > p,
+        )
+    ]
+    progress = jnp.broadcast_to(jnp.stack(numbers), (*so_far.shape, len(numbers)))
+    return Remaining(y, spanned, features.offset + so_far, progress, which)
+
+
+def close_up_of(ahead: jax.Array) -> jax.Array:
+    """(..., 3) of (...,) log-volumes behind the best: 1 for the best, each sharper."""
+    return jnp.stack([jnp.exp(scale * ahead) for scale in _CLOSE], axis=-1)
+
+
+def _vector_features(
+    y: jax.Array, spanned: bool, active: jax.Array, depth: int, close_up: bool
+) -> VectorFeatures:
+    """Features of vectors y (..., M, p); ``spanned`` and ``depth`` as in lookahead."""
+    y = y * active[..., None].astype(y.dtype)
+    number = jnp.maximum(active.sum(-1).astype(y.dtype), 1.0)
+    square = (y * y).sum(-1)
+    mean_square = jnp.maximum(square.sum(-1) / number, 1e-8)
+    unit = y * jax.lax.rsqrt(mean_square)[..., None, None]
+    moments = _second_moments(unit) * jax.lax.rsqrt(number)[..., None, None]
+    steps = geometry.lookahead(y, spanned, active, depth)
+    ahead = jnp.stack([steps[min(d, depth) - 1] for d in (1, 2, 3, depth)], axis=-1)
+    best = ahead.max(-2)
+    ahead = jnp.maximum(ahead - best[..., None, :], -30.0)
+    level = jnp.log(jnp.maximum(square, 1e-6) / mean_square[..., None])
+    short = jnp.maximum(ahead, _FLOOR)
+    shown = [
+        short / 2.0,
+        jnp.exp(short),
+        jnp.exp(4.0 * short),
+        jnp.clip(level, _FLOOR, 4.0)[..., None] / 2.0,
+    ]
+    if close_up:
+        shown.append(close_up_of(short[..., 3]))
+    columns = jnp.concatenate(shown, axis=-1)
+    columns = jnp.where(active[..., None], columns, 0.0)
+    return VectorFeatures(columns, moments, active, ahead, best)
+
+
+def _second_moments(x: jax.Array) -> jax.Array:
+    """(..., M, p) -> (..., M, p (p + 1) / 2) with phi(x) . phi(y) = (x . y)^2."""
+    p = x.shape[-1]
+    return jnp.stack(
+        [
+            x[..., i] * x[..., j] * (1.0 if i == j else 2.0**0.5)
+            for i in range(p)
+            for j in range(i, p)
+        ],
+        axis=-1,
+    )

@@ -1,0 +1,73 @@
+"""The affine model ``y = A u + b``."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import axis_letter, whole_number
+from jaxcal.information.regression import regression_matrix, regressors
+
+__all__ = ["Affine"]
+
+Array = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True)
+class Affine:
+    """n inputs, m outputs; parameters are A row by row, then b (paper, Equation 9).
+
+    The outputs share one regressor ``[u, 1]``: with unit noise the information of a
+    posture is m equal diagonal blocks, so one block [u, 1] counted m times holds it.
+    """
+
+    num_inputs: int  # n
+    num_outputs: int  # m
+
+    def __post_init__(self) -> None:
+        whole_number("num_inputs", self.num_inputs, 1)
+        whole_number("num_outputs", self.num_outputs, 1)
+
+    @property
+    def num_parameters(self) -> int:
+        """m (n + 1)."""
+        return self.num_outputs * (self.num_inputs + 1)
+
+    @property
+    def multiplicity(self) -> int:
+        """How often log det of the blocks counts: once per output."""
+        return self.num_outputs
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """``a11 a12 ... bx by bz``."""
+        n, m = self.num_inputs, self.num_outputs
+        slopes = [f"a{i + 1}{j + 1}" for i in range(m) for j in range(n)]
+        return (*slopes, *(f"b{axis_letter(i, m)}" for i in range(m)))
+
+    @property
+    def nominal(self) -> Array:
+        """(m (n + 1),) the outputs are the inputs: A is the identity, b is zero."""
+        slopes = np.eye(self.num_outputs, self.num_inputs)
+        return np.concatenate([slopes.ravel(), np.zeros(self.num_outputs)])
+
+    def predict(self, commands: ArrayLike, parameters: ArrayLike) -> Array:
+        """Outputs (N, m) at commands (N, n) for parameters (m (n + 1),)."""
+        return self.jacobian(commands) @ np.asarray(parameters, dtype=np.float64)
+
+    def jacobian(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
+        """(N, m, m (n + 1)) derivative of the outputs; ``parameters`` do not matter."""
+        matrix = regression_matrix(commands, self.num_outputs)
+        return matrix.reshape(-1, self.num_outputs, self.num_parameters)
+
+    def blocks(self, commands: ArrayLike) -> Array:
+        """(..., N, 1, n + 1) information blocks [u, 1] of commands (..., N, n)."""
+        return regressors(commands)[..., None, :]
+
+    def default_prior(self) -> Array:
+        """(m (n + 1), m (n + 1)) precision: zero, nothing is known beforehand."""
+        return np.zeros((self.num_parameters, self.num_parameters))

@@ -1,0 +1,70 @@
+"""What the paper's commands share: errors of one line, exit codes, common arguments."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+__all__ = ["Parser", "positive", "run", "seed"]
+
+
+class Parser(argparse.ArgumentParser):
+    """Reports a bad argument in one line and keeps the layout of its texts."""
+
+    def __init__(self, **fields: Any) -> None:
+        fields.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        super().__init__(allow_abbrev=False, **fields)
+
+    def error(self, message: str) -> NoReturn:
+        print(f"{self.prog}: error: {message}; see --help", file=sys.stderr)
+        sys.exit(2)
+
+
+def run(command: Callable[[], None], name: str, interrupted: str) -> int:
+    """Run a command; its exit code.
+
+    Args:
+        command: what it does.
+        name: in front of an error.
+        interrupted: what an interruption leaves.
+
+    Returns:
+        0; 2 where an argument, a file or a folder is bad, 3 where a program that it
+        started failed, 130 where it was interrupted.
+    """
+    try:
+        command()
+    except KeyboardInterrupt:
+        print(f"{name}: interrupted; {interrupted}", file=sys.stderr)
+        return 130
+    except (ValueError, OSError, RuntimeError) as error:
+        text = " ".join(str(error).split())
+        if isinstance(error, OSError) and error.strerror and error.filename:
+            text = f"{error.filename}: {error.strerror}"
+        print(f"{name}: error: {text}", file=sys.stderr)
+        return 3 if isinstance(error, RuntimeError) else 2
+    return 0
+
+
+def seed(text: str) -> int:
+    """A whole number of at least 0, for ``type=``."""
+    return _whole(text, 0)
+
+
+def positive(text: str) -> int:
+    """A whole number of at least 1, for ``type=``."""
+    return _whole(text, 1)
+
+
+def _whole(text: str, least: int) -> int:
+    try:
+        number = int(text)
+    except ValueError:
+        number = least - 1
+    if number < least:
+        raise argparse.ArgumentTypeError(
+            f"must be a whole number of at least {least}, got {text!r}"
+        )
+    return number

@@ -1,0 +1,12 @@
+"""The paper's datasets, as ``jaxcal.evaluation`` takes them."""
+
+from __future__ import annotations
+
+from jaxcal.evaluation.catalogue import Catalogue
+from jaxcal.paper.datasets.datasets import BLOCK, DRAWN, EPISODES, drawn, make_dataset
+
+__all__ = ["CATALOGUE"]
+
+CATALOGUE = Catalogue(
+    sizes=EPISODES, make=make_dataset, endless=DRAWN, draw=drawn, block=BLOCK
+)

@@ -1,0 +1,143 @@
+"""The paper's attention policy (its Table 2); a network of the kind ``paper``."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from jaxcal.learning.environments.observation import context_features
+from jaxcal.learning.policies.networks import NetworkConfig, mask_logits
+
+__all__ = ["HEADS", "PaperNetwork"]
+
+HEADS = ("actor", "critic_1", "critic_2")  # everything else is shared
+
+
+class Candidates(NamedTuple):
+    """A set, as it is."""
+
+    poses: jax.Array  # (..., M, n), in [0, 1]
+
+
+class Decision(NamedTuple):
+    """What a decision adds to the set."""
+
+    context: jax.Array  # (..., 2 n + 4), see ``context_features``
+    available: jax.Array  # (..., M) bool
+
+
+class _Keys(nn.Module):
+    """A linear map of candidates that is never applied to them.
+
+    A score ``q . (K.T p + b)`` is ``(K q) . p`` and a number that is the same for every
+    candidate, which no softmax sees; a weighted mean of keys is the key of the weighted
+    mean. So the map is applied to a few queries and not to every candidate.
+    """
+
+    width: int
+
+    def setup(self) -> None:
+        shape = (self.width, self.width)
+        self.kernel = self.param("kernel", nn.initializers.lecun_normal(), shape)
+        self.bias = self.param("bias", nn.initializers.zeros, (self.width,))
+
+    def __call__(self, poses: jax.Array) -> jax.Array:
+        """Keys (..., width) of encoded poses (..., width)."""
+        keys = poses @ self.kernel
+        return keys + jnp.broadcast_to(self.bias, keys.shape)
+
+    def scores(self, query: jax.Array, poses: jax.Array) -> jax.Array:
+        """(..., M) inner products with the keys, less what all of them share."""
+        return jnp.einsum("...w,...mw->...m", query @ self.kernel.T, poses)
+
+
+class PaperNetwork(nn.Module):
+    """The paper's attention policy: hidden 768, 3.5 M parameters, 71 % shared.
+
+    Candidates are encoded one by one, a context encoder reads the ten numbers of the
+    state that are not candidates, attention relates the two, and an actor and a critic
+    stand on that shared encoder. Any M runs; it is not invariant to affine maps.
+    """
+
+    config: NetworkConfig
+
+    num_unlearned = 0
+
+    def setup(self) -> None:
+        width = self.config.width
+        self.pose_1, self.pose_2 = nn.Dense(width), nn.Dense(width)
+        self.pose_norm = nn.LayerNorm()
+        self.key = _Keys(width)
+        self.context_1, self.context_2 = nn.Dense(width), nn.Dense(width)
+        self.context_norm = nn.LayerNorm()
+        self.query = nn.Dense(width)
+        self.squeeze = nn.Dense(max(width * 3 // 32, 1))
+        self.expand = nn.Dense(width)
+        self.actor = nn.Dense(width)
+        self.critic_1 = nn.Dense(max(width * 2 // 3, 1))
+        self.critic_2 = nn.Dense(1, kernel_init=nn.initializers.orthogonal(0.1))
+
+    def candidate_features(
+        self, candidates: jax.Array, usable: jax.Array
+    ) -> Candidates:
+        """The candidates as they are."""
+        return Candidates(candidates)
+
+    def decision_features(
+        self,
+        features: Candidates,
+        chosen: jax.Array,
+        available: jax.Array,
+        count: int | jax.Array,
+    ) -> Decision:
+        """The ten context numbers and the availability of the 210."""
+        return Decision(context_features(features.poses, chosen), available)
+
+    def shares_program(self, features: Candidates, k: int) -> range:
+        """None: every choice is written out, they are few."""
+        return range(0)
+
+    def encode(self, features: Candidates) -> jax.Array:
+        """The candidates (..., M, width), encoded one by one."""
+        poses = nn.relu(self.pose_1(2.0 * features.poses - 1.0))
+        return self.pose_norm(nn.relu(self.pose_2(poses)))
+
+    def decode(
+        self, memory: jax.Array, decision: Decision
+    ) -> tuple[jax.Array, jax.Array]:
+        """Score the next choice: (..., M) masked logits and (...,) value."""
+        context = nn.relu(self.context_1(decision.context))
+        context = self.context_norm(nn.relu(self.context_2(context)))
+        scale = self.config.width**-0.5
+        scores = self.key.scores(self.query(context), memory) * scale
+        weights = nn.softmax(mask_logits(scores, decision.available))
+        glimpse = self.key(jnp.einsum("...m,...mw->...w", weights, memory))
+        shared = context + self.expand(nn.relu(self.squeeze(context + glimpse)))
+        logits = self.key.scores(self.actor(shared), memory) * scale
+        value = self.critic_2(nn.relu(self.critic_1(shared)))[..., 0]
+        return mask_logits(logits, decision.available), value
+
+    def __call__(
+        self,
+        candidates: jax.Array,
+        usable: jax.Array,
+        chosen: jax.Array,
+        available: jax.Array,
+    ) -> tuple[jax.Array, jax.Array]:
+        """The first decision; flax makes the parameters with it."""
+        features = self.candidate_features(candidates, usable)
+        decision = self.decision_features(features, chosen, available, 0)
+        return self.decode(self.encode(features), decision)
+
+    def from_observation(
+        self, observation: jax.Array, num_candidates: int, num_inputs: int
+    ) -> tuple[jax.Array, jax.Array]:
+        """Logits and value from the (..., 210) numbers of ``selection.observe``."""
+        m, n = num_candidates, num_inputs
+        poses = observation[..., : n * m].reshape(*observation.shape[:-1], m, n)
+        available = observation[..., n * m : (n + 1) * m] > 0.5
+        decision = Decision(observation[..., (n + 1) * m :], available)
+        return self.decode(self.encode(Candidates(poses)), decision)

@@ -1,0 +1,34 @@
+"""The preset ``paper``: the network and the schedule of the paper's Table 2.
+
+An update every 16 episodes, 10 epochs, 200,000 episodes, and no more: the paper gives
+no learning rate, clip range or entropy bonus. Adam at 1e-4, 0.2 and 0.01 without
+schedule are the usual ones for a network of this size.
+"""
+
+from __future__ import annotations
+
+from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.training.config import PPOConfig, TrainConfig
+
+__all__ = ["PAPER"]
+
+PAPER = TrainConfig(
+    preset="paper",
+    about="the paper's network (3.5 million weights) and schedule; hours on a CPU",
+    network=NetworkConfig(kind="paper", width=768),
+    ppo=PPOConfig(
+        num_episodes=200_000,
+        episodes_per_update=16,
+        episodes_per_set=1,
+        num_epochs=10,
+        num_minibatches=1,
+        learning_rate=1e-4,
+        final_learning_rate=1e-4,
+        entropy_start=0.01,
+        entropy_end=0.01,
+        normalise_per_decision=False,
+        value_error_limit=1e9,
+        advantage_limit=1e9,
+        average_decay=0.99,
+    ),
+)

@@ -1,0 +1,74 @@
+"""How long moves take.
+
+A move is a trapezoid profile on every axis (accelerate, cruise, brake), all axes start
+together and the slowest sets the time. Each axis' time is a concave function of its
+distance that is zero at zero, so the travel time is a metric. Loads numpy alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import numbers
+
+__all__ = ["Motion", "travel_times"]
+
+Array = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion:
+    """How the device moves; in the unit of the candidates and seconds."""
+
+    speed: tuple[float, ...]  # (n,) or one for all axes, unit/s
+    acceleration: tuple[float, ...]  # likewise, unit/s^2; also the deceleration
+    settle: float = 0.0  # s at every posture, before and while measuring
+
+    def __post_init__(self) -> None:
+        for name in ("speed", "acceleration"):
+            given = numbers(name, getattr(self, name))
+            if given.ndim > 1 or not given.size or (given <= 0.0).any():
+                raise ValueError(
+                    f"{name} must be positive numbers, one or one an axis, "
+                    f"got {getattr(self, name)!r}"
+                )
+            object.__setattr__(self, name, tuple(np.atleast_1d(given).tolist()))
+        settle = numbers("settle", self.settle)
+        if settle.ndim or settle < 0.0:
+            raise ValueError(f"settle must be at least 0 seconds, got {self.settle!r}")
+
+
+def travel_times(points: ArrayLike, others: ArrayLike, motion: Motion) -> Array:
+    """Seconds from each of some postures to each of others, without settling.
+
+    An axis that moves d at speed v and acceleration a takes ``d / v + v / a``, or
+    ``2 sqrt(d / a)`` where it never reaches v (d < v^2 / a); the slowest axis counts.
+
+    Args:
+        points: (A, n).
+        others: (B, n) in the same unit.
+        motion: limits of the axes.
+
+    Returns:
+        (A, B).
+    """
+    a, b = numbers("points", points), numbers("others", others)
+    if a.ndim != 2 or b.ndim != 2 or a.shape[1] != b.shape[1]:
+        raise ValueError(
+            f"points and others must be (A, n) and (B, n), got {a.shape} and {b.shape}"
+        )
+    n = a.shape[1]
+    limits = []
+    for name in ("speed", "acceleration"):
+        value = np.asarray(getattr(motion, name))
+        if len(value) not in (1, n):
+            raise ValueError(f"motion.{name} must hold 1 or {n}, got {len(value)}")
+        limits.append(np.broadcast_to(value, (n,)))
+    speed, ramp = limits
+    way = np.abs(a[:, None] - b[None])
+    cruise = way >= speed**2 / ramp
+    seconds = np.where(cruise, way / speed + speed / ramp, 2.0 * np.sqrt(way / ramp))
+    return seconds.max(axis=2)

@@ -1,0 +1,87 @@
+"""What no design of K measurements beats: lower bounds on G and I.
+
+For weights w over the region with W = sum of w z z.T and any positive definite M0,
+convexity and the best scaling of M0 give for every design M of K measurements
+
+    trace(W M^-1) >= trace(W M0^-1)^2 / (largest sum of K gains x.T M0^-1 W M0^-1 x),
+
+and the largest variance is at least every weighted mean of it. For G the weights are
+those of the D-optimal measure of the region, which make the bound p / K where the
+region is the candidates and replicates are free (Kiefer and Wolfowitz 1960). Source:
+Pukelsheim, Optimal Design of Experiments, chapter 9.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.selection.problem import Problem
+
+__all__ = ["lower_bound", "region_weighting"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+_ITERATIONS = 300  # any count gives a true bound
+
+
+def region_weighting(points: Array, criterion: str) -> Array:
+    """(p, p) W, the sum of w z z.T over the region, of weights that sum to 1.
+
+    Args:
+        points: (R, p) whitened regressors of the region.
+        criterion: "G", weights of the D-optimal measure of the region by Titterington's
+            steps w <- w (z.T W^-1 z) / p, or "I", equal weights.
+    """
+    num_points, p = points.shape
+    weight = np.full(num_points, 1.0 / num_points)
+    for _ in range(_ITERATIONS if criterion == "G" else 0):
+        inverse = np.linalg.pinv((points * weight[:, None]).T @ points, hermitian=True)
+        weight *= np.einsum("ra,ab,rb->r", points, inverse, points) / p
+        weight /= weight.sum()
+    return (points * weight[:, None]).T @ points
+
+
+def lower_bound(problem: Problem, weighting: Array, k: int) -> float:
+    """No design of k within the counts has a smaller ``trace(W M^-1)``.
+
+    M0 is the relaxed minimiser, from multiplicative steps on counts that are clipped
+    to their limits; whatever M0 they end in, the bound holds.
+    """
+    rows, lower = problem.rows, problem.lower
+    upper = np.where(problem.available, min(problem.max_replicates, k), 0)
+    count = np.where(problem.available, k / problem.available.sum(), 0.0)
+    best = 0.0
+    for iteration in range(_ITERATIONS):
+        gram = (rows * count[:, None]).T @ rows
+        inverse = np.linalg.pinv(gram, hermitian=True)
+        gain = np.einsum("ma,ab,mb->m", rows, inverse @ weighting @ inverse, rows)
+        if iteration % 10 == 0 or iteration == _ITERATIONS - 1:
+            most = _largest_sum(gain, lower, upper, k)
+            best = max(best, float(np.trace(weighting @ inverse)) ** 2 / most)
+        count = _scaled_to(count * np.sqrt(np.maximum(gain, 0.0)), lower, upper, k)
+    return best
+
+
+def _largest_sum(gain: Array, lower: Indices, upper: Indices, k: int) -> float:
+    """Largest ``sum of c_i gain_i`` with counts within their limits and sum k."""
+    order = np.argsort(-gain)
+    room = (upper - lower)[order]
+    free = k - int(lower.sum())
+    filled = np.clip(free - (np.cumsum(room) - room), 0, room)
+    return float(lower @ gain + filled @ gain[order])
+
+
+def _scaled_to(count: Array, lower: Indices, upper: Indices, k: int) -> Array:
+    """``clip(c count, lower, upper)`` with the c that makes the sum k, by bisection."""
+    low, high = 0.0, 1.0
+    while np.clip(high * count, lower, upper).sum() < k and high < 1e12:
+        high *= 2.0
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        if np.clip(middle * count, lower, upper).sum() < k:
+            low = middle
+        else:
+            high = middle
+    return np.clip(high * count, lower, upper)

@@ -1,0 +1,124 @@
+"""The table of solvers, and which options each reads. A new solver is one row here."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxcal.checks import one_of, seconds, share, whole_number
+from jaxcal.selection import auto, greedy, random
+from jaxcal.selection.exact import exact
+from jaxcal.selection.exchange import exchange
+from jaxcal.selection.problem import Problem
+from jaxcal.selection.solver import Found
+
+__all__ = ["METHODS", "SOLVERS", "Solver", "checked_options", "checked_seed"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Solver:
+    """A method of ``select``; see :mod:`jaxcal.selection.solver` for the functions."""
+
+    solve: Callable[..., Found]
+    solve_many: Callable[..., list[Found]] | None = None
+
+    @functools.cached_property
+    def options(self) -> tuple[str, ...]:
+        """Names of the options it reads."""
+        kind = inspect.Parameter.KEYWORD_ONLY
+        found = inspect.signature(self.solve).parameters.values()
+        return tuple(each.name for each in found if each.kind == kind)
+
+
+def _policy(
+    problem: Problem, *, seed: int, checkpoint: Any, decoding: str, num: int
+) -> Found:
+    from jaxcal.selection.policy import select_batch
+
+    if problem.candidates is None:
+        raise ValueError(
+            'blocks cannot be used with method "policy", which is trained on '
+            "candidates of the affine model; use auto, exact or exchange"
+        )
+    if problem.max_replicates > 1:
+        raise ValueError(
+            'max_replicates must be 1 with method "policy", which picks distinct '
+            f"postures, got {problem.max_replicates}"
+        )
+    indices = select_batch(
+        problem.candidates[None],
+        problem.k,
+        available=problem.available[None],
+        required=problem.required[None] if len(problem.required) else None,
+        decoding=decoding,
+        num=num,
+        seed=seed,
+        checkpoint=checkpoint,
+    )
+    return Found(np.asarray(indices[0], dtype=np.int64), seed=seed)
+
+
+SOLVERS = {
+    "random": Solver(random.solve, random.solve_many),
+    "greedy": Solver(greedy.solve, greedy.solve_many),
+    "exchange": Solver(exchange.solve, exchange.solve_many),
+    "exact": Solver(exact.solve, exact.solve_many),
+    "policy": Solver(_policy),
+    "auto": Solver(auto.solve),
+}
+METHODS = tuple(SOLVERS)
+
+# Default and check of every option; a value equal to the default counts as not given.
+_OPTIONS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
+    "seed": (0, lambda value: checked_seed(value)),
+    "restarts": (None, lambda value: whole_number("restarts", value, 1)),
+    "time_limit": (None, lambda value: seconds("time_limit", value)),
+    "best": (1, lambda value: whole_number("best", value, 1)),
+    "checkpoint": (None, lambda value: value),
+    "decoding": ("greedy", lambda value: value),
+    "num": (16, lambda value: whole_number("num", value, 1)),
+    "least_efficiency": (0.999, lambda value: share("least_efficiency", value)),
+}
+
+
+def checked_options(
+    method: str, given: Mapping[str, Any], more: tuple[str, ...] = ()
+) -> dict[str, Any]:
+    """The options that a method reads, checked.
+
+    Args:
+        method: a name of ``SOLVERS``.
+        given: every option of ``select`` by name.
+        more: options that something beside the solver reads.
+
+    Raises:
+        ValueError: an option has a bad value, or belongs to other methods.
+    """
+    one_of("method", method, METHODS)
+    reads = SOLVERS[method].options
+    checked = {}
+    for name, value in given.items():
+        default, check = _OPTIONS[name]
+        is_default = value is default or (
+            type(value) is type(default) and value == default
+        )
+        checked[name] = value if is_default else check(value)
+        if not is_default and name not in (*reads, *more):
+            others = [other for other in METHODS if name in SOLVERS[other].options]
+            raise ValueError(
+                f'{name} is not an option of method "{method}" '
+                f"(it is of {', '.join(others)})"
+            )
+    return {name: checked[name] for name in reads}
+
+
+def checked_seed(value: Any) -> int:
+    """``value``, or a number drawn from it where it is a numpy Generator."""
+    if isinstance(value, np.random.Generator):
+        return int(value.integers(2**63))
+    return whole_number("seed", value, 0)

@@ -1,0 +1,133 @@
+"""The commands of ``python -m rig``; each imports what it needs."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+
+from rig.config import example_text, load_config
+from rig.config.files import EXAMPLES, ConfigError
+from rig.guard.faults import EXIT_FAULT, EXIT_OK
+from rig.sessions import load, make_simulator, run_session, say
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command that was asked for; returns the exit code."""
+    if "list" in getattr(args, "fault", []):
+        from rig.simulator.faults import KINDS
+
+        for kind, text in KINDS.items():
+            print(f"{kind:<16} {text}")
+        return EXIT_OK
+    commands: dict[str, Callable[[argparse.Namespace], int]] = {
+        "identify": _identify,
+        "stop": _stop,
+        "simulate": _simulate,
+        "example": _example,
+        "check": _check,
+    }
+    return commands.get(args.command, run_session)(args)
+
+
+def _identify(args: argparse.Namespace) -> int:
+    from rig.device.bus import Bus, BusError
+    from rig.device.drives import Drive
+
+    config, simulator, failed = load(args), None, False
+    if args.simulate:
+        simulator = make_simulator(config, vars(args), [])
+        config = simulator.start()
+    try:
+        with Bus(config.bus, config.silence_s) as bus:
+            for axis in config.axes:
+                drive, who = Drive(bus, axis), f"{axis.name} (unit {axis.unit}"
+                try:
+                    status, alarm = drive.status(), drive.alarm()
+                    identity = drive.identity()
+                except BusError as error:
+                    failed = True
+                    print(f"{who}): {error}")
+                    continue
+                names = ("enabled", "done", "moving", "fault")
+                words = " ".join(name for name in names if getattr(status, name))
+                print(
+                    f"{who}, {axis.map.title}): status 0x{status.word:04X} {words}, "
+                    f"position {status.position} pulses = "
+                    f"{axis.to_deg(status.position):.4f} deg"
+                    + (f", {alarm}" if alarm else "")
+                )
+                for name, value in identity.items():
+                    print(f"    {name} = {value}")
+    finally:
+        if simulator is not None:
+            simulator.close()
+    return EXIT_FAULT if failed else EXIT_OK
+
+
+def _stop(args: argparse.Namespace) -> int:
+    from rig.device.bus import Bus, BusError
+    from rig.device.drives import Drive
+    from rig.guard.stop import stop_all
+
+    config = load(args)
+    bus = Bus(config.bus, config.silence_s)
+    try:
+        bus.open()
+    except BusError as error:
+        raise BusError(
+            f"NOTHING WAS STOPPED: {error}. If a session holds the port, press Ctrl-C "
+            "twice there; otherwise use the emergency stop"
+        ) from None
+    with bus:
+        results = stop_all([Drive(bus, axis) for axis in config.axes])
+    for result in results:
+        print(result)
+    stopped = all(r.acknowledged and r.standing for r in results)
+    return EXIT_OK if stopped else EXIT_FAULT
+
+
+def _simulate(args: argparse.Namespace) -> int:
+    config = load(args)
+    listens = config.imu.transport == "listen"
+    if listens and config.imu.port == 0:
+        imu = config.imu.model_copy(update={"port": 2055})
+        config = config.model_copy(update={"imu": imu})
+    port = config.bus.port if args.bus_port is None else args.bus_port
+    with make_simulator(config, vars(args), args.fault) as simulator:
+        served = simulator.start(port)
+        simulator.start_phone(config.imu.port)
+        phone = f"sends to 127.0.0.1:{config.imu.port}"
+        if not listens:
+            phone = f"listens on 127.0.0.1:{served.imu.port}"
+        print(f"drives: {served.bus.where}; units {[a.unit for a in config.axes]}")
+        print(f"phone: {config.imu.format}, {phone}")
+        say("Ctrl-C ends")
+        try:
+            while True:
+                time.sleep(3600)
+        except KeyboardInterrupt:
+            return EXIT_OK
+
+
+def _example(args: argparse.Namespace) -> int:
+    if args.name is None:
+        print("\n".join(sorted(path.stem for path in EXAMPLES.glob("*.toml"))))
+    else:
+        print(example_text(args.name), end="")
+    return EXIT_OK
+
+
+def _check(args: argparse.Namespace) -> int:
+    path = args.config or args.file
+    if path is None:
+        raise ConfigError("configuration", ["--config FILE is required"])
+    config = load_config(path)
+    print(f"{path}: valid; fingerprint {config.fingerprint()[:16]}")
+    for axis in config.axes:
+        print(
+            f"  {axis.name}: unit {axis.unit}, {axis.map.name}, "
+            f"{axis.pulses_per_deg:.3f} pulses per degree, "
+            f"{axis.min_pulses}..{axis.max_pulses} pulses"
+        )
+    return EXIT_OK

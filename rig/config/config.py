@@ -1,0 +1,142 @@
+"""The whole of rig.toml, and what follows from several of its tables."""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from pydantic import PrivateAttr
+
+from rig.attitude import Array
+from rig.config.axis import AXIS_NAMES, Axis, Pulses, Scale
+from rig.config.schema import Section, key
+from rig.config.settings import (
+    BusSettings,
+    ImuSettings,
+    MechanismSettings,
+    MotionSettings,
+    SessionSettings,
+    SettleSettings,
+)
+
+
+class RigConfig(Section):
+    """A whole, valid configuration."""
+
+    bus: BusSettings
+    axes: tuple[Axis, Axis, Axis]
+    imu: ImuSettings
+    mechanism: MechanismSettings = MechanismSettings()
+    settle: SettleSettings = SettleSettings()
+    motion: MotionSettings = MotionSettings()
+    session: SessionSettings = SessionSettings()
+    output: str = key("every run makes its own folder in here", "runs")
+    _text: str = PrivateAttr("")
+
+    @property
+    def text(self) -> str:
+        """The TOML it came from."""
+        return self._text
+
+    @property
+    def letters(self) -> tuple[str, str, str]:
+        """Axis letters of pitch, yaw and roll."""
+        a, b, c = (axis.rotates for axis in self.axes)
+        return a, b, c
+
+    @property
+    def ranges(self) -> tuple[tuple[float, float], ...]:
+        """(3, 2) degrees in which candidates are drawn."""
+        overshoot = self.motion.approach_overshoot_deg
+        return tuple(
+            getattr(self.session, f"{axis.name}_range_deg")
+            or (axis.min_deg + overshoot, axis.max_deg)
+            for axis in self.axes
+        )
+
+    @property
+    def silence_s(self) -> float:
+        """Silence between frames that the slowest of the drives wants."""
+        return max(axis.map.inter_frame_s for axis in self.axes)
+
+    def to_pulses(self, angles_deg: Any) -> Pulses:
+        """Whole pulses of (3,) degrees."""
+        a, b, c = (
+            axis.to_pulses(float(angle))
+            for axis, angle in zip(self.axes, angles_deg, strict=True)
+        )
+        return a, b, c
+
+    def to_deg(self, pulses: Any) -> Array:
+        """(..., 3) degrees of (..., 3) pulses."""
+        scales = np.array([axis.pulses_per_deg for axis in self.axes])
+        return np.asarray(pulses, dtype=np.float64) / scales
+
+    def described(self) -> dict[str, Any]:
+        """Everything as JSON values, in the layout of run folders of version 1."""
+        axes = []
+        moved = {*Scale.model_fields, "rotates", "map"}
+        for axis in self.axes:
+            plain = axis.model_dump(exclude=moved)
+            plain["letter"] = axis.rotates
+            plain["map"] = {"name": axis.map.name, "digest": axis.map.digest}
+            plain["scale"] = axis.model_dump(include=set(Scale.model_fields))
+            axes.append(plain)
+        imu = self.imu.model_dump()
+        imu["quaternion"], imu["angle_unit"] = (
+            imu.pop("quaternion_columns"),
+            imu.pop("unit"),
+        )
+        imu["stamp_column"] = None if imu["stamp_column"] < 0 else imu["stamp_column"]
+        imu["column_count"] = imu["column_count"] or None
+        session = self.session.model_dump()
+        for name in AXIS_NAMES:
+            del session[f"{name}_range_deg"]
+        return {
+            "bus": self.bus.model_dump(),
+            "axes": axes,
+            "imu": imu,
+            "mechanism_order": self.mechanism.order,
+            "settle": self.settle.model_dump(),
+            "motion": self.motion.model_dump(),
+            "session": session | {"ranges": self.ranges},
+        }
+
+    def fingerprint(self) -> str:
+        """SHA-256 of what a measurement depends on.
+
+        Where the bus and the phone are reached may change between a run and its
+        resumption; how the device moves and is measured may not.
+        """
+        data = self.described()
+        del data["bus"]
+        for name in ("host", "port", "transport", "stale_s"):
+            del data["imu"][name]
+        text = json.dumps(data, sort_keys=True, default=str)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def broken_rules(self) -> Iterator[str]:
+        motion, session = self.motion, self.session
+        slowest = self.bus.timeout_s * (self.bus.read_retries + 1)
+        overshoot = motion.approach_overshoot_deg
+        if session.k >= session.candidates:
+            yield f"session.k: must be under candidates ({session.candidates})"
+        for axis, (low, high) in zip(self.axes, self.ranges, strict=True):
+            at, span = f"axes.{axis.name}", f"session.{axis.name}_range_deg"
+            if abs(1.0 / axis.pulses_per_deg) > motion.position_tolerance_deg:
+                yield f"{at}: one pulse is coarser than motion.position_tolerance_deg"
+            if axis.comm_timeout_s is not None and axis.comm_timeout_s <= slowest:
+                least = f"bus.timeout_s x (read_retries + 1) = {slowest:g} s"
+                yield f"{at}.comm_timeout_s: must exceed {least}"
+            if motion.mirror_limits and axis.map.limits is None:
+                lack = f"the map {axis.map.name} of {axis.name} has no limit registers"
+                yield f"motion.mirror_limits: {lack}"
+            if low >= high:
+                yield f"{span}: must be [low, high], got [{low}, {high}]"
+            elif low - overshoot < axis.min_deg - 1e-9 or high > axis.max_deg + 1e-9:
+                limits = f"[{axis.min_deg}, {axis.max_deg}]"
+                yield (
+                    f"{span}: [{low}, {high}] with an overshoot of {overshoot} leaves "
+                    f"the axis's limits {limits}"
+                )

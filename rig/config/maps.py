@@ -1,0 +1,119 @@
+"""Register maps: a drive family as data.
+
+A map is one TOML file in ``rig/maps`` (or anywhere: a configuration may give a path).
+It says where a drive keeps its status, position and alarm, and which registers to write
+to move, stop, enable. Nothing here opens a port.
+"""
+
+import hashlib
+import json
+import pathlib
+import tomllib
+from collections.abc import Iterator
+from typing import Any, Literal
+
+from pydantic import PrivateAttr
+
+from rig.config.registers import (
+    Alarm,
+    CommTimeout,
+    Move,
+    Position,
+    Read,
+    StatusWord,
+    Units,
+    Writes,
+)
+from rig.config.schema import Section, key, validated
+
+MAP_FOLDER = pathlib.Path(__file__).parent.parent / "maps"
+
+
+class MapError(ValueError):
+    """A register map breaks the schema; the text lists every fault."""
+
+
+class RegisterMap(Section):
+    """One drive family."""
+
+    schema_: Literal[1] = key("version of this schema", alias="schema")
+    name: str = key("name of the map", min_length=1)
+    title: str = key("drives it is for", min_length=1)
+    sources: str = key("where the addresses are from", min_length=1)
+    confidence: str = key("how far they were checked", "")
+    word_order: Literal["big", "little"] = key(
+        "of 32-bit pairs; big: high word first, little: low word first"
+    )
+    inter_frame_s: float = key("silence the drive wants between frames", ..., 0, 1)
+    serial: dict[str, int | str] = key("the maker's default line format", {})
+    units: Units = key(
+        "`speed`, `accel` of the registers; `speed_per_unit`, `accel_per_unit` counts"
+    )
+    status: StatusWord = key(
+        "address, type; `done`, `moving`, `fault`, `enabled` as bits `{ set, clear }`"
+    )
+    position: Position = key("address, type (i32) of the position in pulses")
+    alarm: Alarm | None = key("address, type; `names` of its codes", None)
+    move: Move = key(
+        "`write`: frames of numbers, or `position:i32`, `speed:u16`, `accel`, `decel`; "
+        "`trigger` is the last word"
+    )
+    stop: Writes = key("`write`: frames of the quick stop; torque must stay on")
+    enable: Writes | None = key("`write`: switch the power stage on", None)
+    alarm_reset: Writes | None = key("`write`: reset an alarm", None)
+    comm_timeout: CommTimeout | None = key(
+        "`write` with `timeout`, counts `per_s`: the drive's own watch of the line",
+        None,
+    )
+    limits: Writes | None = key("`write` with `min` and `max` in pulses", None)
+    identity: dict[str, Read] = key("registers that `identify` prints", {})
+    _digest: str = PrivateAttr("")
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the parsed file, for the run's fingerprint."""
+        return self._digest
+
+    def broken_rules(self) -> Iterator[str]:
+        if self.stop.writes("position"):
+            yield "stop.write: must not write a position"
+
+
+def available_maps() -> list[str]:
+    """Names of the maps that ship."""
+    return sorted(path.stem for path in MAP_FOLDER.glob("*.toml"))
+
+
+def load_map(name: str, folder: pathlib.Path | None = None) -> RegisterMap:
+    """Read a map by name (one that ships) or by path, relative to ``folder``.
+
+    Raises:
+        MapError: no such map, not TOML, or the schema is broken.
+    """
+    path = MAP_FOLDER / f"{name}.toml"
+    if name.endswith(".toml"):
+        path = (folder or pathlib.Path()) / name
+    elif name not in available_maps():
+        raise MapError(
+            f"no register map {name!r}: have {', '.join(available_maps())}, "
+            "or give the path of a .toml file"
+        )
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise MapError(f"register map {path}: {error}") from None
+    return parse_map(data, path.name)
+
+
+def parse_map(data: dict[str, Any], source: str) -> RegisterMap:
+    """Check a parsed map as a whole.
+
+    Raises:
+        MapError: with every fault, one a line.
+    """
+    result, faults = validated(RegisterMap, data)
+    if result is None:
+        raise MapError("\n".join(f"{source}: {fault}" for fault in faults))
+    text = json.dumps(data, sort_keys=True, default=str)
+    result._digest = hashlib.sha256(text.encode()).hexdigest()
+    return result

@@ -1,0 +1,210 @@
+"""The parts of a register map: values, words, frames, bits."""
+
+import struct
+from collections.abc import Iterator
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    BeforeValidator,
+    Field,
+    PlainValidator,
+    WithJsonSchema,
+)
+
+from rig.config.schema import Section, key
+
+FORMATS = {"u16": ">H", "i16": ">h", "u32": ">I", "i32": ">i"}  # of struct
+VALUES = ("position", "speed", "accel", "decel", "timeout", "min", "max")
+Kind = Literal["u16", "i16", "u32", "i32"]
+Word = int | tuple[str, str]  # a constant, or (name of VALUES, type)
+
+
+def encode(value: int, kind: str, word_order: str) -> list[int]:
+    """Registers of a value.
+
+    Raises:
+        ValueError: the value does not fit the type.
+    """
+    try:
+        data = struct.pack(FORMATS[kind], value)
+    except struct.error:
+        raise ValueError(f"{value} does not fit {kind}") from None
+    words = list(struct.unpack(f">{len(data) // 2}H", data))
+    return words if word_order == "big" else words[::-1]
+
+
+def decode(words: list[int], kind: str, word_order: str) -> int:
+    """Value of one or two registers."""
+    ordered = words if word_order == "big" else words[::-1]
+    return struct.unpack(FORMATS[kind], struct.pack(f">{len(words)}H", *ordered))[0]
+
+
+def registers_of(kind: str) -> int:
+    """Registers that a type takes."""
+    return struct.calcsize(FORMATS[kind]) // 2
+
+
+def _word(word: Any) -> Word:
+    if type(word) is int and 0 <= word <= 0xFFFF:
+        return word
+    name, _, kind = str(word).partition(":")
+    if isinstance(word, str) and name in VALUES and kind in FORMATS:
+        return name, kind
+    raise ValueError(
+        f"must be 0..65535 or NAME:TYPE with NAME of {', '.join(VALUES)} and TYPE of "
+        f"{', '.join(FORMATS)}, got {word!r}"
+    )
+
+
+def _codes(names: Any) -> Any:
+    try:
+        return {int(code, 0): text for code, text in names.items()}
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ValueError(f"must be numbers and their names: {error}") from None
+
+
+Register = Annotated[int, Field(ge=0, le=0xFFFF)]
+Bits = tuple[Annotated[int, Field(ge=0, le=31)], ...]
+FrameWord = Annotated[Word, PlainValidator(_word), WithJsonSchema({"type": "string"})]
+Names = Annotated[
+    dict[int, str], BeforeValidator(_codes), WithJsonSchema({"type": "object"})
+]
+
+
+class Read(Section):
+    """A value to read: one or two registers."""
+
+    address: Register
+    type: Kind = "u16"
+
+    @property
+    def count(self) -> int:
+        """Registers to read."""
+        return registers_of(self.type)
+
+
+class Position(Read):
+    """The drive's own position in pulses."""
+
+    type: Kind = "i32"
+
+
+class Alarm(Read):
+    """The alarm's code; 0 is none."""
+
+    names: Names = key("of codes, such as 0x0001", {})
+
+
+class Predicate(Section):
+    """Bits of the status word: every ``set`` bit is 1 and every ``clear`` bit is 0."""
+
+    set: Bits = ()
+    clear: Bits = ()
+
+    def holds(self, word: int) -> bool:
+        """Whether a status word satisfies it."""
+        return all(word >> b & 1 for b in self.set) and not any(
+            word >> b & 1 for b in self.clear
+        )
+
+    def broken_rules(self) -> Iterator[str]:
+        if not self.set and not self.clear:
+            yield "set: name at least one bit in set or clear"
+
+
+class StatusWord(Read):
+    """The status word and what its bits say."""
+
+    done: Predicate
+    moving: Predicate
+    fault: Predicate
+    enabled: Predicate | None = None
+
+    def broken_rules(self) -> Iterator[str]:
+        for name in ("done", "moving", "fault", "enabled"):
+            bits = getattr(self, name)
+            if bits and max((*bits.set, *bits.clear)) >= 16 * self.count:
+                yield f"{name}: must name bits 0..{16 * self.count - 1} of {self.type}"
+
+
+class Write(Section):
+    """One frame to write: constants, and values by name such as ``position:i32``."""
+
+    address: Register
+    words: Annotated[tuple[FrameWord, ...], Field(min_length=1)]
+    function: Literal[6, 16] = Field(
+        default_factory=lambda made: 6 if _registers(made["words"]) == 1 else 16
+    )
+
+    @property
+    def count(self) -> int:
+        """Registers written."""
+        return _registers(self.words)
+
+    def offset_of(self, name: str) -> tuple[int, str] | None:
+        """Address and type of a named value inside the frame, or None."""
+        address = self.address
+        for word in self.words:
+            if not isinstance(word, int) and word[0] == name:
+                return address, word[1]
+            address += _registers([word])
+        return None
+
+    def broken_rules(self) -> Iterator[str]:
+        if self.function == 6 and self.count != 1:
+            yield "function: must be 16, or 6 for one register"
+        if self.count > 123 or self.address + self.count > 0x10000:
+            yield f"words: {self.count} registers from {self.address} do not fit"
+
+
+def _registers(words: Any) -> int:
+    return sum(1 if isinstance(word, int) else registers_of(word[1]) for word in words)
+
+
+class Writes(Section):
+    """Frames that are written one after another."""
+
+    write: Annotated[tuple[Write, ...], Field(min_length=1)]
+
+    def writes(self, name: str) -> bool:
+        """Whether a frame holds the named value."""
+        return any(frame.offset_of(name) for frame in self.write)
+
+
+class Trigger(Section):
+    """The register and the value whose writing starts the move."""
+
+    address: Register
+    value: Register
+
+
+class Move(Writes):
+    """An absolute move."""
+
+    trigger: Trigger
+
+    def broken_rules(self) -> Iterator[str]:
+        if not self.writes("position"):
+            yield "write: no frame writes position"
+        last, trigger = self.write[-1], self.trigger
+        ends = last.address + last.count - 1
+        if (ends, last.words[-1]) != (trigger.address, trigger.value):
+            yield "trigger: must be the last word of the last frame"
+
+
+Positive = Annotated[float, Field(ge=1e-12, le=1e12)]
+
+
+class CommTimeout(Writes):
+    """The drive's own watch over the line."""
+
+    per_s: Positive  # register counts for one second
+
+
+class Units(Section):
+    """Units of the speed and acceleration registers, and their counts for 1."""
+
+    speed: Literal["rev_per_s", "pulse_per_s"]
+    speed_per_unit: Positive
+    accel: Literal["rev_per_s2", "pulse_per_s2", "s_per_rev_per_s"]
+    accel_per_unit: Positive

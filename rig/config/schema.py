@@ -1,0 +1,157 @@
+"""The base of every table read from a file, and its faults in words.
+
+A key is described once, by its field: type, default, bounds and meaning; its unit ends
+its name. That one description checks the value, words the fault, and fills the tables
+of docs/rig.md. Modules of tables leave out ``from __future__ import annotations``:
+pydantic would compile every annotation again at each start.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import PydanticCustomError
+
+
+class Section(BaseModel):
+    """A table of a file: frozen, unknown keys are faults, no silent conversions."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False
+    )
+
+    def broken_rules(self) -> Iterator[str]:
+        """``key: fault`` of every rule about more than one key that is not kept."""
+        return iter(())
+
+    @model_validator(mode="after")
+    def _keep_the_rules(self) -> Section:
+        if faults := list(self.broken_rules()):
+            raise PydanticCustomError("rules", "{faults}", {"faults": faults})
+        return self
+
+
+def key(
+    about: str,
+    default: Any = ...,
+    low: float | None = None,
+    high: float | None = None,
+    *,
+    by: Any = None,
+    **more: Any,
+) -> Any:
+    """A key of a file.
+
+    Args:
+        about: what it means, for the reference table.
+        default: value of an absent key; ``...``: the key is required. Beside ``by``
+            the text that says what ``by`` comes to.
+        low: smallest value.
+        high: largest value.
+        by: function of the keys before it that makes the default.
+        more: further arguments of ``pydantic.Field``.
+    """
+    if by is not None:
+        more |= {"default_factory": by, "json_schema_extra": {"default": default}}
+    else:
+        more["default"] = default
+    return Field(description=about, ge=low, le=high, **more)
+
+
+Model = TypeVar("Model", bound=Section)
+
+
+def validated(
+    model: type[Model], data: Any, context: Any = None
+) -> tuple[Model | None, list[str]]:
+    """The table as a model, or None with everything that is wrong with it.
+
+    Returns:
+        The model, and faults as ``section.key: rule, value``.
+    """
+    try:
+        return model.model_validate(_tuples(data), context=context), []
+    except ValidationError as error:
+        schema = model.model_json_schema()
+        found = error.errors(include_url=False)
+        return None, [text for e in found for text in _texts(e, data, schema)]
+
+
+def _tuples(data: Any) -> Any:
+    """Lists of a file as tuples, which is what frozen models hold."""
+    if isinstance(data, dict):
+        return {name: _tuples(value) for name, value in data.items()}
+    return tuple(map(_tuples, data)) if isinstance(data, list) else data
+
+
+def resolved(described: dict[str, Any], root: dict[str, Any]) -> dict[str, Any]:
+    """A JSON schema without reference and without the choice of null."""
+    for choice in described.get("anyOf", ()):
+        if choice.get("type") != "null":
+            return resolved(choice, root)
+    if "$ref" in described:
+        return root["$defs"][described["$ref"].rpartition("/")[2]]
+    return described
+
+
+def rule(described: dict[str, Any], root: dict[str, Any]) -> str:
+    """What a value must be, in words, from its JSON schema."""
+    described = resolved(described, root)
+    known = described.get("enum", [described["const"]] if "const" in described else [])
+    if known:
+        words = [str(word) for word in known]
+        return " or ".join(words) if len(words) < 3 else "one of " + ", ".join(words)
+    kind = described.get("type")
+    if kind == "array":
+        item = described.get("items") or described["prefixItems"][0]
+        count = described.get("minItems", "")
+        exact = count and count == described.get("maxItems")
+        return f"a list of {count if exact else 'items'}, each {rule(item, root)}"
+    if kind in ("integer", "number"):
+        noun = "a whole number" if kind == "integer" else "a number"
+        if "minimum" not in described:
+            return noun
+        low, high = described["minimum"], described["maximum"]
+        return f"{noun} in [{low}, {high}]"
+    return {"boolean": "true or false", "string": "a text"}.get(str(kind), "a table")
+
+
+def _texts(error: Any, value: Any, root: dict[str, Any]) -> list[str]:
+    """Faults of one pydantic error; axes are called by their names."""
+    kind, path, here, known = error["type"], "", root, []
+    if kind == "default_factory_not_called":
+        return []  # it is made from a key that is at fault itself
+    for part in error["loc"]:
+        table = resolved(here, root)
+        try:
+            value = value[part]
+        except (KeyError, IndexError, TypeError):
+            value = None
+        if isinstance(part, int):
+            name = value.get("name") if isinstance(value, dict) else None
+            path += f".{name}" if isinstance(name, str) else f"[{part}]"
+            here = table.get("items") or table["prefixItems"][part]
+        else:
+            path += f".{part}" if path else str(part)
+            known = sorted(table.get("properties", ()))
+            others = table.get("additionalProperties") or {}
+            here = table.get("properties", {}).get(part, others)
+    if kind == "rules":
+        return [f"{path}.{fault}".lstrip(".") for fault in error["ctx"]["faults"]]
+    if kind == "value_error":
+        return [f"{path}: {line}" for line in str(error["ctx"]["error"]).split("\n")]
+    if kind == "extra_forbidden":
+        near = difflib.get_close_matches(error["loc"][-1], known, 1)
+        hint = f"did you mean {near[0]}? " if near else ""
+        return [f"{path}: unknown key; {hint}known here: {', '.join(known)}"]
+    wanted = rule(here, root)
+    if kind == "missing":
+        return [f"{path}: missing; {wanted} is required"]
+    got = error["input"]
+    got = repr(list(got) if isinstance(got, tuple) else got)
+    if kind in ("too_short", "too_long"):
+        got = f"{error['ctx']['actual_length']}"
+    return [f"{path}: must be {wanted}, got {got[:80]}"]

@@ -1,0 +1,184 @@
+"""The tables of rig.toml but for its axes: one class a table, one field a key."""
+
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any, Literal
+
+from pydantic import Field
+
+from rig.attitude import Array, euler_to_matrix
+from rig.config.schema import Section, key
+
+Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
+Sign = Literal[1, -1]
+Column = Annotated[int, Field(ge=0, le=200)]
+Angle = Annotated[float, Field(ge=-360, le=360)]
+JointAngle = Annotated[float, Field(ge=-180, le=180)]
+Range = tuple[JointAngle, JointAngle]
+
+# key(what it means, default (... where required), lowest, highest)
+
+
+class BusSettings(Section):
+    """One Modbus line for the three drives."""
+
+    transport: Literal["tcp", "rtu_tcp", "rtu"] = key(
+        "rtu: serial port; tcp: Modbus TCP; rtu_tcp: RTU frames over TCP"
+    )
+    host: str = key("address of a tcp or rtu_tcp bus", "")
+    port: int = key("TCP port of the same", 502, 1, 65535)
+    device: str = key("serial port of an rtu bus", "")
+    baudrate: int = key("of an rtu bus", 115200, 1200, 3_000_000)
+    parity: Literal["N", "E", "O"] = key("of an rtu bus", "N")
+    stopbits: int = key("of an rtu bus", 1, 1, 2)
+    bytesize: int = key("of an rtu bus", 8, 7, 8)
+    timeout_s: float = key("for one reply", 0.3, 0.01, 5)
+    read_retries: int = key("of reads only; a motion write is sent once", 2, 0, 10)
+
+    @property
+    def where(self) -> str:
+        """The bus in words."""
+        if self.transport == "rtu":
+            return f"{self.device} at {self.baudrate} baud"
+        return f"{self.host}:{self.port} ({self.transport})"
+
+    def broken_rules(self) -> Iterator[str]:
+        wanted = "device" if self.transport == "rtu" else "host"
+        if not getattr(self, wanted):
+            yield f"{wanted}: missing; transport {self.transport!r} needs one"
+
+
+def _by_format(hyperimu: Any, other: Any) -> Callable[[dict[str, Any]], Any]:
+    return lambda made: hyperimu if made["format"] == "hyperimu" else other
+
+
+def _phone_order(made: dict[str, Any]) -> str | None:
+    angles = made["format"] == "lines" and not made["quaternion_columns"]
+    return None if angles else "ZYX"
+
+
+class ImuSettings(Section):
+    """The phone's stream."""
+
+    format: Literal["hyperimu", "lines", "sensorlogger"] = key("app of the phone")
+    transport: Literal["listen", "connect"] = key(
+        "listen: the phone connects to this computer", "listen"
+    )
+    host: str = key(
+        "listen: this computer's address; connect: the phone's", "127.0.0.1"
+    )
+    port: int = key("TCP port; 0: any free one", ..., 0, 65535)
+    # HyperIMU sends azimuth, pitch, roll, which turn about Z, X, Y; the order is ZYX.
+    columns: tuple[Column, Column, Column] = key(
+        "of the three angles, in the sequence of order",
+        "[0, 1, 2]; hyperimu: [1, 3, 2]",
+        by=_by_format((1, 3, 2), (0, 1, 2)),
+    )
+    quaternion_columns: tuple[Column, Column, Column, Column] | None = key(
+        "of x, y, z, w, in place of angles", None
+    )
+    stamp_column: int = key(
+        "of the phone's clock in ms; -1: none", "-1; hyperimu: 0", -1, 200,
+        by=_by_format(0, -1),
+    )  # fmt: skip
+    column_count: int = key(
+        "a line of another width is refused; 0: as the first line", 0, 0, 200
+    )
+    separator: str = key("between columns", ",")
+    unit: Literal["deg", "rad"] = key("of the angles", "deg")
+    order: Order | None = key(
+        "sequence of the phone's Euler angles", "ZYX; lines of angles: required",
+        by=_phone_order,
+    )  # fmt: skip
+    signs: tuple[Sign, Sign, Sign] = key(
+        "of the angles, in the sequence of order",
+        "[1, 1, 1]; hyperimu: [-1, -1, -1]",
+        by=_by_format((-1, -1, -1), (1, 1, 1)),
+    )
+    mounting_deg: tuple[Angle, Angle, Angle] = key(
+        "turn of the phone on the end-effector about Z, then Y, then X", (0.0, 0.0, 0.0)
+    )
+    stale_s: float = key("older than this while moving: stop", 0.4, 0.02, 10)
+    max_jump_deg: float = key("between two readings", 20.0, 0.1, 180)
+
+    @property
+    def mounting(self) -> Array:
+        """(3, 3) R_EP."""
+        return euler_to_matrix(self.mounting_deg, "ZYX")
+
+    def broken_rules(self) -> Iterator[str]:
+        if self.format == "sensorlogger" and self.transport != "listen":
+            yield "transport: must be listen: Sensor Logger pushes its messages"
+        named = (*self.columns, *(self.quaternion_columns or ()), self.stamp_column)
+        if self.column_count and max(named) >= self.column_count:
+            yield f"column_count: {self.column_count} is too few for the columns named"
+        if self.order is None:
+            yield "order: missing; a line stream does not say the order of its angles"
+        if len(self.separator) != 1 or self.separator in "0123456789+-.eE\r\n":
+            got = repr(self.separator)
+            yield f"separator: must be one character that no number has, got {got}"
+
+
+class MechanismSettings(Section):
+    """The chain of joints."""
+
+    order: Order = key("axes of the joints from the base outwards", "ZXY")
+
+
+class MotionSettings(Section):
+    """How the device is moved."""
+
+    max_step_deg: float = key("longer moves are split", 15.0, 0.1, 360)
+    approach_overshoot_deg: float = key(
+        "> 0: come to every posture from below; play becomes pure bias", 0.0, 0, 20
+    )
+    position_tolerance_deg: float = key(
+        "a drive this close is on its target", 0.05, 1e-4, 5
+    )
+    poll_s: float = key("between two looks at drives and IMU", 0.05, 0.001, 0.1)
+    deadline_factor: float = key("a move may take its computed time times", 2.0, 1, 20)
+    deadline_slack_s: float = key("plus", 2.0, 0.05, 60)
+    stall_s: float = key("standing so long off its target is a fault", 1.0, 0.05, 30)
+    following_deg: float = key("a drive may leave its way by", 3.0, 0.01, 45)
+    envelope_margin_deg: float = key("the IMU may read past limits by", 15.0, 0.1, 90)
+    max_disagreement_deg: float = key(
+        "between IMU and command at a posture", 45.0, 0.1, 180
+    )
+    heartbeat_s: float = key("a motion loop silent for so long: stop", 3.0, 0.2, 60)
+    mirror_limits: bool = key("write the soft limits to the drives too", False)
+
+
+class SettleSettings(Section):
+    """When a posture counts as settled, and how long it is measured."""
+
+    window_s: float = key("time over which the IMU must be quiet", 0.5, 0.01, 60)
+    min_samples: int = key("readings in the window, at least", 10, 3, 10_000)
+    std_deg: float = key("largest deviation over the window", 0.1, 1e-6, 10)
+    slope_deg_s: float = key("largest slope over the window", 0.2, 1e-6, 100)
+    timeout_s: float = key("to settle", 10.0, 0.05, 600)
+    samples: int = key("readings averaged for one measurement", 25, 1, 10_000)
+
+    def broken_rules(self) -> Iterator[str]:
+        if self.timeout_s <= self.window_s:
+            yield f"timeout_s: must be longer than window_s, got {self.timeout_s}"
+
+
+class SessionSettings(Section):
+    """What a calibration session does."""
+
+    candidates: int = key("M, postures drawn", 50, 5, 100_000)
+    k: int = key("K, postures chosen; 4 leave no residual", 4, 4, 10_000)
+    method: Literal["policy", "auto", "exact", "exchange", "greedy", "random"] = key(
+        "how they are chosen", "policy"
+    )
+    min_efficiency: float = key("under this D-efficiency exact is used", 0.9, 0, 1)
+    seed: int = key("of the candidates drawn", 0, 0, 2**31 - 1)
+    pitch_range_deg: Range | None = key("of the candidates; absent: the limits", None)
+    yaw_range_deg: Range | None = key("likewise", None)
+    roll_range_deg: Range | None = key("likewise", None)
+    verify_postures: int = key("held out; each before and after", 4, 0, 1000)
+    verify_limit_deg: float = key("largest good error once compensated", 0.5, 1e-3, 45)
+    reference_tolerance_deg: float = key("zero posture on `resume`", 0.5, 1e-3, 45)
+    max_unreachable: int = key("postures out of reach until a fault", 3, 0, 1000)
+    zero: Literal["here", "drive"] = key(
+        "here: the device stands in its zero posture; drive: go to pulse 0", "here"
+    )

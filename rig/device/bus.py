@@ -1,0 +1,244 @@
+"""The Modbus line. This is the only file that opens a drive port.
+
+pymodbus does the framing. What it leaves to its caller is done here: exception replies
+are errors, replies are checked against their request, the silence between frames is
+kept, reads are retried, and a motion write is sent exactly once. After any failed
+exchange the line is emptied (or the connection opened again), so that a late reply can
+never be taken for the answer to a later request.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rig.config.registers import Read, decode
+from rig.config.settings import BusSettings
+
+
+class BusError(RuntimeError):
+    """No valid reply: silence, noise, a closed port, or a reply to something else."""
+
+
+class Rejected(BusError):
+    """The drive answered with an exception."""
+
+    def __init__(self, text: str, code: int) -> None:
+        self.code = code
+        super().__init__(text)
+
+
+class Bus:
+    """One Modbus line with any number of units; safe to use from several threads."""
+
+    def __init__(self, settings: BusSettings, silence_s: float = 0.0) -> None:
+        self.settings = settings
+        self.silence_s = silence_s
+        self.on_frame: Callable[[str, dict[str, Any]], None] | None = None
+        self._lock = threading.RLock()
+        self._quiet_until = 0.0
+        self._client: Any = None
+
+    def _make_client(self) -> Any:
+        from pymodbus import FramerType
+        from pymodbus.client import ModbusSerialClient, ModbusTcpClient
+
+        logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
+        s = self.settings
+        if s.transport == "rtu":
+            return ModbusSerialClient(
+                s.device, framer=FramerType.RTU, baudrate=s.baudrate,
+                parity=s.parity, stopbits=s.stopbits, bytesize=s.bytesize,
+                timeout=s.timeout_s, retries=0,
+            )  # fmt: skip
+        framer = FramerType.SOCKET if s.transport == "tcp" else FramerType.RTU
+        return ModbusTcpClient(
+            s.host, port=s.port, framer=framer, timeout=s.timeout_s, retries=0
+        )
+
+    def open(self) -> Bus:
+        """Open the port.
+
+        Raises:
+            BusError: it is absent, refused, or held by another program.
+        """
+        with self._lock:
+            if self._client is None:
+                try:
+                    self._client = self._make_client()
+                except RuntimeError as error:  # pymodbus without pyserial
+                    text = " ".join(str(error).split())
+                    raise BusError(
+                        f"cannot open {self.settings.where}: {text}"
+                    ) from None
+            if not self._client.connect():
+                hint = _why_closed(self.settings)
+                raise BusError(f"cannot open {self.settings.where}: {hint}")
+        return self
+
+    def close(self) -> None:
+        """Close the port; opening it again is possible."""
+        with self._lock:
+            if self._client is not None:
+                self._client.close()
+                self._client = None
+
+    def __enter__(self) -> Bus:
+        return self.open()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def read(self, unit: int, read: Read, word_order: str, retries: int = -1) -> int:
+        """Read one value.
+
+        Args:
+            unit: Modbus unit id.
+            read: address and type.
+            word_order: of 32-bit values.
+            retries: more tries after silence or noise; the configured number if < 0.
+
+        Raises:
+            BusError: no valid reply after all tries.
+            Rejected: the drive answered with an exception, every time.
+        """
+        words = self.read_words(unit, read.address, read.count, retries)
+        return decode(words, read.type, word_order)
+
+    def read_words(
+        self, unit: int, address: int, count: int, retries: int = -1
+    ) -> list[int]:
+        """Read ``count`` holding registers; see ``read``."""
+        tries = 1 + (self.settings.read_retries if retries < 0 else retries)
+        left = tries
+        while True:
+            left -= 1
+            try:
+                reply = self._exchange(
+                    "read_holding_registers", unit, address, count=count
+                )
+                words = list(getattr(reply, "registers", []))
+                if len(words) != count:
+                    raise BusError(
+                        f"unit {unit}: asked for {count} registers at 0x{address:04X}, "
+                        f"got {len(words)}"
+                    )
+                return words
+            except BusError as error:
+                if not isinstance(error, Rejected):
+                    self._resynchronise()
+                if not left:
+                    error.args = (f"{error} (tried {tries} times)",)
+                    raise
+
+    def write(self, unit: int, address: int, function: int, words: list[int]) -> None:
+        """Write registers once. Never retried: a lost reply may hide a started move.
+
+        Raises:
+            BusError: no valid reply; whether the drive obeyed is unknown.
+            Rejected: the drive refused.
+        """
+        if self.on_frame is not None:
+            self.on_frame("write", {"unit": unit, "address": address, "words": words})
+        try:
+            if function == 6:
+                reply = self._exchange("write_register", unit, address, words[0])
+                echoed = list(getattr(reply, "registers", [])) == words
+            else:
+                reply = self._exchange("write_registers", unit, address, words)
+                echoed = getattr(reply, "count", None) == len(words)
+            if not echoed or getattr(reply, "address", None) != address:
+                raise BusError(f"unit {unit}: the reply to a write does not echo it")
+        except Rejected:
+            raise
+        except BusError:
+            self._resynchronise()
+            raise
+
+    def _exchange(
+        self, method: str, unit: int, address: int, *args: Any, **kw: Any
+    ) -> Any:
+        from pymodbus.exceptions import ModbusException
+
+        with self._lock:
+            if self._client is None:
+                self.open()
+            pause = self._quiet_until - time.monotonic()
+            if pause > 0:
+                time.sleep(pause)
+            try:
+                reply = getattr(self._client, method)(
+                    address, *args, device_id=unit, **kw
+                )
+            except ModbusException as error:
+                text = " ".join(str(error).split())
+                if "No response" in text:
+                    text = f"silent for {self.settings.timeout_s:g} s"
+                raise BusError(f"unit {unit}: no valid reply ({text})") from None
+            except Exception as error:
+                # pymodbus lets struct, index and socket errors of mangled frames out.
+                text = f"{type(error).__name__}: {error}"
+                raise BusError(f"unit {unit}: no valid reply ({text})") from None
+            finally:
+                self._quiet_until = time.monotonic() + self.silence_s
+        expected = {
+            "read_holding_registers": 3, "write_register": 6, "write_registers": 16
+        }[method]  # fmt: skip
+        if reply is None or reply.dev_id != unit:
+            raise BusError(f"unit {unit}: the reply is from another unit")
+        if reply.isError():
+            code = int(getattr(reply, "exception_code", 0))
+            raise Rejected(
+                f"unit {unit} answered exception {code} ({_exception_name(code)}) at "
+                f"0x{address:04X}",
+                code,
+            )
+        if reply.function_code != expected:
+            raise BusError(f"unit {unit}: a reply of function {reply.function_code}")
+        return reply
+
+    def _resynchronise(self) -> None:
+        """Empty the line, so that a late reply is not taken for the next one's."""
+        with self._lock:
+            if self._client is None:
+                return
+            if self.settings.transport != "rtu":
+                self._client.close()  # the next request connects again
+                return
+            port = self._client.socket
+            if port is None:
+                return
+            byte_s = 11.0 / self.settings.baudrate
+            gap = max(0.02, 20 * byte_s, self.silence_s)
+            end = time.monotonic() + 2 * self.settings.timeout_s
+            try:
+                while time.monotonic() < end:
+                    time.sleep(gap)
+                    if not port.in_waiting:
+                        return
+                    port.reset_input_buffer()
+            except OSError:
+                self._client.close()
+
+
+def _why_closed(settings: BusSettings) -> str:
+    if settings.transport != "rtu":
+        return "nothing answers there, or its connections are all taken"
+    if not os.path.exists(settings.device):
+        return "there is no such port. Is the adapter plugged in?"
+    if not os.access(settings.device, os.R_OK | os.W_OK):
+        return "this user may not open it. Join its group, often dialout"
+    return "held by another program. Is a session running?"
+
+
+def _exception_name(code: int) -> str:
+    names = {
+        1: "illegal function", 2: "illegal address", 3: "illegal value",
+        4: "device failure", 5: "acknowledge", 6: "busy", 8: "CRC or parity",
+        10: "no gateway path", 11: "gateway target silent",
+    }  # fmt: skip
+    return names.get(code, "unknown")

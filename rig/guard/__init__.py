@@ -1,0 +1,1 @@
+"""What keeps the device safe: limits, faults, the stop path, signals, the watchdog."""

@@ -1,0 +1,49 @@
+"""How a run can end: exit codes, and what raises them."""
+
+from __future__ import annotations
+
+EXIT_OK = 0
+EXIT_RECALIBRATE = 1  # done, but the errors say: calibrate (again)
+EXIT_BAD_INPUT = 2
+EXIT_FAULT = 3  # stopped by a fault; `resume` goes on
+EXIT_PAUSED = 4  # paused by Ctrl-C; `resume` goes on
+
+
+class Refused(ValueError):
+    """The request makes no sense for this run; nothing was moved."""
+
+
+class LimitError(ValueError):
+    """A target leaves the soft limits; nothing was sent."""
+
+
+class MotionFault(RuntimeError):
+    """Something is wrong with the device: stop everything and latch."""
+
+
+class NotFollowing(MotionFault):
+    """A drive turned and the IMU did not see it.
+
+    ``suspects`` are the postures recorded since the axis was last seen to follow: the
+    coupling may have slipped before any of them.
+    """
+
+    def __init__(self, text: str, suspects: list[str]) -> None:
+        self.suspects = suspects
+        super().__init__(text)
+
+
+class Unreachable(RuntimeError):
+    """The device is sound but cannot get there: leave this posture out."""
+
+
+class StopRequested(BaseException):
+    """Stop now: second Ctrl-C, SIGTERM, SIGHUP, or a latched stop."""
+
+    def __init__(self, reason: str, exit_code: int) -> None:
+        self.exit_code = exit_code
+        super().__init__(reason)
+
+
+class PauseRequested(BaseException):
+    """First Ctrl-C: the posture in progress was finished, the run can be resumed."""

@@ -1,0 +1,62 @@
+"""Ctrl-C, SIGTERM and SIGHUP as requests to pause or to stop, checked by every loop."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Callable
+from types import FrameType
+from typing import Any
+
+from rig.guard.faults import PauseRequested, StopRequested
+
+
+class Signals:
+    """Ctrl-C once: finish the posture and pause; twice, SIGTERM or SIGHUP: stop now.
+
+    While armed, a signal only sets a flag, so that no frame on the bus and no line of
+    the journal is cut in two; every loop looks at the flag at least every
+    ``bus.timeout_s``. While nothing can move, it ends the program at once.
+    """
+
+    def __init__(self, say: Callable[[str], None] = lambda text: None) -> None:
+        self.armed = False
+        self.pause = False
+        self._stop: StopRequested | None = None
+        self._say = say
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> Signals:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                self._previous[number] = signal.signal(number, self._handle)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGINT and not self.pause and self.armed:
+            self.pause = True
+            self._say("Ctrl-C: finishing this posture, then pausing; again to stop now")
+            return
+        name = signal.Signals(number).name
+        self._stop = self._stop or StopRequested(name, 128 + number)
+        if not self.armed:
+            raise self._stop
+
+    def request_stop(self, reason: str, exit_code: int) -> None:
+        """Ask for a stop from inside the program, as a signal would."""
+        self._stop = self._stop or StopRequested(reason, exit_code)
+
+    def check_stop(self) -> None:
+        """Raise StopRequested where one has been asked for."""
+        if self._stop is not None:
+            raise self._stop
+
+    def check_pause(self) -> None:
+        """Raise PauseRequested where one has been asked for; between postures."""
+        self.check_stop()
+        if self.pause:
+            raise PauseRequested("paused by Ctrl-C")

@@ -1,0 +1,123 @@
+"""Stopping: every unit, whatever happened, and proof that it stands.
+
+Nothing here touches JAX, the IMU or the plan. A stop goes to each unit by itself, goes
+on past units that fail, is repeated (a stop may be sent twice, unlike a move) and is
+verified by reading the status back. After a fault the latch stays on: only a new
+process, armed by a person, moves again.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+import time
+from collections.abc import Callable
+
+from rig.device.drives import Drive
+from rig.guard.faults import EXIT_FAULT, StopRequested
+
+ROUNDS = 3  # times a stop is sent to a unit that does not acknowledge
+VERIFY_S = 3.0  # for all units together to come to rest
+POLL_S = 0.02
+
+
+@dataclasses.dataclass
+class UnitStop:
+    """What became of the stop of one unit."""
+
+    axis: str
+    unit: int
+    acknowledged: bool = False  # the drive answered the stop
+    standing: bool = False  # its status says so, and its position holds still
+    detail: str = ""
+
+    def __str__(self) -> str:
+        state = "acknowledged" if self.acknowledged else "NOT acknowledged"
+        rest = "standing" if self.standing else "NOT seen standing"
+        return f"{self.axis} (unit {self.unit}): {state}, {rest}" + (
+            f" ({self.detail})" if self.detail else ""
+        )
+
+
+def stop_all(drives: list[Drive], verify_s: float = VERIFY_S) -> list[UnitStop]:
+    """Quick-stop every drive; never raises, never leaves one out.
+
+    Args:
+        drives: the units; one that fails does not keep the others from their stop.
+        verify_s: how long to wait for them to come to rest.
+
+    Returns:
+        One entry a drive, in order.
+    """
+    results = [UnitStop(d.axis.name, d.axis.unit) for d in drives]
+    for _ in range(ROUNDS):
+        for drive, result in zip(drives, results, strict=True):
+            if not result.acknowledged:
+                _send(drive, result)
+        if all(result.acknowledged for result in results):
+            break
+    end = time.monotonic() + verify_s
+    before: list[int | None] = [None] * len(drives)
+    while not all(result.standing for result in results):
+        for index, (drive, result) in enumerate(zip(drives, results, strict=True)):
+            if result.standing:
+                continue
+            try:
+                status = drive.status(retries=0)
+            except Exception as error:
+                result.detail = str(error)
+                continue
+            if not result.acknowledged:
+                _send(drive, result)
+            result.standing = not status.moving and status.position == before[index]
+            before[index] = status.position
+            if result.standing and result.acknowledged:
+                result.detail = "alarm" if status.fault else ""
+        if time.monotonic() > end:
+            break
+        time.sleep(POLL_S)
+    return results
+
+
+def _send(drive: Drive, result: UnitStop) -> None:
+    try:
+        drive.stop()
+        result.acknowledged = True
+        result.detail = ""
+    except Exception as error:
+        result.detail = str(error)
+
+
+class Stopper:
+    """The latch: after a stop for a fault nothing moves again."""
+
+    def __init__(
+        self,
+        drives: list[Drive],
+        report: Callable[[str, list[UnitStop]], None] | None = None,
+    ) -> None:
+        self.drives = drives
+        self.reason = ""
+        self.results: list[UnitStop] = []
+        self._report = report
+        self._lock = threading.RLock()
+
+    @property
+    def latched(self) -> bool:
+        """Whether a stop has latched."""
+        return bool(self.reason)
+
+    def stop(self, reason: str, latch: bool = True) -> list[UnitStop]:
+        """Stop every unit now; the first reason is the one that is kept."""
+        with self._lock:
+            if latch and not self.reason:
+                self.reason = reason or "stopped"
+            self.results = stop_all(self.drives)
+            if self._report is not None:
+                self._report(reason, self.results)
+            return self.results
+
+    def check(self) -> None:
+        """Raise StopRequested where a stop has latched."""
+        if self.reason:
+            raise StopRequested(f"stopped: {self.reason}", EXIT_FAULT)

@@ -1,0 +1,236 @@
+"""The calibration session: choose, visit, identify, verify, save."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rig.attitude import Array
+from rig.config.axis import AXIS_NAMES
+from rig.guard.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault
+from rig.guard.limits import check_plan
+from rig.outputs.console import plan_lines, summary_lines
+from rig.session.folder import Record
+from rig.session.identification import (
+    errors,
+    fit,
+    order_residuals,
+    reading_noise,
+    uncertainty,
+    zero_variance,
+)
+from rig.session.planning import (
+    Choice,
+    choose,
+    draw_candidates,
+    draw_held_out,
+    travel_order,
+)
+from rig.session.run import DRY_RUN, Run
+
+
+def calibrate(run: Run, dry_run: bool = False) -> int:
+    """Run the whole session; returns the exit code."""
+    config, session = run.config, run.config.session
+    candidates, choice = _plan(run)
+    check_plan(config, [tuple(candidates[i].tolist()) for i in choice.indices])
+    if dry_run:
+        run.say(DRY_RUN)
+        return EXIT_OK
+    run.planned = session.k + 2 * session.verify_postures + 1
+    if run.zero_pulses is None:
+        run.ready()
+    chosen = _visit_chosen(run, candidates, choice)
+    run.phase("saving")
+    first = fit(chosen, reading_noise(chosen))
+    first.save(run.folder / "calibration.partial.json")
+    held = _held_out(run, first)
+    run.planned = session.k + 2 * len(held) + 1
+    before, after, desired = visit_pairs(run, held)
+    end = run.visit("reference:end", run.zero_pulses, role="reference")
+    run.say("drives at rest; identifying")
+    drift = None if end is None else float(np.abs(end["measured_deg"]).max())
+    return _finish(run, chosen, before, after, desired, choice, drift)
+
+
+def _plan(run: Run) -> tuple[Array, Choice]:
+    """(M, 3) candidate pulses and the first choice; made once, then remembered."""
+    config = run.config
+
+    def make() -> dict[str, Any]:
+        candidates = draw_candidates(config)
+        choice = choose(config, config.to_deg(candidates))
+        return {"candidates": candidates.tolist(), "choice": choice.described()}
+
+    record = run.remember("plan", make)
+    candidates, choice = np.array(record["candidates"]), Choice(**record["choice"])
+    start = config.to_deg(run.zero_pulses or (0, 0, 0))
+    chosen = np.array(choice.indices)
+    order = chosen[travel_order(config, config.to_deg(candidates[chosen]), start)]
+    shown = Choice(**{**choice.described(), "indices": tuple(order.tolist())})
+    for line in plan_lines(config, shown, candidates, start):
+        run.say(line)
+    return candidates, choice
+
+
+def _visit_chosen(run: Run, candidates: Array, choice: Choice) -> list[Record]:
+    """Measure K postures; without one out of reach the rest are selected again."""
+    config, degrees = run.config, run.config.to_deg(candidates)
+    available = np.ones(len(candidates), dtype=bool)
+    records: dict[int, Record] = {}
+    start = config.to_deg(run.zero_pulses)
+    plans = run.journal.events("replan")
+    while True:
+        left = np.array([i for i in choice.indices if i not in records], dtype=int)
+        here = degrees[list(records)[-1]] if records else start
+        failed = None
+        for index in left[travel_order(config, degrees[left], here)].tolist():
+            record = run.visit(
+                f"select:{index}", candidates[index], role="select", index=index
+            )
+            if record is None:
+                failed = index
+                break
+            records[index] = record
+        if failed is None:
+            return list(records.values())
+        available[failed] = False
+        lost = int((~available).sum())
+        if lost > config.session.max_unreachable:
+            raise MotionFault(
+                f"{lost} postures are out of reach, more than session.max_unreachable "
+                f"({config.session.max_unreachable}). Check the ranges"
+            )
+        if len(plans) >= lost:
+            choice = Choice(**plans[lost - 1]["choice"])
+        else:
+            choice = choose(config, degrees, available, tuple(records), replanning=True)
+            run.journal.write("replan", sync=True, choice=choice.described())
+        run.say(
+            f"  selected again without {failed}: log det {choice.log_det:.4f}, "
+            f"{len(records)} measured postures kept"
+        )
+
+
+def _held_out(run: Run, calibration: Any) -> list[Any]:
+    """Pairs of pulses, raw and compensated; drawn once for one set of chosen postures.
+
+    Where a chosen posture was withdrawn since, the compensated commands came from a
+    wrong calibration: they are drawn again, and what was measured there is withdrawn.
+    """
+    known = run.journal.events("held_out")
+    voids = [
+        record["seq"]
+        for record in run.journal.events("void")
+        if any(name.startswith("select:") for name in record["names"])
+    ]
+    if known and not (voids and voids[-1] > known[-1]["seq"]):
+        return known[-1]["pairs"]
+    stale = [n for n in run.postures() if n.startswith(("before:", "after:"))]
+    if stale:
+        run.journal.write("void", sync=True, names=stale)
+    wanted = run.config.session.verify_postures
+    found = draw_held_out(run.config, calibration, wanted)
+    if len(found) < wanted:
+        run.say(
+            f"  note: only {len(found)} of {wanted} held-out targets can be reached "
+            "compensated within the ranges"
+        )
+    return run.journal.write("held_out", sync=True, pairs=found)["pairs"]
+
+
+def visit_pairs(run: Run, held: list[Any]) -> tuple[list[Record], list[Record], Array]:
+    """Visit held-out targets raw and compensated, in the order of least travel.
+
+    Returns:
+        Records before and after compensation, and the (N, 3) desired degrees, of the
+        targets of which both could be reached.
+    """
+    config = run.config
+    visits = [(f"before:{i}", raw) for i, (raw, _) in enumerate(held)]
+    visits += [(f"after:{i}", command) for i, (_, command) in enumerate(held)]
+    points = config.to_deg([pulses for _, pulses in visits] or np.empty((0, 3)))
+    found: dict[str, Record | None] = {}
+    for number in travel_order(
+        config, points, config.to_deg(run.zero_pulses or (0, 0, 0))
+    ):
+        name, pulses = visits[number]
+        found[name] = run.visit(name, pulses, role=name.partition(":")[0])
+    before, after, desired = [], [], []
+    for i, (raw, _) in enumerate(held):
+        one, two = found[f"before:{i}"], found[f"after:{i}"]
+        if one is not None and two is not None:
+            before.append(one)
+            after.append(two)
+            desired.append(config.to_deg(raw))
+    return before, after, np.array(desired).reshape(-1, 3)
+
+
+def _finish(
+    run: Run,
+    chosen: list[Record],
+    before: list[Record],
+    after: list[Record],
+    desired: Array,
+    choice: Choice,
+    drift: float | None,
+) -> int:
+    """Stop the drives, close the bus; then identify, check, save, report."""
+    assert run.frame is not None
+    config = run.config
+    run.phase("finishing")
+    if run.motion is not None:
+        run.stop("", latch=False)
+        run.disarm()
+    run.signals.check_stop()
+    zero = run.journal.events("zero")[-1]
+    limits = uncertainty(
+        fit(chosen, reading_noise(chosen)), chosen, before + after, zero
+    )
+    shared = {
+        "zero_pulses": list(run.zero_pulses or ()),
+        "fingerprint": config.fingerprint(),
+        "postures": [record["name"] for record in chosen],
+    }
+    notes = shared | {
+        "mechanism_order": config.mechanism.order,
+        "noise_from": limits["basis"],
+        "run": run.folder.name,
+    }
+    noise = max(1e-9, float(np.mean(limits["noise_std_deg"])))
+    zero_std = float(np.sqrt(zero_variance(zero).mean()))
+    calibration = fit(chosen, noise, notes, zero_std)
+    summary: dict[str, Any] = {
+        "schema": 1,
+        "mode": "calibrate",
+        "axes": list(AXIS_NAMES),
+        "unit": "deg",
+        "A": np.asarray(calibration.matrix).tolist(),
+        "b": np.asarray(calibration.bias).tolist(),
+        **limits,
+        **shared,
+        "choice": choice.described(),
+        "drift_deg": drift,
+        "orders": order_residuals(config, run.frame, chosen + before + after),
+        "simulated": run.journal.records[0].get("simulated"),
+    }
+    code = EXIT_OK
+    if before:
+        summary["before"] = errors(before, desired)
+        summary["after"] = errors(after, desired)
+        if summary["after"]["max"] > config.session.verify_limit_deg:
+            code = EXIT_RECALIBRATE
+    calibration.save(run.folder / "calibration.json")
+    (run.folder / "calibration.partial.json").unlink(missing_ok=True)
+    run.save_pairs()
+    run.save_summary(summary)
+    from rig.outputs.report import write_report
+
+    write_report(run.folder, summary, run.journal.records[0], run.postures())
+    for line in summary_lines(summary, config.session.verify_limit_deg):
+        run.say(line)
+    run.say(
+        f"saved: {run.folder}/calibration.json, pairs.csv, summary.json, report.html"
+    )
+    return code

@@ -1,0 +1,169 @@
+"""calibrate, collect, verify, goto and resume: from arguments to an exit code."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import pathlib
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from rig.config import RigConfig, example_text, load_config, parse_config
+from rig.config.files import ConfigError
+from rig.guard.faults import Refused
+
+if TYPE_CHECKING:
+    from rig.session.run import Run
+    from rig.simulator import Simulator
+
+SIMULATION = ("transport", "noise", "backlash", "drift", "speedup", "rate")
+
+
+def say(text: str) -> None:
+    print(text, flush=True)
+
+
+def load(args: argparse.Namespace) -> RigConfig:
+    if args.config is not None:
+        return load_config(args.config)
+    if getattr(args, "simulate", False) or args.command == "simulate":
+        return parse_config(example_text("simulate"))
+    raise ConfigError("configuration", ["--config FILE is required (or --simulate)"])
+
+
+def make_simulator(
+    config: RigConfig, options: dict[str, Any], faults: list[str]
+) -> Simulator:
+    from rig.simulator import Simulator, Truth, parse_fault
+
+    truth = Truth(
+        noise_deg=options["noise"],
+        backlash_deg=options["backlash"],
+        drift_deg_per_min=options["drift"],
+        seed=config.session.seed,
+    )
+    return Simulator(
+        config,
+        truth,
+        [parse_fault(text) for text in faults],
+        transport=options["transport"],
+        rate_hz=options["rate"],
+        speedup=options["speedup"],
+    )
+
+
+def run_session(args: argparse.Namespace) -> int:
+    """calibrate, collect, verify, goto and resume."""
+    from rig.session.folder import new_run_folder
+    from rig.session.run import Run
+    from rig.session.runner import run_safely
+
+    resumed = args.command == "resume"
+    config, start = _recorded(args) if resumed else _new(args)
+    mode, simulation = start["mode"], start["simulated"]
+    dry_run = getattr(args, "dry_run", False)
+    procedure, zero_at = _procedure(mode, start["inputs"], dry_run)
+    if args.zero:
+        zero_at = None  # the operator put the device into its zero posture
+    if resumed:
+        folder = args.run
+    else:
+        folder = new_run_folder(args.out or pathlib.Path(config.output), mode)
+        (folder / "rig.toml").write_text(config.text, encoding="utf-8")
+    simulator = None
+    if simulation is not None:
+        simulator = make_simulator(config, simulation, args.fault)
+        config = simulator.start()
+    try:
+        session = Run(
+            config,
+            folder,
+            mode,
+            say,
+            start={key: start[key] for key in ("simulated", "inputs", "maps_from")},
+            reset_alarms=args.reset_alarms,
+            on_imu_port=simulator.start_phone if simulator else None,
+            zero_at=zero_at,
+        )
+        if simulator is not None:
+            session.phase_listeners.append(simulator.enter)
+        else:
+            session.confirm = functools.partial(_confirm, args)
+        return run_safely(session, procedure)
+    finally:
+        if simulator is not None:
+            simulator.close()
+
+
+def _new(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
+    """The configuration of a run that begins, and what its journal says of it first."""
+    if getattr(args, "count", 1) < 1:
+        raise Refused(f"--count must be at least 1, got {args.count}")
+    calibration = getattr(args, "calibration", None)
+    simulation = {name: getattr(args, name) for name in SIMULATION}
+    return load(args), {
+        "mode": args.command,
+        "inputs": {
+            "count": getattr(args, "count", None),
+            "to": getattr(args, "to", None),
+            "calibration": None if calibration is None else str(calibration.resolve()),
+        },
+        "simulated": simulation if args.simulate else None,
+        "maps_from": str((args.config or pathlib.Path()).resolve().parent),
+    }
+
+
+def _recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
+    """The same of a run that is resumed, from its folder."""
+    from rig.outputs.journal import read_journal
+    from rig.session.folder import JOURNAL
+
+    records = read_journal(args.run / JOURNAL)
+    if not records or records[0]["event"] != "start":
+        raise Refused(f"{args.run} holds no run")
+    start = records[0]
+    if args.config is not None:
+        return load_config(args.config), start
+    text = (args.run / "rig.toml").read_text(encoding="utf-8")
+    return parse_config(text, pathlib.Path(start["maps_from"]), str(args.run)), start
+
+
+def _procedure(
+    mode: str, inputs: dict[str, Any], dry_run: bool
+) -> tuple[Callable[[Run], int], Any]:
+    """What a session does, and the pulses of its zero posture where they are known."""
+    import numpy as np
+
+    from rig.session import calibrate, checking
+
+    if mode == "calibrate":
+        return functools.partial(calibrate.calibrate, dry_run=dry_run), None
+    count = inputs["count"]
+    if mode == "collect":
+        return functools.partial(checking.collect, count=count, dry_run=dry_run), None
+    calibration, zero_at = checking.load_calibration(
+        pathlib.Path(inputs["calibration"])
+    )
+    if mode == "verify":
+        return lambda run: checking.verify(run, calibration, count, dry_run), zero_at
+    desired = np.array(inputs["to"], dtype=np.float64)
+    return lambda run: checking.goto(run, calibration, desired, dry_run), zero_at
+
+
+def _confirm(args: argparse.Namespace, session: Run) -> None:
+    """Ask for what --arm and --zero would have confirmed."""
+    takes_zero = session.frame is None and session.zero_at is None
+    questions = {
+        "arm": "the device will move; nobody and nothing is in its way, no patient is "
+        "attached, the emergency stop is at hand"
+    }
+    if takes_zero and session.config.session.zero == "here":
+        questions["zero"] = "the device stands in its zero posture"
+    for word, text in questions.items():
+        if getattr(args, word):
+            continue
+        if not sys.stdin.isatty():
+            raise Refused(f"{text}: confirm with --{word}")
+        if input(f"{text}. Type {word} to confirm: ").strip() != word:
+            raise Refused("not confirmed; nothing was moved")

@@ -1,0 +1,173 @@
+"""``jaxcal COMMAND`` as a user types it; oracles by brute force in float64."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from jaxcal.commands import main
+
+MATRIX = np.array([[0.43, 0.02, 0.0], [0.0, 0.71, 0.01], [0.03, 0.0, 0.87]])
+BIAS = np.array([3.1, -5.8, 2.41])
+NAMES = ("pitch", "yaw", "roll")
+
+
+@pytest.fixture
+def commands():
+    return np.random.default_rng(3).uniform(-20.0, 20.0, (10, 3))
+
+
+@pytest.fixture
+def candidates(tmp_path, commands):
+    path = tmp_path / "candidates.csv"
+    rows = [
+        f"p{i},{','.join(map(repr, row))}" for i, row in enumerate(commands.tolist())
+    ]
+    path.write_text("label,pitch,yaw,roll\n" + "\n".join(rows) + "\n")
+    return str(path)
+
+
+@pytest.fixture
+def calibration(tmp_path, commands, capsys):
+    """A calibration made by the command itself from exact measurements."""
+    path, out = tmp_path / "measured.csv", tmp_path / "calibration.json"
+    measured = commands @ MATRIX.T + BIAS
+    rows = np.concatenate([commands, measured], axis=1).tolist()
+    header = ",".join((*NAMES, "y_1", "y_2", "y_3"))
+    path.write_text("\n".join([header, *(",".join(map(repr, r)) for r in rows)]))
+    assert main(["identify", str(path), "--out", str(out)]) == 0
+    assert "pitch" in capsys.readouterr().out
+    return str(out)
+
+
+def parsed(text):
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+def best_subset(commands, k):
+    z = np.concatenate([commands, np.ones((len(commands), 1))], axis=1)
+    return max(
+        itertools.combinations(range(len(z)), k),
+        key=lambda s: np.linalg.slogdet(z[list(s)].T @ z[list(s)])[1],
+    )
+
+
+@pytest.mark.parametrize("k", [None, 5])
+def test_select_finds_the_brute_force_optimum(candidates, commands, capsys, k):
+    flags = [] if k is None else ["-k", str(k)]
+    assert main(["select", candidates, *flags, "--csv"]) == 0
+    rows = parsed(capsys.readouterr().out)
+    chosen = tuple(sorted(int(row["index"]) for row in rows))
+    assert chosen == best_subset(commands, k or 4)
+    for row in rows:
+        assert row["label"] == f"p{row['index']}"
+        given = commands[int(row["index"])]
+        assert [float(row[name]) for name in NAMES] == given.tolist()
+
+
+def test_select_for_people_and_machines(candidates, commands, capsys):
+    assert main(["select", candidates]) == 0
+    shown = capsys.readouterr().out
+    assert "pitch" in shown
+    assert "proven" in shown
+    assert main(["select", candidates, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert tuple(sorted(document["indices"])) == best_subset(commands, 4)
+    assert document["proven"] is True
+    assert {row["label"] for row in document["rows"]} == {
+        f"p{i}" for i in document["indices"]
+    }
+
+
+def test_score_judges_what_select_wrote(tmp_path, candidates, capsys):
+    out = str(tmp_path / "plan.csv")
+    assert main(["select", candidates, "--method", "greedy", "--out", out]) == 0
+    subset = ["score", candidates, "--subset", out, "--reference", "exact", "--json"]
+    assert main(subset) == 0
+    judged = json.loads(capsys.readouterr().out)
+    chosen = ",".join(str(i) for i in judged["indices"])
+    assert main(["score", candidates, "--indices", chosen, "--json"]) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert judged["log_det"] == again["log_det"]
+    assert 0.0 < judged["efficiency"] <= 1.0
+
+
+def test_plan_prints_a_table_and_the_rows(candidates, capsys):
+    flags = ["--accuracy", "0.2", "--noise", "0.1", "--replicates", "3"]
+    assert main(["plan", candidates, *flags]) == 0
+    assert "measure rows" in capsys.readouterr().out
+    assert main(["plan", candidates, *flags, "--csv"]) == 0
+    rows = parsed(capsys.readouterr().out)
+    assert float(rows[-1]["standard_error"]) <= 0.2
+
+
+def test_predict_and_command_are_inverse(calibration, tmp_path, commands, capsys):
+    table = tmp_path / "u.csv"
+    table.write_text(
+        "pitch,yaw,roll\n"
+        + "\n".join(",".join(map(repr, r)) for r in commands.tolist())
+    )
+    assert main(["predict", calibration, str(table)]) == 0
+    text = capsys.readouterr().out
+    there = np.array([[float(v) for v in row.values()] for row in parsed(text)])
+    np.testing.assert_allclose(there, commands @ MATRIX.T + BIAS, atol=1e-9)
+    reached = tmp_path / "y.csv"
+    reached.write_text(text)
+    assert main(["command", calibration, str(reached), "--limits=-20,20"]) == 0
+    back = np.array(
+        [[float(v) for v in row.values()] for row in parsed(capsys.readouterr().out)]
+    )
+    np.testing.assert_allclose(back, commands, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["select", "missing.csv"], "missing.csv"),
+        (["select", "CANDIDATES", "-k", "3"], "k must be at least 4"),
+        (["select", "CANDIDATES", "--method", "greedy", "--restarts", "3"], "restarts"),
+        (["select", "CANDIDATES", "--columns", "pitch,sway"], "no column 'sway'"),
+        (["score", "CANDIDATES", "--indices", "0,1,2,99"], "99"),
+        (["command", "CALIBRATION", "CANDIDATES", "--clip"], "--clip needs --limits"),
+        (["command", "CALIBRATION", "CANDIDATES", "--limits", "1"], "LOW,HIGH"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_2(
+    candidates, calibration, capsys, arguments, message
+):
+    names = {"CANDIDATES": candidates, "CALIBRATION": calibration}
+    arguments = [names.get(argument, argument) for argument in arguments]
+    if arguments[0] == "command":
+        arguments += ["--columns", "pitch,yaw,roll"]
+    assert main(arguments) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"jaxcal {arguments[0]}: ")
+    assert message in said
+    assert said.count("\n") == 1
+
+
+def test_select_in_a_pipe_loads_no_jax(commands):
+    text = "\n".join(",".join(map(repr, row)) for row in commands.tolist())
+    code = (
+        "import sys; from jaxcal.commands import main; code = main(sys.argv[1:]);"
+        "print(sorted({'jax', 'flax', 'matplotlib', 'pandas'} & set(sys.modules)),"
+        "file=sys.stderr); sys.exit(code)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "select", "-", "-k", "4", "--csv"],
+        input=text,
+        capture_output=True,
+        text=True,
+        env=os.environ,
+        check=True,
+    )
+    assert len(parsed(done.stdout)) == 4
+    assert done.stderr.strip() == "[]"

@@ -1,0 +1,348 @@
+"""Streams: tallies that add up, resumption, sharing, and the plain evaluation."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import pathlib
+import subprocess
+import sys
+import time
+import tracemalloc
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxcal.evaluation import stream
+from jaxcal.evaluation.methods import evaluate
+from jaxcal.evaluation.report import json_document, text_table
+from jaxcal.evaluation.results import Summary
+from jaxcal.evaluation.stream import Plan, evaluate_stream, open_folder
+from jaxcal.evaluation.tally import (
+    BINS_PER_UNIT,
+    Tally,
+    add,
+    as_json,
+    from_json,
+    summary,
+    tally_of,
+)
+from jaxcal.information.regression import log_det_information
+from jaxcal.paper.datasets.catalogue import CATALOGUE
+from jaxcal.paper.datasets.datasets import drawn, make_dataset
+
+LOGS = st.floats(-300.0, 300.0)
+PLAN = Plan(CATALOGUE, "dataset2", methods=("random", "greedy", "exact"), draws=3)
+
+
+@given(st.lists(st.lists(LOGS, min_size=1, max_size=9), min_size=1, max_size=6))
+def test_totals_do_not_depend_on_the_order_of_the_blocks(
+    blocks: list[list[float]],
+) -> None:
+    tallies = [
+        tally_of(
+            np.array(values)[:, None],
+            np.full(len(values), 400.0),
+            np.ones(len(values), bool),
+            3,
+            12,
+            0.0,
+        )
+        for values in blocks
+    ]
+    forward: Tally = {}
+    backward: Tally = {}
+    pairs: Tally = {}
+    for row in tallies:
+        add(forward, row)
+    for row in reversed(tallies):
+        add(backward, row)
+    for begin in range(0, len(tallies), 2):
+        part: Tally = {}
+        for row in tallies[begin : begin + 2]:
+            add(part, row)
+        add(pairs, from_json(json.loads(json.dumps(as_json(part)))))
+    assert forward == backward == pairs
+    exact = sum((Fraction(math.fsum(np.exp(v))) for v in blocks), Fraction(0))
+    assert forward["det"] == exact
+
+
+def test_a_tally_has_the_moments_of_numpy(rng: np.random.Generator) -> None:
+    log_det = rng.normal(-2.0, 3.0, size=(400, 5))
+    reference = log_det.max(axis=1) + rng.choice([0.0, 0.1], size=400)
+    proven = rng.random(400) < 0.9
+    tally = tally_of(log_det, reference, proven, 3, 12, 2.0)
+    random = tally_of(log_det - 1.0, reference, proven, 3, 12, 0.0)
+    row = summary(tally, random)
+    det, behind = np.exp(log_det), log_det - reference[:, None]
+    assert row["det_s"]["mean"] == pytest.approx(det.mean(), rel=1e-14)
+    assert row["det_s"]["std"] == pytest.approx(det.std(), rel=1e-12)
+    assert row["log_det_s"]["mean"] == pytest.approx(log_det.mean(), rel=1e-13)
+    assert row["log_det_s"]["std"] == pytest.approx(log_det.std(), rel=1e-12)
+    middle = float(np.median(log_det))
+    assert abs(row["log_det_s"]["median"] - middle) <= 1 / BINS_PER_UNIT
+    assert row["ratio_to_exact"] == pytest.approx(np.exp(behind).mean(), rel=1e-14)
+    assert row["d_efficiency"] == pytest.approx(np.exp(behind / 12).mean(), rel=1e-14)
+    assert row["hit_rate"] == ((behind > -1e-12) & proven[:, None]).mean()
+    assert row["ratio_to_random"] == pytest.approx(math.e, rel=1e-13)
+    assert row["seconds_per_selection"] == 2.0 / 400 and row["draws_per_episode"] == 5
+    assert from_json(json.loads(json.dumps(as_json(tally)))) == tally
+
+
+def test_singular_selections_are_counted_not_summed() -> None:
+    log_det = np.array([[-np.inf], [0.5], [1.0]])
+    tally = tally_of(log_det, np.ones(3), np.ones(3, bool), 3, 12, 0.0)
+    row = summary(tally, tally)
+    assert row["log_det_s"]["mean"] is None and row["hit_rate"] == 1 / 3
+    assert row["det_s"]["mean"] == pytest.approx((np.exp(0.5) + np.exp(1)) / 3)
+    flat = tally_of(log_det[:1], np.ones(1), np.ones(1, bool), 3, 12, 0.0)
+    row = summary(flat, tally)
+    assert row["log_det_s"]["median"] is None and row["det_s"]["median"] == 0.0
+
+
+def run(
+    folder: pathlib.Path, episodes: int, plan: Plan = PLAN, **options: object
+) -> Summary:
+    open_folder(plan, folder)
+    return evaluate_stream(plan, episodes, folder, **{"workers": 1} | options)  # type: ignore[arg-type]  # a test's shorthand
+
+
+def exact_numbers(found: Summary) -> list[dict[str, object]]:
+    """All but the measured seconds."""
+    rows = [dict(row.numbers) for row in found.rows]
+    assert all(row.pop("seconds_per_selection") > 0 for row in rows)
+    return rows
+
+
+def test_the_first_block_has_the_numbers_of_a_plain_evaluation(
+    tmp_path: pathlib.Path,
+) -> None:
+    streamed = run(tmp_path, 300)
+    plain = evaluate(
+        make_dataset("dataset2", episodes=300), 4, PLAN.methods, random_draws=3
+    )
+    for one, other in zip(streamed.rows, plain.summarise().rows, strict=True):
+        row, expected = one.numbers, other.numbers
+        assert row["label"] == expected["label"]
+        assert row["hit_rate"] == expected["hit_rate"]
+        for name in ("ratio_to_exact", "d_efficiency", "ratio_to_random"):
+            assert row[name] == pytest.approx(expected[name], rel=1e-13)
+        for name in ("det_s", "log_det_s"):
+            for moment in ("mean", "std"):
+                value = expected[name][moment]
+                assert row[name][moment] == pytest.approx(value, rel=1e-12)
+        middle = expected["log_det_s"]["median"]
+        assert abs(row["log_det_s"]["median"] - middle) <= 1 / BINS_PER_UNIT
+    assert streamed.num_proven == 300
+    text = text_table(streamed)
+    assert "300 episodes" in text and "exact sums over all episodes" in text
+    entry = json.loads(json_document([streamed], command=["x"]))["results"][0]
+    assert entry["dataset"]["episodes"] == 300 and entry["proven"] == 1.0
+
+
+def quick_block(plan: Plan, begin: int, end: int) -> tuple[int, dict[str, Tally]]:
+    """In place of the solvers: the first four and the next four postures."""
+    candidates = drawn(plan.dataset, plan.seed, begin, end).candidates
+    first, next_four = (
+        log_det_information(candidates[:, cut, :], 3)[:, None]
+        for cut in (slice(0, 4), slice(4, 8))
+    )
+    best, proven = np.maximum(first, next_four)[:, 0], candidates[:, 8, 0] < 0.9
+    tallies = {
+        name: tally_of(values, best, proven, 3, 12, 0.1)
+        for name, values in (
+            ("random", np.hstack([first, next_four])),
+            ("greedy", first),
+            ("exact", best[:, None]),
+        )
+    }
+    return int(proven.sum()), tallies
+
+
+def test_cutting_stopping_and_sharing_do_not_change_a_digit(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stream, "_solve_block", quick_block)
+    whole = exact_numbers(run(tmp_path / "one", 7_300, part=10_000))
+    assert exact_numbers(run(tmp_path / "parts", 7_300, part=1_000)) == whole
+    assert exact_numbers(run(tmp_path / "pairs", 7_300, part=2_000)) == whole
+
+    def stop(task: str, done: int, total: int) -> None:
+        if done == 2_000:
+            raise KeyboardInterrupt
+
+    stopped = tmp_path / "stopped"
+    with pytest.raises(KeyboardInterrupt):
+        run(stopped, 7_300, part=1_000, progress=stop)
+    stamps = {path.name: path.stat().st_mtime_ns for path in stopped.glob("part-*")}
+    assert len(stamps) == 2
+    assert exact_numbers(run(stopped, 7_300, part=1_000)) == whole
+    for name, stamp in stamps.items():
+        assert (stopped / name).stat().st_mtime_ns == stamp
+
+    # Three processes: each waits for the parts of the others.
+    def shared(number: int) -> Summary:
+        place = tmp_path / "shared"
+        return run(place, 7_300, part=1_000, process=(number, 3))
+
+    with ThreadPoolExecutor(3) as threads:
+        for found in threads.map(shared, range(3)):
+            assert exact_numbers(found) == whole
+
+    # More episodes later go on from the whole parts that are there.
+    grown = tmp_path / "grown"
+    run(grown, 3_300, part=1_000)
+    assert exact_numbers(run(grown, 7_300, part=1_000)) == whole
+
+
+@pytest.mark.slow
+def test_workers_do_not_change_a_digit(tmp_path: pathlib.Path) -> None:
+    methods = ("random", "greedy", "exchange", "exact")
+    plan = Plan(CATALOGUE, "dataset2", methods=methods, draws=3)
+    here = run(tmp_path / "here", 2_200, plan, part=2_000)
+    there = run(tmp_path / "there", 2_200, plan, part=1_000, workers=2)
+    assert exact_numbers(here) == exact_numbers(there)
+
+
+@pytest.mark.skipif(not pathlib.Path("/proc/self/task").exists(), reason="no /proc")
+def test_a_killed_stream_leaves_no_worker_and_loses_no_part(
+    tmp_path: pathlib.Path,
+) -> None:
+    root = pathlib.Path(__file__).resolve().parents[2]
+    code = (
+        "import pathlib, sys; from jaxcal.evaluation import stream as s\n"
+        "from jaxcal.paper.datasets.catalogue import CATALOGUE\n"
+        "if __name__ == '__main__':\n"
+        f"    plan = s.Plan(CATALOGUE, 'dataset2', methods={PLAN.methods!r}, draws=3)\n"
+        "    folder = pathlib.Path(sys.argv[1]); s.open_folder(plan, folder)\n"
+        "    s.evaluate_stream(plan, 10**7, folder, workers=2, part=1_000)\n"
+    )
+    script = tmp_path / "stream.py"
+    script.write_text(code)
+    folder = tmp_path / "parts"
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    with subprocess.Popen(
+        [sys.executable, str(script), str(folder)], env=environment
+    ) as process:
+        try:
+            wait_for(lambda: len(list(folder.glob("part-*"))) >= 2)
+            children = children_of(process.pid)
+        finally:
+            process.kill()
+    assert len(children) >= 2
+    wait_for(lambda: not any(running(pid) for pid in children))
+    assert not [path for path in folder.iterdir() if path.suffix != ".json"]
+    done = run(folder, 2_000, PLAN, part=1_000)
+    whole = run(tmp_path / "whole", 2_000, PLAN, part=2_000)
+    assert exact_numbers(done) == exact_numbers(whole)
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen in time"
+        time.sleep(0.05)
+
+
+def children_of(pid: int) -> list[int]:
+    found = pathlib.Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    return [int(child) for child in found.split()]
+
+
+def running(pid: int) -> bool:
+    """Neither gone nor a corpse that nobody has fetched."""
+    try:
+        return "\nState:\tZ" not in pathlib.Path(f"/proc/{pid}/status").read_text()
+    except FileNotFoundError:
+        return False
+
+
+def test_a_stream_goes_on_where_the_dataset_ends() -> None:
+    whole = make_dataset("dataset1", 5, 2_500)
+    np.testing.assert_array_equal(
+        drawn("dataset1", 5, 1_000, 2_500).candidates, whole.candidates[1_000:]
+    )
+    far = drawn("dataset2", 0, 9_999_000, 10_000_000).candidates
+    assert far.shape == (1_000, 50, 3) and far.min() >= 0.0 and far.max() <= 1.0
+    assert not np.isin(far[:, 0, 0], make_dataset("dataset2").candidates[..., 0]).any()
+
+
+def test_memory_does_not_grow_with_the_episodes(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stream, "_solve_block", quick_block)
+    peaks = []
+    for number, episodes in enumerate((2_000, 2_000, 12_000)):
+        tracemalloc.start()
+        run(tmp_path / str(number), episodes, part=2_000)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    one_block = 1_000 * 50 * 3 * 8
+    assert peaks[2] - peaks[1] < one_block
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"k": 5}, "its k is 4, not 5"),
+        ({"seed": 1}, "its seed is 0, not 1"),
+        ({"methods": ("exact",)}, "its methods is"),
+        ({"draws": 4}, "its draws is 3, not 4"),
+    ],
+)
+def test_another_plan_is_refused(
+    tmp_path: pathlib.Path, change: dict[str, object], says: str
+) -> None:
+    open_folder(PLAN, tmp_path)
+    open_folder(PLAN, tmp_path)
+    other = dataclasses.replace(PLAN, **change)  # type: ignore[arg-type]  # a test's shorthand
+    with pytest.raises(ValueError, match=says):
+        open_folder(other, tmp_path)
+
+
+def test_damage_is_named(tmp_path: pathlib.Path) -> None:
+    plan = Plan(CATALOGUE, "dataset2", methods=("greedy",), draws=1)
+    run(tmp_path, 20, plan)
+    part = next(tmp_path.glob("part-*"))
+    part.write_text(part.read_text()[:100])
+    with pytest.raises(ValueError, match=r"part-.* is damaged .* delete it"):
+        run(tmp_path, 20, plan)
+    (tmp_path / "stream.json").write_text("[1")
+    with pytest.raises(ValueError, match=r"stream\.json is damaged"):
+        open_folder(plan, tmp_path)
+
+
+def test_a_folder_of_another_version_is_refused(tmp_path: pathlib.Path) -> None:
+    open_folder(PLAN, tmp_path)
+    path = tmp_path / "stream.json"
+    held = json.loads(path.read_text())
+    path.write_text(json.dumps(held | {"version": 1, "seed": 5}))
+    with pytest.raises(ValueError, match=r"format 1, this one uses 2\): name another"):
+        open_folder(PLAN, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("values", "says"),
+    [
+        ({"dataset": "dataset4"}, "streamed dataset must be one of .* got 'dataset4'"),
+        ({"methods": ("auto",)}, "streamed method must be one of .* got 'auto'"),
+        ({"k": 3}, r"k must be in \[4, 50\), got 3"),
+    ],
+)
+def test_bad_plans_are_named(values: dict[str, object], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        dataclasses.replace(PLAN, **values)  # type: ignore[arg-type]  # bad on purpose
+
+
+def test_bad_parts_and_workers_are_named(tmp_path: pathlib.Path) -> None:
+    with pytest.raises(ValueError, match="multiple of 1000 episodes, got 1500"):
+        run(tmp_path, 10, part=1_500)
+    with pytest.raises(ValueError, match="workers must be at least 1, got 0"):
+        run(tmp_path, 10, workers=0)

@@ -1,0 +1,168 @@
+"""The largest volume against brute force, and both ways of finding it."""
+
+from __future__ import annotations
+
+import itertools
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxcal.selection import select
+from jaxcal.selection.exact import volume
+from jaxcal.selection.exact.volume import Volumes, largest_volumes
+
+Array = np.ndarray
+
+
+def sphere(seed: int, count: int, n: int = 3) -> Array:
+    points = np.random.default_rng(seed).normal(size=(count, n))
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def rows(points: Array) -> Array:
+    return np.column_stack([points, np.ones(len(points))])
+
+
+def determinants(vectors: Array, subsets: Array) -> Array:
+    return np.abs(np.linalg.det(vectors[subsets]))
+
+
+def brute_force(vectors: Array) -> float:
+    h, q = vectors.shape
+    return float(
+        determinants(vectors, np.array(list(itertools.combinations(range(h), q)))).max()
+    )
+
+
+def searched(
+    monkeypatch: pytest.MonkeyPatch, vectors: Array, deadline: float | None = None
+) -> Volumes:
+    """The compiled search, however few subsets there are."""
+    with monkeypatch.context() as patch:
+        for name in ("_PRUNE", "_MINORS", "_SEARCH"):
+            patch.setattr(volume, name, 0)
+        return largest_volumes(vectors, deadline=deadline)
+
+
+def enumerated(monkeypatch: pytest.MonkeyPatch, vectors: Array) -> Volumes:
+    """Matrix products, however many subsets there are."""
+    with monkeypatch.context() as patch:
+        patch.setattr(volume, "_PRUNE", 10**12)
+        return largest_volumes(vectors)
+
+
+def make(kind: str, seed: int, h: int, q: int) -> Array:
+    rng = np.random.default_rng(seed)
+    vectors = rng.normal(size=(h, q))
+    if kind == "ties":
+        return np.round(vectors)
+    if kind == "duplicates":
+        return vectors[rng.integers(0, min(h, q + 1), h)]
+    if kind == "coplanar":  # all but one in a subspace
+        vectors[1:, -1] = 0.0
+    if kind == "zeros":
+        vectors[rng.permutation(h)[: h - q]] = 0.0
+    if kind == "skewed":
+        return vectors * 10.0 ** rng.uniform(-6, 6, q)
+    if kind == "lengths":
+        return vectors * 10.0 ** rng.uniform(-3, 3, (h, 1))
+    if kind == "sphere":
+        return rows(sphere(seed, h, q - 1)) if q > 2 else vectors
+    return vectors
+
+
+KINDS = (
+    "plain", "ties", "duplicates", "coplanar", "zeros", "skewed", "lengths", "sphere",
+)  # fmt: skip
+
+
+@settings(max_examples=60)
+@given(
+    st.sampled_from(KINDS),
+    st.integers(0, 10**6),
+    st.integers(2, 5),
+    st.integers(0, 7),
+)
+def test_the_search_finds_what_brute_force_finds(
+    kind: str, seed: int, q: int, more: int
+) -> None:
+    vectors = make(kind, seed, q + more, q)
+    expected = brute_force(vectors)
+    with pytest.MonkeyPatch.context() as patch:
+        found = searched(patch, vectors)
+    # A volume is known to the rounding of the longest vectors.
+    size = np.prod(np.sort(np.linalg.norm(vectors, axis=1))[-q:])
+    tolerance = {"rel": 1e-9, "abs": 1e-12 * size}
+    assert found.complete
+    assert found.volumes[0] == pytest.approx(expected, **tolerance)
+    assert found.bound == found.volumes[0]
+    assert len(set(found.subsets[0].tolist())) == q
+    actual = float(determinants(vectors, found.subsets)[0])
+    assert actual == pytest.approx(expected, **tolerance)
+
+
+@pytest.mark.parametrize("q", [2, 3, 4, 5])
+@pytest.mark.parametrize("h", [8, 12])
+def test_volumes_are_in_the_callers_unit(q: int, h: int) -> None:
+    vectors = 7.0 * np.random.default_rng(q).normal(size=(h, q))
+    for best in (1, 3):
+        found = largest_volumes(vectors, best)
+        np.testing.assert_allclose(
+            found.volumes, determinants(vectors, found.subsets), rtol=1e-12
+        )
+        assert found.volumes[0] == pytest.approx(brute_force(vectors))
+
+
+@pytest.mark.parametrize(("h", "q"), [(60, 4), (120, 4), (90, 3), (200, 3), (30, 5)])
+@pytest.mark.parametrize("kind", ["plain", "sphere"])
+def test_search_and_enumeration_agree(
+    monkeypatch: pytest.MonkeyPatch, kind: str, h: int, q: int
+) -> None:
+    vectors = make(kind, h, h, q)
+    found, slow = searched(monkeypatch, vectors), enumerated(monkeypatch, vectors)
+    np.testing.assert_array_equal(found.subsets, slow.subsets)
+    assert found.volumes[0] == pytest.approx(slow.volumes[0], rel=1e-12)
+    assert found.examined < slow.examined
+
+
+def test_the_search_resumes_where_it_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    vectors = rows(sphere(3, 60, 4))
+    whole = searched(monkeypatch, vectors)
+    monkeypatch.setattr(volume, "_WORK", 1)  # one node per call
+    steps = searched(monkeypatch, vectors)
+    np.testing.assert_array_equal(steps.subsets, whole.subsets)
+    assert steps.examined == whole.examined
+
+
+@pytest.mark.parametrize("stop_after", [0, 1, 5, 40])
+def test_a_deadline_leaves_an_honest_bound(
+    monkeypatch: pytest.MonkeyPatch, stop_after: int
+) -> None:
+    vectors = rows(sphere(4, 80))
+    optimum = searched(monkeypatch, vectors).volumes[0]
+    clock = itertools.chain([0.0] * stop_after, itertools.repeat(2.0))
+    monkeypatch.setattr(volume, "_WORK", 1)
+    monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
+    found = searched(monkeypatch, vectors, deadline=1.0)
+    assert not found.complete and found.examined == stop_after
+    assert found.volumes[0] <= optimum * (1 + 1e-12) and optimum <= found.bound
+    assert found.volumes[0] == pytest.approx(determinants(vectors, found.subsets)[0])
+    assert found.volumes[0] > 0.9 * optimum
+
+
+@pytest.mark.parametrize("vectors", [np.zeros((6, 3)), np.eye(4)[:3].repeat(3, axis=0)])
+def test_no_volume_at_all(monkeypatch: pytest.MonkeyPatch, vectors: Array) -> None:
+    for found in (largest_volumes(vectors), searched(monkeypatch, vectors)):
+        assert found.volumes[0] == pytest.approx(0.0, abs=1e-12)
+        assert found.complete and found.subsets.shape == (1, vectors.shape[1])
+
+
+@pytest.mark.parametrize(("count", "n"), [(500, 3), (600, 3), (300, 4), (200, 7)])
+def test_a_sphere_is_proven_within_seconds(count: int, n: int) -> None:
+    candidates = sphere(0, count, n)
+    found = select(candidates, n + 1, "exact", time_limit=20)
+    assert found.proven and found.seconds < 10  # milliseconds once compiled
+    assert found.log_det >= select(candidates, n + 1, "exchange").log_det - 1e-9

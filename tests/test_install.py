@@ -1,0 +1,96 @@
+"""Each extra alone in a fresh environment: the wheel installs and does its job.
+
+Slow, and needs a package index: run by hand before a release.
+"""
+
+from __future__ import annotations
+
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parents[1]
+
+pytestmark = pytest.mark.slow
+
+SELECT = """
+import numpy as np, jaxcal
+u = np.random.default_rng(0).uniform(-20, 20, (50, 3))
+chosen = jaxcal.select(u, 4)
+assert chosen.proven, chosen
+commands = u[chosen.indices]
+calibration = jaxcal.identify(commands, commands * 0.5 + 1.0)
+assert abs(calibration.matrix[0, 0] - 0.5) < 1e-9
+jaxcal.plan(u, target_accuracy=0.2, noise_std=0.1, max_replicates=2)
+"""
+ABSENT = """
+import importlib.util as i
+found = [name for name in {names!r} if i.find_spec(name)]
+assert not found, found
+"""
+HEAVY = ("jax", "flax", "orbax", "brax", "mujoco", "matplotlib", "pymodbus", "pydantic")
+
+# extra: packages that must not come with it; commands and what their output must hold
+CASES = {
+    "": (
+        HEAVY,
+        [
+            (["jaxcal", "train"], 2, "pip install 'jaxcal[policy]'"),
+            (["jaxcal-rig", "calibrate", "--simulate"], 2, "pip install 'jaxcal[rig]'"),
+            (["jaxcal", "evaluate"], 2, "pip install 'jaxcal["),
+        ],
+    ),
+    "policy": (
+        ("brax", "mujoco", "matplotlib", "pymodbus"),
+        [
+            (["jaxcal", "train", "--episodes", "2048", "--out", "run"], 0, "saved run"),
+        ],
+    ),
+    "rig": (
+        ("jax", "flax", "brax", "mujoco", "matplotlib"),
+        [(["jaxcal-rig", "calibrate", "--simulate"], 0, "")],
+    ),
+    "study": (
+        ("pymodbus", "pydantic"),
+        [
+            (
+                ["jaxcal", "evaluate", "--episodes", "20", "--report", "report"],
+                0,
+                "policy",
+            ),
+        ],
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("wheel")
+    build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w"]
+    subprocess.run([*build, str(folder), str(ROOT)], check=True)
+    return next(folder.glob("jaxcal-*.whl"))
+
+
+@pytest.mark.parametrize("extra", CASES)
+def test_an_extra_alone(extra, wheel, tmp_path):
+    absent, commands = CASES[extra]
+    subprocess.run([sys.executable, "-m", "venv", str(tmp_path / "env")], check=True)
+    bin_folder = tmp_path / "env" / "bin"
+    wanted = f"{wheel}[{extra}]" if extra else str(wheel)
+    install = [bin_folder / "python", "-m", "pip", "install", "-q"]
+    subprocess.run([*install, "-c", ROOT / "constraints.txt", wanted], check=True)
+    for code in (SELECT, ABSENT.format(names=absent)):
+        subprocess.run([bin_folder / "python", "-c", code], check=True, cwd=tmp_path)
+    for (name, *arguments), code, expected in commands:
+        done = subprocess.run(
+            [bin_folder / name, *arguments],
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+            check=False,
+        )
+        assert done.returncode == code, done.stdout + done.stderr
+        assert expected in done.stdout + done.stderr
+        assert "Traceback" not in done.stderr
