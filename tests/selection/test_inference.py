@@ -125,19 +125,11 @@ def test_the_scores_are_those_of_jax_in_double_precision(rng, key, config, n, k,
     free[:, :made] = False
     with jax.enable_x64(True):
         double = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
-<<<<<<< HEAD
-        features = network.candidate_features(
-            jnp.asarray(whitened(problems)), jnp.asarray(available)
-        )
-        memory = networks.encode(network, double, features)
-        given = features, memory, jnp.asarray(chosen, jnp.int32), jnp.asarray(free)
-=======
         view = network.candidate_features(
             jnp.asarray(whitened(problems)), jnp.asarray(available)
         )
         memory = networks.encode(network, double, view)
         given = view, memory, jnp.asarray(chosen, jnp.int32), jnp.asarray(free)
->>>>>>> main
         logits, _ = decoding.logits_at(network, double, *given, made)
     ours = CompactNetwork(dataclasses.asdict(config), weights.flat(params))
     x = np.stack([p.rows.T * np.sqrt(p.available.sum()) for p in problems])
