@@ -130,6 +130,7 @@ class Observer:
             self.imu.check_fault()
             readings = self._window(since, now)
             span = readings[-1].time - readings[0].time if readings else 0.0
+            hint = "Check the phone's app and its Wi-Fi"
             if len(readings) < settle.min_samples or span < 0.8 * settle.window_s:
                 reason = f"{len(readings)} readings over {span:.2f} s of the window"
             elif now - readings[-1].time > self.config.imu.stale_s:
@@ -138,10 +139,13 @@ class Observer:
                 reason = self._unquiet(readings)
                 if not reason:
                     return statuses
+                hint = (
+                    "Look for vibration, a loose phone, or [settle] limits too narrow"
+                )
             if now > deadline:
                 raise MotionFault(
                     f"the device did not settle in {settle.timeout_s:g} s: {reason}. "
-                    "Look for vibration, a loose phone, or [settle] limits too narrow"
+                    f"{hint}"
                 )
             time.sleep(poll)
 
