@@ -32,7 +32,7 @@ def run(budget: Budget) -> Row:
     rounds = budget.pick(5, 1)
     for method in ("policy", "exchange", "exact"):
         code = _CODE.replace("METHOD", repr(method))
-        fresh_process(code)  # the compiled programs of a first use on this machine
+        fresh_process(code)  # numba compiles at a first use on this machine
         taken = [json.loads(fresh_process(code)) for _ in range(rounds)]
         cold = statistics.median(t["cold"] for t in taken)
         warm = 1e3 * statistics.median(t["warm"] for t in taken)
@@ -46,7 +46,7 @@ def run(budget: Budget) -> Row:
                 Verdict("select, same process", warm, 5.0, larger=False, unit="ms"),
             ]
     row.notes.append(
-        "compiled programs are on disk, as after any earlier use on the machine; "
-        "without them see the row startup"
+        "compiled code is on disk, as after any earlier use on the machine; "
+        "without it see the row startup"
     )
     return row

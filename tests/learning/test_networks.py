@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import json
 import pathlib
@@ -34,12 +35,19 @@ def made(config, m=12, n=3, k=4, seed=0):
 
 def score(network, params, points, chosen, k=4):
     points = jnp.asarray(points, jnp.float32)
-    batch, m, _ = points.shape
-    features = network.candidate_features(points, jnp.ones((batch, m), bool))
+    picks = jnp.full((len(points), k), -1)
+    picks = picks.at[:, : len(chosen)].set(jnp.asarray(chosen, int))
+    free = jnp.ones(points.shape[:2], bool)
+    free = free.at[:, jnp.asarray(chosen, int)].set(False)
+    return scored(network, params, points, picks, free, len(chosen))
+
+
+# One program, which the cache keeps: op by op it would be hundreds.
+@functools.partial(jax.jit, static_argnames=("network", "count"))
+def scored(network, params, points, picks, free, count):
+    features = network.candidate_features(points, jnp.ones(points.shape[:2], bool))
     memory = networks.encode(network, params, features)
-    picks = jnp.full((batch, k), -1).at[:, : len(chosen)].set(jnp.asarray(chosen, int))
-    free = jnp.ones((batch, m), bool).at[:, jnp.asarray(chosen, int)].set(False)
-    decision = network.decision_features(features, picks, free, len(chosen))
+    decision = network.decision_features(features, picks, free, count)
     return networks.decode(network, params, memory, decision)
 
 

@@ -307,7 +307,7 @@ def test_an_unknown_network_or_preset_is_named():
 def test_learning_finds_the_papers_network_without_importing_the_paper():
     code = (
         "import sys\n"
-        "from jaxcal.learning.policies.networks import NetworkConfig, build\n"
+        "from jaxcal.learning.policies.build import build\n"
         "from jaxcal.learning.training import presets\n"
         "assert not any(name.startswith('jaxcal.paper') for name in sys.modules)\n"
         "print(type(build(presets.load('paper').network)).__module__)"

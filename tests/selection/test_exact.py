@@ -7,7 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from jaxcal.selection import auto as auto_module
 from jaxcal.selection import exact_batch, exchange_batch, make_problem, score, select
+from jaxcal.selection.exact import exact as exact_module
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
 from jaxcal.selection.exact.exact import solve_exact, upper_bound
 from jaxcal.selection.exact.volume import largest_volumes
@@ -275,6 +277,19 @@ def test_time_limit_returns_the_best_found_and_an_honest_bound():
     assert found.gap > 0.0
     assert 0.9 < found.efficiency < 1.0
     assert found.log_det >= select(candidates, 12, "greedy").log_det - 1e-9
+
+
+@pytest.mark.parametrize("method", ["exact", "auto"])
+def test_there_is_a_time_limit_by_default(monkeypatch, method):
+    """600 postures on a sphere: the proof would not end in any reasonable time."""
+    for module in (exact_module, auto_module):
+        monkeypatch.setattr(module, "TIME_LIMIT", 0.2)
+    extra = {"least_efficiency": 1.0} if method == "auto" else {}
+    found = select(sphere(0, 600), 8, method, **extra)
+    assert not found.proven
+    assert found.seconds < 5.0
+    assert found.bound > found.log_det
+    assert 0.9 < found.efficiency < 1.0
 
 
 def test_time_limit_during_enumeration_is_honest_too():

@@ -25,7 +25,7 @@ from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.checkpoint_folder import default_folder
 from jaxcal.learning.training import checkpoint
 from jaxcal.selection.policy import select_batch
-from jaxcal.selection.policy.compact import CompactPolicy, _Sets
+from jaxcal.selection.policy.compact import CompactNetwork, _Sets
 from jaxcal.selection.policy.kernel import look_ahead
 from jaxcal.selection.problem import make_problems
 
@@ -125,11 +125,13 @@ def test_the_scores_are_those_of_jax_in_double_precision(rng, key, config, n, k,
     free[:, :made] = False
     with jax.enable_x64(True):
         double = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
-        view = network.look(jnp.asarray(whitened(problems)), jnp.asarray(available))
+        view = network.candidate_features(
+            jnp.asarray(whitened(problems)), jnp.asarray(available)
+        )
         memory = networks.encode(network, double, view)
         given = view, memory, jnp.asarray(chosen, jnp.int32), jnp.asarray(free)
         logits, _ = decoding.logits_at(network, double, *given, made)
-    ours = CompactPolicy(dataclasses.asdict(config), weights.flat(params))
+    ours = CompactNetwork(dataclasses.asdict(config), weights.flat(params))
     x = np.stack([p.rows.T * np.sqrt(p.available.sum()) for p in problems])
     own = ours._encoded(np.ascontiguousarray(x), available)
     np.testing.assert_allclose(own, memory, rtol=1e-4, atol=1e-4)
@@ -178,18 +180,12 @@ def test_samples_are_drawn_from_the_policy(rng):
     problems, _, available, _ = drawn(rng, 1, 6, 2, 3)
     begin = jnp.zeros((1, 6, 2)), jnp.ones((1, 6), bool), jnp.full((1, 3), -1)
     params = network.init(jax.random.key(0), *begin, begin[1])["params"]
-    policy = CompactPolicy(dataclasses.asdict(config), weights.flat(params))
-    rows = np.repeat(problems[0].rows[None], 4000, axis=0)
-    mask = np.repeat(available, 4000, axis=0)
-    streams = [np.random.default_rng((1, b)) for b in range(4000)]
-    picks = policy.choose(
-        rows, mask, np.zeros((4000, 0), np.int64), 3, "samples", 1, streams
-    )
-    x = np.ascontiguousarray(np.matrix_transpose(rows[:1])) * np.sqrt(6)
+    policy = CompactNetwork(dataclasses.asdict(config), weights.flat(params))
+    picks = policy(problems * 4000, "samples", 1, seed=1)
+    x = np.ascontiguousarray(problems[0].rows.T)[None] * np.sqrt(6)
+    memory = policy._encoded(x, available)
     none = np.full((1, 3), -1)
-    scores = policy._scores(
-        _Sets(x, policy._encoded(x, mask[:1]), none, mask[:1].copy()), 0
-    )[0]
+    scores = policy._scores(_Sets(x, memory, none, available), 0)[0]
     expected = np.exp(scores - scores.max())
     expected /= expected.sum()
     share = np.bincount(picks[:, 0], minlength=6) / 4000
@@ -281,7 +277,7 @@ def test_deciding_needs_no_jax():
         "import json, sys, numpy as np, jaxcal\n"
         "points = np.random.default_rng(0).random((30, 3))\n"
         "chosen = jaxcal.select(points, 4, 'policy').indices.tolist()\n"
-        "heavy = {'jax', 'flax', 'orbax', 'scipy.linalg'} & set(sys.modules)\n"
+        "heavy = {'jax', 'flax', 'orbax', 'optax'} & set(sys.modules)\n"
         "print(json.dumps([chosen, sorted(heavy)]))"
     )
     done = subprocess.run(

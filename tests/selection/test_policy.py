@@ -137,6 +137,7 @@ def test_the_shipped_checkpoint_says_how_it_was_made():
 def test_importing_jaxcal_loads_nothing_heavy():
     code = (
         "import sys, jaxcal, jaxcal.calibration, jaxcal.information, jaxcal.selection\n"
+        "import jaxcal.selection.policy\n"
         "heavy = {'jax', 'brax', 'mujoco', 'matplotlib', 'flax', 'orbax', 'numba'}\n"
         "print(sorted(heavy & set(sys.modules)))"
     )

@@ -24,7 +24,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "benchmarks"))
 
 import replanning
 
-REST = ((4, 2), (4, 3), (6, 1), (6, 2), (6, 3))  # each compiles a program of its own
+REST = ((4, 2), (4, 3), (6, 1), (6, 2), (6, 3))
 
 
 def conditional_optimum(candidates, k, required, available):

@@ -169,6 +169,11 @@ def _weights(config: NetworkConfig, params: Any, meta: dict[str, Any]) -> Weight
     return Weights(dataclasses.asdict(config), weights.flat(params), meta)
 
 
+def _unreadable(path: pathlib.Path, what: str, error: Exception) -> CheckpointError:
+    line = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+    return CheckpointError(f"checkpoint {path} cannot be {what} ({line})")
+
+
 def _latest(folder: pathlib.Path) -> tuple[pathlib.Path, int, dict[str, Any]]:
     """The newest complete step of a folder and its meta, checked."""
     step = int(newest_step(folder).name)
@@ -178,10 +183,8 @@ def _latest(folder: pathlib.Path) -> tuple[pathlib.Path, int, dict[str, Any]]:
                 step, args=ocp.args.Composite(meta=ocp.args.JsonRestore())
             )["meta"]
     except Exception as error:  # orbax and tensorstore raise many kinds
-        raise CheckpointError(
-            f"checkpoint {folder / str(step)} cannot be read: its meta is damaged "
-            f"({_first_line(error)})"
-        ) from error
+        what = "read: its meta is damaged"
+        raise _unreadable(folder / str(step), what, error) from error
     if not isinstance(meta, dict) or meta.get("schema") != SCHEMA:
         raise CheckpointError(
             f"checkpoint {folder / str(step)} is not a jaxcal policy: its schema is "
@@ -193,10 +196,6 @@ def _latest(folder: pathlib.Path) -> tuple[pathlib.Path, int, dict[str, Any]]:
             f"this jaxcal reads version {VERSION}"
         )
     return folder / str(step), step, meta
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
 
 
 def load(folder: str | pathlib.Path | None = None) -> Policy:
@@ -219,10 +218,7 @@ def load(folder: str | pathlib.Path | None = None) -> Policy:
     try:
         params = jax.tree.map(jax.numpy.asarray, _plain_policy(path / "policy"))
     except Exception as error:  # orbax and tensorstore raise many kinds
-        raise CheckpointError(
-            f"checkpoint {path} cannot be read: its weights are damaged "
-            f"({_first_line(error)})"
-        ) from error
+        raise _unreadable(path, "read: its weights are damaged", error) from error
     network = build(config)
     _check_weights(path, params, network, meta)
     return Policy(network, params, meta, root, step)
@@ -256,24 +252,23 @@ def _check_weights(
     expected = jax.eval_shape(
         lambda: networks.initial(network, jax.random.key(0), m, n, k)
     )
-    wanted, held = _shapes(expected), _shapes(params)
+    wanted = {
+        jax.tree_util.keystr(name, simple=True, separator="."): leaf.shape
+        for name, leaf in jax.tree_util.tree_leaves_with_path(expected)
+    }
+    arrays = weights.flat(params)
+    held = {name: array.shape for name, array in arrays.items()}
     if wanted != held:
         name = sorted(set(wanted.items()) ^ set(held.items()))[0][0]
         raise CheckpointError(
             f"checkpoint {path} does not fit its network: {name} has shape "
             f"{held.get(name)}, the network wants {wanted.get(name)}"
         )
-    for keys, leaf in jax.tree_util.tree_leaves_with_path(params):
-        if not np.isfinite(np.asarray(leaf)).all():
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
             raise CheckpointError(
-                f"checkpoint {path} holds weights that are not finite, in "
-                + jax.tree_util.keystr(keys)
+                f"checkpoint {path} holds weights that are not finite, in {name}"
             )
-
-
-def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    return {jax.tree_util.keystr(keys): tuple(leaf.shape) for keys, leaf in leaves}
 
 
 def export(run: str | pathlib.Path, folder: str | pathlib.Path) -> None:
@@ -327,10 +322,8 @@ def restore(folder: str | pathlib.Path, fresh: Any) -> tuple[Any, dict[str, Any]
                 ),
             )["state"]
     except Exception as error:  # orbax and tensorstore raise many kinds
-        raise CheckpointError(
-            f"checkpoint {path} cannot be resumed: its training state is damaged or of "
-            f"another configuration ({_first_line(error)})"
-        ) from error
+        what = "resumed: its training state is damaged or of another configuration"
+        raise _unreadable(path, what, error) from error
     state = jax.tree.map(
         lambda new, old: (
             jax.random.wrap_key_data(jax.numpy.asarray(old))

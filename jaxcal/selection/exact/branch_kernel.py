@@ -1,4 +1,4 @@
-"""Compiled branch and bound, called by :mod:`jaxcal.selection.exact.branch_and_bound`.
+"""Compiled branch and bound; ``jaxcal.selection.exact.branch_and_bound`` is its front.
 
 A node bounds the count of every candidate, ``low_i <= c_i <= high_i``, sum k. Its
 relaxation lets counts be real numbers; it is climbed by moving weight between two
@@ -212,9 +212,9 @@ def relax(
         value = factor(gram, inverse)
         if not value > -np.inf:
             return value, 0.0, 0.0
-    _leverages(columns, inverse, products, leverage, curvature)
     most, cut = 0.0, 0.0
     for step_number in range(_MAX_STEPS):
+        _leverages(columns, inverse, products, leverage, curvature)
         up, down = -1, -1
         for i in range(num_blocks):
             if c[i] < high[i] and (up < 0 or leverage[i] > leverage[up]):
@@ -263,7 +263,6 @@ def relax(
             best_step *= 0.5
         c[up] = float(high[up]) if best_step == rise else c[up] + best_step
         c[best] = float(low[best]) if best_step == fall else c[best] - best_step
-        _leverages(columns, inverse, products, leverage, curvature)
     return value, most, cut
 
 

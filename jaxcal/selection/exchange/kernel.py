@@ -32,7 +32,7 @@ _RIDGE = 1e-6  # of the information of all candidates, to climb from a singular 
 def _random_start(
     blocks, upper, required, span, full, k, state, order, basis, chosen, counts
 ):
-    """Fill ``chosen`` (k,) at random, singular only where that is hard to avoid.
+    """Fill ``chosen`` (k,) at random, rarely singular.
 
     Args:
         blocks: (M, q, p).
@@ -44,7 +44,7 @@ def _random_start(
         basis: (p, p) work space.
         chosen, counts: (k,) and (M,), filled.
     """
-    num_blocks, _, p = blocks.shape
+    num_blocks, p = len(blocks), blocks.shape[2]
     counts[:] = 0
     size = len(required)
     for r in range(size):
@@ -54,7 +54,7 @@ def _random_start(
         b = draw(state, a + 1)
         order[a], order[b] = order[b], order[a]
     # An orthonormal basis grows with what is chosen: first the required ones, then
-    # at random what leaves the span by enough, then the farthest where that fails.
+    # at random what leaves the span by enough.
     rank = len(span)
     basis[:rank] = span
     for r in range(size):
@@ -70,42 +70,12 @@ def _random_start(
                 chosen[size] = i
                 counts[i] += 1
                 size += 1
-    while rank < p and size < k:
-        farthest, most = -1, 0.0
-        for i in range(num_blocks):
-            if counts[i] < upper[i]:
-                outside = _outside(blocks, i, basis, rank)
-                if outside > most:
-                    most = outside
-                    farthest = i
-        if farthest < 0:
-            break
-        rank = _extend(blocks, farthest, basis, rank, 1e-15 * most)
-        chosen[size] = farthest
-        counts[farthest] += 1
-        size += 1
     while size < k:
         i = order[draw(state, num_blocks)]
         if counts[i] < upper[i]:
             chosen[size] = i
             counts[i] += 1
             size += 1
-
-
-@njit(cache=True, nogil=True)
-def _outside(blocks, i, basis, rank):
-    """Squared length of the rows of block i outside the first ``rank`` basis rows."""
-    _, q, p = blocks.shape
-    square = 0.0
-    for s in range(q):
-        for a in range(p):
-            square += blocks[i, s, a] * blocks[i, s, a]
-        for r in range(rank):
-            dot = 0.0
-            for a in range(p):
-                dot += basis[r, a] * blocks[i, s, a]
-            square -= dot * dot
-    return square
 
 
 @njit(cache=True, nogil=True)
@@ -300,14 +270,14 @@ def exchange_starts(
         _random_start(
             blocks, upper, required, span, full, k, state, order, basis, chosen, counts
         )
-        log_det = climb(
-            blocks, columns, upper, fixed, chosen, counts, prior, gram, inverse
-        )
-        if not log_det > -np.inf:  # swaps may still leave a singular start
-            climb(blocks, columns, upper, fixed, chosen, counts, ridged, gram, inverse)
+        log_det = -np.inf
+        for attempt in range(3):  # the last two where swaps may mend a singular start
+            known = ridged if attempt == 1 else prior
             log_det = climb(
-                blocks, columns, upper, fixed, chosen, counts, prior, gram, inverse
+                blocks, columns, upper, fixed, chosen, counts, known, gram, inverse
             )
+            if attempt == 0 and log_det > -np.inf:
+                break
         if log_det > best + 1e-10:
             best = log_det
             best_chosen[:] = chosen

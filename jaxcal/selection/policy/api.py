@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import os
 import pathlib
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Protocol
 
 import numpy as np
@@ -26,8 +24,6 @@ from jaxcal.selection.problem import Problem, make_problems, whole_number
 __all__ = ["DECODINGS", "Policy", "load_policy", "select_batch"]
 
 DECODINGS = ("greedy", "samples", "first", "exchange")
-
-_ROWS = 1_024  # candidates of all episodes in a piece of work: they fit a core's cache
 
 Indices = NDArray[np.int64]
 
@@ -76,50 +72,14 @@ def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Policy:
         with needs("policy", f"checkpoint {path.parent}, which holds no {path.name},"):
             from jaxcal.learning.training import checkpoint
         found = checkpoint.as_weights(checkpoint.load(path.parent.parent))
-    kind = found.network["kind"]
-    choose = _compact(found) if kind == "compact" else _through_jax(path)
-    return Policy(kind, found.meta, choose)
+    return Policy(found.network["kind"], found.meta, _network(found, path))
 
 
-def _compact(found: Weights) -> Network:
-    from jaxcal.selection.policy.compact import CompactPolicy
+def _network(found: Weights, path: pathlib.Path) -> Network:
+    if found.network["kind"] == "compact":
+        from jaxcal.selection.policy.compact import CompactNetwork
 
-    network = CompactPolicy(found.network, found.arrays)
-
-    def piece(
-        problems: Sequence[Problem], first: int, decoding: str, num: int, seed: int
-    ) -> Indices:
-        draws = decoding == "samples"
-        sets = range(first, first + len(problems)) if draws else ()
-        return network.choose(
-            np.stack([problem.rows for problem in problems]),
-            np.stack([problem.available for problem in problems]),
-            np.stack([problem.required for problem in problems]),
-            problems[0].k,
-            decoding,
-            num,
-            [np.random.default_rng((seed, i)) for i in sets],
-        )
-
-    def choose(
-        problems: Sequence[Problem], decoding: str, num: int, seed: int
-    ) -> Indices:
-        tries = 1 if decoding == "greedy" else num
-        size = max(1, _ROWS // (len(problems[0].rows) * tries))
-        cuts = [problems[i : i + size] for i in range(0, len(problems), size)]
-        if len(cuts) == 1:
-            return piece(problems, 0, decoding, num, seed)
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            found = pool.map(
-                lambda i: piece(cuts[i], i * size, decoding, num, seed),
-                range(len(cuts)),
-            )
-            return np.concatenate(list(found))
-
-    return choose
-
-
-def _through_jax(path: pathlib.Path) -> Network:
+        return CompactNetwork(found.network, found.arrays)
     with needs("policy", f"checkpoint {path.parent}, whose network is not compact,"):
         from jaxcal.selection.policy.through_jax import JaxNetwork
     return JaxNetwork(path.parent.parent)

@@ -6,21 +6,25 @@ candidates, K choices in all, p regressors, w width of the network. Weights are 
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.selection.policy.kernel import CLOSE, describe
+from jaxcal.selection.problem import Problem
 
-__all__ = ["CompactPolicy"]
+__all__ = ["CompactNetwork"]
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
+_ROWS = 1_024  # candidates of all episodes in a piece of work: they fit a core's cache
 _RULE = 20.0  # multiple of the look-ahead in the rule that ``trust`` weighs
 _UNLEARNED = 2  # choices at the end that the look-ahead makes alone: they are exact
 _SHARP = 60.0  # inverse temperature of those
@@ -49,8 +53,8 @@ class _Decision(NamedTuple):
     active: Array32  # (E, M) 1 or 0
 
 
-class CompactPolicy:
-    """Chooses K of M for B candidate sets at once.
+class CompactNetwork:
+    """Chooses for problems of one shape, in pieces, on every core.
 
     Args:
         config: fields of a ``NetworkConfig`` of kind "compact".
@@ -66,27 +70,38 @@ class CompactPolicy:
         self._decoder = [f"decoder_{i}" for i in range(config["decoder_rounds"])]
         self._weights = dict(arrays)
 
-    def choose(
+    def __call__(
+        self, problems: Sequence[Problem], decoding: str, num: int, seed: int
+    ) -> Indices:
+        """See ``jaxcal.selection.policy.api.Network``."""
+        tries = 1 if decoding == "greedy" else num
+        size = max(1, _ROWS // (len(problems[0].rows) * tries))
+
+        def piece(begin: int) -> Indices:
+            some = problems[begin : begin + size]
+            draws = range(begin, begin + len(some)) if decoding == "samples" else ()
+            streams = [np.random.default_rng((seed, b)) for b in draws]
+            return self._choose(some, decoding, num, streams)
+
+        begins = range(0, len(problems), size)
+        if len(begins) == 1:
+            return piece(0)
+        # The kernel and numpy's products release the interpreter.
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            return np.concatenate(list(pool.map(piece, begins)))
+
+    def _choose(
         self,
-        rows: Array,
-        available: Mask,
-        required: Indices,
-        k: int,
+        problems: Sequence[Problem],
         decoding: str,
         num: int,
         generators: Sequence[np.random.Generator],
     ) -> Indices:
-        """(B, k) indices, the required first, then in the order of choice.
-
-        Args:
-            rows: (B, M, p) whitened regressors, ``rows.T @ rows = I``, 0 where masked.
-            available: (B, M).
-            required: (B, r) chosen before the policy begins.
-            k: choices in all.
-            decoding: "greedy", "first" or "samples".
-            num: tries of the last two.
-            generators: one a set, for "samples".
-        """
+        """(B, k) indices; one generator a problem for "samples", else none."""
+        k = problems[0].k
+        rows = np.stack([problem.rows for problem in problems])
+        available = np.stack([problem.available for problem in problems])
+        required = np.stack([problem.required for problem in problems])
         batch, r = required.shape
         x = np.ascontiguousarray(np.matrix_transpose(rows))
         x *= np.sqrt(available.sum(axis=1))[:, None, None]
@@ -200,7 +215,7 @@ class CompactPolicy:
             inner += np.matrix_transpose(seen.moments) @ (sent @ mix[width:])
         inner += shared[:, None]
         np.maximum(inner, 0.0, out=inner)
-        out: Array32 = np.asarray(inner @ weights[f"{name}.out.kernel"], np.float32)
+        out: Array32 = np.matmul(inner, weights[f"{name}.out.kernel"])
         out += weights[f"{name}.out.bias"]
         out *= seen.active[..., None]
         out += h
