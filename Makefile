@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help train checkpoint evaluate reproduce test  test-all lint format benchmark clean
+.PHONY: help train checkpoint evaluate reproduce test test-all lint format benchmark clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -31,7 +31,7 @@ reproduce: $(READY) ## the paper's figures, tables and claims from our own runs,
 	$(BIN)/python -m jaxcal.paper $(ARGS)
 
 test: lint ## set everything up, lint, and run the quick tests (the ones CI runs)
-	$(BIN)/python -m pytest -n 2 --dist loadgroup -m 'not slow' $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not slow' $(ARGS)
 
 test-all: lint ## every test, the slow ones too
 	$(BIN)/python -m pytest $(ARGS)

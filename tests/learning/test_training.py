@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import csv
 import dataclasses
 import json
@@ -167,6 +168,19 @@ def _truncate(step: pathlib.Path) -> None:
     assert data
     for path in data:
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def test_results_that_arrive_after_a_failed_read_are_ignored():
+    # Orbax closes its event loop while tensorstore still reads; without this, users
+    # see "Event loop is closed" below the message about a damaged checkpoint.
+    with checkpoint._late_reads_ignored():
+        loop = asyncio.new_event_loop()
+    loop.close()
+    assert loop.call_soon_threadsafe(print) is None
+    plain = asyncio.new_event_loop()
+    plain.close()
+    with pytest.raises(RuntimeError, match="Event loop is closed"):
+        plain.call_soon_threadsafe(print)
 
 
 def test_a_missing_folder_and_a_policy_without_state_are_told(finished, tmp_path):

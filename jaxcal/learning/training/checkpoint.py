@@ -17,6 +17,8 @@ here alone, so that changing it touches one file.
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import dataclasses
 import datetime
 import importlib.metadata
@@ -25,6 +27,7 @@ import pathlib
 import platform
 import sys
 import tempfile
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -92,6 +95,38 @@ def _alone() -> Any:
     return ocp.options.MultiprocessingOptions(
         primary_host=own, active_processes={own}, barrier_sync_key_prefix=str(own)
     )
+
+
+class _PatientLoop(asyncio.SelectorEventLoop):
+    """An event loop that ignores results which arrive after it is closed."""
+
+    def call_soon_threadsafe(  # type: ignore[override]  # generic in its arguments
+        self, *arguments: Any, **options: Any
+    ) -> Any:
+        """As asyncio's, but nothing where the loop is closed."""
+        if self.is_closed():
+            return None
+        return super().call_soon_threadsafe(*arguments, **options)
+
+
+class _PatientPolicy(asyncio.DefaultEventLoopPolicy):
+    def new_event_loop(self) -> asyncio.AbstractEventLoop:
+        return _PatientLoop()
+
+
+@contextlib.contextmanager
+def _late_reads_ignored() -> Iterator[None]:
+    """Around reads by orbax, which leaves the others to end where one has failed.
+
+    They end in a thread of tensorstore after orbax has closed its event loop; asyncio
+    then prints "Event loop is closed", which says nothing to anybody.
+    """
+    before = asyncio.get_event_loop_policy()
+    asyncio.set_event_loop_policy(_PatientPolicy())
+    try:
+        yield
+    finally:
+        asyncio.set_event_loop_policy(before)
 
 
 def _manager(folder: pathlib.Path, keep: int | None, create: bool) -> Any:
@@ -216,7 +251,8 @@ def load(folder: str | pathlib.Path | None = None) -> Policy:
             f"checkpoint {path} names no network this jaxcal knows: {error}"
         ) from error
     try:
-        params = jax.tree.map(jax.numpy.asarray, _plain_policy(path / "policy"))
+        with _late_reads_ignored():
+            params = jax.tree.map(jax.numpy.asarray, _plain_policy(path / "policy"))
     except Exception as error:  # orbax and tensorstore raise many kinds
         raise _unreadable(path, "read: its weights are damaged", error) from error
     network = build(config)
@@ -314,7 +350,7 @@ def restore(folder: str | pathlib.Path, fresh: Any) -> tuple[Any, dict[str, Any]
             f"checkpoint {path} holds a policy but no training state to resume from"
         )
     try:
-        with _manager(root, None, create=False) as manager:
+        with _late_reads_ignored(), _manager(root, None, create=False) as manager:
             plain = manager.restore(
                 step,
                 args=ocp.args.Composite(
