@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 import pathlib
 import sys
-from collections.abc import Callable
 from typing import Any, NoReturn
 
+from jaxcal.arguments import at_least, seconds
 from jaxcal.evaluation.methods import DEFAULT_METHODS
 from jaxcal.learning.runtime import processes
 
@@ -86,7 +86,7 @@ def parser(program: str, typed: str) -> argparse.ArgumentParser:
     add = out.add_argument
     several: dict[str, Any] = {"nargs": "+", "action": "extend", "default": []}
     folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
-    natural, index = _at_least(1), _at_least(0)
+    natural, index = at_least(1), at_least(0)
     add(
         "--checkpoint",
         metavar="DIR",
@@ -108,7 +108,7 @@ def parser(program: str, typed: str) -> argparse.ArgumentParser:
     add("--draws", type=natural, default=100, help="random selections an episode; 100")
     add(
         "--time-limit",
-        type=_seconds,
+        type=seconds,
         metavar="SECONDS",
         help="of the exact solver, a dataset; what it cannot prove is bounded",
     )
@@ -135,28 +135,3 @@ def parser(program: str, typed: str) -> argparse.ArgumentParser:
     add("--quiet", action="store_true", help="no progress")
     processes.add_arguments(out)
     return out
-
-
-def _at_least(least: int) -> Callable[[str], int]:
-    def parse(text: str) -> int:
-        try:
-            number = int(text)
-        except ValueError:
-            number = least - 1
-        if number < least:
-            raise argparse.ArgumentTypeError(
-                f"must be a whole number of at least {least}, got {text!r}"
-            )
-        return number
-
-    return parse
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be seconds above 0, got {text!r}")
-    return value

@@ -7,6 +7,8 @@ import sys
 from collections.abc import Callable
 from typing import Any, NoReturn
 
+from jaxcal.arguments import at_least
+
 __all__ = ["Parser", "positive", "run", "seed"]
 
 
@@ -48,23 +50,5 @@ def run(command: Callable[[], None], name: str, interrupted: str) -> int:
     return 0
 
 
-def seed(text: str) -> int:
-    """A whole number of at least 0, for ``type=``."""
-    return _whole(text, 0)
-
-
-def positive(text: str) -> int:
-    """A whole number of at least 1, for ``type=``."""
-    return _whole(text, 1)
-
-
-def _whole(text: str, least: int) -> int:
-    try:
-        number = int(text)
-    except ValueError:
-        number = least - 1
-    if number < least:
-        raise argparse.ArgumentTypeError(
-            f"must be a whole number of at least {least}, got {text!r}"
-        )
-    return number
+seed = at_least(0)  # for ``type=``
+positive = at_least(1)
