@@ -33,8 +33,8 @@ reproduce: $(READY) ## the paper's figures, tables and claims from our own runs,
 test: lint ## set everything up, lint, and run the quick tests (the ones CI runs)
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not slow' $(ARGS)
 
-test-all: lint ## every test, the slow ones too
-	$(BIN)/python -m pytest $(ARGS)
+test-all: lint ## every test, the slow ones too, hypothesis drawing new examples
+	$(BIN)/python -m pytest --hypothesis-profile=new $(ARGS)
 
 lint: $(READY) ## ruff (lint and format), mypy and the import contracts
 	$(BIN)/ruff check .

@@ -21,9 +21,11 @@ import pytest
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-# A loaded machine is slow, not wrong: no example has a deadline.
-hypothesis.settings.register_profile("jaxcal", deadline=None)
-hypothesis.settings.load_profile("jaxcal")
+# A loaded machine is slow, not wrong: no example has a deadline. `make test` draws the
+# same examples every time; `make test-all` draws new ones (--hypothesis-profile=new).
+hypothesis.settings.register_profile("same", deadline=None, derandomize=True)
+hypothesis.settings.register_profile("new", deadline=None)
+hypothesis.settings.load_profile("same")
 
 
 @pytest.fixture

@@ -93,8 +93,10 @@ def test_the_search_finds_what_brute_force_finds(
     expected = brute_force(vectors)
     with pytest.MonkeyPatch.context() as patch:
         found = searched(patch, vectors)
-    # A volume is known to the rounding of the longest vectors.
-    size = np.prod(np.sort(np.linalg.norm(vectors, axis=1))[-q:])
+    # A volume is known to the rounding of the longest vectors; where fewer than q are
+    # not zero, it is zero to the rounding of the longest alone.
+    lengths = np.sort(np.linalg.norm(vectors, axis=1))
+    size = np.prod(np.where(lengths[-q:] > 0.0, lengths[-q:], 1e-3 * lengths[-1]))
     tolerance = {"rel": 1e-9, "abs": 1e-12 * size}
     assert found.complete
     assert found.volumes[0] == pytest.approx(expected, **tolerance)
