@@ -30,6 +30,9 @@ evaluate: $(READY) ## compare every method with the proven optimum on 1,000 unse
 reproduce: $(READY) ## the paper's figures, tables and claims from our own runs, in report/index.html
 	$(BIN)/python -m jaxcal.paper $(ARGS)
 
+# Most of a first run is XLA compiling: without its optimiser that takes a third of the
+# time. `make test-all` compiles as users do.
+test: export XLA_FLAGS ?= --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
 test: lint ## set everything up, lint, and run the quick tests (the ones CI runs)
 	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not slow' $(ARGS)
 
