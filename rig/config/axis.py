@@ -103,9 +103,8 @@ class Axis(Scale):
         counts = {"speed": max(1, round(speed * units.speed_per_unit))}
         counts["accel"] = counts["decel"] = max(1, round(accel * units.accel_per_unit))
         for name, count in counts.items():
-            for frame in self.map.move.write:
-                if found := frame.offset_of(name):
-                    encode(count, found[1], self.map.word_order)
+            if place := self.map.move.place_of(name):
+                encode(count, place[1], self.map.word_order)
         return counts
 
     def broken_rules(self) -> Iterator[str]:
@@ -114,14 +113,11 @@ class Axis(Scale):
             if low >= high:
                 yield f"min_{unit}: must be under max_{unit}, got {low} and {high}"
                 return
+        allowed = f"min_pulses..max_pulses ({self.min_pulses}..{self.max_pulses})"
         for name in ("min_deg", "max_deg"):
             pulses = self.to_pulses(getattr(self, name))
             if not self.min_pulses <= pulses <= self.max_pulses:
-                allowed = f"{self.min_pulses}..{self.max_pulses}"
-                yield (
-                    f"{name}: {pulses} pulses are outside min_pulses..max_pulses "
-                    f"({allowed})"
-                )
+                yield f"{name}: {pulses} pulses are outside {allowed}"
         try:
             self.motion_counts()
         except ValueError as error:

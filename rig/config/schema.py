@@ -9,7 +9,9 @@ pydantic would compile every annotation again at each start.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator
+import pathlib
+import tomllib
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -61,23 +63,56 @@ def key(
     return Field(description=about, ge=low, le=high, **more)
 
 
+class ConfigError(ValueError):
+    """A file is not usable; ``faults`` lists all that is wrong."""
+
+    def __init__(self, source: str, faults: list[str]) -> None:
+        self.source = source
+        self.faults = faults
+        count = f"{len(faults)} fault{'s' if len(faults) > 1 else ''}"
+        lines = "".join(f"\n  - {fault}" for fault in faults)
+        super().__init__(f"{source}: {count}{lines}")
+
+
+def read_text(path: str | pathlib.Path) -> str:
+    """Text of a file; ConfigError where it cannot be read."""
+    try:
+        return pathlib.Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ConfigError(str(path), [f"cannot be read: {reason}"]) from None
+
+
 Model = TypeVar("Model", bound=Section)
 
 
-def validated(
-    model: type[Model], data: Any, context: Any = None
-) -> tuple[Model | None, list[str]]:
-    """The table as a model, or None with everything that is wrong with it.
+def parse(
+    model: type[Model],
+    text: str,
+    source: str,
+    context: Any = None,
+    more: Callable[[Any], Iterable[str]] = lambda data: (),
+) -> tuple[Model, dict[str, Any]]:
+    """A TOML text as a model, and as it was parsed.
 
-    Returns:
-        The model, and faults as ``section.key: rule, value``.
+    Raises:
+        ConfigError: every fault as ``section.key: rule, value``, and those that
+            ``more`` finds in what was parsed.
     """
     try:
-        return model.model_validate(_tuples(data), context=context), []
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(source, [f"not valid TOML: {error}"]) from None
+    faults = list(more(data))
+    try:
+        result = model.model_validate(_tuples(data), context=context)
     except ValidationError as error:
         schema = model.model_json_schema()
-        found = error.errors(include_url=False)
-        return None, [text for e in found for text in _texts(e, data, schema)]
+        each = error.errors(include_url=False)
+        faults = [text for e in each for text in _texts(e, data, schema)] + faults
+    if faults:
+        raise ConfigError(source, faults)
+    return result, data
 
 
 def _tuples(data: Any) -> Any:
@@ -142,7 +177,10 @@ def _texts(error: Any, value: Any, root: dict[str, Any]) -> list[str]:
     if kind == "rules":
         return [f"{path}.{fault}".lstrip(".") for fault in error["ctx"]["faults"]]
     if kind == "value_error":
-        return [f"{path}: {line}" for line in str(error["ctx"]["error"]).split("\n")]
+        inner = error["ctx"]["error"]
+        if isinstance(inner, ConfigError):  # of a file that this one names
+            return [f"{path}: {inner.source}: {fault}" for fault in inner.faults]
+        return [f"{path}: {inner}"]
     if kind == "extra_forbidden":
         near = difflib.get_close_matches(error["loc"][-1], known, 1)
         hint = f"did you mean {near[0]}? " if near else ""

@@ -10,11 +10,11 @@ import numpy as np
 from jaxcal.files import atomic_write
 from rig.attitude import Array
 from rig.config.axis import Pulses
-from rig.guard.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
+from rig.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
 from rig.outputs.console import numbers
 from rig.session.calibrate import visit_pairs
 from rig.session.identification import errors, pairs
-from rig.session.planning import draw_collection, draw_held_out
+from rig.session.planning import draw, draw_held_out
 from rig.session.run import DRY_RUN, Run
 
 
@@ -26,7 +26,7 @@ def collect(run: Run, count: int, dry_run: bool = False) -> int:
     """
     config = run.config
     targets = run.remember(
-        "collection", lambda: {"pulses": draw_collection(config, count).tolist()}
+        "collection", lambda: {"pulses": draw(config, count, 2).tolist()}
     )["pulses"]
     if dry_run:
         for number, target in enumerate(targets):
@@ -36,23 +36,19 @@ def collect(run: Run, count: int, dry_run: bool = False) -> int:
     run.planned = len(targets)
     for number, target in enumerate(targets):
         run.visit(f"collect:{number}", target, role="collect")
-    run.phase("saving")
-    records = list(run.postures().values())
-    size = config.session.candidates
-    commands, measured = pairs(records)
-    episodes = len(records) // size
-    if episodes == 0:
-        episodes, size = 1, len(records)
+    run.emit("phase", phase="saving")
+    commands, measured = pairs(list(run.postures().values()))
+    size = min(config.session.candidates, len(commands))
+    episodes = len(commands) // max(1, size)
     run.save_pairs()
-    whole, shape = episodes * size, (episodes, size, 3)
     with atomic_write(run.folder / "dataset.npz") as file:
         np.savez(
             file,
-            candidates=commands[:whole].reshape(shape),
-            measured=measured[:whole].reshape(shape),
+            candidates=commands[: episodes * size].reshape(episodes, size, 3),
+            measured=measured[: episodes * size].reshape(episodes, size, 3),
         )
     run.say(
-        f"saved: {run.folder}/pairs.csv ({len(records)} postures), dataset.npz "
+        f"saved: {run.folder}/pairs.csv ({len(commands)} postures), dataset.npz "
         f"({episodes} x {size})"
     )
     return EXIT_OK
@@ -72,10 +68,10 @@ def load_calibration(path: pathlib.Path) -> tuple[Any, Pulses | None]:
         calibration = jaxcal.Calibration.load(path)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise Refused(f"{path}: not a calibration: {error}") from None
-    notes = calibration.provenance.get("notes", {})
-    if "zero_pulses" not in notes:
+    zero = calibration.provenance.get("notes", {}).get("zero_pulses")
+    if zero is None:
         return calibration, None
-    a, b, c = (int(value) for value in notes["zero_pulses"])
+    a, b, c = map(int, zero)
     return calibration, (a, b, c)
 
 
@@ -96,39 +92,32 @@ def verify(run: Run, calibration: Any, count: int, dry_run: bool = False) -> int
     before, after, desired = visit_pairs(run, held)
     if not before:
         raise Refused("no held-out posture could be reached")
-    found = {"before": errors(before, desired), "after": errors(after, desired)}
+    raw, compensated = errors(before, desired), errors(after, desired)
     commands, measured = pairs(before + after)
     off = measured - calibration.predict(commands)
-    limit, worst = config.session.verify_limit_deg, found["after"]["max"]
-    again = bool(worst > limit)
-    run.phase("saving")
+    limit = config.session.verify_limit_deg
+    again = compensated["max"] > limit
+    run.emit("phase", phase="saving")
     run.save_pairs()
     run.save_summary(
         {
-            **found,
+            "before": raw,
+            "after": compensated,
             "prediction_rms": float(np.sqrt((off**2).mean())),
             "limit_deg": limit,
             "recalibrate": again,
         }
     )
     run.say(
-        f"error raw {found['before']['rms']:.4f} deg rms (max "
-        f"{found['before']['max']:.4f}), compensated {found['after']['rms']:.4f} (max "
-        f"{worst:.4f}), limit {limit:g}"
+        f"error raw {raw['rms']:.4f} deg rms (max {raw['max']:.4f}), compensated "
+        f"{compensated['rms']:.4f} (max {compensated['max']:.4f}), limit {limit:g}"
     )
     run.say("RECALIBRATE: over the limit" if again else "the calibration still holds")
     return EXIT_RECALIBRATE if again else EXIT_OK
 
 
 def goto(run: Run, calibration: Any, desired: Array, dry_run: bool = False) -> int:
-    """Move the end-effector to a desired posture through a calibration.
-
-    Args:
-        run: the run.
-        calibration: gives ``command_for``.
-        desired: (3,) degrees.
-        dry_run: move nothing.
-    """
+    """Move the end-effector to (3,) desired degrees through a calibration."""
     config = run.config
     command = np.asarray(calibration.command_for(desired), dtype=np.float64)
     for axis, value in zip(config.axes, command, strict=True):

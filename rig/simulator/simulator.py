@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from typing import Any
 
@@ -33,26 +34,21 @@ class Simulator:
         self.faults = FaultInjector(faults)
         self.transport = transport
         self.rate_hz = rate_hz
-        jig = Plant.jig_posture(self.truth)
         self.drives: list[SimDrive] = []
-        for axis, angle in zip(config.axes, jig, strict=True):
-            travel = None
+        for number, axis in enumerate(config.axes):
+            travel = position = None
             if travel_deg is not None:
-                ends = sorted(axis.to_pulses(end) for end in travel_deg)
-                travel = (ends[0], ends[1])
-            position = 0.0
+                travel = sorted(axis.to_pulses(end) for end in travel_deg)
             if config.session.zero == "here":
-                position = float(axis.to_pulses(float(angle)))
+                position = axis.to_pulses(float(self.truth.jig_deg[number]))
             self.drives.append(
                 SimDrive(
-                    axis.map, axis.pulses_per_rev, position,
-                    speedup=speedup, travel=travel,
+                    axis.map, axis.pulses_per_rev, position or 0, speedup, travel,
+                    functools.partial(self.faults.take, "stuck_axis", number),
                 )
             )  # fmt: skip
-        for number, drive in enumerate(self.drives):
-            drive.stuck = lambda n=number: bool(self.faults.take("stuck_axis", n))  # type: ignore[misc] # a default argument binds the axis
-        self.plant = Plant(config, self.truth, self.drives)
-        self.plant.slipping = lambda axis: bool(self.faults.take("slipping_axis", axis))
+        slipping = functools.partial(self.faults.take, "slipping_axis")
+        self.plant = Plant(config, self.truth, self.drives, slipping)
         units = [axis.unit for axis in config.axes]
         self.server = ModbusServer(
             dict(zip(units, self.drives, strict=True)), self.faults, self.truth.seed
@@ -91,6 +87,11 @@ class Simulator:
         )
         self.phone.start(port)
 
+    def hear(self, record: dict[str, Any]) -> None:
+        """Listen to the events of a session."""
+        if record["event"] == "phase":
+            self.enter(record["phase"])
+
     def enter(self, phase: str) -> None:
         """The session entered a phase: faults that wait for it begin."""
         self.faults.enter(phase)
@@ -114,7 +115,7 @@ class Simulator:
 
     def executions(self) -> list[list[int]]:
         """Targets in pulses each drive really ran, pitch, yaw, roll."""
-        return [[target for _, target in drive.executions] for drive in self.drives]
+        return [list(drive.executions) for drive in self.drives]
 
     def close(self) -> None:
         """Stop serving and sending."""

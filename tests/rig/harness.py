@@ -90,14 +90,22 @@ def session(
         (said if said is not None else []).append,
         start={"simulated": {"noise": 0.0}, "inputs": {}, "maps_from": "."},
         reset_alarms=True,
-        on_imu_port=on_imu_port or (sim.start_phone if sim else None),
     )
+    if on_imu_port or sim:
+        run.on_imu_port = on_imu_port or sim.start_phone
     for listener in listeners:
-        run.phase_listeners.append(lambda phase, f=listener: f(run, phase))
+        on_phase(run, lambda phase, f=listener: f(run, phase))
     with contextlib.ExitStack() as stack:
         if not figures:
             stack.enter_context(mock.patch.object(report, "_drawn", _undrawn))
         return run_safely(run, calibrate)
+
+
+def on_phase(run: Run, listener) -> None:
+    """Call a function whenever the run enters a phase."""
+    run.listeners.append(
+        lambda record: record["event"] == "phase" and listener(record["phase"])
+    )
 
 
 def _undrawn(*_: object) -> str:

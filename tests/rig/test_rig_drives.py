@@ -286,9 +286,11 @@ def test_a_serial_port_in_use_says_so():
 
 def test_identify_only_reads():
     config = fast_config()
-    with simulator(config) as sim, Bus(sim.start().bus) as bus:
-        frames = []
-        bus.on_frame = lambda event, fields: frames.append(event)
+    frames = []
+    with (
+        simulator(config) as sim,
+        Bus(sim.start().bus, emit=lambda event, **fields: frames.append(event)) as bus,
+    ):
         for axis in config.axes:
             drive = Drive(bus, axis)
             drive.status(), drive.alarm()

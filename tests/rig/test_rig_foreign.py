@@ -15,10 +15,10 @@ import time
 import numpy as np
 import pytest
 from fault_matrix import _free_port
+from scipy.spatial.transform import Rotation
 
 from rig.__main__ import main
 from rig.attitude import angle_between_deg, euler_to_matrix
-from rig.simulator.phone import matrix_to_quaternion
 
 MATRIX = np.array([[0.95, 0.03, -0.02], [0.01, 1.04, 0.02], [-0.015, 0.01, 0.9]])
 PULSES_PER_DEG = 1000
@@ -181,7 +181,7 @@ def logger_phone(slave, port, closing, rate):
     while not closing.is_set():
         payload = []
         for _ in range(max(1, round(rate / 2))):
-            q = matrix_to_quaternion(attitude(slave)[0])
+            q = Rotation.from_matrix(attitude(slave)[0]).as_quat()
             values = dict(zip(("qx", "qy", "qz", "qw"), q.tolist(), strict=True))
             payload.append(
                 {"name": "orientation", "time": time.time_ns(), "values": values}

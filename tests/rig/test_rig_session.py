@@ -1,6 +1,7 @@
 """Whole sessions: calibrate, collect, verify, goto, resume, and the command line."""
 
 import csv
+import dataclasses
 import gc
 import importlib.util
 import itertools
@@ -23,6 +24,7 @@ from harness import (
     changed,
     fast_config,
     fast_text,
+    on_phase,
     session,
     simulator,
 )
@@ -31,7 +33,7 @@ import jaxcal
 from rig.__main__ import main
 from rig.arguments import make_parser
 from rig.config import example_text, parse_config
-from rig.guard.faults import Refused
+from rig.faults import Refused
 from rig.outputs.journal import read_journal
 from rig.session.calibrate import calibrate
 from rig.session.checking import collect
@@ -227,7 +229,8 @@ def test_a_terminal_that_goes_away_stops_the_run_and_not_the_stop(tmp_path):
             if "1/7" in text or "stop" in text or "acknowledged" in text:
                 raise BrokenPipeError("Broken pipe")
 
-        run = Run(served, folder, "calibrate", broken, on_imu_port=sim.start_phone)
+        run = Run(served, folder, "calibrate", broken)
+        run.on_imu_port = sim.start_phone
         assert run_safely(run, calibrate) == 3
         assert all(drive.stops for drive in sim.drives)
         assert read_journal(folder / "journal.jsonl")[-1]["event"] == "stopped"
@@ -265,15 +268,15 @@ def test_collect_records_a_dataset_and_resumes(tmp_path):
         served, pressed = sim.start(), []
 
         def once():
-            run = Run(served, folder, "collect", said.append,
-                      on_imu_port=sim.start_phone)  # fmt: skip
+            run = Run(served, folder, "collect", said.append)
+            run.on_imu_port = sim.start_phone
 
             def press(phase):
                 if len(run.journal.events("posture")) == 3 and not pressed:
                     pressed.append(True)
                     signal.raise_signal(signal.SIGINT)
 
-            run.phase_listeners.append(press)
+            on_phase(run, press)
             return run_safely(run, lambda r: collect(r, 8))
 
         assert once() == 4
@@ -690,6 +693,8 @@ def test_a_plan_that_leaves_the_limits_is_refused_before_arming(tmp_path):
     wild = draw_candidates(config)
     wild[:, 0] = 99999
     choice = choose(config, config.to_deg(draw_candidates(config)))
-    run.journal.write("plan", candidates=wild.tolist(), choice=choice.described())
+    run.journal.write(
+        "plan", candidates=wild.tolist(), choice=dataclasses.asdict(choice)
+    )
     assert run_safely(run, calibrate) == 2
     assert any("leaves the limits" in line for line in said)
