@@ -51,3 +51,7 @@ class StopRequested(BaseException):
 
 class PauseRequested(BaseException):
     """First Ctrl-C: the posture in progress was finished, the run can be resumed."""
+
+
+class PlanOnly(BaseException):
+    """A dry run has come to the point where it would move."""

@@ -67,8 +67,7 @@ def run_session(args: argparse.Namespace) -> int:
     resumed = args.command == "resume"
     config, start = _recorded(args) if resumed else _new(args)
     mode = start["mode"]
-    dry_run = getattr(args, "dry_run", False)
-    procedure, zero_at = _procedure(mode, start["inputs"], dry_run)
+    procedure, zero_at = _procedure(mode, start["inputs"])
     if args.zero:
         zero_at = None  # the operator put the device into its zero posture
     if resumed:
@@ -89,6 +88,7 @@ def run_session(args: argparse.Namespace) -> int:
             start={key: start[key] for key in ("simulated", "inputs", "maps_from")},
             reset_alarms=args.reset_alarms,
             zero_at=zero_at,
+            dry_run=getattr(args, "dry_run", False),
         )
         if simulator is None:
             session.confirm = functools.partial(_confirm, args)
@@ -132,7 +132,7 @@ def _recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
 
 
 def _procedure(
-    mode: str, inputs: dict[str, Any], dry_run: bool
+    mode: str, inputs: dict[str, Any]
 ) -> tuple[Callable[[Run], int], Pulses | None]:
     """What a session does, and the pulses of its zero posture where they are known."""
     import numpy as np
@@ -140,17 +140,17 @@ def _procedure(
     from rig.session import calibrate, checking
 
     if mode == "calibrate":
-        return lambda run: calibrate.calibrate(run, dry_run), None
+        return calibrate.calibrate, None
     count = inputs["count"]
     if mode == "collect":
-        return lambda run: checking.collect(run, count, dry_run), None
+        return lambda run: checking.collect(run, count), None
     calibration, zero_at = checking.load_calibration(
         pathlib.Path(inputs["calibration"])
     )
     if mode == "verify":
-        return lambda run: checking.verify(run, calibration, count, dry_run), zero_at
+        return lambda run: checking.verify(run, calibration, count), zero_at
     desired = np.array(inputs["to"], dtype=np.float64)
-    return lambda run: checking.goto(run, calibration, desired, dry_run), zero_at
+    return lambda run: checking.goto(run, calibration, desired), zero_at
 
 
 def _confirm(args: argparse.Namespace, session: Run) -> None:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import PrivateAttr
 
 from rig.config.axis import AXIS_NAMES, Axis, Pulses, Scale
 from rig.config.schema import Section, key
@@ -32,12 +31,6 @@ class RigConfig(Section):
     motion: MotionSettings = MotionSettings()
     session: SessionSettings = SessionSettings()
     output: str = key("every run makes its own folder in here", "runs")
-    _text: str = PrivateAttr("")
-
-    @property
-    def text(self) -> str:
-        """The TOML it came from."""
-        return self._text
 
     @property
     def letters(self) -> tuple[str, str, str]:

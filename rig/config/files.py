@@ -26,11 +26,9 @@ def parse_config(
     text: str, folder: pathlib.Path | None = None, source: str = "configuration"
 ) -> RigConfig:
     """Check the text of a configuration; maps by path are relative to ``folder``."""
-    config, _ = parse(RigConfig, text, source, {"folder": folder}, _repeated)
+    config = parse(RigConfig, text, source, {"folder": folder}, _repeated)
     axes = sorted(config.axes, key=lambda axis: AXIS_NAMES.index(axis.name))
-    config = config.model_copy(update={"axes": tuple(axes)})
-    config._text = text
-    return config
+    return config.model_copy(update={"axes": tuple(axes)})
 
 
 def _repeated(data: dict[str, Any]) -> Iterator[str]:

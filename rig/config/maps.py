@@ -8,10 +8,9 @@ to move, stop, enable. Nothing here opens a port.
 import hashlib
 import json
 import pathlib
+import tomllib
 from collections.abc import Iterator
 from typing import Literal
-
-from pydantic import PrivateAttr
 
 from rig.config.registers import (
     Alarm,
@@ -62,12 +61,12 @@ class RegisterMap(Section):
     )
     limits: Writes | None = key("`write` with `min` and `max` in pulses", None)
     identity: dict[str, Read] = key("registers that `identify` prints", {})
-    _digest: str = PrivateAttr("")
 
     @property
     def digest(self) -> str:
         """SHA-256 of the parsed file, for the run's fingerprint."""
-        return self._digest
+        data = json.dumps(tomllib.loads(self.text), sort_keys=True, default=str)
+        return hashlib.sha256(data.encode()).hexdigest()
 
     def broken_rules(self) -> Iterator[str]:
         if self.stop.place_of("position"):
@@ -94,12 +93,4 @@ def load_map(name: str, folder: pathlib.Path | None = None) -> RegisterMap:
             f"no register map {name!r}: have {', '.join(available_maps())}, "
             "or give the path of a .toml file"
         )
-    return parse_map(read_text(path), path.name)
-
-
-def parse_map(text: str, source: str) -> RegisterMap:
-    """A map from its text; ConfigError lists every fault."""
-    result, data = parse(RegisterMap, text, source)
-    plain = json.dumps(data, sort_keys=True, default=str)
-    result._digest = hashlib.sha256(plain.encode()).hexdigest()
-    return result
+    return parse(RegisterMap, read_text(path), path.name)

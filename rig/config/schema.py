@@ -9,12 +9,20 @@ pydantic would compile every annotation again at each start.
 from __future__ import annotations
 
 import difflib
+import json
 import pathlib
 import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 
@@ -24,6 +32,12 @@ class Section(BaseModel):
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False
     )
+    _text: str = PrivateAttr("")
+
+    @property
+    def text(self) -> str:
+        """The TOML it came from, where it is the whole of a file."""
+        return self._text
 
     def broken_rules(self) -> Iterator[str]:
         """``key: fault`` of every rule about more than one key that is not kept."""
@@ -92,8 +106,8 @@ def parse(
     source: str,
     context: Any = None,
     more: Callable[[Any], Iterable[str]] = lambda data: (),
-) -> tuple[Model, dict[str, Any]]:
-    """A TOML text as a model, and as it was parsed.
+) -> Model:
+    """A TOML text as a model.
 
     Raises:
         ConfigError: every fault as ``section.key: rule, value``, and those that
@@ -105,21 +119,17 @@ def parse(
         raise ConfigError(source, [f"not valid TOML: {error}"]) from None
     faults = list(more(data))
     try:
-        result = model.model_validate(_tuples(data), context=context)
+        # Of JSON pydantic takes lists for tuples; nothing else is converted.
+        plain = json.dumps(data, default=lambda date: [str(date)])  # no key takes one
+        result = model.model_validate_json(plain, context=context)
     except ValidationError as error:
         schema = model.model_json_schema()
         each = error.errors(include_url=False)
         faults = [text for e in each for text in _texts(e, data, schema)] + faults
     if faults:
         raise ConfigError(source, faults)
-    return result, data
-
-
-def _tuples(data: Any) -> Any:
-    """Lists of a file as tuples, which is what frozen models hold."""
-    if isinstance(data, dict):
-        return {name: _tuples(value) for name, value in data.items()}
-    return tuple(map(_tuples, data)) if isinstance(data, list) else data
+    result._text = text
+    return result
 
 
 def resolved(described: dict[str, Any], root: dict[str, Any]) -> dict[str, Any]:

@@ -29,7 +29,7 @@ def write_report(
     start: dict[str, Any],
     postures: dict[str, dict[str, Any]],
 ) -> pathlib.Path:
-    """Write ``report.html`` of a run's summary, start and postures; returns its path."""
+    """Write ``report.html`` of a run; returns its path."""
     records, orders = list(postures.values()), summary["orders"]
     made = f"{start['started']} on {start['host']}, jaxcal {start['jaxcal']}"
     intro = [Text([made, "."])]

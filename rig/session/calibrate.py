@@ -27,17 +27,14 @@ from rig.session.planning import (
     draw_held_out,
     travel_order,
 )
-from rig.session.run import DRY_RUN, Run
+from rig.session.run import Run
 
 
-def calibrate(run: Run, dry_run: bool = False) -> int:
+def calibrate(run: Run) -> int:
     """Run the whole session; returns the exit code."""
     config, session = run.config, run.config.session
     candidates, choice = _plan(run)
     check_plan(config, [tuple(candidates[i].tolist()) for i in choice.indices])
-    if dry_run:
-        run.say(DRY_RUN)
-        return EXIT_OK
     run.planned = session.k + 2 * session.verify_postures + 1
     if run.zero_pulses is None:
         run.ready()

@@ -15,10 +15,10 @@ from rig.outputs.console import numbers
 from rig.session.calibrate import visit_pairs
 from rig.session.identification import errors, pairs
 from rig.session.planning import draw, draw_held_out
-from rig.session.run import DRY_RUN, Run
+from rig.session.run import Run
 
 
-def collect(run: Run, count: int, dry_run: bool = False) -> int:
+def collect(run: Run, count: int) -> int:
     """Record ``count`` random postures: the paper's Datasets 4 and 5.
 
     Writes pairs.csv and dataset.npz with ``candidates`` and ``measured`` of shape
@@ -28,11 +28,9 @@ def collect(run: Run, count: int, dry_run: bool = False) -> int:
     targets = run.remember(
         "collection", lambda: {"pulses": draw(config, count, 2).tolist()}
     )["pulses"]
-    if dry_run:
+    if run.dry_run:
         for number, target in enumerate(targets):
             run.say(f"  {number:>5}   {numbers(config.to_deg(target))}   {target}")
-        run.say(DRY_RUN)
-        return EXIT_OK
     run.planned = len(targets)
     for number, target in enumerate(targets):
         run.visit(f"collect:{number}", target, role="collect")
@@ -75,7 +73,7 @@ def load_calibration(path: pathlib.Path) -> tuple[Any, Pulses | None]:
     return calibration, (a, b, c)
 
 
-def verify(run: Run, calibration: Any, count: int, dry_run: bool = False) -> int:
+def verify(run: Run, calibration: Any, count: int) -> int:
     """Fresh held-out postures against a saved calibration: is it still true?"""
     config = run.config
     held = run.remember(
@@ -84,11 +82,9 @@ def verify(run: Run, calibration: Any, count: int, dry_run: bool = False) -> int
     if not held:
         raise Refused("no target in the ranges can be reached through this calibration")
     run.planned = 2 * len(held)
-    if dry_run:
+    if run.dry_run:
         for raw, command in held:
             run.say(f"  target {numbers(config.to_deg(raw))}  command {list(command)}")
-        run.say(DRY_RUN)
-        return EXIT_OK
     before, after, desired = visit_pairs(run, held)
     if not before:
         raise Refused("no held-out posture could be reached")
@@ -116,7 +112,7 @@ def verify(run: Run, calibration: Any, count: int, dry_run: bool = False) -> int
     return EXIT_RECALIBRATE if again else EXIT_OK
 
 
-def goto(run: Run, calibration: Any, desired: Array, dry_run: bool = False) -> int:
+def goto(run: Run, calibration: Any, desired: Array) -> int:
     """Move the end-effector to (3,) desired degrees through a calibration."""
     config = run.config
     command = np.asarray(calibration.command_for(desired), dtype=np.float64)
@@ -131,9 +127,6 @@ def goto(run: Run, calibration: Any, desired: Array, dry_run: bool = False) -> i
         f"desired {desired.tolist()} deg: command {command.round(4).tolist()} deg, "
         f"pulses {list(pulses)}"
     )
-    if dry_run:
-        run.say(DRY_RUN)
-        return EXIT_OK
     run.planned = 1
     record = run.visit("goto", pulses, role="goto")
     if record is None:

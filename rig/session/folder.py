@@ -12,10 +12,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from jaxcal.files import write_text
-from rig.attitude import Array
 from rig.config import AXIS_NAMES, RigConfig
 from rig.faults import Refused
 from rig.outputs.journal import Journal, JournalError, Record
@@ -130,8 +127,3 @@ class RunFolder:
     def save_summary(self, summary: dict[str, Any]) -> None:
         """Write summary.json."""
         write_text(self.folder / "summary.json", json.dumps(summary, indent=1))
-
-
-def rounded(values: Array, digits: int) -> Any:
-    """Nested lists for the journal."""
-    return np.round(np.asarray(values, dtype=np.float64), digits).tolist()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
+from typing import Any
 
 import numpy as np
 
@@ -18,19 +18,6 @@ from rig.session.device import Device
 FOLLOW_MIN_DEG = 3.0  # a commanded change this large must be seen by the IMU
 FOLLOW_SHARE = 0.1  # at least this share of it
 FOLLOW_LEADING = 0.3  # of axes that move at least this share of the largest move
-
-
-@dataclasses.dataclass(frozen=True)
-class Measurement:
-    """One settled posture."""
-
-    pulses: Pulses  # commanded
-    feedback: Pulses  # the drives' own positions
-    attitude: Array  # (3, 3) mean attitude of the phone
-    angles: Array  # (3,) degrees: pitch, yaw, roll of the end-effector
-    std: Array  # (3,) degrees, of single readings
-    samples: int
-    raw: Array  # (samples, 3) degrees
 
 
 def frame_at(config: RigConfig, zero: Array) -> Frame:
@@ -55,13 +42,19 @@ class Observer:
 
     def measure(
         self, target: Pulses, label: str = "", samples: int | None = None
-    ) -> Measurement:
+    ) -> dict[str, Any]:
         """Wait until the device has settled, then average fresh readings.
 
         Args:
             target: pulses commanded.
             label: name of the posture.
             samples: readings to average; as configured when not given.
+
+        Returns:
+            For the journal: ``pulses`` commanded and ``feedback`` of the drives;
+            ``commanded_deg``, ``measured_deg`` and, of single readings, ``std_deg``
+            (3,); ``samples`` and ``raw_deg`` (samples, 3); ``attitude`` (3, 3), the
+            mean of the phone's.
 
         Raises:
             MotionFault: it does not settle in time, or the IMU disagrees with the
@@ -82,20 +75,21 @@ class Observer:
             if (std <= settle.std_deg).all():
                 break  # or settle again: the readings themselves were not quiet
         attitude = mean_rotation(matrices)
-        pitch, yaw, roll = (status.position for status in statuses)
-        result = Measurement(
-            pulses=target,
-            feedback=(pitch, yaw, roll),
-            attitude=attitude,
-            angles=frame.angles(attitude),
-            std=std,
-            samples=len(readings),
-            raw=raw,
-        )
-        self._check_position(result)
+        angles = frame.angles(attitude)
+        feedback = [status.position for status in statuses]
+        self._check_position(target, feedback)
         if self.device.frame is not None:
-            self._check_agreement(result, label)
-        return result
+            self._check_agreement(self.config.to_deg(target), angles, label)
+        return {
+            "pulses": list(target),
+            "feedback": feedback,
+            "commanded_deg": self.config.to_deg(target).round(9).tolist(),
+            "measured_deg": angles.round(9).tolist(),
+            "std_deg": std.round(6).tolist(),
+            "samples": len(readings),
+            "attitude": attitude.round(12).tolist(),
+            "raw_deg": raw.round(5).tolist(),
+        }
 
     def _frame(self, readings: list[Reading]) -> Frame:
         """Before the zero is taken, the first of the readings stands for it."""
@@ -177,22 +171,19 @@ class Observer:
                     )
             time.sleep(0.002)
 
-    def _check_position(self, measurement: Measurement) -> None:
+    def _check_position(self, target: Pulses, feedback: list[int]) -> None:
         """The drives still stand on their targets."""
         tolerance = self.config.motion.position_tolerance_deg
-        for axis, pulses, feedback in zip(
-            self.config.axes, measurement.pulses, measurement.feedback, strict=True
-        ):
-            if abs(pulses - feedback) > axis.pulses_within(tolerance):
+        for axis, goal, here in zip(self.config.axes, target, feedback, strict=True):
+            if abs(goal - here) > axis.pulses_within(tolerance):
                 raise MotionFault(
-                    f"{axis.name} left its target while settling: {feedback} pulses "
-                    f"instead of {pulses}. Check holding torque and load"
+                    f"{axis.name} left its target while settling: {here} pulses "
+                    f"instead of {goal}. Check holding torque and load"
                 )
 
-    def _check_agreement(self, measurement: Measurement, label: str) -> None:
+    def _check_agreement(self, commanded: Array, measured: Array, label: str) -> None:
         """The joints are where the drives say, roughly, and moved when they moved."""
-        commanded = self.config.to_deg(measurement.pulses)
-        apart = np.abs(measurement.angles - commanded)
+        apart = np.abs(measured - commanded)
         if (apart > self.config.motion.max_disagreement_deg).any():
             worst = int(np.argmax(apart))
             raise MotionFault(
@@ -201,7 +192,7 @@ class Observer:
                 "order and signs"
             )
         asked = np.abs(commanded - self._seen[0])
-        seen = np.abs(measurement.angles - self._seen[1])
+        seen = np.abs(measured - self._seen[1])
         leading = max(FOLLOW_MIN_DEG, FOLLOW_LEADING * float(asked.max()))
         for index, name in enumerate(AXIS_NAMES):
             if asked[index] < leading:
@@ -215,4 +206,4 @@ class Observer:
                 )
             else:
                 self._unproven[index] = []
-        self._seen = (commanded, measurement.angles)
+        self._seen = (commanded, measured)

@@ -18,17 +18,16 @@ from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.device.bus import Bus
 from rig.device.imu import Imu
-from rig.faults import EXIT_FAULT, MotionFault, NotFollowing, Unreachable
+from rig.faults import EXIT_FAULT, MotionFault, NotFollowing, PlanOnly, Unreachable
 from rig.guard.limits import check_plan
 from rig.guard.signals import Signals
 from rig.outputs.console import event_lines, numbers
 from rig.outputs.journal import Record
 from rig.session.device import Device
-from rig.session.folder import RunFolder, rounded
-from rig.session.measuring import Measurement, Observer, frame_at
+from rig.session.folder import RunFolder
+from rig.session.measuring import Observer, frame_at
 from rig.session.motion import Motion
 
-DRY_RUN = "dry run: nothing was sent to the bus"
 STREAM_WAIT_S = 60.0  # time to start the app on the phone
 ZERO_FACTOR = 4  # readings of the zero posture, in those of a posture
 
@@ -46,6 +45,7 @@ class Run(RunFolder):
         start: Record | None = None,
         reset_alarms: bool = False,
         zero_at: Pulses | None = None,
+        dry_run: bool = False,
     ) -> None:
         self._say = say
         self.confirm: Callable[[Run], None] = lambda run: None  # before ports open
@@ -54,6 +54,7 @@ class Run(RunFolder):
         self.frame: Frame | None = None
         self.zero_pulses: Pulses | None = None
         self.zero_at = zero_at
+        self.dry_run = dry_run
         self.signals = Signals(self.say)
         self.planned = 0
         self._visited = 0
@@ -79,7 +80,10 @@ class Run(RunFolder):
 
         Raises:
             MotionFault, BusError, ImuError: not fit to move.
+            PlanOnly: this is a dry run.
         """
+        if self.dry_run:
+            raise PlanOnly
         if self.device is not None:
             return self.device
         config = self.config
@@ -116,15 +120,8 @@ class Run(RunFolder):
         # Every posture is measured against this one, so its noise must be the smaller.
         samples = ZERO_FACTOR * self.config.settle.samples
         measured = self.observer.measure(target, "zero", samples)
-        record = self.emit(
-            "zero",
-            sync=True,
-            pulses=list(measured.pulses),
-            attitude=rounded(measured.attitude, 12),
-            std_deg=rounded(measured.std, 6),
-            samples=measured.samples,
-        )
-        self.observer.zeroed(self._set_zero(record), measured.pulses)
+        record = self.emit("zero", sync=True, **measured)
+        self.observer.zeroed(self._set_zero(record), target)
 
     def _set_zero(self, record: Record) -> Frame:
         a, b, c = record["pulses"]
@@ -136,9 +133,9 @@ class Run(RunFolder):
         """Before a resumed run goes on: the zero posture must still read zero."""
         self.motion.move_to(zero, "reference")
         measured = self.observer.measure(zero, "reference")
-        worst = float(np.abs(measured.angles).max())
+        angles = measured["measured_deg"]
+        worst = max(map(abs, angles))
         limit = self.config.session.reference_tolerance_deg
-        angles = rounded(measured.angles, 9)
         self.emit("reference", sync=True, angles=angles, limit=limit)
         if worst > limit:
             raise MotionFault(
@@ -175,28 +172,12 @@ class Run(RunFolder):
             self.emit("unreachable", sync=True, name=name, reason=str(reason))
             return None
         self.emit("phase", phase="saving")
-        record = self._record(name, measured, fields)
+        record = self.emit("posture", sync=True, name=name, **measured, **fields)
         self._visited += 1
         self._visit_s.append(time.monotonic() - begun)
         self._progress(record)
         self.signals.check_pause()
         return record
-
-    def _record(self, name: str, measured: Measurement, fields: Record) -> Record:
-        return self.emit(
-            "posture",
-            sync=True,
-            name=name,
-            pulses=list(measured.pulses),
-            feedback=list(measured.feedback),
-            commanded_deg=rounded(self.config.to_deg(measured.pulses), 9),
-            measured_deg=rounded(measured.angles, 9),
-            std_deg=rounded(measured.std, 6),
-            samples=measured.samples,
-            attitude=rounded(measured.attitude, 12),
-            raw_deg=rounded(measured.raw, 5),
-            **fields,
-        )
 
     def _progress(self, record: Record) -> None:
         left = max(0, self.planned - self._visited)

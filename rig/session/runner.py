@@ -7,9 +7,11 @@ from collections.abc import Callable
 from rig.faults import (
     EXIT_BAD_INPUT,
     EXIT_FAULT,
+    EXIT_OK,
     EXIT_PAUSED,
     Fault,
     PauseRequested,
+    PlanOnly,
     Refused,
     StopRequested,
 )
@@ -28,6 +30,9 @@ def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
         try:
             code = procedure(run)
             event = "end"
+        except PlanOnly:
+            code, event = EXIT_OK, "end"
+            run.say("dry run: nothing was sent to the bus")
         except PauseRequested as pause:
             code, event, reason = EXIT_PAUSED, "paused", str(pause)
         except StopRequested as stop:

@@ -9,8 +9,9 @@ from reference import configuration_table, register_map_table
 from rig.config import ConfigError, load_config, parse_config
 from rig.config.axis import Scale
 from rig.config.files import EXAMPLES
-from rig.config.maps import MAP_FOLDER, available_maps, load_map, parse_map
+from rig.config.maps import MAP_FOLDER, RegisterMap, available_maps, load_map
 from rig.config.registers import decode, encode
+from rig.config.schema import parse
 
 EXAMPLE_TEXT = (EXAMPLES / "simulate.toml").read_text()
 GENERIC = (MAP_FOLDER / "generic.toml").read_text()
@@ -161,7 +162,7 @@ def test_every_fault_of_a_map_is_listed_at_once():
         assert old in text
         text = text.replace(old, new)
     with pytest.raises(ConfigError) as caught:
-        parse_map(text, "broken.toml")
+        parse(RegisterMap, text, "broken.toml")
     text = str(caught.value)
     for part in ("word_order", "position.address", "positon", "status.done", "colour"):
         assert part in text
@@ -170,7 +171,7 @@ def test_every_fault_of_a_map_is_listed_at_once():
 def test_the_trigger_must_be_written_last():
     text = GENERIC.replace("trigger = { address = 0x0028", "trigger = { address = 0x20")
     with pytest.raises(ConfigError, match="last word of the last frame"):
-        parse_map(text, "broken.toml")
+        parse(RegisterMap, text, "broken.toml")
 
 
 def test_a_map_beside_the_configuration_needs_no_code(tmp_path):
