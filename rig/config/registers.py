@@ -80,7 +80,6 @@ class Read(Section):
 
     @property
     def count(self) -> int:
-        """Registers to read."""
         return registers_of(self.type)
 
 
@@ -147,17 +146,14 @@ class Write(Section):
 
     @property
     def count(self) -> int:
-        """Registers written."""
         return _registers(self.words)
 
-    def offset_of(self, name: str) -> tuple[int, str] | None:
-        """Address and type of a named value inside the frame, or None."""
+    def places(self) -> Iterator[tuple[int, Word]]:
+        """Every word with its address."""
         address = self.address
-        for value, kind in self.words:
-            if value == name:
-                return address, kind
-            address += registers_of(kind)
-        return None
+        for word in self.words:
+            yield address, word
+            address += registers_of(word.kind)
 
     def broken_rules(self) -> Iterator[str]:
         if self.function == 6 and self.count != 1:
@@ -177,8 +173,8 @@ class Writes(Section):
 
     def place_of(self, name: str) -> tuple[int, str] | None:
         """Address and type of a named value, or None where no frame holds it."""
-        found = (frame.offset_of(name) for frame in self.write)
-        return next((place for place in found if place), None)
+        places = (place for frame in self.write for place in frame.places())
+        return next(((a, w.kind) for a, w in places if w.value == name), None)
 
 
 class Trigger(Section):
@@ -196,10 +192,8 @@ class Move(Writes):
     def broken_rules(self) -> Iterator[str]:
         if not self.place_of("position"):
             yield "write: no frame writes position"
-        last = self.write[-1]
-        ends = last.address + last.count - 1
-        trigger = (self.trigger.address, self.trigger.value)
-        if (ends, last.words[-1].value) != trigger:
+        *_, (address, last) = self.write[-1].places()
+        if (address, last.value) != (self.trigger.address, self.trigger.value):
             yield "trigger: must be the last word of the last frame"
 
 

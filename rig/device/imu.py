@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import http.server
+import itertools
 import socket
 import threading
 import time
@@ -105,12 +106,9 @@ class Imu:
     def since(self, start: float) -> list[Reading]:
         """Readings measured at or after a monotonic time, oldest first."""
         with self._lock:
-            found = []
-            for reading in reversed(self._ring):
-                if reading.time < start:
-                    break
-                found.append(reading)
-        return found[::-1]
+            newest = reversed(self._ring)
+            recent = itertools.takewhile(lambda r: r.time >= start, newest)
+            return [*recent][::-1]
 
     def check_fault(self) -> None:
         """Raise ImuError where the stream was found not to be trusted."""

@@ -32,13 +32,11 @@ class Heartbeat(threading.Thread):
         self._fed = time.monotonic()
 
     def close(self) -> None:
-        """End the thread."""
         self._closing.set()
         if self.is_alive():
             self.join(2.0)
 
     def run(self) -> None:
-        """Watch until closed."""
         while not self._closing.wait(0.05):
             silence = time.monotonic() - self._fed
             if self._moving and silence > self._silence_s:

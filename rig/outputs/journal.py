@@ -113,5 +113,4 @@ class Journal:
         return [record for record in self.records if record["event"] == event]
 
     def close(self) -> None:
-        """Close the file."""
         os.close(self._fd)

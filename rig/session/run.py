@@ -49,7 +49,7 @@ class Run(RunFolder):
     ) -> None:
         self._say = say
         self.confirm: Callable[[Run], None] = lambda run: None  # before ports open
-        self.on_imu_port: Callable[[int], None] = lambda port: None
+        self.on_imu_port: Callable[[int], object] = lambda port: None
         self.device: Device | None = None
         self.frame: Frame | None = None
         self.zero_pulses: Pulses | None = None

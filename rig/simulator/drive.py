@@ -7,7 +7,15 @@ import time
 from collections.abc import Callable, Sequence
 
 from rig.config.maps import RegisterMap
-from rig.config.registers import Read, Write, Writes, decode, encode, registers_of
+from rig.config.registers import (
+    FLAGS,
+    Read,
+    Write,
+    Writes,
+    decode,
+    encode,
+    registers_of,
+)
 
 ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 2, 3, 4
 STEP_S = 0.001
@@ -89,17 +97,18 @@ class SimDrive:
         self._now = max(self._now, now)
 
     def _step(self, dt: float) -> None:
+        if self._stuck():
+            self.velocity = 0.0
+            if not self._stopping:
+                return
         if self._stopping:
             drop = QUICK_STOP_FACTOR * self._accel * dt
-            if abs(self.velocity) <= drop or self._stuck():
+            if abs(self.velocity) <= drop:
                 self.velocity, self.moving, self._stopping = 0.0, False, False
                 self.position = float(round(self.position))
                 return
             self.velocity -= math.copysign(drop, self.velocity)
             self.position += self.velocity * dt
-            return
-        if self._stuck():
-            self.velocity = 0.0
             return
         error = self.target - self.position
         wanted = math.copysign(
@@ -129,44 +138,34 @@ class SimDrive:
         self.advance()
         self._last_frame = time.monotonic()
         m = self.map
-        self._put(m.status.address, self._status(), m.status.type)
-        self._put(m.position.address, round(self.position), m.position.type)
-        if m.alarm:
-            self._put(m.alarm.address, self.alarm, m.alarm.type)
+        values: list[tuple[Read, int]]
+        values = [(m.status, self._status()), (m.position, round(self.position))]
+        values += [(m.alarm, self.alarm)] if m.alarm else []
+        for place, value in values:
+            for i, word in enumerate(encode(value, place.type, m.word_order)):
+                self._registers[place.address + i] = word
         try:
             return [self._registers[address + i] for i in range(count)]
         except KeyError:
             raise DriveException(ILLEGAL_ADDRESS) from None
 
-    def _put(self, address: int, value: int, kind: str) -> None:
-        for i, word in enumerate(encode(value, kind, self.map.word_order)):
-            self._registers[address + i] = word
-
     def _status(self) -> int:
-        m, word = self.map.status, 0
-        if self.enabled and m.enabled:
-            word |= sum(1 << bit for bit in m.enabled.set)
-        if self.moving:
-            word |= sum(1 << bit for bit in m.moving.set)
-        elif self.done and not self.alarm:
-            word |= sum(1 << bit for bit in m.done.set)
-        if self.alarm:
-            word |= sum(1 << bit for bit in m.fault.set)
-        return word
+        resting = self.done and not self.moving and not self.alarm
+        on = (self.enabled, resting, self.moving, bool(self.alarm))
+        named = [getattr(self.map.status, name) for name in FLAGS]
+        pairs = [bits for bits, holds in zip(named, on, strict=True) if bits and holds]
+        return sum({1 << bit for bits in pairs for bit in bits.set})
 
     def write(self, address: int, words: list[int]) -> None:
         """Write holding registers, and do what they mean."""
         self.advance()
         self._last_frame = time.monotonic()
-        if any(address + i not in self._registers for i in range(len(words))):
-            raise DriveException(ILLEGAL_ADDRESS)
-        m = self.map
         at = {address + i: word for i, word in enumerate(words)}
-        trigger = m.move.trigger
-        moves = at.get(trigger.address) == trigger.value
-        before = dict(self._registers)
-        self._registers |= at
-        if moves:
+        if not at.keys() <= self._registers.keys():
+            raise DriveException(ILLEGAL_ADDRESS)
+        m, before = self.map, self._registers
+        self._registers = before | at
+        if at.get(m.move.trigger.address) == m.move.trigger.value:
             try:
                 self._start()
             except DriveException:

@@ -35,8 +35,6 @@ KINDS = {
 
 @dataclasses.dataclass
 class FaultSpec:
-    """One fault to inject."""
-
     kind: str
     phase: str | None = None  # inject when the session first enters this phase
     after_s: float | None = None  # or so long after the simulator started
@@ -84,7 +82,6 @@ class FaultInjector:
         self._begin(lambda spec: spec.phase is None and spec.after_s is None)
 
     def add(self, spec: FaultSpec) -> None:
-        """Inject now."""
         with self._lock:
             self._active.append((dataclasses.replace(spec), time.monotonic()))
 

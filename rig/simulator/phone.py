@@ -67,19 +67,22 @@ class Phone:
         self._listener: socket.socket | None = None
         self._frozen = np.eye(3)
 
-    def start(self, port: int) -> None:
-        """Begin; ``port`` is where the rig listens, or where this phone shall."""
+    def start(self, port: int) -> int:
+        """Send to the port the rig listens on, or listen there; returns the port."""
         self.port = port
+        if self._thread.is_alive():
+            return port
         if self.settings.transport == "connect":
             self._listener = socket.create_server(("127.0.0.1", port), backlog=1)
             self._listener.settimeout(0.1)
             self.port = int(self._listener.getsockname()[1])
         self._thread.start()
+        return self.port
 
     def close(self) -> None:
-        """Stop sending."""
         self._closing.set()
-        self._thread.join(2.0)
+        if self._thread.is_alive():
+            self._thread.join(2.0)
         if self._listener:
             self._listener.close()
 

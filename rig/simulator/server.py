@@ -67,7 +67,6 @@ class ModbusServer:
         return os.ttyname(slave)
 
     def close(self) -> None:
-        """Stop serving."""
         self._closing.set()
         for thread in list(self._threads):
             thread.join(2.0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import threading
 from typing import Any
 
 from rig.attitude import Array
@@ -33,7 +32,6 @@ class Simulator:
         self.truth = truth or Truth(seed=config.session.seed)
         self.faults = FaultInjector(faults)
         self.transport = transport
-        self.rate_hz = rate_hz
         self.drives: list[SimDrive] = []
         for number, axis in enumerate(config.axes):
             travel = position = None
@@ -53,8 +51,9 @@ class Simulator:
         self.server = ModbusServer(
             dict(zip(units, self.drives, strict=True)), self.faults, self.truth.seed
         )
-        self.phone: Phone | None = None
-        self._alarm_lock = threading.Lock()
+        self.phone = Phone(
+            config.imu, self._attitude, self.faults, rate_hz, self.truth.seed
+        )
 
     def start(self, port: int = 0) -> RigConfig:
         """Serve the drives; the phone starts with ``start_phone``."""
@@ -66,9 +65,7 @@ class Simulator:
             bus |= {"host": "127.0.0.1", "port": port}
         phone_port = 0
         if self.config.imu.transport == "connect":
-            self.start_phone(0)
-            assert self.phone is not None
-            phone_port = self.phone.port
+            phone_port = self.start_phone(0)
         imu = {"host": "127.0.0.1", "port": phone_port}
         return self.config.model_copy(
             update={
@@ -77,15 +74,9 @@ class Simulator:
             }
         )
 
-    def start_phone(self, port: int) -> None:
-        """Begin to send to the port the rig listens on; once only."""
-        if self.phone is not None:
-            self.phone.port = port
-            return
-        self.phone = Phone(
-            self.config.imu, self._attitude, self.faults, self.rate_hz, self.truth.seed
-        )
-        self.phone.start(port)
+    def start_phone(self, port: int) -> int:
+        """Send to the port the rig listens on, or listen; returns the port."""
+        return self.phone.start(port)
 
     def hear(self, record: dict[str, Any]) -> None:
         """Listen to the events of a session."""
@@ -98,7 +89,7 @@ class Simulator:
         self._alarms()
 
     def _alarms(self) -> None:
-        with self._alarm_lock, self.server.lock:
+        with self.server.lock:
             for axis, drive in enumerate(self.drives):
                 if not drive.alarm and self.faults.take("alarm", axis):
                     drive.raise_alarm(0x30)
@@ -118,9 +109,7 @@ class Simulator:
         return [list(drive.executions) for drive in self.drives]
 
     def close(self) -> None:
-        """Stop serving and sending."""
-        if self.phone is not None:
-            self.phone.close()
+        self.phone.close()
         self.server.close()
 
     def __enter__(self) -> Simulator:
