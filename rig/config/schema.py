@@ -198,8 +198,4 @@ def _texts(error: Any, value: Any, root: dict[str, Any]) -> list[str]:
     wanted = rule(here, root)
     if kind == "missing":
         return [f"{path}: missing; {wanted} is required"]
-    got = error["input"]
-    got = repr(list(got) if isinstance(got, tuple) else got)
-    if kind in ("too_short", "too_long"):
-        got = f"{error['ctx']['actual_length']}"
-    return [f"{path}: must be {wanted}, got {got[:80]}"]
+    return [f"{path}: must be {wanted}, got {repr(error['input'])[:80]}"]

@@ -39,7 +39,7 @@ class UnitStop:
         return f"{self.axis} (unit {self.unit}): {state}, {rest}{detail}"
 
 
-def stop_all(drives: list[Drive], verify_s: float = VERIFY_S) -> list[UnitStop]:
+def stop_all(drives: list[Drive]) -> list[UnitStop]:
     """Quick-stop every drive, and wait for them to come to rest.
 
     Never raises, never leaves one out: one that fails does not keep the others from
@@ -51,7 +51,7 @@ def stop_all(drives: list[Drive], verify_s: float = VERIFY_S) -> list[UnitStop]:
         for drive, result in pairs:
             if not result.acknowledged:
                 _send(drive, result)
-    end = time.monotonic() + verify_s
+    end = time.monotonic() + VERIFY_S
     before: dict[str, int] = {}
     while not all(result.standing for result in results):
         for drive, result in pairs:

@@ -305,7 +305,7 @@ def test_stop_reaches_the_others_when_one_unit_is_dead():
         for drive in drives:
             drive.move(5000 if drive.axis.name != "yaw" else -5000)
         sim.faults.add(parse_fault("dead_drive,axis=yaw"))
-        pitch, yaw, roll = stop_all(drives, verify_s=1.0)
+        pitch, yaw, roll = stop_all(drives)
         assert pitch.acknowledged and pitch.standing
         assert roll.acknowledged and roll.standing
         assert not yaw.acknowledged and not yaw.standing and yaw.detail

@@ -15,6 +15,7 @@ import time
 import numpy as np
 import pytest
 from fault_matrix import _free_port
+from harness import no_figures
 from scipy.spatial.transform import Rotation
 
 from rig.__main__ import main
@@ -62,7 +63,7 @@ stale_s = 1.5
 """
 QUICK = """
 [settle]
-window_s = 0.2
+window_s = 0.1
 min_samples = 5
 samples = 10
 """
@@ -235,7 +236,8 @@ def test_a_whole_calibration_with_a_strangers_slave_and_phone(
     )
     thread.start()
     try:
-        code = main(["calibrate", "--config", str(tmp_path / "rig.toml"), "--arm",
+        with no_figures():
+            code = main(["calibrate", "--config", str(tmp_path / "rig.toml"), "--arm",
                      "--zero", "--out", str(tmp_path / "runs")])  # fmt: skip
     finally:
         closing.set()

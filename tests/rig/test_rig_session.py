@@ -24,6 +24,7 @@ from harness import (
     changed,
     fast_config,
     fast_text,
+    no_figures,
     on_phase,
     session,
     simulator,
@@ -416,7 +417,8 @@ def test_travel_order_takes_the_least_time(rng):
 def test_calibrate_simulate_needs_no_configuration(tmp_path, capsys):
     """The shipped settings and the shipped policy."""
     quick = ["--speedup", "5", "--rate", "250"]
-    assert main(["calibrate", "--simulate", *quick, "--out", str(tmp_path)]) == 0
+    with no_figures():
+        assert main(["calibrate", "--simulate", *quick, "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert "95 % confidence" in said and "after compensation" in said
     plan, _, moved = said.partition("armed:")
@@ -590,8 +592,9 @@ def test_simulate_serves_a_session_in_another_process(tmp_path):
         for line in served.stdout:
             if "Ctrl-C" in line:
                 break
-        code = main(["calibrate", "--config", str(path), "--arm", "--zero",
-                     "--out", str(tmp_path / "runs")])  # fmt: skip
+        with no_figures():
+            code = main(["calibrate", "--config", str(path), "--arm", "--zero",
+                         "--out", str(tmp_path / "runs")])  # fmt: skip
         assert code == 0
     finally:
         os.kill(served.pid, signal.SIGINT)
