@@ -34,34 +34,32 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _identify(args: argparse.Namespace) -> int:
-    config, failed = load(args), False
+    config, code = load(args), EXIT_OK
     with contextlib.ExitStack() as stack:
         if args.simulate:
             simulator = make_simulator(config, vars(args), args.fault)
             config = stack.enter_context(simulator).start()
         bus = stack.enter_context(Bus(config.bus, config.silence_s))
         for axis in config.axes:
-            drive, who = Drive(bus, axis), f"{axis.name} (unit {axis.unit}"
             try:
-                status, alarm, identity = (
-                    drive.status(),
-                    drive.alarm(),
-                    drive.identity(),
-                )
+                print(*_described(Drive(bus, axis)), sep="\n")
             except BusError as error:
-                failed = True
-                print(f"{who}): {error}")
-                continue
-            flags = axis.map.status.flags(status.word)
-            words = " ".join(name for name, on in flags.items() if on)
-            print(
-                f"{who}, {axis.map.title}): status 0x{status.word:04X} {words}, "
-                f"position {status.position} pulses = "
-                f"{axis.to_deg(status.position):.4f} deg" + (alarm and f", {alarm}")
-            )
-            for name, value in identity.items():
-                print(f"    {name} = {value}")
-    return EXIT_FAULT if failed else EXIT_OK
+                code = EXIT_FAULT
+                print(f"{axis.name} (unit {axis.unit}): {error}")
+    return code
+
+
+def _described(drive: Drive) -> list[str]:
+    axis, status, alarm = drive.axis, drive.status(), drive.alarm()
+    flags = axis.map.status.flags(status.word)
+    words = " ".join(name for name, on in flags.items() if on)
+    identity = [f"    {name} = {value}" for name, value in drive.identity().items()]
+    return [
+        f"{axis.name} (unit {axis.unit}, {axis.map.title}): status "
+        f"0x{status.word:04X} {words}, position {status.position} pulses = "
+        f"{axis.to_deg(status.position):.4f} deg" + (alarm and f", {alarm}"),
+        *identity,
+    ]
 
 
 def _stop(args: argparse.Namespace) -> int:

@@ -87,11 +87,7 @@ class Axis(Scale):
         return max(1, round(angle_deg * abs(self.pulses_per_deg)))
 
     def motion_counts(self) -> dict[str, int]:
-        """Register values of speed and acceleration of a move.
-
-        Raises:
-            ValueError: one does not fit its register.
-        """
+        """Speed and ramps as register values; ValueError where one does not fit."""
         units, turns = self.map.units, self.reduction / 360.0
         speed, accel = self.speed_deg_s * turns, self.accel_deg_s2 * turns  # of motor
         if units.speed == "pulse_per_s":

@@ -14,11 +14,7 @@ EXAMPLES = pathlib.Path(__file__).parent.parent / "examples"
 
 
 def load_config(path: str | pathlib.Path) -> RigConfig:
-    """Read and check a configuration file.
-
-    Raises:
-        ConfigError: unreadable, not TOML, or wrong; lists every fault.
-    """
+    """Read and check a configuration file; ConfigError lists every fault."""
     return parse_config(read_text(path), pathlib.Path(path).parent, str(path))
 
 
@@ -48,11 +44,7 @@ def example_names() -> list[str]:
 
 
 def example_text(name: str) -> str:
-    """Text of an example configuration that ships.
-
-    Raises:
-        ConfigError: there is none of that name.
-    """
+    """Text of a configuration that ships; ConfigError where none has the name."""
     if name not in example_names():
         raise ConfigError(name, [f"no such example: have {', '.join(example_names())}"])
     return (EXAMPLES / f"{name}.toml").read_text(encoding="utf-8")

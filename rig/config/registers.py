@@ -21,11 +21,7 @@ class Word(NamedTuple):
 
 
 def encode(value: int, kind: str, word_order: str) -> list[int]:
-    """Registers of a value.
-
-    Raises:
-        ValueError: the value does not fit the type.
-    """
+    """Registers of a value; ValueError where it does not fit the type."""
     try:
         data = struct.pack(FORMATS[kind], value)
     except struct.error:

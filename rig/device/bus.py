@@ -74,11 +74,7 @@ class Bus:
         )
 
     def open(self) -> Bus:
-        """Open the port.
-
-        Raises:
-            BusError: it is absent, refused, or held by another program.
-        """
+        """Open the port; BusError where it is absent, refused or held by another."""
         with self._lock:
             hint = ""
             try:

@@ -39,11 +39,7 @@ class Drive:
         return Status(word, position, time.monotonic(), **status.flags(word))
 
     def sound(self) -> Status:
-        """Status of a drive that has no fault.
-
-        Raises:
-            MotionFault: the fault bit is set.
-        """
+        """Status; MotionFault where the fault bit is set."""
         status = self.status()
         if status.fault:
             text = "fault bit set"

@@ -41,11 +41,7 @@ class Imu:
         self._fault = ""
 
     def open(self) -> Imu:
-        """Listen, or begin to connect.
-
-        Raises:
-            ImuError: the port cannot be opened.
-        """
+        """Listen, or begin to connect; ImuError where the port cannot be opened."""
         s, receive = self.settings, self._receive_lines
         try:
             if s.format == "sensorlogger":
@@ -82,11 +78,7 @@ class Imu:
         self.close()
 
     def latest(self) -> Reading:
-        """The newest reading.
-
-        Raises:
-            ImuError: none is fresh.
-        """
+        """The newest reading; ImuError where none is fresh."""
         self.check_fault()
         with self._lock:
             reading = self._ring[-1] if self._ring else None
@@ -116,11 +108,7 @@ class Imu:
             raise ImuError(self._fault)
 
     def wait_for_stream(self, timeout_s: float) -> Reading:
-        """The first fresh reading.
-
-        Raises:
-            ImuError: none came in time.
-        """
+        """The first fresh reading; ImuError where none came in time."""
         end = time.monotonic() + timeout_s
         while True:
             try:

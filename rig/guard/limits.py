@@ -34,11 +34,7 @@ def approach(config: RigConfig, target: Pulses) -> list[Pulses]:
 
 
 def check_plan(config: RigConfig, targets: Iterable[Pulses]) -> None:
-    """Every target, and the point it is approached from, lies inside the limits.
-
-    Raises:
-        LimitError: lists each that does not.
-    """
+    """LimitError lists each target, or point it is approached from, that is outside."""
     points = (point for target in targets for point in approach(config, target))
     faults = [fault for point in points for fault in outside(config, point)]
     if faults:

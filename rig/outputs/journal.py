@@ -48,11 +48,7 @@ def _parse(data: bytes, path: pathlib.Path) -> tuple[list[Record], int]:
 
 
 def read_journal(path: pathlib.Path) -> list[Record]:
-    """All whole records.
-
-    Raises:
-        JournalError: unreadable, or damaged before its last line.
-    """
+    """All whole records; JournalError where one before the last is damaged."""
     try:
         return _parse(path.read_bytes(), path)[0]
     except OSError as error:

@@ -53,11 +53,7 @@ def collect(run: Run, count: int) -> int:
 
 
 def load_calibration(path: pathlib.Path) -> tuple[Any, Pulses | None]:
-    """A saved calibration and the pulses of its zero posture (None where unknown).
-
-    Raises:
-        Refused: it cannot be read.
-    """
+    """A saved calibration and the pulses of its zero posture (None where unknown)."""
     import jaxcal
 
     if path.is_dir():

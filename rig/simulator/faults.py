@@ -44,11 +44,7 @@ class FaultSpec:
 
 
 def parse_fault(text: str) -> FaultSpec:
-    """Read ``kind[@phase | @SECONDSs][,count=N][,axis=NAME][,seconds=S]``.
-
-    Raises:
-        ValueError: names what is unknown.
-    """
+    """Read ``kind[@phase | @SECONDSs][,count=N][,axis=NAME][,seconds=S]``."""
     head, *options = text.split(",")
     kind, _, when = head.partition("@")
     if kind not in KINDS:
