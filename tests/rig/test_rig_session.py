@@ -352,7 +352,13 @@ def test_the_policys_place_is_taken_by_exact_when_it_is_missing_or_poor(monkeypa
         assert part in choice.note and "\n" not in choice.note
 
 
-@pytest.mark.parametrize("method", ["auto", "exact", "exchange", "greedy", "random"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        "auto", "exact", "greedy", "random",
+        pytest.param("exchange", marks=pytest.mark.slow),  # compiles for ten seconds
+    ],
+)  # fmt: skip
 def test_every_method_of_a_session_makes_a_choice(method):
     text = f'\n[session]\nmethod = "{method}"\nmin_efficiency = 0.01\nseed = 3\n'
     config = parse_config(fast_text(session=text))
