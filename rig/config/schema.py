@@ -59,16 +59,10 @@ def key(
     by: Any = None,
     **more: Any,
 ) -> Any:
-    """A key of a file.
+    """A key of a file: what it means, its default (``...``: required) and bounds.
 
-    Args:
-        about: what it means, for the reference table.
-        default: value of an absent key; ``...``: the key is required. Beside ``by``
-            the text that says what ``by`` comes to.
-        low: smallest value.
-        high: largest value.
-        by: function of the keys before it that makes the default.
-        more: further arguments of ``pydantic.Field``.
+    ``by`` makes the default from the keys before it; ``default`` then says in words
+    what that comes to.
     """
     if by is not None:
         more |= {"default_factory": by, "json_schema_extra": {"default": default}}

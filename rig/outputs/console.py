@@ -36,13 +36,8 @@ def plan_lines(
 ) -> list[str]:
     """What will be done: a choice, in the order of visits, of (M, 3) ``pulses``."""
     session, settle = config.session, config.settle
-    rank = "proven optimum" if choice.proven else "best known"
-    lines = [
-        f"{session.k} of {session.candidates} candidates by {choice.method}: log det "
-        f"{choice.log_det:.4f} (commands in degrees), {rank} "
-        f"{choice.best_log_det:.4f}, gap {choice.best_log_det - choice.log_det:.4f}, "
-        f"D-efficiency {choice.efficiency:.4f}"
-    ]
+    text = choice_text(vars(choice))
+    lines = [f"{session.k} of {session.candidates} candidates by {text}"]
     if choice.note:
         lines.append(f"  note: {choice.note}")
     lines.append("  order   candidate   degrees (pitch yaw roll)        pulses")
@@ -74,12 +69,7 @@ def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
         lines.append(f"  {name:<5} [{values}]   {b:8.4f} +- {wide[3]:.4f}")
     lines.append(f"  {noise_text(summary)}")
     if "before" in summary:
-        before, after = summary["before"], summary["after"]
-        lines.append(
-            f"held-out error before {before['rms']:.4f} deg rms (max "
-            f"{before['max']:.4f}), after compensation {after['rms']:.4f} (max "
-            f"{after['max']:.4f})"
-        )
+        lines.append(f"held-out {error_text(summary)}")
     if summary["drift_deg"] is not None:
         lines.append(
             f"zero posture at the end: {summary['drift_deg']:.4f} deg from zero"
@@ -100,4 +90,24 @@ def noise_text(summary: dict[str, Any]) -> str:
     return (
         f"noise of one posture {summary['noise_std_deg'][0]:.4f} deg, from "
         f"{summary['basis']} ({summary['dof']} degrees of freedom)"
+    )
+
+
+def choice_text(choice: dict[str, Any]) -> str:
+    """How the postures were chosen, and how good they are."""
+    rank = "proven optimum" if choice["proven"] else "best known"
+    gap = choice["best_log_det"] - choice["log_det"]
+    return (
+        f"{choice['method']}: log det {choice['log_det']:.4f} (commands in degrees), "
+        f"{rank} {choice['best_log_det']:.4f}, gap {gap:.4f}, D-efficiency "
+        f"{np.exp(-gap / 12.0):.4f}"
+    )
+
+
+def error_text(found: dict[str, Any]) -> str:
+    """Errors at held-out postures, raw and compensated."""
+    before, after = found["before"], found["after"]
+    return (
+        f"error before {before['rms']:.4f} deg rms (max {before['max']:.4f}), after "
+        f"compensation {after['rms']:.4f} (max {after['max']:.4f})"
     )

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxcal.pages import Figure, Page, Section, Strong, Table, Text, write_page
 from rig.config import AXIS_NAMES
-from rig.outputs.console import noise_text
+from rig.outputs.console import choice_text, noise_text
 
 FOOTER = (
     "Research software, not a medical device. Calibrate with no patient attached; a "
@@ -44,7 +44,7 @@ def write_report(
             f"{', '.join(summary['postures'])}.",
         ],
         "Choice": [
-            _chosen(summary["choice"]),
+            f"{choice_text(summary['choice'])}. {summary['choice']['note']}",
             _drawn(_postures, records, (10, 3.2), "commanded postures, three planes"),
         ],
     }
@@ -79,16 +79,6 @@ def _fitted(summary: dict[str, Any]) -> Table:
         for name, row, wide in zip(AXIS_NAMES, values, summary["ci95"], strict=True)
     ]
     return Table(["", *(f"u {name}" for name in AXIS_NAMES), "b"], rows)
-
-
-def _chosen(choice: dict[str, Any]) -> str:
-    rank = "the proven optimum" if choice["proven"] else "the best known subset"
-    efficiency = np.exp((choice["log_det"] - choice["best_log_det"]) / 12.0)
-    return (
-        f"{choice['method']}: log det {choice['log_det']:.4f} with commands in "
-        f"degrees; {rank} {choice['best_log_det']:.4f}; D-efficiency "
-        f"{efficiency:.4f}. {choice['note']}"
-    )
 
 
 def _compared(summary: dict[str, Any]) -> Table:

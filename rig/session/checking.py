@@ -11,7 +11,7 @@ from jaxcal.files import atomic_write
 from rig.attitude import Array
 from rig.config.axis import Pulses
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
-from rig.outputs.console import numbers
+from rig.outputs.console import error_text, numbers
 from rig.session.calibrate import visit_pairs
 from rig.session.identification import errors, pairs
 from rig.session.planning import draw, draw_held_out
@@ -84,26 +84,22 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     before, after, desired = visit_pairs(run, held)
     if not before:
         raise Refused("no held-out posture could be reached")
-    raw, compensated = errors(before, desired), errors(after, desired)
+    found = {"before": errors(before, desired), "after": errors(after, desired)}
     commands, measured = pairs(before + after)
     off = measured - calibration.predict(commands)
     limit = config.session.verify_limit_deg
-    again = compensated["max"] > limit
+    again = found["after"]["max"] > limit
     run.emit("phase", phase="saving")
     run.save_pairs()
     run.save_summary(
         {
-            "before": raw,
-            "after": compensated,
+            **found,
             "prediction_rms": float(np.sqrt((off**2).mean())),
             "limit_deg": limit,
             "recalibrate": again,
         }
     )
-    run.say(
-        f"error raw {raw['rms']:.4f} deg rms (max {raw['max']:.4f}), compensated "
-        f"{compensated['rms']:.4f} (max {compensated['max']:.4f}), limit {limit:g}"
-    )
+    run.say(f"{error_text(found)}, limit {limit:g}")
     run.say("RECALIBRATE: over the limit" if again else "the calibration still holds")
     return EXIT_RECALIBRATE if again else EXIT_OK
 
