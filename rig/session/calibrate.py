@@ -44,21 +44,18 @@ def calibrate(run: Run) -> int:
     first.save(run.folder / "calibration.partial.json")
     held = _held_out(run, first)
     run.planned = session.k + 2 * len(held) + 1
-    before, after, desired = visit_pairs(run, held)
+    held_out, off = visit_pairs(run, held)
     end = run.visit("reference:end", run.zero_pulses, role="reference")
     run.say("drives at rest; identifying")
     run.emit("phase", phase="finishing")
     run.stop("", latch=False)
     run.disarm()
     run.signals.check_stop()
-    summary = _identify(run, first, chosen, before + after)
+    summary = _identify(run, first, chosen, held_out) | off
     summary["choice"] = dataclasses.asdict(choice)
     summary["drift_deg"] = None
     if end is not None:
         summary["drift_deg"] = float(np.abs(end["measured_deg"]).max())
-    if before:
-        summary["before"] = errors(before, desired)
-        summary["after"] = errors(after, desired)
     return _save(run, summary)
 
 
@@ -147,30 +144,33 @@ def _held_out(run: Run, calibration: Any) -> list[Any]:
     return run.emit("held_out", sync=True, pairs=found)["pairs"]
 
 
-def visit_pairs(run: Run, held: list[Any]) -> tuple[list[Record], list[Record], Array]:
+def visit_pairs(run: Run, held: list[Any]) -> tuple[list[Record], dict[str, Any]]:
     """Visit held-out targets raw and compensated, in the order of least travel.
 
     Returns:
-        Records before and after compensation, and the (N, 3) desired degrees, of the
-        targets of which both could be reached.
+        The records, and the errors ``before`` and ``after`` compensation, of the
+        targets of which both could be reached; no errors where there are none.
     """
-    config = run.config
-    visits = [(f"before:{i}", raw) for i, (raw, _) in enumerate(held)]
-    visits += [(f"after:{i}", command) for i, (_, command) in enumerate(held)]
-    points = config.to_deg([pulses for _, pulses in visits] or np.empty((0, 3)))
+    config, roles = run.config, ("before", "after")
+    visits = [
+        (f"{role}:{i}", role, pair[number])
+        for number, role in enumerate(roles)
+        for i, pair in enumerate(held)
+    ]
+    points = config.to_deg([pulses for *_, pulses in visits] or np.empty((0, 3)))
     start = config.to_deg(run.zero_pulses or (0, 0, 0))
-    found: dict[str, Record | None] = {}
+    found: dict[str, Record] = {}
     for number in travel_order(config, points, start):
-        name, pulses = visits[number]
-        found[name] = run.visit(name, pulses, role=name.partition(":")[0])
-    before, after, desired = [], [], []
-    for i, (raw, _) in enumerate(held):
-        one, two = found[f"before:{i}"], found[f"after:{i}"]
-        if one is not None and two is not None:
-            before.append(one)
-            after.append(two)
-            desired.append(config.to_deg(raw))
-    return before, after, np.array(desired).reshape(-1, 3)
+        name, role, pulses = visits[number]
+        if record := run.visit(name, pulses, role=role):
+            found[name] = record
+    both = [i for i in range(len(held)) if found.keys() >= {f"{r}:{i}" for r in roles}]
+    if not both:
+        return [], {}
+    records = {role: [found[f"{role}:{i}"] for i in both] for role in roles}
+    desired = config.to_deg([held[i][0] for i in both])
+    off = {role: errors(records[role], desired) for role in roles}
+    return records["before"] + records["after"], off
 
 
 def _identify(

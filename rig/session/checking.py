@@ -13,7 +13,7 @@ from rig.config.axis import Pulses
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
 from rig.outputs.console import error_text, numbers
 from rig.session.calibrate import visit_pairs
-from rig.session.identification import errors, pairs
+from rig.session.identification import pairs
 from rig.session.planning import draw, draw_held_out
 from rig.session.run import Run
 
@@ -81,11 +81,10 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     if run.dry_run:
         for raw, command in held:
             run.say(f"  target {numbers(config.to_deg(raw))}  command {list(command)}")
-    before, after, desired = visit_pairs(run, held)
-    if not before:
+    records, found = visit_pairs(run, held)
+    if not found:
         raise Refused("no held-out posture could be reached")
-    found = {"before": errors(before, desired), "after": errors(after, desired)}
-    commands, measured = pairs(before + after)
+    commands, measured = pairs(records)
     off = measured - calibration.predict(commands)
     limit = config.session.verify_limit_deg
     again = found["after"]["max"] > limit
