@@ -80,7 +80,7 @@ def choose(
 
     exact = select("exact", time_limit=limit)
 
-    def rated(selection: Any, note: str = "") -> Choice:
+    def rated(selection: Any, note: str) -> Choice:
         log_det = float(selection.log_det)
         return Choice(
             indices=tuple(int(i) for i in selection.indices),
@@ -92,28 +92,26 @@ def choose(
         )
 
     if session.method == "exact" or replanning:
-        return rated(exact)
+        return rated(exact, "")
     more: dict[str, Any] = {}
     if session.method == "auto":
         more = {"least_efficiency": session.min_efficiency, "time_limit": limit}
     try:
         chosen = select(session.method, **more)
+        choice = rated(chosen, getattr(chosen, "reason", ""))
+        if choice.efficiency >= session.min_efficiency:
+            return choice
+        note = (
+            f"{session.method} reached a D-efficiency of {choice.efficiency:.3f}, "
+            f"under session.min_efficiency = {session.min_efficiency:g}; using exact"
+        )
     except Exception as error:
         if session.method not in ("policy", "auto"):
             raise
         # A missing or foreign checkpoint must not keep a rig from being calibrated.
         reason = " ".join(str(error).split())[:200]
-        return rated(
-            exact, f"no policy could be used ({reason}); exact is used instead"
-        )
-    choice = rated(chosen, getattr(chosen, "reason", ""))
-    if choice.efficiency < session.min_efficiency:
-        note = (
-            f"{session.method} reached a D-efficiency of {choice.efficiency:.3f}, "
-            f"under session.min_efficiency = {session.min_efficiency:g}; using exact"
-        )
-        return rated(exact, note)
-    return choice
+        note = f"no policy could be used ({reason}); exact is used instead"
+    return rated(exact, note)
 
 
 def travel_order(config: RigConfig, points_deg: Array, start_deg: Array) -> list[int]:
