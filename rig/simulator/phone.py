@@ -27,10 +27,10 @@ def format_line(
     """One line as the configured app would send it, without its end."""
     columns: tuple[int, ...]
     if settings.quaternion_columns:
-        columns = settings.quaternion_columns
+        columns, digits = settings.quaternion_columns, 9
         numbers = Rotation.from_matrix(matrix).as_quat()
     else:
-        columns = settings.columns
+        columns, digits = settings.columns, 7
         numbers = matrix_to_euler(matrix, order) * np.array(settings.signs)
         if settings.format == "hyperimu":
             numbers[0] %= 360.0  # the azimuth runs from 0 to 360
@@ -39,7 +39,7 @@ def format_line(
     width = settings.column_count or 1 + max(*columns, settings.stamp_column)
     fields = ["0.0"] * width
     for column, value in zip(columns, numbers, strict=True):
-        fields[column] = f"{value:.9f}"
+        fields[column] = f"{value:.{digits}f}"
     if settings.stamp_column >= 0:
         fields[settings.stamp_column] = str(round(stamp_s * 1000))
     return settings.separator.join(fields)
