@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import pathlib
 from collections.abc import Callable
+from typing import Any
 
 EPILOG = """\
 exit codes: 0 done; 1 done, but the error says calibrate (again); 2 bad input, nothing
@@ -14,6 +15,84 @@ After 3, 4 and signals `resume RUN` goes on.
 Research software, not a medical device. Calibrate with no patient attached; a hardware
 emergency stop is required.
 """
+Options = dict[str, dict[str, Any]]  # name to what add_argument is given
+
+
+def _flag(text: str) -> dict[str, Any]:
+    return {"action": "store_true", "help": text}
+
+
+def _path(text: str, **more: Any) -> dict[str, Any]:
+    return {"type": pathlib.Path, "help": text, **more}
+
+
+def _count(default: int) -> Options:
+    text = f"postures (default {default})"
+    return {"--count": {"type": int, "default": default, "help": text}}
+
+
+def _within(low: float, high: float) -> Callable[[str], float]:
+    def number(text: str) -> float:
+        value = float(text)
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"must be in [{low:g}, {high:g}]: {text}")
+        return value
+
+    return number
+
+
+def _number(low: float, high: float, default: float, text: str) -> dict[str, Any]:
+    text = f"{text} (default {default:g})"
+    return {"type": _within(low, high), "default": default, "help": text}
+
+
+CONFIG: Options = {"--config": _path("rig.toml", metavar="FILE")}
+FOLDER: Options = {
+    "--out": _path("folder for the run's folder"),
+    "--dry-run": _flag("plan; open no port"),
+}
+MOTION: Options = {
+    "--arm": _flag("arm without prompting"),
+    "--reset-alarms": _flag("before arming"),
+    "--zero": _flag("confirm that the device stands in its zero posture"),
+}
+SIMULATOR: Options = {
+    "--simulate": _flag("run against a simulated rig"),
+    "--transport": {
+        "choices": ("tcp", "rtu_tcp", "rtu"),
+        "default": "tcp",
+        "help": "of the simulated bus; rtu is a pseudo-terminal",
+    },
+    "--fault": {
+        "action": "append",
+        "default": [],
+        "metavar": "KIND[@PHASE|@Ns][,count=N]...",
+        "help": "inject a fault; --fault list names them",
+    },
+    "--noise": _number(0.0, 90.0, 0.02, "degrees"),
+    "--backlash": _number(0.0, 90.0, 0.0, "degrees"),
+    "--drift": _number(-90.0, 90.0, 0.0, "degrees per minute"),
+    "--speedup": _number(0.01, 100.0, 1.0, "factor on the speed of the axes"),
+    "--rate": _number(0.1, 1000.0, 100.0, "of the phone, Hz"),
+}
+SESSION: Options = CONFIG | FOLDER | MOTION
+RUN: Options = {
+    "run": _path("the run's folder"),
+    "--config": _path("for a changed port"),
+}
+FILE: Options = {"file": _path("rig.toml", nargs="?")}
+NAME: Options = {"name": {"nargs": "?", "help": "without it the names are listed"}}
+PORT: Options = {"--bus-port": {"type": int, "help": "0: any free one"}}
+SAVED: Options = {"calibration": _path("its file, or its run's folder")}
+TO: Options = {
+    "--to": {
+        "type": _within(-360, 360),
+        "nargs": 3,
+        "required": True,
+        "metavar": ("PITCH", "YAW", "ROLL"),
+        "help": "desired posture in degrees",
+    }
+}
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -26,110 +105,28 @@ def make_parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def add(name: str, text: str) -> argparse.ArgumentParser:
-        return commands.add_parser(name, help=text, description=text)
+    def add(name: str, text: str, options: Options, simulated: bool = True) -> None:
+        command = commands.add_parser(name, help=text, description=text)
+        for option, given in options.items():
+            command.add_argument(option, **given)
+        group = command.add_argument_group("simulator")  # left out of help where empty
+        for option, given in (SIMULATOR if simulated else {}).items():
+            group.add_argument(option, **given)
 
-    sessions = {
-        "calibrate": add("calibrate", "choose, visit, identify, verify and save"),
-        "collect": add("collect", "record random postures (Datasets 4 and 5)"),
-        "verify": add("verify", "compare a calibration with fresh measurements"),
-        "goto": add("goto", "move the end-effector to a posture, calibrated"),
-    }
-    for name in ("verify", "goto"):
-        sessions[name].add_argument(
-            "calibration", type=pathlib.Path, help="its file, or its run's folder"
-        )
-    sessions["goto"].add_argument(
-        "--to",
-        type=_number_within(-360, 360),
-        nargs=3,
-        required=True,
-        metavar=("PITCH", "YAW", "ROLL"),
-        help="desired posture in degrees",
-    )
-    for name, count in (("collect", 50), ("verify", 6)):
-        sessions[name].add_argument(
-            "--count", type=int, default=count, help=f"postures (default {count})"
-        )
-    for sub in sessions.values():
-        _config_option(sub)
-        sub.add_argument("--out", type=pathlib.Path, help="folder for the run's folder")
-        sub.add_argument("--dry-run", action="store_true", help="plan; open no port")
-        _motion_options(sub, "confirm that the device stands in its zero posture")
-        _simulator_options(sub)
-    resume = add("resume", "go on with a run that was paused, stopped or killed")
-    resume.add_argument("run", type=pathlib.Path, help="the run's folder")
-    resume.add_argument("--config", type=pathlib.Path, help="for a changed port")
-    _motion_options(resume, argparse.SUPPRESS)
-    _simulator_options(resume)
-    identify = add("identify", "read identity and status of every drive; write nothing")
-    _config_option(identify)
-    _simulator_options(identify, hidden=True)
-    _config_option(add("stop", "quick-stop every drive now, and verify"))
-    check = add("check", "check a configuration and list every fault")
-    check.add_argument("file", nargs="?", type=pathlib.Path, help="rig.toml")
-    _config_option(check)
-    example = add("example", "print a commented example configuration")
-    example.add_argument("name", nargs="?", help="without it the names are listed")
-    simulate = add("simulate", "serve simulated drives and a phone on loopback")
-    _config_option(simulate)
-    simulate.add_argument("--bus-port", type=int, default=None, help="0: any free one")
-    _simulator_options(simulate)
+    add("calibrate", "choose, visit, identify, verify and save", SESSION)
+    text = "record random postures (Datasets 4 and 5)"
+    add("collect", text, _count(50) | SESSION)
+    text = "compare a calibration with fresh measurements"
+    add("verify", text, SAVED | _count(6) | SESSION)
+    text = "move the end-effector to a posture, calibrated"
+    add("goto", text, SAVED | TO | SESSION)
+    text = "go on with a run that was paused, stopped or killed"
+    add("resume", text, RUN | MOTION)
+    text = "read identity and status of every drive; write nothing"
+    add("identify", text, CONFIG)
+    add("stop", "quick-stop every drive now, and verify", CONFIG, False)
+    add("check", "check a configuration and list every fault", FILE | CONFIG, False)
+    add("example", "print a commented example configuration", NAME, False)
+    text = "serve simulated drives and a phone on loopback"
+    add("simulate", text, CONFIG | PORT)
     return parser
-
-
-def _number_within(low: float, high: float) -> Callable[[str], float]:
-    def number(text: str) -> float:
-        value = float(text)
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"must be in [{low:g}, {high:g}]: {text}")
-        return value
-
-    return number
-
-
-def _config_option(sub: argparse.ArgumentParser) -> None:
-    sub.add_argument("--config", type=pathlib.Path, metavar="FILE", help="rig.toml")
-
-
-def _motion_options(sub: argparse.ArgumentParser, zero: str) -> None:
-    sub.add_argument("--arm", action="store_true", help="arm without prompting")
-    sub.add_argument("--reset-alarms", action="store_true", help="before arming")
-    sub.add_argument("--zero", action="store_true", help=zero)
-
-
-def _simulator_options(sub: argparse.ArgumentParser, hidden: bool = False) -> None:
-    group = sub.add_argument_group("simulator")
-    group.add_argument(
-        "--simulate", action="store_true", help="run against a simulated rig"
-    )
-
-    def shown(text: str) -> str:
-        return argparse.SUPPRESS if hidden else text
-
-    group.add_argument(
-        "--transport",
-        choices=("tcp", "rtu_tcp", "rtu"),
-        default="tcp",
-        help=shown("of the simulated bus; rtu is a pseudo-terminal"),
-    )
-    group.add_argument(
-        "--fault",
-        action="append",
-        default=[],
-        metavar="KIND[@PHASE|@Ns][,count=N]...",
-        help=shown("inject a fault; --fault list names them"),
-    )
-    for name, low, high, default, text in (
-        ("--noise", 0.0, 90.0, 0.02, "degrees"),
-        ("--backlash", 0.0, 90.0, 0.0, "degrees"),
-        ("--drift", -90.0, 90.0, 0.0, "degrees per minute"),
-        ("--speedup", 0.01, 100.0, 1.0, "factor on the speed of the axes"),
-        ("--rate", 0.1, 1000.0, 100.0, "of the phone, Hz"),
-    ):
-        group.add_argument(
-            name,
-            type=_number_within(low, high),
-            default=default,
-            help=shown(f"{text} (default {default:g})"),
-        )

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import time
 from collections.abc import Callable
 
-from rig.config import example_text, load_config
-from rig.config.files import EXAMPLES, ConfigError
-from rig.guard.faults import EXIT_FAULT, EXIT_OK
-from rig.sessions import load, make_simulator, run_session, say
+from rig.config import ConfigError, example_text, load_config
+from rig.config.files import example_names
+from rig.device.bus import Bus, BusError
+from rig.device.drives import Drive
+from rig.faults import EXIT_FAULT, EXIT_OK
+from rig.sessions import load, make_simulator, run_session
 
 
 def run(args: argparse.Namespace) -> int:
@@ -31,43 +34,35 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _identify(args: argparse.Namespace) -> int:
-    from rig.device.bus import Bus, BusError
-    from rig.device.drives import Drive
+    config, code = load(args), EXIT_OK
+    with contextlib.ExitStack() as stack:
+        if args.simulate:
+            simulator = make_simulator(config, vars(args), args.fault)
+            config = stack.enter_context(simulator).start()
+        bus = stack.enter_context(Bus(config.bus, config.silence_s))
+        for axis in config.axes:
+            try:
+                print(*_described(Drive(bus, axis)), sep="\n")
+            except BusError as error:
+                code = EXIT_FAULT
+                print(f"{axis.name} (unit {axis.unit}): {error}")
+    return code
 
-    config, simulator, failed = load(args), None, False
-    if args.simulate:
-        simulator = make_simulator(config, vars(args), [])
-        config = simulator.start()
-    try:
-        with Bus(config.bus, config.silence_s) as bus:
-            for axis in config.axes:
-                drive, who = Drive(bus, axis), f"{axis.name} (unit {axis.unit}"
-                try:
-                    status, alarm = drive.status(), drive.alarm()
-                    identity = drive.identity()
-                except BusError as error:
-                    failed = True
-                    print(f"{who}): {error}")
-                    continue
-                names = ("enabled", "done", "moving", "fault")
-                words = " ".join(name for name in names if getattr(status, name))
-                print(
-                    f"{who}, {axis.map.title}): status 0x{status.word:04X} {words}, "
-                    f"position {status.position} pulses = "
-                    f"{axis.to_deg(status.position):.4f} deg"
-                    + (f", {alarm}" if alarm else "")
-                )
-                for name, value in identity.items():
-                    print(f"    {name} = {value}")
-    finally:
-        if simulator is not None:
-            simulator.close()
-    return EXIT_FAULT if failed else EXIT_OK
+
+def _described(drive: Drive) -> list[str]:
+    axis, status, alarm = drive.axis, drive.status(), drive.alarm()
+    flags = axis.map.status.flags(status.word)
+    words = " ".join(name for name, on in flags.items() if on)
+    identity = [f"    {name} = {value}" for name, value in drive.identity().items()]
+    return [
+        f"{axis.name} (unit {axis.unit}, {axis.map.title}): status "
+        f"0x{status.word:04X} {words}, position {status.position} pulses = "
+        f"{axis.to_deg(status.position):.4f} deg" + (alarm and f", {alarm}"),
+        *identity,
+    ]
 
 
 def _stop(args: argparse.Namespace) -> int:
-    from rig.device.bus import Bus, BusError
-    from rig.device.drives import Drive
     from rig.guard.stop import stop_all
 
     config = load(args)
@@ -89,20 +84,17 @@ def _stop(args: argparse.Namespace) -> int:
 
 def _simulate(args: argparse.Namespace) -> int:
     config = load(args)
-    listens = config.imu.transport == "listen"
-    if listens and config.imu.port == 0:
-        imu = config.imu.model_copy(update={"port": 2055})
-        config = config.model_copy(update={"imu": imu})
     port = config.bus.port if args.bus_port is None else args.bus_port
     with make_simulator(config, vars(args), args.fault) as simulator:
         served = simulator.start(port)
-        simulator.start_phone(config.imu.port)
-        phone = f"sends to 127.0.0.1:{config.imu.port}"
-        if not listens:
-            phone = f"listens on 127.0.0.1:{served.imu.port}"
+        phone = f"listens on 127.0.0.1:{served.imu.port}"
+        if config.imu.transport == "listen":
+            phone_port = config.imu.port or 2055
+            simulator.start_phone(phone_port)
+            phone = f"sends to 127.0.0.1:{phone_port}"
         print(f"drives: {served.bus.where}; units {[a.unit for a in config.axes]}")
         print(f"phone: {config.imu.format}, {phone}")
-        say("Ctrl-C ends")
+        print("Ctrl-C ends", flush=True)
         try:
             while True:
                 time.sleep(3600)
@@ -112,7 +104,7 @@ def _simulate(args: argparse.Namespace) -> int:
 
 def _example(args: argparse.Namespace) -> int:
     if args.name is None:
-        print("\n".join(sorted(path.stem for path in EXAMPLES.glob("*.toml"))))
+        print("\n".join(example_names()))
     else:
         print(example_text(args.name), end="")
     return EXIT_OK

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import pathlib
 import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from rig.config import RigConfig, example_text, load_config, parse_config
-from rig.config.files import ConfigError
-from rig.guard.faults import Refused
+from rig.config import (
+    ConfigError,
+    RigConfig,
+    example_text,
+    load_config,
+    parse_config,
+)
+from rig.config.axis import Pulses
+from rig.faults import Refused
 
 if TYPE_CHECKING:
     from rig.session.run import Run
@@ -20,11 +27,8 @@ if TYPE_CHECKING:
 SIMULATION = ("transport", "noise", "backlash", "drift", "speedup", "rate")
 
 
-def say(text: str) -> None:
-    print(text, flush=True)
-
-
 def load(args: argparse.Namespace) -> RigConfig:
+    """The configuration a command was given, or the simulator's own."""
     if args.config is not None:
         return load_config(args.config)
     if getattr(args, "simulate", False) or args.command == "simulate":
@@ -35,6 +39,7 @@ def load(args: argparse.Namespace) -> RigConfig:
 def make_simulator(
     config: RigConfig, options: dict[str, Any], faults: list[str]
 ) -> Simulator:
+    """A simulated rig as the options of the command line describe it."""
     from rig.simulator import Simulator, Truth, parse_fault
 
     truth = Truth(
@@ -54,16 +59,15 @@ def make_simulator(
 
 
 def run_session(args: argparse.Namespace) -> int:
-    """calibrate, collect, verify, goto and resume."""
+    """Run a session, new or resumed; returns the exit code."""
     from rig.session.folder import new_run_folder
     from rig.session.run import Run
     from rig.session.runner import run_safely
 
     resumed = args.command == "resume"
     config, start = _recorded(args) if resumed else _new(args)
-    mode, simulation = start["mode"], start["simulated"]
-    dry_run = getattr(args, "dry_run", False)
-    procedure, zero_at = _procedure(mode, start["inputs"], dry_run)
+    mode = start["mode"]
+    procedure, zero_at = _procedure(mode, start["inputs"])
     if args.zero:
         zero_at = None  # the operator put the device into its zero posture
     if resumed:
@@ -71,29 +75,27 @@ def run_session(args: argparse.Namespace) -> int:
     else:
         folder = new_run_folder(args.out or pathlib.Path(config.output), mode)
         (folder / "rig.toml").write_text(config.text, encoding="utf-8")
-    simulator = None
-    if simulation is not None:
-        simulator = make_simulator(config, simulation, args.fault)
-        config = simulator.start()
-    try:
+    with contextlib.ExitStack() as stack:
+        simulator = None
+        if start["simulated"] is not None:
+            simulator = make_simulator(config, start["simulated"], args.fault)
+            config = stack.enter_context(simulator).start()
         session = Run(
             config,
             folder,
             mode,
-            say,
+            functools.partial(print, flush=True),
             start={key: start[key] for key in ("simulated", "inputs", "maps_from")},
             reset_alarms=args.reset_alarms,
-            on_imu_port=simulator.start_phone if simulator else None,
             zero_at=zero_at,
+            dry_run=getattr(args, "dry_run", False),
         )
-        if simulator is not None:
-            session.phase_listeners.append(simulator.enter)
-        else:
+        if simulator is None:
             session.confirm = functools.partial(_confirm, args)
+        else:
+            session.on_imu_port = simulator.start_phone
+            session.listeners.append(simulator.hear)
         return run_safely(session, procedure)
-    finally:
-        if simulator is not None:
-            simulator.close()
 
 
 def _new(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
@@ -130,25 +132,25 @@ def _recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
 
 
 def _procedure(
-    mode: str, inputs: dict[str, Any], dry_run: bool
-) -> tuple[Callable[[Run], int], Any]:
+    mode: str, inputs: dict[str, Any]
+) -> tuple[Callable[[Run], int], Pulses | None]:
     """What a session does, and the pulses of its zero posture where they are known."""
     import numpy as np
 
     from rig.session import calibrate, checking
 
     if mode == "calibrate":
-        return functools.partial(calibrate.calibrate, dry_run=dry_run), None
+        return calibrate.calibrate, None
     count = inputs["count"]
     if mode == "collect":
-        return functools.partial(checking.collect, count=count, dry_run=dry_run), None
+        return lambda run: checking.collect(run, count), None
     calibration, zero_at = checking.load_calibration(
         pathlib.Path(inputs["calibration"])
     )
     if mode == "verify":
-        return lambda run: checking.verify(run, calibration, count, dry_run), zero_at
+        return lambda run: checking.verify(run, calibration, count), zero_at
     desired = np.array(inputs["to"], dtype=np.float64)
-    return lambda run: checking.goto(run, calibration, desired, dry_run), zero_at
+    return lambda run: checking.goto(run, calibration, desired), zero_at
 
 
 def _confirm(args: argparse.Namespace, session: Run) -> None:

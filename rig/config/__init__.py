@@ -6,7 +6,8 @@ the faults; ``files`` reads. (3,) arrays are in the order pitch, yaw, roll.
 
 from rig.config.axis import AXIS_NAMES
 from rig.config.config import RigConfig
-from rig.config.files import ConfigError, example_text, load_config, parse_config
+from rig.config.files import example_text, load_config, parse_config
+from rig.config.schema import ConfigError
 
 __all__ = [
     "AXIS_NAMES",

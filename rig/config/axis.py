@@ -87,11 +87,7 @@ class Axis(Scale):
         return max(1, round(angle_deg * abs(self.pulses_per_deg)))
 
     def motion_counts(self) -> dict[str, int]:
-        """Register values of speed and acceleration of a move.
-
-        Raises:
-            ValueError: one does not fit its register.
-        """
+        """Speed and ramps as register values; ValueError where one does not fit."""
         units, turns = self.map.units, self.reduction / 360.0
         speed, accel = self.speed_deg_s * turns, self.accel_deg_s2 * turns  # of motor
         if units.speed == "pulse_per_s":
@@ -103,9 +99,8 @@ class Axis(Scale):
         counts = {"speed": max(1, round(speed * units.speed_per_unit))}
         counts["accel"] = counts["decel"] = max(1, round(accel * units.accel_per_unit))
         for name, count in counts.items():
-            for frame in self.map.move.write:
-                if found := frame.offset_of(name):
-                    encode(count, found[1], self.map.word_order)
+            if place := self.map.move.place_of(name):
+                encode(count, place[1], self.map.word_order)
         return counts
 
     def broken_rules(self) -> Iterator[str]:
@@ -114,14 +109,11 @@ class Axis(Scale):
             if low >= high:
                 yield f"min_{unit}: must be under max_{unit}, got {low} and {high}"
                 return
+        allowed = f"min_pulses..max_pulses ({self.min_pulses}..{self.max_pulses})"
         for name in ("min_deg", "max_deg"):
             pulses = self.to_pulses(getattr(self, name))
             if not self.min_pulses <= pulses <= self.max_pulses:
-                allowed = f"{self.min_pulses}..{self.max_pulses}"
-                yield (
-                    f"{name}: {pulses} pulses are outside min_pulses..max_pulses "
-                    f"({allowed})"
-                )
+                yield f"{name}: {pulses} pulses are outside {allowed}"
         try:
             self.motion_counts()
         except ValueError as error:

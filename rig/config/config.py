@@ -6,9 +6,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from pydantic import PrivateAttr
+from numpy.typing import NDArray
 
-from rig.attitude import Array
 from rig.config.axis import AXIS_NAMES, Axis, Pulses, Scale
 from rig.config.schema import Section, key
 from rig.config.settings import (
@@ -32,12 +31,6 @@ class RigConfig(Section):
     motion: MotionSettings = MotionSettings()
     session: SessionSettings = SessionSettings()
     output: str = key("every run makes its own folder in here", "runs")
-    _text: str = PrivateAttr("")
-
-    @property
-    def text(self) -> str:
-        """The TOML it came from."""
-        return self._text
 
     @property
     def letters(self) -> tuple[str, str, str]:
@@ -68,40 +61,30 @@ class RigConfig(Section):
         )
         return a, b, c
 
-    def to_deg(self, pulses: Any) -> Array:
+    def to_deg(self, pulses: Any) -> NDArray[np.float64]:
         """(..., 3) degrees of (..., 3) pulses."""
         scales = np.array([axis.pulses_per_deg for axis in self.axes])
         return np.asarray(pulses, dtype=np.float64) / scales
 
     def described(self) -> dict[str, Any]:
         """Everything as JSON values, in the layout of run folders of version 1."""
-        axes = []
-        moved = {*Scale.model_fields, "rotates", "map"}
-        for axis in self.axes:
-            plain = axis.model_dump(exclude=moved)
-            plain["letter"] = axis.rotates
-            plain["map"] = {"name": axis.map.name, "digest": axis.map.digest}
-            plain["scale"] = axis.model_dump(include=set(Scale.model_fields))
-            axes.append(plain)
-        imu = self.imu.model_dump()
-        imu["quaternion"], imu["angle_unit"] = (
-            imu.pop("quaternion_columns"),
-            imu.pop("unit"),
-        )
+        data = self.model_dump(exclude={"mechanism", "output", "axes"})
+        imu, session = data["imu"], data["session"]
+        imu["quaternion"] = imu.pop("quaternion_columns")
+        imu["angle_unit"] = imu.pop("unit")
         imu["stamp_column"] = None if imu["stamp_column"] < 0 else imu["stamp_column"]
         imu["column_count"] = imu["column_count"] or None
-        session = self.session.model_dump()
         for name in AXIS_NAMES:
             del session[f"{name}_range_deg"]
-        return {
-            "bus": self.bus.model_dump(),
-            "axes": axes,
-            "imu": imu,
-            "mechanism_order": self.mechanism.order,
-            "settle": self.settle.model_dump(),
-            "motion": self.motion.model_dump(),
-            "session": session | {"ranges": self.ranges},
-        }
+        session["ranges"] = self.ranges
+        scale = set(Scale.model_fields)
+        axes = [
+            axis.model_dump(exclude={*scale, "rotates", "map"})
+            | {"letter": axis.rotates, "scale": axis.model_dump(include=scale)}
+            | {"map": {"name": axis.map.name, "digest": axis.map.digest}}
+            for axis in self.axes
+        ]
+        return {**data, "axes": axes, "mechanism_order": self.mechanism.order}
 
     def fingerprint(self) -> str:
         """SHA-256 of what a measurement depends on.

@@ -10,9 +10,7 @@ import json
 import pathlib
 import tomllib
 from collections.abc import Iterator
-from typing import Any, Literal
-
-from pydantic import PrivateAttr
+from typing import Literal
 
 from rig.config.registers import (
     Alarm,
@@ -24,13 +22,9 @@ from rig.config.registers import (
     Units,
     Writes,
 )
-from rig.config.schema import Section, key, validated
+from rig.config.schema import Section, key, parse, read_text
 
 MAP_FOLDER = pathlib.Path(__file__).parent.parent / "maps"
-
-
-class MapError(ValueError):
-    """A register map breaks the schema; the text lists every fault."""
 
 
 class RegisterMap(Section):
@@ -67,15 +61,15 @@ class RegisterMap(Section):
     )
     limits: Writes | None = key("`write` with `min` and `max` in pulses", None)
     identity: dict[str, Read] = key("registers that `identify` prints", {})
-    _digest: str = PrivateAttr("")
 
     @property
     def digest(self) -> str:
         """SHA-256 of the parsed file, for the run's fingerprint."""
-        return self._digest
+        data = json.dumps(tomllib.loads(self.text), sort_keys=True, default=str)
+        return hashlib.sha256(data.encode()).hexdigest()
 
     def broken_rules(self) -> Iterator[str]:
-        if self.stop.writes("position"):
+        if self.stop.place_of("position"):
             yield "stop.write: must not write a position"
 
 
@@ -88,32 +82,15 @@ def load_map(name: str, folder: pathlib.Path | None = None) -> RegisterMap:
     """Read a map by name (one that ships) or by path, relative to ``folder``.
 
     Raises:
-        MapError: no such map, not TOML, or the schema is broken.
+        ValueError: no such map.
+        ConfigError: not TOML, or the schema is broken; lists every fault.
     """
     path = MAP_FOLDER / f"{name}.toml"
     if name.endswith(".toml"):
         path = (folder or pathlib.Path()) / name
     elif name not in available_maps():
-        raise MapError(
+        raise ValueError(
             f"no register map {name!r}: have {', '.join(available_maps())}, "
             "or give the path of a .toml file"
         )
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise MapError(f"register map {path}: {error}") from None
-    return parse_map(data, path.name)
-
-
-def parse_map(data: dict[str, Any], source: str) -> RegisterMap:
-    """Check a parsed map as a whole.
-
-    Raises:
-        MapError: with every fault, one a line.
-    """
-    result, faults = validated(RegisterMap, data)
-    if result is None:
-        raise MapError("\n".join(f"{source}: {fault}" for fault in faults))
-    text = json.dumps(data, sort_keys=True, default=str)
-    result._digest = hashlib.sha256(text.encode()).hexdigest()
-    return result
+    return parse(RegisterMap, read_text(path), path.name)

@@ -2,29 +2,26 @@
 
 import struct
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
-from pydantic import (
-    BeforeValidator,
-    Field,
-    PlainValidator,
-    WithJsonSchema,
-)
+from pydantic import BeforeValidator, Field, PlainValidator, WithJsonSchema
 
 from rig.config.schema import Section, key
 
 FORMATS = {"u16": ">H", "i16": ">h", "u32": ">I", "i32": ">i"}  # of struct
 VALUES = ("position", "speed", "accel", "decel", "timeout", "min", "max")
 Kind = Literal["u16", "i16", "u32", "i32"]
-Word = int | tuple[str, str]  # a constant, or (name of VALUES, type)
+
+
+class Word(NamedTuple):
+    """What a frame has at one place: one or two registers."""
+
+    value: int | str  # a constant, or one of VALUES
+    kind: str = "u16"
 
 
 def encode(value: int, kind: str, word_order: str) -> list[int]:
-    """Registers of a value.
-
-    Raises:
-        ValueError: the value does not fit the type.
-    """
+    """Registers of a value; ValueError where it does not fit the type."""
     try:
         data = struct.pack(FORMATS[kind], value)
     except struct.error:
@@ -46,10 +43,10 @@ def registers_of(kind: str) -> int:
 
 def _word(word: Any) -> Word:
     if type(word) is int and 0 <= word <= 0xFFFF:
-        return word
+        return Word(word)
     name, _, kind = str(word).partition(":")
     if isinstance(word, str) and name in VALUES and kind in FORMATS:
-        return name, kind
+        return Word(name, kind)
     raise ValueError(
         f"must be 0..65535 or NAME:TYPE with NAME of {', '.join(VALUES)} and TYPE of "
         f"{', '.join(FORMATS)}, got {word!r}"
@@ -79,7 +76,6 @@ class Read(Section):
 
     @property
     def count(self) -> int:
-        """Registers to read."""
         return registers_of(self.type)
 
 
@@ -112,16 +108,24 @@ class Predicate(Section):
             yield "set: name at least one bit in set or clear"
 
 
+FLAGS = ("enabled", "done", "moving", "fault")
+
+
 class StatusWord(Read):
     """The status word and what its bits say."""
 
     done: Predicate
     moving: Predicate
     fault: Predicate
-    enabled: Predicate | None = None
+    enabled: Predicate | None = None  # where no bit says it, the drive always is
+
+    def flags(self, word: int) -> dict[str, bool]:
+        """Which of FLAGS a word has."""
+        named = {name: getattr(self, name) for name in FLAGS}
+        return {name: not bits or bits.holds(word) for name, bits in named.items()}
 
     def broken_rules(self) -> Iterator[str]:
-        for name in ("done", "moving", "fault", "enabled"):
+        for name in FLAGS:
             bits = getattr(self, name)
             if bits and max((*bits.set, *bits.clear)) >= 16 * self.count:
                 yield f"{name}: must name bits 0..{16 * self.count - 1} of {self.type}"
@@ -138,17 +142,14 @@ class Write(Section):
 
     @property
     def count(self) -> int:
-        """Registers written."""
         return _registers(self.words)
 
-    def offset_of(self, name: str) -> tuple[int, str] | None:
-        """Address and type of a named value inside the frame, or None."""
+    def places(self) -> Iterator[tuple[int, Word]]:
+        """Every word with its address."""
         address = self.address
         for word in self.words:
-            if not isinstance(word, int) and word[0] == name:
-                return address, word[1]
-            address += _registers([word])
-        return None
+            yield address, word
+            address += registers_of(word.kind)
 
     def broken_rules(self) -> Iterator[str]:
         if self.function == 6 and self.count != 1:
@@ -157,8 +158,8 @@ class Write(Section):
             yield f"words: {self.count} registers from {self.address} do not fit"
 
 
-def _registers(words: Any) -> int:
-    return sum(1 if isinstance(word, int) else registers_of(word[1]) for word in words)
+def _registers(words: tuple[Word, ...]) -> int:
+    return sum(registers_of(word.kind) for word in words)
 
 
 class Writes(Section):
@@ -166,9 +167,10 @@ class Writes(Section):
 
     write: Annotated[tuple[Write, ...], Field(min_length=1)]
 
-    def writes(self, name: str) -> bool:
-        """Whether a frame holds the named value."""
-        return any(frame.offset_of(name) for frame in self.write)
+    def place_of(self, name: str) -> tuple[int, str] | None:
+        """Address and type of a named value, or None where no frame holds it."""
+        places = (place for frame in self.write for place in frame.places())
+        return next(((a, w.kind) for a, w in places if w.value == name), None)
 
 
 class Trigger(Section):
@@ -184,11 +186,10 @@ class Move(Writes):
     trigger: Trigger
 
     def broken_rules(self) -> Iterator[str]:
-        if not self.writes("position"):
+        if not self.place_of("position"):
             yield "write: no frame writes position"
-        last, trigger = self.write[-1], self.trigger
-        ends = last.address + last.count - 1
-        if (ends, last.words[-1]) != (trigger.address, trigger.value):
+        *_, (address, last) = self.write[-1].places()
+        if (address, last.value) != (self.trigger.address, self.trigger.value):
             yield "trigger: must be the last word of the last frame"
 
 

@@ -9,10 +9,20 @@ pydantic would compile every annotation again at each start.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator
+import json
+import pathlib
+import tomllib
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    model_validator,
+)
 from pydantic_core import PydanticCustomError
 
 
@@ -22,6 +32,12 @@ class Section(BaseModel):
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False
     )
+    _text: str = PrivateAttr("")
+
+    @property
+    def text(self) -> str:
+        """The TOML it came from, where it is the whole of a file."""
+        return self._text
 
     def broken_rules(self) -> Iterator[str]:
         """``key: fault`` of every rule about more than one key that is not kept."""
@@ -43,16 +59,10 @@ def key(
     by: Any = None,
     **more: Any,
 ) -> Any:
-    """A key of a file.
+    """A key of a file: what it means, its default (``...``: required) and bounds.
 
-    Args:
-        about: what it means, for the reference table.
-        default: value of an absent key; ``...``: the key is required. Beside ``by``
-            the text that says what ``by`` comes to.
-        low: smallest value.
-        high: largest value.
-        by: function of the keys before it that makes the default.
-        more: further arguments of ``pydantic.Field``.
+    ``by`` makes the default from the keys before it; ``default`` then says in words
+    what that comes to.
     """
     if by is not None:
         more |= {"default_factory": by, "json_schema_extra": {"default": default}}
@@ -61,30 +71,59 @@ def key(
     return Field(description=about, ge=low, le=high, **more)
 
 
+class ConfigError(ValueError):
+    """A file is not usable; ``faults`` lists all that is wrong."""
+
+    def __init__(self, source: str, faults: list[str]) -> None:
+        self.source = source
+        self.faults = faults
+        count = f"{len(faults)} fault{'s' if len(faults) > 1 else ''}"
+        lines = "".join(f"\n  - {fault}" for fault in faults)
+        super().__init__(f"{source}: {count}{lines}")
+
+
+def read_text(path: str | pathlib.Path) -> str:
+    """Text of a file; ConfigError where it cannot be read."""
+    try:
+        return pathlib.Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise ConfigError(str(path), [f"cannot be read: {reason}"]) from None
+
+
 Model = TypeVar("Model", bound=Section)
 
 
-def validated(
-    model: type[Model], data: Any, context: Any = None
-) -> tuple[Model | None, list[str]]:
-    """The table as a model, or None with everything that is wrong with it.
+def parse(
+    model: type[Model],
+    text: str,
+    source: str,
+    context: Any = None,
+    more: Callable[[Any], Iterable[str]] = lambda data: (),
+) -> Model:
+    """A TOML text as a model.
 
-    Returns:
-        The model, and faults as ``section.key: rule, value``.
+    Raises:
+        ConfigError: every fault as ``section.key: rule, value``, and those that
+            ``more`` finds in what was parsed.
     """
     try:
-        return model.model_validate(_tuples(data), context=context), []
+        data = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(source, [f"not valid TOML: {error}"]) from None
+    faults = list(more(data))
+    try:
+        # Of JSON pydantic takes lists for tuples; nothing else is converted.
+        plain = json.dumps(data, default=lambda date: [str(date)])  # no key takes one
+        result = model.model_validate_json(plain, context=context)
     except ValidationError as error:
         schema = model.model_json_schema()
-        found = error.errors(include_url=False)
-        return None, [text for e in found for text in _texts(e, data, schema)]
-
-
-def _tuples(data: Any) -> Any:
-    """Lists of a file as tuples, which is what frozen models hold."""
-    if isinstance(data, dict):
-        return {name: _tuples(value) for name, value in data.items()}
-    return tuple(map(_tuples, data)) if isinstance(data, list) else data
+        each = error.errors(include_url=False)
+        faults = [text for e in each for text in _texts(e, data, schema)] + faults
+    if faults:
+        raise ConfigError(source, faults)
+    result._text = text
+    return result
 
 
 def resolved(described: dict[str, Any], root: dict[str, Any]) -> dict[str, Any]:
@@ -142,7 +181,10 @@ def _texts(error: Any, value: Any, root: dict[str, Any]) -> list[str]:
     if kind == "rules":
         return [f"{path}.{fault}".lstrip(".") for fault in error["ctx"]["faults"]]
     if kind == "value_error":
-        return [f"{path}: {line}" for line in str(error["ctx"]["error"]).split("\n")]
+        inner = error["ctx"]["error"]
+        if isinstance(inner, ConfigError):  # of a file that this one names
+            return [f"{path}: {inner.source}: {fault}" for fault in inner.faults]
+        return [f"{path}: {inner}"]
     if kind == "extra_forbidden":
         near = difflib.get_close_matches(error["loc"][-1], known, 1)
         hint = f"did you mean {near[0]}? " if near else ""
@@ -150,8 +192,4 @@ def _texts(error: Any, value: Any, root: dict[str, Any]) -> list[str]:
     wanted = rule(here, root)
     if kind == "missing":
         return [f"{path}: missing; {wanted} is required"]
-    got = error["input"]
-    got = repr(list(got) if isinstance(got, tuple) else got)
-    if kind in ("too_short", "too_long"):
-        got = f"{error['ctx']['actual_length']}"
-    return [f"{path}: must be {wanted}, got {got[:80]}"]
+    return [f"{path}: must be {wanted}, got {repr(error['input'])[:80]}"]

@@ -5,7 +5,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from rig.attitude import Array, euler_to_matrix
 from rig.config.schema import Section, key
 
 Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
@@ -99,11 +98,6 @@ class ImuSettings(Section):
     )
     stale_s: float = key("older than this while moving: stop", 0.4, 0.02, 10)
     max_jump_deg: float = key("between two readings", 20.0, 0.1, 180)
-
-    @property
-    def mounting(self) -> Array:
-        """(3, 3) R_EP."""
-        return euler_to_matrix(self.mounting_deg, "ZYX")
 
     def broken_rules(self) -> Iterator[str]:
         if self.format == "sensorlogger" and self.transport != "listen":

@@ -16,11 +16,18 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from rig.config.registers import Read, decode
 from rig.config.settings import BusSettings
+from rig.faults import Fault
+
+METHODS = {3: "read_holding_registers", 6: "write_register", 16: "write_registers"}
+EXCEPTIONS = {
+    1: "illegal function", 2: "illegal address", 3: "illegal value",
+    4: "device failure", 5: "acknowledge", 6: "busy", 8: "CRC or parity",
+    10: "no gateway path", 11: "gateway target silent",
+}  # fmt: skip
 
 
-class BusError(RuntimeError):
+class BusError(Fault):
     """No valid reply: silence, noise, a closed port, or a reply to something else."""
 
 
@@ -35,10 +42,16 @@ class Rejected(BusError):
 class Bus:
     """One Modbus line with any number of units; safe to use from several threads."""
 
-    def __init__(self, settings: BusSettings, silence_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        settings: BusSettings,
+        silence_s: float = 0.0,
+        emit: Callable[..., Any] = lambda event, **fields: None,
+    ) -> None:
         self.settings = settings
-        self.silence_s = silence_s
-        self.on_frame: Callable[[str, dict[str, Any]], None] | None = None
+        # On Modbus TCP the gateway keeps the line's silence.
+        self.silence_s = 0.0 if settings.transport == "tcp" else silence_s
+        self._emit = emit  # told of every write before it is sent
         self._lock = threading.RLock()
         self._quiet_until = 0.0
         self._client: Any = None
@@ -61,22 +74,16 @@ class Bus:
         )
 
     def open(self) -> Bus:
-        """Open the port.
-
-        Raises:
-            BusError: it is absent, refused, or held by another program.
-        """
+        """Open the port; BusError where it is absent, refused or held by another."""
         with self._lock:
-            if self._client is None:
-                try:
-                    self._client = self._make_client()
-                except RuntimeError as error:  # pymodbus without pyserial
-                    text = " ".join(str(error).split())
-                    raise BusError(
-                        f"cannot open {self.settings.where}: {text}"
-                    ) from None
-            if not self._client.connect():
-                hint = _why_closed(self.settings)
+            hint = ""
+            try:
+                self._client = self._client or self._make_client()
+                if not self._client.connect():
+                    hint = _why_closed(self.settings)
+            except RuntimeError as error:  # pymodbus without pyserial
+                hint = " ".join(str(error).split())
+            if hint:
                 raise BusError(f"cannot open {self.settings.where}: {hint}")
         return self
 
@@ -93,34 +100,21 @@ class Bus:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def read(self, unit: int, read: Read, word_order: str, retries: int = -1) -> int:
-        """Read one value.
-
-        Args:
-            unit: Modbus unit id.
-            read: address and type.
-            word_order: of 32-bit values.
-            retries: more tries after silence or noise; the configured number if < 0.
+    def read_words(
+        self, unit: int, address: int, count: int, retries: int | None = None
+    ) -> list[int]:
+        """Read holding registers, with as many more tries as configured or given.
 
         Raises:
             BusError: no valid reply after all tries.
             Rejected: the drive answered with an exception, every time.
         """
-        words = self.read_words(unit, read.address, read.count, retries)
-        return decode(words, read.type, word_order)
-
-    def read_words(
-        self, unit: int, address: int, count: int, retries: int = -1
-    ) -> list[int]:
-        """Read ``count`` holding registers; see ``read``."""
-        tries = 1 + (self.settings.read_retries if retries < 0 else retries)
+        tries = 1 + (self.settings.read_retries if retries is None else retries)
         left = tries
         while True:
             left -= 1
             try:
-                reply = self._exchange(
-                    "read_holding_registers", unit, address, count=count
-                )
+                reply = self._exchange(3, unit, address, count=count)
                 words = list(getattr(reply, "registers", []))
                 if len(words) != count:
                     raise BusError(
@@ -129,8 +123,7 @@ class Bus:
                     )
                 return words
             except BusError as error:
-                if not isinstance(error, Rejected):
-                    self._resynchronise()
+                self._resynchronise(error)
                 if not left:
                     error.args = (f"{error} (tried {tries} times)",)
                     raise
@@ -142,78 +135,61 @@ class Bus:
             BusError: no valid reply; whether the drive obeyed is unknown.
             Rejected: the drive refused.
         """
-        if self.on_frame is not None:
-            self.on_frame("write", {"unit": unit, "address": address, "words": words})
+        self._emit("write", unit=unit, address=address, words=words)
         try:
             if function == 6:
-                reply = self._exchange("write_register", unit, address, words[0])
+                reply = self._exchange(6, unit, address, words[0])
                 echoed = list(getattr(reply, "registers", [])) == words
             else:
-                reply = self._exchange("write_registers", unit, address, words)
+                reply = self._exchange(16, unit, address, words)
                 echoed = getattr(reply, "count", None) == len(words)
             if not echoed or getattr(reply, "address", None) != address:
                 raise BusError(f"unit {unit}: the reply to a write does not echo it")
-        except Rejected:
-            raise
-        except BusError:
-            self._resynchronise()
+        except BusError as error:
+            self._resynchronise(error)
             raise
 
     def _exchange(
-        self, method: str, unit: int, address: int, *args: Any, **kw: Any
+        self, function: int, unit: int, address: int, *args: Any, **more: Any
     ) -> Any:
-        from pymodbus.exceptions import ModbusException
-
         with self._lock:
             if self._client is None:
                 self.open()
-            pause = self._quiet_until - time.monotonic()
-            if pause > 0:
-                time.sleep(pause)
+            time.sleep(max(0.0, self._quiet_until - time.monotonic()))
             try:
-                reply = getattr(self._client, method)(
-                    address, *args, device_id=unit, **kw
-                )
-            except ModbusException as error:
-                text = " ".join(str(error).split())
+                send = getattr(self._client, METHODS[function])
+                reply = send(address, *args, device_id=unit, **more)
+            except Exception as error:
+                # pymodbus lets struct, index and socket errors of mangled frames out.
+                text = " ".join(f"{type(error).__name__}: {error}".split())
                 if "No response" in text:
                     text = f"silent for {self.settings.timeout_s:g} s"
                 raise BusError(f"unit {unit}: no valid reply ({text})") from None
-            except Exception as error:
-                # pymodbus lets struct, index and socket errors of mangled frames out.
-                text = f"{type(error).__name__}: {error}"
-                raise BusError(f"unit {unit}: no valid reply ({text})") from None
             finally:
                 self._quiet_until = time.monotonic() + self.silence_s
-        expected = {
-            "read_holding_registers": 3, "write_register": 6, "write_registers": 16
-        }[method]  # fmt: skip
         if reply is None or reply.dev_id != unit:
             raise BusError(f"unit {unit}: the reply is from another unit")
         if reply.isError():
             code = int(getattr(reply, "exception_code", 0))
-            raise Rejected(
-                f"unit {unit} answered exception {code} ({_exception_name(code)}) at "
-                f"0x{address:04X}",
-                code,
-            )
-        if reply.function_code != expected:
+            name = EXCEPTIONS.get(code, "unknown")
+            text = f"unit {unit} answered exception {code} ({name}) at 0x{address:04X}"
+            raise Rejected(text, code)
+        if reply.function_code != function:
             raise BusError(f"unit {unit}: a reply of function {reply.function_code}")
         return reply
 
-    def _resynchronise(self) -> None:
+    def _resynchronise(self, error: BusError) -> None:
         """Empty the line, so that a late reply is not taken for the next one's."""
         with self._lock:
-            if self._client is None:
-                return
+            if self._client is None or isinstance(error, Rejected):
+                return  # a refusal is a whole reply
             if self.settings.transport != "rtu":
                 self._client.close()  # the next request connects again
                 return
             port = self._client.socket
             if port is None:
                 return
-            byte_s = 11.0 / self.settings.baudrate
-            gap = max(0.02, 20 * byte_s, self.silence_s)
+            gap = max(0.02, 20 * 11.0 / self.settings.baudrate, self.silence_s)
             end = time.monotonic() + 2 * self.settings.timeout_s
             try:
                 while time.monotonic() < end:
@@ -233,12 +209,3 @@ def _why_closed(settings: BusSettings) -> str:
     if not os.access(settings.device, os.R_OK | os.W_OK):
         return "this user may not open it. Join its group, often dialout"
     return "held by another program. Is a session running?"
-
-
-def _exception_name(code: int) -> str:
-    names = {
-        1: "illegal function", 2: "illegal address", 3: "illegal value",
-        4: "device failure", 5: "acknowledge", 6: "busy", 8: "CRC or parity",
-        10: "no gateway path", 11: "gateway target silent",
-    }  # fmt: skip
-    return names.get(code, "unknown")

@@ -6,8 +6,9 @@ import dataclasses
 import time
 
 from rig.config.axis import Axis
-from rig.config.registers import Writes, encode
-from rig.device.bus import Bus, Rejected
+from rig.config.registers import Read, Writes, decode, encode
+from rig.device.bus import Bus, BusError, Rejected
+from rig.faults import MotionFault
 
 
 @dataclasses.dataclass(frozen=True)
@@ -16,11 +17,11 @@ class Status:
 
     word: int
     position: int  # pulses
+    time: float  # monotonic seconds
+    enabled: bool
     done: bool
     moving: bool
     fault: bool
-    enabled: bool
-    time: float  # monotonic seconds
 
 
 class Drive:
@@ -30,29 +31,33 @@ class Drive:
         self.bus = bus
         self.axis = axis
 
-    def status(self, retries: int = -1) -> Status:
-        """Read status and position."""
-        m = self.axis.map
-        word = self.bus.read(self.axis.unit, m.status, m.word_order, retries)
-        position = self.bus.read(self.axis.unit, m.position, m.word_order, retries)
-        return Status(
-            word=word,
-            position=position,
-            done=m.status.done.holds(word),
-            moving=m.status.moving.holds(word),
-            fault=m.status.fault.holds(word),
-            enabled=m.status.enabled is None or m.status.enabled.holds(word),
-            time=time.monotonic(),
-        )
+    def status(self, retries: int | None = None) -> Status:
+        """Read status and position; ``retries`` as configured where not given."""
+        status = self.axis.map.status
+        word = self._read(status, retries)
+        position = self._read(self.axis.map.position, retries)
+        return Status(word, position, time.monotonic(), **status.flags(word))
+
+    def sound(self) -> Status:
+        """Status; MotionFault where the fault bit is set."""
+        status = self.status()
+        if status.fault:
+            text = "fault bit set"
+            try:
+                text = self.alarm() or text
+            except BusError:
+                pass  # the fault bit alone is reason enough to stop
+            raise MotionFault(f"{self.axis.name}: {text}")
+        return status
 
     def alarm(self) -> str:
         """The alarm in words, empty where there is none or no register for it."""
-        m = self.axis.map
-        if m.alarm is None:
+        read = self.axis.map.alarm
+        code = self._read(read) if read else 0
+        if not read or not code:
             return ""
-        code = self.bus.read(self.axis.unit, m.alarm, m.word_order)
-        name = m.alarm.names.get(code)
-        return (f"alarm 0x{code:X}" + (f" ({name})" if name else "")) if code else ""
+        name = read.names.get(code)
+        return f"alarm 0x{code:X}" + (f" ({name})" if name else "")
 
     def move(self, pulses: int) -> None:
         """Start an absolute move; every frame is sent exactly once.
@@ -67,53 +72,33 @@ class Drive:
                 f"{axis.name}: {pulses} pulses leave the limits "
                 f"{axis.min_pulses}..{axis.max_pulses}"
             )
-        self._write(axis.map.move, {"position": pulses, **axis.motion_counts()})
+        self.write(axis.map.move, position=pulses, **axis.motion_counts())
 
     def stop(self) -> None:
         """Quick stop; torque stays on."""
-        self._write(self.axis.map.stop)
+        self.write(self.axis.map.stop)
 
-    def enable(self) -> None:
-        """Enable the power stage, where the map can."""
-        self._write(self.axis.map.enable)
-
-    def reset_alarm(self) -> None:
-        """Reset an alarm, where the map can."""
-        self._write(self.axis.map.alarm_reset)
-
-    def set_comm_timeout(self, seconds: float) -> None:
-        """Make the drive stop by itself when the line is silent, where the map can."""
-        table = self.axis.map.comm_timeout
-        if table is not None:
-            self._write(table, {"timeout": max(1, round(seconds * table.per_s))})
-
-    def mirror_limits(self) -> None:
-        """Write the soft limits to the drive, where the map can."""
-        axis = self.axis
-        self._write(axis.map.limits, {"min": axis.min_pulses, "max": axis.max_pulses})
+    def write(self, table: Writes | None, **values: int) -> None:
+        """Send the frames of one of the map's tables; none where the map lacks it."""
+        order = self.axis.map.word_order
+        for frame in table.write if table else ():
+            words: list[int] = []
+            for value, kind in frame.words:
+                number = values[value] if isinstance(value, str) else value
+                words += encode(number, kind, order)
+            self.bus.write(self.axis.unit, frame.address, frame.function, words)
 
     def identity(self) -> dict[str, int | str]:
         """Read what the map calls identity; a register that refuses says so."""
-        m = self.axis.map
         found: dict[str, int | str] = {}
-        for name, read in m.identity.items():
+        for name, read in self.axis.map.identity.items():
             try:
-                found[name] = self.bus.read(self.axis.unit, read, m.word_order)
+                found[name] = self._read(read)
             except Rejected as error:
                 found[name] = f"exception {error.code}"
         return found
 
-    def _write(
-        self, table: Writes | None, values: dict[str, int] | None = None
-    ) -> None:
-        for frame in table.write if table else ():
-            words: list[int] = []
-            for word in frame.words:
-                if isinstance(word, int):
-                    words.append(word)
-                else:
-                    name, kind = word
-                    words += encode(
-                        (values or {})[name], kind, self.axis.map.word_order
-                    )
-            self.bus.write(self.axis.unit, frame.address, frame.function, words)
+    def _read(self, read: Read, retries: int | None = None) -> int:
+        unit, order = self.axis.unit, self.axis.map.word_order
+        words = self.bus.read_words(unit, read.address, read.count, retries)
+        return decode(words, read.type, order)

@@ -14,12 +14,9 @@ import re
 from collections import Counter, deque
 from typing import Any
 
-from rig.attitude import (
-    Array,
-    angle_between_deg,
-    euler_to_matrix,
-    quaternion_to_matrix,
-)
+from scipy.spatial.transform import Rotation
+
+from rig.attitude import Array, angle_between_deg, euler_to_matrix
 from rig.config.settings import ImuSettings
 
 MAX_LINE = 1024  # bytes; a phone's line has under 200
@@ -44,14 +41,6 @@ class _Dropped(ValueError):
 
 
 @dataclasses.dataclass(frozen=True)
-class Attitude:
-    """One record of the phone."""
-
-    stamp: float | None  # seconds on the phone's clock
-    matrix: Array  # (3, 3) phone to its world
-
-
-@dataclasses.dataclass(frozen=True)
 class Reading:
     """One accepted attitude on the computer's clock."""
 
@@ -65,7 +54,6 @@ class LineSplitter:
     def __init__(self) -> None:
         self._tail = b""
         self._skip = True  # the first line may be the end of one that began earlier
-        self.dropped = 0
 
     def feed(self, data: bytes) -> list[bytes]:
         """Complete lines, without their ends; empty and over-long ones are left out."""
@@ -74,13 +62,11 @@ class LineSplitter:
         lines = []
         for part in parts:
             if self._skip or len(part) > MAX_LINE:
-                self.dropped += bool(part)
                 self._skip = False
             elif part:
                 lines.append(part)
         if len(self._tail) > MAX_LINE:
             self._tail, self._skip = b"", True
-            self.dropped += 1
         return lines
 
 
@@ -96,6 +82,11 @@ class Parser:
     def __init__(self, settings: ImuSettings) -> None:
         self._settings = settings
         self._width = settings.column_count or None
+        self.counts: Counter[str] = Counter()
+        self.reconnected()
+
+    def reconnected(self) -> None:
+        """A new connection: the phone may have moved and its clock may have changed."""
         self._widths: deque[int] = deque(maxlen=RECOUNT)
         self._stamp: float | None = None
         self._odd = 0
@@ -104,57 +95,41 @@ class Parser:
         self._last: Array | None = None
         self._far: deque[Array] = deque(maxlen=REJOIN)
         self._zeros_from: float | None = None
-        self.counts: Counter[str] = Counter()
-
-    def reconnected(self) -> None:
-        """A new connection: the phone may have moved and its clock may have changed."""
-        self._stamp = None
-        self._offset = None
-        self._odd = 0
-        self._last = None
-        self._zeros_from = None
-        self._far.clear()
-        self._widths.clear()
 
     def lines(self, lines: list[bytes], now: float) -> list[Reading]:
-        """Readings of CSV lines that arrived together at ``now`` (monotonic s).
-
-        Raises:
-            StreamFault: the number of columns changed.
-        """
+        """Readings of CSV lines that arrived at ``now`` (monotonic s)."""
         return self._accept(lines, self._line, now)
 
     def body(self, body: bytes, now: float) -> list[Reading]:
         """Readings of one message Sensor Logger pushed."""
         try:
             payload = json.loads(body)["payload"]
-            if not isinstance(payload, list):
-                raise TypeError
+            entries = [
+                entry
+                for entry in payload
+                if isinstance(entry, dict) and entry.get("name") == "orientation"
+            ]
         except (ValueError, TypeError, KeyError, RecursionError):
             self.counts["not a Sensor Logger message"] += 1
             return []
-        entries = [
-            entry
-            for entry in payload
-            if isinstance(entry, dict) and entry.get("name") == "orientation"
-        ]
         return self._accept(entries, self._entry, now)
 
     def _accept(self, records: list[Any], parse: Any, now: float) -> list[Reading]:
         readings = []
         for record in records:
             try:
-                attitude = parse(record, now)
-                time = self._time(attitude.stamp, now)
-                self._gate(attitude.matrix)
+                stamp, matrix = parse(record, now)
+                time = self._time(stamp, now)
+                self._gate(matrix)
             except _Dropped as reason:
                 self.counts[str(reason)] += 1
                 continue
             self.counts["accepted"] += 1
-            readings.append(Reading(time, attitude.matrix))
+            readings.append(Reading(time, matrix))
         return readings
 
-    def _line(self, line: bytes, now: float) -> Attitude:
+    def _line(self, line: bytes, now: float) -> tuple[float | None, Array]:
+        """Seconds on the phone's clock, and (3, 3) phone to its world."""
         s = self._settings
         try:
             text = line.decode("ascii").strip(" \t\0")
@@ -172,12 +147,11 @@ class Parser:
         values = {column: _number(fields[column]) for column in used}
         stamp = values[s.stamp_column] / 1000.0 if s.stamp_column >= 0 else None
         if s.quaternion_columns:
-            numbers = [values[c] for c in s.quaternion_columns]
-            return Attitude(stamp, _quaternion(numbers))
+            return stamp, _quaternion([values[c] for c in s.quaternion_columns])
         angles = [values[c] for c in s.columns]
         if not any(angles):
             self._check_zeros(now)
-        return Attitude(stamp, self._euler(angles))
+        return stamp, self._euler(angles)
 
     def _check_width(self, fields: list[str], used: set[int]) -> None:
         width = len(fields)
@@ -207,9 +181,7 @@ class Parser:
 
     def _euler(self, values: list[float]) -> Array:
         s = self._settings
-        degrees = values
-        if s.unit == "rad":
-            degrees = [math.degrees(value) for value in values]
+        degrees = [*map(math.degrees, values)] if s.unit == "rad" else values
         middle = degrees[1]  # an arc sine
         if s.format == "lines":
             middle = math.remainder(middle, 360.0)  # some write -10 as 350
@@ -218,21 +190,17 @@ class Parser:
         signed = [v * sign for v, sign in zip(degrees, s.signs, strict=True)]
         return euler_to_matrix(signed, str(s.order))
 
-    def _entry(self, entry: dict[str, Any], now: float) -> Attitude:
+    def _entry(self, entry: dict[str, Any], now: float) -> tuple[float | None, Array]:
         values = entry.get("values")
         if not isinstance(values, dict):
             values = entry
-        numbers = [values.get(key) for key in ("qx", "qy", "qz", "qw")]
         stamp = entry.get("time")
         try:
-            return Attitude(
-                None if stamp is None else float(stamp) * 1e-9,
-                _quaternion([float(number) for number in numbers]),  # type: ignore[arg-type] # None raises TypeError, which is caught
-            )
-        except (TypeError, ValueError, OverflowError) as error:
-            if isinstance(error, _Dropped):
-                raise
+            numbers = [float(values[key]) for key in ("qx", "qy", "qz", "qw")]
+            seconds = None if stamp is None else float(stamp) * 1e-9
+        except (KeyError, TypeError, ValueError, OverflowError):
             raise _Dropped("no quaternion") from None
+        return seconds, _quaternion(numbers)
 
     def _time(self, stamp: float | None, now: float) -> float:
         """When the phone measured, on the computer's clock.
@@ -281,4 +249,4 @@ def _quaternion(values: list[float]) -> Array:
         raise _Dropped("not a number")
     if not 0.98 <= math.fsum(value * value for value in values) <= 1.02:
         raise _Dropped("a quaternion that is not of length one")
-    return quaternion_to_matrix(values)
+    return Rotation.from_quat(values).as_matrix()

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
-from rig.guard.faults import PauseRequested, StopRequested
+from rig.faults import PauseRequested, StopRequested
 
 
 class Signals:
@@ -41,13 +41,12 @@ class Signals:
             self.pause = True
             self._say("Ctrl-C: finishing this posture, then pausing; again to stop now")
             return
-        name = signal.Signals(number).name
-        self._stop = self._stop or StopRequested(name, 128 + number)
+        self.request_stop(signal.Signals(number).name, 128 + number)
         if not self.armed:
-            raise self._stop
+            self.check_stop()
 
     def request_stop(self, reason: str, exit_code: int) -> None:
-        """Ask for a stop from inside the program, as a signal would."""
+        """Ask for a stop; the first request is the one that is kept."""
         self._stop = self._stop or StopRequested(reason, exit_code)
 
     def check_stop(self) -> None:

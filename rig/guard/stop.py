@@ -12,9 +12,10 @@ import dataclasses
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 from rig.device.drives import Drive
-from rig.guard.faults import EXIT_FAULT, StopRequested
+from rig.faults import EXIT_FAULT, StopRequested
 
 ROUNDS = 3  # times a stop is sent to a unit that does not acknowledge
 VERIFY_S = 3.0  # for all units together to come to rest
@@ -34,32 +35,26 @@ class UnitStop:
     def __str__(self) -> str:
         state = "acknowledged" if self.acknowledged else "NOT acknowledged"
         rest = "standing" if self.standing else "NOT seen standing"
-        return f"{self.axis} (unit {self.unit}): {state}, {rest}" + (
-            f" ({self.detail})" if self.detail else ""
-        )
+        detail = f" ({self.detail})" if self.detail else ""
+        return f"{self.axis} (unit {self.unit}): {state}, {rest}{detail}"
 
 
-def stop_all(drives: list[Drive], verify_s: float = VERIFY_S) -> list[UnitStop]:
-    """Quick-stop every drive; never raises, never leaves one out.
+def stop_all(drives: list[Drive]) -> list[UnitStop]:
+    """Quick-stop every drive, and wait for them to come to rest.
 
-    Args:
-        drives: the units; one that fails does not keep the others from their stop.
-        verify_s: how long to wait for them to come to rest.
-
-    Returns:
-        One entry a drive, in order.
+    Never raises, never leaves one out: one that fails does not keep the others from
+    their stop.
     """
     results = [UnitStop(d.axis.name, d.axis.unit) for d in drives]
+    pairs = list(zip(drives, results, strict=True))
     for _ in range(ROUNDS):
-        for drive, result in zip(drives, results, strict=True):
+        for drive, result in pairs:
             if not result.acknowledged:
                 _send(drive, result)
-        if all(result.acknowledged for result in results):
-            break
-    end = time.monotonic() + verify_s
-    before: list[int | None] = [None] * len(drives)
+    end = time.monotonic() + VERIFY_S
+    before: dict[str, int] = {}
     while not all(result.standing for result in results):
-        for index, (drive, result) in enumerate(zip(drives, results, strict=True)):
+        for drive, result in pairs:
             if result.standing:
                 continue
             try:
@@ -69,8 +64,9 @@ def stop_all(drives: list[Drive], verify_s: float = VERIFY_S) -> list[UnitStop]:
                 continue
             if not result.acknowledged:
                 _send(drive, result)
-            result.standing = not status.moving and status.position == before[index]
-            before[index] = status.position
+            still = status.position == before.get(result.axis)
+            result.standing = still and not status.moving
+            before[result.axis] = status.position
             if result.standing and result.acknowledged:
                 result.detail = "alarm" if status.fault else ""
         if time.monotonic() > end:
@@ -94,18 +90,13 @@ class Stopper:
     def __init__(
         self,
         drives: list[Drive],
-        report: Callable[[str, list[UnitStop]], None] | None = None,
+        emit: Callable[..., Any] = lambda event, **fields: None,
     ) -> None:
         self.drives = drives
-        self.reason = ""
+        self.reason = ""  # of the stop that has latched
         self.results: list[UnitStop] = []
-        self._report = report
+        self._emit = emit
         self._lock = threading.RLock()
-
-    @property
-    def latched(self) -> bool:
-        """Whether a stop has latched."""
-        return bool(self.reason)
 
     def stop(self, reason: str, latch: bool = True) -> list[UnitStop]:
         """Stop every unit now; the first reason is the one that is kept."""
@@ -113,8 +104,8 @@ class Stopper:
             if latch and not self.reason:
                 self.reason = reason or "stopped"
             self.results = stop_all(self.drives)
-            if self._report is not None:
-                self._report(reason, self.results)
+            units = [dataclasses.asdict(result) for result in self.results]
+            self._emit("stop", reason=reason, units=units)
             return self.results
 
     def check(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 
@@ -9,7 +10,7 @@ from rig.device.bus import BusError
 from rig.guard.stop import Stopper
 
 
-class Heartbeat:
+class Heartbeat(threading.Thread):
     """A thread that stops the drives when the motion loop is silent for too long.
 
     It also keeps the line alive for drives that watch their communication while the
@@ -17,20 +18,13 @@ class Heartbeat:
     """
 
     def __init__(self, stopper: Stopper, silence_s: float, keep_alive_s: float) -> None:
+        super().__init__(name="heartbeat", daemon=True)
         self._stopper = stopper
         self._silence_s = silence_s
         self._keep_alive_s = keep_alive_s
         self._moving = False
         self._fed = time.monotonic()
         self._closing = threading.Event()
-        self._thread = threading.Thread(
-            target=self._watch, name="heartbeat", daemon=True
-        )
-
-    def start(self) -> Heartbeat:
-        """Begin to watch."""
-        self._thread.start()
-        return self
 
     def feed(self, moving: bool) -> None:
         """The motion loop is alive; ``moving``: it must be heard again soon."""
@@ -38,12 +32,11 @@ class Heartbeat:
         self._fed = time.monotonic()
 
     def close(self) -> None:
-        """End the thread."""
         self._closing.set()
-        if self._thread.is_alive():
-            self._thread.join(2.0)
+        if self.is_alive():
+            self.join(2.0)
 
-    def _watch(self) -> None:
+    def run(self) -> None:
         while not self._closing.wait(0.05):
             silence = time.monotonic() - self._fed
             if self._moving and silence > self._silence_s:
@@ -51,8 +44,6 @@ class Heartbeat:
                 return
             if not self._moving and self._keep_alive_s and silence > self._keep_alive_s:
                 for drive in self._stopper.drives:
-                    try:
+                    with contextlib.suppress(BusError):  # the plan's own reads find it
                         drive.status(retries=0)
-                    except BusError:
-                        continue  # the plan thread finds out by its own reads
                 self._fed = time.monotonic()

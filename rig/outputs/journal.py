@@ -7,6 +7,7 @@ by the next writer; any other damage is an error, never a guess.
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import json
 import os
@@ -15,43 +16,43 @@ import threading
 import time
 from typing import Any
 
+from rig.faults import Fault
 
-class JournalError(RuntimeError):
+Record = dict[str, Any]
+
+
+class JournalError(Fault):
     """The journal cannot be written, or is damaged."""
 
 
-def _parse(data: bytes, path: pathlib.Path) -> tuple[list[dict[str, Any]], int]:
+def _parse(data: bytes, path: pathlib.Path) -> tuple[list[Record], int]:
     """Records and the length in bytes of the undamaged part."""
-    records: list[dict[str, Any]] = []
+    records: list[Record] = []
     good = 0
-    lines = data.split(b"\n")
-    for number, line in enumerate(lines[:-1]):
+    *lines, tail = data.split(b"\n")
+    for number, line in enumerate(lines):
         try:
             record = json.loads(line)
-            if record["seq"] != number:
-                raise ValueError
+            whole = record["seq"] == number
         except (ValueError, KeyError, TypeError):
-            if number == len(lines) - 2 and lines[-1] == b"":
+            whole = False
+        if not whole:
+            if number == len(lines) - 1 and not tail:
                 break  # the last line, whole but mangled: also torn
             raise JournalError(
                 f"{path}: line {number + 1} is damaged; the run cannot be resumed"
-            ) from None
+            )
         records.append(record)
         good += len(line) + 1
     return records, good
 
 
-def read_journal(path: pathlib.Path) -> list[dict[str, Any]]:
-    """All whole records.
-
-    Raises:
-        JournalError: unreadable, or damaged before its last line.
-    """
+def read_journal(path: pathlib.Path) -> list[Record]:
+    """All whole records; JournalError where one before the last is damaged."""
     try:
-        data = path.read_bytes()
+        return _parse(path.read_bytes(), path)[0]
     except OSError as error:
         raise JournalError(f"{path}: {error.strerror or error}") from None
-    return _parse(data, path)[0]
 
 
 class Journal:
@@ -59,7 +60,6 @@ class Journal:
 
     def __init__(self, path: pathlib.Path) -> None:
         self.path = path
-        self.records: list[dict[str, Any]] = []
         self._lock = threading.Lock()
         flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
         try:
@@ -68,31 +68,24 @@ class Journal:
             raise JournalError(f"{path}: {error.strerror or error}") from None
         try:
             fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            os.close(self._fd)
-            raise JournalError(f"{path}: a running session is writing it") from None
-        data = path.read_bytes()
-        try:
-            self.records, self._size = _parse(data, path)
-        except JournalError:
-            os.close(self._fd)
-            raise
-        if self._size != len(data):
+            self.records, self._size = _parse(path.read_bytes(), path)
             os.ftruncate(self._fd, self._size)
+        except BlockingIOError:
+            self.close()
+            raise JournalError(f"{path}: a running session is writing it") from None
+        except BaseException:
+            self.close()
+            raise
 
-    def write(self, event: str, *, sync: bool = False, **fields: Any) -> dict[str, Any]:
+    def write(self, event: str, *, sync: bool = False, **fields: Any) -> Record:
         """Append one record; with ``sync`` it is on the disk when this returns.
 
         Raises:
             JournalError: the disk is full or gone; the journal keeps its whole lines.
         """
         with self._lock:
-            record = {
-                "seq": len(self.records),
-                "time": round(time.time(), 4),
-                "event": event,
-                **fields,
-            }
+            now = round(time.time(), 4)
+            record = {"seq": len(self.records), "time": now, "event": event, **fields}
             line = json.dumps(record, allow_nan=False, separators=(",", ":")) + "\n"
             data = line.encode()
             try:
@@ -102,7 +95,8 @@ class Journal:
                 if sync:
                     os.fsync(self._fd)
             except OSError as error:
-                self._cut()
+                with contextlib.suppress(OSError):  # or the next writer cuts it off
+                    os.ftruncate(self._fd, self._size)
                 raise JournalError(
                     f"cannot write {self.path}: {error.strerror or error}"
                 ) from None
@@ -110,16 +104,9 @@ class Journal:
             self.records.append(record)
             return record
 
-    def _cut(self) -> None:
-        try:
-            os.ftruncate(self._fd, self._size)
-        except OSError:
-            return  # the torn line is cut off by the next writer
-
-    def events(self, event: str) -> list[dict[str, Any]]:
+    def events(self, event: str) -> list[Record]:
         """Records of one kind."""
         return [record for record in self.records if record["event"] == event]
 
     def close(self) -> None:
-        """Close the file."""
         os.close(self._fd)

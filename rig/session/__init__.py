@@ -1,5 +1,5 @@
 """One run of the device: plan, move, settle, measure, identify.
 
-``motion`` and ``measuring`` are the path from a posture to the motors and back; they
-import the device and its guards and nothing else.
+``device``, ``motion`` and ``measuring`` are the path from a posture to the motors and
+back; beside each other they import ``rig.config``, ``rig.device`` and ``rig.guard``.
 """

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import numpy as np
 
 from rig.attitude import Array
-from rig.config.axis import AXIS_NAMES
-from rig.guard.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault
+from rig.config import AXIS_NAMES
+from rig.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault
 from rig.guard.limits import check_plan
 from rig.outputs.console import plan_lines, summary_lines
-from rig.session.folder import Record
+from rig.outputs.journal import Record
 from rig.session.identification import (
     errors,
     fit,
+    mean_variance,
     order_residuals,
-    reading_noise,
     uncertainty,
-    zero_variance,
 )
 from rig.session.planning import (
     Choice,
@@ -27,31 +27,36 @@ from rig.session.planning import (
     draw_held_out,
     travel_order,
 )
-from rig.session.run import DRY_RUN, Run
+from rig.session.run import Run
 
 
-def calibrate(run: Run, dry_run: bool = False) -> int:
+def calibrate(run: Run) -> int:
     """Run the whole session; returns the exit code."""
     config, session = run.config, run.config.session
     candidates, choice = _plan(run)
     check_plan(config, [tuple(candidates[i].tolist()) for i in choice.indices])
-    if dry_run:
-        run.say(DRY_RUN)
-        return EXIT_OK
     run.planned = session.k + 2 * session.verify_postures + 1
     if run.zero_pulses is None:
         run.ready()
     chosen = _visit_chosen(run, candidates, choice)
-    run.phase("saving")
-    first = fit(chosen, reading_noise(chosen))
+    run.emit("phase", phase="saving")
+    first = fit(chosen)
     first.save(run.folder / "calibration.partial.json")
     held = _held_out(run, first)
     run.planned = session.k + 2 * len(held) + 1
-    before, after, desired = visit_pairs(run, held)
+    held_out, off = visit_pairs(run, held)
     end = run.visit("reference:end", run.zero_pulses, role="reference")
     run.say("drives at rest; identifying")
-    drift = None if end is None else float(np.abs(end["measured_deg"]).max())
-    return _finish(run, chosen, before, after, desired, choice, drift)
+    run.emit("phase", phase="finishing")
+    run.stop("", latch=False)
+    run.disarm()
+    run.signals.check_stop()
+    summary = _identify(run, first, chosen, held_out) | off
+    summary["choice"] = dataclasses.asdict(choice)
+    summary["drift_deg"] = None
+    if end is not None:
+        summary["drift_deg"] = float(np.abs(end["measured_deg"]).max())
+    return _save(run, summary)
 
 
 def _plan(run: Run) -> tuple[Array, Choice]:
@@ -61,16 +66,18 @@ def _plan(run: Run) -> tuple[Array, Choice]:
     def make() -> dict[str, Any]:
         candidates = draw_candidates(config)
         choice = choose(config, config.to_deg(candidates))
-        return {"candidates": candidates.tolist(), "choice": choice.described()}
+        return {
+            "candidates": candidates.tolist(),
+            "choice": dataclasses.asdict(choice),
+        }
 
     record = run.remember("plan", make)
     candidates, choice = np.array(record["candidates"]), Choice(**record["choice"])
     start = config.to_deg(run.zero_pulses or (0, 0, 0))
     chosen = np.array(choice.indices)
     order = chosen[travel_order(config, config.to_deg(candidates[chosen]), start)]
-    shown = Choice(**{**choice.described(), "indices": tuple(order.tolist())})
-    for line in plan_lines(config, shown, candidates, start):
-        run.say(line)
+    shown = dataclasses.replace(choice, indices=tuple(order.tolist()))
+    run.say(*plan_lines(config, shown, candidates, start))
     return candidates, choice
 
 
@@ -79,36 +86,33 @@ def _visit_chosen(run: Run, candidates: Array, choice: Choice) -> list[Record]:
     config, degrees = run.config, run.config.to_deg(candidates)
     available = np.ones(len(candidates), dtype=bool)
     records: dict[int, Record] = {}
-    start = config.to_deg(run.zero_pulses)
-    plans = run.journal.events("replan")
+    here = config.to_deg(run.zero_pulses)
+    plans = iter(run.journal.events("replan"))
     while True:
         left = np.array([i for i in choice.indices if i not in records], dtype=int)
-        here = degrees[list(records)[-1]] if records else start
-        failed = None
         for index in left[travel_order(config, degrees[left], here)].tolist():
             record = run.visit(
                 f"select:{index}", candidates[index], role="select", index=index
             )
             if record is None:
-                failed = index
                 break
-            records[index] = record
-        if failed is None:
+            records[index], here = record, degrees[index]
+        else:
             return list(records.values())
-        available[failed] = False
+        available[index] = False
         lost = int((~available).sum())
         if lost > config.session.max_unreachable:
             raise MotionFault(
                 f"{lost} postures are out of reach, more than session.max_unreachable "
                 f"({config.session.max_unreachable}). Check the ranges"
             )
-        if len(plans) >= lost:
-            choice = Choice(**plans[lost - 1]["choice"])
-        else:
+        plan = next(plans, None)
+        if plan is None:
             choice = choose(config, degrees, available, tuple(records), replanning=True)
-            run.journal.write("replan", sync=True, choice=choice.described())
+            plan = run.emit("replan", sync=True, choice=dataclasses.asdict(choice))
+        choice = Choice(**plan["choice"])
         run.say(
-            f"  selected again without {failed}: log det {choice.log_det:.4f}, "
+            f"  selected again without {index}: log det {choice.log_det:.4f}, "
             f"{len(records)} measured postures kept"
         )
 
@@ -129,7 +133,7 @@ def _held_out(run: Run, calibration: Any) -> list[Any]:
         return known[-1]["pairs"]
     stale = [n for n in run.postures() if n.startswith(("before:", "after:"))]
     if stale:
-        run.journal.write("void", sync=True, names=stale)
+        run.emit("void", sync=True, names=stale)
     wanted = run.config.session.verify_postures
     found = draw_held_out(run.config, calibration, wanted)
     if len(found) < wanted:
@@ -137,57 +141,46 @@ def _held_out(run: Run, calibration: Any) -> list[Any]:
             f"  note: only {len(found)} of {wanted} held-out targets can be reached "
             "compensated within the ranges"
         )
-    return run.journal.write("held_out", sync=True, pairs=found)["pairs"]
+    return run.emit("held_out", sync=True, pairs=found)["pairs"]
 
 
-def visit_pairs(run: Run, held: list[Any]) -> tuple[list[Record], list[Record], Array]:
+def visit_pairs(run: Run, held: list[Any]) -> tuple[list[Record], dict[str, Any]]:
     """Visit held-out targets raw and compensated, in the order of least travel.
 
     Returns:
-        Records before and after compensation, and the (N, 3) desired degrees, of the
-        targets of which both could be reached.
+        The records, and the errors ``before`` and ``after`` compensation, of the
+        targets of which both could be reached; no errors where there are none.
     """
-    config = run.config
-    visits = [(f"before:{i}", raw) for i, (raw, _) in enumerate(held)]
-    visits += [(f"after:{i}", command) for i, (_, command) in enumerate(held)]
-    points = config.to_deg([pulses for _, pulses in visits] or np.empty((0, 3)))
-    found: dict[str, Record | None] = {}
-    for number in travel_order(
-        config, points, config.to_deg(run.zero_pulses or (0, 0, 0))
-    ):
-        name, pulses = visits[number]
-        found[name] = run.visit(name, pulses, role=name.partition(":")[0])
-    before, after, desired = [], [], []
-    for i, (raw, _) in enumerate(held):
-        one, two = found[f"before:{i}"], found[f"after:{i}"]
-        if one is not None and two is not None:
-            before.append(one)
-            after.append(two)
-            desired.append(config.to_deg(raw))
-    return before, after, np.array(desired).reshape(-1, 3)
+    config, roles = run.config, ("before", "after")
+    visits = [
+        (f"{role}:{i}", role, pair[number])
+        for number, role in enumerate(roles)
+        for i, pair in enumerate(held)
+    ]
+    points = config.to_deg([pulses for *_, pulses in visits] or np.empty((0, 3)))
+    start = config.to_deg(run.zero_pulses or (0, 0, 0))
+    found: dict[str, Record] = {}
+    for number in travel_order(config, points, start):
+        name, role, pulses = visits[number]
+        if record := run.visit(name, pulses, role=role):
+            found[name] = record
+    both = [i for i in range(len(held)) if found.keys() >= {f"{r}:{i}" for r in roles}]
+    if not both:
+        return [], {}
+    records = {role: [found[f"{role}:{i}"] for i in both] for role in roles}
+    desired = config.to_deg([held[i][0] for i in both])
+    off = {role: errors(records[role], desired) for role in roles}
+    return records["before"] + records["after"], off
 
 
-def _finish(
-    run: Run,
-    chosen: list[Record],
-    before: list[Record],
-    after: list[Record],
-    desired: Array,
-    choice: Choice,
-    drift: float | None,
-) -> int:
-    """Stop the drives, close the bus; then identify, check, save, report."""
+def _identify(
+    run: Run, first: Any, chosen: list[Record], held_out: list[Record]
+) -> dict[str, Any]:
+    """Identify A and b, save calibration.json; what the summary says of them."""
     assert run.frame is not None
     config = run.config
-    run.phase("finishing")
-    if run.motion is not None:
-        run.stop("", latch=False)
-        run.disarm()
-    run.signals.check_stop()
     zero = run.journal.events("zero")[-1]
-    limits = uncertainty(
-        fit(chosen, reading_noise(chosen)), chosen, before + after, zero
-    )
+    limits = uncertainty(first, chosen, held_out, zero)
     shared = {
         "zero_pulses": list(run.zero_pulses or ()),
         "fingerprint": config.fingerprint(),
@@ -198,10 +191,12 @@ def _finish(
         "noise_from": limits["basis"],
         "run": run.folder.name,
     }
-    noise = max(1e-9, float(np.mean(limits["noise_std_deg"])))
-    zero_std = float(np.sqrt(zero_variance(zero).mean()))
+    noise = float(np.mean(limits["noise_std_deg"]))
+    zero_std = float(np.sqrt(mean_variance(zero).mean()))
     calibration = fit(chosen, noise, notes, zero_std)
-    summary: dict[str, Any] = {
+    calibration.save(run.folder / "calibration.json")
+    (run.folder / "calibration.partial.json").unlink(missing_ok=True)
+    return {
         "schema": 1,
         "mode": "calibrate",
         "axes": list(AXIS_NAMES),
@@ -210,27 +205,22 @@ def _finish(
         "b": np.asarray(calibration.bias).tolist(),
         **limits,
         **shared,
-        "choice": choice.described(),
-        "drift_deg": drift,
-        "orders": order_residuals(config, run.frame, chosen + before + after),
+        "orders": order_residuals(config, run.frame, chosen + held_out),
         "simulated": run.journal.records[0].get("simulated"),
     }
-    code = EXIT_OK
-    if before:
-        summary["before"] = errors(before, desired)
-        summary["after"] = errors(after, desired)
-        if summary["after"]["max"] > config.session.verify_limit_deg:
-            code = EXIT_RECALIBRATE
-    calibration.save(run.folder / "calibration.json")
-    (run.folder / "calibration.partial.json").unlink(missing_ok=True)
-    run.save_pairs()
-    run.save_summary(summary)
+
+
+def _save(run: Run, summary: dict[str, Any]) -> int:
+    """Write pairs, summary and report, say what they hold; returns the exit code."""
     from rig.outputs.report import write_report
 
+    run.save_pairs()
+    run.save_summary(summary)
     write_report(run.folder, summary, run.journal.records[0], run.postures())
-    for line in summary_lines(summary, config.session.verify_limit_deg):
-        run.say(line)
+    limit = run.config.session.verify_limit_deg
     run.say(
-        f"saved: {run.folder}/calibration.json, pairs.csv, summary.json, report.html"
+        *summary_lines(summary, limit),
+        f"saved: {run.folder}/calibration.json, pairs.csv, summary.json, report.html",
     )
-    return code
+    off = "after" in summary and summary["after"]["max"] > limit
+    return EXIT_RECALIBRATE if off else EXIT_OK

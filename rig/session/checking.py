@@ -10,15 +10,15 @@ import numpy as np
 from jaxcal.files import atomic_write
 from rig.attitude import Array
 from rig.config.axis import Pulses
-from rig.guard.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
-from rig.outputs.console import numbers
+from rig.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
+from rig.outputs.console import error_text, numbers
 from rig.session.calibrate import visit_pairs
-from rig.session.identification import errors, pairs
-from rig.session.planning import draw_collection, draw_held_out
-from rig.session.run import DRY_RUN, Run
+from rig.session.identification import pairs
+from rig.session.planning import draw, draw_held_out
+from rig.session.run import Run
 
 
-def collect(run: Run, count: int, dry_run: bool = False) -> int:
+def collect(run: Run, count: int) -> int:
     """Record ``count`` random postures: the paper's Datasets 4 and 5.
 
     Writes pairs.csv and dataset.npz with ``candidates`` and ``measured`` of shape
@@ -26,44 +26,34 @@ def collect(run: Run, count: int, dry_run: bool = False) -> int:
     """
     config = run.config
     targets = run.remember(
-        "collection", lambda: {"pulses": draw_collection(config, count).tolist()}
+        "collection", lambda: {"pulses": draw(config, count, 2).tolist()}
     )["pulses"]
-    if dry_run:
+    if run.dry_run:
         for number, target in enumerate(targets):
             run.say(f"  {number:>5}   {numbers(config.to_deg(target))}   {target}")
-        run.say(DRY_RUN)
-        return EXIT_OK
     run.planned = len(targets)
     for number, target in enumerate(targets):
         run.visit(f"collect:{number}", target, role="collect")
-    run.phase("saving")
-    records = list(run.postures().values())
-    size = config.session.candidates
-    commands, measured = pairs(records)
-    episodes = len(records) // size
-    if episodes == 0:
-        episodes, size = 1, len(records)
+    run.emit("phase", phase="saving")
+    commands, measured = pairs(list(run.postures().values()))
+    size = min(config.session.candidates, len(commands))
+    episodes = len(commands) // max(1, size)
     run.save_pairs()
-    whole, shape = episodes * size, (episodes, size, 3)
     with atomic_write(run.folder / "dataset.npz") as file:
         np.savez(
             file,
-            candidates=commands[:whole].reshape(shape),
-            measured=measured[:whole].reshape(shape),
+            candidates=commands[: episodes * size].reshape(episodes, size, 3),
+            measured=measured[: episodes * size].reshape(episodes, size, 3),
         )
     run.say(
-        f"saved: {run.folder}/pairs.csv ({len(records)} postures), dataset.npz "
+        f"saved: {run.folder}/pairs.csv ({len(commands)} postures), dataset.npz "
         f"({episodes} x {size})"
     )
     return EXIT_OK
 
 
 def load_calibration(path: pathlib.Path) -> tuple[Any, Pulses | None]:
-    """A saved calibration and the pulses of its zero posture (None where unknown).
-
-    Raises:
-        Refused: it cannot be read.
-    """
+    """A saved calibration and the pulses of its zero posture (None where unknown)."""
     import jaxcal
 
     if path.is_dir():
@@ -72,14 +62,14 @@ def load_calibration(path: pathlib.Path) -> tuple[Any, Pulses | None]:
         calibration = jaxcal.Calibration.load(path)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise Refused(f"{path}: not a calibration: {error}") from None
-    notes = calibration.provenance.get("notes", {})
-    if "zero_pulses" not in notes:
+    zero = calibration.provenance.get("notes", {}).get("zero_pulses")
+    if zero is None:
         return calibration, None
-    a, b, c = (int(value) for value in notes["zero_pulses"])
+    a, b, c = map(int, zero)
     return calibration, (a, b, c)
 
 
-def verify(run: Run, calibration: Any, count: int, dry_run: bool = False) -> int:
+def verify(run: Run, calibration: Any, count: int) -> int:
     """Fresh held-out postures against a saved calibration: is it still true?"""
     config = run.config
     held = run.remember(
@@ -88,20 +78,17 @@ def verify(run: Run, calibration: Any, count: int, dry_run: bool = False) -> int
     if not held:
         raise Refused("no target in the ranges can be reached through this calibration")
     run.planned = 2 * len(held)
-    if dry_run:
+    if run.dry_run:
         for raw, command in held:
             run.say(f"  target {numbers(config.to_deg(raw))}  command {list(command)}")
-        run.say(DRY_RUN)
-        return EXIT_OK
-    before, after, desired = visit_pairs(run, held)
-    if not before:
+    records, found = visit_pairs(run, held)
+    if not found:
         raise Refused("no held-out posture could be reached")
-    found = {"before": errors(before, desired), "after": errors(after, desired)}
-    commands, measured = pairs(before + after)
+    commands, measured = pairs(records)
     off = measured - calibration.predict(commands)
-    limit, worst = config.session.verify_limit_deg, found["after"]["max"]
-    again = bool(worst > limit)
-    run.phase("saving")
+    limit = config.session.verify_limit_deg
+    again = found["after"]["max"] > limit
+    run.emit("phase", phase="saving")
     run.save_pairs()
     run.save_summary(
         {
@@ -111,24 +98,13 @@ def verify(run: Run, calibration: Any, count: int, dry_run: bool = False) -> int
             "recalibrate": again,
         }
     )
-    run.say(
-        f"error raw {found['before']['rms']:.4f} deg rms (max "
-        f"{found['before']['max']:.4f}), compensated {found['after']['rms']:.4f} (max "
-        f"{worst:.4f}), limit {limit:g}"
-    )
+    run.say(f"{error_text(found)}, limit {limit:g}")
     run.say("RECALIBRATE: over the limit" if again else "the calibration still holds")
     return EXIT_RECALIBRATE if again else EXIT_OK
 
 
-def goto(run: Run, calibration: Any, desired: Array, dry_run: bool = False) -> int:
-    """Move the end-effector to a desired posture through a calibration.
-
-    Args:
-        run: the run.
-        calibration: gives ``command_for``.
-        desired: (3,) degrees.
-        dry_run: move nothing.
-    """
+def goto(run: Run, calibration: Any, desired: Array) -> int:
+    """Move the end-effector to (3,) desired degrees through a calibration."""
     config = run.config
     command = np.asarray(calibration.command_for(desired), dtype=np.float64)
     for axis, value in zip(config.axes, command, strict=True):
@@ -142,9 +118,6 @@ def goto(run: Run, calibration: Any, desired: Array, dry_run: bool = False) -> i
         f"desired {desired.tolist()} deg: command {command.round(4).tolist()} deg, "
         f"pulses {list(pulses)}"
     )
-    if dry_run:
-        run.say(DRY_RUN)
-        return EXIT_OK
     run.planned = 1
     record = run.visit("goto", pulses, role="goto")
     if record is None:

@@ -8,38 +8,44 @@ from typing import Any
 import numpy as np
 
 from rig.attitude import ORDERS, Array, Frame
-from rig.config.axis import AXIS_NAMES
-from rig.config.config import RigConfig
+from rig.config import AXIS_NAMES, RigConfig
+from rig.outputs.journal import Record
 
 
-def pairs(records: list[dict[str, Any]]) -> tuple[Array, Array]:
+def pairs(records: list[Record]) -> tuple[Array, Array]:
     """(N, 3) commands and (N, 3) measurements in degrees of posture records."""
-    commands = np.array([r["commanded_deg"] for r in records], dtype=np.float64)
-    measured = np.array([r["measured_deg"] for r in records], dtype=np.float64)
-    return commands.reshape(-1, 3), measured.reshape(-1, 3)
+    commands = np.array([r["commanded_deg"] for r in records]).reshape(-1, 3)
+    return commands, np.array([r["measured_deg"] for r in records]).reshape(-1, 3)
+
+
+def mean_variance(record: Record) -> Array:
+    """(3,) degrees squared, of the mean of a posture's or the zero's readings."""
+    return np.array(record["std_deg"]) ** 2 / record["samples"]
 
 
 def fit(
-    records: list[dict[str, Any]],
-    noise_std: float,
-    notes: dict[str, Any] | None = None,
+    records: list[Record],
+    noise_std: float | None = None,
+    notes: Record | None = None,
     zero_std: float = 0.0,
 ) -> Any:
     """``jaxcal.identify`` on posture records.
 
     Args:
         records: chosen postures.
-        noise_std: degrees, of one recorded mean.
+        noise_std: degrees, of one recorded mean; from the scatter of its readings when
+            not given.
         notes: stored in the calibration's file.
         zero_std: degrees, of the zero reference. It shifts every output equally, so it
             adds to the variance of the outputs' mean.
     """
     import jaxcal
 
-    commands, measured = pairs(records)
+    if noise_std is None:
+        noise_std = np.sqrt(np.mean([mean_variance(r) for r in records]))
+    noise_std = max(1e-9, float(noise_std))
     fitted = jaxcal.identify(
-        commands,
-        measured,
+        *pairs(records),
         noise_std=noise_std,
         input_names=AXIS_NAMES,
         output_names=AXIS_NAMES,
@@ -47,17 +53,12 @@ def fit(
         measured_unit="deg",
         notes=notes,
     )
-    shift = (zero_std / noise_std) ** 2
-    return dataclasses.replace(
-        fitted, total_weight=1.0 / (1.0 / fitted.total_weight + shift)
-    )
+    total = 1.0 / (1.0 / fitted.total_weight + (zero_std / noise_std) ** 2)
+    return dataclasses.replace(fitted, total_weight=total)
 
 
 def uncertainty(
-    calibration: Any,
-    chosen: list[dict[str, Any]],
-    held_out: list[dict[str, Any]],
-    zero: dict[str, Any],
+    calibration: Any, chosen: list[Record], held_out: list[Record], zero: Record
 ) -> dict[str, Any]:
     """Noise of one recorded mean and 95 % half-widths of A and b.
 
@@ -77,62 +78,43 @@ def uncertainty(
     """
     from scipy import stats
 
+    inverse = calibration.unit_covariance  # of (slopes, bias), for noise of 1 degree
     commands, measured = pairs(chosen)
-    design = np.column_stack([commands, np.ones(len(commands))])
-    inverse = np.linalg.inv(design.T @ design)
-    residual = measured - calibration.predict(commands)
-    dof = len(commands) - 4
-    squares = (residual**2).sum(axis=0)
+    squares = ((measured - calibration.predict(commands)) ** 2).sum()
+    dof = 3 * (len(chosen) - 4)
     basis = ["residuals of the chosen postures"] if dof else []
     if held_out:
         u, y = pairs(held_out)
         rows = np.column_stack([u, np.ones(len(u))])
-        errors = y - calibration.predict(u)
         # Prediction errors share the fitted parameters: whiten them by their joint
         # covariance, I + Z (Z_s' Z_s)^-1 Z', up to the noise variance looked for.
         covariance = np.eye(len(u)) + rows @ inverse @ rows.T
-        white = np.linalg.solve(np.linalg.cholesky(covariance), errors)
-        squares = squares + (white**2).sum(axis=0)
-        dof += len(u)
+        off = y - calibration.predict(u)
+        squares += (np.linalg.solve(np.linalg.cholesky(covariance), off) ** 2).sum()
+        dof += 3 * len(u)
         basis.append("held-out predictions")
     if dof:
         # One sensor measures the three axes; pooling triples the degrees of freedom.
-        variance = np.full(3, squares.sum() / (3 * dof))
-        law = stats.t(3 * dof)
+        variance, law = np.full(3, squares / dof), stats.t(dof)
     else:
-        std = np.array([r["std_deg"] for r in chosen])
-        counts = np.array([[r["samples"]] for r in chosen])
-        variance = (std**2 / counts).mean(axis=0)
+        variance = np.mean([mean_variance(r) for r in chosen], axis=0)
         law = stats.norm()
         basis = ["scatter of single readings only"]
-    spread = variance[:, None] * np.diag(inverse)[None, :]
-    spread[:, 3] += zero_variance(zero)
+    spread = np.outer(variance, np.diag(inverse))
+    spread[:, 3] += mean_variance(zero)
     one, all_twelve = law.ppf([1 - 0.05 / 2, 1 - 0.05 / 2 / spread.size])
     return {
         "noise_std_deg": np.sqrt(variance).tolist(),
-        "dof": 3 * dof,
+        "dof": dof,
         "basis": " and ".join(basis),
         "ci95": (all_twelve * np.sqrt(spread)).tolist(),
         "ci95_each": (one * np.sqrt(spread)).tolist(),
     }
 
 
-def reading_noise(records: list[dict[str, Any]]) -> float:
-    """Degrees, of a recorded mean as the scatter of its readings has it."""
-    std = np.array([r["std_deg"] for r in records])
-    counts = np.array([[r["samples"]] for r in records])
-    return float(max(1e-9, np.sqrt((std**2 / counts).mean())))
-
-
-def zero_variance(zero: dict[str, Any]) -> Array:
-    """(3,) degrees squared, of the zero reference."""
-    return np.array(zero["std_deg"]) ** 2 / zero["samples"]
-
-
-def errors(records: list[dict[str, Any]], desired: Array) -> dict[str, Any]:
+def errors(records: list[Record], desired: Array) -> dict[str, Any]:
     """Statistics of measured minus desired, degrees, an axis and overall."""
-    _, measured = pairs(records)
-    difference = measured - desired
+    difference = pairs(records)[1] - desired
     return {
         "rms_axis": np.sqrt((difference**2).mean(axis=0)).tolist(),
         "rms": float(np.sqrt((difference**2).mean())),
@@ -142,7 +124,7 @@ def errors(records: list[dict[str, Any]], desired: Array) -> dict[str, Any]:
 
 
 def order_residuals(
-    config: RigConfig, frame: Frame, records: list[dict[str, Any]]
+    config: RigConfig, frame: Frame, records: list[Record]
 ) -> dict[str, Any]:
     """Residual of the linear fit under each of the six mechanism orders.
 
@@ -152,18 +134,16 @@ def order_residuals(
     Returns:
         rms (order to degrees), configured, best, warning (empty where all is well).
     """
+    configured = config.mechanism.order
     if len(records) < 6:
-        return {"rms": {}, "configured": config.mechanism.order, "warning": ""}
-    commands, _ = pairs(records)
-    design = np.column_stack([commands, np.ones(len(commands))])
+        return {"rms": {}, "configured": configured, "warning": ""}
+    design = np.column_stack([pairs(records)[0], np.ones(len(records))])
+    across = np.eye(len(records)) - design @ np.linalg.pinv(design)
     attitudes = np.array([r["attitude"] for r in records])
     rms: dict[str, float] = {}
     for order in ORDERS:
-        angles = frame.angles(attitudes, order)
-        solution = np.linalg.lstsq(design, angles, rcond=None)[0]
-        left = angles - design @ solution
-        rms[order] = float(np.sqrt((left**2).sum() / (3 * (len(commands) - 4))))
-    configured = config.mechanism.order
+        left = across @ frame.angles(attitudes, order)
+        rms[order] = float(np.sqrt((left**2).sum() / (3 * (len(records) - 4))))
     best = min(rms, key=lambda order: rms[order])
     noise = float(np.mean([r["std_deg"] for r in records]))
     warning = ""

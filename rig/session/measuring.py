@@ -1,73 +1,48 @@
-"""Settling and measuring: when a posture is at rest, and what its attitude is.
-
-The loops read drives and IMU, look at the clock and the signals, and do nothing else.
-"""
+"""Settling and measuring: when a posture is at rest, and what its attitude is."""
 
 from __future__ import annotations
 
-import dataclasses
 import time
-from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-from rig.attitude import Array, Frame, mean_rotation
+from rig.attitude import Array, Frame, euler_to_matrix, mean_rotation
 from rig.config.axis import AXIS_NAMES, Pulses
 from rig.config.config import RigConfig
 from rig.device.drives import Status
-from rig.device.imu import Imu
 from rig.device.stream import Reading
-from rig.guard.faults import MotionFault, NotFollowing
+from rig.faults import MotionFault, NotFollowing
+from rig.session.device import Device
 
 FOLLOW_MIN_DEG = 3.0  # a commanded change this large must be seen by the IMU
 FOLLOW_SHARE = 0.1  # at least this share of it
 FOLLOW_LEADING = 0.3  # of axes that move at least this share of the largest move
 
 
-@dataclasses.dataclass(frozen=True)
-class Measurement:
-    """One settled posture."""
-
-    pulses: Pulses  # commanded
-    feedback: Pulses  # the drives' own positions
-    attitude: Array  # (3, 3) mean attitude of the phone
-    angles: Array  # (3,) degrees: pitch, yaw, roll of the end-effector
-    std: Array  # (3,) degrees, of single readings
-    samples: int
-    raw: Array  # (samples, 3) degrees
+def frame_at(config: RigConfig, zero: Array) -> Frame:
+    """The frame in which the (3, 3) attitude ``zero`` of the phone is the zero."""
+    mounting = euler_to_matrix(config.imu.mounting_deg, "ZYX")
+    return Frame(zero, mounting, config.mechanism.order, config.letters)
 
 
 class Observer:
     """What the IMU says about a device that stands."""
 
-    def __init__(
-        self,
-        config: RigConfig,
-        imu: Imu,
-        guard: Callable[[], None],
-        statuses: Callable[[], list[Status]],
-        phase: Callable[[str], None],
-    ) -> None:
-        self.config = config
-        self.imu = imu
-        self.frame: Frame | None = None
-        self._guard = guard  # raises where a stop was asked for
-        self._statuses = statuses  # of all drives; raises on a fault bit
-        self._phase = phase
-        self._seen: tuple[Array, Array] | None = None  # (commanded, measured) last
+    def __init__(self, device: Device) -> None:
+        self.device = device
+        self.config = device.config
+        self._seen = (np.zeros(3), np.zeros(3))  # last commanded and measured
         self._unproven: list[list[str]] = [[], [], []]  # postures, an axis
 
     def zeroed(self, frame: Frame, pulses: Pulses) -> None:
         """Measure against this zero posture from now on."""
-        self.frame = frame
+        self.device.frame = frame
         self._seen = (self.config.to_deg(pulses), np.zeros(3))
 
     def measure(
-        self,
-        target: Pulses,
-        label: str = "",
-        samples: int | None = None,
-    ) -> Measurement:
+        self, target: Pulses, label: str = "", samples: int | None = None
+    ) -> dict[str, Any]:
         """Wait until the device has settled, then average fresh readings.
 
         Args:
@@ -75,60 +50,66 @@ class Observer:
             label: name of the posture.
             samples: readings to average; as configured when not given.
 
+        Returns:
+            For the journal: ``pulses`` commanded and ``feedback`` of the drives;
+            ``commanded_deg``, ``measured_deg`` and, of single readings, ``std_deg``
+            (3,); ``samples`` and ``raw_deg`` (samples, 3); ``attitude`` (3, 3), the
+            mean of the phone's.
+
         Raises:
             MotionFault: it does not settle in time, or the IMU disagrees with the
                 drives. ImuError, BusError, StopRequested: stop everything.
         """
         settle = self.config.settle
         deadline = time.monotonic() + settle.timeout_s
-        quiet = False
-        while not quiet:  # also again where the readings themselves were not
-            self._phase("settling")
+        while True:
+            self.device.emit("phase", phase="settling")
             statuses = self._settled(deadline)
-            self._phase("measuring")
-            collected = self._collect(samples or settle.samples)
-            if collected is None:  # the stream paused
+            self.device.emit("phase", phase="measuring")
+            readings = self._collect(samples or settle.samples)
+            if not readings:  # the stream paused
                 continue
-            readings = collected
-            frame = self._frame_for(readings)
-            raw = frame.angles(np.array([r.matrix for r in readings]))
+            frame, matrices = self._frame(readings), [r.matrix for r in readings]
+            raw = frame.angles(matrices)
             std = raw.std(axis=0, ddof=1) if len(raw) > 1 else np.zeros(3)
-            quiet = bool((std <= settle.std_deg).all())
-        attitude = mean_rotation([r.matrix for r in readings])
-        pitch, yaw, roll = (status.position for status in statuses)
-        result = Measurement(
-            pulses=target,
-            feedback=(pitch, yaw, roll),
-            attitude=attitude,
-            angles=frame.angles(attitude),
-            std=std,
-            samples=len(readings),
-            raw=raw,
-        )
-        self._check_agreement(result, label)
-        return result
+            if (std <= settle.std_deg).all():
+                break  # or settle again: the readings themselves were not quiet
+        attitude = mean_rotation(matrices)
+        angles = frame.angles(attitude)
+        feedback = [status.position for status in statuses]
+        self._check_position(target, feedback)
+        if self.device.frame is not None:
+            self._check_agreement(self.config.to_deg(target), angles, label)
+        return {
+            "pulses": list(target),
+            "feedback": feedback,
+            "commanded_deg": self.config.to_deg(target).round(9).tolist(),
+            "measured_deg": angles.round(9).tolist(),
+            "std_deg": std.round(6).tolist(),
+            "samples": len(readings),
+            "attitude": attitude.round(12).tolist(),
+            "raw_deg": raw.round(5).tolist(),
+        }
 
-    def _frame_for(self, readings: list[Reading]) -> Frame:
-        if self.frame is not None:
-            return self.frame
-        config = self.config
-        return Frame(
-            readings[0].matrix, config.imu.mounting, config.mechanism.order,
-            config.letters,
-        )  # fmt: skip
+    def _frame(self, readings: list[Reading]) -> Frame:
+        """Before the zero is taken, the first of the readings stands for it."""
+        return self.device.frame or frame_at(self.config, readings[0].matrix)
 
     def _settled(self, deadline: float) -> list[Status]:
         """Poll until drives and IMU are quiet; what the drives say then."""
         settle, poll = self.config.settle, self.config.motion.poll_s
         since = time.monotonic()
         while True:
-            self._guard()
-            statuses = self._statuses()
+            self.device.guard()
+            statuses = self.device.statuses()
             now = time.monotonic()
             if any(status.moving for status in statuses):
                 since = now
-            self.imu.check_fault()
-            readings = self._window(since, now)
+            self.device.imu.check_fault()
+            # The last window_s, or the last min_samples of a slow phone.
+            readings = self.device.imu.since(since)
+            recent = sum(reading.time >= now - settle.window_s for reading in readings)
+            readings = readings[-max(recent, settle.min_samples) :]
             span = readings[-1].time - readings[0].time if readings else 0.0
             hint = "Check the phone's app and its Wi-Fi"
             if len(readings) < settle.min_samples or span < 0.8 * settle.window_s:
@@ -149,18 +130,10 @@ class Observer:
                 )
             time.sleep(poll)
 
-    def _window(self, since: float, now: float) -> list[Reading]:
-        """The last window_s, or the last min_samples of a slow phone."""
-        settle = self.config.settle
-        readings = self.imu.since(since)
-        recent = sum(reading.time >= now - settle.window_s for reading in readings)
-        return readings[-max(recent, settle.min_samples) :]
-
     def _unquiet(self, readings: list[Reading]) -> str:
         """What of a window's readings is over its limit; empty where nothing is."""
         settle = self.config.settle
-        frame = self._frame_for(readings)
-        angles = frame.angles(np.array([reading.matrix for reading in readings]))
+        angles = self._frame(readings).angles([reading.matrix for reading in readings])
         times = np.array([reading.time for reading in readings])
         times = times - times.mean()
         slope = np.abs(times @ (angles - angles.mean(axis=0)) / (times @ times))
@@ -174,69 +147,63 @@ class Observer:
                 return f"{what} of {axis} is {value:.3f} {unit} (limit {limit:g})"
         return ""
 
-    def _collect(self, wanted: int) -> list[Reading] | None:
-        """Fresh readings as wanted, or None where the stream paused or time is up."""
-        settle = self.config.settle
-        start = time.monotonic()
+    def _collect(self, wanted: int) -> list[Reading]:
+        """Fresh readings as wanted, or none where the stream paused or time is up."""
+        settle, imu = self.config.settle, self.device.imu
+        start = polled = time.monotonic()
         deadline = start + settle.timeout_s * max(1.0, wanted / settle.samples)
-        polled = start
         while True:
-            self._guard()
-            self.imu.check_fault()
-            readings = self.imu.since(start)
+            self.device.guard()
+            imu.check_fault()
+            readings = imu.since(start)
             if len(readings) >= wanted:
                 return readings[:wanted]
             now = time.monotonic()
             newest = readings[-1].time if readings else start
             if now - newest > self.config.imu.stale_s or now > deadline:
-                return None
+                return []
             if now - polled > self.config.motion.poll_s:
                 polled = now
-                if any(status.moving for status in self._statuses()):
+                if any(status.moving for status in self.device.statuses()):
                     raise MotionFault(
                         "a drive moves while the posture is measured. Stop the other "
                         "controller"
                     )
             time.sleep(0.002)
 
-    def _check_agreement(self, measurement: Measurement, label: str) -> None:
-        """The joints are where the drives say, roughly, and moved when they moved."""
-        config = self.config
-        commanded = config.to_deg(measurement.pulses)
-        for axis, pulses, feedback in zip(
-            config.axes, measurement.pulses, measurement.feedback, strict=True
-        ):
-            if abs(pulses - feedback) > axis.pulses_within(
-                config.motion.position_tolerance_deg
-            ):
+    def _check_position(self, target: Pulses, feedback: list[int]) -> None:
+        """The drives still stand on their targets."""
+        tolerance = self.config.motion.position_tolerance_deg
+        for axis, goal, here in zip(self.config.axes, target, feedback, strict=True):
+            if abs(goal - here) > axis.pulses_within(tolerance):
                 raise MotionFault(
-                    f"{axis.name} left its target while settling: {feedback} pulses "
-                    f"instead of {pulses}. Check holding torque and load"
+                    f"{axis.name} left its target while settling: {here} pulses "
+                    f"instead of {goal}. Check holding torque and load"
                 )
-        if self.frame is None:
-            return
-        apart = np.abs(measurement.angles - commanded)
-        if (apart > config.motion.max_disagreement_deg).any():
+
+    def _check_agreement(self, commanded: Array, measured: Array, label: str) -> None:
+        """The joints are where the drives say, roughly, and moved when they moved."""
+        apart = np.abs(measured - commanded)
+        if (apart > self.config.motion.max_disagreement_deg).any():
             worst = int(np.argmax(apart))
             raise MotionFault(
                 f"the IMU reads {AXIS_NAMES[worst]} {apart[worst]:.1f} deg away from "
                 "the command, more than motion.max_disagreement_deg. Check zero, axis "
                 "order and signs"
             )
-        if self._seen is not None:
-            asked = np.abs(commanded - self._seen[0])
-            seen = np.abs(measurement.angles - self._seen[1])
-            leading = max(FOLLOW_MIN_DEG, FOLLOW_LEADING * float(asked.max()))
-            for index, name in enumerate(AXIS_NAMES):
-                if asked[index] < leading:
-                    self._unproven[index].append(label)
-                elif seen[index] < FOLLOW_SHARE * asked[index]:
-                    raise NotFollowing(
-                        f"the drive of {name} turned {asked[index]:.1f} deg, the IMU "
-                        f"saw {seen[index]:.2f}. Look for a slipped coupling, a frozen "
-                        "stream, or axes mixed up",
-                        self._unproven[index],
-                    )
-                else:
-                    self._unproven[index] = []
-        self._seen = (commanded, measurement.angles)
+        asked = np.abs(commanded - self._seen[0])
+        seen = np.abs(measured - self._seen[1])
+        leading = max(FOLLOW_MIN_DEG, FOLLOW_LEADING * float(asked.max()))
+        for index, name in enumerate(AXIS_NAMES):
+            if asked[index] < leading:
+                self._unproven[index].append(label)
+            elif seen[index] < FOLLOW_SHARE * asked[index]:
+                raise NotFollowing(
+                    f"the drive of {name} turned {asked[index]:.1f} deg, the IMU "
+                    f"saw {seen[index]:.2f}. Look for a slipped coupling, a frozen "
+                    "stream, or axes mixed up",
+                    self._unproven[index],
+                )
+            else:
+                self._unproven[index] = []
+        self._seen = (commanded, measured)

@@ -10,8 +10,8 @@ import numpy as np
 
 from jaxcal.selection.fastest import Motion, fastest_tour, travel_times
 from rig.attitude import Array
+from rig.config import RigConfig
 from rig.config.axis import Pulses
-from rig.config.config import RigConfig
 
 EXACT_LIMIT_S = 20.0  # for the proof that the choice is (or is not) the optimum
 REPLAN_LIMIT_S = 5.0  # the same while the drives stand armed
@@ -34,26 +34,18 @@ class Choice:
         """D-efficiency ``(det S / det S*) ** (1/12)``."""
         return math.exp((self.log_det - self.best_log_det) / 12.0)
 
-    def described(self) -> dict[str, Any]:
-        """For the journal."""
-        return dataclasses.asdict(self)
 
-
-def _drawn(config: RigConfig, count: int, *seed: int) -> Array:
+def draw(config: RigConfig, count: int, *seed: int) -> Array:
     """(count, 3) int pulses, uniform in the ranges; only whole ones can be sent."""
     low, high = np.array(config.ranges).T
-    angles = np.random.default_rng(seed).uniform(low, high, size=(count, 3))
+    rng = np.random.default_rng([config.session.seed, *seed])
+    angles = rng.uniform(low, high, size=(count, 3))
     return np.array([config.to_pulses(angle) for angle in angles])
 
 
 def draw_candidates(config: RigConfig) -> Array:
     """(M, 3) int pulses from which the postures are chosen."""
-    return _drawn(config, config.session.candidates, config.session.seed)
-
-
-def draw_collection(config: RigConfig, count: int) -> Array:
-    """(count, 3) int pulses of a recording."""
-    return _drawn(config, count, config.session.seed, 2)
+    return draw(config, config.session.candidates)
 
 
 def choose(
@@ -63,7 +55,7 @@ def choose(
     required: tuple[int, ...] = (),
     replanning: bool = False,
 ) -> Choice:
-    """The K postures to measure.
+    """The K postures to measure of (M, 3) candidates.
 
     Args:
         config: names K, the method and the efficiency under which exact replaces it.
@@ -71,22 +63,22 @@ def choose(
         available: (M,) False where a posture cannot be reached.
         required: indices measured already, which stay in the choice.
         replanning: the drives stand armed: the exact solver alone, and less time.
-
-    Raises:
-        ValueError: no K postures are left, or they lie in one plane.
     """
     import jaxcal
 
     session = config.session
-    given: dict[str, Any] = {"seed": session.seed}
-    if available is not None:
-        given["available"] = available
-    if required:
-        given["required"] = list(required)
     limit = REPLAN_LIMIT_S if replanning else EXACT_LIMIT_S
-    exact = jaxcal.select(
-        candidates_deg, session.k, method="exact", time_limit=limit, **given
-    )
+
+    def select(method: str, **more: Any) -> Any:
+        if available is not None:
+            more["available"] = available
+        if required:
+            more["required"] = list(required)
+        if method != "greedy":  # which draws nothing
+            more["seed"] = session.seed
+        return jaxcal.select(candidates_deg, session.k, method=method, **more)
+
+    exact = select("exact", time_limit=limit)
 
     def rated(selection: Any, note: str) -> Choice:
         log_det = float(selection.log_det)
@@ -101,85 +93,64 @@ def choose(
 
     if session.method == "exact" or replanning:
         return rated(exact, "")
-    if session.method == "greedy":
-        del given["seed"]  # greedy draws nothing
+    more: dict[str, Any] = {}
     if session.method == "auto":
-        given |= {"least_efficiency": session.min_efficiency, "time_limit": limit}
+        more = {"least_efficiency": session.min_efficiency, "time_limit": limit}
     try:
-        chosen = jaxcal.select(
-            candidates_deg, session.k, method=session.method, **given
+        chosen = select(session.method, **more)
+        choice = rated(chosen, getattr(chosen, "reason", ""))
+        if choice.efficiency >= session.min_efficiency:
+            return choice
+        note = (
+            f"{session.method} reached a D-efficiency of {choice.efficiency:.3f}, "
+            f"under session.min_efficiency = {session.min_efficiency:g}; using exact"
         )
     except Exception as error:
         if session.method not in ("policy", "auto"):
             raise
         # A missing or foreign checkpoint must not keep a rig from being calibrated.
         reason = " ".join(str(error).split())[:200]
-        return rated(
-            exact, f"no policy could be used ({reason}); exact is used instead"
-        )
-    choice = rated(chosen, getattr(chosen, "reason", ""))
-    if choice.efficiency < session.min_efficiency:
-        note = (
-            f"{session.method} reached a D-efficiency of {choice.efficiency:.3f}, "
-            f"under session.min_efficiency = {session.min_efficiency:g}; using exact"
-        )
-        return rated(exact, note)
-    return choice
+        note = f"no policy could be used ({reason}); exact is used instead"
+    return rated(exact, note)
 
 
 def travel_order(config: RigConfig, points_deg: Array, start_deg: Array) -> list[int]:
-    """Order of visits of least travel time on an open path.
+    """Order of visits of (N, 3) points of least travel time from (3,), ending anywhere.
 
-    The axes move at the same time, so the slowest of them sets the time.
-
-    Args:
-        config: speeds and accelerations of the axes.
-        points_deg: (N, 3).
-        start_deg: (3,) where the device stands.
-
-    Returns:
-        (N,) indices of ``points_deg``: optimal for N up to 12; above 200 each next one
-        is the nearest.
+    The axes move at the same time, so the slowest of them sets the time. Optimal for N
+    up to 12; above 200 each next point is the nearest.
     """
     if not len(points_deg):
         return []
     speed = tuple(axis.speed_deg_s for axis in config.axes)
     motion = Motion(speed, tuple(axis.accel_deg_s2 for axis in config.axes))
+    here = travel_times([start_deg], points_deg, motion)[0]
     if len(points_deg) <= MOST_IMPROVED:
-        start = travel_times([start_deg], points_deg, motion)[0]
         times = travel_times(points_deg, points_deg, motion)
-        return [int(i) for i in fastest_tour(times, start)[0]]
+        return [int(i) for i in fastest_tour(times, here)[0]]
     order: list[int] = []
-    here, left = start_deg, list(range(len(points_deg)))
-    while left:
-        times = travel_times([here], points_deg[left], motion)[0]
-        order.append(left.pop(int(times.argmin())))
-        here = points_deg[order[-1]]
+    left = np.arange(len(points_deg))
+    while len(left):
+        order.append(int(left[here[left].argmin()]))
+        left = left[left != order[-1]]
+        here = travel_times(points_deg[order[-1:]], points_deg, motion)[0]
     return order
 
 
 def draw_held_out(
     config: RigConfig, calibration: Any, count: int
 ) -> list[tuple[Pulses, Pulses]]:
-    """Held-out targets that can be sent both raw and compensated.
+    """Held-out targets in pulses, each as it is and as its compensated command.
 
-    Args:
-        config: ranges and limits.
-        calibration: gives ``command_for``.
-        count: how many.
-
-    Returns:
-        Pairs of pulses: the target sent as it is, and the compensated command for it.
-        Fewer than ``count`` where little of the range can be reached compensated.
+    Fewer than ``count`` where little of the range can be reached compensated.
     """
-    rng = np.random.default_rng([config.session.seed, 1])
     low, high = np.array(config.ranges).T
     pairs: list[tuple[Pulses, Pulses]] = []
-    for _ in range(200 * count):
+    for pulses in draw(config, 200 * count, 1):
         if len(pairs) == count:
             break
-        raw = config.to_pulses(rng.uniform(low, high))
-        command = calibration.command_for(config.to_deg(raw))
-        if (command >= low).all() and (command <= high).all():
-            pairs.append((raw, config.to_pulses(command)))
+        command = calibration.command_for(config.to_deg(pulses))
+        if ((command >= low) & (command <= high)).all():
+            a, b, c = pulses.tolist()
+            pairs.append(((a, b, c), config.to_pulses(command)))
     return pairs

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rig.device.bus import BusError
-from rig.device.imu import ImuError
-from rig.guard.faults import (
+from rig.faults import (
     EXIT_BAD_INPUT,
     EXIT_FAULT,
+    EXIT_OK,
     EXIT_PAUSED,
-    LimitError,
-    MotionFault,
+    Fault,
     PauseRequested,
+    PlanOnly,
     Refused,
     StopRequested,
 )
@@ -30,32 +29,31 @@ def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
     with run.signals:
         try:
             code = procedure(run)
-            event, reason = "end", ""
+            event = "end"
+        except PlanOnly:
+            code, event = EXIT_OK, "end"
+            run.say("dry run: nothing was sent to the bus")
         except PauseRequested as pause:
             code, event, reason = EXIT_PAUSED, "paused", str(pause)
         except StopRequested as stop:
             code, event, reason = stop.exit_code, "stopped", str(stop)
         except KeyboardInterrupt:
             code, event, reason = 130, "stopped", "SIGINT"
-        except (Refused, LimitError) as error:
-            moved = bool(run.journal.events("command"))
-            code = EXIT_FAULT if moved else EXIT_BAD_INPUT
-            event, reason = "fault" if moved else "refused", str(error)
-        except (MotionFault, BusError, ImuError, JournalError) as error:
+        except Refused as error:
+            reason = str(error)
+            if not run.journal.events("command"):
+                code, event = EXIT_BAD_INPUT, "refused"
+        except Fault as error:
             reason = str(error)
         except OSError as error:
             reason = f"cannot write to {run.folder}: {error.strerror or error}"
         except Exception as error:
             reason = f"{type(error).__name__}: {error}"
         finally:
-            run.signals.armed = run.motion is not None
-            if event != "end":
-                run.stop(reason, latch=event != "paused")
-            elif run.motion is not None:
-                run.stop("", latch=False)
+            run.stop(reason, latch=event not in ("end", "paused"))
             run.disarm()
     try:
-        run.journal.write(event, sync=True, code=code, reason=reason)
+        run.emit(event, sync=True, code=code, reason=reason)
     except JournalError as error:
         run.say(f"the journal could not be closed with a last line: {error}")
     if event != "end":

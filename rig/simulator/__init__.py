@@ -6,15 +6,8 @@ server is written from the protocol's text and shares no code with the client's 
 
 from __future__ import annotations
 
-from rig.simulator.faults import FaultInjector, FaultSpec, parse_fault
-from rig.simulator.plant import Plant, Truth
+from rig.simulator.faults import parse_fault
+from rig.simulator.plant import Truth
 from rig.simulator.simulator import Simulator
 
-__all__ = [
-    "FaultInjector",
-    "FaultSpec",
-    "Plant",
-    "Simulator",
-    "Truth",
-    "parse_fault",
-]
+__all__ = ["Simulator", "Truth", "parse_fault"]

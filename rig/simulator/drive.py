@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from rig.config.maps import RegisterMap
-from rig.config.registers import Writes, decode, encode
+from rig.config.registers import (
+    FLAGS,
+    Read,
+    Write,
+    Writes,
+    decode,
+    encode,
+    registers_of,
+)
 
 ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 2, 3, 4
 STEP_S = 0.001
@@ -24,16 +32,16 @@ class DriveException(Exception):
 
 
 class SimDrive:
-    """One unit. Positions in pulses, time from ``clock`` in seconds."""
+    """One unit; positions in pulses."""
 
     def __init__(
         self,
         register_map: RegisterMap,
         pulses_per_rev: int,
         position: float = 0.0,
-        clock: Callable[[], float] = time.monotonic,
         speedup: float = 1.0,
-        travel: tuple[int, int] | None = None,
+        travel: Sequence[int] | None = None,
+        stuck: Callable[[], object] = lambda: False,
     ) -> None:
         self.map = register_map
         self.position = float(position)
@@ -43,38 +51,35 @@ class SimDrive:
         self.done = True
         self.alarm = 0
         self.enabled = True
-        self.stuck: Callable[[], bool] = lambda: False
-        self.executions: list[tuple[float, int]] = []  # (time, target) of each move run
+        self.executions: list[int] = []  # target of each move that was run
         self.stops: list[float] = []
         self.comm_stops = 0
         self._travel = travel  # targets outside are answered with exception 3
         self._pulses_per_rev = pulses_per_rev
-        self._clock = clock
+        self._stuck = stuck
         self._speedup = speedup
         self._speed = self._accel = 1.0
         self._stopping = False
         self._comm_timeout = 0.0
-        self._last_frame = self._now = clock()
+        self._last_frame = self._now = time.monotonic()
         self._registers = self._known()
 
     def _known(self) -> dict[int, int]:
+        """Every register of the map; the first of the identity is the resolution."""
         m = self.map
-        known = {m.status.address + i: 0 for i in range(m.status.count)}
-        reads = [m.position, *m.identity.values()]
-        if m.alarm:
-            reads.append(m.alarm)
-        for read in reads:
-            known |= {read.address + i: 0 for i in range(read.count)}
         tables = (m.move, m.stop, m.enable, m.alarm_reset, m.comm_timeout, m.limits)
-        for frame in [frame for table in tables if table for frame in table.write]:
-            known |= {frame.address + i: 0 for i in range(frame.count)}
-        for read in list(m.identity.values())[:1]:
+        identity = list(m.identity.values())
+        places: list[Read | Write] = [m.status, m.position, *identity]
+        places += [m.alarm] if m.alarm else []
+        places += [frame for table in tables if table for frame in table.write]
+        known = {p.address + i: 0 for p in places for i in range(p.count)}
+        for read in identity[:1]:
             known[read.address + read.count - 1] = self._pulses_per_rev & 0xFFFF
         return known
 
     def advance(self) -> None:
         """Bring position and velocity up to the clock."""
-        now = self._clock()
+        now = time.monotonic()
         if self.moving and self._comm_timeout:
             lost = self._last_frame + self._comm_timeout
             if now > lost and not self._stopping:
@@ -92,17 +97,18 @@ class SimDrive:
         self._now = max(self._now, now)
 
     def _step(self, dt: float) -> None:
+        if self._stuck():
+            self.velocity = 0.0
+            if not self._stopping:
+                return
         if self._stopping:
             drop = QUICK_STOP_FACTOR * self._accel * dt
-            if abs(self.velocity) <= drop or self.stuck():
+            if abs(self.velocity) <= drop:
                 self.velocity, self.moving, self._stopping = 0.0, False, False
                 self.position = float(round(self.position))
                 return
             self.velocity -= math.copysign(drop, self.velocity)
             self.position += self.velocity * dt
-            return
-        if self.stuck():
-            self.velocity = 0.0
             return
         error = self.target - self.position
         wanted = math.copysign(
@@ -130,53 +136,43 @@ class SimDrive:
     def read(self, address: int, count: int) -> list[int]:
         """Holding registers; raises DriveException where there are none."""
         self.advance()
-        self._last_frame = self._clock()
+        self._last_frame = time.monotonic()
         m = self.map
-        self._put(m.status.address, self._status(), m.status.type)
-        self._put(m.position.address, round(self.position), m.position.type)
-        if m.alarm:
-            self._put(m.alarm.address, self.alarm, m.alarm.type)
+        values: list[tuple[Read, int]]
+        values = [(m.status, self._status()), (m.position, round(self.position))]
+        values += [(m.alarm, self.alarm)] if m.alarm else []
+        for place, value in values:
+            for i, word in enumerate(encode(value, place.type, m.word_order)):
+                self._registers[place.address + i] = word
         try:
             return [self._registers[address + i] for i in range(count)]
         except KeyError:
             raise DriveException(ILLEGAL_ADDRESS) from None
 
-    def _put(self, address: int, value: int, kind: str) -> None:
-        for i, word in enumerate(encode(value, kind, self.map.word_order)):
-            self._registers[address + i] = word
-
     def _status(self) -> int:
-        m, word = self.map.status, 0
-        if self.enabled and m.enabled:
-            word |= sum(1 << bit for bit in m.enabled.set)
-        if self.moving:
-            word |= sum(1 << bit for bit in m.moving.set)
-        elif self.done and not self.alarm:
-            word |= sum(1 << bit for bit in m.done.set)
-        if self.alarm:
-            word |= sum(1 << bit for bit in m.fault.set)
-        return word
+        resting = self.done and not self.moving and not self.alarm
+        on = (self.enabled, resting, self.moving, bool(self.alarm))
+        named = [getattr(self.map.status, name) for name in FLAGS]
+        pairs = [bits for bits, holds in zip(named, on, strict=True) if bits and holds]
+        return sum({1 << bit for bits in pairs for bit in bits.set})
 
     def write(self, address: int, words: list[int]) -> None:
         """Write holding registers, and do what they mean."""
         self.advance()
-        self._last_frame = self._clock()
-        if any(address + i not in self._registers for i in range(len(words))):
-            raise DriveException(ILLEGAL_ADDRESS)
-        m = self.map
+        self._last_frame = time.monotonic()
         at = {address + i: word for i, word in enumerate(words)}
-        trigger = m.move.trigger
-        moves = at.get(trigger.address) == trigger.value
-        before = dict(self._registers)
-        self._registers |= at
-        if moves:
+        if not at.keys() <= self._registers.keys():
+            raise DriveException(ILLEGAL_ADDRESS)
+        m, before = self.map, self._registers
+        self._registers = before | at
+        if at.get(m.move.trigger.address) == m.move.trigger.value:
             try:
                 self._start()
             except DriveException:
                 self._registers = before
                 raise
         elif self._begins(m.stop, address, words):
-            self.stops.append(self._clock())
+            self.stops.append(time.monotonic())
             self._stopping = self.moving
             self.target = round(self.position)
         elif self._begins(m.alarm_reset, address, words):
@@ -184,29 +180,28 @@ class SimDrive:
         elif self._begins(m.enable, address, words):
             self.enabled = True
         elif m.comm_timeout and address == m.comm_timeout.write[0].address:
-            value = self._value(m.comm_timeout, "timeout")
-            self._comm_timeout = (value or 0) / m.comm_timeout.per_s
+            counts = self._value(m.comm_timeout, "timeout")
+            self._comm_timeout = counts / m.comm_timeout.per_s
 
     def _begins(self, table: Writes | None, address: int, words: list[int]) -> bool:
         first = table.write[0] if table else None
-        return bool(first and first.address == address and list(first.words) == words)
+        sent = [word.value for word in first.words] if first else None
+        return bool(first and (first.address, sent) == (address, words))
 
-    def _value(self, table: Writes, name: str) -> int | None:
-        for frame in table.write:
-            found = frame.offset_of(name)
-            if found:
-                address, kind = found
-                count = 2 if kind.endswith("32") else 1
-                words = [self._registers[address + i] for i in range(count)]
-                return decode(words, kind, self.map.word_order)
-        return None
+    def _value(self, table: Writes, name: str) -> int:
+        """What the registers hold of a named value; 0 where the table has none."""
+        place = table.place_of(name)
+        if place is None:
+            return 0
+        address, kind = place
+        words = [self._registers[address + i] for i in range(registers_of(kind))]
+        return decode(words, kind, self.map.word_order)
 
     def _start(self) -> None:
         m = self.map
         if self.alarm or not self.enabled:
             raise DriveException(DEVICE_FAILURE)
         target = self._value(m.move, "position")
-        assert target is not None  # the schema demands it
         if self._travel and not self._travel[0] <= target <= self._travel[1]:
             raise DriveException(ILLEGAL_VALUE)
         units, per_rev = m.units, float(self._pulses_per_rev)
@@ -216,6 +211,6 @@ class SimDrive:
             accel = 1.0 / accel
         self._speed = speed * (per_rev if units.speed == "rev_per_s" else 1.0)
         self._accel = accel * (1.0 if units.accel == "pulse_per_s2" else per_rev)
-        self.executions.append((self._clock(), target))
+        self.executions.append(target)
         self.target, self.moving, self.done = target, True, False
         self._stopping = False

@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import threading
 import time
+from collections.abc import Callable
 from typing import Any
 
 from rig.config.axis import AXIS_NAMES
 
 PHASES = ("zeroing", "moving", "settling", "measuring", "saving")
-BUS_KINDS = {
+KINDS = {
     "lost_reply": "the drive obeys, its reply is lost",
     "lost_write_reply": "the drive obeys a write, its reply is lost",
     "lost_request": "the drive never sees the request",
@@ -18,8 +19,6 @@ BUS_KINDS = {
     "noise_bytes": "random bytes before the reply",
     "exception_reply": "the drive answers exception 4 and does nothing",
     "dead_drive": "one unit is silent",
-}
-KINDS = BUS_KINDS | {
     "alarm": "the drive faults and stops itself",
     "stuck_axis": "the motor stands although it is told to move",
     "slipping_axis": "the motor turns, the joint does not",
@@ -34,24 +33,18 @@ KINDS = BUS_KINDS | {
 }
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class FaultSpec:
-    """One fault to inject."""
-
     kind: str
     phase: str | None = None  # inject when the session first enters this phase
     after_s: float | None = None  # or so long after the simulator started
-    count: int | None = None  # replies or lines spoilt; None: until cleared
+    count: float = float("inf")  # replies or lines left to spoil
     axis: int | None = None  # None: any
     seconds: float | None = None  # length of a gap or delay
 
 
 def parse_fault(text: str) -> FaultSpec:
-    """Read ``kind[@phase | @SECONDSs][,count=N][,axis=NAME][,seconds=S]``.
-
-    Raises:
-        ValueError: names what is unknown.
-    """
+    """Read ``kind[@phase | @SECONDSs][,count=N][,axis=NAME][,seconds=S]``."""
     head, *options = text.split(",")
     kind, _, when = head.partition("@")
     if kind not in KINDS:
@@ -78,19 +71,15 @@ class FaultInjector:
     """Which faults are on now; asked by the drives, the line and the phone."""
 
     def __init__(self, specs: list[FaultSpec] | None = None) -> None:
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._start = time.monotonic()
         self._waiting = list(specs or [])
-        self._active: list[list] = []  # [spec, count left or None, since]
-        self.fired: list[tuple[str, float]] = []
-        for spec in list(self._waiting):
-            if spec.phase is None and spec.after_s is None:
-                self._activate(spec)
+        self._active: list[tuple[FaultSpec, float]] = []  # and since when
+        self._begin(lambda spec: spec.phase is None and spec.after_s is None)
 
     def add(self, spec: FaultSpec) -> None:
-        """Inject now."""
         with self._lock:
-            self._activate(spec)
+            self._active.append((dataclasses.replace(spec), time.monotonic()))
 
     def clear(self) -> None:
         """Repair everything; nothing more is injected."""
@@ -100,35 +89,25 @@ class FaultInjector:
 
     def enter(self, phase: str) -> None:
         """The session entered a phase."""
-        with self._lock:
-            for spec in [s for s in self._waiting if s.phase == phase]:
-                self._activate(spec)
+        self._begin(lambda spec: spec.phase == phase)
 
-    def _activate(self, spec: FaultSpec) -> None:
-        if spec in self._waiting:
-            self._waiting.remove(spec)
-        self._active.append([spec, spec.count, time.monotonic()])
-        self.fired.append((spec.kind, time.monotonic()))
+    def _begin(self, due: Callable[[FaultSpec], bool]) -> None:
+        with self._lock:
+            for spec in [spec for spec in self._waiting if due(spec)]:
+                self._waiting.remove(spec)
+                self.add(spec)
 
     def take(self, kind: str, axis: int | None = None) -> FaultSpec | None:
         """The active fault of a kind that hits this axis; uses one of its count."""
         now = time.monotonic()
+        self._begin(lambda s: s.after_s is not None and now >= self._start + s.after_s)
         with self._lock:
-            for spec in [s for s in self._waiting if s.after_s is not None]:
-                if now - self._start >= (spec.after_s or 0.0):
-                    self._activate(spec)
-            for entry in self._active:
-                spec, left, since = entry
-                if spec.kind != kind or (
-                    axis is not None and spec.axis is not None and spec.axis != axis
-                ):
-                    continue
-                timed = kind not in ("delayed_reply",) and spec.seconds is not None
-                if timed and now - since > spec.seconds:
-                    continue
-                if left is None:
-                    return spec
-                if left > 0:
-                    entry[1] = left - 1
+            for spec, since in self._active:
+                hits = spec.kind == kind and (axis is None or spec.axis in (None, axis))
+                # The seconds of a delayed reply are its delay.
+                lasts = spec.seconds if kind != "delayed_reply" else None
+                over = lasts is not None and now > since + lasts
+                if hits and spec.count > 0 and not over:
+                    spec.count -= 1
                     return spec
         return None

@@ -18,32 +18,28 @@ from rig.attitude import Array, matrix_to_euler
 from rig.config.settings import ImuSettings
 from rig.simulator.faults import FaultInjector
 
-
-def matrix_to_quaternion(matrix: Array) -> Array:
-    """(4,) x, y, z, w of a (3, 3) rotation."""
-    return Rotation.from_matrix(matrix).as_quat()
+BATCH = 5  # readings that Sensor Logger pushes at once
 
 
 def format_line(
     settings: ImuSettings, matrix: Array, stamp_s: float, order: str
 ) -> str:
     """One line as the configured app would send it, without its end."""
-    used = (*settings.columns, *(settings.quaternion_columns or ()))
-    width = settings.column_count or 1 + max(*used, settings.stamp_column)
-    fields = ["0.0"] * width
+    columns: tuple[int, ...]
     if settings.quaternion_columns:
-        for column, value in zip(
-            settings.quaternion_columns, matrix_to_quaternion(matrix), strict=True
-        ):
-            fields[column] = f"{value:.9f}"
+        columns, digits = settings.quaternion_columns, 9
+        numbers = Rotation.from_matrix(matrix).as_quat()
     else:
-        angles = matrix_to_euler(matrix, order) * np.array(settings.signs)
+        columns, digits = settings.columns, 7
+        numbers = matrix_to_euler(matrix, order) * np.array(settings.signs)
         if settings.format == "hyperimu":
-            angles[0] %= 360.0  # the azimuth runs from 0 to 360
+            numbers[0] %= 360.0  # the azimuth runs from 0 to 360
         if settings.unit == "rad":
-            angles = np.radians(angles)
-        for column, value in zip(settings.columns, angles, strict=True):
-            fields[column] = f"{value:.7f}"
+            numbers = np.radians(numbers)
+    width = settings.column_count or 1 + max(*columns, settings.stamp_column)
+    fields = ["0.0"] * width
+    for column, value in zip(columns, numbers, strict=True):
+        fields[column] = f"{value:.{digits}f}"
     if settings.stamp_column >= 0:
         fields[settings.stamp_column] = str(round(stamp_s * 1000))
     return settings.separator.join(fields)
@@ -61,7 +57,6 @@ class Phone:
         seed: int = 0,
     ) -> None:
         self.settings = settings
-        self.lines = 0
         self.port = settings.port
         self._attitude = attitude
         self._faults = faults
@@ -70,21 +65,24 @@ class Phone:
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._listener: socket.socket | None = None
-        self._frozen: Array | None = None
+        self._frozen = np.eye(3)
 
-    def start(self, port: int) -> None:
-        """Begin; ``port`` is where the rig listens, or where this phone shall."""
+    def start(self, port: int) -> int:
+        """Send to the port the rig listens on, or listen there; returns the port."""
         self.port = port
+        if self._thread.is_alive():
+            return port
         if self.settings.transport == "connect":
             self._listener = socket.create_server(("127.0.0.1", port), backlog=1)
             self._listener.settimeout(0.1)
             self.port = int(self._listener.getsockname()[1])
         self._thread.start()
+        return self.port
 
     def close(self) -> None:
-        """Stop sending."""
         self._closing.set()
-        self._thread.join(2.0)
+        if self._thread.is_alive():
+            self._thread.join(2.0)
         if self._listener:
             self._listener.close()
 
@@ -117,7 +115,6 @@ class Phone:
                     else:
                         connection.sendall(data + (held or b""))
                         held = None
-                    self.lines += 1
                 next_time += self._period
                 self._closing.wait(max(0.0, next_time - time.monotonic()))
 
@@ -127,10 +124,9 @@ class Phone:
         if faults.take("imu_wrong_order"):
             order = "XYZ" if s.order != "XYZ" else "ZYX"
         matrix = self._attitude()
-        if faults.take("imu_frozen"):
-            self._frozen = matrix = matrix if self._frozen is None else self._frozen
-        else:
-            self._frozen = None
+        if not faults.take("imu_frozen"):
+            self._frozen = matrix
+        matrix = self._frozen
         text = format_line(s, matrix, time.time(), order)
         if faults.take("imu_nan"):
             fields = text.split(s.separator)
@@ -147,37 +143,24 @@ class Phone:
 
     def _push(self) -> None:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=2.0)
-        number = 0
         with contextlib.closing(connection):
             while not self._closing.is_set():
                 payload = []
-                for _ in range(5):
-                    q = matrix_to_quaternion(self._attitude())
+                for _ in range(BATCH):
+                    q = Rotation.from_matrix(self._attitude()).as_quat()
                     if self._faults.take("imu_nan"):
                         q = q * np.nan
-                    keys = ("qx", "qy", "qz", "qw")
-                    values = dict(zip(keys, q.tolist(), strict=True))
-                    payload.append(
-                        {
-                            "name": "orientation",
-                            "time": time.time_ns(),
-                            "values": values,
-                        }
+                    values = dict(
+                        zip(("qx", "qy", "qz", "qw"), q.tolist(), strict=True)
                     )
+                    entry = {"name": "orientation", "time": time.time_ns()}
+                    payload.append(entry | {"values": values})
                     self._closing.wait(self._period)
-                message = {
-                    "messageId": number,
-                    "sessionId": "simulated",
-                    "deviceId": "simulated",
-                    "payload": payload,
-                }
-                number += 1
                 if self._faults.take("imu_gap"):
                     continue
-                body = json.dumps(message)
+                body = json.dumps({"deviceId": "simulated", "payload": payload})
                 if self._faults.take("imu_garbage"):
                     body = body[: self._random.randrange(len(body))]
                 headers = {"Content-Type": "application/json"}
                 connection.request("POST", "/", body, headers)
                 connection.getresponse().read()
-                self.lines += 1

@@ -7,8 +7,9 @@ import time
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from rig.attitude import Array, euler_to_matrix, small_rotation
+from rig.attitude import Array, euler_to_matrix
 from rig.config.config import RigConfig
 from rig.simulator.drive import SimDrive
 
@@ -33,6 +34,11 @@ class Truth:
     heading_deg: float = 170.0  # of the base in the phone's world
     seed: int = 0
 
+    @property
+    def jig_deg(self) -> Array:
+        """(3,) commands at which every joint stands at zero."""
+        return np.linalg.solve(np.array(self.matrix), -np.array(self.bias))
+
 
 class Plant:
     """From drive positions to the phone's attitude, with play, noise and drift."""
@@ -42,25 +48,19 @@ class Plant:
         config: RigConfig,
         truth: Truth,
         drives: list[SimDrive],
-        clock: Callable[[], float] = time.monotonic,
+        slipping: Callable[[int], object] = lambda axis: False,
     ) -> None:
         self.truth = truth
-        self.slipping: Callable[[int], bool] = lambda axis: False
         self._config = config
         self._drives = drives
-        self._clock = clock
-        self._start = clock()
+        self._slipping = slipping
+        self._start = time.monotonic()
         self._rng = np.random.default_rng(truth.seed)
         self._matrix = np.array(truth.matrix)
         self._bias = np.array(truth.bias)
         self._drive_deg = self._commanded()
         self._loose = self._drive_deg.copy()  # behind the play
         self._slip = np.zeros(3)
-
-    @staticmethod
-    def jig_posture(truth: Truth) -> Array:
-        """(3,) commands in degrees at which every joint stands at zero."""
-        return np.linalg.solve(np.array(truth.matrix), -np.array(truth.bias))
 
     def tighten(self) -> None:
         """Put slipped joints back to where their drives say."""
@@ -75,7 +75,7 @@ class Plant:
             drive.advance()
         now = self._commanded()
         for axis in range(3):
-            if self.slipping(axis):
+            if self._slipping(axis):
                 self._slip[axis] += now[axis] - self._drive_deg[axis]
         self._drive_deg = now
         turned = now - self._slip
@@ -89,14 +89,14 @@ class Plant:
         config = self._config
         order = config.mechanism.order
         sequence = [joints[config.letters.index(letter)] for letter in order]
-        minutes = (self._clock() - self._start) / 60.0
+        minutes = (time.monotonic() - self._start) / 60.0
         heading = self.truth.heading_deg + self.truth.drift_deg_per_min * minutes
         attitude = (
             euler_to_matrix([heading, 0.0, 0.0], "ZYX")
             @ euler_to_matrix(sequence, order)
-            @ config.imu.mounting
+            @ euler_to_matrix(config.imu.mounting_deg, "ZYX")
         )
         if self.truth.noise_deg:
             noise = self._rng.normal(0.0, self.truth.noise_deg, 3)
-            attitude = attitude @ small_rotation(noise)
+            attitude = attitude @ Rotation.from_rotvec(noise, degrees=True).as_matrix()
         return attitude

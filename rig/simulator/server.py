@@ -15,11 +15,12 @@ import struct
 import threading
 import time
 import tty
+from collections.abc import Callable
 
 from rig.simulator.drive import DriveException, SimDrive
 from rig.simulator.faults import FaultInjector
 
-GATEWAY_SILENT = 11
+Cut = Callable[[bytes], tuple[bytes, list[bytes]]]  # to the rest, and the answers
 
 
 def crc16(data: bytes) -> bytes:
@@ -46,83 +47,61 @@ class ModbusServer:
         self._random = random.Random(seed)
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []
-        self._listener: socket.socket | None = None
-        self._pty: tuple[int, int] | None = None
+        self._open = contextlib.ExitStack()
 
     def serve_tcp(self, port: int = 0, rtu: bool = False) -> int:
         """Listen on loopback; returns the port."""
-        self._listener = socket.create_server(("127.0.0.1", port), backlog=8)
-        self._listener.settimeout(0.1)
-        self._start(self._accept, rtu)
-        return int(self._listener.getsockname()[1])
+        listener = socket.create_server(("127.0.0.1", port), backlog=8)
+        self._open.callback(listener.close)
+        listener.settimeout(0.1)
+        self._start(self._accept, listener, self._cut_rtu if rtu else self._cut_mbap)
+        return int(listener.getsockname()[1])
 
     def serve_pty(self) -> str:
         """Open a pseudo-terminal; returns the path a client opens as a serial port."""
         master, slave = os.openpty()
-        tty.setraw(master)
-        tty.setraw(slave)
-        self._pty = (master, slave)  # the slave stays open, or the master hangs up
-        self._start(self._serve_fd, master)
+        for fd in (master, slave):  # the slave stays open, or the master hangs up
+            tty.setraw(fd)
+            self._open.callback(os.close, fd)
+        self._start(self._serve, master, self._cut_rtu)
         return os.ttyname(slave)
 
     def close(self) -> None:
-        """Stop serving."""
         self._closing.set()
         for thread in list(self._threads):
             thread.join(2.0)
-        if self._listener:
-            self._listener.close()
-        for fd in self._pty or ():
-            with contextlib.suppress(OSError):
-                os.close(fd)
+        self._open.close()
 
-    def _start(self, target: object, *args: object) -> None:
-        thread = threading.Thread(target=target, args=args, daemon=True)  # type: ignore[arg-type] # bound methods
+    def _start(self, target: Callable[..., None], *args: object) -> None:
+        thread = threading.Thread(target=target, args=args, daemon=True)
+        self._threads = [t for t in self._threads if t.is_alive()]
         self._threads.append(thread)
         thread.start()
 
-    def _accept(self, rtu: bool) -> None:
-        assert self._listener is not None
+    def _accept(self, listener: socket.socket, cut: Cut) -> None:
         while not self._closing.is_set():
-            try:
-                connection, _ = self._listener.accept()
-            except TimeoutError:
-                continue
-            except OSError:
-                return
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._threads = [t for t in self._threads if t.is_alive()]
-            self._start(self._serve_socket, connection, rtu)
+            with contextlib.suppress(TimeoutError):
+                connection, _ = listener.accept()
+                connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                self._start(self._serve_socket, connection, cut)
 
-    def _serve_socket(self, connection: socket.socket, rtu: bool) -> None:
+    def _serve_socket(self, connection: socket.socket, cut: Cut) -> None:
+        with contextlib.closing(connection):
+            self._serve(connection.fileno(), cut)
+
+    def _serve(self, fd: int, cut: Cut) -> None:
         buffer = b""
-        with contextlib.closing(connection), contextlib.suppress(OSError):
+        with contextlib.suppress(OSError):
             while not self._closing.is_set():
-                if not select.select([connection], [], [], 0.1)[0]:
+                if not select.select([fd], [], [], 0.1)[0]:
                     buffer = b""  # a frame does not pause for so long
                     continue
-                data = connection.recv(4096)
+                data = os.read(fd, 4096)
                 if not data:
                     return
-                buffer += data
-                cut = self._cut_rtu if rtu else self._cut_mbap
-                buffer, answers = cut(buffer)
-                for answer in answers:
-                    connection.sendall(answer)
-
-    def _serve_fd(self, fd: int) -> None:
-        buffer = b""
-        while not self._closing.is_set():
-            try:
-                if not select.select([fd], [], [], 0.05)[0]:
-                    buffer = b""
-                    continue
-                buffer += os.read(fd, 4096)
-                buffer, answers = self._cut_rtu(buffer)
+                buffer, answers = cut(buffer + data)
                 for answer in answers:
                     os.write(fd, answer)
-            except OSError:
-                return
 
     def _cut_mbap(self, buffer: bytes) -> tuple[bytes, list[bytes]]:
         answers: list[bytes] = []
@@ -134,18 +113,15 @@ class ModbusServer:
                 break
             unit, pdu = buffer[6], buffer[7 : 6 + length]
             buffer = buffer[6 + length :]
-            reply, noise = self._answer(unit, pdu)
-            if reply is not None:
+            for noise, reply in self._answer(unit, pdu):
                 head = struct.pack(">HHHB", tid, 0, len(reply) + 1, unit)
                 answers.append(noise + head + reply)
         return buffer, answers
 
     def _cut_rtu(self, buffer: bytes) -> tuple[bytes, list[bytes]]:
-        answers = []
+        answers: list[bytes] = []
         while len(buffer) >= 8:
-            size = 8
-            if buffer[1] == 16:
-                size = 9 + buffer[6]
+            size = 9 + buffer[6] if buffer[1] == 16 else 8
             if len(buffer) < size:
                 break
             frame = buffer[:size]
@@ -153,56 +129,54 @@ class ModbusServer:
                 buffer = buffer[1:]
                 continue
             buffer = buffer[size:]
-            reply, noise = self._answer(frame[0], frame[1:-2])
-            if reply is not None:
+            for noise, reply in self._answer(frame[0], frame[1:-2]):
                 body = frame[:1] + reply
                 answers.append(noise + body + crc16(body))
         return buffer, answers
 
-    def _answer(self, unit: int, pdu: bytes) -> tuple[bytes | None, bytes]:
-        """Reply PDU (None: silence) and the noise to send before it."""
-        axis = self._axis.get(unit)
-        faults = self.faults
+    def _answer(self, unit: int, pdu: bytes) -> list[tuple[bytes, bytes]]:
+        """Noise to send first and the reply's PDU; empty: silence."""
+        axis, faults = self._axis.get(unit), self.faults
         if axis is None:
-            return None, b""
+            return []
         if faults.take("dead_drive", axis) or faults.take("lost_request", axis):
-            return None, b""
+            return []
         if faults.take("exception_reply", axis):
-            return bytes([pdu[0] | 0x80, 4]), b""
+            return [(b"", bytes([pdu[0] | 0x80, 4]))]
         with self.lock:
             self.requests += 1
-            reply = self._execute(self.drives[unit], pdu)
+            reply = _execute(self.drives[unit], pdu)
         if faults.take("lost_reply", axis):
-            return None, b""
+            return []
         if pdu[0] in (6, 16) and faults.take("lost_write_reply", axis):
-            return None, b""
-        delayed = faults.take("delayed_reply", axis)
-        if delayed:
+            return []
+        if delayed := faults.take("delayed_reply", axis):
             time.sleep(0.5 if delayed.seconds is None else delayed.seconds)
         noise = b""
         if faults.take("noise_bytes", axis):
             noise = self._random.randbytes(self._random.randint(1, 6))
-        return reply, noise
+        return [(noise, reply)]
 
-    def _execute(self, drive: SimDrive, pdu: bytes) -> bytes:
-        function = pdu[0]
-        try:
-            if function == 3 and len(pdu) == 5:
-                address, count = struct.unpack(">HH", pdu[1:])
-                if not 1 <= count <= 125:
-                    raise DriveException(3)
-                words = drive.read(address, count)
-                return struct.pack(f">BB{count}H", 3, 2 * count, *words)
-            if function == 6 and len(pdu) == 5:
-                address, value = struct.unpack(">HH", pdu[1:])
-                drive.write(address, [value])
-                return pdu
-            if function == 16 and len(pdu) >= 8:
-                address, count, size = struct.unpack(">HHB", pdu[1:6])
-                if size != 2 * count or len(pdu) != 6 + size or not count:
-                    raise DriveException(3)
-                drive.write(address, list(struct.unpack(f">{count}H", pdu[6:])))
-                return pdu[:5]
-            raise DriveException(1)
-        except DriveException as error:
-            return bytes([function | 0x80, error.code])
+
+def _execute(drive: SimDrive, pdu: bytes) -> bytes:
+    function = pdu[0]
+    try:
+        if function == 3 and len(pdu) == 5:
+            address, count = struct.unpack(">HH", pdu[1:])
+            if not 1 <= count <= 125:
+                raise DriveException(3)
+            words = drive.read(address, count)
+            return struct.pack(f">BB{count}H", 3, 2 * count, *words)
+        if function == 6 and len(pdu) == 5:
+            address, value = struct.unpack(">HH", pdu[1:])
+            drive.write(address, [value])
+            return pdu
+        if function == 16 and len(pdu) >= 8:
+            address, count, size = struct.unpack(">HHB", pdu[1:6])
+            if size != 2 * count or len(pdu) != 6 + size or not count:
+                raise DriveException(3)
+            drive.write(address, list(struct.unpack(f">{count}H", pdu[6:])))
+            return pdu[:5]
+        raise DriveException(1)
+    except DriveException as error:
+        return bytes([function | 0x80, error.code])

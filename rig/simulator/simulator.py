@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import threading
+import functools
 from typing import Any
 
 from rig.attitude import Array
@@ -32,33 +32,28 @@ class Simulator:
         self.truth = truth or Truth(seed=config.session.seed)
         self.faults = FaultInjector(faults)
         self.transport = transport
-        self.rate_hz = rate_hz
-        jig = Plant.jig_posture(self.truth)
         self.drives: list[SimDrive] = []
-        for axis, angle in zip(config.axes, jig, strict=True):
-            travel = None
+        for number, axis in enumerate(config.axes):
+            travel = position = None
             if travel_deg is not None:
-                ends = sorted(axis.to_pulses(end) for end in travel_deg)
-                travel = (ends[0], ends[1])
-            position = 0.0
+                travel = sorted(axis.to_pulses(end) for end in travel_deg)
             if config.session.zero == "here":
-                position = float(axis.to_pulses(float(angle)))
+                position = axis.to_pulses(float(self.truth.jig_deg[number]))
             self.drives.append(
                 SimDrive(
-                    axis.map, axis.pulses_per_rev, position,
-                    speedup=speedup, travel=travel,
+                    axis.map, axis.pulses_per_rev, position or 0, speedup, travel,
+                    functools.partial(self.faults.take, "stuck_axis", number),
                 )
             )  # fmt: skip
-        for number, drive in enumerate(self.drives):
-            drive.stuck = lambda n=number: bool(self.faults.take("stuck_axis", n))  # type: ignore[misc] # a default argument binds the axis
-        self.plant = Plant(config, self.truth, self.drives)
-        self.plant.slipping = lambda axis: bool(self.faults.take("slipping_axis", axis))
+        slipping = functools.partial(self.faults.take, "slipping_axis")
+        self.plant = Plant(config, self.truth, self.drives, slipping)
         units = [axis.unit for axis in config.axes]
         self.server = ModbusServer(
             dict(zip(units, self.drives, strict=True)), self.faults, self.truth.seed
         )
-        self.phone: Phone | None = None
-        self._alarm_lock = threading.Lock()
+        self.phone = Phone(
+            config.imu, self._attitude, self.faults, rate_hz, self.truth.seed
+        )
 
     def start(self, port: int = 0) -> RigConfig:
         """Serve the drives; the phone starts with ``start_phone``."""
@@ -70,9 +65,7 @@ class Simulator:
             bus |= {"host": "127.0.0.1", "port": port}
         phone_port = 0
         if self.config.imu.transport == "connect":
-            self.start_phone(0)
-            assert self.phone is not None
-            phone_port = self.phone.port
+            phone_port = self.start_phone(0)
         imu = {"host": "127.0.0.1", "port": phone_port}
         return self.config.model_copy(
             update={
@@ -81,15 +74,14 @@ class Simulator:
             }
         )
 
-    def start_phone(self, port: int) -> None:
-        """Begin to send to the port the rig listens on; once only."""
-        if self.phone is not None:
-            self.phone.port = port
-            return
-        self.phone = Phone(
-            self.config.imu, self._attitude, self.faults, self.rate_hz, self.truth.seed
-        )
-        self.phone.start(port)
+    def start_phone(self, port: int) -> int:
+        """Send to the port the rig listens on, or listen; returns the port."""
+        return self.phone.start(port)
+
+    def hear(self, record: dict[str, Any]) -> None:
+        """Listen to the events of a session."""
+        if record["event"] == "phase":
+            self.enter(record["phase"])
 
     def enter(self, phase: str) -> None:
         """The session entered a phase: faults that wait for it begin."""
@@ -97,7 +89,7 @@ class Simulator:
         self._alarms()
 
     def _alarms(self) -> None:
-        with self._alarm_lock, self.server.lock:
+        with self.server.lock:
             for axis, drive in enumerate(self.drives):
                 if not drive.alarm and self.faults.take("alarm", axis):
                     drive.raise_alarm(0x30)
@@ -114,12 +106,10 @@ class Simulator:
 
     def executions(self) -> list[list[int]]:
         """Targets in pulses each drive really ran, pitch, yaw, roll."""
-        return [[target for _, target in drive.executions] for drive in self.drives]
+        return [list(drive.executions) for drive in self.drives]
 
     def close(self) -> None:
-        """Stop serving and sending."""
-        if self.phone is not None:
-            self.phone.close()
+        self.phone.close()
         self.server.close()
 
     def __enter__(self) -> Simulator:

@@ -118,7 +118,7 @@ def check_invariants(folder: pathlib.Path, sim: Simulator, alive: bool, deaf: bo
             for r in records
             if r["event"] == "command" and r["axis"] == axis
         ]
-        ran = [target for _, target in drive.executions]
+        ran = drive.executions
         rest = iter(asked)
         missing = [target for target in ran if target not in rest]
         assert not missing, f"{axis} ran moves twice or without a command: {missing}"

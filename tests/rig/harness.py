@@ -17,11 +17,15 @@ from unittest import mock
 
 from rig.config import RigConfig, parse_config
 from rig.config.files import EXAMPLES
+from rig.guard import stop
 from rig.outputs import report
 from rig.session.calibrate import calibrate
 from rig.session.run import Run
 from rig.session.runner import run_safely
 from rig.simulator import Simulator, Truth
+
+# A simulated drive stands within 0.1 s; for a dead one the whole time is waited.
+stop.VERIFY_S = 0.6
 
 RATE_HZ = 250.0
 HOST_FAULTS = ("sigint", "sigint_twice", "sigterm", "sigkill", "full_disk")
@@ -90,18 +94,26 @@ def session(
         (said if said is not None else []).append,
         start={"simulated": {"noise": 0.0}, "inputs": {}, "maps_from": "."},
         reset_alarms=True,
-        on_imu_port=on_imu_port or (sim.start_phone if sim else None),
     )
+    if on_imu_port or sim:
+        run.on_imu_port = on_imu_port or sim.start_phone
     for listener in listeners:
-        run.phase_listeners.append(lambda phase, f=listener: f(run, phase))
-    with contextlib.ExitStack() as stack:
-        if not figures:
-            stack.enter_context(mock.patch.object(report, "_drawn", _undrawn))
+        on_phase(run, lambda phase, f=listener: f(run, phase))
+    with contextlib.nullcontext() if figures else no_figures():
         return run_safely(run, calibrate)
 
 
-def _undrawn(*_: object) -> str:
-    return "no figures in this test"
+def on_phase(run: Run, listener) -> None:
+    """Call a function whenever the run enters a phase."""
+    run.listeners.append(
+        lambda record: record["event"] == "phase" and listener(record["phase"])
+    )
+
+
+def no_figures():
+    """The report without its figures, which take longer than a fast session."""
+    text = "no figures in this test"
+    return mock.patch.object(report, "_drawn", lambda *_: text)
 
 
 def in_the_middle(run: Run, phase: str) -> bool:

@@ -1,7 +1,6 @@
 """Configuration and maps: every fault at once, and all that ships is valid."""
 
 import pathlib
-import tomllib
 
 import pydantic
 import pytest
@@ -10,10 +9,12 @@ from reference import configuration_table, register_map_table
 from rig.config import ConfigError, load_config, parse_config
 from rig.config.axis import Scale
 from rig.config.files import EXAMPLES
-from rig.config.maps import MAP_FOLDER, MapError, available_maps, load_map, parse_map
+from rig.config.maps import MAP_FOLDER, RegisterMap, available_maps, load_map
 from rig.config.registers import decode, encode
+from rig.config.schema import parse
 
 EXAMPLE_TEXT = (EXAMPLES / "simulate.toml").read_text()
+GENERIC = (MAP_FOLDER / "generic.toml").read_text()
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda p: p.stem)
@@ -29,7 +30,7 @@ def test_every_map_that_ships_keeps_the_schema(name):
     frames = loaded.move.write
     written = {f.address + i for f in frames for i in range(f.count)}
     assert loaded.move.trigger.address in written
-    names = {w[0] for f in frames for w in f.words if not isinstance(w, int)}
+    names = {word.value for frame in frames for word in frame.words}
     assert {"position", "speed", "accel"} <= names
 
 
@@ -151,28 +152,30 @@ def test_word_order_of_a_pair_is_the_makers():
 
 
 def test_every_fault_of_a_map_is_listed_at_once():
-    data = tomllib.loads((MAP_FOLDER / "generic.toml").read_text())
-    data["word_order"] = "middle"
-    data["position"]["address"] = 70000
-    data["move"]["write"][0]["words"][0] = "positon:i32"
-    data["status"]["done"] = {"set": [99]}
-    data["colour"] = "red"
-    with pytest.raises(MapError) as caught:
-        parse_map(data, "broken.toml")
+    text = 'colour = "red"\n' + GENERIC
+    for old, new in {
+        'word_order = "big"': 'word_order = "middle"',
+        "address = 0x0012": "address = 70000",
+        "position:i32": "positon:i32",
+        "done = { set = [3]": "done = { set = [99]",
+    }.items():
+        assert old in text
+        text = text.replace(old, new)
+    with pytest.raises(ConfigError) as caught:
+        parse(RegisterMap, text, "broken.toml")
     text = str(caught.value)
     for part in ("word_order", "position.address", "positon", "status.done", "colour"):
         assert part in text
 
 
 def test_the_trigger_must_be_written_last():
-    data = tomllib.loads((MAP_FOLDER / "generic.toml").read_text())
-    data["move"]["write"].reverse()
-    with pytest.raises(MapError, match="last word of the last frame"):
-        parse_map(data, "broken.toml")
+    text = GENERIC.replace("trigger = { address = 0x0028", "trigger = { address = 0x20")
+    with pytest.raises(ConfigError, match="last word of the last frame"):
+        parse(RegisterMap, text, "broken.toml")
 
 
 def test_a_map_beside_the_configuration_needs_no_code(tmp_path):
-    text = (MAP_FOLDER / "generic.toml").read_text().replace("0x0012", "0x0112")
+    text = GENERIC.replace("0x0012", "0x0112")
     (tmp_path / "mine.toml").write_text(text.replace('"generic"', '"mine"'))
     (tmp_path / "rig.toml").write_text(
         EXAMPLE_TEXT.replace('map = "leadshine_pr"', 'map = "mine.toml"')

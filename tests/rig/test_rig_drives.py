@@ -286,9 +286,11 @@ def test_a_serial_port_in_use_says_so():
 
 def test_identify_only_reads():
     config = fast_config()
-    with simulator(config) as sim, Bus(sim.start().bus) as bus:
-        frames = []
-        bus.on_frame = lambda event, fields: frames.append(event)
+    frames = []
+    with (
+        simulator(config) as sim,
+        Bus(sim.start().bus, emit=lambda event, **fields: frames.append(event)) as bus,
+    ):
         for axis in config.axes:
             drive = Drive(bus, axis)
             drive.status(), drive.alarm()
@@ -303,7 +305,7 @@ def test_stop_reaches_the_others_when_one_unit_is_dead():
         for drive in drives:
             drive.move(5000 if drive.axis.name != "yaw" else -5000)
         sim.faults.add(parse_fault("dead_drive,axis=yaw"))
-        pitch, yaw, roll = stop_all(drives, verify_s=1.0)
+        pitch, yaw, roll = stop_all(drives)
         assert pitch.acknowledged and pitch.standing
         assert roll.acknowledged and roll.standing
         assert not yaw.acknowledged and not yaw.standing and yaw.detail

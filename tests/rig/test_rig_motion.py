@@ -13,16 +13,17 @@ from harness import HASTY, UNSETTLED, fast_config, fast_text, simulator
 from rig.config import parse_config
 from rig.device.bus import Bus
 from rig.device.imu import Imu
-from rig.guard.faults import (
+from rig.faults import (
     LimitError,
     MotionFault,
     PauseRequested,
     StopRequested,
     Unreachable,
 )
-from rig.guard.limits import approach_point, check_plan
+from rig.guard.limits import approach, check_plan
 from rig.guard.signals import Signals
-from rig.guard.stop import Stopper
+from rig.session.device import Device
+from rig.session.measuring import Observer
 from rig.session.motion import Motion
 from rig.simulator import parse_fault
 
@@ -34,26 +35,26 @@ WATCHED = {
 
 @contextlib.contextmanager
 def bench(config=None, arm=True, **options):
-    """Motion on a simulated rig; ``events`` is what it logged."""
+    """Motion on a simulated rig."""
     config = config or fast_config()
     with simulator(config, **options) as sim:
         served = sim.start()
-        events = []
         with Imu(served.imu) as imu, Bus(served.bus) as bus:
             sim.start_phone(imu.port)
             imu.wait_for_stream(5)
-            motion = Motion(
-                served, bus, imu, Signals(), Stopper([]),
-                lambda event, **fields: events.append((event, fields)),
-                lambda phase: sim.enter(phase),
+            signals = Signals()
+            device = Device(
+                served, bus, imu, signals,
+                lambda event, **fields: sim.hear({"event": event, **fields}),
             )  # fmt: skip
-            motion.sim, motion.events = sim, events
+            motion = Motion(device)
+            motion.sim, motion.signals = sim, signals
             if arm:
-                motion.arm()
+                device.arm()
             try:
                 yield motion
             finally:
-                motion.heartbeat.close()
+                device.heartbeat.close()
 
 
 def test_nothing_moves_before_arming():
@@ -67,14 +68,14 @@ def test_an_alarm_or_a_silent_phone_keeps_it_from_arming():
     with bench(arm=False) as motion:
         motion.sim.drives[1].raise_alarm(0x40)
         with pytest.raises(MotionFault, match="yaw is in alarm: alarm 0x40"):
-            motion.arm()
-        motion.arm(reset_alarms=True)
-        assert motion.armed
+            motion.device.arm()
+        motion.device.arm(reset_alarms=True)
+        assert motion.device.armed
     with bench(fast_config(HASTY), arm=False) as motion:
         motion.sim.faults.add(parse_fault("imu_gap"))
         time.sleep(motion.config.imu.stale_s + 0.1)
         with pytest.raises(MotionFault, match="reading is"):
-            motion.arm()
+            motion.device.arm()
 
 
 def test_a_position_outside_the_limits_keeps_it_from_arming():
@@ -82,7 +83,7 @@ def test_a_position_outside_the_limits_keeps_it_from_arming():
         drive = motion.sim.drives[2]
         drive.position = motion.config.axes[2].max_pulses + 500.0
         with pytest.raises(MotionFault, match="outside its limits"):
-            motion.arm()
+            motion.device.arm()
 
 
 def test_soft_limits_are_mirrored_in_drives_that_have_them():
@@ -90,7 +91,7 @@ def test_soft_limits_are_mirrored_in_drives_that_have_them():
                "[motion]": "[motion]\nmirror_limits = true"}  # fmt: skip
     with bench(parse_config(fast_text(changes))) as motion:
         axis = motion.config.axes[0]
-        words = motion.bus.read_words(axis.unit, 0x2C, 4)
+        words = motion.device.bus.read_words(axis.unit, 0x2C, 4)
         low, high = (a << 16 | b for a, b in (words[:2], words[2:]))
         assert (low - 2**32, high) == (axis.min_pulses, axis.max_pulses)
 
@@ -120,7 +121,7 @@ def test_a_target_outside_sends_nothing():
 
 def test_long_moves_are_split_and_short_ones_are_not():
     with bench() as motion:
-        start = motion.config.to_deg(motion.positions())
+        start = motion.config.to_deg(motion.device.positions())
         target = motion.config.to_pulses([18.0, -18.0, 18.0])
         motion.move_to(target, "far")
         way = np.abs(motion.config.to_deg(target) - start).max()
@@ -129,7 +130,7 @@ def test_long_moves_are_split_and_short_ones_are_not():
         near = motion.config.to_pulses([17.0, -17.0, 17.0])
         motion.move_to(near, "near")
         assert [len(ran) for ran in motion.sim.executions()] == [steps + 1] * 3
-        assert motion.positions() == near
+        assert motion.device.positions() == near
 
 
 def test_every_posture_is_approached_from_one_side():
@@ -138,7 +139,7 @@ def test_every_posture_is_approached_from_one_side():
         for goal in ([10, 10, 10], [-10, -10, -10]):
             target = motion.config.to_pulses(goal)
             motion.move_to(target, "x")
-            via = approach_point(motion.config, target)
+            via, _ = approach(motion.config, target)
             for ran, last, before in zip(
                 motion.sim.executions(), target, via, strict=True
             ):
@@ -168,10 +169,10 @@ def test_settled_means_drives_done_and_imu_quiet():
     with bench(noise_deg=0.01) as motion:
         target = motion.config.to_pulses([5, 5, 5])
         motion.move_to(target, "x")
-        measured = motion.observer.measure(target)
-        assert measured.samples == motion.config.settle.samples
-        assert (measured.std <= motion.config.settle.std_deg).all()
-        assert measured.feedback == target
+        measured = Observer(motion.device).measure(target)
+        assert measured["samples"] == motion.config.settle.samples
+        assert max(measured["std_deg"]) <= motion.config.settle.std_deg
+        assert measured["feedback"] == list(target)
 
 
 def test_a_shaking_device_never_settles():
@@ -179,7 +180,7 @@ def test_a_shaking_device_never_settles():
     reason = r"did not settle.*(deviation|readings over)"
     with bench(fast_config(UNSETTLED), noise_deg=1.0) as motion:
         with pytest.raises(MotionFault, match=reason):
-            motion.observer.measure(motion.positions())
+            Observer(motion.device).measure(motion.device.positions())
 
 
 def test_a_creeping_device_never_settles():
@@ -188,7 +189,7 @@ def test_a_creeping_device_never_settles():
         plant = motion.sim.plant
         plant.truth = dataclasses.replace(plant.truth, drift_deg_per_min=60.0)
         with pytest.raises(MotionFault, match=r"did not settle.*slope"):
-            motion.observer.measure(motion.positions())
+            Observer(motion.device).measure(motion.device.positions())
 
 
 @pytest.mark.parametrize(
@@ -208,7 +209,7 @@ def test_trouble_on_the_way_is_noticed(fault, error):
         motion.sim.enter("moving")
         with pytest.raises(Exception, match=error):
             motion.move_to(motion.config.to_pulses([10, 10, 10]), "x")
-        results = motion.stopper.stop("test")
+        results = motion.device.stopper.stop("test")
         assert sum(result.acknowledged for result in results) >= 2
         with pytest.raises(StopRequested):
             motion.move_to((0, 0, 0), "after a fault")
@@ -225,7 +226,7 @@ def test_a_refused_target_is_out_of_reach_and_latches_nothing():
     with bench(travel_deg=(-15, 15)) as motion:
         with pytest.raises(Unreachable, match="refused"):
             motion.move_to(motion.config.to_pulses([0, 19, 0]), "x")
-        motion.stopper.stop("out of reach", latch=False)
+        motion.device.stopper.stop("out of reach", latch=False)
         motion.move_to(motion.config.to_pulses([0, 5, 0]), "y")
 
 
@@ -258,24 +259,24 @@ def test_sigterm_stops_a_move_under_way():
         send.start()
         with pytest.raises(StopRequested):
             motion.move_to(motion.config.to_pulses([15, 15, 15]), "x")
-        assert all(r.standing for r in motion.stopper.stop("SIGTERM"))
+        assert all(r.standing for r in motion.device.stopper.stop("SIGTERM"))
 
 
 def test_a_lost_heartbeat_stops_the_drives():
     text = fast_text({"[motion]": "[motion]\nheartbeat_s = 0.3"})
     with bench(parse_config(text), speedup=0.02) as motion:
         for drive, pulses in zip(
-            motion.drives, motion.config.to_pulses([15, 15, 15]), strict=True
+            motion.device.drives, motion.config.to_pulses([15, 15, 15]), strict=True
         ):
             drive.move(pulses)
-        motion.heartbeat.feed(moving=True)  # and then the loop falls silent
+        motion.device.heartbeat.feed(moving=True)  # and then the loop falls silent
         end = time.monotonic() + 5
-        while not motion.stopper.latched:
+        while not motion.device.stopper.reason:
             assert time.monotonic() < end
             time.sleep(0.01)
-        assert "heartbeat" in motion.stopper.reason
+        assert "heartbeat" in motion.device.stopper.reason
         end = time.monotonic() + 5
-        while not motion.stopper.results:
+        while not motion.device.stopper.results:
             assert time.monotonic() < end
             time.sleep(0.01)
         assert all(drive.stops for drive in motion.sim.drives)
@@ -284,9 +285,9 @@ def test_a_lost_heartbeat_stops_the_drives():
 def test_a_drives_own_watch_stops_it_when_the_host_is_gone():
     text = fast_text(WATCHED)
     with bench(parse_config(text), speedup=0.05) as motion:
-        motion.heartbeat.close()
+        motion.device.heartbeat.close()
         target = motion.config.to_pulses([15, 15, 15])
-        for drive, pulses in zip(motion.drives, target, strict=True):
+        for drive, pulses in zip(motion.device.drives, target, strict=True):
             drive.move(pulses)
         time.sleep(1.2)  # nothing is said on the bus
         for sim, pulses in zip(motion.sim.drives, target, strict=True):
@@ -310,7 +311,8 @@ def test_the_motion_and_stop_modules_never_load_jax():
 
     program = (
         "import sys, rig.session.motion, rig.session.measuring, rig.guard.stop\n"
-        "heavy = {'jax', 'matplotlib', 'numba', 'flax'} & set(sys.modules)\n"
+        "heavy = {'jax', 'matplotlib', 'numba', 'flax', 'rig.outputs'}\n"
+        "heavy &= set(sys.modules)\n"
         "sys.exit(f'loaded {heavy}' if heavy else 0)\n"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -1,6 +1,7 @@
 """Whole sessions: calibrate, collect, verify, goto, resume, and the command line."""
 
 import csv
+import dataclasses
 import gc
 import importlib.util
 import itertools
@@ -23,6 +24,8 @@ from harness import (
     changed,
     fast_config,
     fast_text,
+    no_figures,
+    on_phase,
     session,
     simulator,
 )
@@ -31,7 +34,7 @@ import jaxcal
 from rig.__main__ import main
 from rig.arguments import make_parser
 from rig.config import example_text, parse_config
-from rig.guard.faults import Refused
+from rig.faults import Refused
 from rig.outputs.journal import read_journal
 from rig.session.calibrate import calibrate
 from rig.session.checking import collect
@@ -227,7 +230,8 @@ def test_a_terminal_that_goes_away_stops_the_run_and_not_the_stop(tmp_path):
             if "1/7" in text or "stop" in text or "acknowledged" in text:
                 raise BrokenPipeError("Broken pipe")
 
-        run = Run(served, folder, "calibrate", broken, on_imu_port=sim.start_phone)
+        run = Run(served, folder, "calibrate", broken)
+        run.on_imu_port = sim.start_phone
         assert run_safely(run, calibrate) == 3
         assert all(drive.stops for drive in sim.drives)
         assert read_journal(folder / "journal.jsonl")[-1]["event"] == "stopped"
@@ -265,15 +269,15 @@ def test_collect_records_a_dataset_and_resumes(tmp_path):
         served, pressed = sim.start(), []
 
         def once():
-            run = Run(served, folder, "collect", said.append,
-                      on_imu_port=sim.start_phone)  # fmt: skip
+            run = Run(served, folder, "collect", said.append)
+            run.on_imu_port = sim.start_phone
 
             def press(phase):
                 if len(run.journal.events("posture")) == 3 and not pressed:
                     pressed.append(True)
                     signal.raise_signal(signal.SIGINT)
 
-            run.phase_listeners.append(press)
+            on_phase(run, press)
             return run_safely(run, lambda r: collect(r, 8))
 
         assert once() == 4
@@ -348,7 +352,13 @@ def test_the_policys_place_is_taken_by_exact_when_it_is_missing_or_poor(monkeypa
         assert part in choice.note and "\n" not in choice.note
 
 
-@pytest.mark.parametrize("method", ["auto", "exact", "exchange", "greedy", "random"])
+@pytest.mark.parametrize(
+    "method",
+    [
+        "auto", "exact", "greedy", "random",
+        pytest.param("exchange", marks=pytest.mark.slow),  # compiles for ten seconds
+    ],
+)  # fmt: skip
 def test_every_method_of_a_session_makes_a_choice(method):
     text = f'\n[session]\nmethod = "{method}"\nmin_efficiency = 0.01\nseed = 3\n'
     config = parse_config(fast_text(session=text))
@@ -413,7 +423,8 @@ def test_travel_order_takes_the_least_time(rng):
 def test_calibrate_simulate_needs_no_configuration(tmp_path, capsys):
     """The shipped settings and the shipped policy."""
     quick = ["--speedup", "5", "--rate", "250"]
-    assert main(["calibrate", "--simulate", *quick, "--out", str(tmp_path)]) == 0
+    with no_figures():
+        assert main(["calibrate", "--simulate", *quick, "--out", str(tmp_path)]) == 0
     said = capsys.readouterr().out
     assert "95 % confidence" in said and "after compensation" in said
     plan, _, moved = said.partition("armed:")
@@ -587,8 +598,9 @@ def test_simulate_serves_a_session_in_another_process(tmp_path):
         for line in served.stdout:
             if "Ctrl-C" in line:
                 break
-        code = main(["calibrate", "--config", str(path), "--arm", "--zero",
-                     "--out", str(tmp_path / "runs")])  # fmt: skip
+        with no_figures():
+            code = main(["calibrate", "--config", str(path), "--arm", "--zero",
+                         "--out", str(tmp_path / "runs")])  # fmt: skip
         assert code == 0
     finally:
         os.kill(served.pid, signal.SIGINT)
@@ -690,6 +702,8 @@ def test_a_plan_that_leaves_the_limits_is_refused_before_arming(tmp_path):
     wild = draw_candidates(config)
     wild[:, 0] = 99999
     choice = choose(config, config.to_deg(draw_candidates(config)))
-    run.journal.write("plan", candidates=wild.tolist(), choice=choice.described())
+    run.journal.write(
+        "plan", candidates=wild.tolist(), choice=dataclasses.asdict(choice)
+    )
     assert run_safely(run, calibrate) == 2
     assert any("leaves the limits" in line for line in said)

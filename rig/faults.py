@@ -13,12 +13,16 @@ class Refused(ValueError):
     """The request makes no sense for this run; nothing was moved."""
 
 
-class LimitError(ValueError):
+class LimitError(Refused):
     """A target leaves the soft limits; nothing was sent."""
 
 
-class MotionFault(RuntimeError):
-    """Something is wrong with the device: stop everything and latch."""
+class Fault(RuntimeError):
+    """Bus, phone, journal or device failed: stop everything and latch."""
+
+
+class MotionFault(Fault):
+    """Something is wrong with the device."""
 
 
 class NotFollowing(MotionFault):
@@ -47,3 +51,7 @@ class StopRequested(BaseException):
 
 class PauseRequested(BaseException):
     """First Ctrl-C: the posture in progress was finished, the run can be resumed."""
+
+
+class PlanOnly(BaseException):
+    """A dry run has come to the point where it would move."""
