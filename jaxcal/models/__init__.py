@@ -4,6 +4,7 @@ from jaxcal.models.affine import Affine
 from jaxcal.models.identifiability import identifiability
 from jaxcal.models.kinds import from_dict
 from jaxcal.models.model import Model
+from jaxcal.models.serial import SerialChain
 from jaxcal.models.uncertainty import Noise, Prior, ResolvedPrior
 
 __all__ = [
@@ -12,6 +13,7 @@ __all__ = [
     "Noise",
     "Prior",
     "ResolvedPrior",
+    "SerialChain",
     "from_dict",
     "identifiability",
 ]

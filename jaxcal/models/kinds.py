@@ -8,6 +8,7 @@ from typing import Any
 from jaxcal.checks import one_of
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model
+from jaxcal.models.serial import SerialChain
 
 __all__ = ["from_dict"]
 
@@ -16,7 +17,14 @@ def _affine(data: Mapping[str, Any]) -> Affine:
     return Affine(data["num_inputs"], data["num_outputs"])
 
 
-_KINDS: dict[str, Callable[[Mapping[str, Any]], Model]] = {"affine": _affine}
+def _serial_chain(data: Mapping[str, Any]) -> SerialChain:
+    return SerialChain.from_dh(**{key: data[key] for key in data if key != "kind"})
+
+
+_KINDS: dict[str, Callable[[Mapping[str, Any]], Model]] = {
+    "affine": _affine,
+    "serial_chain": _serial_chain,
+}
 
 
 def from_dict(data: Mapping[str, Any]) -> Model:
