@@ -87,7 +87,7 @@ def identifiability(
         slopes = None
         if noise.command_std is not None:
             slopes = model.command_jacobian(commands)
-        jacobian = noise.whitening(*jacobian.shape[:2], slopes) @ jacobian
+        jacobian = noise.whitening(len(commands), model.num_outputs, slopes) @ jacobian
     rows = jacobian.reshape(-1, model.num_parameters)
     asked = np.ones(model.num_parameters, dtype=np.bool_)
     if prior is not None:

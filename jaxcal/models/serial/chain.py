@@ -85,7 +85,7 @@ class SerialChain(Arm):
                 ("compliance2"): degrees per unit of weight times length.
             loads: (link, weight, centre in the frame of that row); by default a weight
                 of one at the tool. The torques are those of the nominal arm.
-            gravity: direction in which weight acts, in the measuring frame; times 9.81 where
+            gravity: direction of weight in the measuring frame; times 9.81 where
                 loads are masses.
             joint_names: what the joints are called, for the reader.
         """
