@@ -1,0 +1,166 @@
+"""Models from JAX functions."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxcal.models import FromJax, Model, from_dict, identifiability
+
+from .arms import differences, ur5, ur5_data
+
+
+def two_link(u, theta):
+    first, both = jnp.radians(u[0] + theta[2]), jnp.radians(u[0] + u[1] + theta[3])
+    return jnp.stack(
+        [
+            theta[0] * jnp.cos(first) + theta[1] * jnp.cos(both),
+            theta[0] * jnp.sin(first) + theta[1] * jnp.sin(both),
+        ]
+    )
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return FromJax(two_link, [300.0, 200.0, 1.0, -2.0], ["l1", "l2", "o1", "o2"], 2)
+
+
+COMMANDS = np.random.default_rng(0).uniform(-90.0, 90.0, (5, 2))
+
+
+def test_derivatives_are_those_of_central_differences(arm):
+    assert isinstance(arm, Model)
+    at = arm.nominal + 0.5
+    numeric = differences(lambda theta: arm.predict(COMMANDS, theta), at)
+    np.testing.assert_allclose(arm.jacobian(COMMANDS, at), numeric, atol=1e-6)
+    slopes = arm.command_jacobian(COMMANDS, at)
+    for i, command in enumerate(COMMANDS):
+        numeric = differences(lambda u: arm.predict([u, *COMMANDS[1:]], at)[0], command)
+        np.testing.assert_allclose(slopes[i], numeric, atol=1e-6)
+
+
+def test_results_are_float64_and_the_configuration_stays(arm):
+    before = jax.config.jax_enable_x64
+    outputs = arm.predict(COMMANDS)
+    assert outputs.dtype == np.float64
+    first, both = np.radians([[1.0, 0.0], [-2.0, 0.0]]) @ [[1.0], [0.0]]
+    first = first + np.radians(COMMANDS[:, 0])
+    both = both + np.radians(COMMANDS.sum(axis=1))
+    x = 300.0 * np.cos(first) + 200.0 * np.cos(both)
+    np.testing.assert_allclose(outputs[:, 0], x, rtol=1e-14)
+    assert jax.config.jax_enable_x64 is before
+
+
+def test_a_scalar_is_one_output_and_the_inputs_are_those_of_the_first_commands():
+    model = FromJax(lambda u, t: t[0] * u[0] ** t[1], [1.0, 2.0])
+    with pytest.raises(ValueError, match="num_inputs of this model is not known"):
+        model.num_inputs  # noqa: B018 (reading it is the test)
+    assert model.names == ("t1", "t2")
+    np.testing.assert_array_equal(model.predict([[3.0]]), [[9.0]])
+    assert (model.num_inputs, model.num_outputs) == (1, 1)
+    with pytest.raises(ValueError, match=r"commands must have shape \(N, 1\)"):
+        model.predict([[3.0, 4.0]])
+
+
+def test_it_compiles_once_for_a_number_of_commands():
+    calls = []
+
+    def f(u, theta):
+        calls.append(1)
+        return theta * u
+
+    model = FromJax(f, [1.0], num_inputs=1)
+    model.predict([[1.0]])
+    traced = len(calls)
+    model.predict([[2.0]], [3.0])
+    assert len(calls) == traced
+
+
+@pytest.mark.parametrize(
+    ("f", "message"),
+    [
+        (lambda u, t: np.sin(u), "JAX cannot follow f .* TracerArrayConversionError"),
+        (lambda u, t: u if u[0] > 0 else t, "JAX cannot follow f .* TracerBool"),
+        (lambda u, t: jnp.ones((3, 3)) @ u, r"a command \(2,\) .* TypeError"),
+        (lambda u, t: jnp.outer(u, t), r"f must return an array \(q,\) .* \(2, 1\)"),
+        (lambda u, t: (u[0], u[1]), "got tuple"),
+        (lambda u, t: u[:0], r"got \(0,\)"),
+        (3, "f must be a function"),
+    ],
+)
+def test_functions_that_are_no_model_are_refused(f, message):
+    with pytest.raises(ValueError, match=message):
+        FromJax(f, [1.0], num_inputs=2)
+
+
+@pytest.mark.parametrize(
+    ("nominal", "names", "message"),
+    [
+        ([[1.0]], None, r"nominal must have shape \(p,\)"),
+        ([np.nan], None, "nominal must be finite"),
+        ([1.0, 2.0], ["a"], "names must hold 2 names"),
+        ([1.0, 2.0], ["a", "a"], "names must differ"),
+    ],
+)
+def test_parameters_that_do_not_fit_are_refused(nominal, names, message):
+    with pytest.raises(ValueError, match=message):
+        FromJax(lambda u, t: u, nominal, names)
+
+
+def test_what_is_not_finite_is_named():
+    model = FromJax(lambda u, t: t[0] + u * jnp.sqrt(t[1]), [1.0, 0.0], ["gain", "w"])
+    with pytest.raises(ValueError, match=r"derivative of f by 'w' .* at command 1"):
+        model.jacobian([[0.0], [1.0]][::-1] + [[1.0]])[0]
+    with pytest.raises(ValueError, match="f must be finite, got nan for output 1"):
+        model.predict([[1.0]], [1.0, -1.0])
+    root = FromJax(lambda u, t: t * jnp.sqrt(u), [1.0])
+    with pytest.raises(ValueError, match="derivative of f by input 1 .* at command 0"):
+        root.command_jacobian([[0.0]])
+
+
+def test_a_function_cannot_come_back_from_a_file(arm):
+    data = arm.to_dict()
+    assert data["names"] == ["l1", "l2", "o1", "o2"] and data["kind"] == "jax"
+    with pytest.raises(ValueError, match=r"holds a function.*model=\.\.\."):
+        from_dict(data)
+
+
+def test_an_arm_of_ones_own_shows_what_the_chain_shows():
+    """A UR5 written in JAX, radians and all: the same 25 combinations are seen."""
+    chain = ur5()
+
+    def turn(axis, angle):
+        c, s = jnp.cos(angle), jnp.sin(angle)
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        eye = jnp.eye(4).at[i, i].set(c).at[j, j].set(c)
+        return eye.at[i, j].set(-s).at[j, i].set(s)
+
+    def slide(axis, length):
+        return jnp.eye(4).at[axis, 3].set(length)
+
+    def f(u, theta):
+        frame = jnp.eye(4)
+        for axis in range(3):
+            frame = frame @ slide(axis, theta[30 + axis])
+        for axis in range(3):
+            frame = frame @ turn(axis, theta[33 + axis])
+        for i in range(6):
+            a, alpha, d, offset, beta = theta[5 * i : 5 * i + 5]
+            frame = frame @ turn(2, jnp.radians(u[i]) + offset) @ slide(2, d)
+            frame = frame @ slide(0, a) @ turn(0, alpha) @ turn(1, beta)
+        return (frame @ jnp.append(theta[36:39], 1.0))[:3]
+
+    angles = np.array(chain.units) == "deg"
+    nominal = np.where(angles, np.radians(chain.nominal), chain.nominal)
+    model = FromJax(f, nominal, chain.names, 6)
+    commands = ur5_data()[0][:100]
+    np.testing.assert_allclose(
+        model.predict(commands), chain.predict(commands), atol=1e-9
+    )
+    report = identifiability(model, commands)
+    assert report.rank == 25
+    assert {each.words for each in report.directions} == {
+        each.words for each in identifiability(chain, commands).directions
+    }
