@@ -86,8 +86,9 @@ class FromJax:
         """(N, q, p)."""
         slopes = self._run(1, commands, parameters)
         for i, j, k in np.argwhere(~np.isfinite(slopes)):
+            name = self.names[self._without_derivative(i, j, k, commands, parameters)]
             raise ValueError(
-                f"the derivative of f by {self.names[k]!r} must be finite, got "
+                f"the derivative of f by {name!r} must be finite, got "
                 f"{slopes[i, j, k]} for output {j + 1} at command {i}"
             )
         return slopes
@@ -152,6 +153,21 @@ class FromJax:
             jax.jit(jax.vmap(each, in_axes=(0, None)))
             for each in (f, jax.jacfwd(f, argnums=1), jax.jacfwd(f, argnums=0))
         )
+
+    def _without_derivative(
+        self, i: int, j: int, k: int, commands: ArrayLike, parameters: ArrayLike | None
+    ) -> int:
+        """The parameter to blame: forward derivatives of the others are 0 inf = nan."""
+        import jax
+
+        at = as_commands(commands, self.num_inputs)[i], as_parameters(self, parameters)
+        try:
+            with jax.enable_x64(True):
+                row = jax.jacrev(lambda *at: jax.numpy.ravel(self.f(*at))[j], 1)(*at)
+        except ValueError:  # f has a loop that JAX differentiates forward only
+            return k
+        bad = np.flatnonzero(~np.isfinite(np.asarray(row)))
+        return int(bad[0]) if len(bad) else k
 
     def _run(
         self, which: int, commands: ArrayLike, parameters: ArrayLike | None

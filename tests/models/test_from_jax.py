@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxcal.models import FromJax, Model, from_dict, identifiability
+from jaxcal.models import FromJax, Model, SerialChain, from_dict, identifiability
 
-from .arms import differences, ur5, ur5_data
+from .arms import UR5_TABLE, differences, ur5_data
 
 
 def two_link(u, theta):
@@ -111,12 +111,12 @@ def test_parameters_that_do_not_fit_are_refused(nominal, names, message):
 
 def test_what_is_not_finite_is_named():
     model = FromJax(lambda u, t: t[0] + u * jnp.sqrt(t[1]), [1.0, 0.0], ["gain", "w"])
-    with pytest.raises(ValueError, match=r"derivative of f by 'w' .* at command 1"):
-        model.jacobian([[0.0], [1.0]][::-1] + [[1.0]])[0]
+    with pytest.raises(ValueError, match=r"derivative of f by 'w' .* at command 0"):
+        model.jacobian([[1.0], [2.0]])
     with pytest.raises(ValueError, match="f must be finite, got nan for output 1"):
         model.predict([[1.0]], [1.0, -1.0])
     root = FromJax(lambda u, t: t * jnp.sqrt(u), [1.0])
-    with pytest.raises(ValueError, match="derivative of f by input 1 .* at command 0"):
+    with pytest.raises(ValueError, match=r"derivative of f by input 1 .* at command 0"):
         root.command_jacobian([[0.0]])
 
 
@@ -128,39 +128,34 @@ def test_a_function_cannot_come_back_from_a_file(arm):
 
 
 def test_an_arm_of_ones_own_shows_what_the_chain_shows():
-    """A UR5 written in JAX, radians and all: the same 25 combinations are seen."""
-    chain = ur5()
+    """The first joints of a UR5 in JAX, radians and all: the same is seen of them."""
+    chain = SerialChain.from_dh(UR5_TABLE[:3], tool=(0, 0, 31))
 
     def turn(axis, angle):
         c, s = jnp.cos(angle), jnp.sin(angle)
         i, j = (axis + 1) % 3, (axis + 2) % 3
-        eye = jnp.eye(4).at[i, i].set(c).at[j, j].set(c)
+        eye = jnp.eye(3).at[i, i].set(c).at[j, j].set(c)
         return eye.at[i, j].set(-s).at[j, i].set(s)
 
-    def slide(axis, length):
-        return jnp.eye(4).at[axis, 3].set(length)
-
     def f(u, theta):
-        frame = jnp.eye(4)
-        for axis in range(3):
-            frame = frame @ slide(axis, theta[30 + axis])
-        for axis in range(3):
-            frame = frame @ turn(axis, theta[33 + axis])
-        for i in range(6):
-            a, alpha, d, offset, beta = theta[5 * i : 5 * i + 5]
-            frame = frame @ turn(2, jnp.radians(u[i]) + offset) @ slide(2, d)
-            frame = frame @ slide(0, a) @ turn(0, alpha) @ turn(1, beta)
-        return (frame @ jnp.append(theta[36:39], 1.0))[:3]
+        rows, base, tool = theta[:15].reshape(3, 5), theta[15:21], theta[21:]
+        point = tool
+        for (a, alpha, d, offset, beta), angle in zip(rows[::-1], u[::-1], strict=True):
+            point = turn(0, alpha) @ turn(1, beta) @ point + jnp.array([1.0, 0, 0]) * a
+            point = turn(2, jnp.radians(angle) + offset) @ point
+            point = point + jnp.array([0.0, 0, 1]) * d
+        for axis in (2, 1, 0):
+            point = turn(axis, base[3 + axis]) @ point
+        return base[:3] + point
 
     angles = np.array(chain.units) == "deg"
     nominal = np.where(angles, np.radians(chain.nominal), chain.nominal)
-    model = FromJax(f, nominal, chain.names, 6)
-    commands = ur5_data()[0][:100]
+    model = FromJax(f, nominal, chain.names, 3)
+    commands = ur5_data()[0][:60, :3]
     np.testing.assert_allclose(
         model.predict(commands), chain.predict(commands), atol=1e-9
     )
-    report = identifiability(model, commands)
-    assert report.rank == 25
-    assert {each.words for each in report.directions} == {
-        each.words for each in identifiability(chain, commands).directions
-    }
+    own, built_in = (identifiability(each, commands) for each in (model, chain))
+    assert own.rank == built_in.rank < 24
+    words = [{each.words for each in report.directions} for report in (own, built_in)]
+    assert words[0] == words[1]

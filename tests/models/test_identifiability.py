@@ -89,7 +89,7 @@ def test_some_parameters_taking_the_others_as_known():
     assert report.names == ("a2", "d2", "d3", "theta6")
     assert [each.words for each in report.directions] == ["d2 = d3", "theta6"]
     assert report.identifiable == ("a2",)
-    with pytest.raises(ValueError, match="parameters must be among .* got 'd9'"):
+    with pytest.raises(ValueError, match=r"parameters must be among .* got 'd9'"):
         identifiability(ur5(), ur5_data()[0][:50], parameters=["d9"])
 
 
@@ -142,4 +142,5 @@ def test_a_pose_shows_more_than_a_position():
     pose = identifiability(ur5(output="pose"), commands)
     assert pose.rank > position.rank
     gantry = SerialChain.from_dh([(0, 0, 0, 0)] * 3, joints="PPP")
-    assert "theta1" in identifiability(gantry, commands[:, :3]).directions[1].words
+    unseen = identifiability(gantry, commands[:, :3]).directions
+    assert "theta1" in [each.words for each in unseen]

@@ -113,16 +113,13 @@ def test_outputs_are_those_of_products_of_matrices(arm):
     )
 
 
+@hypothesis.settings(max_examples=25)
 @hypothesis.given(arms(compliance=True))
 def test_derivatives_are_those_of_central_differences(arm):
     model, commands, parameters = arm
     numeric = differences(lambda at: model.predict(commands, at), parameters)
     np.testing.assert_allclose(
         model.jacobian(commands, parameters), numeric, atol=2e-6, rtol=1e-6
-    )
-    at_nominal = differences(lambda at: model.predict(commands, at), model.nominal)
-    np.testing.assert_allclose(
-        model.jacobian(commands), at_nominal, atol=2e-6, rtol=1e-6
     )
     by_command = np.stack(
         [
@@ -157,15 +154,11 @@ def test_a_model_comes_back_from_json(arm):
 def test_a_command_turns_a_pose_against_the_orientation_it_is_compared_with():
     model = ur5(output="pose")
     commands = ur5_data("ur5_random_20.csv")[0][:3]
+    values = dict(zip(model.names, model.nominal, strict=True))
     frames = []
     for step in (1e-4, -1e-4):
-        moved = commands + [0, 0, 0, step, 0, 0]
-        frames.append(
-            [
-                tool_frame(model, each, dict(zip(model.names, model.nominal)))[:3, :3]
-                for each in moved
-            ]
-        )
+        moved = commands + np.array([0, 0, 0, step, 0, 0])
+        frames.append([tool_frame(model, each, values)[:3, :3] for each in moved])
     first, second = (model.rotation_vectors(commands, each) for each in frames)
     slope = model.command_jacobian(commands)[:, 3:, 3]
     np.testing.assert_allclose(slope, (first - second) / 2e-4, atol=1e-7)

@@ -163,5 +163,5 @@ def test_links_that_do_not_fit_are_refused(tmp_path):
         '<joint name="back" type="fixed"><parent link="link1"/>'
         '<child link="link0"/></joint>',
     )
-    with pytest.raises(ValueError, match="the joints j1, back form a loop"):
+    with pytest.raises(ValueError, match="the joints back, j1 form a loop"):
         _read(tmp_path, ring, "link1")
