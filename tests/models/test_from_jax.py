@@ -53,15 +53,48 @@ def test_results_are_float64_and_the_configuration_stays(arm):
     assert jax.config.jax_enable_x64 is before
 
 
-def test_a_scalar_is_one_output_and_the_inputs_are_those_of_the_first_commands():
+def test_a_scalar_is_one_output():
     model = FromJax(lambda u, t: t[0] * u[0] ** t[1], [1.0, 2.0])
-    with pytest.raises(ValueError, match="num_inputs of this model is not known"):
-        model.num_inputs  # noqa: B018 (reading it is the test)
     assert model.names == ("t1", "t2")
     np.testing.assert_array_equal(model.predict([[3.0]]), [[9.0]])
     assert (model.num_inputs, model.num_outputs) == (1, 1)
     with pytest.raises(ValueError, match=r"commands must have shape \(N, 1\)"):
         model.predict([[3.0, 4.0]])
+
+
+@pytest.mark.parametrize(
+    "f",
+    [
+        lambda u, t: t[0] * u[0] + u[2],
+        lambda u, t: jnp.stack([*u[:2], u[2]]),
+        jax.jit(lambda u, t: u[2] * t[1]),
+        lambda u, t: jnp.ones((2, 3)) @ u,
+    ],
+)
+def test_the_number_of_inputs_is_read_from_the_function(f):
+    assert FromJax(f, [1.0, 2.0]).num_inputs == 3
+
+
+def test_the_number_of_inputs_is_else_that_of_the_first_commands():
+    model = FromJax(lambda u, t: t[0] * jnp.sum(u[1:]), [1.0])
+    with pytest.raises(ValueError, match="num_inputs of this model is not known"):
+        model.num_inputs  # noqa: B018 (reading it is the test)
+    model.predict([[1.0, 2.0, 3.0, 4.0]])
+    assert model.num_inputs == 4
+
+
+@pytest.mark.parametrize(
+    ("f", "message"),
+    [
+        (lambda u, t: t[2] * u[0], r"f reads theta\[2\], which theta of 2 entries"),
+        (lambda u, t: t[0] * u[0] + u[2], r"f reads u\[2\], which u of 2 entries"),
+    ],
+)
+def test_an_index_beyond_the_end_is_refused(f, message):
+    with pytest.raises(ValueError, match=message):
+        FromJax(f, [1.0, 2.0], num_inputs=2)
+    ends = FromJax(lambda u, t: t[-1] * u[0] + t[0] * u[-1], [1.0, 2.0], num_inputs=2)
+    np.testing.assert_array_equal(ends.predict([[10.0, 100.0]]), [[120.0]])
 
 
 def test_it_compiles_once_for_a_number_of_commands():
