@@ -16,7 +16,7 @@ from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training import optimiser, ppo, rollout
 from jaxcal.learning.training.config import PPOConfig
-from jaxcal.learning.training.loss import surrogate
+from jaxcal.learning.training.ppo import surrogate
 
 SMALL = NetworkConfig(width=8, encoder_rounds=1)
 TINY = PPOConfig(

@@ -57,7 +57,7 @@ def finished(tmp_path_factory):
 
 
 def leaves(state):
-    return [np.asarray(x) for x in jax.tree.leaves(checkpoint._plain_keys(state))]
+    return [np.asarray(x) for x in jax.tree.leaves(state)]
 
 
 def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished, tmp_path):
@@ -141,7 +141,7 @@ def test_validation_of_the_optimum_itself_is_one():
             lambda step: _edit(step, network={"kind": "compact", "size": 1}),
             "no network",
         ),
-        (lambda step: _edit(step, network={"width": 16}), "does not fit its network"),
+        (lambda step: _edit(step, network={"width": 16}), "do not fit its network"),
         (lambda step: shutil.rmtree(step), "holds no checkpoint"),
         (lambda step: _truncate(step), "damaged"),
     ],
@@ -173,8 +173,7 @@ def _truncate(step: pathlib.Path) -> None:
 def test_results_that_arrive_after_a_failed_read_are_ignored():
     # Orbax closes its event loop while tensorstore still reads; without this, users
     # see "Event loop is closed" below the message about a damaged checkpoint.
-    with checkpoint._late_reads_ignored():
-        loop = asyncio.new_event_loop()
+    loop = checkpoint._PatientPolicy().new_event_loop()
     loop.close()
     assert loop.call_soon_threadsafe(print) is None
     plain = asyncio.new_event_loop()

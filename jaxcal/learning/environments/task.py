@@ -1,8 +1,7 @@
 """What is trained on: an episode of selection and where its candidates come from.
 
-A ``Task`` is all that the trainer knows of an environment: how to begin, how to step,
-and what a decision pays (``training.rollout.Rules`` says what it needs). Another
-environment is another class with these methods.
+A ``Task`` is all that the trainer knows of an environment; ``training.rules.Rules``
+says what it needs. Another environment is another class with these methods.
 """
 
 from __future__ import annotations

@@ -92,8 +92,8 @@ class _Categorical:
         return jnp.argmax(self.logits, axis=-1)
 
     def log_prob(self, x: jax.Array) -> jax.Array:
-        log_probs = jax.nn.log_softmax(self.logits)
         index = x.astype(jnp.int32)[..., None]
+        log_probs = jax.nn.log_softmax(self.logits)
         return jnp.take_along_axis(log_probs, index, axis=-1)[..., 0]
 
     def entropy(self) -> jax.Array:

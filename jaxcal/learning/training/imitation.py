@@ -28,16 +28,7 @@ from jaxcal.learning.training.optimiser import Keys, Metrics
 from jaxcal.learning.training.rules import Rules
 from jaxcal.learning.training.update import Update
 
-__all__ = [
-    "Attempt",
-    "Lesson",
-    "Lessons",
-    "Teacher",
-    "draw",
-    "follow",
-    "loss",
-    "updater",
-]
+__all__ = ["Lesson", "Lessons", "Teacher", "draw", "follow", "loss", "updater"]
 
 Teacher = Callable[
     [np.ndarray, np.ndarray, np.ndarray, int], tuple[np.ndarray, np.ndarray]
@@ -94,22 +85,19 @@ def _drawn(key: jax.Array, num_sets: int, task: Rules) -> tuple[jax.Array, jax.A
 
 
 class Lessons:
-    """Lessons in order, the next one prepared while this one is learned."""
+    """Lessons ``0`` to ``last - 1``, the next prepared while this one is learned."""
 
     def __init__(self, prepare: Callable[[int], Lesson], last: int) -> None:
         self._prepare, self._last = prepare, last
         self._pool = ThreadPoolExecutor(1)
-        self._next: tuple[int, Future[Lesson]] | None = None
+        self._asked: dict[int, Future[Lesson]] = {}
 
     def at(self, index: int) -> Lesson:
         """The lesson of update ``index``."""
-        if self._next is None or self._next[0] != index:
-            self._next = (index, self._pool.submit(self._prepare, index))
-        lesson = self._next[1].result()
-        if index + 1 < self._last:
-            following = self._pool.submit(self._prepare, index + 1)
-            self._next = (index + 1, following)
-        return lesson
+        for i in range(index, min(index + 2, self._last)):
+            if i not in self._asked:
+                self._asked[i] = self._pool.submit(self._prepare, i)
+        return self._asked.pop(index).result()
 
     def close(self) -> None:
         """Forget what was being prepared."""
@@ -163,12 +151,8 @@ def loss(
         The loss, and metrics named as those of PPO.
     """
     memory = networks.encode(network, params, attempt.features)
-    decode = jax.vmap(
-        lambda seen: networks.decode(network, params, memory, seen),
-        in_axes=1,
-        out_axes=1,
-    )
-    logits, value = decode(attempt.decisions)  # (B, T, M), (B, T)
+    # (B, T, M), (B, T)
+    logits, value = networks.decode(network, params, memory, attempt.decisions, axes=1)
     log_probs = jax.nn.log_softmax(logits)
     hopes = networks.mask_logits(log_probs, attempt.wanted)
     number = jnp.maximum(attempt.counted.sum(), 1.0)
