@@ -184,12 +184,12 @@ def _streamed(
         draws=options.draws,
     )
     process = _process()
-    if process[1] == 1:
-        open_folder(plan, options.stream)
-    else:
+    if process[1] > 1:
         from jaxcal.learning.runtime import devices
 
         devices.on_first(lambda: open_folder(plan, options.stream))
+    else:
+        open_folder(plan, options.stream)
     if not (options.stream / "stream.json").exists():
         raise ValueError(
             f"--stream {options.stream} must be a folder that all processes see; "
@@ -209,11 +209,8 @@ def _streamed(
 
 def _process() -> tuple[int, int]:
     """Which process this is, and of how many; one that holds no JAX is alone."""
-    if "jax" not in sys.modules:
-        return 0, 1
-    import jax
-
-    if not jax.distributed.is_initialized():
+    jax = sys.modules.get("jax")
+    if jax is None or not jax.distributed.is_initialized():
         return 0, 1
     return jax.process_index(), jax.process_count()
 

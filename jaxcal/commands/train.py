@@ -9,7 +9,7 @@ import hashlib
 import pathlib
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -58,7 +58,7 @@ def _run(arguments: argparse.Namespace) -> int:
     cache.keep_compiled_programs()
     out = pathlib.Path(arguments.out or f"runs/{arguments.preset}")
     config = devices.on_first(lambda: _configuration(arguments, out))
-    stop = _Stop()
+    stop = _stop_on_signals()
     if arguments.trainer == "brax":
         from jaxcal.learning.training import brax_ppo
 
@@ -85,7 +85,7 @@ def _run(arguments: argparse.Namespace) -> int:
             resume=arguments.resume,
             validation=validation,
             report=_show,
-            should_stop=stop.requested,
+            should_stop=stop,
             num_devices=arguments.devices,
             teacher=teacher,
         )
@@ -129,7 +129,7 @@ def _configuration(arguments: argparse.Namespace, out: pathlib.Path) -> TrainCon
             )
         config = TrainConfig.from_meta(checkpoint.load(out).meta)
         held = config.tasks[0].given
-        if held != candidates:  # they are compared by name and digest
+        if held != candidates:  # they are compared by their digest
             what = f"{held.name} (SHA-256 {held.sha256[:12]})" if held else "no file"
             rule = "give the same file" if held else "leave it out"
             raise ValueError(f"--candidates: the run was trained on {what}; {rule}")
@@ -261,22 +261,18 @@ def _introduce(config: TrainConfig, out: pathlib.Path, devices: str) -> None:
     print(f"configuration: {config.as_meta()}")
 
 
-class _Stop:
-    """Ctrl-C or SIGTERM asks the loop to save and stop; a second Ctrl-C is at once."""
+def _stop_on_signals() -> Callable[[], bool]:
+    """Whether Ctrl-C or SIGTERM asked to save and stop; a second Ctrl-C is at once."""
+    asked: list[int] = []
 
-    def __init__(self) -> None:
-        self._asked = False
-        for name in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(name, self._ask)
-
-    def _ask(self, number: int, frame: Any) -> None:
-        self._asked = True
+    def ask(number: int, frame: Any) -> None:
+        asked.append(number)
         print("\nstopping after this update and saving ...", flush=True)
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    def requested(self) -> bool:
-        """Whether to stop."""
-        return self._asked
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, ask)
+    return lambda: bool(asked)
 
 
 def _show(report: Report) -> None:

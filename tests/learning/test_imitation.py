@@ -15,7 +15,7 @@ from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies import networks
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.training import checkpoint, imitation, optimiser
+from jaxcal.learning.training import imitation, optimiser
 from jaxcal.learning.training import run as training
 from jaxcal.learning.training.config import PPOConfig, TrainConfig
 

@@ -27,7 +27,7 @@ __all__ = ["GivenCandidates", "Task"]
 class GivenCandidates:
     """The user's own candidates, known by their digest; a checkpoint holds no copy."""
 
-    name: str  # of the file, for messages
+    name: str = field(compare=False)  # of the file, for messages
     sha256: str  # of the file
     # (B, M, n) sets, or (1, N, n): a pool that every episode draws its M from. None
     # where only the digest is known.

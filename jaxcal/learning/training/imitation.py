@@ -56,15 +56,14 @@ def draw(
     num_sets = config.episodes_per_update
     key = jax.random.fold_in(Keys.of(config.seed).lessons, index)
     key_sets, key_share, key_length, key_given = jax.random.split(key, 4)
-    candidates, available = _drawn(key_sets, num_sets, task)
+    points, free = map(np.asarray, _drawn(key_sets, num_sets, task))
     learned = task.num_decisions - network.num_unlearned
     begun = jax.random.uniform(key_share, (num_sets,)) < task.random_starts
     length = jax.random.randint(key_length, (num_sets,), 1, max(learned, 2))
     lengths = np.asarray(jnp.where(begun, length, 0))
-    rank = jax.random.uniform(key_given, available.shape)
-    order = np.asarray(jnp.argsort(jnp.where(available, rank, 2.0), axis=-1))
+    rank = jax.random.uniform(key_given, free.shape)
+    order = np.asarray(jnp.argsort(jnp.where(free, rank, 2.0), axis=-1))
     given = order[:, :learned].astype(np.int32)
-    points, free = np.asarray(candidates), np.asarray(available)
     wanted = np.zeros(free.shape, bool)
     best = np.zeros(num_sets, np.float32)
     for count in np.unique(lengths):

@@ -46,17 +46,13 @@ class Validation:
 
     def measure(self, network: Network, params: Any, k: int) -> tuple[float, float]:
         """Mean det S / det S* and the share of optima hit, by greedy decoding."""
-        batch, m, _ = self.candidates.shape
-        free = np.ones((batch, m), bool) if self.available is None else self.available
         candidates = jnp.asarray(self.candidates, jnp.float32)
+        free = jnp.ones(candidates.shape[:2], bool)
+        if self.available is not None:
+            free = jnp.asarray(self.available)
+        nothing, unused = jnp.zeros((len(free), 0), jnp.int32), jax.random.key(0)
         indices = decoding.choose(
-            network,
-            params,
-            candidates,
-            jnp.asarray(free),
-            jnp.zeros((batch, 0), jnp.int32),
-            jax.random.key(0),
-            k=k,
+            network, params, candidates, free, nothing, unused, k=k
         )
         gap = np.asarray(decoding.log_det_of(candidates, indices)) - self.best
         # float32 values against a float64 optimum: equal to a few units in the last
