@@ -1,11 +1,35 @@
-"""Types for argparse that say in one line what is wrong."""
+"""Command lines: a parser, types of values, and errors, each said in one line."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from collections.abc import Callable
+from typing import Any, NoReturn, TypeVar
 
-__all__ = ["at_least", "seconds"]
+__all__ = ["Parser", "at_least", "refused", "seconds", "several"]
+
+T = TypeVar("T")
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line, and keeps the layout of its texts."""
+
+    def __init__(self, **fields: Any) -> None:
+        fields.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        super().__init__(allow_abbrev=False, **fields)
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message}; see --help\n")
+
+
+def refused(program: str, error: Exception) -> int:
+    """Print an error in one line on standard error; the exit code, 2."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, OSError) and error.strerror and error.filename is not None:
+        text = f"{error.filename}: {error.strerror}"
+    print(f"{program}: {text}", file=sys.stderr)
+    return 2
 
 
 def at_least(least: int) -> Callable[[str], int]:
@@ -34,3 +58,17 @@ def seconds(text: str) -> float:
     if not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"must be seconds above 0, got {text!r}")
     return value
+
+
+def several(kind: Callable[[str], T], what: str) -> Callable[[str], list[T]]:
+    """Values separated by commas, called ``what`` where one is not of the kind."""
+
+    def parse(text: str) -> list[T]:
+        try:
+            return [kind(part) for part in text.split(",") if part.strip()]
+        except ValueError:
+            raise argparse.ArgumentTypeError(
+                f"must be {what} separated by commas, got {text!r}"
+            ) from None
+
+    return parse

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import axis_names, numbers
+from jaxcal.checks import axis_names, numbers, whole_number
 
 __all__ = ["JointRanges", "draw_from_pool", "uniform_candidates"]
 
@@ -92,26 +92,12 @@ class JointRanges:
 
 
 def uniform_candidates(
-    rng: np.random.Generator,
-    num_sets: int,
-    num_candidates: int,
-    ranges: JointRanges | int = 3,
+    rng: np.random.Generator, num_sets: int, num_candidates: int, num_inputs: int = 3
 ) -> Array:
-    """(B, M, n) candidate sets drawn uniformly within the ranges, in their unit.
-
-    Args:
-        rng: source of the draw.
-        num_sets: B.
-        num_candidates: M.
-        ranges: the joint ranges, or n for [0, 1] on each of n axes.
-    """
-    _require_count("num_sets", num_sets)
-    _require_count("num_candidates", num_candidates)
-    if isinstance(ranges, int):
-        _require_count("ranges given as a number of axes", ranges)
-        return rng.random((num_sets, num_candidates, ranges))
-    unit = rng.random((num_sets, num_candidates, ranges.num_inputs))
-    return ranges.low + unit * ranges.span
+    """(B, M, n) candidate sets drawn uniformly in [0, 1] on every axis."""
+    whole_number("num_sets", num_sets, 1)
+    whole_number("num_candidates", num_candidates, 1)
+    return rng.random((num_sets, num_candidates, num_inputs))
 
 
 def draw_from_pool(
@@ -133,13 +119,8 @@ def draw_from_pool(
             f"num_candidates must be in [1, {pool_size}], the size of the pool, "
             f"got {num_candidates}"
         )
-    _require_count("num_sets", num_sets)
+    whole_number("num_sets", num_sets, 1)
     draws = [
         rng.choice(pool_size, num_candidates, replace=False) for _ in range(num_sets)
     ]
     return np.stack(draws).astype(np.int64)
-
-
-def _require_count(name: str, value: int) -> None:
-    if value < 1:
-        raise ValueError(f"{name} must be at least 1, got {value}")

@@ -137,20 +137,16 @@ def whole_number(argument: str, value: Any, least: int) -> int:
 
 def share(argument: str, value: Any) -> float:
     """``value`` as a float in (0, 1]."""
-    if not _is_number(value) or not 0.0 < value <= 1.0:
-        raise ValueError(f"{argument} must be in (0, 1], got {value!r}")
-    return float(value)
+    return _number(argument, value, 1.0, "in (0, 1]")
 
 
 def seconds(argument: str, value: Any) -> float:
     """``value`` as a time limit above 0 s; infinity is no limit."""
-    if not _is_number(value) or not value > 0.0:
-        raise ValueError(
-            f"{argument} must be a number above 0 in seconds, got {value!r}"
-        )
-    return float(value)
+    return _number(argument, value, np.inf, "a number above 0 in seconds")
 
 
-def _is_number(value: Any) -> bool:
+def _number(argument: str, value: Any, most: float, rule: str) -> float:
     number = isinstance(value, int | float | np.integer | np.floating)
-    return number and not isinstance(value, bool)
+    if not number or isinstance(value, bool) or not 0.0 < value <= most:
+        raise ValueError(f"{argument} must be {rule}, got {value!r}")
+    return float(value)

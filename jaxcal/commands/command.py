@@ -1,4 +1,7 @@
-"""``jaxcal command``: what to command to reach given outputs, the inverse map."""
+"""``jaxcal command``: what to command to reach given outputs, the inverse map.
+
+A command beyond its limits is refused; --clip moves it onto the limit instead.
+"""
 
 from __future__ import annotations
 
@@ -10,37 +13,30 @@ from jaxcal.commands.tables import read_table
 
 __all__ = ["add_arguments", "run"]
 
-EPILOG = """\
-A command beyond its limits is refused; --clip moves it onto the limit instead."""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Flags of the command."""
     add_files(parser, "desired outputs")
-    parser.add_argument(
-        "--limits",
-        metavar="LOW,HIGH",
-        help="of every command, or LOW,HIGH for each separated by spaces "
-        "(--limits='-20,20 -30,30'); inf where there is none",
+    limits = (
+        "of every command, or LOW,HIGH for each separated by spaces "
+        "(--limits='-20,20 -30,30'); inf where there is none"
     )
+    parser.add_argument("--limits", metavar="LOW,HIGH", help=limits)
     parser.add_argument("--clip", action="store_true", help="move onto the limits")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Invert and print."""
     calibration = Calibration.load(arguments.calibration)
     table = read_table(arguments.file)
-    columns = columns_of(table, arguments.columns, calibration.output_names)
+    desired = columns_of(table, arguments.columns, calibration.output_names)
     limits = None
     if arguments.limits is not None:
         limits = _limits(arguments.limits, calibration.num_inputs)
-    if arguments.clip and limits is None:
+    elif arguments.clip:
         raise ValueError("--clip needs --limits")
-    commands = calibration.command_for(
-        table.columns(columns), limits=limits, clip=arguments.clip
-    )
+    commands = calibration.command_for(desired, limits=limits, clip=arguments.clip)
     emit(arguments, calibration.input_names, commands)
-    return 0
 
 
 def _limits(text: str, count: int) -> list[list[float]]:

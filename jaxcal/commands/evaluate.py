@@ -10,17 +10,16 @@ import sys
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NoReturn
 
+from jaxcal.arguments import refused
 from jaxcal.extras import MissingExtraError, needs
+from jaxcal.learning.runtime import processes
 
 if TYPE_CHECKING:
-    from jaxcal.evaluation.catalogue import Catalogue
     from jaxcal.evaluation.results import Evaluation, Summary
     from jaxcal.progress import Progress
 
 __all__ = ["main"]
 
-EXIT_OK = 0
-EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
 EXIT_TERMINATED = 143
 
@@ -35,30 +34,21 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
     Returns:
         The exit code.
     """
-    from jaxcal.learning.runtime import processes
-    from jaxcal.paper.datasets.catalogue import CATALOGUE
-
     given = list(sys.argv[1:] if argv is None else argv)
-    command = ["python", prog] if prog.endswith(".py") else prog.split()
     advice = "finished parts stay: start every process again"
-
-    def work() -> int:
-        return _alone(given, CATALOGUE, command, prog)
-
-    return processes.run_job(prog, given, work, advice)
+    return processes.run_job(prog, given, lambda: _alone(given, prog), advice)
 
 
-def _alone(
-    given: list[str], catalogue: Catalogue, command: Sequence[str], program: str
-) -> int:
+def _alone(given: list[str], program: str) -> int:
     """The command in this process, which may be one of several."""
     from jaxcal.commands.evaluate_arguments import parser
 
+    command = ["python", program] if program.endswith(".py") else program.split()
     options = parser(program, " ".join(command)).parse_args(given)
     options.command = [*command, *given]
     before = signal.signal(signal.SIGTERM, _terminate)
     try:
-        return _run(options, catalogue)
+        _run(options)
     except KeyboardInterrupt as stop:
         terminated = isinstance(stop, _Terminated)
         kept = "nothing was written"
@@ -68,10 +58,10 @@ def _alone(
         print(f"{program}: {how}, {kept}", file=sys.stderr)
         return EXIT_TERMINATED if terminated else EXIT_INTERRUPTED
     except (ValueError, OSError, MissingExtraError) as error:
-        print(f"{program}: error: {_one_line(error)}", file=sys.stderr)
-        return EXIT_ERROR
+        return refused(program, error)
     finally:
         signal.signal(signal.SIGTERM, before)
+    return 0
 
 
 class _Terminated(KeyboardInterrupt):
@@ -82,14 +72,14 @@ def _terminate(number: int, frame: object) -> NoReturn:
     raise _Terminated
 
 
-def _run(options: argparse.Namespace, catalogue: Catalogue) -> int:
+def _run(options: argparse.Namespace) -> None:
     with needs("study", "evaluate"):
         from jaxcal.progress import Progress
     from jaxcal.evaluation.methods import POLICIES, check_methods
     from jaxcal.evaluation.report import json_document, text_table, write_report
     from jaxcal.files import write_text
 
-    options.methods = check_methods([m for m in options.methods.split(",") if m])
+    options.methods = check_methods(options.methods)
     if options.checkpoint:
         if not set(options.methods) & set(POLICIES):
             raise ValueError(
@@ -108,7 +98,7 @@ def _run(options: argparse.Namespace, catalogue: Catalogue) -> int:
     evaluated = _whole if options.stream is None else _streamed
     progress = Progress(quiet=options.quiet)
     try:
-        for summary, evaluation in evaluated(options, catalogue, progress):
+        for summary, evaluation in evaluated(options, progress):
             progress.clear()
             if summaries:
                 print()
@@ -127,19 +117,19 @@ def _run(options: argparse.Namespace, catalogue: Catalogue) -> int:
         options.json.parent.mkdir(parents=True, exist_ok=True)
         write_text(options.json, json_document(summaries, command=options.command))
         print(f"saved: {options.json}")
-    return EXIT_OK
 
 
 def _whole(
-    options: argparse.Namespace, catalogue: Catalogue, progress: Progress
+    options: argparse.Namespace, progress: Progress
 ) -> Iterator[tuple[Summary, Evaluation]]:
     """Every dataset, read or made before the first is evaluated."""
     from jaxcal.evaluation.methods import evaluate
+    from jaxcal.paper.datasets.catalogue import CATALOGUE
 
     if _process()[1] > 1:
         raise ValueError("several processes can share an evaluation with --stream only")
     datasets = [
-        catalogue.load(
+        CATALOGUE.load(
             name,
             options.seed,
             options.episodes,
@@ -164,17 +154,18 @@ def _whole(
 
 
 def _streamed(
-    options: argparse.Namespace, catalogue: Catalogue, progress: Progress
+    options: argparse.Namespace, progress: Progress
 ) -> Iterator[tuple[Summary, None]]:
     """One dataset in parts; of several processes the first has the totals."""
     from jaxcal.evaluation.stream import Plan, evaluate_stream, open_folder
+    from jaxcal.paper.datasets.catalogue import CATALOGUE
 
-    refused = {
+    whole = {
         "--report": options.report is not None,
         "--indices": options.indices,
         "--time-limit": options.time_limit is not None,
     }
-    for flag in [flag for flag, given in refused.items() if given]:
+    for flag in (flag for flag, given in whole.items() if given):
         raise ValueError(f"{flag} needs every episode at once and --stream keeps none")
     if len(options.dataset) > 1:
         raise ValueError(
@@ -183,7 +174,7 @@ def _streamed(
     if options.episodes is None:
         raise ValueError("--stream needs --episodes")
     plan = Plan(
-        catalogue,
+        CATALOGUE,
         options.dataset[0],
         seed=options.seed,
         k=options.k,
@@ -193,12 +184,12 @@ def _streamed(
         draws=options.draws,
     )
     process = _process()
-    if process[1] == 1:
-        open_folder(plan, options.stream)
-    else:
+    if process[1] > 1:
         from jaxcal.learning.runtime import devices
 
         devices.on_first(lambda: open_folder(plan, options.stream))
+    else:
+        open_folder(plan, options.stream)
     if not (options.stream / "stream.json").exists():
         raise ValueError(
             f"--stream {options.stream} must be a folder that all processes see; "
@@ -218,11 +209,8 @@ def _streamed(
 
 def _process() -> tuple[int, int]:
     """Which process this is, and of how many; one that holds no JAX is alone."""
-    if "jax" not in sys.modules:
-        return 0, 1
-    import jax
-
-    if not jax.distributed.is_initialized():
+    jax = sys.modules.get("jax")
+    if jax is None or not jax.distributed.is_initialized():
         return 0, 1
     return jax.process_index(), jax.process_count()
 
@@ -261,9 +249,3 @@ def _run_folders(
         near = [folder, *folder.resolve().parents[:2]]
         found += [place for place in near if (place / "metrics.csv").is_file()][:1]
     return list({place.resolve(): place for place in found}.values())
-
-
-def _one_line(error: Exception) -> str:
-    if isinstance(error, OSError) and error.strerror and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
-    return " ".join(str(error).split()) or type(error).__name__

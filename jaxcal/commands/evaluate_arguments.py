@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import argparse
 import pathlib
-import sys
-from typing import Any, NoReturn
+from typing import Any
 
-from jaxcal.arguments import at_least, seconds
+from jaxcal.arguments import Parser, at_least, seconds, several
 from jaxcal.evaluation.methods import DEFAULT_METHODS
 from jaxcal.learning.runtime import processes
 
@@ -61,43 +59,23 @@ examples:
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    """Reports an error in one line, without the usage."""
-
-    def error(self, message: str) -> NoReturn:
-        print(f"{self.prog}: error: {message}; see --help", file=sys.stderr)
-        sys.exit(2)
-
-
-def parser(program: str, typed: str) -> argparse.ArgumentParser:
-    """The parser.
-
-    Args:
-        program: begins every message.
-        typed: the command in the examples.
-    """
-    out = _Parser(
-        prog=program,
-        description=_DESCRIPTION,
-        epilog=_EPILOG.format(program=typed),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
+def parser(program: str, typed: str) -> Parser:
+    """The parser: ``program`` begins a message, ``typed`` an example of the help."""
+    out = Parser(
+        prog=program, description=_DESCRIPTION, epilog=_EPILOG.format(program=typed)
     )
     add = out.add_argument
-    several: dict[str, Any] = {"nargs": "+", "action": "extend", "default": []}
+    many: dict[str, Any] = {"nargs": "+", "action": "extend", "default": []}
     folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
     natural, index = at_least(1), at_least(0)
-    add(
-        "--checkpoint",
-        metavar="DIR",
-        help="trained policies; the shipped one",
-        **several,
-    )
-    add("--dataset", metavar="NAME|FILE", help="datasets; dataset2", **several)
+    trained = "trained policies; the shipped one"
+    add("--checkpoint", metavar="DIR", help=trained, **many)
+    add("--dataset", metavar="NAME|FILE", help="datasets; dataset2", **many)
     add("--recordings", help="of dataset4.csv and dataset5.csv, by the rig", **folder)
     add(
         "--methods",
-        default=",".join(DEFAULT_METHODS),
+        type=several(str, "names"),
+        default=DEFAULT_METHODS,
         metavar="LIST",
         help="comma separated; all but auto",
     )
@@ -106,32 +84,17 @@ def parser(program: str, typed: str) -> argparse.ArgumentParser:
     add("--seed", type=index, default=0, metavar="S", help="of datasets and draws; 0")
     add("--num", type=natural, default=16, help="tries of policy:samples and :first")
     add("--draws", type=natural, default=100, help="random selections an episode; 100")
-    add(
-        "--time-limit",
-        type=seconds,
-        metavar="SECONDS",
-        help="of the exact solver, a dataset; what it cannot prove is bounded",
-    )
+    limit = "of the exact solver, a dataset; what it cannot prove is bounded"
+    add("--time-limit", type=seconds, metavar="SECONDS", help=limit)
     add("--json", type=pathlib.Path, metavar="FILE", help="write every number")
     add("--indices", action="store_true", help="and the postures chosen, in the JSON")
     add("--report", help="write figures and index.html", **folder)
-    add(
-        "--run",
-        help="training runs to draw curves of; those of --checkpoint are found",
-        **several,
-        **folder,
-    )
-    add(
-        "--stream",
-        help="evaluate in parts kept in DIR: any number of --episodes, resumable",
-        **folder,
-    )
-    add(
-        "--workers",
-        type=natural,
-        metavar="N",
-        help="processes of --stream; one for each core",
-    )
+    runs = "training runs to draw curves of; those of --checkpoint are found"
+    add("--run", help=runs, **many, **folder)
+    parts = "evaluate in parts kept in DIR: any number of --episodes, resumable"
+    add("--stream", help=parts, **folder)
+    cores = "processes of --stream; one for each core"
+    add("--workers", type=natural, metavar="N", help=cores)
     add("--quiet", action="store_true", help="no progress")
     processes.add_arguments(out)
     return out

@@ -1,4 +1,8 @@
-"""``jaxcal identify``: fit ``y = A u + b`` to measurements and save the calibration."""
+"""``jaxcal identify``: fit ``y = A u + b`` to measurements and save the calibration.
+
+Columns that begin with u_ are commands, those with y_ what was measured; --inputs and
+--outputs name others.
+"""
 
 from __future__ import annotations
 
@@ -10,39 +14,28 @@ from jaxcal.commands.tables import read_table, write_json
 
 __all__ = ["add_arguments", "run"]
 
-EPILOG = """\
-Columns that begin with u_ are commands, those with y_ what was measured; --inputs and
---outputs name others."""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Flags of the command."""
-    parser.add_argument("file", metavar="FILE", help="measurements: .csv, .npz or -")
-    parser.add_argument("--inputs", metavar="A,B", help="columns of commands")
-    parser.add_argument("--outputs", metavar="C,D", help="columns of measurements")
-    parser.add_argument(
-        "--noise",
-        type=numbers,
-        metavar="S",
-        help="standard deviation of a measurement, where it is known",
-    )
-    parser.add_argument("--weights", metavar="W", help="column of relative weights")
-    parser.add_argument("--command-unit", default="", metavar="UNIT")
-    parser.add_argument("--measured-unit", default="", metavar="UNIT")
-    parser.add_argument("--out", metavar="FILE", help="save the calibration (.json)")
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    add = parser.add_argument
+    add("file", metavar="FILE", help="measurements: .csv, .npz or -")
+    add("--inputs", metavar="A,B", help="columns of commands")
+    add("--outputs", metavar="C,D", help="columns of measurements")
+    noise = "standard deviation of a measurement, where it is known"
+    add("--noise", type=numbers, metavar="S", help=noise)
+    add("--weights", metavar="W", help="column of relative weights")
+    add("--command-unit", default="", metavar="UNIT")
+    add("--measured-unit", default="", metavar="UNIT")
+    add("--out", metavar="FILE", help="save the calibration (.json)")
+    add("--json", action="store_true", help="print JSON")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Fit, print and save."""
-    table = read_table(arguments.file)
-    outputs = table.outputs(arguments.outputs)
-    inputs = tuple(
-        name
-        for name in table.inputs(arguments.inputs)
-        if arguments.inputs or name not in (*outputs, arguments.weights)
-    )
-    noise = arguments.noise
+    table, noise = read_table(arguments.file), arguments.noise
+    outputs, inputs = table.outputs(arguments.outputs), table.inputs(arguments.inputs)
+    if not arguments.inputs:
+        inputs = tuple(n for n in inputs if n not in (*outputs, arguments.weights))
     calibration = identify(
         table.columns(inputs),
         table.columns(outputs),
@@ -57,8 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
         calibration.save(arguments.out)
     if arguments.json:
         write_json(None, calibration.to_dict())
-    else:
-        print(calibration.summary())
-        if arguments.out:
-            print(f"saved {arguments.out}")
-    return 0
+        return
+    print(calibration.summary())
+    if arguments.out:
+        print(f"saved {arguments.out}")

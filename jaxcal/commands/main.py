@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import os
 import sys
-from typing import NoReturn
 
+from jaxcal.arguments import Parser, refused
 from jaxcal.extras import MissingExtraError
 
 __all__ = ["main"]
@@ -35,13 +34,6 @@ examples:
 Tables are CSV (with or without a header) or .npz; - is standard input."""
 
 
-class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}; see --help\n")
-
-
 def main(argv: list[str] | None = None) -> int:
     """Run one command.
 
@@ -55,41 +47,30 @@ def main(argv: list[str] | None = None) -> int:
     arguments = _parser(given).parse_args(given)
     module = importlib.import_module(f"jaxcal.commands.{arguments.command}")
     try:
-        code = int(module.run(arguments))
+        module.run(arguments)
         sys.stdout.flush()
-        return code
     except BrokenPipeError:  # the reader of a pipe, such as head, has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
     except (ValueError, OSError, MissingExtraError) as error:
-        print(f"jaxcal {arguments.command}: {error}", file=sys.stderr)
-        return 2
+        return refused(f"jaxcal {arguments.command}", error)
+    return 0
 
 
-def _parser(given: list[str]) -> argparse.ArgumentParser:
-    parser = _Parser(
+def _parser(given: list[str]) -> Parser:
+    from jaxcal import __version__
+
+    parser = Parser(
         prog="jaxcal",
         description="Which few measurements to make, and the calibration that follows.",
         epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    from jaxcal import __version__
-
     parser.add_argument("--version", action="version", version=f"jaxcal {__version__}")
-    commands = parser.add_subparsers(
-        dest="command", metavar="COMMAND", required=True, parser_class=_Parser
-    )
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, line in (_HERE | _WHOLE).items():
-        module = None
+        about = line[0].upper() + line[1:] + "."
+        command = commands.add_parser(name, help=line, description=about)
         if name in given and name in _HERE:  # only the one that runs is imported
             module = importlib.import_module(f"jaxcal.commands.{name}")
-        command = commands.add_parser(
-            name,
-            help=line,
-            description=line[0].upper() + line[1:] + ".",
-            epilog=getattr(module, "EPILOG", None),
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-        )
-        if module is not None:
+            command.epilog = (module.__doc__ or "").partition("\n\n")[2]
             module.add_arguments(command)
     return parser

@@ -5,54 +5,33 @@ from __future__ import annotations
 import argparse
 import dataclasses
 
-from jaxcal.commands.select import add_candidates, add_output
-from jaxcal.commands.tables import read_table, write_json, write_rows
+from jaxcal.arguments import several
+from jaxcal.commands.select import add_candidates
+from jaxcal.commands.tables import add_output, read_table, written
 from jaxcal.selection.plan import plan
 
-__all__ = ["add_arguments", "run"]
+__all__ = ["add_arguments", "numbers", "run"]
+
+numbers = several(float, "numbers")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Flags of the command."""
     add_candidates(parser)
-    parser.add_argument(
-        "--accuracy",
-        type=numbers,
-        required=True,
-        metavar="E",
-        help="standard error that a prediction may have; one number or one per output",
-    )
-    parser.add_argument(
-        "--noise",
-        type=numbers,
-        required=True,
-        metavar="S",
-        help="standard deviation of one measurement, in the same unit",
-    )
-    parser.add_argument(
-        "--criterion",
-        choices=("G", "I"),
-        default="G",
-        help="G: the largest standard error over the candidates; I: the average",
-    )
-    parser.add_argument("--max-k", type=int, metavar="K", help="most measurements")
-    parser.add_argument(
-        "--more", type=int, default=0, metavar="N", help="rows beyond the answer; 0"
-    )
+    add = parser.add_argument
+    accuracy = "standard error that a prediction may have; one number or one per output"
+    add("--accuracy", type=numbers, required=True, metavar="E", help=accuracy)
+    noise = "standard deviation of one measurement, in the same unit"
+    add("--noise", type=numbers, required=True, metavar="S", help=noise)
+    criterion = "G: the largest standard error over the candidates; I: the average"
+    add("--criterion", choices=("G", "I"), default="G", help=criterion)
+    add("--max-k", type=int, metavar="K", help="most measurements")
+    more = "rows beyond the answer; 0"
+    add("--more", type=int, default=0, metavar="N", help=more)
     add_output(parser)
 
 
-def numbers(text: str) -> list[float]:
-    """Numbers separated by commas."""
-    try:
-        return [float(part) for part in text.split(",") if part.strip()]
-    except ValueError:
-        raise argparse.ArgumentTypeError(
-            f"must be numbers separated by commas, got {text!r}"
-        ) from None
-
-
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> None:
     """Plan and print."""
     table = read_table(arguments.file)
     accuracy, noise = (
@@ -70,17 +49,11 @@ def run(arguments: argparse.Namespace) -> int:
         max_k=arguments.max_k,
         more=arguments.more,
     )
-    out = arguments.out
-    if arguments.json or (out and out.endswith(".json")):
-        document = dataclasses.asdict(result)
-        write_json(out, document)
-    elif arguments.csv or out:
-        rows = [
-            [row.k, row.num_distinct, row.standard_error.max(), row.least_error.max()]
-            for row in result.rows
-        ]
-        write_rows(out, ("k", "distinct", "standard_error", "least_error"), rows)
-    else:
+    header = ("k", "distinct", "standard_error", "least_error")
+    rows = [
+        [row.k, row.num_distinct, row.standard_error.max(), row.least_error.max()]
+        for row in result.rows
+    ]
+    if not written(arguments, header, rows, dataclasses.asdict(result)):
         print(result.table())
         print(f"measure rows {', '.join(str(i) for i in result.indices)}")
-    return 0

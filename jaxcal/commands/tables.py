@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
 import dataclasses
 import io
@@ -17,7 +18,15 @@ from numpy.typing import NDArray
 from jaxcal.checks import axis_letter
 from jaxcal.files import write_text
 
-__all__ = ["Frame", "Table", "read_table", "write_json", "write_rows"]
+__all__ = [
+    "Frame",
+    "Table",
+    "add_output",
+    "read_table",
+    "write_json",
+    "write_rows",
+    "written",
+]
 
 Array = NDArray[np.float64]
 
@@ -75,19 +84,16 @@ class Table:
     def inputs(self, chosen: str | None) -> tuple[str, ...]:
         """Columns of commands: those chosen, else ``u_...``, else all but outputs."""
         if chosen is not None:
-            return split_names(chosen)
+            return _split(chosen)
         marked = tuple(name for name in self.names if name.startswith("u_"))
         special = {"available", "episode", "candidate", "index"}
-        return marked or tuple(
-            name
-            for name in self.names
-            if name not in special and not name.startswith("y_")
-        )
+        others = (name for name in self.names if name not in special)
+        return marked or tuple(name for name in others if not name.startswith("y_"))
 
     def outputs(self, chosen: str | None) -> tuple[str, ...]:
         """Columns of measurements: those chosen, else ``y_...``."""
         if chosen is not None:
-            return split_names(chosen)
+            return _split(chosen)
         marked = tuple(name for name in self.names if name.startswith("y_"))
         if not marked:
             raise ValueError(
@@ -101,17 +107,15 @@ class Table:
         if "available" not in (*self.names, *self.labels):
             return None
         mask = self.columns(["available"])[:, 0]
-        if not np.isin(mask, (0.0, 1.0)).all():
-            where = int(np.flatnonzero(~np.isin(mask, (0.0, 1.0)))[0])
+        for row in np.flatnonzero((mask != 0.0) & (mask != 1.0)):
             raise ValueError(
-                f"{self.source}: available must be 0 or 1, got {mask[where]:g} in row "
-                f"{where}"
+                f"{self.source}: available must be 0 or 1, got {mask[row]:g} in row "
+                f"{row}"
             )
         return mask == 1.0
 
 
-def split_names(text: str) -> tuple[str, ...]:
-    """Names separated by commas."""
+def _split(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
@@ -140,17 +144,14 @@ def read_table(path: str) -> Table:
 def _from_csv(source: str, text: str) -> Table:
     first = text.partition("\n")[0]
     delimiter = max(",;\t", key=first.count)
-    rows = [
-        (number, [cell.strip() for cell in row])
-        for number, row in enumerate(csv.reader(io.StringIO(text), delimiter=delimiter))
-        if any(cell.strip() for cell in row)
-    ]
+    lines = enumerate(csv.reader(io.StringIO(text), delimiter=delimiter), start=1)
+    rows = [(line, [cell.strip() for cell in row]) for line, row in lines]
+    rows = [(line, row) for line, row in rows if any(row)]
     if not rows:
         raise ValueError(f"{source}: the table is empty")
     header = rows[0][1]
-    if all(_is_number(cell) for cell in header):
-        count = len(header)
-        header = [f"u_{axis_letter(i, count)}" for i in range(count)]
+    if all(map(_is_number, header)):
+        header = _letters("u", len(header))
     else:
         rows = rows[1:]
     if not rows:
@@ -158,22 +159,25 @@ def _from_csv(source: str, text: str) -> Table:
     twice = [name for name in header if header.count(name) > 1]
     if twice:
         raise ValueError(f"{source}: column {twice[0]!r} comes twice")
-    for number, row in rows:
+    for line, row in rows:
         if len(row) != len(header):
             raise ValueError(
-                f"{source}: line {number + 1} has {len(row)} cells, the first has "
+                f"{source}: line {line} has {len(row)} cells, the first has "
                 f"{len(header)}"
             )
     cells = {name: [row[i] for _, row in rows] for i, name in enumerate(header)}
-    names = tuple(
-        name
+    numbers = {
+        name: [float(cell) if cell else np.nan for cell in column]
         for name, column in cells.items()
         if all(_is_number(cell) or not cell for cell in column)
-    )
-    numbers = [[float(c) if c else np.nan for c in cells[name]] for name in names]
-    values = np.array(numbers, dtype=np.float64).reshape(len(names), len(rows)).T
-    labels = {name: column for name, column in cells.items() if name not in names}
-    return Table(source, names, values, labels)
+    }
+    values = np.array(list(numbers.values())).reshape(len(numbers), len(rows)).T
+    labels = {name: column for name, column in cells.items() if name not in numbers}
+    return Table(source, tuple(numbers), values, labels)
+
+
+def _letters(letter: str, count: int) -> list[str]:
+    return [f"{letter}_{axis_letter(i, count)}" for i in range(count)]
 
 
 def _from_npz(source: str, data: bytes) -> Table:
@@ -189,41 +193,58 @@ def _from_npz(source: str, data: bytes) -> Table:
     for key, array in arrays.items():
         if key in ("low", "high"):
             continue
-        if key == "available":
-            table = np.asarray(array, dtype=np.float64).reshape(-1, 1)
-            names.append("available")
-        elif key in _NPZ_COLUMNS:
-            table = _matrix(source, key, array)
-            count = table.shape[1]
-            letter = _NPZ_COLUMNS[key]
-            names += [f"{letter}_{axis_letter(i, count)}" for i in range(count)]
-        else:
+        if key != "available" and key not in _NPZ_COLUMNS:
             known = ", ".join((*_NPZ_COLUMNS, "available"))
             raise ValueError(f"{source}: unknown key {key!r}; keys: {known}")
-        columns.append(table)
+        if array.dtype.kind not in "biuf":
+            raise ValueError(f"{source}: {key} must hold numbers, got {array.dtype}")
+        flat = array.reshape(-1, 1) if key == "available" else array
+        if flat.ndim == 3 and len(flat) == 1:
+            flat = flat[0]
+        if flat.ndim != 2 or 0 in flat.shape:
+            raise ValueError(
+                f"{source}: {key} must have shape (N, axes), got {array.shape}"
+                + ("; evaluate takes many sets" if array.ndim == 3 else "")
+            )
+        columns.append(flat.astype(np.float64))
+        letter = _NPZ_COLUMNS.get(key)
+        names += _letters(letter, flat.shape[1]) if letter else ["available"]
     lengths = {len(table) for table in columns}
     if len(lengths) != 1:
         raise ValueError(f"{source}: the arrays must have equal lengths, got {lengths}")
     return Table(source, tuple(names), np.concatenate(columns, axis=1), {})
 
 
-def _matrix(source: str, key: str, array: NDArray[Any]) -> Array:
-    if array.dtype.kind not in "iuf":
-        raise ValueError(f"{source}: {key} must hold numbers, got {array.dtype}")
-    if array.ndim == 3 and len(array) == 1:
-        array = array[0]
-    if array.ndim != 2 or 0 in array.shape:
-        raise ValueError(
-            f"{source}: {key} must have shape (N, axes), got {array.shape}"
-            + ("; evaluate takes many sets" if array.ndim == 3 else "")
-        )
-    return array.astype(np.float64)
-
-
 def _is_number(cell: str) -> bool:
     try:
         float(cell)
     except ValueError:
+        return False
+    return True
+
+
+def add_output(parser: argparse.ArgumentParser) -> None:
+    """Where the answer goes and in which form."""
+    form = parser.add_mutually_exclusive_group()
+    form.add_argument("--json", action="store_true", help="print JSON")
+    form.add_argument("--csv", action="store_true", help="print CSV")
+    where = "write to FILE (.csv or .json) instead"
+    parser.add_argument("--out", metavar="FILE", help=where)
+
+
+def written(
+    arguments: argparse.Namespace,
+    names: Sequence[str],
+    rows: Sequence[Sequence[Any]],
+    document: Any,
+) -> bool:
+    """Write where ``add_output`` asks for a form or a file; False where neither is."""
+    out = arguments.out
+    if arguments.json or (out and out.endswith(".json")):
+        write_json(out, document)
+    elif arguments.csv or out:
+        write_rows(out, names, rows)
+    else:
         return False
     return True
 
@@ -252,8 +273,6 @@ def _emit(out: str | None, text: str) -> None:
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
+    if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
-    if isinstance(value, np.generic):
-        return value.item()
     raise TypeError(f"cannot write {type(value).__name__} as JSON")

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import datetime
 import hashlib
 import pathlib
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxcal.arguments import refused
 from jaxcal.commands.tables import read_table
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder
@@ -41,8 +43,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
                 from jaxcal.commands.train_arguments import parser
             return _run(parser(prog).parse_args(given))
         except (ValueError, OSError, MissingExtraError) as error:
-            print(f"{prog}: {error}", file=sys.stderr)
-            return 2
+            return refused(prog, error)
 
     advice = "what is saved stays: start every process again with --resume"
     return processes.run_job(prog, given, alone, advice)
@@ -55,12 +56,13 @@ def _run(arguments: argparse.Namespace) -> int:
     from jaxcal.selection.teacher import fixed_validation, teacher
 
     cache.keep_compiled_programs()
-    brax = arguments.trainer == "brax"
     out = pathlib.Path(arguments.out or f"runs/{arguments.preset}")
     config = devices.on_first(lambda: _configuration(arguments, out))
-    stop = _Stop()
-    if brax:
-        _train_with_brax(config, out)
+    stop = _stop_on_signals()
+    if arguments.trainer == "brax":
+        from jaxcal.learning.training import brax_ppo
+
+        brax_ppo.train(config, out, lambda line: print(line, flush=True))
         done = config.ppo.num_updates
     else:
         mesh = devices.make_mesh(arguments.devices)
@@ -70,9 +72,9 @@ def _run(arguments: argparse.Namespace) -> int:
             _introduce(config, out, devices.describe(mesh))
             if not arguments.no_validation:
                 validation = fixed_validation(config)
-            print("compiling the training step (about half a minute; a few seconds")
-            print("where this machine has compiled it before) ...")
             print(
+                "compiling the training step (about half a minute; a few seconds "
+                "where this machine has compiled it before) ...\n"
                 "   update   episodes     /s   elapsed      left   reward"
                 "   ratio to exact   optima hit",
                 flush=True,
@@ -83,7 +85,7 @@ def _run(arguments: argparse.Namespace) -> int:
             resume=arguments.resume,
             validation=validation,
             report=_show,
-            should_stop=stop.requested,
+            should_stop=stop,
             num_devices=arguments.devices,
             teacher=teacher,
         )
@@ -110,9 +112,7 @@ def _configuration(arguments: argparse.Namespace, out: pathlib.Path) -> TrainCon
     from jaxcal.learning.training.config import TrainConfig
 
     given = values_of(arguments)
-    candidates = None
-    if arguments.candidates is not None:
-        candidates = _candidates(arguments.candidates)
+    candidates = _candidates(arguments.candidates) if arguments.candidates else None
     steps = out / "checkpoint"
     if not arguments.resume and steps.is_dir() and any(steps.iterdir()):
         raise ValueError(
@@ -128,13 +128,27 @@ def _configuration(arguments: argparse.Namespace, out: pathlib.Path) -> TrainCon
                 + ", ".join("--" + name.replace("_", "-") for name in sorted(given))
             )
         config = TrainConfig.from_meta(checkpoint.load(out).meta)
-        config = _with_the_same(config, candidates)
+        held = config.tasks[0].given
+        if held != candidates:  # they are compared by their digest
+            what = f"{held.name} (SHA-256 {held.sha256[:12]})" if held else "no file"
+            rule = "give the same file" if held else "leave it out"
+            raise ValueError(f"--candidates: the run was trained on {what}; {rule}")
+        config = _with_candidates(config, candidates)
     elif candidates is None:
         config = presets.with_values(config, given)
     else:
         config = _trained_on(config, candidates, given)
     require_writable_folder(out)
     return config
+
+
+def _with_candidates(
+    config: TrainConfig, candidates: GivenCandidates | None
+) -> TrainConfig:
+    if candidates is None:
+        return config
+    task = dataclasses.replace(config.tasks[0], given=candidates)
+    return dataclasses.replace(config, tasks=(task,))
 
 
 def _candidates(path: str) -> GivenCandidates:
@@ -150,13 +164,12 @@ def _candidates(path: str) -> GivenCandidates:
         values, available = dataset.candidates, dataset.available
     else:
         table = read_table(path)
-        values = table.columns(table.inputs(None))[None]
-        mask = table.available()
+        values, mask = table.columns(table.inputs(None))[None], table.available()
         available = None if mask is None else mask[None]
     used = values if available is None else values[available]
-    low, high = (f(used.reshape(-1, used.shape[-1]), axis=0) for f in (np.min, np.max))
-    if not (low < high).all():  # also where a cell is empty
-        axis = int(np.flatnonzero(~(low < high))[0])
+    used = used.reshape(-1, used.shape[-1])
+    low, high = used.min(axis=0), used.max(axis=0)
+    for axis in np.flatnonzero(~(low < high)):  # also where a cell is empty
         raise ValueError(
             f"{path}: every column must hold numbers that differ, got {low[axis]:g} to "
             f"{high[axis]:g} in input {axis + 1}: leave it out"
@@ -192,38 +205,16 @@ def _trained_on(
             f"{config.preset} has {len(config.tasks)}"
         )
     sizes = {"num_inputs": n, "num_outputs": n, "num_selected": n + 1}
-    if num_sets > 1:
-        sizes["num_candidates"] = m
-    wrong = [
-        name
-        for name in ("num_inputs", "num_candidates")
-        if given.get(name, sizes.get(name)) != sizes.get(name, given.get(name))
-    ]
-    if wrong:
-        flag = "--" + wrong[0].replace("_", "-")
-        raise ValueError(
-            f"{flag} must be {sizes[wrong[0]]}, as in {candidates.name}, got "
-            f"{given[wrong[0]]}: leave it out"
-        )
-    config = presets.with_values(config, sizes | given)
-    task = dataclasses.replace(config.tasks[0], given=candidates)
-    candidates.source(task.environment)  # refuses a pool that is too small
-    return dataclasses.replace(config, tasks=(task,))
-
-
-def _with_the_same(
-    config: TrainConfig, candidates: GivenCandidates | None
-) -> TrainConfig:
-    """A run to go on with, its own candidates given again."""
-    held = config.tasks[0].given
-    if held is None and candidates is None:
-        return config
-    if held is None or candidates is None or held.sha256 != candidates.sha256:
-        what = f"{held.name} (SHA-256 {held.sha256[:12]})" if held else "no file"
-        rule = "give the same file" if held else "leave it out"
-        raise ValueError(f"--candidates: the run was trained on {what}; {rule}")
-    task = dataclasses.replace(config.tasks[0], given=candidates)
-    return dataclasses.replace(config, tasks=(task,))
+    fixed = {"num_inputs": n} | ({"num_candidates": m} if num_sets > 1 else {})
+    for name, value in fixed.items():
+        if given.get(name, value) != value:
+            raise ValueError(
+                f"--{name.replace('_', '-')} must be {value}, as in "
+                f"{candidates.name}, got {given[name]}: leave it out"
+            )
+    config = presets.with_values(config, sizes | fixed | given)
+    candidates.source(config.tasks[0].environment)  # refuses a pool that is too small
+    return _with_candidates(config, candidates)
 
 
 def _for_brax(
@@ -249,12 +240,6 @@ def _for_brax(
     return brax_ppo.adapted(config)
 
 
-def _train_with_brax(config: TrainConfig, out: pathlib.Path) -> None:
-    from jaxcal.learning.training import brax_ppo
-
-    brax_ppo.train(config, out, lambda line: print(line, flush=True))
-
-
 def _introduce(config: TrainConfig, out: pathlib.Path, devices: str) -> None:
     """What will be trained, in one line and in every number."""
     import jax
@@ -276,22 +261,18 @@ def _introduce(config: TrainConfig, out: pathlib.Path, devices: str) -> None:
     print(f"configuration: {config.as_meta()}")
 
 
-class _Stop:
-    """Ctrl-C or SIGTERM asks the loop to save and stop; a second Ctrl-C is at once."""
+def _stop_on_signals() -> Callable[[], bool]:
+    """Whether Ctrl-C or SIGTERM asked to save and stop; a second Ctrl-C is at once."""
+    asked: list[int] = []
 
-    def __init__(self) -> None:
-        self._asked = False
-        for name in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(name, self._ask)
-
-    def _ask(self, number: int, frame: Any) -> None:
-        self._asked = True
+    def ask(number: int, frame: Any) -> None:
+        asked.append(number)
         print("\nstopping after this update and saving ...", flush=True)
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    def requested(self) -> bool:
-        """Whether to stop."""
-        return self._asked
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, ask)
+    return lambda: bool(asked)
 
 
 def _show(report: Report) -> None:
@@ -311,5 +292,4 @@ def _show(report: Report) -> None:
 
 def _clock(seconds: float) -> str:
     """h:mm:ss."""
-    whole = round(seconds)
-    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+    return str(datetime.timedelta(seconds=round(seconds)))

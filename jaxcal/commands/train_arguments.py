@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import textwrap
-from typing import Any, NoReturn
+from typing import Any
 
+from jaxcal.arguments import Parser
 from jaxcal.learning.runtime import processes
 from jaxcal.learning.settings import settings_of
 from jaxcal.learning.training import presets
 from jaxcal.learning.training.config import TrainConfig
 
 __all__ = ["parser", "values_of"]
-
-_DESCRIPTION = "Train a policy that selects postures, and save it with all it needs."
 
 _EPILOG = """\
 presets:
@@ -40,7 +38,7 @@ A run folder holds metrics.csv, TensorBoard events and checkpoint/; measure it w
 Ctrl-C saves and stops; --resume then continues bit for bit (on the same CPU).
 All devices of all processes share each update: docs/scaling.md."""
 
-_OWN_FLAGS = {"num_episodes": "episodes", "seed": "seed"}  # above the groups
+_ABOVE = ("num_episodes", "seed")  # flags above the groups
 
 _TITLES = {
     "ppo": ("optimisation", "in brackets the value of compact, and of others"),
@@ -49,71 +47,47 @@ _TITLES = {
 }
 
 
-class _Parser(argparse.ArgumentParser):
-    """Says what is wrong in one line."""
-
-    def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}; see --help\n")
-
-
-def parser(prog: str) -> argparse.ArgumentParser:
-    """All flags.
-
-    Args:
-        prog: what was typed, "train.py" or "jaxcal train".
-    """
+def parser(prog: str) -> Parser:
+    """All flags; ``prog`` is what was typed, "train.py" or "jaxcal train"."""
     program = f"python {prog}" if prog.endswith(".py") else prog
     known = {name: presets.load(name) for name in presets.names()}
-    out = _Parser(
+    out = Parser(
         prog=prog,
         usage="%(prog)s [--preset NAME] [--episodes N] [--out DIR] [flags below]",
-        description=_DESCRIPTION,
+        description="Train a policy that selects postures, and save it with all it "
+        "needs.",
         epilog=_EPILOG.format(program=program, presets=_abouts(known)),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = out.add_argument
-    add(
-        "--preset",
-        choices=sorted(known),
-        default="compact",
-        help="see below [compact]",
-    )
+    preset = "see below [compact]"
+    add("--preset", choices=sorted(known), default="compact", help=preset)
     budget = "training budget" + _held("num_episodes", known)
-    add("--episodes", type=int, metavar="N", help=budget)
+    add("--episodes", type=int, metavar="N", dest="num_episodes", help=budget)
     add("--seed", type=int, metavar="S", help="of everything random [0]")
     add("--out", metavar="DIR", help="run folder [runs/PRESET]")
     add("--resume", action="store_true", help="go on from the run folder's checkpoint")
-    add(
-        "--candidates",
-        metavar="FILE",
-        help="train on your own postures, .csv or .npz: one table is a pool that every "
-        "episode draws --num-candidates from; several episodes are candidate sets",
+    own = (
+        "train on your own postures, .csv or .npz: one table is a pool that every "
+        "episode draws --num-candidates from; several episodes are candidate sets"
     )
-    add(
-        "--trainer",
-        choices=("jaxcal", "brax"),
-        default="jaxcal",
-        help="jaxcal's own PPO, or brax's on the same environment [jaxcal]",
-    )
+    add("--candidates", metavar="FILE", help=own)
+    trainer = "jaxcal's own PPO, or brax's on the same environment [jaxcal]"
+    add("--trainer", choices=("jaxcal", "brax"), default="jaxcal", help=trainer)
     add("--export", metavar="DIR", help="write the finished policy alone to DIR")
-    add(
-        "--no-validation",
-        action="store_true",
-        help="do not measure the gap to the proven optimum while training",
-    )
+    gap = "do not measure the gap to the proven optimum while training"
+    add("--no-validation", action="store_true", help=gap)
     add("--devices", type=int, metavar="N", help="devices of each process [all]")
     processes.add_arguments(out)
     for part, (title, description) in _TITLES.items():
         group = out.add_argument_group(title, description)
         for field in settings_of(presets.PARTS[part]):
-            if field.name in _OWN_FLAGS:
+            if field.name in _ABOVE:
                 continue
             flag = "--" + field.name.replace("_", "-")
             line = (field.help + _held(field.name, known)).replace("%", "%%")
             if field.kind is bool:
-                group.add_argument(
-                    flag, action=argparse.BooleanOptionalAction, help=line
-                )
+                yes_no = argparse.BooleanOptionalAction
+                group.add_argument(flag, action=yes_no, help=line)
             else:
                 metavar = {int: "N", float: "X", str: "NAME"}[field.kind]
                 group.add_argument(flag, type=field.kind, metavar=metavar, help=line)
@@ -122,18 +96,15 @@ def parser(prog: str) -> argparse.ArgumentParser:
 
 def values_of(arguments: argparse.Namespace) -> dict[str, Any]:
     """The fields of a configuration that were given: name to value."""
-    names = presets.field_names() - {"num_episodes"}
-    given = {name: getattr(arguments, name) for name in names}
-    given["num_episodes"] = arguments.episodes
+    given = {name: getattr(arguments, name) for name in presets.field_names()}
     return {name: value for name, value in given.items() if value is not None}
 
 
 def _abouts(known: dict[str, TrainConfig]) -> str:
     lines = []
     for name, config in known.items():
-        indent = " " * 12
-        text = textwrap.fill(config.about, 86 - len(indent))
-        lines.append(f"  {name:9} {textwrap.indent(text, indent).strip()}")
+        about = f"  {name:9} {config.about}"
+        lines += textwrap.wrap(about, 86, subsequent_indent=" " * 12)
     return "\n".join(lines)
 
 
@@ -141,9 +112,8 @@ def _held(name: str, known: dict[str, TrainConfig]) -> str:
     """The value of compact, and of presets that differ: ``" [2; paper 10]"``."""
     values = {}
     for preset, config in known.items():
-        task = config.tasks[0].environment
-        for part in (config.ppo, config.network, task):
-            if name in {field.name for field in dataclasses.fields(part)}:
+        for part in (config.ppo, config.network, config.tasks[0].environment):
+            if hasattr(part, name):
                 values[preset] = _shown(getattr(part, name))
     others = [f"{p} {v}" for p, v in values.items() if v != values["compact"]]
     return " [" + "; ".join([values["compact"], *others]) + "]"

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.metadata
 import typing
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-__all__ = ["Setting", "require", "setting", "settings_of"]
+__all__ = ["Setting", "installed", "require", "setting", "settings_of"]
 
 
 class Setting(NamedTuple):
@@ -41,3 +42,8 @@ def require(config: Any, rule: str, holds: Callable[[Any], bool], *names: str) -
         value = getattr(config, name)
         if not holds(value):
             raise ValueError(f"{name} must be {rule}, got {value}")
+
+
+def installed(group: str) -> dict[str, importlib.metadata.EntryPoint]:
+    """What installed packages offer under an entry-point group, by name."""
+    return {p.name: p for p in importlib.metadata.entry_points(group=group)}

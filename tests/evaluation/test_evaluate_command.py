@@ -192,7 +192,7 @@ def test_every_error_is_one_line_and_code_2(
     done = call(capsys, *methods, *outputs, *given)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1, done.stderr
-    assert done.stderr.startswith("evaluate.py: error: ")
+    assert done.stderr.startswith("evaluate.py: ")
     assert re.search(message, done.stderr), done.stderr
     assert done.stdout == ""
     assert {path.name for path in tmp_path.iterdir()} == before
@@ -240,8 +240,7 @@ def test_a_missing_extra_is_one_line_that_names_the_command(
     done = call(capsys, "--methods", "greedy", "--episodes", 2, *given)
     assert done.returncode == 2 and done.stdout == ""
     assert done.stderr.splitlines() == [
-        f"evaluate.py: error: {says}, which is not installed: "
-        "pip install 'jaxcal[study]'"
+        f"evaluate.py: {says}, which is not installed: pip install 'jaxcal[study]'"
     ]
     assert list(tmp_path.iterdir()) == []
 

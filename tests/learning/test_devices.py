@@ -71,8 +71,7 @@ out["losses"] = distance(
 out["rewards"] = distance(
     [r["rewards"] for r in one[1]], [r["rewards"] for r in other[1]]
 )
-data = jax.random.key_data
-out["key"] = bool((data(one[0].key) == np.asarray(data(other[0].key))).all())
+out["key"] = distance(one[0].key, other[0].key) == 0.0
 leaf = jax.tree.leaves(other[0].params)[0]
 out["whole"] = leaf.sharding.is_fully_replicated
 """
@@ -87,8 +86,10 @@ def play(params, keys, mesh):
 
 with jax.disable_jit():
     plain = play(params, keys, None)
-given = devices.replicate((params, keys), mesh)
-shared = jax.jit(lambda params, keys: play(params, keys, mesh))(*given)
+given = devices.replicate((params, jax.random.key_data(keys)), mesh)
+shared = jax.jit(
+    lambda params, keys: play(params, jax.random.wrap_key_data(keys), mesh)
+)(*given)
 out["same actions"] = float((plain.action == np.asarray(shared.action)).mean())
 out["log_prob"] = distance(plain.log_prob, shared.log_prob)
 out["advantage"] = distance(plain.advantage, shared.advantage)

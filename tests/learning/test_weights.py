@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from jaxcal.learning.runtime import weights
-from jaxcal.learning.runtime.checkpoint_folder import CheckpointError, default_folder
-from jaxcal.learning.runtime.weights import Weights
+from jaxcal.learning.runtime.weights import CheckpointError, Weights, default_folder
 from jaxcal.learning.training import checkpoint
 
 HELD = Weights(
@@ -63,7 +62,7 @@ def test_another_format_is_refused(tmp_path, monkeypatch):
 def test_the_shipped_file_holds_the_shipped_checkpoint():
     found = weights.read(weights.locate(None))
     policy = checkpoint.load()
-    assert found.fingerprint == checkpoint.as_weights(policy).fingerprint
+    assert found.fingerprint == policy.weights.fingerprint
     assert checkpoint.fingerprint() == found.fingerprint
     assert found.meta == policy.meta
 

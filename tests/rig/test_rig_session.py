@@ -319,11 +319,11 @@ def test_the_shipped_policy_makes_the_default_choice():
 
 
 def test_without_a_checkpoint_the_choice_is_the_exact_optimum(tmp_path, monkeypatch):
-    from jaxcal.learning.runtime import checkpoint_folder
+    from jaxcal.learning.runtime import weights
 
     config = parse_config(example_text("simulate"))
     candidates = config.to_deg(draw_candidates(config))
-    monkeypatch.setattr(checkpoint_folder, "default_folder", lambda: tmp_path / "none")
+    monkeypatch.setattr(weights, "default_folder", lambda: tmp_path / "none")
     choice = choose(config, candidates)
     assert (choice.method, choice.efficiency) == ("exact", 1.0)
     assert "no policy could be used" in choice.note

@@ -22,7 +22,7 @@ from jaxcal.learning.policies import decoding, networks
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
-from jaxcal.learning.runtime.checkpoint_folder import default_folder
+from jaxcal.learning.runtime.weights import default_folder
 from jaxcal.learning.training import checkpoint
 from jaxcal.selection.policy import select_batch
 from jaxcal.selection.policy.compact import CompactNetwork, _Sets

@@ -52,14 +52,13 @@ class SelectionEnv(Env):
         after, reward, done = environment.step(
             state.pipeline_state, action, self.config
         )
-        metrics = dict(state.metrics)
-        metrics["log_det"] = reward / self.config.reward_scale
+        paid = {"log_det": reward / self.config.reward_scale}
         return state.replace(
             pipeline_state=after,
             obs=environment.observe(after, self.config),
             reward=reward,
             done=done.astype(jnp.float32),
-            metrics=metrics,
+            metrics=state.metrics | paid,
         )
 
     @property
@@ -90,12 +89,9 @@ class _FreshReset(Wrapper):
                 shape = (*state.done.shape, *(1,) * (old.ndim - state.done.ndim))
                 return jnp.where(state.done.reshape(shape) > 0, new, old)
 
-            return state.replace(
-                pipeline_state=jax.tree.map(
-                    where_done, fresh.pipeline_state, state.pipeline_state
-                ),
-                obs=jax.tree.map(where_done, fresh.obs, state.obs),
-            )
+            new, old = ((s.pipeline_state, s.obs) for s in (fresh, state))
+            episode, obs = jax.tree.map(where_done, new, old)
+            return state.replace(pipeline_state=episode, obs=obs)
 
         # All environments of a batch end together, so three steps of four skip this.
         return jax.lax.cond(jnp.any(state.done > 0), renewed, lambda s: s, state)

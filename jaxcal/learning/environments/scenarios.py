@@ -1,4 +1,4 @@
-"""Where training candidates come from: ranges, shapes and masks, a pool, given sets.
+"""Where training candidates come from: shapes and masks, a pool, given sets.
 
 Each function returns a ``Candidates``: key -> (M, n) candidates and (M,) available. The
 compact network is blind to affine maps, so ranges, shear and correlation need no shape
@@ -7,6 +7,7 @@ of their own in ``mixture``; what is left is the shape of the cloud and what is 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import jax
@@ -15,37 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxcal.learning.environments import randomness
-from jaxcal.learning.environments.selection import (
-    Candidates,
-    SelectionConfig,
-    unit_cube,
-)
+from jaxcal.learning.environments.selection import Candidates, SelectionConfig
 
-__all__ = ["SHAPES", "from_pool", "from_sets", "mixture", "uniform"]
+__all__ = ["SHAPES", "from_pool", "from_sets", "mixture"]
 
 SHAPES = ("uniform", "gaussian", "sphere", "clustered", "grid", "cluster_uniform")
-
-
-def uniform(
-    config: SelectionConfig, low: Sequence[float], high: Sequence[float]
-) -> Candidates:
-    """Candidates uniform between ``low`` and ``high``, n numbers each."""
-    lower, upper = np.asarray(low), np.asarray(high)
-    if lower.shape != (config.num_inputs,) or upper.shape != (config.num_inputs,):
-        raise ValueError(
-            f"low and high must hold {config.num_inputs} numbers, "
-            f"got {lower.shape} and {upper.shape}"
-        )
-    if not (lower < upper).all():
-        raise ValueError(f"low must be below high on every axis, got {low} and {high}")
-    unit = unit_cube(config)
-
-    def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        points, available = unit(key)
-        span = jnp.float32(upper - lower)
-        return jnp.float32(lower)[None, :] + points * span[None, :], available
-
-    return draw
 
 
 def from_pool(
@@ -59,21 +34,17 @@ def from_pool(
         available: (N,) bool, those that may be chosen; all when None.
     """
     postures = np.asarray(pool, np.float32)
-    if postures.ndim != 2 or postures.shape[1] != config.num_inputs:
-        raise ValueError(
-            f"pool must have shape (N, {config.num_inputs}), got {postures.shape}"
-        )
-    free = np.ones(len(postures), bool) if available is None else np.asarray(available)
-    keep = np.flatnonzero(free)
-    if len(keep) < config.num_candidates:
+    if available is not None:
+        postures = postures[np.asarray(available)]
+    if len(postures) < config.num_candidates:
         raise ValueError(
             f"pool must hold at least {config.num_candidates} postures, the "
-            f"num_candidates of an episode, got {len(keep)} available"
+            f"num_candidates of an episode, got {len(postures)} available"
         )
-    kept = jnp.asarray(postures[keep])
+    kept = jnp.asarray(postures)
 
     def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        index = jax.random.permutation(key, len(keep))[: config.num_candidates]
+        index = jax.random.permutation(key, len(kept))[: config.num_candidates]
         return kept[index], jnp.ones(config.num_candidates, bool)
 
     return draw
@@ -90,21 +61,15 @@ def from_sets(
         available: (B, M) bool; all when None. At least ``num_selected`` in every set.
     """
     points = jnp.asarray(sets, jnp.float32)
-    shape = (config.num_candidates, config.num_inputs)
-    if points.ndim != 3 or points.shape[1:] != shape:
+    masks = jnp.ones(points.shape[:2], bool)
+    if available is not None:
+        masks = jnp.asarray(available)
+    least = int(masks.sum(axis=1).min())
+    if least < config.num_selected:
         raise ValueError(
-            f"sets must have shape (B, {shape[0]}, {shape[1]}), got {points.shape}"
+            f"every set must have {config.num_selected} available candidates, got "
+            f"{least} in one of them"
         )
-    free = (
-        np.ones(points.shape[:2], bool) if available is None else np.asarray(available)
-    )
-    few = np.flatnonzero(free.sum(axis=1) < config.num_selected)
-    if few.size:
-        raise ValueError(
-            f"every set must have {config.num_selected} available candidates, "
-            f"got {int(free[few[0]].sum())} in set {few[0]}"
-        )
-    masks = jnp.asarray(free)
 
     def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         index = jax.random.randint(key, (), 0, len(points))
@@ -130,21 +95,17 @@ def _shape(name: str, key: jax.Array, m: int, n: int) -> jax.Array:
         key_width, key_noise = jax.random.split(key_c)
         width = jax.random.uniform(key_width, (), minval=0.02, maxval=0.15)
         return centres[which] + width * jax.random.normal(key_noise, (m, n))
-    if name == "grid":
-        # Distinct nodes of a grid fine enough for M, with a little freedom in its size.
-        least = 2
-        while least**n < m:
-            least += 1
-        side = jax.random.randint(key_a, (), least, least + 3)
-        nodes = jax.random.permutation(key_b, (least + 2) ** n)
-        inside = nodes < side**n
-        node = nodes[jnp.argsort(~inside, stable=True)[:m]]
-        digits = []
-        for _ in range(n):
-            digits.append(node % side)
-            node = node // side
-        return jnp.stack(digits, axis=-1) / (side - 1)
-    raise ValueError(f"shape must be one of {', '.join(SHAPES)}, got {name!r}")
+    # "grid": distinct nodes of one fine enough for M, of a size that varies a little.
+    least = next(side for side in itertools.count(2) if side**n >= m)
+    side = jax.random.randint(key_a, (), least, least + 3)
+    nodes = jax.random.permutation(key_b, (least + 2) ** n)
+    inside = nodes < side**n
+    node = nodes[jnp.argsort(~inside, stable=True)[:m]]
+    digits = []
+    for _ in range(n):
+        digits.append(node % side)
+        node = node // side
+    return jnp.stack(digits, axis=-1) / (side - 1)
 
 
 def mixture(

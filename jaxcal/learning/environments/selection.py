@@ -36,7 +36,6 @@ __all__ = [
     "reset_from",
     "start",
     "step",
-    "unit_cube",
 ]
 
 Candidates = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
@@ -115,14 +114,11 @@ def reset(
             on every axis when None.
     """
     key_draw, key_next = randomness.split(key)
-    candidates, available = (draw or unit_cube(config))(key_draw)
-    return start(candidates, available, config, key_next)
-
-
-def unit_cube(config: SelectionConfig) -> Candidates:
-    """Candidates uniform in [0, 1] on every axis, all available."""
-    shape = (config.num_candidates, config.num_inputs)
-    return lambda key: (randomness.uniform(key, shape), jnp.ones(shape[0], bool))
+    if draw is not None:
+        return start(*draw(key_draw), config, key_next)
+    m = config.num_candidates
+    candidates = randomness.uniform(key_draw, (m, config.num_inputs))
+    return start(candidates, jnp.ones(m, bool), config, key_next)
 
 
 def reset_from(

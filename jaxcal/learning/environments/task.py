@@ -1,8 +1,7 @@
 """What is trained on: an episode of selection and where its candidates come from.
 
-A ``Task`` is all that the trainer knows of an environment: how to begin, how to step,
-and what a decision pays (``training.rollout.Rules`` says what it needs). Another
-environment is another class with these methods.
+A ``Task`` is all that the trainer knows of an environment; ``training.rules.Rules``
+says what it needs. Another environment is another class with these methods.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ __all__ = ["GivenCandidates", "Task"]
 class GivenCandidates:
     """The user's own candidates, known by their digest; a checkpoint holds no copy."""
 
-    name: str  # of the file, for messages
+    name: str = field(compare=False)  # of the file, for messages
     sha256: str  # of the file
     # (B, M, n) sets, or (1, N, n): a pool that every episode draws its M from. None
     # where only the digest is known.

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import cast
 
 from jaxcal.learning.policies.compact import CompactNetwork
-from jaxcal.learning.policies.networks import Network, NetworkConfig, added_kinds
+from jaxcal.learning.policies.networks import GROUP, Network, NetworkConfig
+from jaxcal.learning.settings import installed
 
 __all__ = ["build"]
 
@@ -14,4 +15,4 @@ def build(config: NetworkConfig) -> Network:
     """The network that a configuration names, as a flax module."""
     if config.kind == "compact":
         return cast(Network, CompactNetwork(config))
-    return cast(Network, added_kinds()[config.kind].load()(config))
+    return cast(Network, installed(GROUP)[config.kind].load()(config))

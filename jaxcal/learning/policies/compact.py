@@ -6,11 +6,14 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from jaxcal.learning.policies import features as geometry
+from jaxcal.learning.policies import geometry
 from jaxcal.learning.policies.features import (
     CandidateFeatures,
     DecisionFeatures,
     VectorFeatures,
+    close_up_of,
+    remaining,
+    vector_features,
 )
 from jaxcal.learning.policies.networks import NetworkConfig, mask_logits
 
@@ -88,10 +91,11 @@ class CompactNetwork(nn.Module):
         self, candidates: jax.Array, usable: jax.Array
     ) -> CandidateFeatures:
         """The geometry of sets; see ``networks.Network`` for the arguments."""
-        config = self.config
-        return geometry.candidate_features(
-            candidates, usable, config.lookahead, config.close_up
-        )
+        whitened, offset = geometry.whiten(candidates, usable)
+        depth = min(self.config.lookahead, whitened.shape[-1])
+        close_up = self.config.close_up
+        vectors = vector_features(whitened, False, usable, depth, close_up)
+        return CandidateFeatures(vectors, whitened, offset)
 
     def decision_features(
         self,
@@ -101,9 +105,17 @@ class CompactNetwork(nn.Module):
         count: int | jax.Array,
     ) -> DecisionFeatures:
         """The geometry of a decision; see ``networks.Network`` for the arguments."""
-        config = self.config
-        return geometry.decision_features(
-            features, chosen, available, count, config.lookahead, config.close_up
+        left, depth = remaining(features, chosen, count), self.config.lookahead
+        if isinstance(count, int):
+            depth = min(depth, chosen.shape[-1] - count)
+        vectors = vector_features(
+            left.vectors, left.spanned, available, depth, self.config.close_up
+        )
+        return DecisionFeatures(
+            vectors,
+            chosen=left.chosen.sum(-2) / jnp.maximum(count, 1),
+            reached=left.log_det + vectors.best[..., 3],
+            progress=left.progress,
         )
 
     def shares_program(self, features: CandidateFeatures, k: int) -> range:
@@ -149,7 +161,7 @@ class CompactNetwork(nn.Module):
         # How far to believe the greedy look ahead is learned.
         rule = 20.0 * vectors.ahead[..., 3]
         if self.config.close_up:
-            rule = rule + geometry.close_up_of(vectors.ahead[..., 3]).sum(-1)
+            rule = rule + close_up_of(vectors.ahead[..., 3]).sum(-1)
         logits = self.actor(g)[..., 0] + self.trust * rule
         logits = mask_logits(logits, active)
         weight = active[..., None].astype(g.dtype)

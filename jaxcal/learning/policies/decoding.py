@@ -16,15 +16,7 @@ from jaxcal.learning.policies import networks
 from jaxcal.learning.policies.networks import Network
 from jaxcal.learning.small_matrices import log_det_gram
 
-__all__ = [
-    "DECODINGS",
-    "choose",
-    "complete",
-    "log_det_of",
-    "logits_at",
-]
-
-DECODINGS = ("greedy", "samples", "first")
+__all__ = ["choose", "complete", "log_det_of", "logits_at"]
 
 
 def log_det_of(candidates: jax.Array, indices: jax.Array) -> jax.Array:
@@ -64,12 +56,12 @@ def complete(
     carry = (chosen, available, key)
     position = first
     while position < k:
-        end = shared.stop if position in shared else position + 1
-        if end == position + 1:
-            carry = next_one(position, carry)
+        if position in shared and position + 1 in shared:
+            carry = jax.lax.fori_loop(position, shared.stop, next_one, carry)
+            position = shared.stop
         else:
-            carry = jax.lax.fori_loop(position, end, next_one, carry)
-        position = end
+            carry = next_one(position, carry)
+            position += 1
     return carry[0]
 
 

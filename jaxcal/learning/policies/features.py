@@ -18,10 +18,9 @@ __all__ = [
     "DecisionFeatures",
     "Remaining",
     "VectorFeatures",
-    "candidate_features",
     "close_up_of",
-    "decision_features",
     "remaining",
+    "vector_features",
 ]
 
 _FLOOR = -8.0  # least log-volume, relative to the best, that a feature can show
@@ -69,62 +68,20 @@ class Remaining(NamedTuple):
     chosen: jax.Array  # (..., c, M) one-hot choices; c = count, K where that is traced
 
 
-def candidate_features(
-    candidates: jax.Array, usable: jax.Array, lookahead: int, close_up: bool
-) -> CandidateFeatures:
-    """The geometry of a set.
-
-    Args:
-        candidates: (..., M, n) commands in any unit.
-        usable: (..., M) bool, available or already chosen.
-        lookahead: most greedy choices ahead that a feature shows.
-        close_up: whether to add the columns that tell near-equal look-aheads apart.
-    """
-    whitened, offset = geometry.whiten(candidates, usable)
-    depth = min(lookahead, whitened.shape[-1])
-    vectors = _vector_features(whitened, False, usable, depth, close_up)
-    return CandidateFeatures(vectors, whitened, offset)
-
-
-def decision_features(
-    features: CandidateFeatures,
-    chosen: jax.Array,
-    available: jax.Array,
-    count: int | jax.Array,
-    lookahead: int,
-    close_up: bool,
-) -> DecisionFeatures:
-    """The geometry of a decision.
+def remaining(
+    features: CandidateFeatures, chosen: jax.Array, count: int | jax.Array
+) -> Remaining:
+    """What is left of a set after ``count`` choices.
 
     Args:
         features: of the set.
         chosen: (..., K) int, of which the first ``count`` are chosen, the rest -1.
-        available: (..., M) bool.
-        count: choices made, the same for the whole batch. Traced only where the chosen
-            span the space and the look-ahead is not cut short by the end.
-        lookahead, close_up: see ``candidate_features``.
+        count: the same for the whole batch. Traced only where the chosen span the space
+            and the look-ahead is not cut short by the end.
     """
-    left = remaining(features, chosen, count)
-    depth = lookahead
-    if isinstance(count, int):
-        depth = min(depth, chosen.shape[-1] - count)
-    vectors = _vector_features(left.vectors, left.spanned, available, depth, close_up)
-    return DecisionFeatures(
-        vectors,
-        chosen=left.chosen.sum(-2) / jnp.maximum(count, 1),
-        reached=left.log_det + vectors.best[..., 3],
-        progress=left.progress,
-    )
-
-
-def remaining(
-    features: CandidateFeatures, chosen: jax.Array, count: int | jax.Array
-) -> Remaining:
-    """What is left of a set after ``count`` choices; see ``decision_features``."""
     x = features.whitened
     p, total = x.shape[-1], chosen.shape[-1]
     left = total - count
-    known = isinstance(count, int)
     shown = chosen[..., :count] if isinstance(count, int) else chosen
     which = jax.nn.one_hot(shown, x.shape[-2], dtype=x.dtype)
     picked = jnp.einsum(
@@ -137,21 +94,12 @@ def remaining(
     else:
         # The metric of the chosen; until they span the space, with a ridge small
         # beside what a posture contributes.
-        ridge = _RIDGE if known and count < p else 0.0
+        ridge = _RIDGE if isinstance(count, int) and count < p else 0.0
         y, so_far = geometry.normalised_by(x, picked, ridge)
         spanned = True
-    numbers = [
-        jnp.asarray(number, x.dtype)
-        for number in (
-            left == 1,
-            left == 2,
-            left == 3,
-            1.0 / left,
-            count / p,
-            jnp.minimum(left / p, 3.0),
-            total > p,
-        )
-    ]
+    ends = (left == 1, left == 2, left == 3, 1.0 / left)
+    shares = (count / p, jnp.minimum(left / p, 3.0), total > p)
+    numbers = [jnp.asarray(number, x.dtype) for number in (*ends, *shares)]
     progress = jnp.broadcast_to(jnp.stack(numbers), (*so_far.shape, len(numbers)))
     return Remaining(y, spanned, features.offset + so_far, progress, which)
 
@@ -161,10 +109,13 @@ def close_up_of(ahead: jax.Array) -> jax.Array:
     return jnp.stack([jnp.exp(scale * ahead) for scale in _CLOSE], axis=-1)
 
 
-def _vector_features(
+def vector_features(
     y: jax.Array, spanned: bool, active: jax.Array, depth: int, close_up: bool
 ) -> VectorFeatures:
-    """Features of vectors y (..., M, p); ``spanned`` and ``depth`` as in lookahead."""
+    """Features of vectors y (..., M, p); arguments as in ``geometry.lookahead``.
+
+    ``close_up`` adds the columns that tell near-equal look-aheads apart.
+    """
     y = y * active[..., None].astype(y.dtype)
     number = jnp.maximum(active.sum(-1).astype(y.dtype), 1.0)
     square = (y * y).sum(-1)
@@ -193,11 +144,9 @@ def _vector_features(
 def _second_moments(x: jax.Array) -> jax.Array:
     """(..., M, p) -> (..., M, p (p + 1) / 2) with phi(x) . phi(y) = (x . y)^2."""
     p = x.shape[-1]
-    return jnp.stack(
-        [
-            x[..., i] * x[..., j] * (1.0 if i == j else 2.0**0.5)
-            for i in range(p)
-            for j in range(i, p)
-        ],
-        axis=-1,
-    )
+    products = [
+        x[..., i] * x[..., j] * (1.0 if i == j else 2.0**0.5)
+        for i in range(p)
+        for j in range(i, p)
+    ]
+    return jnp.stack(products, axis=-1)

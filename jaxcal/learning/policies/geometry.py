@@ -18,7 +18,6 @@ __all__ = [
     "log_det_lengths",
     "lookahead",
     "normalised_by",
-    "num_starts",
     "projected",
     "whiten",
 ]
@@ -137,9 +136,10 @@ def lookahead(
         ``depth`` arrays (..., M): the log of the factor by which the determinant grows
         over the first 1, 2, ... choices; -30 where not active. The first is the gain.
         The second is the gain of the best pair, exactly; later ones are what greedy
-        choices reach. Cost: ``depth - 1`` products of (S, p) with (p, M), where
-        S = ``num_starts(M)``. Of more than 1,024 candidates only the 512 of largest
-        gain are looked ahead from; the others have -30 after the first choice.
+        choices reach. Cost: ``depth - 1`` products of (S, p) with (p, M) from S starts.
+        Of more than 1,024 candidates only the 512 of largest gain are starts; the
+        others have -30 after the first choice. (A member of the best set has a large
+        gain of its own; memory and time then grow with M and not with its square.)
     """
     m = y.shape[-2]
     base = 1.0 if spanned else 0.0
@@ -149,7 +149,7 @@ def lookahead(
     if depth == 1:
         return values
     # For every start i (axis -2): the gains of all j (axis -1) after its choices.
-    number = num_starts(m)
+    number = m if m <= _ALL_START else _STARTS
     shape = (*square.shape[:-1], number, m)
     if number < m:
         starts = jax.lax.top_k(values[0], number)[1]
@@ -202,16 +202,6 @@ def lookahead(
             overlap = (picked * before).sum(-1) * shrink
             picked = picked - overlap[..., None] * before
     return values
-
-
-def num_starts(num_candidates: int) -> int:
-    """Candidates that ``lookahead`` looks ahead from: all of up to 1,024, else 512.
-
-    A member of the best set has a large gain of its own, so a set is found from one of
-    its members as long as that one is a start; memory and time then grow with M and not
-    with its square.
-    """
-    return num_candidates if num_candidates <= _ALL_START else _STARTS
 
 
 def log_det_lengths(chosen: jax.Array) -> jax.Array:

@@ -19,25 +19,23 @@ package adds a kind by an entry point, as jaxcal's own pyproject.toml adds ``pap
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 from typing import Any, Protocol, cast
 
 import jax
 import jax.numpy as jnp
 
-from jaxcal.learning.settings import require, setting
+from jaxcal.learning.settings import installed, require, setting
 
 __all__ = [
     "Network",
     "NetworkConfig",
-    "added_kinds",
     "decode",
     "encode",
     "initial",
     "mask_logits",
 ]
 
-_GROUP = "jaxcal.networks"
+GROUP = "jaxcal.networks"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,11 +60,12 @@ class NetworkConfig:
     initial_actor: float = setting(0.1, "scale of the learned score before learning")
 
     def __post_init__(self) -> None:
-        if self.kind != "compact" and self.kind not in added_kinds():
+        if self.kind != "compact" and self.kind not in installed(GROUP):
+            known = ", ".join(["compact", *installed(GROUP)])
             raise ValueError(
-                f"kind must be one of {', '.join(['compact', *added_kinds()])}, got "
+                f"kind must be one of {known}, got "
                 f"{self.kind!r}; a package adds a kind by an entry point in the group "
-                f"{_GROUP}, when it is installed"
+                f"{GROUP}, when it is installed"
             )
         require(self, "at least 1", lambda v: v >= 1, "width", "lookahead")
         rounds = ("encoder_rounds", "decoder_rounds")
@@ -123,11 +122,6 @@ class Network(Protocol):
         """flax's: a method with given parameters."""
 
 
-def added_kinds() -> dict[str, importlib.metadata.EntryPoint]:
-    """The kinds of installed packages."""
-    return {p.name: p for p in importlib.metadata.entry_points(group=_GROUP)}
-
-
 def initial(network: Network, key: jax.Array, m: int, n: int, k: int) -> Any:
     """Fresh parameters for M candidates of n inputs and K choices."""
     free = jnp.ones((1, m), bool)
@@ -141,11 +135,19 @@ def encode(network: Network, params: Any, features: Any) -> jax.Array:
 
 
 def decode(
-    network: Network, params: Any, memory: jax.Array, decision: Any
+    network: Network, params: Any, memory: jax.Array, decision: Any, axes: int = 0
 ) -> tuple[jax.Array, jax.Array]:
-    """Apply ``network.decode`` with given parameters: logits and value."""
-    out = network.apply({"params": params}, memory, decision, method="decode")
-    return cast(tuple[jax.Array, jax.Array], out)
+    """Apply ``network.decode`` with given parameters: logits and value.
+
+    ``axes`` axes of decisions of the same set follow the first one, of the sets.
+    """
+
+    def scored(decision: Any) -> Any:
+        return network.apply({"params": params}, memory, decision, method="decode")
+
+    for _ in range(axes):
+        scored = jax.vmap(scored, in_axes=1, out_axes=1)
+    return cast(tuple[jax.Array, jax.Array], scored(decision))
 
 
 def mask_logits(logits: jax.Array, available: jax.Array) -> jax.Array:

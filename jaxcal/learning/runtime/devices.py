@@ -9,7 +9,6 @@ read goes to the others through ``on_first``.
 
 from __future__ import annotations
 
-import dataclasses
 import pickle
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -46,28 +45,18 @@ def make_mesh(num_devices: int | None = None) -> Mesh | None:
     Raises:
         ValueError: a process has fewer.
     """
-    devices = jax.devices()
-    if num_devices is not None:
-        have = jax.local_device_count()
-        if not 1 <= num_devices <= have:
-            raise ValueError(f"devices must be in [1, {have}], got {num_devices}")
-        devices = [
-            device
-            for process in range(jax.process_count())
-            for device in [d for d in devices if d.process_index == process][
-                :num_devices
-            ]
-        ]
-    return Mesh(np.asarray(devices), ("sets",)) if len(devices) > 1 else None
+    have = jax.local_device_count()
+    number = have if num_devices is None else num_devices
+    if not 1 <= number <= have:
+        raise ValueError(f"devices must be in [1, {have}], got {num_devices}")
+    chosen: list[jax.Device] = []
+    for process in range(jax.process_count()):
+        chosen += [d for d in jax.devices() if d.process_index == process][:number]
+    return Mesh(np.asarray(chosen), ("sets",)) if len(chosen) > 1 else None
 
 
 def require_divisible(sets: int, mesh: Mesh | None) -> None:
-    """Refuse a minibatch that the devices cannot share evenly.
-
-    Args:
-        sets: candidate sets in a minibatch.
-        mesh: from ``make_mesh``.
-    """
+    """Refuse a minibatch of ``sets`` candidate sets that the devices cannot share."""
     if mesh is not None and sets % mesh.size:
         fewer = max(n for n in range(1, mesh.size) if sets % n == 0)
         raise ValueError(
@@ -89,18 +78,18 @@ def describe(mesh: Mesh | None) -> str:
 
 def by_set(tree: Any, mesh: Mesh | None) -> Any:
     """The same values, the leading axis of every leaf spread over the devices."""
-    if mesh is None:
-        return tree
-    return jax.lax.with_sharding_constraint(
-        tree, NamedSharding(mesh, PartitionSpec("sets"))
-    )
+    return _placed(tree, mesh, PartitionSpec("sets"))
 
 
 def everywhere(tree: Any, mesh: Mesh | None) -> Any:
     """The same values, whole on every device."""
+    return _placed(tree, mesh, PartitionSpec())
+
+
+def _placed(tree: Any, mesh: Mesh | None, spec: PartitionSpec) -> Any:
     if mesh is None:
         return tree
-    return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, PartitionSpec()))
+    return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, spec))
 
 
 def is_first() -> bool:
@@ -112,7 +101,7 @@ def on_first(function: Callable[[], T]) -> T:
     """Call on process 0 alone; every process gets the result, or raises the same error.
 
     Args:
-        function: returns a pytree of arrays and of what can be pickled.
+        function: returns what can be pickled, arrays among it.
 
     Raises:
         ValueError, OSError: what ``function`` raised.
@@ -122,7 +111,7 @@ def on_first(function: Callable[[], T]) -> T:
     answer: Any = None
     if is_first():
         try:
-            answer = (True, jax.tree.map(_without_key, function()))
+            answer = (True, function())
         except (ValueError, OSError) as error:
             answer = (False, error)
     data = np.frombuffer(pickle.dumps(answer), np.uint8)
@@ -133,32 +122,7 @@ def on_first(function: Callable[[], T]) -> T:
     fine, result = pickle.loads(data.tobytes())
     if not fine:
         raise result
-    return jax.tree.map(_with_key, result)
-
-
-@dataclasses.dataclass(frozen=True)
-class _KeyData:
-    """A PRNG key on its way to another process."""
-
-    data: np.ndarray
-
-
-def _is_key(leaf: Any) -> bool:
-    return isinstance(leaf, jax.Array) and jax.dtypes.issubdtype(
-        leaf.dtype, jax.dtypes.prng_key
-    )
-
-
-def _without_key(leaf: Any) -> Any:
-    if _is_key(leaf):
-        return _KeyData(np.asarray(jax.random.key_data(leaf)))
-    return np.asarray(leaf) if isinstance(leaf, jax.Array) else leaf
-
-
-def _with_key(leaf: Any) -> Any:
-    if isinstance(leaf, _KeyData):
-        return jax.random.wrap_key_data(jax.numpy.asarray(leaf.data))
-    return leaf
+    return result
 
 
 def any_process(flag: bool) -> bool:
@@ -170,22 +134,16 @@ def any_process(flag: bool) -> bool:
 
 
 def replicate(tree: Any, mesh: Mesh | None) -> Any:
-    """Put values that every process holds alike on every device of the mesh.
-
-    Args:
-        tree: arrays, typed PRNG keys among them.
-        mesh: from ``make_mesh``.
-    """
+    """Put arrays that every process holds alike on every device of the mesh."""
     if mesh is None:
         return tree
     sharding = NamedSharding(mesh, PartitionSpec())
 
     def put(leaf: Any) -> jax.Array:
-        plain = np.asarray(jax.random.key_data(leaf) if _is_key(leaf) else leaf)
-        array = jax.make_array_from_callback(
+        plain = np.asarray(leaf)
+        return jax.make_array_from_callback(
             plain.shape, sharding, lambda cut: plain[cut]
         )
-        return jax.random.wrap_key_data(array) if _is_key(leaf) else array
 
     return jax.tree.map(put, tree)
 

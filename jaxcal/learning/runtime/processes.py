@@ -1,11 +1,10 @@
 """A job of several processes: who takes part, and what happens when one is lost.
 
 Every process runs the same command. It learns of the others from ``--coordinator``,
-``--num-processes`` and ``--process-id``, or from what JAX finds out by itself under
-SLURM, Open MPI, Kubernetes and on Cloud TPU. JAX ends a process whose partner died by
-an abort with a page of traces, and when the coordinator died it does so at once; so the
-work is done in a child, and the parent, which holds no JAX, says in one line what
-happened. Nothing here imports JAX before the fork.
+``--num-processes`` and ``--process-id``, or from what JAX finds under SLURM, Open MPI,
+Kubernetes and on Cloud TPU. JAX aborts a process whose partner died, with a page of
+traces; so the work is done in a child, and the parent, which holds no JAX, says in one
+line what happened. Nothing here imports JAX before the fork.
 """
 
 from __future__ import annotations
@@ -29,7 +28,6 @@ __all__ = [
     "HEARTBEAT_SECONDS",
     "LostProcessError",
     "add_arguments",
-    "connect",
     "expected",
     "local_device_ids",
     "losing_a_process",
@@ -41,10 +39,7 @@ EXIT_LOST = 3  # another process of the job is gone
 HEARTBEAT_SECONDS = 20  # silence after which a process counts as lost
 _CONNECT_SECONDS = 300  # for all processes to come together
 _LEAVE_SECONDS = 3600  # for the first to write, when the others are done
-_SAYS = "jaxcal: "  # begins the line in the log that the parent repeats
-_PARENT_SECONDS = 0.5  # between looks whether the parent lives
-
-_identity_pipe: int | None = None  # where a child tells its parent which process it is
+_SAYS = "jaxcal: "  # begins a line of the log that is meant for the parent
 
 
 class LostProcessError(RuntimeError):
@@ -63,19 +58,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--process-id", type=int, metavar="I", help="0 to N - 1")
 
 
-def expected(
-    arguments: argparse.Namespace, environ: Mapping[str, str] = os.environ
-) -> bool:
+def expected(job: argparse.Namespace, environ: Mapping[str, str] = os.environ) -> bool:
     """Whether this process is one of several, or may be.
 
     Raises:
         ValueError: naming the flag, the rule and the value.
     """
-    address, number, own = (
-        arguments.coordinator,
-        arguments.num_processes,
-        arguments.process_id,
-    )
+    address, number, own = job.coordinator, job.num_processes, job.process_id
     if number is not None and number < 1:
         raise ValueError(f"--num-processes must be at least 1, got {number}")
     if own is not None and (number is None or not 0 <= own < number):
@@ -86,28 +75,27 @@ def expected(
             raise ValueError(f"--coordinator must be HOST:PORT, got {address!r}")
         if number is None or own is None:
             raise ValueError("--coordinator needs --num-processes and --process-id")
-    if number == 1:
-        return False
-    if number is not None:
-        if own is None or (address is None and not _cluster(environ)):
-            raise ValueError("--num-processes needs --coordinator and --process-id")
-        return True
-    return _cluster(environ)
+    if number is None or number == 1:
+        return number is None and _cluster(environ)
+    if own is None or (address is None and not _cluster(environ)):
+        raise ValueError("--num-processes needs --coordinator and --process-id")
+    return True
 
 
 def _cluster(environ: Mapping[str, str]) -> bool:
     """Whether a launcher that JAX knows started several of these processes."""
-    for name in ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE"):
-        if environ.get(name, "1") != "1":
-            # A batch script has the first of these, but is no task of its own job step.
-            return name != "SLURM_NTASKS" or "SLURM_STEP_NODELIST" in environ
+    if environ.get("SLURM_NTASKS", "1") != "1":
+        # A batch script has this, too, but is no task of its own job step.
+        return "SLURM_STEP_NODELIST" in environ
+    if environ.get("OMPI_COMM_WORLD_SIZE", "1") != "1":
+        return True
     if "," in environ.get("TPU_WORKER_HOSTNAMES", ""):
         return True
     several = ("JAX_COORDINATOR_ADDRESS", "MEGASCALE_COORDINATOR_ADDRESS")
     if any(name in environ for name in (*several, "JOB_COMPLETION_INDEX")):
         return True
     # A Cloud TPU machine keeps its slice in its metadata, which only JAX reads.
-    return pathlib.Path("/dev/accel0").exists() or pathlib.Path("/dev/vfio/0").exists()
+    return any(map(os.path.exists, ("/dev/accel0", "/dev/vfio/0")))
 
 
 def local_device_ids(environ: Mapping[str, str] = os.environ) -> list[int] | None:
@@ -118,23 +106,14 @@ def local_device_ids(environ: Mapping[str, str] = os.environ) -> list[int] | Non
     machine.
     """
     visible = environ.get("CUDA_VISIBLE_DEVICES", "")
-    if (
-        "SLURM_PROCID" not in environ
-        or not visible
-        or "JAX_LOCAL_DEVICE_IDS" in environ
-    ):
+    if not visible or "SLURM_PROCID" not in environ:
         return None
     number = len(visible.split(","))
     tasks = environ.get("SLURM_STEP_TASKS_PER_NODE", "")
-    alone = re.fullmatch(r"1(\(x\d+\))?", tasks) is not None
-    return list(range(number)) if alone or number == 1 else None
-
-
-class _Flags(argparse.ArgumentParser):
-    """Raises instead of leaving."""
-
-    def error(self, message: str) -> NoReturn:
-        raise ValueError(message)
+    own = number == 1 or re.fullmatch(r"1(\(x\d+\))?", tasks)
+    return (
+        list(range(number)) if own and "JAX_LOCAL_DEVICE_IDS" not in environ else None
+    )
 
 
 def run_job(
@@ -148,27 +127,30 @@ def run_job(
         work: the command itself.
         advice: how to go on when a process was lost.
     """
-    flags = _Flags(add_help=False, allow_abbrev=False)
+    flags = argparse.ArgumentParser(
+        add_help=False, allow_abbrev=False, exit_on_error=False
+    )
     add_arguments(flags)
     try:
-        arguments, _ = flags.parse_known_args(argv)
-        if not expected(arguments):
+        job, _ = flags.parse_known_args(argv)
+        if not expected(job):
             return work()
-    except ValueError as error:
+    except (ValueError, argparse.ArgumentError) as error:
         print(f"{program}: {error}", file=sys.stderr)
         return 2
 
     def joined() -> int:
+        import jax
+
         try:
-            connect(arguments)
+            _connect(job)
             code = work()
-            if code == 0:
-                _leave()
+            if code == 0 and jax.distributed.is_initialized():
+                sys.stdout.flush()
+                jax.distributed.shutdown()  # whoever does not wait counts as lost
             return code
         except LostProcessError as error:
             _note(f"{_SAYS}{error}")
-            if _identity_pipe is None:
-                print(f"{program}: {error}; {advice}", file=sys.stderr)
             return EXIT_LOST
         except ValueError as error:
             print(f"{program}: {error}", file=sys.stderr)
@@ -177,22 +159,12 @@ def run_job(
     return supervise(program, joined, advice)
 
 
-def _leave() -> None:
-    """Wait for the others: whoever goes silently counts as lost."""
-    import jax
-
-    if jax.distributed.is_initialized():
-        sys.stdout.flush()
-        jax.distributed.shutdown()
-
-
 def _note(text: str) -> None:
     """Write where the runtime writes: into the log that the parent reads."""
-    if _identity_pipe is not None:
-        os.write(2, f"{text}\n".encode())
+    os.write(2, f"{text}\n".encode())
 
 
-def connect(arguments: argparse.Namespace) -> None:
+def _connect(job: argparse.Namespace) -> None:
     """Join the job, before anything else of JAX is used.
 
     Raises:
@@ -204,27 +176,24 @@ def connect(arguments: argparse.Namespace) -> None:
     jax.config.update("jax_cpu_collectives_implementation", "gloo")
     try:
         jax.distributed.initialize(
-            arguments.coordinator,
-            arguments.num_processes,
-            arguments.process_id,
+            job.coordinator,
+            job.num_processes,
+            job.process_id,
             local_device_ids=local_device_ids(),
             initialization_timeout=_CONNECT_SECONDS,
             heartbeat_timeout_seconds=HEARTBEAT_SECONDS,
             shutdown_timeout_seconds=_LEAVE_SECONDS,
         )
     except ValueError:
-        if arguments.num_processes is None:
+        if job.num_processes is None:
             return  # none of JAX's detections found a job: this process is alone
         raise
     except RuntimeError as error:
-        where = arguments.coordinator or "the coordinator"
         raise LostProcessError(
-            f"not every process came to {where} in {_CONNECT_SECONDS} s "
-            f"({str(error).splitlines()[0][:120]})"
+            f"not every process came to {job.coordinator or 'the coordinator'} in "
+            f"{_CONNECT_SECONDS} s ({str(error).splitlines()[0][:120]})"
         ) from None
-    if _identity_pipe is not None:
-        text = f"{jax.process_index()} {jax.process_count()}"
-        os.write(_identity_pipe, text.encode())
+    _note(f"{_SAYS}process {jax.process_index()} of {jax.process_count()}")
 
 
 @contextlib.contextmanager
@@ -263,33 +232,32 @@ def supervise(program: str, run: Callable[[], int], advice: str) -> int:
     sys.stdout.flush()
     sys.stderr.flush()
     descriptor, name = tempfile.mkstemp(prefix="jaxcal-runtime-", suffix=".log")
-    log = pathlib.Path(name)
-    reading, writing = os.pipe()
     parent = os.getpid()
     child = os.fork()
     if child == 0:
-        os.close(reading)
-        _work(run, parent, descriptor, writing)
-    os.close(writing)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, frame: _pass_on(child, number))
-    _, status = os.waitpid(child, 0)
-    identity = os.read(reading, 64).decode().split()
-    os.close(reading)
+        _work(run, parent, descriptor)
     os.close(descriptor)
-    code = os.waitstatus_to_exitcode(status)
+
+    def pass_on(number: int, frame: Any) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(child, number)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, pass_on)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    log = pathlib.Path(name)
     text = log.read_text(errors="replace")
-    lost = _lost(text)
     if code >= 0 and code != EXIT_LOST:
         log.unlink()
         return code
-    who = "this process"
-    if identity:
-        who = f"process {identity[0]} of {identity[1]}"
-    said = re.findall(f"^{_SAYS}(.*)$", text, re.MULTILINE)
+    who, what, lost = "this process", "", _lost(text)
+    for said in re.findall(f"^{_SAYS}(.*)$", text, re.MULTILINE):
+        if re.fullmatch(r"process \d+ of \d+", said):
+            who = said
+        else:
+            what = f"stops: {said}"
     if code == EXIT_LOST or (code == -signal.SIGABRT and lost):
-        lost = f"{lost or 'another process of the job'} was lost"
-        what = f"stops: {said[-1] if said else lost}"
+        what = what or f"stops: {lost or 'another process of the job'} was lost"
         code = EXIT_LOST
     else:
         what = f"was ended by signal {-code} ({signal.Signals(-code).name})"
@@ -298,27 +266,22 @@ def supervise(program: str, run: Callable[[], int], advice: str) -> int:
     return code
 
 
-def _pass_on(child: int, number: int) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(child, number)
-
-
-def _work(run: Callable[[], int], parent: int, log: int, pipe: int) -> NoReturn:
+def _work(run: Callable[[], int], parent: int, log: int) -> NoReturn:
     """The child: Python's output as before, that of the runtime below into the log."""
-    global _identity_pipe
-    _identity_pipe = pipe
     os.setpgid(0, 0)  # a Ctrl-C of the terminal comes once, through the parent
     for stream in ("stdout", "stderr"):
         old = getattr(sys, stream)
-        number = old.fileno()
-        kept = os.dup(number)
-        os.dup2(log, number)
-        setattr(
-            sys,
-            stream,
-            open(kept, "w", encoding=old.encoding, buffering=1, errors=old.errors),
-        )
-    threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+        kept = os.dup(old.fileno())
+        os.dup2(log, old.fileno())
+        new = open(kept, "w", encoding=old.encoding, buffering=1, errors=old.errors)
+        setattr(sys, stream, new)
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(EXIT_LOST)
+
+    threading.Thread(target=watch, daemon=True).start()
     code: Any = 1
     try:
         code = run()
@@ -329,12 +292,6 @@ def _work(run: Callable[[], int], parent: int, log: int, pipe: int) -> NoReturn:
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)  # without the farewell barrier, which would wait for the lost
-
-
-def _watch(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(_PARENT_SECONDS)
-    os._exit(EXIT_LOST)
 
 
 def _lost(log: str) -> str | None:

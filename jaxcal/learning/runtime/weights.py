@@ -1,4 +1,4 @@
-"""A policy's weights in one plain file that numpy reads: no JAX, no orbax.
+"""Where a checkpoint lies, and its weights in a plain file: no JAX, no orbax.
 
 ``policy.npz`` lies in a step's folder beside what orbax wrote there. It holds the
 weights by flat name (``encoder_0.mix.kernel``) and ``header``: JSON with the format,
@@ -20,19 +20,60 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.files import atomic_write
-from jaxcal.learning.runtime.checkpoint_folder import (
-    CheckpointError,
-    newest_step,
-    resolve,
-)
 
-__all__ = ["NAME", "Weights", "flat", "locate", "read", "write"]
+__all__ = [
+    "NAME",
+    "CheckpointError",
+    "Weights",
+    "default_folder",
+    "flat",
+    "locate",
+    "newest_step",
+    "read",
+    "resolve",
+    "write",
+]
 
 NAME = "policy.npz"
 _FORMAT = "jaxcal-policy-weights"
 _VERSION = 1
 
 Arrays = dict[str, NDArray[Any]]
+
+
+class CheckpointError(ValueError):
+    """A checkpoint that is missing, damaged, or made by another version."""
+
+
+def default_folder() -> pathlib.Path:
+    """The checkpoint that ships: in the installed package, or in the repository."""
+    package = pathlib.Path(__file__).resolve().parents[2]
+    inside = package / "checkpoints" / "default"
+    return inside if inside.is_dir() else package.parent / "checkpoints" / "default"
+
+
+def resolve(folder: str | pathlib.Path | None) -> pathlib.Path:
+    """The folder with the numbered steps: the one given, or its ``checkpoint``.
+
+    Args:
+        folder: a checkpoint folder or a training run's; the one that ships when None.
+
+    Raises:
+        CheckpointError: it does not exist.
+    """
+    path = default_folder() if folder is None else pathlib.Path(folder)
+    if not path.is_dir():
+        hint = " (train one with: python train.py)" if folder is None else ""
+        raise CheckpointError(f"checkpoint folder {path} does not exist{hint}")
+    return path / "checkpoint" if (path / "checkpoint").is_dir() else path
+
+
+def newest_step(folder: pathlib.Path) -> pathlib.Path:
+    """The folder of the newest complete step in a folder from ``resolve``."""
+    steps = [p for p in folder.iterdir() if p.name.isdigit() and p.is_dir()]
+    if not steps:
+        raise CheckpointError(f"checkpoint folder {folder} holds no checkpoint")
+    return max(steps, key=lambda step: int(step.name))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,11 +130,9 @@ def write(path: str | pathlib.Path, weights: Weights) -> None:
         "meta": weights.meta,
     }
     text = np.frombuffer(json.dumps(header).encode(), np.uint8)
-    buffer = io.BytesIO()
     arrays: dict[str, Any] = {"header": text, **weights.arrays}
-    np.savez(buffer, **arrays)
     with atomic_write(path) as file:
-        file.write(buffer.getvalue())
+        np.savez(file, **arrays)
 
 
 def read(path: str | pathlib.Path) -> Weights:

@@ -60,14 +60,7 @@ def adapted(config: TrainConfig) -> TrainConfig:
 
 
 def require_read(given: Collection[str]) -> None:
-    """Refuse values that brax's trainer would not read.
-
-    Args:
-        given: names of fields that the user set.
-
-    Raises:
-        ValueError: naming them.
-    """
+    """Refuse values of fields, by name, that brax's trainer would not read."""
     read = {*READ, "width", *(field.name for field in settings_of(SelectionConfig))}
     unread = sorted(set(given) - read)
     if unread:
@@ -92,8 +85,8 @@ class _Categorical:
         return jnp.argmax(self.logits, axis=-1)
 
     def log_prob(self, x: jax.Array) -> jax.Array:
-        log_probs = jax.nn.log_softmax(self.logits)
         index = x.astype(jnp.int32)[..., None]
+        log_probs = jax.nn.log_softmax(self.logits)
         return jnp.take_along_axis(log_probs, index, axis=-1)[..., 0]
 
     def entropy(self) -> jax.Array:
@@ -131,16 +124,8 @@ def _make_networks(
             )[part],
         )
 
-    def factory(
-        observation_size: Any, action_size: int, preprocess_observations_fn: Any = None
-    ) -> brax_networks.PPONetworks:
-        return brax_networks.PPONetworks(
-            policy_network=read(0),
-            value_network=read(1),
-            parametric_action_distribution=MaskedCategorical(action_size),
-        )
-
-    return factory
+    made = brax_networks.PPONetworks(read(0), read(1), MaskedCategorical(m))
+    return lambda *sizes, **options: made
 
 
 @contextlib.contextmanager
@@ -166,7 +151,7 @@ def train(
     say: Callable[[str], None],
     num_evals: int = 10,
     watch: Callable[[int, Any], None] = lambda step, params: None,
-) -> Any:
+) -> None:
     """Train with ``brax.training.agents.ppo.train`` and save a checkpoint.
 
     The checkpoint's configuration holds what brax was given and nothing else.
@@ -177,9 +162,6 @@ def train(
         say: takes a line of progress.
         num_evals: how often brax reports.
         watch: called with the step and the policy's parameters at every report.
-
-    Returns:
-        The policy's parameters.
     """
     task, ppo = config.tasks[0], config.ppo
     env = task.environment
@@ -221,12 +203,9 @@ def train(
             policy_params_fn=lambda step, _, params: watch(step, params[1]),
             **given,
         )
-    policy = params[1]
-    kept = config.network
     meta = config.as_meta() | {
-        "network": {"kind": kept.kind, "width": kept.width},
+        "network": {"kind": config.network.kind, "width": config.network.width},
         "ppo": {name: getattr(ppo, name) for name in READ},
-        "tasks": [task.as_meta()],
         "trainer": "brax",
         "brax": given,
         "seed": ppo.seed,
@@ -237,5 +216,4 @@ def train(
         },
     }
     root = pathlib.Path(folder) / "checkpoint"
-    checkpoint.save(root, ppo.num_episodes, policy, meta)
-    return policy
+    checkpoint.save(root, ppo.num_episodes, params[1], meta)

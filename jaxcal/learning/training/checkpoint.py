@@ -18,16 +18,15 @@ here alone, so that changing it touches one file.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import dataclasses
 import datetime
 import importlib.metadata
+import json
 import logging
 import pathlib
 import platform
 import sys
 import tempfile
-from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -38,22 +37,20 @@ from jaxcal.learning.policies import networks
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import Network, NetworkConfig
 from jaxcal.learning.runtime import weights
-from jaxcal.learning.runtime.checkpoint_folder import (
+from jaxcal.learning.runtime.weights import (
     CheckpointError,
-    default_folder,
+    Weights,
     newest_step,
     resolve,
 )
-from jaxcal.learning.runtime.weights import Weights
 
 __all__ = [
     "CheckpointError",
     "Policy",
-    "as_weights",
-    "default_folder",
     "export",
     "fingerprint",
     "load",
+    "package_versions",
     "restore",
     "save",
 ]
@@ -61,6 +58,9 @@ __all__ = [
 SCHEMA = "jaxcal-policy"
 VERSION = 1
 _PACKAGES = ("jaxcal", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
+
+# orbax warns of every default it takes, on every load.
+logging.getLogger("absl").setLevel(logging.ERROR)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,6 +72,16 @@ class Policy:
     meta: dict[str, Any]  # as saved
     folder: pathlib.Path
     step: int
+
+    @property
+    def weights(self) -> Weights:
+        """As plain arrays, which ``policy.npz`` holds."""
+        return _plain(self.params, self.meta)
+
+
+def _plain(params: Any, meta: dict[str, Any]) -> Weights:
+    network = NetworkConfig(**meta["network"])  # with every field, also those not saved
+    return Weights(dataclasses.asdict(network), weights.flat(params), meta)
 
 
 def package_versions() -> dict[str, str]:
@@ -85,84 +95,12 @@ def package_versions() -> dict[str, str]:
     return versions
 
 
-# orbax warns of every default it takes, on every load.
-logging.getLogger("absl").setLevel(logging.ERROR)
-
-
 def _alone() -> Any:
     """In a job of several processes, the one that asks works without the others."""
     own = jax.process_index()
     return ocp.options.MultiprocessingOptions(
         primary_host=own, active_processes={own}, barrier_sync_key_prefix=str(own)
     )
-
-
-class _PatientLoop(asyncio.SelectorEventLoop):
-    """An event loop that ignores results which arrive after it is closed."""
-
-    def call_soon_threadsafe(  # type: ignore[override]  # generic in its arguments
-        self, *arguments: Any, **options: Any
-    ) -> Any:
-        """As asyncio's, but nothing where the loop is closed."""
-        if self.is_closed():
-            return None
-        return super().call_soon_threadsafe(*arguments, **options)
-
-
-class _PatientPolicy(asyncio.DefaultEventLoopPolicy):
-    def new_event_loop(self) -> asyncio.AbstractEventLoop:
-        return _PatientLoop()
-
-
-@contextlib.contextmanager
-def _late_reads_ignored() -> Iterator[None]:
-    """Around reads by orbax, which leaves the others to end where one has failed.
-
-    They end in a thread of tensorstore after orbax has closed its event loop; asyncio
-    then prints "Event loop is closed", which says nothing to anybody.
-    """
-    before = asyncio.get_event_loop_policy()
-    asyncio.set_event_loop_policy(_PatientPolicy())
-    try:
-        yield
-    finally:
-        asyncio.set_event_loop_policy(before)
-
-
-def _manager(folder: pathlib.Path, keep: int | None, create: bool) -> Any:
-    if create:
-        folder.mkdir(parents=True, exist_ok=True)
-    return ocp.CheckpointManager(
-        folder.absolute(),
-        options=ocp.CheckpointManagerOptions(
-            max_to_keep=keep,
-            create=False,
-            cleanup_tmp_directories=create,
-            enable_async_checkpointing=False,
-            read_only=not create,
-            multiprocessing_options=_alone(),
-        ),
-    )
-
-
-def _plain_keys(tree: Any) -> Any:
-    """Arrays of the host, which know no device; PRNG keys as what they are made of."""
-    return jax.tree.map(
-        lambda leaf: np.asarray(
-            jax.random.key_data(leaf)
-            if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-            else leaf
-        ),
-        tree,
-    )
-
-
-def _plain_policy(folder: pathlib.Path) -> Any:
-    """Weights as arrays of the host, whatever devices they were saved from."""
-    with ocp.StandardCheckpointer(multiprocessing_options=_alone()) as reader:
-        saved = reader.metadata(folder.absolute()).item_metadata
-        like = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), saved.tree)
-        return reader.restore(folder.absolute(), like)
 
 
 def save(
@@ -183,25 +121,72 @@ def save(
         state: what ``restore`` gives back, or None for a policy only.
         keep: older steps beyond these are deleted.
     """
+    root = pathlib.Path(folder)
+    root.mkdir(parents=True, exist_ok=True)
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     own: dict[str, Any] = {"schema": SCHEMA, "version": VERSION}
     meta = own | {"created": now, "versions": package_versions()} | meta
+    arrays = {"policy": params} | ({} if state is None else {"state": state})
+    # Arrays of the host, which know no device.
     items = {
-        "policy": ocp.args.StandardSave(_plain_keys(params)),
-        "meta": ocp.args.JsonSave(meta),
+        name: ocp.args.StandardSave(jax.tree.map(np.asarray, tree))
+        for name, tree in arrays.items()
     }
-    if state is not None:
-        items["state"] = ocp.args.StandardSave(_plain_keys(state))
-    with _manager(pathlib.Path(folder), keep, create=True) as manager:
+    options = ocp.CheckpointManagerOptions(
+        max_to_keep=keep,
+        create=False,
+        cleanup_tmp_directories=True,
+        enable_async_checkpointing=False,
+        multiprocessing_options=_alone(),
+    )
+    with ocp.CheckpointManager(root.absolute(), options=options) as manager:
         if step in manager.all_steps():
             return
-        manager.save(step, args=ocp.args.Composite(**items))
-    plain = _weights(NetworkConfig(**meta["network"]), params, meta)
-    weights.write(pathlib.Path(folder) / str(step) / weights.NAME, plain)
+        manager.save(
+            step, args=ocp.args.Composite(meta=ocp.args.JsonSave(meta), **items)
+        )
+    weights.write(root / str(step) / weights.NAME, _plain(params, meta))
 
 
-def _weights(config: NetworkConfig, params: Any, meta: dict[str, Any]) -> Weights:
-    return Weights(dataclasses.asdict(config), weights.flat(params), meta)
+class _PatientLoop(asyncio.SelectorEventLoop):
+    """An event loop that ignores results which arrive after it is closed."""
+
+    def call_soon_threadsafe(  # type: ignore[override]  # generic in its arguments
+        self, *arguments: Any, **options: Any
+    ) -> Any:
+        """As asyncio's, but nothing where the loop is closed."""
+        if self.is_closed():
+            return None
+        return super().call_soon_threadsafe(*arguments, **options)
+
+
+class _PatientPolicy(asyncio.DefaultEventLoopPolicy):
+    def new_event_loop(self) -> asyncio.AbstractEventLoop:
+        return _PatientLoop()
+
+
+def _read(path: pathlib.Path, like: Any, what: str) -> Any:
+    """A tree of arrays that orbax saved, of the shapes and types of ``like``.
+
+    Raises:
+        CheckpointError: it cannot be read, or has another shape.
+    """
+    like = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), like)
+    # Where a read fails, orbax leaves the others to end: in a thread of tensorstore,
+    # after its event loop is closed. asyncio would print that.
+    before = asyncio.get_event_loop_policy()
+    asyncio.set_event_loop_policy(_PatientPolicy())
+    try:
+        with ocp.StandardCheckpointer(multiprocessing_options=_alone()) as reader:
+            found = reader.restore(path.absolute(), like)
+        for leaf, wanted in zip(*map(jax.tree.leaves, (found, like)), strict=True):
+            if leaf.shape != wanted.shape:
+                raise ValueError(f"shape {leaf.shape}, not {wanted.shape}")
+    except Exception as error:  # orbax and tensorstore raise many kinds
+        raise _unreadable(path.parent, what, error) from error
+    finally:
+        asyncio.set_event_loop_policy(before)
+    return jax.tree.map(jax.numpy.asarray, found)
 
 
 def _unreadable(path: pathlib.Path, what: str, error: Exception) -> CheckpointError:
@@ -209,28 +194,21 @@ def _unreadable(path: pathlib.Path, what: str, error: Exception) -> CheckpointEr
     return CheckpointError(f"checkpoint {path} cannot be {what} ({line})")
 
 
-def _latest(folder: pathlib.Path) -> tuple[pathlib.Path, int, dict[str, Any]]:
+def _latest(folder: str | pathlib.Path | None) -> tuple[pathlib.Path, dict[str, Any]]:
     """The newest complete step of a folder and its meta, checked."""
-    step = int(newest_step(folder).name)
+    path = newest_step(resolve(folder))
     try:
-        with _manager(folder, None, create=False) as manager:
-            meta = manager.restore(
-                step, args=ocp.args.Composite(meta=ocp.args.JsonRestore())
-            )["meta"]
-    except Exception as error:  # orbax and tensorstore raise many kinds
-        what = "read: its meta is damaged"
-        raise _unreadable(folder / str(step), what, error) from error
+        meta = json.loads((path / "meta" / "metadata").read_text())
+    except (OSError, ValueError) as error:
+        raise _unreadable(path, "read: its meta is damaged", error) from error
     if not isinstance(meta, dict) or meta.get("schema") != SCHEMA:
-        raise CheckpointError(
-            f"checkpoint {folder / str(step)} is not a jaxcal policy: its schema is "
-            f"{meta.get('schema')!r}, not {SCHEMA!r}"
-        )
+        raise CheckpointError(f"checkpoint {path} is not a jaxcal policy")
     if meta.get("version") != VERSION:
         raise CheckpointError(
-            f"checkpoint {folder / str(step)} has version {meta.get('version')!r}; "
-            f"this jaxcal reads version {VERSION}"
+            f"checkpoint {path} has version {meta.get('version')!r}; this jaxcal reads "
+            f"version {VERSION}"
         )
-    return folder / str(step), step, meta
+    return path, meta
 
 
 def load(folder: str | pathlib.Path | None = None) -> Policy:
@@ -242,27 +220,24 @@ def load(folder: str | pathlib.Path | None = None) -> Policy:
     Raises:
         CheckpointError: there is none, it is damaged, or another version made it.
     """
-    root = resolve(folder)
-    path, step, meta = _latest(root)
+    path, meta = _latest(folder)
     try:
-        config = NetworkConfig(**meta["network"])
-    except (KeyError, TypeError, ValueError) as error:
+        network = build(NetworkConfig(**meta["network"]))
+        env = meta["tasks"][0]["environment"]
+        m, n, k = env["num_candidates"], env["num_inputs"], env["num_selected"]
+    except (KeyError, IndexError, TypeError, ValueError) as error:
         raise CheckpointError(
-            f"checkpoint {path} names no network this jaxcal knows: {error}"
+            f"checkpoint {path} names no network or task this jaxcal knows: {error}"
         ) from error
-    try:
-        with _late_reads_ignored():
-            params = jax.tree.map(jax.numpy.asarray, _plain_policy(path / "policy"))
-    except Exception as error:  # orbax and tensorstore raise many kinds
-        raise _unreadable(path, "read: its weights are damaged", error) from error
-    network = build(config)
-    _check_weights(path, params, network, meta)
-    return Policy(network, params, meta, root, step)
-
-
-def as_weights(policy: Policy) -> Weights:
-    """A policy as plain arrays, which ``policy.npz`` holds."""
-    return _weights(policy.network.config, policy.params, policy.meta)
+    like = jax.eval_shape(lambda: networks.initial(network, jax.random.key(0), m, n, k))
+    what = "read: its weights are damaged or do not fit its network"
+    params = _read(path / "policy", like, what)
+    for name, array in weights.flat(params).items():
+        if not np.isfinite(array).all():
+            raise CheckpointError(
+                f"checkpoint {path} holds weights that are not finite, in {name}"
+            )
+    return Policy(network, params, meta, path.parent, int(path.name))
 
 
 def fingerprint(folder: str | pathlib.Path | None = None) -> str:
@@ -271,40 +246,7 @@ def fingerprint(folder: str | pathlib.Path | None = None) -> str:
     Raises:
         CheckpointError: see ``load``.
     """
-    return as_weights(load(folder)).fingerprint
-
-
-def _check_weights(
-    path: pathlib.Path, params: Any, network: Network, meta: dict[str, Any]
-) -> None:
-    """Refuse weights that the network cannot use."""
-    try:
-        env = meta["tasks"][0]["environment"]
-        m, n, k = env["num_candidates"], env["num_inputs"], env["num_selected"]
-    except (KeyError, IndexError, TypeError) as error:
-        raise CheckpointError(
-            f"checkpoint {path} does not say what it was trained on: no {error}"
-        ) from error
-    expected = jax.eval_shape(
-        lambda: networks.initial(network, jax.random.key(0), m, n, k)
-    )
-    wanted = {
-        jax.tree_util.keystr(name, simple=True, separator="."): leaf.shape
-        for name, leaf in jax.tree_util.tree_leaves_with_path(expected)
-    }
-    arrays = weights.flat(params)
-    held = {name: array.shape for name, array in arrays.items()}
-    if wanted != held:
-        name = sorted(set(wanted.items()) ^ set(held.items()))[0][0]
-        raise CheckpointError(
-            f"checkpoint {path} does not fit its network: {name} has shape "
-            f"{held.get(name)}, the network wants {wanted.get(name)}"
-        )
-    for name, array in arrays.items():
-        if not np.isfinite(array).all():
-            raise CheckpointError(
-                f"checkpoint {path} holds weights that are not finite, in {name}"
-            )
+    return load(folder).weights.fingerprint
 
 
 def export(run: str | pathlib.Path, folder: str | pathlib.Path) -> None:
@@ -343,33 +285,13 @@ def restore(folder: str | pathlib.Path, fresh: Any) -> tuple[Any, dict[str, Any]
     Raises:
         CheckpointError: none, damaged, or one without a training state.
     """
-    root = resolve(folder)
-    path, step, meta = _latest(root)
+    path, meta = _latest(folder)
     if not (path / "state").exists():
         raise CheckpointError(
             f"checkpoint {path} holds a policy but no training state to resume from"
         )
-    try:
-        with _late_reads_ignored(), _manager(root, None, create=False) as manager:
-            plain = manager.restore(
-                step,
-                args=ocp.args.Composite(
-                    state=ocp.args.StandardRestore(_plain_keys(fresh))
-                ),
-            )["state"]
-    except Exception as error:  # orbax and tensorstore raise many kinds
-        what = "resumed: its training state is damaged or of another configuration"
-        raise _unreadable(path, what, error) from error
-    state = jax.tree.map(
-        lambda new, old: (
-            jax.random.wrap_key_data(jax.numpy.asarray(old))
-            if jax.dtypes.issubdtype(new.dtype, jax.dtypes.prng_key)
-            else jax.numpy.asarray(old)
-        ),
-        fresh,
-        plain,
-    )
-    return state, meta
+    what = "resumed: its training state is damaged or of another configuration"
+    return _read(path / "state", fresh, what), meta
 
 
 def main(argv: list[str]) -> int:
@@ -380,7 +302,7 @@ def main(argv: list[str]) -> int:
     try:
         policy = load(argv[0])
         path = policy.folder / str(policy.step) / weights.NAME
-        weights.write(path, as_weights(policy))
+        weights.write(path, policy.weights)
     except (CheckpointError, OSError) as error:
         print(f"checkpoint: {error}", file=sys.stderr)
         return 2

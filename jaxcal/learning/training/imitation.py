@@ -28,16 +28,7 @@ from jaxcal.learning.training.optimiser import Keys, Metrics
 from jaxcal.learning.training.rules import Rules
 from jaxcal.learning.training.update import Update
 
-__all__ = [
-    "Attempt",
-    "Lesson",
-    "Lessons",
-    "Teacher",
-    "draw",
-    "follow",
-    "loss",
-    "updater",
-]
+__all__ = ["Lesson", "Lessons", "Teacher", "draw", "follow", "loss", "updater"]
 
 Teacher = Callable[
     [np.ndarray, np.ndarray, np.ndarray, int], tuple[np.ndarray, np.ndarray]
@@ -65,15 +56,14 @@ def draw(
     num_sets = config.episodes_per_update
     key = jax.random.fold_in(Keys.of(config.seed).lessons, index)
     key_sets, key_share, key_length, key_given = jax.random.split(key, 4)
-    candidates, available = _drawn(key_sets, num_sets, task)
+    points, free = map(np.asarray, _drawn(key_sets, num_sets, task))
     learned = task.num_decisions - network.num_unlearned
     begun = jax.random.uniform(key_share, (num_sets,)) < task.random_starts
     length = jax.random.randint(key_length, (num_sets,), 1, max(learned, 2))
     lengths = np.asarray(jnp.where(begun, length, 0))
-    rank = jax.random.uniform(key_given, available.shape)
-    order = np.asarray(jnp.argsort(jnp.where(available, rank, 2.0), axis=-1))
+    rank = jax.random.uniform(key_given, free.shape)
+    order = np.asarray(jnp.argsort(jnp.where(free, rank, 2.0), axis=-1))
     given = order[:, :learned].astype(np.int32)
-    points, free = np.asarray(candidates), np.asarray(available)
     wanted = np.zeros(free.shape, bool)
     best = np.zeros(num_sets, np.float32)
     for count in np.unique(lengths):
@@ -94,22 +84,19 @@ def _drawn(key: jax.Array, num_sets: int, task: Rules) -> tuple[jax.Array, jax.A
 
 
 class Lessons:
-    """Lessons in order, the next one prepared while this one is learned."""
+    """Lessons ``0`` to ``last - 1``, the next prepared while this one is learned."""
 
     def __init__(self, prepare: Callable[[int], Lesson], last: int) -> None:
         self._prepare, self._last = prepare, last
         self._pool = ThreadPoolExecutor(1)
-        self._next: tuple[int, Future[Lesson]] | None = None
+        self._asked: dict[int, Future[Lesson]] = {}
 
     def at(self, index: int) -> Lesson:
         """The lesson of update ``index``."""
-        if self._next is None or self._next[0] != index:
-            self._next = (index, self._pool.submit(self._prepare, index))
-        lesson = self._next[1].result()
-        if index + 1 < self._last:
-            following = self._pool.submit(self._prepare, index + 1)
-            self._next = (index + 1, following)
-        return lesson
+        for i in range(index, min(index + 2, self._last)):
+            if i not in self._asked:
+                self._asked[i] = self._pool.submit(self._prepare, i)
+        return self._asked.pop(index).result()
 
     def close(self) -> None:
         """Forget what was being prepared."""
@@ -163,12 +150,8 @@ def loss(
         The loss, and metrics named as those of PPO.
     """
     memory = networks.encode(network, params, attempt.features)
-    decode = jax.vmap(
-        lambda seen: networks.decode(network, params, memory, seen),
-        in_axes=1,
-        out_axes=1,
-    )
-    logits, value = decode(attempt.decisions)  # (B, T, M), (B, T)
+    # (B, T, M), (B, T)
+    logits, value = networks.decode(network, params, memory, attempt.decisions, axes=1)
     log_probs = jax.nn.log_softmax(logits)
     hopes = networks.mask_logits(log_probs, attempt.wanted)
     number = jnp.maximum(attempt.counted.sum(), 1.0)

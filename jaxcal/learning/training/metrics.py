@@ -6,7 +6,7 @@ import csv
 import os
 import pathlib
 
-from jaxcal.files import atomic_write
+from jaxcal.files import write_text
 
 __all__ = ["COLUMNS", "MetricsTable"]
 
@@ -34,10 +34,8 @@ class MetricsTable:
         from tensorboardX import SummaryWriter  # 0.2 s; loads PyTorch where installed
 
         path = root / "metrics.csv"
-        kept = _rows_until(path, done) if done else []
-        with atomic_write(path) as file:
-            lines = [",".join(COLUMNS), *kept]
-            file.write(("\n".join(lines) + "\n").encode())
+        lines = [",".join(COLUMNS), *_rows_until(path, done)]
+        write_text(path, "\n".join(lines) + "\n")
         self._file = path.open("a", newline="")
         self._writer = csv.DictWriter(self._file, COLUMNS, extrasaction="ignore")
         self._events = SummaryWriter(str(root), flush_secs=30)
@@ -60,11 +58,11 @@ class MetricsTable:
 
 def _rows_until(path: pathlib.Path, done: int) -> list[str]:
     """Whole rows of a metrics file up to an update; later ones were never saved."""
-    if not path.exists():
-        return []
-    kept = []
-    for line in path.read_text().splitlines()[1:]:
-        cells = line.split(",")
-        if len(cells) == len(COLUMNS) and cells[0].isdigit() and int(cells[0]) <= done:
-            kept.append(line)
-    return kept
+    lines = path.read_text().splitlines()[1:] if path.exists() else []
+    whole = [line for line in lines if line.count(",") == len(COLUMNS) - 1]
+    numbers = [line.partition(",")[0] for line in whole]
+    return [
+        line
+        for line, number in zip(whole, numbers, strict=True)
+        if number.isdigit() and int(number) <= done
+    ]

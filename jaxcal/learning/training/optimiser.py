@@ -44,7 +44,7 @@ class TrainState:
     params: Any  # network parameters
     average: Any  # exponential average of the parameters, what a checkpoint offers
     opt_state: Any  # optax state
-    key: jax.Array  # () PRNG key of the next update
+    key: jax.Array  # (2,) uint32, data of the PRNG key of the next update
     num_updates: jax.Array  # () int32, updates made
 
 
@@ -59,7 +59,7 @@ def init(config: PPOConfig, task: Rules, network: Network) -> TrainState:
         params=params,
         average=jax.tree.map(jnp.copy, params),
         opt_state=optimiser(config).init(params),
-        key=keys.updates,
+        key=jax.random.key_data(keys.updates),
         num_updates=jnp.zeros((), jnp.int32),
     )
 
@@ -72,11 +72,10 @@ def learn(
     loss: Loss,
     key: jax.Array,
 ) -> tuple[TrainState, Metrics]:
-    """Epochs of minibatches over what an update has gathered.
+    """Epochs of minibatches over the ``num_sets`` sets that an update has gathered.
 
     Args:
-        state: before the update.
-        config: the optimisation.
+        state, config: before the update, and how to optimise.
         num_sets: candidate sets gathered, B.
         minibatch: (S,) indices of sets -> what was gathered of them.
         loss: of a minibatch.

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.metadata
 from typing import Any
 
 from jaxcal.learning.environments.scenarios import SHAPES
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.settings import settings_of
+from jaxcal.learning.settings import installed, settings_of
 from jaxcal.learning.training.config import PPOConfig, TrainConfig
 
 __all__ = ["PARTS", "field_names", "load", "names", "with_values"]
@@ -28,22 +27,9 @@ _COMPACT = TrainConfig(
 _ALL = ("uniform", *SHAPES)  # uniform twice as often as any other
 
 
-def _task(
-    num_candidates: int = 50,
-    num_selected: int = 4,
-    num_inputs: int = 3,
-    shapes: tuple[str, ...] = ("uniform",),
-    masked: float = 0.0,
-    random_starts: float = 0.0,
-) -> Task:
-    environment = SelectionConfig(
-        num_candidates,
-        num_selected,
-        num_inputs,
-        num_inputs,
-        reward_gain=num_selected > num_inputs + 1,
-    )
-    return Task(environment, shapes, masked, random_starts)
+def _task(k: int = 4, m: int = 50, n: int = 3, **drawn: Any) -> Task:
+    """Choose k of m postures of n inputs, ``drawn`` as ``Task`` says."""
+    return Task(SelectionConfig(m, k, n, n, reward_gain=k > n + 1), **drawn)
 
 
 # It begins as the look-ahead rule and imitates the solvers, which is what adds most to
@@ -54,24 +40,20 @@ _GENERAL = TrainConfig(
     about="what ships: twelve tasks of other sizes, shapes and masks, imitating the "
     "solvers from the look-ahead rule on; ten minutes",
     network=NetworkConfig(close_up=True, initial_trust=4.0, initial_actor=0.05),
-    ppo=PPOConfig(
-        num_episodes=300_000,
-        entropy_start=0.002,
-        imitation=1.0,
-    ),
+    ppo=PPOConfig(num_episodes=300_000, entropy_start=0.002, imitation=1.0),
     tasks=(
         _task(),
-        _task(num_selected=6),
+        _task(6),
         _task(shapes=SHAPES, masked=0.4, random_starts=0.3),
-        _task(num_selected=5, shapes=_ALL),
+        _task(5, shapes=_ALL),
         _task(),
-        _task(num_selected=6, masked=0.3, random_starts=0.2),
-        _task(num_candidates=20, shapes=_ALL),
-        _task(num_selected=8, shapes=_ALL),
+        _task(6, masked=0.3, random_starts=0.2),
+        _task(m=20, shapes=_ALL),
+        _task(8, shapes=_ALL),
         _task(shapes=_ALL),
-        _task(num_selected=5),
-        _task(num_selected=3, num_inputs=2),
-        _task(num_selected=5, num_inputs=4),
+        _task(5),
+        _task(3, n=2),
+        _task(5, n=4),
     ),
 )
 
@@ -84,13 +66,9 @@ PARTS: dict[str, type] = {
 }
 
 
-def _added() -> dict[str, importlib.metadata.EntryPoint]:
-    return {p.name: p for p in importlib.metadata.entry_points(group=_GROUP)}
-
-
 def names() -> list[str]:
     """Presets of jaxcal and of installed packages."""
-    return sorted({*_OWN, *_added()})
+    return sorted({*_OWN, *installed(_GROUP)})
 
 
 def load(name: str) -> TrainConfig:
@@ -101,9 +79,9 @@ def load(name: str) -> TrainConfig:
     """
     if name in _OWN:
         return _OWN[name]
-    if name not in _added():
+    if name not in names():
         raise ValueError(f"preset must be one of {', '.join(names())}, got {name!r}")
-    config: TrainConfig = _added()[name].load()
+    config: TrainConfig = installed(_GROUP)[name].load()
     return config
 
 
@@ -126,14 +104,12 @@ def with_values(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
     Raises:
         ValueError: no part has such a field, or a part refuses the value.
     """
-    left = dict(values)
-    parts: dict[str, dict[str, Any]] = {}
-    for part, kind in PARTS.items():
-        own = {field.name for field in settings_of(kind)}
-        parts[part] = {name: left.pop(name) for name in list(left) if name in own}
-    if left:
-        raise ValueError(f"no configuration has the field {sorted(left)[0]}")
-    changed = parts["environment"]
+    for name in sorted(set(values) - field_names()):
+        raise ValueError(f"no configuration has the field {name}")
+    network, ppo, changed = (
+        {f.name: values[f.name] for f in settings_of(PARTS[part]) if f.name in values}
+        for part in ("network", "ppo", "environment")
+    )
     for name in changed:
         held = sorted({getattr(task.environment, name) for task in config.tasks})
         if len(held) > 1:
@@ -144,8 +120,8 @@ def with_values(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
             )
     return dataclasses.replace(
         config,
-        network=dataclasses.replace(config.network, **parts["network"]),
-        ppo=dataclasses.replace(config.ppo, **parts["ppo"]),
+        network=dataclasses.replace(config.network, **network),
+        ppo=dataclasses.replace(config.ppo, **ppo),
         tasks=tuple(_changed(task, changed) for task in config.tasks),
     )
 

@@ -62,7 +62,10 @@ def play(
         lambda leaf: jnp.broadcast_to(leaf[None], (repeats, *leaf.shape)), sets
     )
     decode = jax.vmap(lambda seen: networks.decode(network, params, memory, seen))
+    # The rules are those of one episode.
     advance = jax.vmap(jax.vmap(task.step))
+    paid_of = jax.vmap(jax.vmap(task.paid))
+    outcome_of = jax.vmap(jax.vmap(task.outcome))
     length = _start_lengths(task, (repeats, len(sets.available)), key_starts)
     learned = task.num_decisions - network.num_unlearned
     out: list[dict[str, Any]] = []
@@ -82,7 +85,7 @@ def play(
                 step < length, jax.random.categorical(key_random, blind), action
             )
         # What was paid already is not to come: the value is of the rest.
-        paid = task.paid(states)
+        paid = paid_of(states)
         states, reward, _ = advance(states, action)
         final = final + reward
         log_probs = jax.nn.log_softmax(logits)
@@ -122,7 +125,7 @@ def play(
         target=by_set(target),
         counted=by_set(counted),
     )
-    outcome = (task.outcome(states) * own).sum() / jnp.maximum(own.sum(), 1.0)
+    outcome = (outcome_of(states) * own).sum() / jnp.maximum(own.sum(), 1.0)
     metrics = {
         "rewards": final.reshape(-1),
         "reward_mean": final.mean(),

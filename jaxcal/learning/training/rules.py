@@ -16,10 +16,12 @@ class Rules(Protocol):
     ``available`` (M,) bool and ``chosen`` (K,) int, -1 where nothing is chosen yet.
     """
 
-    random_starts: float  # share of episodes begun with random choices
-
     def __hash__(self) -> int:
         """It is static to ``jit``."""
+
+    @property
+    def random_starts(self) -> float:
+        """Share of episodes begun with random choices."""
 
     @property
     def num_decisions(self) -> int:

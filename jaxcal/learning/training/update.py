@@ -48,7 +48,9 @@ def jitted(
     """
 
     def update(state: TrainState, *given: Any) -> tuple[TrainState, Metrics]:
-        key, key_gather, key_epochs = jax.random.split(state.key, 3)
+        key, key_gather, key_epochs = jax.random.split(
+            jax.random.wrap_key_data(state.key), 3
+        )
         sets = devices.by_set(draw(key_gather, *given), mesh)
         experience, metrics = gather(state.params, sets, key_gather)
         experience = devices.everywhere(experience, mesh)
@@ -65,7 +67,7 @@ def jitted(
             lambda params, batch: loss(params, batch, state.num_updates),
             key_epochs,
         )
-        after = dataclasses.replace(after, key=key)
+        after = dataclasses.replace(after, key=jax.random.key_data(key))
         return devices.everywhere((after, metrics | losses), mesh)
 
     return jax.jit(update, donate_argnums=0)

@@ -71,7 +71,7 @@ def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Policy:
     else:
         with needs("policy", f"checkpoint {path.parent}, which holds no {path.name},"):
             from jaxcal.learning.training import checkpoint
-        found = checkpoint.as_weights(checkpoint.load(path.parent.parent))
+        found = checkpoint.load(path.parent.parent).weights
     return Policy(found.network["kind"], found.meta, _network(found, path))
 
 
