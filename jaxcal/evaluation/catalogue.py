@@ -55,6 +55,4 @@ class Catalogue:
                 f"file, got {name!r}"
             )
         dataset = load_dataset(name)
-        if episodes is None:
-            return dataset
-        return dataset.first(min(episodes, dataset.num_episodes))
+        return dataset if episodes is None else dataset.part(0, episodes)

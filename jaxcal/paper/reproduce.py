@@ -158,9 +158,7 @@ def _write(out: pathlib.Path, files: dict[str, bytes]) -> None:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = command.Parser(
-        prog="python -m jaxcal.paper", description=_DESCRIPTION, epilog=_EPILOG
-    )
+    parser = command.Parser("python -m jaxcal.paper", _DESCRIPTION, _EPILOG)
     add = parser.add_argument
     folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
     add("--quick", action="store_true", help="fewer episodes, draws and devices")

@@ -23,30 +23,23 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.spatial.transform import Rotation
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers
-from jaxcal.paper.twin.attitude import ORDERS, angles_of, require_order, rotation_of
+from jaxcal.checks import numbers, one_of
 
-__all__ = [
-    "ORDERS",
-    "RobotConfig",
-    "joint_angles",
-    "measure",
-    "play",
-    "read_out",
-]
+__all__ = ["ORDERS", "RobotConfig", "joint_angles", "measure", "play", "read_out"]
 
 Array = NDArray[np.float64]
-PerAxis = float | tuple[float, float, float]
+Triple = tuple[float, float, float]
+PerAxis = float | Triple
 """One number for all axes, or pitch, yaw and roll"""
+
+ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
+"""Of Euler angles, the outermost turn first; angles are kept by axis, x, y, z"""
 
 GRAVITY = 9.81  # m/s^2, along -y
 _NEWTON_STEPS = 6  # of the sag; it converges quadratically
-_PER_AXIS = (
-    *("backlash_deg", "compliance_deg_per_nm"),
-    *("noise_std_deg", "drift_std_deg"),
-)
 _MAX_SLENDERNESS = 0.5  # compliance x weight x arm, rad; far from buckling (1)
 
 
@@ -59,45 +52,48 @@ class RobotConfig:
     the gap between the two stops of a joint, in joint degrees.
     """
 
-    scale: tuple[float, float, float] = (0.43, 0.71, 0.87)
-    bias_deg: tuple[float, float, float] = (3.1, -5.8, 2.41)
+    scale: Triple = (0.43, 0.71, 0.87)
+    bias_deg: Triple = (3.1, -5.8, 2.41)
     mechanism_order: str = "XYZ"  # axes from the base outwards
     read_out_order: str = "XYZ"  # of the Euler angles that are read
-    mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mounting_deg: Triple = (0.0, 0.0, 0.0)
     backlash_deg: PerAxis = 0.0
     compliance_deg_per_nm: PerAxis = 0.0  # of each joint
     load_kg: float = 1.0  # foot and plate; felt only through compliance
-    load_offset_m: tuple[float, float, float] = (0.0, -0.03, 0.05)  # from the ankle
+    load_offset_m: Triple = (0.0, -0.03, 0.05)  # from the ankle
     noise_std_deg: PerAxis = 0.0  # white, of each angle read
     drift_std_deg: PerAxis = 0.0  # step of the bias from a session to the next
     drift_seed: int = 0  # of that random walk
 
     def __post_init__(self) -> None:
-        require_order("mechanism_order", self.mechanism_order)
-        require_order("read_out_order", self.read_out_order)
+        for name in ("mechanism_order", "read_out_order"):
+            one_of(name, getattr(self, name), ORDERS)
         for name in ("scale", "bias_deg", "mounting_deg", "load_offset_m"):
             value = getattr(self, name)
             if np.shape(value) != (3,) or not np.isfinite(value).all():
                 raise ValueError(f"{name} must be three finite numbers, got {value!r}")
             object.__setattr__(self, name, tuple(float(v) for v in value))
-        for name in _PER_AXIS:
-            value = np.asarray(getattr(self, name), dtype=np.float64)
-            if value.shape not in ((), (3,)) or not (value >= 0).all():
-                raise ValueError(
-                    f"{name} must be one number or three, none negative, got "
-                    f"{getattr(self, name)!r}"
-                )
-            if not np.isfinite(value).all():
-                raise ValueError(f"{name} must be finite, got {getattr(self, name)!r}")
-            plain = float(value) if value.ndim == 0 else tuple(map(float, value))
-            object.__setattr__(self, name, plain)
+        for field in dataclasses.fields(self):
+            if field.type == "PerAxis":
+                value = getattr(self, field.name)
+                if (
+                    np.shape(value) not in ((), (3,))
+                    or not np.greater_equal(value, 0).all()
+                ):
+                    raise ValueError(
+                        f"{field.name} must be one number or three, none negative, got "
+                        f"{value!r}"
+                    )
+                if not np.isfinite(value).all():
+                    raise ValueError(f"{field.name} must be finite, got {value!r}")
+                plain = np.asarray(value, dtype=np.float64).tolist()
+                plain = tuple(plain) if isinstance(plain, list) else plain
+                object.__setattr__(self, field.name, plain)
         if not 0.0 <= self.load_kg < float("inf"):
             raise ValueError(f"load_kg must be finite and >= 0, got {self.load_kg}")
-        slender = (
-            np.radians(self.per_axis("compliance_deg_per_nm").max())
-            * (self.load_kg * GRAVITY)
-            * float(np.linalg.norm(self.load_offset_m))
-        )
+        arm = float(np.linalg.norm(self.load_offset_m))
+        slender = np.radians(self.per_axis("compliance_deg_per_nm").max())
+        slender *= self.load_kg * GRAVITY * arm
         if slender > _MAX_SLENDERNESS:
             raise ValueError(
                 "compliance_deg_per_nm x load_kg x load_offset_m must bend the robot "
@@ -107,6 +103,15 @@ class RobotConfig:
     def per_axis(self, name: str) -> Array:
         """(3,) a field that is one number for all axes, or three."""
         return np.broadcast_to(np.float64(getattr(self, name)), (3,))
+
+
+def rotation_of(angles_deg: jax.Array, order: str) -> Rotation:
+    """The rotation of three angles (3,) about x, y and z, turned in this order."""
+    return Rotation.from_euler(order, angles_deg[_axes(order)], degrees=True)
+
+
+def _axes(order: str) -> jax.Array:
+    return jnp.array(["XYZ".index(letter) for letter in order])
 
 
 def read_out(config: RobotConfig, commands_deg: ArrayLike | jax.Array) -> Any:
@@ -126,13 +131,7 @@ def read_out(config: RobotConfig, commands_deg: ArrayLike | jax.Array) -> Any:
 
 
 def joint_angles(config: RobotConfig, commands_deg: ArrayLike | jax.Array) -> Any:
-    """(..., 3) where the joints settle, in degrees, without play and drift.
-
-    Args:
-        config: the robot.
-        commands_deg: (..., 3) pitch, yaw, roll in degrees.
-    """
-
+    """(..., 3) where the joints settle, in degrees, without play and drift."""
     return _in_its_precision(functools.partial(_joint_angles, config), commands_deg)
 
 
@@ -225,11 +224,10 @@ def _bent(config: RobotConfig, target_deg: jax.Array) -> jax.Array:
     dtype = target_deg.dtype
     softness = jnp.asarray(compliance, dtype)
     offset = jnp.asarray(config.load_offset_m, dtype)
-    weight = config.load_kg * GRAVITY
 
     def potential(joints: jax.Array) -> jax.Array:
         turned = rotation_of(jnp.rad2deg(joints), config.mechanism_order)
-        return weight * (turned[1] @ offset)
+        return config.load_kg * GRAVITY * turned.apply(offset)[1]
 
     target = jnp.deg2rad(target_deg)
 
@@ -239,18 +237,17 @@ def _bent(config: RobotConfig, target_deg: jax.Array) -> jax.Array:
         slope = jnp.eye(3, dtype=dtype) + softness[:, None] * curvature
         return joints - jnp.linalg.solve(slope, excess)
 
-    joints = jax.lax.fori_loop(0, _NEWTON_STEPS, newton, target)
-    return jnp.rad2deg(joints)
+    return jnp.rad2deg(jax.lax.fori_loop(0, _NEWTON_STEPS, newton, target))
 
 
 def _seen(config: RobotConfig, joints_deg: jax.Array) -> jax.Array:
     """(3,) angles that the phone reads at joints (3,)."""
     turned = rotation_of(joints_deg, config.mechanism_order)
     if any(config.mounting_deg):
-        mounting = jnp.asarray(config.mounting_deg, joints_deg.dtype)
-        phone = rotation_of(mounting, "XYZ")
-        turned = phone.T @ turned @ phone
-    return angles_of(turned, config.read_out_order)
+        phone = rotation_of(jnp.asarray(config.mounting_deg, joints_deg.dtype), "XYZ")
+        turned = phone.inv() * turned * phone
+    order = config.read_out_order
+    return turned.as_euler(order, degrees=True)[jnp.argsort(_axes(order))]
 
 
 # -- many ------------------------------------------------------------------------------

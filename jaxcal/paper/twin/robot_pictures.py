@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import ctypes.util
 import importlib
-import io
 import itertools
 import os
 import pathlib
@@ -23,13 +22,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.checks import one_of
 from jaxcal.files import atomic_write
 from jaxcal.paper import command
 from jaxcal.paper.twin.robot import RobotConfig, joint_angles, read_out
 from jaxcal.paper.twin.robot_drawing import Drawing
 from jaxcal.paper.twin.robot_model import load_model, pose, trajectory
 from jaxcal.paper.twin.robot_parts import AXIS_COLOURS
-from jaxcal.progress import Progress
 
 __all__ = ["BACKENDS", "animate", "draw", "main", "render"]
 
@@ -63,7 +62,7 @@ def render(
     size: tuple[int, int] = (960, 720),
     backend: str = "auto",
 ) -> str:
-    """Write a picture of the robot at one command.
+    """Write a picture of the robot at one command; what drew it, as in ``draw``.
 
     Args:
         config: the robot.
@@ -71,9 +70,6 @@ def render(
         commands_deg: (3,) pitch, yaw, roll in degrees.
         size: width and height in pixels, at most 1280 x 960.
         backend: mujoco, matplotlib, or auto: the first that works.
-
-    Returns:
-        What drew it: mujoco or matplotlib.
 
     Raises:
         OSError: the file cannot be written.
@@ -101,7 +97,7 @@ def animate(
         config: the robot.
         path: of the GIF.
         commands_deg: (N, 3) pitch, yaw, roll in degrees, one second each.
-        size: as ``backend`` and what is returned and raised, see ``render``.
+        size: as ``backend``, what is returned and what is raised, see ``render``.
         backend: mujoco, matplotlib or auto.
         progress: told how many frames of how many are drawn.
     """
@@ -126,10 +122,7 @@ def draw(
     """What draws, and a function from joint angles (3,) in degrees to an image."""
     import mujoco
 
-    if backend not in BACKENDS:
-        raise ValueError(
-            f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}"
-        )
+    one_of("backend", backend, BACKENDS)
     width, height = size
     if not (1 <= width <= 1280 and 1 <= height <= 960):
         raise ValueError(f"size must be within 1280 x 960 pixels, got {size}")
@@ -165,8 +158,7 @@ def _renderer(model: Any, width: int, height: int) -> Any:
 
     if os.environ.get("MUJOCO_GL") or not sys.platform.startswith("linux"):
         return mujoco.Renderer(model, height, width)
-    found = (name for name in ("EGL", "OSMesa") if ctypes.util.find_library(name))
-    library = next(found, None)
+    library = next(filter(ctypes.util.find_library, ("EGL", "OSMesa")), None)
     if library is None:
         raise RuntimeError(
             "there is no EGL or OSMesa library (Debian: libegl1 and libgl1-mesa-dri)"
@@ -198,29 +190,30 @@ def _captioned(config: RobotConfig, image: Image, command_deg: Array) -> Any:
     read = np.asarray(read_out(config, command_deg))
     rows = [("axis", "command", "phone", (60, 60, 60))]
     names = ("pitch", "yaw", "roll")
-    for name, letter, told, seen in zip(names, "XYZ", command_deg, read, strict=True):
-        red, green, blue = (round(255 * value) for value in AXIS_COLOURS[letter])
-        rows.append((name, f"{told:+.1f}°", f"{seen:+.1f}°", (red, green, blue)))
-    for line, (name, told, reached, colour) in enumerate(rows):
+    for name, rgb, *angles in zip(
+        names, AXIS_COLOURS.values(), command_deg, read, strict=True
+    ):
+        red, green, blue = (round(255 * value) for value in rgb)
+        told, reached = (f"{angle:+.1f}°" for angle in angles)
+        rows.append((name, told, reached, (red, green, blue)))
+    for line, (*texts, colour) in enumerate(rows):
         y = size * (0.6 + 1.35 * line)
-        pen.text((0.7 * size, y), name, colour, font)
-        for column, text in ((8.0, told), (12.5, reached)):
-            width = pen.textlength(text, font)
-            pen.text((column * size - width, y), text, colour, font)
+        for text, column, anchor in zip(
+            texts, (0.7, 8.0, 12.5), ("la", "ra", "ra"), strict=True
+        ):
+            pen.text((column * size, y), text, colour, font, anchor)
     return picture
 
 
 def _save(path: str | os.PathLike[str], frames: list[Any], frame_ms: int) -> None:
     """One frame as a PNG, several as a GIF that repeats."""
-    buffer = io.BytesIO()
-    if frame_ms == 0:
-        frames[0].save(buffer, "PNG", optimize=True)
-    else:
-        first, *rest = _in_one_palette(frames)
-        film = {"save_all": True, "append_images": rest, "duration": frame_ms}
-        first.save(buffer, "GIF", loop=0, optimize=False, **film)
     with atomic_write(path) as file:
-        file.write(buffer.getvalue())
+        if frame_ms == 0:
+            frames[0].save(file, "PNG", optimize=True)
+        else:
+            first, *rest = _in_one_palette(frames)
+            film = {"save_all": True, "append_images": rest, "duration": frame_ms}
+            first.save(file, "GIF", loop=0, optimize=False, **film)
 
 
 def _in_one_palette(frames: list[Any]) -> list[Any]:
@@ -249,8 +242,8 @@ def _smooth(postures_deg: Array) -> Array:
 def main(arguments: list[str] | None = None) -> int:
     """Write both; the exit code."""
     parser = command.Parser(
-        prog="python -m jaxcal.paper.twin.robot_pictures",
-        description="Write robot.png and robot.gif, a picture and a film of the robot.",
+        "python -m jaxcal.paper.twin.robot_pictures",
+        "Write robot.png and robot.gif, a picture and a film of the robot.",
     )
     parser.add_argument("folder", type=pathlib.Path, metavar="DIR")
     parser.add_argument("--backend", choices=BACKENDS, default="auto")
@@ -259,13 +252,11 @@ def main(arguments: list[str] | None = None) -> int:
     def write() -> None:
         config = RobotConfig(mechanism_order="YXZ", read_out_order="YXZ")
         options.folder.mkdir(parents=True, exist_ok=True)
-        path = options.folder / "robot.png"
-        name = render(config, path, backend=options.backend)
-        print(f"saved: {path}, drawn by {name}", flush=True)
-        path, progress = options.folder / "robot.gif", Progress()
-        name = animate(config, path, backend=options.backend, progress=progress)
-        progress.clear()
-        print(f"saved: {path}, drawn by {name}")
+        for make, file in ((render, "robot.png"), (animate, "robot.gif")):
+            path = options.folder / file
+            print(
+                f"saved: {path}, drawn by {make(config, path, backend=options.backend)}"
+            )
 
     return command.run(write, "robot_pictures", "files already named are complete")
 
