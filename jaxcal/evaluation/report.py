@@ -103,13 +103,12 @@ def write_report(
     """
     from jaxcal.evaluation.figures import evaluation_figures
     from jaxcal.evaluation.training_figure import training_curves
-    from jaxcal.plots import as_bytes
+    from jaxcal.plots.style import as_files
 
     files: dict[str, bytes] = {}
 
     def drawn(name: str, figure: Any) -> Figure:
-        for suffix in ("svg", "png"):
-            files[f"{name}.{suffix}"] = as_bytes(figure, suffix)
+        files[f"{name}.svg"], files[f"{name}.png"] = as_files(figure, "svg", "png")
         return Figure(files[f"{name}.svg"], name.replace("_", " "))
 
     sections = []

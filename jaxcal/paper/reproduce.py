@@ -127,14 +127,14 @@ def _files(
     """Everything to write, by path below the folder; the page last."""
     from jaxcal.evaluation.csv_rows import csv_text
     from jaxcal.paper.exhibits.page import json_document, page
-    from jaxcal.plots import as_bytes
+    from jaxcal.plots.style import as_files
 
     figures = {name: f for e in exhibits for name, f in e.figures.items()}
     files: dict[str, bytes] = {}
     for number, (name, figure) in enumerate(figures.items()):
         progress("drawing", number, len(figures))
-        for kind in ("svg", "png"):
-            files[f"figures/{name}.{kind}"] = as_bytes(figure, kind)
+        svg, png = as_files(figure, "svg", "png")
+        files |= {f"figures/{name}.svg": svg, f"figures/{name}.png": png}
     for exhibit in exhibits:
         files |= {f"figures/{name}": p for name, p in exhibit.pictures.items()}
         for name, columns in exhibit.tables.items():

@@ -22,18 +22,26 @@ GREY = "#7F7F7F"
 BLACK = "#000000"
 
 
-def as_bytes(figure: Figure, suffix: str) -> bytes:
-    """The figure as a file of the given kind, "png" or "svg"; the same every time.
+def as_files(figure: Figure, *suffixes: str) -> list[bytes]:
+    """The figure as files of these kinds, "png" or "svg"; the same every time.
 
     The constrained layout makes room for the tick labels of the drawing before, so the
-    first drawing of a figure can cut a label off: the figure is drawn twice.
+    first drawing of a figure can cut a label off: the figure is drawn once more.
     """
-    buffer = io.BytesIO()
-    metadata: dict[str, Any] = {"Date": None} if suffix == "svg" else {}
+    found = []
     with rc_context({"svg.hashsalt": "jaxcal"}):
         figure.draw_without_rendering()
-        figure.savefig(buffer, format=suffix, dpi=150, metadata=metadata)
-    return buffer.getvalue()
+        for suffix in suffixes:
+            buffer = io.BytesIO()
+            metadata: dict[str, Any] = {"Date": None} if suffix == "svg" else {}
+            figure.savefig(buffer, format=suffix, dpi=150, metadata=metadata)
+            found.append(buffer.getvalue())
+    return found
+
+
+def as_bytes(figure: Figure, suffix: str) -> bytes:
+    """The figure as one file, see ``as_files``."""
+    return as_files(figure, suffix)[0]
 
 
 def panels(

@@ -40,6 +40,10 @@ ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
 
 GRAVITY = 9.81  # m/s^2, along -y
 _NEWTON_STEPS = 6  # of the sag; it converges quadratically
+_PER_AXIS = (
+    *("backlash_deg", "compliance_deg_per_nm"),
+    *("noise_std_deg", "drift_std_deg"),
+)
 _MAX_SLENDERNESS = 0.5  # compliance x weight x arm, rad; far from buckling (1)
 
 
@@ -73,22 +77,19 @@ class RobotConfig:
             if np.shape(value) != (3,) or not np.isfinite(value).all():
                 raise ValueError(f"{name} must be three finite numbers, got {value!r}")
             object.__setattr__(self, name, tuple(float(v) for v in value))
-        for field in dataclasses.fields(self):
-            if field.type == "PerAxis":
-                value = getattr(self, field.name)
-                if (
-                    np.shape(value) not in ((), (3,))
-                    or not np.greater_equal(value, 0).all()
-                ):
-                    raise ValueError(
-                        f"{field.name} must be one number or three, none negative, got "
-                        f"{value!r}"
-                    )
-                if not np.isfinite(value).all():
-                    raise ValueError(f"{field.name} must be finite, got {value!r}")
-                plain = np.asarray(value, dtype=np.float64).tolist()
-                plain = tuple(plain) if isinstance(plain, list) else plain
-                object.__setattr__(self, field.name, plain)
+        for name in _PER_AXIS:
+            value = getattr(self, name)
+            if (
+                np.shape(value) not in ((), (3,))
+                or not np.greater_equal(value, 0).all()
+            ):
+                raise ValueError(
+                    f"{name} must be one number or three, none negative, got {value!r}"
+                )
+            if not np.isfinite(value).all():
+                raise ValueError(f"{name} must be finite, got {value!r}")
+            plain = tuple(map(float, value)) if np.ndim(value) else float(value)
+            object.__setattr__(self, name, plain)
         if not 0.0 <= self.load_kg < float("inf"):
             raise ValueError(f"load_kg must be finite and >= 0, got {self.load_kg}")
         arm = float(np.linalg.norm(self.load_offset_m))
@@ -255,10 +256,7 @@ def _seen(config: RobotConfig, joints_deg: jax.Array) -> jax.Array:
 
 def _each(function: Any, rows: jax.Array) -> jax.Array:
     """Apply a function of (3,) to (..., 3)."""
-    if rows.ndim < 1 or rows.shape[-1] != 3:
-        raise ValueError(f"commands must have shape (..., 3), got {rows.shape}")
-    flat = jax.vmap(function)(rows.reshape(-1, 3))
-    return flat.reshape(rows.shape)
+    return jnp.vectorize(function, signature="(k)->(k)")(rows)
 
 
 def _joint_angles(config: RobotConfig, commands: jax.Array) -> jax.Array:
@@ -274,19 +272,25 @@ def _read_out(config: RobotConfig, commands: jax.Array) -> jax.Array:
 def _measure(
     config: RobotConfig, commands: jax.Array, drift: jax.Array, noise: jax.Array
 ) -> jax.Array:
-    dtype = commands.dtype
-    driven = _each(lambda u: _driven(config, u), commands)
-    gap = jnp.asarray(config.per_axis("backlash_deg"), dtype)
-    start = jnp.asarray(config.bias_deg, dtype)
-    rows = driven.reshape(-1, *driven.shape[-2:])
-    loose = jax.vmap(play, (0, None, None))(rows, gap, start).reshape(driven.shape)
+    gap, start, level = (
+        jnp.asarray(values, commands.dtype)
+        for values in (
+            config.per_axis("backlash_deg"),
+            config.bias_deg,
+            config.per_axis("noise_std_deg"),
+        )
+    )
+    drag = jnp.vectorize(lambda q: play(q, gap, start), signature="(n,k)->(n,k)")
+    loose = drag(_each(lambda u: _driven(config, u), commands))
     read = _each(lambda q: _seen(config, _bent(config, q)), loose + drift)
-    level = jnp.asarray(config.per_axis("noise_std_deg"), dtype)
     return read + jnp.broadcast_to(level, noise.shape) * noise
 
 
 def _in_its_precision(function: Any, commands_deg: ArrayLike | jax.Array) -> Any:
     """JAX arrays as they are; everything else in float64, and back to numpy."""
+    shape = np.shape(commands_deg)
+    if shape[-1:] != (3,):
+        raise ValueError(f"commands must have shape (..., 3), got {shape}")
     if isinstance(commands_deg, jax.Array):
         if not jnp.issubdtype(commands_deg.dtype, jnp.floating):
             commands_deg = commands_deg.astype(jnp.float32)

@@ -128,14 +128,15 @@ def draw(
         raise ValueError(f"size must be within 1280 x 960 pixels, got {size}")
     model = load_model(config)
     data = mujoco.MjData(model)
-    try:
-        if backend == "matplotlib":
-            raise RuntimeError("not asked for")
-        canvas, name = _renderer(model, width, height), "mujoco"
-    except Exception as error:  # drivers fail in many ways
-        if backend == "mujoco":
-            why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-            raise RuntimeError(f"MuJoCo cannot draw here: {why}") from None
+    canvas, name = None, "mujoco"
+    if backend != "matplotlib":
+        try:
+            canvas = _renderer(model, width, height)
+        except Exception as error:  # drivers fail in many ways
+            if backend == "mujoco":
+                why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+                raise RuntimeError(f"MuJoCo cannot draw here: {why}") from None
+    if canvas is None:
         canvas, name = Drawing(model, width, height), "matplotlib"
 
     def picture(joints_deg: ArrayLike) -> Image:
