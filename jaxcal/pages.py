@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Literal
 
 from jaxcal.extras import needs
@@ -29,7 +29,6 @@ __all__ = [
     "Strong",
     "Table",
     "Text",
-    "Values",
     "render",
     "write_page",
 ]
@@ -130,13 +129,6 @@ class Figure:
 
 
 @dataclasses.dataclass(frozen=True)
-class Values:
-    """Names with their values, one a line."""
-
-    items: Mapping[str, Content]
-
-
-@dataclasses.dataclass(frozen=True)
 class Box:
     """A titled, shaded paragraph."""
 
@@ -151,7 +143,7 @@ class Row:
     blocks: Sequence[Block]
 
 
-Block = str | Text | Table | Figure | Values | Box | Row
+Block = str | Text | Table | Figure | Box | Row
 
 
 @dataclasses.dataclass(frozen=True)

@@ -35,15 +35,15 @@ class Dataset:
                 "candidates must have shape (episodes, M, n), none of them 0, got "
                 f"{shape}"
             )
-        seen, mask = np.shape(self.measured), np.shape(self.available)
-        if self.measured is not None and (
-            len(seen) != 3 or seen[:2] != shape[:2] or seen[2] < 1
-        ):
+        if self.measured is not None:
+            seen = self.measured.shape
+            if len(seen) != 3 or seen[:2] != shape[:2] or seen[2] < 1:
+                want = (*shape[:2], "m")
+                raise ValueError(f"measured must have shape {want}, got {seen}")
+        if self.available is not None and self.available.shape != shape[:2]:
             raise ValueError(
-                f"measured must have shape {(*shape[:2], 'm')}, got {seen}"
+                f"available must have shape {shape[:2]}, got {self.available.shape}"
             )
-        if self.available is not None and mask != shape[:2]:
-            raise ValueError(f"available must have shape {shape[:2]}, got {mask}")
 
     @property
     def num_episodes(self) -> int:

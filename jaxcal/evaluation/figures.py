@@ -183,10 +183,7 @@ def variances(
 ) -> Figure:
     """Variance of each parameter, a marker for each way of choosing.
 
-    Args:
-        rows: label, (P,) variances, lower and upper ends of their intervals, style.
-        names: of the P parameters.
-        unit: in words.
+    ``rows``: label, (P,) variances, lower and upper ends of their intervals, style.
     """
     figure, axes = _panels((8.0, 4.0))
     look = {"linestyle": "none", "markersize": 4.5, "elinewidth": 0.9}

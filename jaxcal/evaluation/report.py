@@ -27,12 +27,7 @@ _ABOUT = (
 
 
 def text_table(shown: Summary, *, many: bool = False) -> str:
-    """One dataset as a table for the terminal.
-
-    Args:
-        shown: the numbers.
-        many: name the checkpoint of each policy.
-    """
+    """One dataset as a table; where there are ``many``, a policy's checkpoint too."""
     rows = [_COLUMNS, *_rows(shown, many)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     rows.insert(1, tuple("-" * width for width in widths))
@@ -65,12 +60,7 @@ def notes(shown: Summary) -> list[str]:
 
 
 def json_document(summaries: Sequence[Summary], *, command: Sequence[str]) -> str:
-    """The numbers of several evaluations; the layout is in docs/evaluation.md.
-
-    Args:
-        summaries: one a dataset.
-        command: what was typed, for the record.
-    """
+    """The numbers of several datasets; the layout is in docs/evaluation.md."""
     document = {
         "format": "jaxcal-evaluation",
         "version": 1,

@@ -95,8 +95,7 @@ class Evaluation:
     def summarise(self, *, indices: bool = False) -> Summary:
         """The numbers of every method.
 
-        Args:
-            indices: also what each chose in every episode (random: its first draw).
+        With ``indices`` also what each chose in every episode (random: its first draw).
         """
         rows, data = [], self.dataset
         for result in self.results:

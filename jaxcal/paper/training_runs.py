@@ -85,11 +85,7 @@ def train_seed(
 
 
 def collect(run: pathlib.Path, out: pathlib.Path) -> dict[str, Any]:
-    """Keep what a report needs of a run folder; the summary that was written.
-
-    Args:
-        run: folder of a run, finished or not.
-        out: made where missing; what it holds of an earlier collection is replaced.
+    """Keep in ``out`` what a report needs of a run, finished or not; its summary.
 
     Raises:
         OSError: the run holds no metrics.csv, or ``out`` cannot be written.

@@ -71,7 +71,7 @@ def card_of(
     """Everything a reader of the files needs, without jaxcal.
 
     Args:
-        dataset: one of the paper's, or its first chunk where it is written in chunks.
+        dataset: one of the paper's.
         files: SHA-256 of each file by its name.
         recordings: folder that the recorded ones come from, when not the shipped one.
     """

@@ -13,12 +13,7 @@ claim = Claim.from_texts
 
 
 def claims(exhibits: list[Exhibit], recorded: str) -> list[Claim]:
-    """Judge every claim by the numbers of the exhibits.
-
-    Args:
-        exhibits: all of them.
-        recorded: what Datasets 4 and 5 are, in words.
-    """
+    """Judge every claim by the exhibits; ``recorded`` is what Datasets 4 and 5 are."""
     found = {exhibit.key: exhibit for exhibit in exhibits}
     return [
         *_information(found, recorded),

@@ -87,10 +87,8 @@ def _ellipses(
 ) -> Figure:
     """95 % ellipses of pairs of a11, a12, a13, bx.
 
-    Args:
-        covariance: (4, 4) of those four, by choice of postures.
-        centre: (4,) true values.
-        estimates: (R, 4) simulated ones, of the policy.
+    From their (4, 4) covariance by choice of postures, around the (4,) true values,
+    with the (R, 4) simulated estimates of the policy.
     """
     names = (*PITCH_ROW[:3], "bx (°)")
     title = "95 % error ellipses of the pitch row of A and b (+: set values)"

@@ -43,12 +43,9 @@ class Exhibit:
     def from_texts(
         cls, section: str, words: Mapping[str, Any], **fields: Any
     ) -> Exhibit:
-        """An exhibit with the texts of a section of texts.toml.
+        """An exhibit with the texts of a section of texts.toml, its key by default.
 
-        Args:
-            section: its name; the key too, where ``fields`` gives none.
-            words: what its texts cite beside the numbers of the exhibit.
-            fields: of the exhibit.
+        The texts cite the exhibit's numbers and the ``words``.
         """
         known = {**fields.get("numbers", {}), **words}
         return cls(**{"key": section, **_filled(_texts()[section], known), **fields})
@@ -91,14 +88,10 @@ class Claim:
         key: str = "",
         **words: Any,
     ) -> Claim:
-        """A claim with the texts of ``claims.section`` of texts.toml.
+        """A claim with the texts of ``claims.section`` of texts.toml, and its key.
 
-        Args:
-            section: its name; the key too, where none is given.
-            exhibit: with the evidence, whose numbers the texts cite.
-            verdict: "not comparable" when None.
-            key: of the claim.
-            words: what else its texts cite.
+        The texts cite the numbers of the exhibit, which is the evidence, and the
+        ``words``. Without a verdict it is "not comparable".
         """
         filled = _filled(_texts()["claims"][section], {**exhibit.numbers, **words})
         verdict = verdict or "not comparable"

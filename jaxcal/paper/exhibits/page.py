@@ -31,14 +31,7 @@ def page(
     images: Mapping[str, bytes],
     settings: Settings,
 ) -> str:
-    """One self-contained page.
-
-    Args:
-        exhibits: in the order they are shown.
-        claims: of the paper.
-        images: SVG files by figure name.
-        settings: that the exhibits were made with.
-    """
+    """One self-contained page; ``images`` are the SVG files by figure name."""
     count = Counter[str](claim.verdict for claim in claims)
     said = [f"{count[v]} {plural}" for v, (_, plural) in _TONES.items() if count[v]]
     made_with = ", ".join(f"{name} {number}" for name, number in versions().items())

@@ -36,11 +36,8 @@ def trace_columns(
 ) -> dict[str, Any]:
     """Measured and predicted angles, a row per posture.
 
-    Args:
-        sessions: (S,) numbers.
-        commands: (S, POINTS, 3) degrees.
-        measured: (S, POINTS, 3) degrees.
-        parameters: (12,) of each calibration.
+    Of (S,) sessions, (S, POINTS, 3) commands and readings in degrees, and the (12,)
+    parameters of each calibration.
     """
     u = commands.reshape(-1, 3)
     shown = {name: predict(found, u) for name, found in parameters.items()}
