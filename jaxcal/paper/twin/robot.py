@@ -23,10 +23,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.spatial.transform import Rotation
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers, one_of
+from jaxcal.paper.twin.attitude import ORDERS, angles_of, rotation_of
 
 __all__ = ["ORDERS", "RobotConfig", "joint_angles", "measure", "play", "read_out"]
 
@@ -34,9 +34,6 @@ Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 PerAxis = float | Triple
 """One number for all axes, or pitch, yaw and roll"""
-
-ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
-"""Of Euler angles, the outermost turn first; angles are kept by axis, x, y, z"""
 
 GRAVITY = 9.81  # m/s^2, along -y
 _NEWTON_STEPS = 6  # of the sag; it converges quadratically
@@ -104,15 +101,6 @@ class RobotConfig:
     def per_axis(self, name: str) -> Array:
         """(3,) a field that is one number for all axes, or three."""
         return np.broadcast_to(np.float64(getattr(self, name)), (3,))
-
-
-def rotation_of(angles_deg: jax.Array, order: str) -> Rotation:
-    """The rotation of three angles (3,) about x, y and z, turned in this order."""
-    return Rotation.from_euler(order, angles_deg[_axes(order)], degrees=True)
-
-
-def _axes(order: str) -> jax.Array:
-    return jnp.array(["XYZ".index(letter) for letter in order])
 
 
 def read_out(config: RobotConfig, commands_deg: ArrayLike | jax.Array) -> Any:
@@ -228,7 +216,7 @@ def _bent(config: RobotConfig, target_deg: jax.Array) -> jax.Array:
 
     def potential(joints: jax.Array) -> jax.Array:
         turned = rotation_of(jnp.rad2deg(joints), config.mechanism_order)
-        return config.load_kg * GRAVITY * turned.apply(offset)[1]
+        return config.load_kg * GRAVITY * (turned[1] @ offset)
 
     target = jnp.deg2rad(target_deg)
 
@@ -246,9 +234,8 @@ def _seen(config: RobotConfig, joints_deg: jax.Array) -> jax.Array:
     turned = rotation_of(joints_deg, config.mechanism_order)
     if any(config.mounting_deg):
         phone = rotation_of(jnp.asarray(config.mounting_deg, joints_deg.dtype), "XYZ")
-        turned = phone.inv() * turned * phone
-    order = config.read_out_order
-    return turned.as_euler(order, degrees=True)[jnp.argsort(_axes(order))]
+        turned = phone.T @ turned @ phone
+    return angles_of(turned, config.read_out_order)
 
 
 # -- many ------------------------------------------------------------------------------
