@@ -78,7 +78,8 @@ def render(
     command_deg = np.asarray(commands_deg, dtype=np.float64).reshape(1, 3)
     with draw(config, size, backend) as (name, picture):
         image = picture(np.asarray(joint_angles(config, command_deg))[0])
-    _save(path, [_captioned(config, image, command_deg[0])], 0)
+    read = np.asarray(read_out(config, command_deg))
+    _save(path, [_captioned(image, command_deg[0], read[0])], 0)
     return name
 
 
@@ -105,12 +106,13 @@ def animate(
     links = trajectory(
         config, way, hold_s=1.0 / _FRAMES_PER_S, frames_per_s=_FRAMES_PER_S
     )[1:]
+    read = np.asarray(read_out(config, way))
     with draw(config, size, backend) as (name, picture):
         frames: list[Any] = []
-        for angles, command_deg in zip(links, way, strict=True):
+        for angles, *told in zip(links, way, read, strict=True):
             if progress is not None:
                 progress("draw the film", len(frames), len(way))
-            frames.append(_captioned(config, picture(angles), command_deg))
+            frames.append(_captioned(picture(angles), *told))
     _save(path, frames, round(1000.0 / _FRAMES_PER_S))
     return name
 
@@ -179,7 +181,7 @@ def _renderer(model: Any, width: int, height: int) -> Any:
 # -- captions and files ----------------------------------------------------------------
 
 
-def _captioned(config: RobotConfig, image: Image, command_deg: Array) -> Any:
+def _captioned(image: Image, command_deg: Array, read: Array) -> Any:
     """A pillow image that says what was commanded and what the phone reads."""
     from PIL import Image as Pillow
     from PIL import ImageDraw, ImageFont
@@ -188,7 +190,6 @@ def _captioned(config: RobotConfig, image: Image, command_deg: Array) -> Any:
     pen = ImageDraw.Draw(picture)
     size = max(11, picture.height // 30)
     font = ImageFont.load_default(size)
-    read = np.asarray(read_out(config, command_deg))
     rows = [("axis", "command", "phone", (60, 60, 60))]
     names = ("pitch", "yaw", "roll")
     for name, rgb, *angles in zip(
