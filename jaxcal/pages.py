@@ -9,8 +9,8 @@ from __future__ import annotations
 import base64
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal
+from collections.abc import Sequence
+from typing import Literal
 
 from jaxcal.extras import needs
 from jaxcal.files import write_text
@@ -29,7 +29,6 @@ __all__ = [
     "Strong",
     "Table",
     "Text",
-    "Values",
     "render",
     "write_page",
 ]
@@ -41,7 +40,6 @@ class Link:
 
     text: str
     href: str
-    kind: ClassVar[str] = "link"
 
     def __post_init__(self) -> None:
         if ":" in self.href or self.href.startswith("/"):
@@ -57,7 +55,6 @@ class Badge:
 
     text: str
     tone: Literal["good", "fair", "bad", "neutral"] = "neutral"
-    kind: ClassVar[str] = "badge"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +62,6 @@ class Code:
     """A command or a file name."""
 
     text: str
-    kind: ClassVar[str] = "code"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +69,6 @@ class Strong:
     """What must not be overlooked."""
 
     text: str
-    kind: ClassVar[str] = "strong"
 
 
 Inline = str | Link | Badge | Code | Strong
@@ -87,7 +82,6 @@ class Text:
 
     text: Content
     role: Literal["", "note", "warning"] = ""  # small print, or a highlighted warning
-    kind: ClassVar[str] = "text"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,7 +92,6 @@ class Table:
     rows: Sequence[Sequence[Content]]
     caption: Content = ""
     numeric: bool = True  # all columns but the first are aligned to the right
-    kind: ClassVar[str] = "table"
 
     def __post_init__(self) -> None:
         for row in self.rows:
@@ -109,6 +102,9 @@ class Table:
                 )
 
 
+_MEDIA = (("png", b"\x89PNG", 4), ("gif", b"GIF8", 4), ("svg+xml", b"<svg", 1000))
+
+
 @dataclasses.dataclass(frozen=True)
 class Figure:
     """A picture inside the page."""
@@ -117,7 +113,6 @@ class Figure:
     alt: str  # what it shows, for readers who do not see it
     caption: Content = ""
     on_paper: bool = True  # False: left out when the page is printed, a film say
-    kind: ClassVar[str] = "figure"
 
     @property
     def uri(self) -> str:
@@ -127,23 +122,10 @@ class Figure:
             ValueError: it is neither SVG nor PNG nor GIF.
         """
         data = self.data.encode() if isinstance(self.data, str) else self.data
-        if data.startswith(b"\x89PNG"):
-            media = "png"
-        elif data.startswith(b"GIF8"):
-            media = "gif"
-        elif b"<svg" in data[:1000]:
-            media = "svg+xml"
-        else:
-            raise ValueError(f"figure {self.alt!r} must be an SVG, PNG or GIF file")
-        return f"data:image/{media};base64,{base64.b64encode(data).decode('ascii')}"
-
-
-@dataclasses.dataclass(frozen=True)
-class Values:
-    """Names with their values, one a line."""
-
-    items: Mapping[str, Content]
-    kind: ClassVar[str] = "values"
+        for media, mark, reach in _MEDIA:
+            if mark in data[:reach]:
+                return f"data:image/{media};base64,{base64.b64encode(data).decode()}"
+        raise ValueError(f"figure {self.alt!r} must be an SVG, PNG or GIF file")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,18 +134,16 @@ class Box:
 
     title: str
     text: Content
-    kind: ClassVar[str] = "box"
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
     """Blocks side by side, one below the other on a phone."""
 
-    blocks: Sequence[str | Text | Table | Figure | Values | Box]
-    kind: ClassVar[str] = "row"
+    blocks: Sequence[Block]
 
 
-Block = str | Text | Table | Figure | Values | Box | Row
+Block = str | Text | Table | Figure | Box | Row
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,7 +185,10 @@ def render(page: Page) -> str:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    environment.filters["pieces"] = _pieces
+    environment.filters |= {
+        "pieces": lambda c: c if isinstance(c, list | tuple) else (c,),
+        "kind": lambda piece: type(piece).__name__.lower(),
+    }
     return environment.get_template("page.html.j2").render(page=page).lstrip()
 
 
@@ -216,8 +199,3 @@ def write_page(path: str | os.PathLike[str], page: Page) -> None:
         OSError: the folder is missing, not writable or full.
     """
     write_text(path, render(page))
-
-
-def _pieces(content: Content) -> Sequence[Any]:
-    """The content as a sequence of inline pieces."""
-    return content if isinstance(content, list | tuple) else (content,)

@@ -36,14 +36,7 @@ class Catalogue:
         recordings: str | os.PathLike[str] | None = None,
         progress: Any = None,
     ) -> Dataset:
-        """A dataset by its name, or from a file.
-
-        Args:
-            name: one of ``sizes``, or the path of a .npz or .csv file.
-            seed: of a named one.
-            episodes: the first so many, where there are more.
-            recordings: folder of recordings, for those that are made from one.
-            progress: told how far a simulation is.
+        """The first episodes of a dataset by its name, or of a .npz or .csv file.
 
         Raises:
             OSError: a file cannot be read.
@@ -62,6 +55,4 @@ class Catalogue:
                 f"file, got {name!r}"
             )
         dataset = load_dataset(name)
-        if episodes is None:
-            return dataset
-        return dataset.first(min(episodes, dataset.num_episodes))
+        return dataset if episodes is None else dataset.part(0, episodes)

@@ -29,26 +29,20 @@ class Dataset:
     sha256: str | None = None  # of the file it was read from
 
     def __post_init__(self) -> None:
-        if self.candidates.ndim != 3 or 0 in self.candidates.shape:
+        shape = self.candidates.shape
+        if len(shape) != 3 or 0 in shape:
             raise ValueError(
                 "candidates must have shape (episodes, M, n), none of them 0, got "
-                f"{self.candidates.shape}"
+                f"{shape}"
             )
-        if self.measured is not None and (
-            self.measured.ndim != 3
-            or self.measured.shape[:2] != self.candidates.shape[:2]
-            or self.measured.shape[2] < 1
-        ):
+        if self.measured is not None:
+            seen = self.measured.shape
+            if len(seen) != 3 or seen[:2] != shape[:2] or seen[2] < 1:
+                want = (*shape[:2], "m")
+                raise ValueError(f"measured must have shape {want}, got {seen}")
+        if self.available is not None and self.available.shape != shape[:2]:
             raise ValueError(
-                f"measured must have shape {(*self.candidates.shape[:2], 'm')}, got "
-                f"{self.measured.shape}"
-            )
-        if self.available is not None and (
-            self.available.shape != self.candidates.shape[:2]
-        ):
-            raise ValueError(
-                f"available must have shape {self.candidates.shape[:2]}, got "
-                f"{self.available.shape}"
+                f"available must have shape {shape[:2]}, got {self.available.shape}"
             )
 
     @property
@@ -83,25 +77,10 @@ class Dataset:
             "sha256": self.sha256,
         }
 
-    def first(self, episodes: int) -> Dataset:
-        """The first episodes only.
-
-        Raises:
-            ValueError: fewer than one, or more than there are.
-        """
-        if not 1 <= episodes <= self.num_episodes:
-            raise ValueError(
-                f"episodes must be in [1, {self.num_episodes}] for {self.name}, "
-                f"got {episodes}"
-            )
-        return self.part(0, episodes)
-
     def part(self, begin: int, end: int) -> Dataset:
         """Episodes ``begin`` to ``end``, the last one not included."""
-        cut = slice(begin, end)
-        return dataclasses.replace(
-            self,
-            candidates=self.candidates[cut],
-            measured=None if self.measured is None else self.measured[cut],
-            available=None if self.available is None else self.available[cut],
-        )
+        held = {name: getattr(self, name) for name in ("measured", "available")}
+        cut = {
+            name: array[begin:end] for name, array in held.items() if array is not None
+        }
+        return dataclasses.replace(self, candidates=self.candidates[begin:end], **cut)

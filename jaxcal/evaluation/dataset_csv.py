@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import math
 import os
 from collections import Counter
 from collections.abc import Iterable
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal.checks import axis_letter
+from jaxcal.evaluation.csv_rows import finite, read_rows
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.files import atomic_write
 
@@ -29,21 +29,24 @@ def save_csv(dataset: Dataset, path: str | os.PathLike[str]) -> None:
 
 
 def save_csv_parts(parts: Iterable[Dataset], path: str | os.PathLike[str]) -> None:
-    """Write one .csv of a dataset that comes in parts, each with as many columns.
-
-    Raises:
-        OSError: the folder is missing, not writable or full.
-    """
+    """Write one .csv of a dataset that comes in parts, each with as many columns."""
     with atomic_write(path) as file:
-        episode = 0
+        total = 0
         for dataset in parts:
             text = io.StringIO()
             writer = csv.writer(text, lineterminator="\n")
-            if episode == 0:
+            if total == 0:
                 writer.writerow(_header(dataset))
-            _write_rows(writer, dataset, episode)
+            mask = dataset.available
+            values = dataset.candidates
+            if dataset.measured is not None:
+                values = np.concatenate([values, dataset.measured], axis=2)
+            for e, episode in enumerate(values.tolist()):
+                for i, row in enumerate(episode):
+                    last = [] if mask is None else [int(mask[e, i])]
+                    writer.writerow([total + e, i, *row, *last])
             file.write(text.getvalue().encode("utf-8"))
-            episode += dataset.num_episodes
+            total += dataset.num_episodes
 
 
 def _header(dataset: Dataset) -> list[str]:
@@ -54,52 +57,33 @@ def _header(dataset: Dataset) -> list[str]:
     return header if dataset.available is None else [*header, "available"]
 
 
-def _write_rows(writer: Any, dataset: Dataset, first_episode: int) -> None:
-    columns = [dataset.candidates]
-    if dataset.measured is not None:
-        columns.append(dataset.measured)
-    for e, episode in enumerate(np.concatenate(columns, axis=2).tolist()):
-        for i, row in enumerate(episode):
-            mask = [] if dataset.available is None else [int(dataset.available[e, i])]
-            writer.writerow([first_episode + e, i, *row, *mask])
-
-
 def read_csv(data: bytes) -> dict[str, Any]:
     """The fields of a ``Dataset``."""
+    header, rows = read_rows(data)
     try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        raise ValueError(f"line {line}: not UTF-8 text") from None
-    reader = csv.reader(io.StringIO(text, newline=""))
-    lines: dict[tuple[int, int], int] = {}  # of each (episode, candidate)
-    values: dict[tuple[int, int], list[float]] = {}
-    try:
-        header = [name.strip() for name in next(reader, [])]
         inputs, outputs, masks = _columns(header)
-        names = [*inputs, *outputs, *masks]
-        place = [header.index(name) for name in names]
-        first, second = header.index("episode"), header.index("candidate")
-        for row in reader:
-            if not any(cell.strip() for cell in row):
-                continue
-            if len(row) != len(header):
-                raise ValueError(f"{len(row)} cells, {len(header)} in the header")
-            label = _whole("episode", row[first]), _whole("candidate", row[second])
-            if label in lines:
+    except ValueError as error:
+        raise ValueError(f"line 1: {error}") from None
+    names = [*inputs, *outputs, *masks]
+    found: dict[tuple[int, int], tuple[int, list[float]]] = {}  # line and values
+    for line, row in rows:
+        cells = dict(zip(header, row, strict=True))
+        try:
+            label = _whole("episode", cells), _whole("candidate", cells)
+            if label in found:
                 raise ValueError(
                     f"candidate {label[1]} of episode {label[0]} was already given in "
-                    f"line {lines[label]}"
+                    f"line {found[label][0]}"
                 )
-            lines[label] = reader.line_num
-            values[label] = [
-                _number(name, row[i]) for name, i in zip(names, place, strict=True)
-            ]
-    except (ValueError, csv.Error) as error:
-        raise ValueError(f"line {max(reader.line_num, 1)}: {error}") from None
-    if not values:
+            found[label] = line, [finite(name, cells[name]) for name in names]
+            if masks and found[label][1][-1] not in (0.0, 1.0):
+                text = cells["available"]
+                raise ValueError(f'"available" must be 0 or 1, got {text!r}')
+        except ValueError as error:
+            raise ValueError(f"line {line}: {error}") from None
+    if not found:
         raise ValueError("no candidates below the header")
-    counts = Counter(episode for episode, _ in sorted(values))
+    counts = Counter(episode for episode, _ in sorted(found))
     (label0, size), *others = counts.items()
     for episode, count in others:
         if count != size:
@@ -107,7 +91,7 @@ def read_csv(data: bytes) -> dict[str, Any]:
                 f"every episode must have as many candidates: episode {label0} has "
                 f"{size}, episode {episode} has {count}"
             )
-    table = np.array([values[label] for label in sorted(values)])
+    table = np.array([found[label][1] for label in sorted(found)])
     table = table.reshape(len(counts), size, len(names))
     n, m = len(inputs), len(outputs)
     fields: dict[str, Any] = {"candidates": table[..., :n]}
@@ -123,8 +107,7 @@ def _columns(header: list[str]) -> tuple[list[str], list[str], list[str]]:
     for name in ("episode", "candidate"):
         if name not in header:
             raise ValueError(f'column "{name}" is missing, found {",".join(header)}')
-    inputs = [name for name in header if name.startswith("u_")]
-    outputs = [name for name in header if name.startswith("y_")]
+    inputs, outputs = ([n for n in header if n.startswith(w)] for w in ("u_", "y_"))
     if not inputs:
         raise ValueError('no input column ("u_x", ...) in the header')
     known = {"episode", "candidate", "available", *inputs, *outputs}
@@ -136,23 +119,13 @@ def _columns(header: list[str]) -> tuple[list[str], list[str], list[str]]:
     return inputs, outputs, ["available"] if "available" in header else []
 
 
-def _whole(name: str, cell: str) -> int:
+def _whole(name: str, cells: dict[str, str]) -> int:
     try:
-        number = int(cell)
+        number = int(cells[name])
     except ValueError:
-        raise ValueError(f'"{name}" must be a whole number, got {cell!r}') from None
+        raise ValueError(
+            f'"{name}" must be a whole number, got {cells[name]!r}'
+        ) from None
     if abs(number) > 2**53:
-        raise ValueError(f'"{name}" is out of range, got {cell!r}')
-    return number
-
-
-def _number(name: str, cell: str) -> float:
-    try:
-        number = float(cell)
-    except ValueError:
-        raise ValueError(f'"{name}" must be a number, got {cell!r}') from None
-    if not math.isfinite(number):
-        raise ValueError(f'"{name}" must be finite, got {cell!r}')
-    if name == "available" and number not in (0.0, 1.0):
-        raise ValueError(f'"available" must be 0 or 1, got {cell!r}')
+        raise ValueError(f'"{name}" is out of range, got {cells[name]!r}')
     return number

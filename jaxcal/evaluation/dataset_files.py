@@ -13,9 +13,6 @@ import hashlib
 import io
 import os
 import pathlib
-import struct
-import zipfile
-import zlib
 from typing import Any
 
 import numpy as np
@@ -30,18 +27,8 @@ __all__ = ["load_dataset", "save_csv", "save_csv_parts", "save_npz"]
 
 Array = NDArray[np.float64]
 
-# What zipfile and numpy raise on bytes that are not what they say.
-_DAMAGE = (
-    zipfile.BadZipFile,
-    zlib.error,
-    struct.error,
-    EOFError,
-    KeyError,
-    MemoryError,
-    OSError,
-    OverflowError,
-    RuntimeError,
-)
+_KEYS = ("candidates", "measured", "available")
+_ENDS = ("low", "high")
 
 
 def load_dataset(path: str | os.PathLike[str]) -> Dataset:
@@ -74,13 +61,10 @@ def save_npz(dataset: Dataset, path: str | os.PathLike[str]) -> None:
     Raises:
         OSError: the folder is missing, not writable or full.
     """
-    arrays: dict[str, NDArray[np.generic]] = {"candidates": dataset.candidates}
-    if dataset.measured is not None:
-        arrays["measured"] = dataset.measured
-    if dataset.available is not None:
-        arrays["available"] = dataset.available
+    held = {name: getattr(dataset, name) for name in _KEYS}
     if dataset.ranges is not None:
-        arrays |= {"low": dataset.ranges.low, "high": dataset.ranges.high}
+        held |= {"low": dataset.ranges.low, "high": dataset.ranges.high}
+    arrays = {name: array for name, array in held.items() if array is not None}
     with atomic_write(path) as file:
         np.savez(file, allow_pickle=False, **arrays)
 
@@ -89,43 +73,41 @@ def _read_npz(data: bytes) -> dict[str, Any]:
     """The fields of a ``Dataset``."""
     try:
         archive = np.load(io.BytesIO(data), allow_pickle=False)
-    except (*_DAMAGE, ValueError):
+    except Exception:  # zipfile and numpy raise ten kinds on bytes that are damaged
         raise ValueError("not a .npz file, or a truncated one") from None
     if not isinstance(archive, np.lib.npyio.NpzFile):
         raise ValueError("not a .npz file but a single array")
     with archive:
-        keys = set(archive.files)
-        if "candidates" not in keys:
-            found = ", ".join(sorted(keys)) or "nothing"
+        held = {k: _member(archive, k) for k in archive.files if k in (*_KEYS, *_ENDS)}
+        if "candidates" not in held:
+            found = ", ".join(sorted(archive.files)) or "nothing"
             raise ValueError(f'key "candidates" is missing, found {found}')
-        fields: dict[str, Any] = {
-            key: _cube(key, _member(archive, key))
-            for key in ("candidates", "measured")
-            if key in keys
-        }
-        if "available" in keys:
-            fields["available"] = _mask(_member(archive, "available"))
-        if {"low", "high"} & keys:
-            if not {"low", "high"} <= keys:
-                raise ValueError('keys "low" and "high" must come together')
-            ranges = JointRanges(_member(archive, "low"), _member(archive, "high"))
-            width = fields["candidates"].shape[2]
-            if ranges.num_inputs != width:
-                raise ValueError(
-                    f'"low" and "high" must hold {width} numbers, got '
-                    f"{ranges.num_inputs}"
-                )
-            fields["ranges"] = ranges
+    fields: dict[str, Any] = {
+        key: _cube(key, held[key]) for key in _KEYS[:2] if key in held
+    }
+    if "available" in held:
+        mask = held["available"]
+        if mask.dtype.kind not in "biuf" or not np.isin(mask, (0, 1)).all():
+            raise ValueError('key "available" must hold true and false (or 1 and 0)')
+        fields["available"] = mask.astype(np.bool_)
+    ends = [held[key] for key in _ENDS if key in held]
+    if len(ends) == 1:
+        raise ValueError('keys "low" and "high" must come together')
+    if ends:
+        ranges, width = JointRanges(ends[0], ends[1]), fields["candidates"].shape[2]
+        if ranges.num_inputs != width:
+            raise ValueError(
+                f'"low" and "high" must hold {width} numbers, got {ranges.num_inputs}'
+            )
+        fields["ranges"] = ranges
     return fields
 
 
 def _member(archive: np.lib.npyio.NpzFile, key: str) -> NDArray[np.generic]:
     try:
         member: NDArray[np.generic] = archive[key]
-    except _DAMAGE:
-        raise ValueError(f'key "{key}" is damaged') from None
-    except ValueError as error:
-        if "pickle" in str(error):
+    except Exception as error:  # as above
+        if isinstance(error, ValueError) and "pickle" in str(error):
             raise ValueError(
                 f'key "{key}" must be an array of numbers; objects (ragged episodes, '
                 "say) are not read"
@@ -150,9 +132,3 @@ def _cube(key: str, array: NDArray[np.generic]) -> Array:
             f"{episode}, row {row}, axis {axis}"
         )
     return values
-
-
-def _mask(array: NDArray[np.generic]) -> NDArray[np.bool_]:
-    if array.dtype.kind not in "biuf" or not np.isin(array, (0, 1)).all():
-        raise ValueError('key "available" must hold true and false (or 1 and 0)')
-    return array.astype(np.bool_)

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from jaxcal.evaluation.parameters import parameter_names
 from jaxcal.evaluation.results import Evaluation, MethodResult, log_mean
-from jaxcal.plots import BLACK, COLOURS, GREY, MARKERS, STYLES, plain_axes
+from jaxcal.plots.style import BLACK, COLOURS, GREY, boxes, legend_right, numbered
+from jaxcal.plots.style import panels as _panels
 
 __all__ = [
     "best_so_far",
@@ -26,14 +27,13 @@ __all__ = [
     "det_per_episode",
     "evaluation_figures",
     "gap_to_optimum",
-    "parameter_variance",
     "variances",
 ]
 
 Array = NDArray[np.float64]
 
+SHOWN_EPISODES = 200  # more than these points side by side cannot be told apart
 _CURVE_POINTS = 600  # draw any step curve
-_SHOWN_EPISODES = 200  # more than these points side by side cannot be told apart
 _FIXED: dict[str, dict[str, Any]] = {  # the style of random and exact in every figure
     "random": {"color": GREY, "linestyle": ":", "marker": "x"},
     "exact": {"color": BLACK, "linestyle": "-", "marker": "*"},
@@ -42,40 +42,35 @@ _FIXED: dict[str, dict[str, Any]] = {  # the style of random and exact in every 
 
 def evaluation_figures(evaluation: Evaluation) -> dict[str, Figure]:
     """Every figure the evaluation holds data for, by file name without suffix."""
-    figures = {
-        "det_per_episode": det_per_episode(evaluation),
-        "det_means": det_means(evaluation),
-        "det_distributions": det_distributions(evaluation),
-        "gap_to_optimum": gap_to_optimum(evaluation),
-        "best_so_far": best_so_far(evaluation),
-    }
+    drawn = [det_per_episode, det_means, det_distributions, gap_to_optimum, best_so_far]
     if evaluation.dataset.measured is not None:
-        figures["parameter_variance"] = parameter_variance(evaluation)
-    return figures
+        drawn.append(parameter_variance)
+    return {draw.__name__: draw(evaluation) for draw in drawn}
 
 
 def det_per_episode(evaluation: Evaluation) -> Figure:
     """det S in each episode: the main method, the optimum and one random draw."""
     figure, axes = _figure(evaluation, "det S per episode", 3.8)
     total = evaluation.dataset.num_episodes
-    shown = min(total, _SHOWN_EPISODES)
-    episodes = np.arange(1, shown + 1)
+    shown = min(total, SHOWN_EPISODES)
 
     def draw(log_det: Array, label: str, **look: Any) -> None:
-        axes.plot(episodes, _log10(log_det[:shown]), label=label, **look)
+        x = np.arange(1, shown + 1)
+        axes.plot(x, log_det[:shown] / np.log(10.0), label=label, **look)
 
     random = evaluation.random_log_det[:, 0]
     draw(random, "random, one draw", ls="none", marker="x", ms=4, color=GREY)
     draw(evaluation.reference, _reference_name(evaluation), lw=0.8, color=BLACK)
-    main = _main(evaluation)
-    if main is not None:
+    # The first policy, else the first method that is neither random nor exact.
+    others = [r for r in evaluation.results if r.method not in ("random", "exact")]
+    if others:
+        main = next((r for r in others if r.is_policy), others[0])
         look = {"ls": "none", "marker": "o", "ms": 3.5, "color": COLOURS[0]}
         draw(main.log_det[:, 0], _label(evaluation, main), **look)
     part = "" if shown == total else f", first {shown} of {total:,}"
     axes.set_xlabel(f"episode{part}")
-    axes.set_ylabel(_det_label(evaluation))
-    _powers_of_ten(axes.yaxis)
-    _legend(axes)
+    _det_axis(axes.yaxis, evaluation)
+    legend_right(axes)
     return figure
 
 
@@ -89,56 +84,35 @@ def det_means(evaluation: Evaluation) -> Figure:
         mean = values.mean()
         half = 1.96 * values.std() / np.sqrt(len(values))
         ends = np.array([max(mean - half, 0.1 * mean), mean, mean + half])
-        low, centre, high = np.log10(ends) + _log10(log_det.max())
+        low, centre, high = np.log10(ends) + log_det.max() / np.log(10.0)
+        error, look = [[centre - low], [high - centre]], style["marker"]
         axes.errorbar(
-            centre,
-            row,
-            xerr=[[centre - low], [high - centre]],
-            fmt=style["marker"],
-            color=style["color"],
-            capsize=3,
+            centre, row, xerr=error, fmt=look, color=style["color"], capsize=3
         )
         if name != "random":
             times = np.exp(log_mean(log_det) - log_mean(evaluation.random_log_det))
-            axes.annotate(
-                f"{times:,.0f} x random",
-                (centre, row),
-                xytext=(0, 7),
-                textcoords="offset points",
-                ha="center",
-                fontsize=8,
-            )
+            place = {"xytext": (0, 7), "textcoords": "offset points", "ha": "center"}
+            text = f"{times:,.0f} x random"
+            axes.annotate(text, (centre, row), fontsize=8, **place)
     axes.set_yticks(range(len(results)), [name for name, _, _ in results])
     axes.set_ylim(len(results) - 0.5, -0.7)
     axes.margins(x=0.12)
-    axes.set_xlabel(f"mean {_det_label(evaluation)}, with its 95 % interval")
-    _powers_of_ten(axes.xaxis)
+    _det_axis(axes.xaxis, evaluation, "mean {}, with its 95 % interval")
     return figure
 
 
 def det_distributions(evaluation: Evaluation) -> Figure:
     """Distribution of det S over the selections of each method, on a log scale."""
-    results = _with_random(evaluation)
-    height = 1.1 + 0.42 * len(results)
+    names, log_dets, styles = zip(*_with_random(evaluation), strict=True)
+    height = 1.1 + 0.42 * len(names)
     figure, axes = _figure(evaluation, "Distribution of det S", height)
-    boxes = axes.boxplot(
-        [_log10(log_det.ravel()) for _, log_det, _ in results],
-        orientation="horizontal",
-        whis=(5, 95),
-        showfliers=False,
-        patch_artist=True,
-        widths=0.6,
-        medianprops={"color": BLACK},
-    )
-    for patch, (_, _, style) in zip(boxes["boxes"], results, strict=True):
-        patch.set_facecolor(style["color"])
-        patch.set_alpha(0.6)
-    axes.set_yticks(range(1, len(results) + 1), [name for name, _, _ in results])
+    samples = [log_det.ravel() / np.log(10.0) for log_det in log_dets]
+    colours = [style["color"] for style in styles]
+    boxes(axes, samples, colours, (5, 95), orientation="horizontal")
+    axes.set_yticks(range(1, len(names) + 1), names)
     axes.invert_yaxis()
-    axes.set_xlabel(
-        f"{_det_label(evaluation)}; box: quartiles and median, whiskers: 5 to 95 %"
-    )
-    _powers_of_ten(axes.xaxis)
+    text = "{}; box: quartiles and median, whiskers: 5 to 95 %"
+    _det_axis(axes.xaxis, evaluation, text)
     return figure
 
 
@@ -152,18 +126,13 @@ def gap_to_optimum(evaluation: Evaluation) -> Figure:
         values, counts = np.unique(ratio.round(9), return_counts=True)
         share = counts[::-1].cumsum()[::-1] / len(ratio)
         keep = np.unique(np.linspace(0, len(values) - 1, _CURVE_POINTS).astype(int))
-        axes.step(
-            np.append(0.0, values[keep]),
-            np.append(1.0, share[keep]),
-            where="pre",
-            label=f"{name} (mean {ratio.mean():.3g})",
-            **_line(style),
-        )
+        x, y = np.append(0.0, values[keep]), np.append(1.0, share[keep])
+        label = f"{name} (mean {ratio.mean():.3g})"
+        axes.step(x, y, where="pre", label=label, **_line(style))
     axes.set_xlabel(f"det S / det S* ({_reference_name(evaluation)})")
     axes.set_ylabel("share of selections at least this good")
-    axes.set_xlim(0.0, 1.005)
-    axes.set_ylim(0.0, 1.02)
-    _legend(axes)
+    axes.set(xlim=(0.0, 1.005), ylim=(0.0, 1.02))
+    legend_right(axes)
     return figure
 
 
@@ -173,46 +142,37 @@ def best_so_far(evaluation: Evaluation) -> Figure:
     Of several draws an episode the median curve, with a band from 5 to 95 % of them.
     """
     figure, axes = _figure(evaluation, "Best det S so far", 3.8)
-    episodes = np.arange(1, evaluation.dataset.num_episodes + 1)
+    x = np.arange(1, evaluation.dataset.num_episodes + 1)
     for name, log_det, style in _with_random(evaluation):
-        best = _log10(np.maximum.accumulate(log_det, axis=0))
+        best = np.maximum.accumulate(log_det, axis=0) / np.log(10.0)
         low, middle, high = np.quantile(best, [0.05, 0.5, 0.95], axis=1)
         label, draws = name, best.shape[1]
         if draws > 1:
-            axes.fill_between(
-                episodes, low, high, step="post", color=style["color"], alpha=0.2, lw=0
-            )
+            look = {"color": style["color"], "alpha": 0.2, "lw": 0}
+            axes.fill_between(x, low, high, step="post", **look)
             label = f"{name}, median and\n5 to 95 % of {draws} draws"
-        axes.step(episodes, middle, where="post", label=label, **_line(style))
+        axes.step(x, middle, where="post", label=label, **_line(style))
     axes.set_xlabel("episode")
-    axes.set_ylabel(f"best {_det_label(evaluation)} so far")
-    _powers_of_ten(axes.yaxis)
-    _legend(axes)
+    _det_axis(axes.yaxis, evaluation, "best {} so far")
+    legend_right(axes)
     return figure
 
 
 def parameter_variance(evaluation: Evaluation) -> Figure:
-    """Variance over the episodes of each identified parameter (paper, Figure 5).
-
-    Raises:
-        ValueError: the dataset holds no measured outputs.
-    """
+    """Variance over the episodes of each identified parameter (paper, Figure 5)."""
     dataset = evaluation.dataset
-    if dataset.measured is None:
-        raise ValueError(f"{dataset.name} holds no measured outputs")
     rows = []
-    styles = _styles(evaluation)
-    for result, style in zip(evaluation.results, styles, strict=True):
-        label = "random, median over draws" if result.method == "random" else None
-        variance = evaluation.parameter_variance(result)
-        rows.append((label or _label(evaluation, result), variance, None, style))
+    for result, style in zip(evaluation.results, _styles(evaluation), strict=True):
+        random = result.method == "random"
+        label = "random, median over draws" if random else _label(evaluation, result)
+        rows.append((label, evaluation.parameter_variance(result), None, style))
     unit = "unit of measured and commands, squared"
     if dataset.ranges is not None:
         unit = "A: no unit, b: deg²"
     names = parameter_names(dataset.num_inputs, dataset.num_outputs)
     figure = variances(rows, names, unit)
     title = "Cross-episode variance of the identified parameters"
-    _title(figure.axes[0], evaluation, title)
+    figure.axes[0].set_title(_title(evaluation, title), fontsize=10)
     return figure
 
 
@@ -223,28 +183,19 @@ def variances(
 ) -> Figure:
     """Variance of each parameter, a marker for each way of choosing.
 
-    Args:
-        rows: label, (P,) variances, lower and upper ends of their intervals, style.
-        names: of the P parameters.
-        unit: in words.
+    ``rows``: label, (P,) variances, lower and upper ends of their intervals, style.
     """
-    figure, axes = _axes(4.0)
+    figure, axes = _panels((8.0, 4.0))
+    look = {"linestyle": "none", "markersize": 4.5, "elinewidth": 0.9}
     offsets = np.linspace(-0.3, 0.3, len(rows)) if len(rows) > 1 else [0.0]
     for (label, variance, ends, style), offset in zip(rows, offsets, strict=True):
         error = None
         if ends is not None:
             # A percentile interval need not hold the estimate.
             error = np.maximum([variance - ends[0], ends[1] - variance], 0.0)
+        own = {"label": label, "color": style["color"], "marker": style["marker"]}
         axes.errorbar(
-            np.arange(len(names)) + offset,
-            variance,
-            yerr=error,
-            linestyle="none",
-            marker=style["marker"],
-            markersize=4.5,
-            elinewidth=0.9,
-            color=style["color"],
-            label=label,
+            np.arange(len(names)) + offset, variance, yerr=error, **own, **look
         )
     for edge in np.arange(len(names) - 1) + 0.5:
         axes.axvline(edge, color="#DDDDDD", linewidth=0.6, zorder=0)
@@ -253,39 +204,32 @@ def variances(
     bars = any(ends is not None for _, _, ends, _ in rows)
     axes.set_xlabel("parameter" + (" (bars: 95 % intervals)" if bars else ""))
     axes.set_ylabel(f"variance over episodes ({unit})")
-    _legend(axes)
+    legend_right(axes)
     return figure
 
 
 def _figure(evaluation: Evaluation, title: str, height: float) -> tuple[Figure, Any]:
     """A titled figure of one panel, and its axes; height in inches."""
-    figure, axes = _axes(height)
-    _title(axes, evaluation, title)
+    figure, axes = _panels((8.0, height))
+    axes.set_title(_title(evaluation, title), fontsize=10)
     return figure, axes
 
 
-def _axes(height: float) -> tuple[Figure, Any]:
-    figure = Figure(figsize=(8.0, height), layout="constrained")
-    axes = figure.subplots()
-    plain_axes(axes)
-    return figure, axes
-
-
-def _legend(axes: Any) -> None:
-    axes.legend(fontsize=8, frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
-
-
-def _title(axes: Any, evaluation: Evaluation, what: str) -> None:
+def _title(evaluation: Evaluation, what: str) -> str:
     dataset = evaluation.dataset
-    axes.set_title(
-        f"{what}: {dataset.name}, {evaluation.k} of {dataset.num_candidates}",
-        fontsize=10,
-    )
+    return f"{what}: {dataset.name}, {evaluation.k} of {dataset.num_candidates}"
 
 
-def _det_label(evaluation: Evaluation) -> str:
-    normalised = evaluation.dataset.ranges is not None
-    return f"det S (commands {'in [0, 1]' if normalised else 'as in the file'})"
+def _det_axis(axis: Any, evaluation: Evaluation, text: str = "{}") -> None:
+    """Name an axis that holds log10 det S and label it with powers of ten.
+
+    The logs are drawn rather than a log axis, because det S of many axes in encoder
+    pulses can exceed the largest float.
+    """
+    unit = "as in the file" if evaluation.dataset.ranges is None else "in [0, 1]"
+    axis.set_label_text(text.format(f"det S (commands {unit})"))
+    axis.set_major_locator(MaxNLocator(nbins=8, integer=True))
+    axis.set_major_formatter(FuncFormatter(lambda x, _: f"$10^{{{x:g}}}$"))
 
 
 def _reference_name(evaluation: Evaluation) -> str:
@@ -301,18 +245,11 @@ def _label(evaluation: Evaluation, result: MethodResult) -> str:
     return f"{result.label}, {pathlib.Path(name).name}"
 
 
-def _main(evaluation: Evaluation) -> MethodResult | None:
-    """The first policy, else the first method that is neither random nor exact."""
-    others = [r for r in evaluation.results if r.method not in ("random", "exact")]
-    return next((r for r in others if r.is_policy), others[0] if others else None)
-
-
 def _styles(evaluation: Evaluation) -> list[dict[str, Any]]:
     """Colour, line and marker of each; random and exact look the same everywhere."""
-    looks = zip(*map(itertools.cycle, (COLOURS, STYLES, MARKERS)), strict=False)
+    number = itertools.count()
     return [
-        _FIXED.get(result.method)
-        or dict(zip(("color", "linestyle", "marker"), next(looks), strict=True))
+        _FIXED.get(result.method) or numbered(next(number))
         for result in evaluation.results
     ]
 
@@ -335,17 +272,3 @@ def _with_random(evaluation: Evaluation) -> list[tuple[str, Array, dict[str, Any
     if all(result.method != "random" for result in results):
         rows.append(("random", evaluation.random_log_det, _FIXED["random"]))
     return rows
-
-
-def _log10(log_values: Any) -> Any:
-    return log_values / np.log(10.0)
-
-
-def _powers_of_ten(axis: Any) -> None:
-    """Label an axis that holds log10 values with the values themselves.
-
-    The logs are drawn rather than a log axis, because det S of many axes in encoder
-    pulses can exceed the largest float.
-    """
-    axis.set_major_locator(MaxNLocator(nbins=8, integer=True))
-    axis.set_major_formatter(FuncFormatter(lambda x, _: f"$10^{{{x:g}}}$"))

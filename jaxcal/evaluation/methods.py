@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -72,17 +72,13 @@ def check_methods(methods: Sequence[str]) -> tuple[str, ...]:
     Raises:
         ValueError: naming the one that is unknown, or that there is none.
     """
+    several = {"policy:all": POLICIES, "policy:greedy": ("policy",)}
     chosen: list[str] = []
     for name in methods:
-        if name == "policy:all":
-            chosen += POLICIES
-        elif name == "policy:greedy":
-            chosen.append("policy")
-        elif name in METHODS:
-            chosen.append(name)
-        else:
+        if name not in METHODS and name not in several:
             known = ", ".join((*METHODS, "policy:all"))
             raise ValueError(f"method must be one of {known}, got {name!r}")
+        chosen += several.get(name, (name,))
     if not chosen:
         raise ValueError("methods must name at least one method, got none")
     return tuple(dict.fromkeys(chosen))
@@ -139,15 +135,13 @@ def evaluate(
         raise ValueError(f"{dataset.name}: {error}") from None
     run = _Run(dataset, k, num, seed, progress or (lambda *_: None))
     rows = rows_of(methods, checkpoints)
-    found: dict[tuple[str, str | None], MethodResult] = {}
-    for method, checkpoint in rows:
-        if method in POLICIES:
-            found[method, checkpoint] = run.policy(method, checkpoint)
-    random = found["random", None] = run.random(random_draws)
-    found["exact", None], reference, proven = run.exact(time_limit)
-    for method in methods:
-        if method in _SOLVERS:
-            found[method, None] = run.solver(method)
+    policies = {row: run.policy(*row) for row in rows if row[0] in POLICIES}
+    random = run.random(random_draws)
+    exact, reference, proven = run.exact(time_limit)
+    found = policies | {("random", None): random, ("exact", None): exact}
+    for row in rows:
+        if row not in found:
+            found[row] = run.solver(row[0])
     return Evaluation(
         dataset=dataset,
         k=k,
@@ -175,60 +169,41 @@ class _Run:
         indices: Indices,
         seconds: float,
         checkpoint: str | None = None,
-        log_det: Array | None = None,
+        gram: Array | None = None,
     ) -> MethodResult:
-        """Judge (E, R, k) indices, unless their (E, R) ``log_det`` is known."""
-        if log_det is None:
-            gram = [
-                log_det_gram_of(self.dataset.candidates[cut], indices[cut])
-                for cut in self.pieces()
-            ]
-            log_det = self.dataset.num_outputs * np.concatenate(gram)
+        """Judge (E, R, k) indices, unless their (E, R) log det of Z.T Z is known."""
+        if gram is None:
+            candidates = self.dataset.candidates
+            parts = [log_det_gram_of(candidates[c], indices[c]) for c in self.pieces()]
+            gram = np.concatenate(parts)
         return MethodResult(
             method=method,
             label=label_of(method, self.num),
             checkpoint=checkpoint,
             indices=indices,
-            log_det=log_det,
+            log_det=self.dataset.num_outputs * gram,
             seconds=seconds / self.dataset.num_episodes,
             parameters=estimate_parameters(self.dataset, indices),
         )
 
-    def pieces(self, size: int = _CHUNK) -> Iterator[slice]:
+    def pieces(self, size: int = _CHUNK) -> list[slice]:
         """All episodes in slices of at most ``size``."""
         total = self.dataset.num_episodes
-        for begin in range(0, total, size):
-            yield slice(begin, min(begin + size, total))
+        return [slice(i, min(i + size, total)) for i in range(0, total, size)]
 
     def part(self, cut: slice) -> dict[str, Any]:
         """What every solver is given of some episodes."""
-        available = self.dataset.available
-        return {
-            "candidates": self.dataset.candidates[cut],
-            "k": self.k,
-            "available": None if available is None else available[cut],
-        }
+        mask = self.dataset.available
+        mask = None if mask is None else mask[cut]
+        candidates = self.dataset.candidates[cut]
+        return {"candidates": candidates, "k": self.k, "available": mask}
 
     def timed(
-        self,
-        label: str,
-        choose: Callable[[slice], T],
-        *,
-        size: int = _CHUNK,
-        warm: int = 1,
+        self, label: str, choose: Callable[[slice], T], size: int = _CHUNK
     ) -> tuple[list[T], float]:
-        """What ``choose`` returns for every piece, and the seconds that took.
-
-        Args:
-            label: for the progress.
-            choose: runs the method on some episodes.
-            size: episodes of a piece.
-            warm: episodes of a first call that is not counted: it may compile.
-        """
+        """What ``choose`` returns for every piece, and the seconds that took."""
         total = self.dataset.num_episodes
         self.progress(label, 0, total)
-        if warm:
-            choose(slice(0, min(warm, total)))
         found, seconds = [], 0.0
         for cut in self.pieces(size):
             start = time.perf_counter()
@@ -254,7 +229,8 @@ class _Run:
                 checkpoint=checkpoint,
             )
 
-        found, seconds = self.timed(label, choose, warm=_CHUNK)
+        choose(self.pieces()[0])  # not timed: it may compile
+        found, seconds = self.timed(label, choose)
         indices = np.concatenate(found)
         self.require_valid(label, indices)
         return self.result(method, indices[:, None], seconds, checkpoint)
@@ -278,8 +254,29 @@ class _Run:
 
     def solver(self, method: str) -> MethodResult:
         """A method without proof and without weights."""
-        solve = _SOLVERS[method]
-        found, seconds = self.timed(method, lambda cut: solve(self, self.part(cut)))
+
+        def choose(cut: slice) -> Indices:
+            part = self.part(cut)
+            if method == "greedy":
+                return selection.greedy_batch(**part).indices
+            if method == "exchange":
+                return selection.exchange_batch(**part, seed=self.seed).indices
+            masks = part["available"]
+            chosen = [
+                selection.select(
+                    candidates,
+                    self.k,
+                    "auto",
+                    available=None if masks is None else masks[i],
+                    num_outputs=self.dataset.num_outputs,
+                    seed=self.seed,
+                ).indices
+                for i, candidates in enumerate(part["candidates"])
+            ]
+            return np.array(chosen)
+
+        choose(slice(0, 1))  # not timed: it may compile
+        found, seconds = self.timed(method, choose)
         return self.result(method, np.concatenate(found)[:, None], seconds)
 
     def exact(
@@ -297,12 +294,13 @@ class _Run:
             )
 
         begun = time.perf_counter()
-        choose(slice(0, 1))  # may compile
+        choose(slice(0, 1))  # not timed: it may compile
         begun = time.perf_counter()
-        found, seconds = self.timed("exact", choose, size=_CHUNK_EXACT, warm=0)
-        indices = np.concatenate([batch.indices for batch in found])
-        proven = np.concatenate([batch.proven for batch in found])
-        bound = np.concatenate([batch.bound for batch in found])
+        found, seconds = self.timed("exact", choose, _CHUNK_EXACT)
+        indices, proven, bound = (
+            np.concatenate([getattr(batch, name) for batch in found])
+            for name in ("indices", "proven", "bound")
+        )
         result = self.result("exact", indices[:, None], seconds)
         reached = result.log_det[:, 0]
         return result, np.where(proven, reached, np.maximum(bound, reached)), proven
@@ -311,41 +309,8 @@ class _Run:
         """``draws`` selections an episode; the time is that of ``random_batch``."""
         batch = selection.random_batch(**self.part(slice(None)), seed=self.seed)
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(0,)))
-
-        def choose(cut: slice) -> tuple[Indices, Array]:
-            return draw_random(rng, **self.part(cut), num=draws)
-
-        found, _ = self.timed("random", choose, warm=0)
-        gram = np.concatenate([gram for _, gram in found])
-        return self.result(
-            "random",
-            np.concatenate([picks for picks, _ in found]),
-            batch.seconds,
-            log_det=self.dataset.num_outputs * gram,
+        found, _ = self.timed(
+            "random", lambda cut: draw_random(rng, **self.part(cut), num=draws)
         )
-
-
-def _auto(run: _Run, part: dict[str, Any]) -> Indices:
-    masks = part["available"]
-    return np.array(
-        [
-            selection.select(
-                candidates,
-                part["k"],
-                "auto",
-                available=None if masks is None else masks[i],
-                num_outputs=run.dataset.num_outputs,
-                seed=run.seed,
-            ).indices
-            for i, candidates in enumerate(part["candidates"])
-        ]
-    )
-
-
-_SOLVERS: dict[str, Callable[[_Run, dict[str, Any]], Indices]] = {
-    "greedy": lambda run, part: selection.greedy_batch(**part).indices,
-    "exchange": lambda run, part: (
-        selection.exchange_batch(**part, seed=run.seed).indices
-    ),
-    "auto": _auto,
-}
+        picks, gram = map(np.concatenate, zip(*found, strict=True))
+        return self.result("random", picks, batch.seconds, gram=gram)

@@ -43,14 +43,9 @@ def estimate_parameters(dataset: Dataset, indices: NDArray[np.int64]) -> Array |
 
 
 def least_squares(commands: Array, measured: Array) -> Array:
-    """Parameters of many sets of postures at once, without uncertainty.
+    """(..., m (n + 1)) A row by row, then b, of many sets of postures at once.
 
-    Args:
-        commands: (..., N, n) with N > n, each set of full rank.
-        measured: (..., N, m).
-
-    Returns:
-        (..., m (n + 1)) A row by row, then b.
+    ``commands`` are (..., N, n), N > n and of full rank, ``measured`` (..., N, m).
     """
     mean_u = commands.mean(axis=-2, keepdims=True)
     mean_y = measured.mean(axis=-2, keepdims=True)
@@ -62,14 +57,9 @@ def least_squares(commands: Array, measured: Array) -> Array:
 
 
 def predict(parameters: Array, commands: Array) -> Array:
-    """Outputs of many calibrations, the batched ``Calibration.predict``.
+    """(..., N, m) outputs at (..., N, n) commands: the batched ``Calibration.predict``.
 
-    Args:
-        parameters: (..., m (n + 1)) A row by row, then b.
-        commands: (..., N, n).
-
-    Returns:
-        (..., N, m).
+    ``parameters`` are (..., m (n + 1)), as those of ``least_squares``.
     """
     n = commands.shape[-1]
     m = parameters.shape[-1] // (n + 1)

@@ -7,31 +7,15 @@ import pathlib
 from collections.abc import Sequence
 from typing import Any
 
-from jaxcal.evaluation.results import Evaluation, Row, Summary, versions
-from jaxcal.files import atomic_write, write_text
+from jaxcal.evaluation.results import Evaluation, Summary, versions
+from jaxcal.files import atomic_write
 from jaxcal.pages import Block, Code, Figure, Page, Section, Table, Text, render
 
-__all__ = [
-    "file_prefixes",
-    "json_document",
-    "notes",
-    "text_table",
-    "versions",
-    "write_report",
-]
-
-FORMAT = "jaxcal-evaluation"
-VERSION = 1
+__all__ = ["file_prefixes", "json_document", "notes", "text_table", "write_report"]
 
 _COLUMNS = (
-    "method",
-    "mean det S",
-    "median det S",
-    "det S/det S*",
-    "hit rate",
-    "D-eff.",
-    "x random",
-    "time each",
+    *("method", "mean det S", "median det S", "det S/det S*", "hit rate"),
+    *("D-eff.", "x random", "time each"),
 )
 _ABOUT = (
     "det S is quoted in the unit of the dataset's commands; S is the information "
@@ -43,21 +27,16 @@ _ABOUT = (
 
 
 def text_table(shown: Summary, *, many: bool = False) -> str:
-    """One dataset as a table for the terminal.
-
-    Args:
-        shown: the numbers.
-        many: name the checkpoint of each policy.
-    """
+    """One dataset as a table; where there are ``many``, a policy's checkpoint too."""
     rows = [_COLUMNS, *_rows(shown, many)]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(_COLUMNS))]
-    lines = [
-        "  ".join(
-            [row[0].ljust(widths[0])]
-            + [cell.rjust(w) for cell, w in zip(row[1:], widths[1:], strict=True)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    rows.insert(1, tuple("-" * width for width in widths))
+    lines = []
+    for name, *cells in rows:
+        pairs = zip(cells, widths[1:], strict=True)
+        lines.append(
+            "  ".join([name.ljust(widths[0]), *(c.rjust(w) for c, w in pairs)])
         )
-        for row in [rows[0], tuple("-" * width for width in widths), *rows[1:]]
-    ]
     return "\n  ".join([_heading(shown), *lines, *notes(shown)])
 
 
@@ -81,15 +60,10 @@ def notes(shown: Summary) -> list[str]:
 
 
 def json_document(summaries: Sequence[Summary], *, command: Sequence[str]) -> str:
-    """The numbers of several evaluations; the layout is in docs/evaluation.md.
-
-    Args:
-        summaries: one a dataset.
-        command: what was typed, for the record.
-    """
+    """The numbers of several datasets; the layout is in docs/evaluation.md."""
     document = {
-        "format": FORMAT,
-        "version": VERSION,
+        "format": "jaxcal-evaluation",
+        "version": 1,
         "command": list(command),
         "versions": versions(),
         "results": [entry for shown in summaries for entry in _entries(shown)],
@@ -119,13 +93,12 @@ def write_report(
     """
     from jaxcal.evaluation.figures import evaluation_figures
     from jaxcal.evaluation.training_figure import training_curves
-    from jaxcal.plots import as_bytes
+    from jaxcal.plots.style import as_files
 
     files: dict[str, bytes] = {}
 
     def drawn(name: str, figure: Any) -> Figure:
-        for suffix in ("svg", "png"):
-            files[f"{name}.{suffix}"] = as_bytes(figure, suffix)
+        files[f"{name}.svg"], files[f"{name}.png"] = as_files(figure, "svg", "png")
         return Figure(files[f"{name}.svg"], name.replace("_", " "))
 
     sections = []
@@ -143,22 +116,20 @@ def write_report(
         curves.append(drawn(f"training_curves{suffix}", training_curves(run)))
     if curves:
         sections.append(Section("Training", curves))
+    made_with = ", ".join(f"{name} {v}" for name, v in versions().items())
     page = Page(
         "Posture selection against the proven optimum",
         sections,
-        intro=[
-            Text(Code(" ".join(command)), "note"),
-            Text(", ".join(f"{name} {v}" for name, v in versions().items()), "note"),
-        ],
+        intro=[Text(Code(" ".join(command)), "note"), Text(made_with, "note")],
         footer=[Text(_ABOUT, "note")],
     )
-    text = render(page)
+    count = len(files) // 2
+    files["index.html"] = render(page).encode()
     folder.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
         with atomic_write(folder / name) as file:
             file.write(data)
-    write_text(folder / "index.html", text)
-    return len(files) // 2
+    return count
 
 
 def file_prefixes(names: Sequence[str]) -> list[str]:
@@ -186,25 +157,25 @@ def _heading(shown: Summary) -> str:
 
 
 def _rows(shown: Summary, many: bool) -> list[tuple[str, ...]]:
-    return [_cells(row, many) for row in shown.rows]
-
-
-def _cells(row: Row, many: bool) -> tuple[str, ...]:
-    """One row of the table, a cell for each of ``_COLUMNS``."""
-    numbers = row.numbers
-    name, times = numbers["label"], numbers["ratio_to_random"]
-    if many and row.is_policy:
-        name += f" ({row.checkpoint or 'default'})"
-    return (
-        name,
-        _number(numbers["det_s"]["mean"]),
-        _number(numbers["det_s"]["median"]),
-        _share(numbers["ratio_to_exact"]),
-        _share(numbers["hit_rate"]),
-        _share(numbers["d_efficiency"]),
-        "-" if times is None else f"{times:,.0f}",
-        _time(numbers["seconds_per_selection"]),
-    )
+    """The rows of the table, a cell for each of ``_COLUMNS``."""
+    rows = []
+    for row in shown.rows:
+        numbers = row.numbers
+        name, times = numbers["label"], numbers["ratio_to_random"]
+        if many and row.is_policy:
+            name += f" ({row.checkpoint or 'default'})"
+        middle = (numbers["det_s"][moment] for moment in ("mean", "median"))
+        shares = ("ratio_to_exact", "hit_rate", "d_efficiency")
+        rows.append(
+            (
+                name,
+                *("-" if value is None else f"{value:.4g}" for value in middle),
+                *(_share(numbers[share]) for share in shares),
+                "-" if times is None else f"{times:,.0f}",
+                _time(numbers["seconds_per_selection"]),
+            )
+        )
+    return rows
 
 
 def _entries(shown: Summary) -> list[dict[str, Any]]:
@@ -231,10 +202,6 @@ def _entries(shown: Summary) -> list[dict[str, Any]]:
     ]
 
 
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.4g}"
-
-
 def _share(value: float) -> str:
     """Four decimals, and never 1.0000 for what is below it."""
     text = f"{value:.4f}"
@@ -242,7 +209,6 @@ def _share(value: float) -> str:
 
 
 def _time(seconds: float) -> str:
-    for unit, size in (("s", 1.0), ("ms", 1e-3)):
-        if seconds >= size:
-            return f"{seconds / size:.3g} {unit}"
-    return f"{seconds / 1e-6:.3g} µs"
+    units = {"s": 1.0, "ms": 1e-3, "µs": 1e-6}
+    unit = next((unit for unit, size in units.items() if seconds >= size), "µs")
+    return f"{seconds / units[unit]:.3g} {unit}"

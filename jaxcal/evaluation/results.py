@@ -95,21 +95,19 @@ class Evaluation:
     def summarise(self, *, indices: bool = False) -> Summary:
         """The numbers of every method.
 
-        Args:
-            indices: also what each chose in every episode (random: its first draw).
+        With ``indices`` also what each chose in every episode (random: its first draw).
         """
-        rows = []
+        rows, data = [], self.dataset
         for result in self.results:
             numbers = self.summary(result)
             if indices:
                 numbers["indices"] = result.indices[:, 0].tolist()
             rows.append(Row(result.method, result.checkpoint, numbers))
         names = None
-        if self.dataset.measured is not None:
-            names = parameter_names(self.dataset.num_inputs, self.dataset.num_outputs)
+        if data.measured is not None:
+            names = parameter_names(data.num_inputs, data.num_outputs)
         proven = int(self.proven.sum())
-        facts = self.dataset.facts()
-        return Summary(facts, self.k, self.seed, proven, tuple(rows), names)
+        return Summary(data.facts(), self.k, self.seed, proven, tuple(rows), names)
 
     def summary(self, result: MethodResult) -> dict[str, Any]:
         """The numbers of one method, as documented in docs/evaluation.md."""
@@ -120,8 +118,8 @@ class Evaluation:
         behind = np.minimum(behind, 0.0)
         with np.errstate(over="ignore"):
             det = np.exp(log_det)
+            times = np.exp(log_mean(log_det) - log_mean(self.random_log_det))
         num_parameters = m * (self.dataset.num_inputs + 1)
-        times = np.exp(log_mean(log_det) - log_mean(self.random_log_det))
         row: dict[str, Any] = {
             "label": result.label,
             "det_s": _moments(det),

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import itertools
 import json
 import pathlib
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
@@ -65,12 +66,11 @@ class Plan:
                 f"a streamed dataset must be one of {', '.join(self.source.endless)}, "
                 f"which are drawn from a seed without end, got {self.dataset!r}"
             )
-        for method in self.methods:
-            if method not in DEFAULT_METHODS:
-                raise ValueError(
-                    "a streamed method must be one of "
-                    f"{', '.join(DEFAULT_METHODS)}, got {method!r}"
-                )
+        for method in set(self.methods) - set(DEFAULT_METHODS):
+            known = ", ".join(DEFAULT_METHODS)
+            raise ValueError(
+                f"a streamed method must be one of {known}, got {method!r}"
+            )
         first = self.source.draw(self.dataset, self.seed, 0, 1)
         if not first.num_inputs < self.k < first.num_candidates:
             raise ValueError(
@@ -80,8 +80,8 @@ class Plan:
 
     def description(self) -> dict[str, Any]:
         """What ``stream.json`` says: equal for folders whose parts add up."""
-        names = [field.name for field in dataclasses.fields(self)]
-        values = {name: getattr(self, name) for name in names if name != "source"}
+        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        del values["source"]
         weights = {}
         if any(method in POLICIES for method in self.methods):
             from jaxcal.learning.training.checkpoint import fingerprint
@@ -148,22 +148,27 @@ def evaluate_stream(
         ValueError: a part is damaged, or a policy returned what it must not.
         OSError: the folder cannot be read or written, or a worker died.
     """
-    block = plan.source.block
-    if part < 1 or part % block:
-        raise ValueError(f"part must be a multiple of {block} episodes, got {part}")
+    size = plan.source.block
+    if part < 1 or part % size:
+        raise ValueError(f"part must be a multiple of {size} episodes, got {part}")
     report = progress or (lambda *_: None)
     workers = num_cores() if workers is None else workers
     cuts = [(begin, min(begin + part, episodes)) for begin in range(0, episodes, part)]
-    own = [
-        cut for cut in cuts[process[0] :: process[1]] if not _path(folder, cut).exists()
-    ]
-    todo = sum(end - begin for begin, end in own)
-    ahead = 1 + 2 * workers * block // part  # parts that keep the workers busy
-    done = 0
+    own = cuts[process[0] :: process[1]]
+    own = [cut for cut in own if not _path(folder, cut).exists()]
+    todo, done = sum(end - begin for begin, end in own), 0
     report("episodes", 0, todo)
     with worker_pool(workers) as executor:
-        for cut, blocks in _begun(plan, own, executor, ahead):
-            text = json.dumps(_added(cut, blocks), separators=(",", ":"))
+        begun = (
+            executor.submit(_solve_block, plan, begin, min(begin + size, end))
+            for first, end in own
+            for begin in range(first, end, size)
+        )
+        blocks = _ahead(begun, part // size + 2 * workers)
+        for cut in own:
+            parts = itertools.islice(blocks, len(range(*cut, size)))
+            added = {"episodes": list(cut)} | _as_json(*_added(parts))
+            text = json.dumps(added, separators=(",", ":"))
             write_text(_path(folder, cut), text + "\n")
             done += cut[1] - cut[0]
             report("episodes", done, todo)
@@ -172,11 +177,11 @@ def evaluate_stream(
     return _total(plan, episodes, folder, cuts, report)
 
 
-# -- one part --------------------------------------------------------------------------
+Block = tuple[int, dict[str, Tally]]  # proven optima, and the tally of every row
 
 
-def _solve_block(plan: Plan, begin: int, end: int) -> tuple[int, dict[str, Tally]]:
-    """Proven optima and the tally of every row, of the episodes of one stream."""
+def _solve_block(plan: Plan, begin: int, end: int) -> Block:
+    """What the episodes of one stream add."""
     dataset = plan.source.draw(plan.dataset, plan.seed, begin, end)
     found = evaluate(
         dataset,
@@ -202,54 +207,54 @@ def _solve_block(plan: Plan, begin: int, end: int) -> tuple[int, dict[str, Tally
     return int(found.proven.sum()), tallies
 
 
-Block = Future[tuple[int, dict[str, Tally]]]
+def _ahead(begun: Iterator[Future[Block]], most: int) -> Iterator[Block]:
+    """The results in their order, at most so many begun before they are taken."""
+    try:
+        waiting = collections.deque(itertools.islice(begun, most))
+        while waiting:
+            yield waiting.popleft().result()
+            waiting.extend(itertools.islice(begun, 1))
+    except BrokenProcessPool:
+        raise OSError(
+            "a worker process died, perhaps because memory ran out: use fewer "
+            "(--workers)"
+        ) from None
 
 
-def _begun(
-    plan: Plan, cuts: list[Cut], executor: Executor, ahead: int
-) -> Iterator[tuple[Cut, list[Block]]]:
-    """Every part with its blocks, some parts begun ahead of the one in hand."""
-    waiting: collections.deque[tuple[Cut, list[Block]]] = collections.deque()
-    size = plan.source.block
-    for cut in cuts:
-        blocks = [
-            executor.submit(_solve_block, plan, begin, min(begin + size, cut[1]))
-            for begin in range(*cut, size)
-        ]
-        waiting.append((cut, blocks))
-        if len(waiting) > ahead:
-            yield waiting.popleft()
-    yield from waiting
-
-
-def _added(cut: Cut, blocks: list[Block]) -> dict[str, Any]:
-    """What a part adds to the totals, as its file holds it."""
-    proven = 0
-    methods: dict[str, Tally] = collections.defaultdict(dict)
-    for block in blocks:
-        try:
-            count, tallies = block.result()
-        except BrokenProcessPool:
-            raise OSError(
-                "a worker process died, perhaps because memory ran out: use fewer "
-                "(--workers)"
-            ) from None
+def _added(parts: Iterable[Block]) -> Block:
+    """All of them added up."""
+    proven, totals = 0, collections.defaultdict[str, Tally](dict)
+    for count, tallies in parts:
         proven += count
         for name, row in tallies.items():
-            tally.add(methods[name], row)
-    rows = {name: tally.as_json(row) for name, row in methods.items()}
-    return {"episodes": list(cut), "proven": proven, "methods": rows}
+            tally.add(totals[name], row)
+    return proven, totals
+
+
+def _as_json(proven: int, tallies: dict[str, Tally]) -> dict[str, Any]:
+    rows = {name: tally.as_json(row) for name, row in tallies.items()}
+    return {"proven": proven, "methods": rows}
 
 
 def _key(method: str, checkpoint: str | None) -> str:
     return method if checkpoint is None else f"{method} {checkpoint}"
 
 
-# -- the folder ------------------------------------------------------------------------
-
-
 def _path(folder: pathlib.Path, cut: Cut) -> pathlib.Path:
     return folder / f"part-{cut[0]:012d}-{cut[1]:012d}.json"
+
+
+def _read_part(path: pathlib.Path, cut: Cut) -> Block:
+    try:
+        part = json.loads(path.read_text(encoding="utf-8"))
+        if part["episodes"] != list(cut):
+            raise ValueError(f"it says episodes {part['episodes']}")
+        rows = part["methods"].items()
+        return int(part["proven"]), {name: tally.from_json(row) for name, row in rows}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(
+            f"{path} is damaged ({error}); delete it, and it is computed again"
+        ) from None
 
 
 def _total(
@@ -260,39 +265,22 @@ def _total(
     report: Progress,
 ) -> Summary:
     """All parts of a folder added up."""
-    proven = 0
-    totals: dict[str, Tally] = collections.defaultdict(dict)
-    for number, cut in enumerate(cuts):
+
+    def read(number: int) -> Block:
         report("parts added up", number, len(cuts))
-        path = _path(folder, cut)
-        try:
-            part = json.loads(path.read_text(encoding="utf-8"))
-            if part["episodes"] != list(cut):
-                raise ValueError(f"it says episodes {part['episodes']}")
-            proven += int(part["proven"])
-            for name, row in part["methods"].items():
-                tally.add(totals[name], tally.from_json(row))
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise ValueError(
-                f"{path} is damaged ({error}); delete it, and it is computed again"
-            ) from None
+        return _read_part(_path(folder, cuts[number]), cuts[number])
+
+    proven, totals = _added(map(read, range(len(cuts))))
     facts = plan.source.draw(plan.dataset, plan.seed, 0, 1).facts()
-    return Summary(
-        dataset=facts | {"episodes": episodes},
-        k=plan.k,
-        seed=plan.seed,
-        num_proven=proven,
-        rows=tuple(
-            Row(
-                method,
-                checkpoint,
-                {"label": label_of(method, plan.num)}
-                | tally.summary(totals[_key(method, checkpoint)], totals["random"]),
-            )
-            for method, checkpoint in rows_of(plan.methods, plan.checkpoints)
-        ),
-        notes=(
-            "means and hit rates are of exact sums over all episodes; medians are read "
-            f"off a histogram of log det S with bins of 1/{BINS_PER_UNIT}",
-        ),
+    rows = []
+    for method, checkpoint in rows_of(plan.methods, plan.checkpoints):
+        own = totals[_key(method, checkpoint)]
+        numbers = {"label": label_of(method, plan.num)}
+        numbers |= tally.summary(own, totals["random"])
+        rows.append(Row(method, checkpoint, numbers))
+    note = (
+        "means and hit rates are of exact sums over all episodes; medians are read off "
+        f"a histogram of log det S with bins of 1/{BINS_PER_UNIT}"
     )
+    facts |= {"episodes": episodes}
+    return Summary(facts, plan.k, plan.seed, proven, tuple(rows), notes=(note,))

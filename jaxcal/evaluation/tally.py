@@ -98,12 +98,7 @@ def from_json(row: Mapping[str, int | str]) -> Tally:
 
 
 def summary(tally: Tally, random: Tally) -> dict[str, Any]:
-    """The numbers of one method, as documented in docs/evaluation.md.
-
-    Args:
-        tally: of the method.
-        random: the baseline behind ``ratio_to_random``.
-    """
+    """The numbers of one method against the baseline, see docs/evaluation.md."""
     count, episodes = tally["selections"], tally["episodes"]
     log_det: dict[str, float | None] = {"mean": None, "std": None}
     if not tally["singular"]:

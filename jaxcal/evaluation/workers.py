@@ -13,15 +13,9 @@ from multiprocessing import get_context, parent_process
 __all__ = ["num_cores", "worker_pool"]
 
 # The arrays of one block are too small to share among threads.
-_ONE_THREAD = dict.fromkeys(
-    (
-        "OPENBLAS_NUM_THREADS",
-        "OMP_NUM_THREADS",
-        "MKL_NUM_THREADS",
-        "NUMBA_NUM_THREADS",
-    ),
-    "1",
-)
+_ONE_THREAD = {
+    f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL", "NUMBA")
+}
 
 
 def num_cores() -> int:
@@ -36,17 +30,12 @@ def worker_pool(workers: int) -> Iterator[Executor]:
     """So many worker processes; one worker is a thread of this process.
 
     What has not begun when the block is left, is cancelled.
-
-    Raises:
-        ValueError: workers is below 1.
     """
     if workers < 1:
         raise ValueError(f"workers must be at least 1, got {workers}")
-    before = dict(os.environ)
-    pool: Executor
-    if workers == 1:
-        pool = ThreadPoolExecutor(1)
-    else:
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    pool: Executor = ThreadPoolExecutor(1)
+    if workers > 1:
         # Read when a worker starts, before it imports numpy.
         os.environ.update(_ONE_THREAD)
         pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin_worker)
@@ -54,11 +43,9 @@ def worker_pool(workers: int) -> Iterator[Executor]:
         yield pool
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-        for name in _ONE_THREAD:
-            if name in before:
-                os.environ[name] = before[name]
-            else:
-                os.environ.pop(name, None)
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            os.environ.update({} if value is None else {name: value})
 
 
 def _begin_worker() -> None:

@@ -4,24 +4,45 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
-from typing import Any, NoReturn
+from collections.abc import Callable, Iterable
+from typing import NoReturn
 
 from jaxcal.arguments import at_least
 
-__all__ = ["Parser", "positive", "run", "seed"]
+__all__ = ["Parser", "one_of", "positive", "run", "seed"]
+
+seed = at_least(0)  # for ``type=``
+positive = at_least(1)
 
 
 class Parser(argparse.ArgumentParser):
     """Reports a bad argument in one line and keeps the layout of its texts."""
 
-    def __init__(self, **fields: Any) -> None:
-        fields.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
-        super().__init__(allow_abbrev=False, **fields)
+    def __init__(self, prog: str, description: str, epilog: str = "") -> None:
+        layout = argparse.RawDescriptionHelpFormatter
+        super().__init__(
+            prog,
+            description=description,
+            epilog=epilog,
+            formatter_class=layout,
+            allow_abbrev=False,
+        )
 
     def error(self, message: str) -> NoReturn:
         print(f"{self.prog}: error: {message}; see --help", file=sys.stderr)
         sys.exit(2)
+
+
+def one_of(names: Iterable[str]) -> Callable[[str], str]:
+    """For ``type=``: one of the names."""
+
+    def parse(text: str) -> str:
+        if text not in names:
+            known = ", ".join(names)
+            raise argparse.ArgumentTypeError(f"must be one of {known}, got {text!r}")
+        return text
+
+    return parse
 
 
 def run(command: Callable[[], None], name: str, interrupted: str) -> int:
@@ -48,7 +69,3 @@ def run(command: Callable[[], None], name: str, interrupted: str) -> int:
         print(f"{name}: error: {text}", file=sys.stderr)
         return 3 if isinstance(error, RuntimeError) else 2
     return 0
-
-
-seed = at_least(0)  # for ``type=``
-positive = at_least(1)

@@ -32,9 +32,8 @@ class Decision(NamedTuple):
 class _Keys(nn.Module):
     """A linear map of candidates that is never applied to them.
 
-    A score ``q . (K.T p + b)`` is ``(K q) . p`` and a number that is the same for every
-    candidate, which no softmax sees; a weighted mean of keys is the key of the weighted
-    mean. So the map is applied to a few queries and not to every candidate.
+    A score ``q . (K.T p + b)`` is ``(K q) . p`` and a number that no softmax sees, and
+    a mean of keys is the key of the mean: the map is applied to a few queries instead.
     """
 
     width: int
@@ -83,7 +82,6 @@ class PaperNetwork(nn.Module):
     def candidate_features(
         self, candidates: jax.Array, usable: jax.Array
     ) -> Candidates:
-        """The candidates as they are."""
         return Candidates(candidates)
 
     def decision_features(
@@ -93,7 +91,6 @@ class PaperNetwork(nn.Module):
         available: jax.Array,
         count: int | jax.Array,
     ) -> Decision:
-        """The ten context numbers and the availability of the 210."""
         return Decision(context_features(features.poses, chosen), available)
 
     def shares_program(self, features: Candidates, k: int) -> range:

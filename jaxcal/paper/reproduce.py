@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import pathlib
 import time
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from jaxcal.progress import Progress
 
 if TYPE_CHECKING:
     from jaxcal.paper.exhibits.exhibit import Claim, Exhibit
-    from jaxcal.paper.exhibits.settings import Settings
+    from jaxcal.paper.exhibits.material import Settings
 
 __all__ = ["main"]
 
@@ -43,7 +44,11 @@ examples:
   python -m jaxcal.paper --seed 1 --out report_1
       other candidate sets, draws and devices: how much of it is luck?
 """
-_ORDER = (
+_PARTS = (  # modules of exhibits, in the order in which they are computed
+    *("training", "calibration", "selection", "variance", "pictures", "tables"),
+    *("accuracy", "ellipsoids", "recalibration", "recorded"),
+)
+_ORDER = (  # of the exhibits, that of the paper
     *("robot", "table_1", "figure_1", "table_2", "table_3", "rank", "reward_range"),
     *("figure_2_paper", "figure_2", "figure_3", "gap_to_optimum", "figure_4"),
     *("figure_5", "ellipsoids", "figure_6", "figure_7", "figure_8", "figure_9"),
@@ -74,23 +79,20 @@ def _run(options: argparse.Namespace, progress: Progress) -> None:
 
     from jaxcal.learning.runtime import cache
     from jaxcal.paper.exhibits.claims import claims
-    from jaxcal.paper.exhibits.settings import STUDIES, Settings
+    from jaxcal.paper.exhibits.material import STUDIES, Settings
 
     cache.keep_compiled_programs()
-    settings = Settings(
-        seed=options.seed,
-        quick=options.quick,
-        data=options.data,
-        studies=options.studies or STUDIES,
-    )
+    studies = options.studies or STUDIES
+    settings = Settings(options.seed, options.quick, options.data, studies)
     exhibits = _exhibits(settings, progress)
     judged = claims(exhibits, settings.recorded)
     _write(options.out, _files(settings, exhibits, judged, progress))
     progress.clear()
     for claim in judged:
         print(f"{claim.verdict:>15}  {claim.claim}: {claim.ours}")
-    for notice in filter(None, (e.notice for e in exhibits)):
-        print(f"note: {notice}")
+    for exhibit in exhibits:
+        if exhibit.notice:
+            print(f"note: {exhibit.notice}")
     print(
         f"saved: {options.out}/index.html, reproduction.json, "
         f"{sum(len(e.figures) for e in exhibits)} figures, "
@@ -102,28 +104,16 @@ def _run(options: argparse.Namespace, progress: Progress) -> None:
 
 def _exhibits(settings: Settings, progress: Progress) -> list[Exhibit]:
     """All of them, in the order of the paper."""
-    from jaxcal.paper.exhibits import (
-        accuracy,
-        calibration,
-        pictures,
-        recalibration,
-        selection,
-        tables,
-        training,
-    )
     from jaxcal.paper.exhibits.material import Material
 
     material = Material(settings, progress)
     # Small inputs that may be wrong come first: a bad file is refused at once.
     for name in ("dataset5", "dataset4"):
         material.dataset(name)
-    parts = (
-        *(training, calibration, selection, pictures),
-        *(tables, accuracy, recalibration),
-    )
     found: list[Exhibit] = []
-    for number, part in enumerate(parts):
-        material.stage = f"part {number + 1} of {len(parts)}, "
+    for number, name in enumerate(_PARTS):
+        material.stage = f"part {number + 1} of {len(_PARTS)}, "
+        part = importlib.import_module(f"jaxcal.paper.exhibits.{name}")
         found += part.exhibits(material)
     return sorted(found, key=lambda exhibit: _ORDER.index(exhibit.key))
 
@@ -135,20 +125,20 @@ def _files(
     progress: Progress,
 ) -> dict[str, bytes]:
     """Everything to write, by path below the folder; the page last."""
-    from jaxcal.paper.exhibits.columns import as_csv
+    from jaxcal.evaluation.csv_rows import csv_text
     from jaxcal.paper.exhibits.page import json_document, page
-    from jaxcal.plots import as_bytes
+    from jaxcal.plots.style import as_files
 
     figures = {name: f for e in exhibits for name, f in e.figures.items()}
     files: dict[str, bytes] = {}
     for number, (name, figure) in enumerate(figures.items()):
         progress("drawing", number, len(figures))
-        files[f"figures/{name}.svg"] = as_bytes(figure, "svg")
-        files[f"figures/{name}.png"] = as_bytes(figure, "png")
+        svg, png = as_files(figure, "svg", "png")
+        files |= {f"figures/{name}.svg": svg, f"figures/{name}.png": png}
     for exhibit in exhibits:
         files |= {f"figures/{name}": p for name, p in exhibit.pictures.items()}
         for name, columns in exhibit.tables.items():
-            files[f"data/{name}"] = as_csv(columns).encode()
+            files[f"data/{name}"] = csv_text(columns).encode()
     images = {name: files[f"figures/{name}.svg"] for name in figures}
     files["reproduction.json"] = json_document(exhibits, judged, settings).encode()
     files["index.html"] = page(exhibits, judged, images, settings).encode()
@@ -157,9 +147,8 @@ def _files(
 
 def _write(out: pathlib.Path, files: dict[str, bytes]) -> None:
     """Each atomically; figures and tables left from an earlier report are removed."""
-    for folder in ("figures", "data"):
-        (out / folder).mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(out / name) as file:
             file.write(data)
     for folder, kinds in (("figures", (".png", ".svg", ".gif")), ("data", (".csv",))):
@@ -169,9 +158,7 @@ def _write(out: pathlib.Path, files: dict[str, bytes]) -> None:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = command.Parser(
-        prog="python -m jaxcal.paper", description=_DESCRIPTION, epilog=_EPILOG
-    )
+    parser = command.Parser("python -m jaxcal.paper", _DESCRIPTION, _EPILOG)
     add = parser.add_argument
     folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
     add("--quick", action="store_true", help="fewer episodes, draws and devices")

@@ -9,9 +9,7 @@ goes to a folder of its own: ``metrics.csv`` (the trainer's columns, at most
 from __future__ import annotations
 
 import argparse
-import csv
 import dataclasses
-import io
 import json
 import pathlib
 import shutil
@@ -22,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.evaluation.csv_rows import csv_text
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.paper import command
 
@@ -30,7 +29,6 @@ __all__ = ["FORMAT", "MAX_ROWS", "collect", "main", "thinned", "train_seed"]
 Array = NDArray[np.float64]
 
 FORMAT = "jaxcal-training-run"
-VERSION = 1
 MAX_ROWS = 1_000
 _VALIDATE_EVERY_S = 5.0  # a curve of a few minutes has some dozens of points
 _LAST_OF_BLOCK = ("update", "episodes", "seconds", "learning_rate")
@@ -74,29 +72,20 @@ def train_seed(
     from jaxcal.selection.teacher import fixed_validation
 
     require_writable_folder(folder)
-    steps = folder / "checkpoint"
-    resume = steps.is_dir() and any(path.name.isdigit() for path in steps.iterdir())
+    resume = any(path.name.isdigit() for path in folder.glob("checkpoint/*"))
     if resume:
         held = TrainConfig.from_meta(checkpoint.load(folder).meta)
         if held.as_meta() != config.as_meta():
             raise ValueError(
                 f"{folder} holds a run of another configuration: name another --runs"
             )
-    training.train(
-        config,
-        folder,
-        resume=resume,
-        validation=fixed_validation(config) if validate else None,
-        report=report or (lambda _: None),
-    )
+    validation = fixed_validation(config) if validate else None
+    report = report or (lambda _: None)
+    training.train(config, folder, resume=resume, validation=validation, report=report)
 
 
 def collect(run: pathlib.Path, out: pathlib.Path) -> dict[str, Any]:
-    """Keep what a report needs of a run folder; the summary that was written.
-
-    Args:
-        run: folder of a run, finished or not.
-        out: made where missing; what it holds of an earlier collection is replaced.
+    """Keep in ``out`` what a report needs of a run, finished or not; its summary.
 
     Raises:
         OSError: the run holds no metrics.csv, or ``out`` cannot be written.
@@ -105,12 +94,12 @@ def collect(run: pathlib.Path, out: pathlib.Path) -> dict[str, Any]:
     from jaxcal.evaluation.training_figure import read_metrics
 
     metrics = read_metrics(run / "metrics.csv")
-    summary = _summary(run, metrics)
+    summary = _summary(run, len(metrics["episodes"]))
     out.mkdir(parents=True, exist_ok=True)
     rewards = run / "last_rewards.npy"
     if rewards.is_file():
         shutil.copyfile(rewards, out / "last_rewards.npy")
-    write_text(out / "metrics.csv", _as_csv(thinned(metrics)))
+    write_text(out / "metrics.csv", csv_text(thinned(metrics), digits=7))
     write_text(out / "summary.json", json.dumps(summary, indent=1) + "\n")
     return summary
 
@@ -125,33 +114,26 @@ def thinned(metrics: dict[str, Array], most: int = MAX_ROWS) -> dict[str, Array]
     count = len(metrics["episodes"])
     if count <= most:
         return metrics
-    blocks = np.array_split(np.arange(count), most)
-    out: dict[str, Array] = {}
-    for name, values in metrics.items():
+
+    def row(name: str, values: Array, block: NDArray[np.int64]) -> float:
+        own = values[block]
         if name in _LAST_OF_BLOCK:
-            rows = [values[block[-1]] for block in blocks]
-        elif name in _IF_MEASURED:
-            known = [values[block][np.isfinite(values[block])] for block in blocks]
-            rows = [part[-1] if part.size else np.nan for part in known]
-        elif name == "reward_std":
-            mean = metrics["reward_mean"]
-            rows = [np.sqrt((values[b] ** 2).mean() + mean[b].var()) for b in blocks]
-        else:
-            rows = [values[block].mean() for block in blocks]
-        out[name] = np.array(rows)
-    return out
+            return own[-1]
+        if name in _IF_MEASURED:
+            known = own[np.isfinite(own)]
+            return known[-1] if known.size else np.nan
+        if name == "reward_std":
+            return np.sqrt((own**2).mean() + metrics["reward_mean"][block].var())
+        return own.mean()
+
+    blocks = np.array_split(np.arange(count), most)
+    return {
+        name: np.array([row(name, values, block) for block in blocks])
+        for name, values in metrics.items()
+    }
 
 
-def _as_csv(metrics: dict[str, Array]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(metrics)
-    for row in zip(*metrics.values(), strict=True):
-        writer.writerow(["" if np.isnan(v) else f"{v:.7g}" for v in row])
-    return text.getvalue()
-
-
-def _summary(run: pathlib.Path, metrics: dict[str, Array]) -> dict[str, Any]:
+def _summary(run: pathlib.Path, rows: int) -> dict[str, Any]:
     """What the run was and how good its policy is, measured on dataset2."""
     import jax
 
@@ -160,28 +142,28 @@ def _summary(run: pathlib.Path, metrics: dict[str, Array]) -> dict[str, Any]:
     from jaxcal.paper.datasets import make_dataset
 
     policy = checkpoint.load(run)
-    measured = evaluate(
-        make_dataset("dataset2"), 4, ("policy",), (str(run),), random_draws=1
-    )
+    data = make_dataset("dataset2")
+    measured = evaluate(data, 4, ("policy",), (str(run),), random_draws=1)
     row = measured.summary(measured.results[0])
-    progress = policy.meta["progress"]
+    meta, progress = policy.meta, policy.meta["progress"]
+    planned = meta["ppo"]["num_episodes"]
     return {
         "format": FORMAT,
-        "version": VERSION,
-        "preset": policy.meta["preset"],
-        "network": policy.meta["network"]["kind"],
+        "version": 1,
+        "preset": meta["preset"],
+        "network": meta["network"]["kind"],
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(policy.params)),
-        "seed": policy.meta["seed"],
+        "seed": meta["seed"],
         "episodes": progress["episodes"],
-        "planned_episodes": policy.meta["ppo"]["num_episodes"],
-        "episodes_per_update": policy.meta["ppo"]["episodes_per_update"],
-        "finished": progress["episodes"] >= policy.meta["ppo"]["num_episodes"],
+        "planned_episodes": planned,
+        "episodes_per_update": meta["ppo"]["episodes_per_update"],
+        "finished": progress["episodes"] >= planned,
         "seconds": float(progress["seconds"]),
         "device": progress["device"],
-        "versions": policy.meta["versions"],
-        "rows": [len(metrics["episodes"]), min(len(metrics["episodes"]), MAX_ROWS)],
+        "versions": meta["versions"],
+        "rows": [rows, min(rows, MAX_ROWS)],
         "dataset2": {
-            "episodes": measured.dataset.num_episodes,
+            "episodes": data.num_episodes,
             "ratio_to_exact": row["ratio_to_exact"],
             "hit_rate": row["hit_rate"],
             "log_det_s_mean": row["log_det_s"]["mean"],
@@ -203,7 +185,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not (options.collect / "metrics.csv").is_file():
             raise ValueError(f"--collect {options.collect} holds no metrics.csv")
         require_writable_folder(options.out)
-        _say(options.out, collect(options.collect, options.out))
+        _collect(options.collect, options.out)
 
     return command.run(keep, "training_runs", "the same command continues from here")
 
@@ -216,51 +198,51 @@ def _train_all(options: argparse.Namespace) -> None:
     runs = options.runs or pathlib.Path("runs") / options.out.resolve().name
     for folder in (options.out, runs):
         require_writable_folder(folder)
-    for number, seed in enumerate(options.seeds):
+    for number, seed in enumerate(options.seeds, start=1):
         values = {"seed": seed}
         if options.episodes is not None:
             values["num_episodes"] = options.episodes
         config = presets.with_values(presets.load(options.preset), values)
         config = dataclasses.replace(config, validate_every=_VALIDATE_EVERY_S)
-        target = options.out / f"seed_{seed}"
+        run, target = (folder / f"seed_{seed}" for folder in (runs, options.out))
         if _is_finished(target / "summary.json", config):
             print(f"{target}: already finished", flush=True)
             continue
-        name = f"seed {seed} ({number + 1} of {len(options.seeds)})"
+        name = f"seed {seed} ({number} of {len(options.seeds)})"
 
         def report(now: Any, name: str = name, config: Any = config) -> None:
-            print(
+            text = (
                 f"{name}: {now.episodes:,} of {config.ppo.num_episodes:,} episodes, "
                 f"{now.episodes_per_second:,.0f}/s, {now.eta / 60:.1f} min left, "
-                f"reward {now.metrics['reward_mean']:.4f}",
-                file=sys.stderr,
-                flush=True,
+                f"reward {now.metrics['reward_mean']:.4f}"
             )
+            print(text, file=sys.stderr, flush=True)
 
-        train_seed(config, runs / f"seed_{seed}", report=report)
-        _say(target, collect(runs / f"seed_{seed}", target))
+        train_seed(config, run, report=report)
+        _collect(run, target)
 
 
 def _is_finished(path: pathlib.Path, config: Any) -> bool:
     """Whether this seed is done; ValueError where it is one of another training."""
     if not path.is_file():
         return False
+    wanted = (config.preset, config.ppo.num_episodes, config.ppo.seed)
     try:
         held = json.loads(path.read_text(encoding="utf-8"))
         same = (held["preset"], held["planned_episodes"], held["seed"])
         finished = bool(held["finished"])
     except (ValueError, KeyError, TypeError):
         raise ValueError(f"{path} is not the summary of a training run") from None
-    wanted = (config.preset, config.ppo.num_episodes, config.ppo.seed)
     if same != wanted:
-        raise ValueError(
-            f"{path} is of preset {same[0]}, {same[1]} episodes, seed {same[2]}, not "
-            f"{wanted[0]}, {wanted[1]}, {wanted[2]}: name another --out"
+        own, other = (
+            "preset {}, {} episodes, seed {}".format(*t) for t in (same, wanted)
         )
+        raise ValueError(f"{path} is of {own}, not {other}: name another --out")
     return finished
 
 
-def _say(out: pathlib.Path, summary: dict[str, Any]) -> None:
+def _collect(run: pathlib.Path, out: pathlib.Path) -> None:
+    summary = collect(run, out)
     good = summary["dataset2"]
     print(
         f"{out}: {summary['episodes']:,} of {summary['planned_episodes']:,} episodes, "
@@ -272,9 +254,7 @@ def _say(out: pathlib.Path, summary: dict[str, Any]) -> None:
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = command.Parser(
-        prog="python -m jaxcal.paper.training_runs",
-        description=_DESCRIPTION,
-        epilog=_EPILOG,
+        "python -m jaxcal.paper.training_runs", _DESCRIPTION, _EPILOG
     )
     add = parser.add_argument
     number: dict[str, Any] = {"type": command.positive, "metavar": "N"}
@@ -288,30 +268,29 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     options = parser.parse_args(arguments)
     if (options.preset is None) == (options.collect is None):
         parser.error("give one of --preset and --collect")
-    if options.preset is not None:
-        from jaxcal.learning.training import presets
+    if options.preset is None:
+        if options.seeds or options.episodes or options.runs:
+            parser.error("--seeds, --episodes and --runs go with --preset")
+        return options
+    from jaxcal.learning.training import presets
 
-        if options.preset not in presets.names():
-            known = ", ".join(presets.names())
-            parser.error(f"--preset must be one of {known}, got {options.preset!r}")
-    elif options.seeds or options.episodes or options.runs:
-        parser.error("--seeds, --episodes and --runs go with --preset")
+    if options.preset not in presets.names():
+        known = ", ".join(presets.names())
+        parser.error(f"--preset must be one of {known}, got {options.preset!r}")
     options.seeds = options.seeds or list(range(5))
     return options
 
 
 def _seeds(text: str) -> list[int]:
-    try:
-        numbers = [int(part) for part in text.split(",")]
-    except ValueError:
-        numbers = [-1]
-    if "," not in text and numbers[0] > 0:
-        return list(range(numbers[0]))
-    if "," not in text or min(numbers) < 0:
-        raise argparse.ArgumentTypeError(
-            f"must be a number of seeds or a list like 3,5,8, got {text!r}"
-        )
-    return list(dict.fromkeys(numbers))
+    parts = text.split(",")
+    if all(part.isdecimal() for part in parts):
+        if len(parts) > 1:
+            return list(dict.fromkeys(map(int, parts)))
+        if int(text) > 0:
+            return list(range(int(text)))
+    raise argparse.ArgumentTypeError(
+        f"must be a number of seeds or a list like 3,5,8, got {text!r}"
+    )
 
 
 if __name__ == "__main__":

@@ -1,13 +1,5 @@
 """Figures: the style that all share, and those of a selection (``plots.selection``)."""
 
-from jaxcal.plots.style import (
-    BLACK,
-    COLOURS,
-    GREY,
-    MARKERS,
-    STYLES,
-    as_bytes,
-    plain_axes,
-)
+from jaxcal.plots.style import as_bytes
 
-__all__ = ["BLACK", "COLOURS", "GREY", "MARKERS", "STYLES", "as_bytes", "plain_axes"]
+__all__ = ["as_bytes"]

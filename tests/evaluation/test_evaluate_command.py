@@ -15,10 +15,13 @@ import numpy as np
 import pytest
 
 from jaxcal.commands import evaluate as command
+from jaxcal.evaluation import stream
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import save_csv, save_npz
+from jaxcal.evaluation.tally import tally_of
 from jaxcal.information.regression import regression_matrix
 from jaxcal.paper.datasets.datasets import make_dataset
+from jaxcal.progress import Progress
 
 ROOT = pathlib.Path(__file__).parents[2]
 
@@ -250,29 +253,41 @@ def test_a_missing_extra_is_one_line_that_names_the_command(
     [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")],
 )
 def test_a_stopped_command_writes_nothing(
-    tmp_path: pathlib.Path, number: int, code: int, says: str
+    tmp_path: pathlib.Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    number: int,
+    code: int,
+    says: str,
 ) -> None:
-    child = subprocess.Popen(
-        [
-            *(sys.executable, str(ROOT / "evaluate.py"), "--dataset", "dataset3"),
-            # minutes of work, so that the signal cannot come too late
-            *("dataset1", "--methods", "exact", "--k", "9"),
-            *("--json", str(tmp_path / "o.json")),
-        ],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=ROOT,
-    )
-    assert child.stdout is not None
-    assert child.stdout.readline().startswith("dataset3")
-    child.send_signal(number)
-    _, errors = child.communicate(timeout=120)
-    assert child.returncode == code, errors
-    assert errors.splitlines()[-1] == f"evaluate.py: {says}, nothing was written"
+    def stop(_: object, task: str, done: int, total: int) -> None:
+        if done:
+            signal.raise_signal(number)
+
+    monkeypatch.setattr(Progress, "__call__", stop)
+    out = tmp_path / "o.json"
+    done = call(capsys, "--episodes", 3, "--methods", "greedy", "--json", out)
+    assert done.returncode == code and done.stdout == ""
+    assert done.stderr == f"evaluate.py: {says}, nothing was written\n"
     assert list(tmp_path.iterdir()) == []
+    folder = tmp_path / "parts"
+    ones = np.ones(1_000)
+    row = tally_of(ones[:, None], ones, ones > 0, 3, 12, 0.1)
+    block = (1_000, {"random": row, "greedy": row})
+    monkeypatch.setattr(stream, "_solve_block", lambda *_: block)
+    done = call(
+        capsys,
+        *("--stream", folder, "--episodes", 9_000, "--methods", "greedy"),
+        *("--draws", 2, "--workers", 1),
+    )
+    assert done.returncode == code
+    kept = "finished parts are kept; the same command goes on"
+    assert done.stderr == f"evaluate.py: {says}, {kept}\n"
+    names = {path.name for path in folder.iterdir()}
+    assert names == {"stream.json", "part-000000000000-000000005000.json"}
 
 
+@pytest.mark.slow  # the test before covers the path in this process
 def test_a_stream_stopped_by_sigterm_says_so_and_keeps_its_parts(
     tmp_path: pathlib.Path,
 ) -> None:

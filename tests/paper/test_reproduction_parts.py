@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from jaxcal.calibration.identify import identify
+from jaxcal.evaluation.csv_rows import csv_text
 from jaxcal.evaluation.parameters import least_squares, predict
 from jaxcal.paper.datasets import make_dataset
 from jaxcal.paper.exhibits import pictures
-from jaxcal.paper.exhibits.columns import as_csv
 from jaxcal.paper.exhibits.devices import Device
 from jaxcal.paper.exhibits.intervals import (
     bootstrap_interval,
@@ -27,10 +27,9 @@ from jaxcal.paper.exhibits.intervals import (
     paired,
     share_interval,
 )
-from jaxcal.paper.exhibits.material import Material
-from jaxcal.paper.exhibits.selection import variance_table
-from jaxcal.paper.exhibits.settings import Settings
+from jaxcal.paper.exhibits.material import Material, Settings
 from jaxcal.paper.exhibits.training import exhibits, kept_runs, plateau
+from jaxcal.paper.exhibits.variance import variance_table
 from jaxcal.paper.training_runs import FORMAT
 from jaxcal.paper.twin import robot_pictures
 from jaxcal.paper.twin.robot import RobotConfig
@@ -139,10 +138,10 @@ def test_a_device_drifts_as_a_random_walk(rng: np.random.Generator) -> None:
 
 
 def test_csv_keeps_twelve_digits_and_refuses_ragged_columns() -> None:
-    text = as_csv({"a": np.array([1 / 3, np.nan]), "b": ["x", 2]})
+    text = csv_text({"a": np.array([1 / 3, np.nan]), "b": ["x", 2]})
     assert text == "a,b\n0.333333333333,x\n,2\n"
     with pytest.raises(ValueError):
-        as_csv({"a": [1.0], "b": [1.0, 2.0]})
+        csv_text({"a": [1.0], "b": [1.0, 2.0]})
 
 
 def test_recordings_can_be_given(tmp_path: pathlib.Path) -> None:
@@ -156,7 +155,7 @@ def test_recordings_can_be_given(tmp_path: pathlib.Path) -> None:
         rows = [",".join(map(repr, row)) for row in np.hstack([u, y]).tolist()]
         (tmp_path / f"{name}.csv").write_text("\n".join([header, *rows]) + "\n")
     given = Material(Settings(data=tmp_path))
-    found = given.all_parameters("dataset4")
+    found = given.parameters("dataset4", "all 50")[:, 0]
     assert found.shape == (100, 12)
     expected = [0.5, 0, 0, 0, 0.6, 0, 0, 0, 0.7, 1, 2, 3]
     np.testing.assert_allclose(found, np.tile(expected, (100, 1)), atol=1e-9)

@@ -4,39 +4,7 @@
 ``python -m jaxcal.paper.datasets.record`` records 4 and 5 against the rig's simulator.
 """
 
-from jaxcal.paper.constants import (
-    AXES,
-    BIAS_DEG,
-    BLOCK,
-    DRAWN,
-    EPISODES,
-    NAMES,
-    NOISE_STD_DEG,
-    NUM_CANDIDATES,
-    RANGES,
-    RECORDED,
-    SCALE,
-)
-from jaxcal.paper.datasets.datasets import chunks, dataset0_robot, drawn, make_dataset
-from jaxcal.paper.datasets.recordings import SHIPPED, read_pool, recorded_dataset
+from jaxcal.paper.constants import BIAS_DEG, SCALE
+from jaxcal.paper.datasets.datasets import chunks, dataset0_robot, make_dataset
 
-__all__ = [
-    "AXES",
-    "BIAS_DEG",
-    "BLOCK",
-    "DRAWN",
-    "EPISODES",
-    "NAMES",
-    "NOISE_STD_DEG",
-    "NUM_CANDIDATES",
-    "RANGES",
-    "RECORDED",
-    "SCALE",
-    "SHIPPED",
-    "chunks",
-    "dataset0_robot",
-    "drawn",
-    "make_dataset",
-    "read_pool",
-    "recorded_dataset",
-]
+__all__ = ["BIAS_DEG", "SCALE", "chunks", "dataset0_robot", "make_dataset"]

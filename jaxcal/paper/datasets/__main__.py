@@ -7,13 +7,15 @@ import json
 import pathlib
 import sys
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import save_csv_parts, save_npz
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.paper import command
-from jaxcal.paper.datasets import BLOCK, EPISODES, NAMES, make_dataset
+from jaxcal.paper.constants import BLOCK, EPISODES, NAMES
 from jaxcal.paper.datasets.data_card import card_of, digest_of, page_of
+from jaxcal.paper.datasets.datasets import make_dataset
 from jaxcal.progress import Progress
 
 __all__ = ["main", "write_datasets"]
@@ -36,7 +38,7 @@ def write_datasets(
     recordings: pathlib.Path | None = None,
     progress: Progress | None = None,
 ) -> list[pathlib.Path]:
-    """Write datasets, one whole file after the other.
+    """Write datasets, one whole file after the other; the files.
 
     Args:
         folder: made when missing.
@@ -47,31 +49,28 @@ def write_datasets(
         recordings: folder of dataset4.csv and dataset5.csv; the shipped one when None.
         progress: told how far each is.
 
-    Returns:
-        The files.
-
     Raises:
         OSError: the folder cannot be written, or a recording not be read.
         ValueError: of an argument or a recording.
     """
-    progress = progress or Progress(quiet=True)
+    report = progress or Progress(quiet=True)
     folder.mkdir(parents=True, exist_ok=True)
     written, cards = [], []
     for name in names:
         total = EPISODES[name] if episodes is None else min(episodes, EPISODES[name])
-        data = make_dataset(name, seed, total, recordings=recordings, progress=progress)
+        data = make_dataset(name, seed, total, recordings=recordings, progress=report)
         files = [folder / f"{name}.{kind}" for kind in formats]
         for path in files:
             if path.suffix == ".npz":
                 save_npz(data, path)
             else:
-                save_csv_parts(_parts(data, f"write {path.name}", progress), path)
+                save_csv_parts(_parts(data, f"write {path.name}", report), path)
         digests = {path.name: digest_of(path) for path in files}
         cards.append(card_of(data, digests, recordings=recordings))
         files.append(folder / f"{name}.json")
         write_text(files[-1], json.dumps(cards[-1], indent=2) + "\n")
         written += files
-    progress.clear()
+    report.clear()
     write_text(folder / "README.md", page_of(cards))
     return [*written, folder / "README.md"]
 
@@ -84,21 +83,14 @@ def _parts(data: Dataset, task: str, progress: Progress) -> Iterator[Dataset]:
 
 def main(arguments: list[str] | None = None) -> int:
     """Write; the exit code."""
-    options = _parse(arguments)
-    progress = Progress(quiet=options.quiet)
+    options = vars(_parser().parse_args(arguments))
+    folder, names = options.pop("out"), list(dict.fromkeys(options.pop("names")))
+    progress = Progress(quiet=options.pop("quiet"))
 
     def write() -> None:
-        require_writable_folder(options.out)
+        require_writable_folder(folder)
         try:
-            files = write_datasets(
-                options.out,
-                list(dict.fromkeys(options.names)) or NAMES,
-                options.seed,
-                episodes=options.episodes,
-                formats=list(dict.fromkeys(options.formats.split(","))),
-                recordings=options.recordings,
-                progress=progress,
-            )
+            files = write_datasets(folder, names or NAMES, progress=progress, **options)
         finally:
             progress.clear()
         for file in files:
@@ -107,36 +99,29 @@ def main(arguments: list[str] | None = None) -> int:
     return command.run(write, "datasets", "each file in the folder is complete")
 
 
-def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = command.Parser(
-        prog="python -m jaxcal.paper.datasets", description=_DESCRIPTION
-    )
+def _formats(text: str) -> list[str]:
+    kinds = list(dict.fromkeys(text.split(",")))
+    if set(kinds) - {"npz", "csv"}:
+        raise argparse.ArgumentTypeError(f"must be npz, csv or both, got {text!r}")
+    return kinds
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = command.Parser("python -m jaxcal.paper.datasets", _DESCRIPTION)
     add = parser.add_argument
-    add("names", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}; all")
-    add("--out", type=pathlib.Path, required=True, metavar="DIR")
+    folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
+    name = command.one_of(NAMES)
+    add("names", nargs="*", type=name, metavar="NAME", help=f"{', '.join(NAMES)}; all")
+    add("--out", required=True, **folder)
     add("--seed", type=command.seed, default=0, metavar="S", help="of every dataset; 0")
-    add(
-        "--episodes",
-        type=command.positive,
-        metavar="N",
-        help="at most the first N of each",
-    )
-    add("--formats", default="npz,csv", metavar="LIST", help="npz,csv")
-    add(
-        "--recordings",
-        type=pathlib.Path,
-        metavar="DIR",
-        help="folder of dataset4.csv and dataset5.csv, your own; the shipped ones",
-    )
+    size: dict[str, Any] = {"type": command.positive, "metavar": "N"}
+    add("--episodes", help="at most the first N of each", **size)
+    kinds: dict[str, Any] = {"type": _formats, "default": "npz,csv"}
+    add("--formats", metavar="LIST", help="npz,csv", **kinds)
+    about = "folder of dataset4.csv and dataset5.csv, your own; the shipped ones"
+    add("--recordings", help=about, **folder)
     add("--quiet", action="store_true", help="no progress")
-    options = parser.parse_args(arguments)
-    for name in options.names:
-        if name not in NAMES:
-            parser.error(f"NAME must be one of {', '.join(NAMES)}, got {name!r}")
-    for kind in options.formats.split(","):
-        if kind not in ("npz", "csv"):
-            parser.error(f"--formats must be npz, csv or both, got {kind!r}")
-    return options
+    return parser
 
 
 if __name__ == "__main__":

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from jaxcal.evaluation.catalogue import Catalogue
-from jaxcal.paper.datasets.datasets import BLOCK, DRAWN, EPISODES, drawn, make_dataset
+from jaxcal.paper.constants import BLOCK, DRAWN, EPISODES
+from jaxcal.paper.datasets.datasets import drawn, make_dataset
 
 __all__ = ["CATALOGUE"]
 

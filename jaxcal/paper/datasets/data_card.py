@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.candidates import JointRanges
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.paper.constants import (
     AXES,
@@ -23,10 +24,10 @@ from jaxcal.paper.constants import (
     RECORDED,
     SCALE,
 )
-from jaxcal.paper.datasets import dataset0_robot
+from jaxcal.paper.datasets.datasets import dataset0_robot
 from jaxcal.paper.datasets.recordings import SHIPPED
 
-__all__ = ["card_of", "digest_of", "page_of"]
+__all__ = ["card_of", "digest_of", "page_of", "ranges_of"]
 
 _WHAT = {
     "dataset0": "the ideal robot of Table 1 driven open loop in MuJoCo, 50 postures of "
@@ -37,6 +38,28 @@ _WHAT = {
     "dataset4": "drawn from a pool of recorded postures, without repeats in an episode",
     "dataset5": "one recorded session",
 }
+_PAGE = """\
+# Datasets
+
+Commands (`u_x`, `u_y`, `u_z`: pitch, yaw, roll) are normalised to [0, 1]; readings \
+(`y_x`, `y_y`, `y_z`) are in degrees. `NAME.npz` holds `candidates`, `measured`, \
+`low` and `high`; `NAME.csv` the same, one posture per line; `NAME.json` every number \
+of this page.
+
+| name | episodes | postures | numbers each | noise | seed | what |
+|---|---|---|---|---|---|---|
+{rows}
+
+Ranges in degrees, what 0 and 1 stand for:
+
+{ranges}
+
+Commands that make them:
+
+```bash
+{commands}
+```
+"""
 
 
 def card_of(
@@ -48,13 +71,12 @@ def card_of(
     """Everything a reader of the files needs, without jaxcal.
 
     Args:
-        dataset: one of the paper's, or its first chunk where it is written in chunks.
+        dataset: one of the paper's.
         files: SHA-256 of each file by its name.
         recordings: folder that the recorded ones come from, when not the shipped one.
     """
     name = dataset.name
     assert dataset.ranges is not None
-    ends = zip(dataset.ranges.low.tolist(), dataset.ranges.high.tolist(), strict=True)
     normalised = "1; command in degrees = low + value * (high - low)"
     arrays = {"candidates": _array(dataset.candidates, normalised, "u")}
     if dataset.measured is not None:
@@ -67,7 +89,7 @@ def card_of(
         "episodes": dataset.num_episodes,
         "candidates_per_episode": dataset.num_candidates,
         "arrays": arrays,
-        "ranges_deg": dict(zip(AXES, map(list, ends), strict=True)),
+        "ranges_deg": ranges_of(dataset.ranges),
         "distribution": "uniform within the ranges, independent",
         "seed": dataset.seed,
         "files": dict(files),
@@ -84,10 +106,30 @@ def card_of(
             "bias_deg": dict(zip(AXES, BIAS_DEG.tolist(), strict=True)),
         }
     if name == "dataset0":
-        card["simulation"] = _simulation()
+        from jaxcal.paper.twin.robot_model import HOLD_S, timestep_of
+
+        robot = dataset0_robot()
+        card["simulation"] = {
+            "engine": "mujoco",
+            "sample_rate_hz": 1.0 / HOLD_S,
+            "seconds_per_episode": NUM_CANDIDATES * HOLD_S,
+            "timestep_s": timestep_of(robot),
+            "robot": dataclasses.asdict(robot),
+        }
     if name in RECORDED:
-        card["recording"] = _recording(name, dataset, recordings)
+        folder = SHIPPED if recordings is None else pathlib.Path(recordings)
+        place = "shipped with jaxcal" if recordings is None else str(folder)
+        card["recording"] = {"file": place, "sha256": dataset.sha256}
+        held = folder / f"{name}.json"
+        if held.is_file():
+            card["recording"]["card"] = json.loads(held.read_text(encoding="utf-8"))
     return card
+
+
+def ranges_of(ranges: JointRanges) -> dict[str, list[float]]:
+    """[low, high] of each axis."""
+    ends = np.stack([ranges.low, ranges.high], axis=1).tolist()
+    return dict(zip(AXES, ends, strict=True))
 
 
 def _array(values: NDArray[np.float64], unit: str, letter: str) -> dict[str, Any]:
@@ -100,33 +142,6 @@ def _array(values: NDArray[np.float64], unit: str, letter: str) -> dict[str, Any
     }
 
 
-def _simulation() -> dict[str, Any]:
-    from jaxcal.paper.twin.robot_model import HOLD_S, timestep_of
-
-    robot = dataset0_robot()
-    return {
-        "engine": "mujoco",
-        "sample_rate_hz": 1.0 / HOLD_S,
-        "seconds_per_episode": NUM_CANDIDATES * HOLD_S,
-        "timestep_s": timestep_of(robot),
-        "robot": dataclasses.asdict(robot),
-    }
-
-
-def _recording(
-    name: str, dataset: Dataset, recordings: pathlib.Path | str | None
-) -> dict[str, Any]:
-    folder = SHIPPED if recordings is None else pathlib.Path(recordings)
-    source: dict[str, Any] = {
-        "file": "shipped with jaxcal" if recordings is None else str(folder),
-        "sha256": dataset.sha256,
-    }
-    card = folder / f"{name}.json"
-    if card.is_file():
-        source["card"] = json.loads(card.read_text(encoding="utf-8"))
-    return source
-
-
 def digest_of(path: pathlib.Path) -> str:
     """SHA-256 of a file."""
     with path.open("rb") as file:
@@ -135,34 +150,18 @@ def digest_of(path: pathlib.Path) -> str:
 
 def page_of(cards: list[dict[str, Any]]) -> str:
     """The cards as one Markdown page."""
-    lines = [
-        "# Datasets",
-        "",
-        "Commands (`u_x`, `u_y`, `u_z`: pitch, yaw, roll) are normalised to [0, 1]; "
-        "readings (`y_x`, `y_y`, `y_z`) are in degrees. `NAME.npz` holds `candidates`, "
-        "`measured`, `low` and `high`; `NAME.csv` the same, one posture per line; "
-        "`NAME.json` every number of this page.",
-        "",
-        "| name | episodes | postures | numbers each | noise | seed | what |",
-        "|---|---|---|---|---|---|---|",
-    ]
+    rows, ranges = [], []
     for card in cards:
-        noise = card.get("noise")
-        level = f"{noise['std_deg']:g} deg" if noise else "-"
-        if "recording" in card:
-            level = "as recorded"
-        lines.append(
-            f"| {card['name']} | {card['episodes']:,} | "
-            f"{card['candidates_per_episode']} | {3 * len(card['arrays'])} | {level} | "
-            f"{card['seed']} | {card['what']} |"
+        level = f"{card['noise']['std_deg']:g} deg" if "noise" in card else "-"
+        cells = (
+            *(card["name"], f"{card['episodes']:,}", card["candidates_per_episode"]),
+            *(3 * len(card["arrays"]), "as recorded" if "recording" in card else level),
+            *(card["seed"], card["what"]),
         )
-    lines += ["", "Ranges in degrees, what 0 and 1 stand for:", ""]
-    for card in cards:
-        ranges = ", ".join(
-            f"{axis} {low:g} to {high:g}"
-            for axis, (low, high) in card["ranges_deg"].items()
-        )
-        lines.append(f"- {card['name']}: {ranges}")
-    lines += ["", "Commands that make them:", "", "```bash"]
-    lines += [card["command"] for card in cards]
-    return "\n".join([*lines, "```", ""])
+        rows.append(f"| {' | '.join(map(str, cells))} |")
+        named = card["ranges_deg"].items()
+        ends = ", ".join(f"{axis} {low:g} to {high:g}" for axis, (low, high) in named)
+        ranges.append(f"- {card['name']}: {ends}")
+    commands = [card["command"] for card in cards]
+    parts = {"rows": rows, "ranges": ranges, "commands": commands}
+    return _PAGE.format(**{name: "\n".join(lines) for name, lines in parts.items()})

@@ -64,18 +64,10 @@ def make_dataset(
     recordings: pathlib.Path | str | None = None,
     progress: Progress | None = None,
 ) -> Dataset:
-    """One of the paper's datasets, whole.
+    """One of the paper's datasets, whole; the arguments are those of ``chunks``.
 
     The whole of dataset1 takes 240 MB; ``chunks`` gives it in pieces. The whole of
     dataset0 takes some seconds of simulation.
-
-    Args:
-        name: dataset0 to dataset5.
-        seed: of the streams; of the draws from the pool (dataset4); none (dataset5).
-        episodes: the first so many; all when not given.
-        recordings: folder of dataset4.csv and dataset5.csv; the shipped one when not
-            given.
-        progress: told how many episodes of how many are made.
     """
     parts = list(chunks(name, seed, episodes, recordings=recordings, progress=progress))
     return _joined(parts)
@@ -89,13 +81,14 @@ def chunks(
     recordings: pathlib.Path | str | None = None,
     progress: Progress | None = None,
 ) -> Iterator[Dataset]:
-    """The same episodes as ``make_dataset``, at most 1,000 at a time.
+    """One of the paper's datasets, at most 1,000 episodes at a time.
 
     Args:
         name: dataset0 to dataset5.
-        seed: of the streams, 0 or greater.
+        seed: of the streams, 0 or greater; of the draws from the pool (dataset4).
         episodes: the first so many; all when not given.
-        recordings: folder of recordings; the shipped one when not given.
+        recordings: folder of dataset4.csv and dataset5.csv; the shipped one when not
+            given.
         progress: told how many episodes of how many are made.
 
     Raises:
@@ -113,13 +106,17 @@ def chunks(
             f"episodes must be in [1, {EPISODES[name]}] for {name}, got {total}"
         )
     if name in RECORDED:
-        whole = recorded_dataset(
-            name, EPISODES[name], NUM_CANDIDATES, seed, folder=recordings
-        )
-        return iter([whole.first(total)])
+        return iter([recorded_dataset(name, seed, folder=recordings).part(0, total)])
+    report = progress or (lambda *_: None)
     if name == "dataset0":
-        return _groups(seed, total, progress)
-    return _blocks(name, seed, total, progress)
+        return iter([_simulated(seed, total, report)])
+    return _blocks(name, seed, total, report)
+
+
+def _blocks(name: str, seed: int, total: int, progress: Progress) -> Iterator[Dataset]:
+    for begin in range(0, total, BLOCK):
+        progress(f"draw {name}", begin, total)
+        yield drawn(name, seed, begin, min(begin + BLOCK, total))
 
 
 def _joined(parts: list[Dataset]) -> Dataset:
@@ -129,15 +126,6 @@ def _joined(parts: list[Dataset]) -> Dataset:
         candidates=np.concatenate([part.candidates for part in parts]),
         measured=np.concatenate(measured) if measured else None,
     )
-
-
-def _blocks(
-    name: str, seed: int, total: int, progress: Progress | None
-) -> Iterator[Dataset]:
-    for begin in range(0, total, BLOCK):
-        if progress is not None:
-            progress(f"draw {name}", begin, total)
-        yield drawn(name, seed, begin, min(begin + BLOCK, total))
 
 
 def drawn(name: str, seed: int, begin: int, end: int) -> Dataset:
@@ -171,25 +159,20 @@ def _streams(
     return np.random.default_rng(draw), np.random.default_rng(noise)
 
 
-def _groups(seed: int, total: int, progress: Progress | None) -> Iterator[Dataset]:
+def _simulated(seed: int, total: int, progress: Progress) -> Dataset:
     """Dataset0: groups of postures driven in MuJoCo, each with a stream of its own."""
     from jaxcal.paper.twin.robot_model import simulate
 
-    candidates, noises = [], []
-    for group in range(total):
-        draw, noise = _streams("dataset0", seed, group)
-        candidates.append(uniform_candidates(draw, 1, NUM_CANDIDATES, 3)[0])
-        noises.append(noise.normal(0.0, NOISE_STD_DEG, candidates[-1].shape))
-    unit = np.stack(candidates)
+    shape = (NUM_CANDIDATES, 3)
+    streams = [_streams("dataset0", seed, group) for group in range(total)]
+    unit = np.stack([uniform_candidates(draw, 1, *shape)[0] for draw, _ in streams])
+    noise = np.stack([rng.normal(0.0, NOISE_STD_DEG, shape) for _, rng in streams])
     read = simulate(dataset0_robot(), RANGES.denormalise(unit), progress=progress)
-    yield Dataset("dataset0", unit, read + noises, ranges=RANGES, seed=seed)
+    return Dataset("dataset0", unit, read + noise, ranges=RANGES, seed=seed)
 
 
 def dataset0_robot() -> RobotConfig:
     """The ideal robot of Table 1."""
     from jaxcal.paper.twin.robot import RobotConfig
 
-    return RobotConfig(
-        scale=(SCALE[0], SCALE[1], SCALE[2]),
-        bias_deg=(BIAS_DEG[0], BIAS_DEG[1], BIAS_DEG[2]),
-    )
+    return RobotConfig(tuple(SCALE), tuple(BIAS_DEG))

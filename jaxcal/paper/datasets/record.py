@@ -21,7 +21,8 @@ import time
 
 from jaxcal.files import atomic_write, require_writable_folder, write_text
 from jaxcal.paper import command
-from jaxcal.paper.constants import AXES, RANGES
+from jaxcal.paper.constants import RANGES
+from jaxcal.paper.datasets.data_card import ranges_of
 
 __all__ = ["main", "record"]
 
@@ -37,15 +38,7 @@ _FLAGS = ("--noise", "--backlash", "--drift", "--speedup", "--rate")
 
 
 def record(name: str, folder: pathlib.Path, count: int | None = None) -> pathlib.Path:
-    """Record one dataset through the rig and write it with its data card.
-
-    Args:
-        name: dataset4 or dataset5.
-        folder: where ``name``.csv and ``name``.json go.
-        count: postures, when not the paper's.
-
-    Returns:
-        The CSV.
+    """Record one dataset through the rig: ``name``.csv and its data card; the CSV.
 
     Raises:
         OSError: the folder cannot be written.
@@ -68,7 +61,6 @@ def record(name: str, folder: pathlib.Path, count: int | None = None) -> pathlib
     path = folder / f"{name}.csv"
     with atomic_write(path) as file:
         file.write(data)
-    ends = zip(RANGES.low.tolist(), RANGES.high.tolist(), strict=True)
     card = {
         "schema": 1,
         "name": name,
@@ -83,7 +75,7 @@ def record(name: str, folder: pathlib.Path, count: int | None = None) -> pathlib
         "columns": "u_deg_*: command of the whole pulses sent; y_deg_*: mean of "
         "`samples` settled readings against the zero posture; "
         "std_deg_*: of one reading",
-        "ranges_deg": dict(zip(AXES, map(list, ends), strict=True)),
+        "ranges_deg": ranges_of(RANGES),
         "recorded": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "seconds": round(seconds, 1),
         "python": platform.python_version(),
@@ -111,16 +103,15 @@ def _rig(*arguments: str, capture: bool = False) -> str:
 def main(arguments: list[str] | None = None) -> int:
     """Record; the exit code."""
     parser = command.Parser(
-        prog="python -m jaxcal.paper.datasets.record",
-        description="Record Datasets 4 and 5 through the rig against its simulator "
-        "(550 postures, about three and a half minutes).",
+        "python -m jaxcal.paper.datasets.record",
+        "Record Datasets 4 and 5 through the rig against its simulator (550 postures, "
+        "about three and a half minutes).",
     )
-    parser.add_argument("names", nargs="*", metavar="NAME", help="dataset4, dataset5")
+    name = command.one_of(SESSIONS)
+    about = "dataset4, dataset5"
+    parser.add_argument("names", nargs="*", type=name, metavar="NAME", help=about)
     parser.add_argument("--out", type=pathlib.Path, required=True, metavar="DIR")
     options = parser.parse_args(arguments)
-    for name in options.names:
-        if name not in SESSIONS:
-            parser.error(f"NAME must be one of {', '.join(SESSIONS)}, got {name!r}")
 
     def write() -> None:
         require_writable_folder(options.out)

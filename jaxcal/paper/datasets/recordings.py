@@ -13,9 +13,7 @@ stands. Dataset5 is the first 50 postures of its own session.
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import json
 import os
 import pathlib
@@ -25,8 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges, draw_from_pool
+from jaxcal.evaluation.csv_rows import finite, read_rows
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.paper.constants import AXES, RANGES
+from jaxcal.paper.constants import AXES, EPISODES, NUM_CANDIDATES, RANGES
 
 __all__ = ["SHIPPED", "read_pool", "recorded_dataset"]
 
@@ -36,22 +35,15 @@ SHIPPED = pathlib.Path(__file__).parent / "data"
 
 
 def recorded_dataset(
-    name: str,
-    num_episodes: int,
-    num_candidates: int,
-    seed: int = 0,
-    *,
-    folder: str | os.PathLike[str] | None = None,
+    name: str, seed: int = 0, *, folder: str | os.PathLike[str] | None = None
 ) -> Dataset:
     """Episodes made of one recording.
 
-    With at least ``num_episodes * num_candidates`` postures they are taken in the order
-    they were recorded; with fewer every episode is a draw without repeats.
+    With enough postures for every episode they are taken in the order they were
+    recorded; with fewer every episode is a draw without repeats.
 
     Args:
-        name: dataset4, say; the recording is ``name``.csv.
-        num_episodes: E.
-        num_candidates: M.
+        name: dataset4 or dataset5; the recording is ``name``.csv.
         seed: of the draws.
         folder: of the recording; the shipped one when not given.
 
@@ -61,24 +53,19 @@ def recorded_dataset(
     """
     path = (SHIPPED if folder is None else pathlib.Path(folder)) / f"{name}.csv"
     commands, measured, ranges, digest = read_pool(path)
-    if len(commands) < num_candidates:
+    episodes, have = EPISODES[name], len(commands)
+    if have < NUM_CANDIDATES:
         raise ValueError(
-            f"{path}: an episode takes {num_candidates} postures, the recording has "
-            f"{len(commands)}"
+            f"{path}: an episode takes {NUM_CANDIDATES} postures, the recording has "
+            f"{have}"
         )
-    if len(commands) >= num_episodes * num_candidates:
-        rows = np.arange(num_episodes * num_candidates).reshape(num_episodes, -1)
+    if have >= episodes * NUM_CANDIDATES:
+        rows = np.arange(episodes * NUM_CANDIDATES).reshape(episodes, -1)
     else:
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(4,)))
-        rows = draw_from_pool(rng, len(commands), num_episodes, num_candidates)
-    return Dataset(
-        name,
-        ranges.normalise(commands)[rows],
-        measured[rows],
-        ranges=ranges,
-        seed=seed,
-        sha256=digest,
-    )
+        rows = draw_from_pool(rng, have, episodes, NUM_CANDIDATES)
+    unit = ranges.normalise(commands)[rows]
+    return Dataset(name, unit, measured[rows], None, ranges, seed, digest)
 
 
 def read_pool(
@@ -115,56 +102,38 @@ def read_pool(
 
 def _table(data: bytes) -> Array:
     """(N, 6) commands and readings."""
-    try:
-        reader = csv.reader(io.StringIO(data.decode("utf-8-sig"), newline=""))
-        rows = [(reader.line_num, row) for row in reader if any(row)]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"not a CSV file: {error}") from None
-    if not rows:
+    header, rows = read_rows(data)
+    if not header:
         raise ValueError("the file is empty")
-    header = [name.strip() for name in rows[0][1]]
     wanted = [f"{what}_deg_{axis}" for what in "uy" for axis in AXES]
     for name in wanted:
         if header.count(name) != 1:
             how = "missing" if name not in header else "there twice"
             raise ValueError(f'line 1: column "{name}" is {how}')
     values = []
-    for line, row in rows[1:]:
-        if len(row) != len(header):
-            raise ValueError(
-                f"line {line}: {len(row)} cells, {len(header)} in the header"
-            )
+    for line, row in rows:
         cells = dict(zip(header, row, strict=True))
-        values.append([_number(line, name, cells[name]) for name in wanted])
+        try:
+            values.append([finite(name, cells[name]) for name in wanted])
+        except ValueError as error:
+            raise ValueError(f"line {line}: {error}") from None
     if not values:
         raise ValueError("no postures below the header")
     return np.array(values)
-
-
-def _number(line: int, name: str, cell: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise ValueError(f'line {line}: "{name}" must be a finite number, got {cell!r}')
-    return value
 
 
 def _ranges_beside(recording: pathlib.Path) -> JointRanges:
     """The ranges its data card names; ours where there is none."""
     card = recording.with_suffix(".json")
     try:
-        text = card.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        return RANGES
-    try:
-        document: Any = json.loads(text)
+        document: Any = json.loads(card.read_text(encoding="utf-8"))
         named = document.get("ranges_deg")
         if named is None:
             return RANGES
         low, high = zip(*(named[axis] for axis in AXES), strict=True)
         return JointRanges(low, high, AXES)
+    except FileNotFoundError:
+        return RANGES
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(
             f'{card}: "ranges_deg" must give [low, high] of {", ".join(AXES)}: {error}'

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from jaxcal.paper.exhibits.exhibit import Claim, Exhibit, Verdict
+from jaxcal.paper.exhibits.exhibit import Claim, Exhibit, judge
 
 __all__ = ["claims"]
 
@@ -13,12 +13,7 @@ claim = Claim.from_texts
 
 
 def claims(exhibits: list[Exhibit], recorded: str) -> list[Claim]:
-    """Judge every claim by the numbers of the exhibits.
-
-    Args:
-        exhibits: all of them.
-        recorded: what Datasets 4 and 5 are, in words.
-    """
+    """Judge every claim by the exhibits; ``recorded`` is what Datasets 4 and 5 are."""
     found = {exhibit.key: exhibit for exhibit in exhibits}
     return [
         *_information(found, recorded),
@@ -31,74 +26,53 @@ def claims(exhibits: list[Exhibit], recorded: str) -> list[Claim]:
     ]
 
 
-def _verdict(true: bool, partly: bool = False) -> Verdict:
-    if true:
-        return "agrees"
-    return "agrees in part" if partly else "disagrees"
-
-
 def _information(found: Found, recorded: str) -> Iterator[Claim]:
     for key, where in (("figure_3", "simulation"), ("figure_7", recorded)):
-        numbers = found[key].numbers
+        exhibit, numbers = found[key], found[key].numbers
         times = numbers["policy"]["times_random"]
+        verdict = judge(times.low > 100, times.high > 100)
+        name = "times_random"
+        yield claim(name, exhibit, verdict, f"{name}_{key}", where=where)
         log, raw, relative = (
             numbers[f"policy_over_random_{name}"].high
             for name in ("std_log_det_s", "std_det_s", "relative_std_det_s")
         )
-        for name, verdict in (
-            ("times_random", _verdict(times.low > 100, times.high > 100)),
-            (
-                "reduced_variance",
-                _verdict(max(log, relative, raw) < 1.0, min(log, relative) < 1.0),
-            ),
-        ):
-            yield claim(name, found[key], verdict, f"{name}_{key}", where=where)
+        verdict = judge(max(log, relative, raw) < 1.0, min(log, relative) < 1.0)
+        name = "reduced_variance"
+        yield claim(name, exhibit, verdict, f"{name}_{key}", where=where)
     best = found["figure_4"]
     policy = best.numbers["comparison"]["policy"]
     far = policy["times_random"].low > 100
     seen = found["figure_3"].numbers["policy"]["ratio_to_exact"]
     as_good = policy["ratio_to_exact"].high >= seen.low
-    yield claim("generalises", best, _verdict(far and as_good, far), seen=seen)
+    yield claim("generalises", best, judge(far and as_good, far), seen=seen)
     never = best.numbers["random_draws_that_never_reach_policys_first"]
     soon = best.numbers["policy_first_episode_within_half_of_best"] <= 50
-    yield claim("best_so_far", best, _verdict(never > 0.95 and soon, never > 0.5))
+    yield claim("best_so_far", best, judge(never > 0.95 and soon, never > 0.5))
 
 
 def _parameters(found: Found, recorded: str) -> Iterator[Claim]:
     for key, where in (("figure_5", "dataset3"), ("figure_9", recorded)):
         random = found[key].numbers["random/policy"]
-        fifty = found[key].numbers["all 50/policy"]
         lower = int((random["low"] > 1.0).sum())
-        fewer = int((fifty["high"] < 1.0).sum())
-        yield claim(
-            "parameter_variance",
-            found[key],
-            _verdict(lower > 6 and fewer == 0, lower > 6),
-            f"parameter_variance_{key}",
-            where=where,
-            lower=lower,
-            fewer=fewer,
-            least=random["value"].min(),
-            most=random["value"].max(),
-        )
+        fewer = int((found[key].numbers["all 50/policy"]["high"] < 1.0).sum())
+        least, most = random["value"].min(), random["value"].max()
+        words = {"lower": lower, "fewer": fewer, "least": least, "most": most}
+        name, verdict = "parameter_variance", judge(lower > 6 and not fewer, lower > 6)
+        yield claim(name, found[key], verdict, f"{name}_{key}", where=where, **words)
 
 
 def _four_and_fifty(exhibit: Exhibit) -> Iterator[Claim]:
+    name = "four_or_fifty"
     for scenario in ("white noise", "drift", "outliers"):
-        ratio = exhibit.numbers[scenario]["ratio_of_means"]
-        better = exhibit.numbers[scenario]["four_better"]
+        numbers = exhibit.numbers[scenario]
+        ratio, better = numbers["ratio_of_means"], numbers["four_better"]
         sides = ratio.high < 1.0, better.low > 0.5
-        yield claim(
-            "four_or_fifty",
-            exhibit,
-            _verdict(all(sides), any(sides)),
-            f"four_or_fifty_{scenario.replace(' ', '_')}",
-            scenario=scenario,
-            ratio=ratio,
-            better=better,
-        )
-    better = exhibit.numbers["recorded"]["ratio_of_means"].high < 1.0
-    yield claim("four_or_fifty_recorded", exhibit, _verdict(better))
+        words = {"scenario": scenario, "ratio": ratio, "better": better}
+        key = f"{name}_{scenario.replace(' ', '_')}"
+        yield claim(name, exhibit, judge(all(sides), any(sides)), key, **words)
+    ratio = exhibit.numbers["recorded"]["ratio_of_means"]
+    yield claim("four_or_fifty_recorded", exhibit, judge(ratio.high < 1.0))
 
 
 def _recalibration(found: Found) -> Iterator[Claim]:
@@ -108,10 +82,8 @@ def _recalibration(found: Found) -> Iterator[Claim]:
         ("policy_x0_against_x_star", "X_0 from the policy's postures (text)"),
     ):
         ratio = exhibit.numbers["error_of_second_over_first"][key]
-        verdict = _verdict(ratio.high < 1.0)
-        yield claim(
-            "recalibration", exhibit, verdict, key, reading=reading, ratio=ratio
-        )
+        words = {"reading": reading, "ratio": ratio}
+        yield claim("recalibration", exhibit, judge(ratio.high < 1.0), key, **words)
     recorded = found["figure_10_recorded"]
     yield claim("recalibration_recorded", recorded, recorded.verdict)
 
@@ -119,23 +91,19 @@ def _recalibration(found: Found) -> Iterator[Claim]:
 def _training(found: Found) -> Iterator[Claim]:
     reward, network = found["reward_range"], found["table_2"]
     bound = reward.numbers["largest_log_det_s_in_unit_cube"] / 10.0
-    yield claim("reward_range", reward, _verdict(bound >= 3.0), bound=bound)
+    yield claim("reward_range", reward, judge(bound >= 3.0), bound=bound)
     size, share = (network.numbers[name] for name in ("parameters", "shared_share"))
-    near = _verdict(abs(size / 3.5e6 - 1.0) < 0.03)
+    near = judge(abs(size / 3.5e6 - 1.0) < 0.03)
     yield claim("parameters", network, near, millions=size / 1e6)
-    yield claim("shared", network, _verdict(abs(share - 0.71) < 0.015))
-    for key, name, how in (
-        ("figure_2_paper", "the paper's network", _convergence_of_paper),
-        ("figure_2", "our compact network", _convergence_of_seeds),
+    yield claim("shared", network, judge(abs(share - 0.71) < 0.015))
+    paper, seeds = found["figure_2_paper"], found["figure_2"]
+    for exhibit, name, how in (
+        (paper, "the paper's network", _convergence_of_paper(paper)),
+        (seeds, "our compact network", _convergence_of_seeds(seeds)),
     ):
-        yield claim(
-            "convergence",
-            found[key],
-            found[key].verdict,
-            f"convergence_{key}",
-            network=name,
-            how=how(found[key]),
-        )
+        key = f"convergence_{exhibit.key}"
+        words = {"network": name, "how": how}
+        yield claim("convergence", exhibit, exhibit.verdict, key, **words)
 
 
 def _convergence_of_seeds(exhibit: Exhibit) -> str:
@@ -171,28 +139,18 @@ def _convergence_of_paper(exhibit: Exhibit) -> str:
 
 def _calibration(found: Found, recorded: str) -> Iterator[Claim]:
     for key, where in (("figure_1", "simulation"), ("figure_6", recorded)):
-        numbers = found[key].numbers
+        exhibit, numbers = found[key], found[key].numbers
         shrink = numbers["interquartile_range_shrinks_by"]
         least = min(shrink.values())
+        by = ", ".join(f"{value:.3g} ({axis})" for axis, value in shrink.items())
+        words = {"where": where, "by": by}
+        verdict = judge(least > 2.0, least > 1.0)
+        yield claim("errors_shrink", exhibit, verdict, f"errors_shrink_{key}", **words)
         before = {axis: numbers[f"{axis}_before"] for axis in shrink}
         widest = max(shrink, key=lambda a: before[a]["interquartile_range_deg"])
         furthest = max(shrink, key=lambda a: abs(before[a]["median_deg"]))
-        yield claim(
-            "errors_shrink",
-            found[key],
-            _verdict(least > 2.0, least > 1.0),
-            f"errors_shrink_{key}",
-            where=where,
-            by=", ".join(f"{v:.3g} ({a})" for a, v in shrink.items()),
-        )
-        yield claim(
-            "yaw",
-            found[key],
-            _verdict(widest == furthest == "yaw", "yaw" in (widest, furthest)),
-            f"yaw_{key}",
-            where=where,
-            furthest=furthest,
-            widest=widest,
-        )
-    yield claim("table_1", found["table_1"], found["table_1"].verdict)
-    yield claim("four_suffice", found["rank"], found["rank"].verdict)
+        verdict = judge(widest == furthest == "yaw", "yaw" in (widest, furthest))
+        words = {"where": where, "furthest": furthest, "widest": widest}
+        yield claim("yaw", exhibit, verdict, f"yaw_{key}", **words)
+    for name, key in (("table_1", "table_1"), ("four_suffice", "rank")):
+        yield claim(name, found[key], found[key].verdict)

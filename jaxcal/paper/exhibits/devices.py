@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.paper.datasets import BIAS_DEG, NOISE_STD_DEG, SCALE
+from jaxcal.paper.constants import BIAS_DEG, NOISE_STD_DEG, SCALE
 
 __all__ = ["Device", "pick", "rms"]
 
@@ -20,8 +20,7 @@ class Device:
 
     noise_std_deg: float = NOISE_STD_DEG  # white, on every output
     drift_std_deg: float = 0.0  # step of the bias from one posture to the next
-    outlier_share: float = 0.0  # of postures that are measured grossly wrong
-    outlier_std_deg: float = 3.0  # of the gross error, on every output
+    outlier_share: float = 0.0  # of postures measured with an error of 3 degrees s.d.
 
     def record(
         self, commands: Array, rng: np.random.Generator, start: Array | None = None
@@ -38,19 +37,17 @@ class Device:
         """
         shape = commands.shape
         walk = np.cumsum(rng.normal(0.0, self.drift_std_deg, shape), axis=-2)
-        if start is not None:
-            walk = walk + start[..., None, :]
+        walk += 0.0 if start is None else start[..., None, :]
         noise = rng.normal(0.0, self.noise_std_deg, shape)
-        gross = rng.normal(0.0, self.outlier_std_deg, shape)
+        gross = rng.normal(0.0, 3.0, shape)
         outlier = rng.random((*shape[:-1], 1)) < self.outlier_share
         measured = self.true_outputs(commands) + walk + noise + gross * outlier
         return measured, walk[..., -1, :]
 
     @staticmethod
-    def true_outputs(commands: Array, bias_off: Array | None = None) -> Array:
-        """(..., N, 3) outputs without noise, the bias (..., 3) degrees off."""
-        outputs = commands * SCALE + BIAS_DEG
-        return outputs if bias_off is None else outputs + bias_off[..., None, :]
+    def true_outputs(commands: Array) -> Array:
+        """(..., N, 3) outputs without noise and drift."""
+        return commands * SCALE + BIAS_DEG
 
 
 def pick(values: Array, indices: NDArray[np.int64]) -> Array:
@@ -59,5 +56,5 @@ def pick(values: Array, indices: NDArray[np.int64]) -> Array:
 
 
 def rms(errors: Array) -> Array:
-    """(E,) root mean square over the postures and axes of (E, N, 3)."""
+    """(...) root mean square over the postures and axes of (..., N, 3)."""
     return np.sqrt((errors**2).mean(axis=(-2, -1)))

@@ -10,13 +10,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import field
 from typing import Any, Literal
 
+import numpy as np
 from matplotlib.figure import Figure
 
-from jaxcal.paper.exhibits.columns import Columns
+from jaxcal.paper.constants import AXES
 
-__all__ = ["Claim", "Exhibit", "Verdict"]
+__all__ = ["Claim", "Columns", "Exhibit", "Verdict", "by_axis", "from_rows", "judge"]
 
 Verdict = Literal["agrees", "agrees in part", "disagrees", "not comparable"]
+Columns = Mapping[str, Sequence[Any] | np.ndarray]
+"""A table by the names of its columns, written as CSV"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,7 +28,7 @@ class Exhibit:
 
     key: str  # of its files: "figure_1"
     title: str
-    caption: str  # what is drawn, sample sizes, what the intervals are
+    caption: str = ""  # what is drawn, sample sizes, what the intervals are
     paper: str = ""  # what the paper states, in our words
     ours: str = ""
     verdict: Verdict | None = None
@@ -40,32 +43,24 @@ class Exhibit:
     def from_texts(
         cls, section: str, words: Mapping[str, Any], **fields: Any
     ) -> Exhibit:
-        """An exhibit with the texts of a section of texts.toml.
+        """An exhibit with the texts of a section of texts.toml, its key by default.
 
-        Args:
-            section: its name; the key too, where ``fields`` gives none.
-            words: what its texts cite beside the numbers of the exhibit.
-            fields: of the exhibit.
+        The texts cite the exhibit's numbers and the ``words``.
         """
-        texts = dict(_texts()[section])
-        texts.pop("missing", None)
-        filled = _filled(texts, {**fields.get("numbers", {}), **words})
-        return cls(**{"key": section, **filled, **fields})
+        known = {**fields.get("numbers", {}), **words}
+        return cls(**{"key": section, **_filled(_texts()[section], known), **fields})
 
     @classmethod
     def missing(cls, section: str, **numbers: Any) -> Exhibit:
         """An exhibit whose kept runs are not there: how to make them."""
-        texts = _texts()[section]
-        texts = {name: texts[name] for name in ("title", "paper")} | {
-            "ours": texts["missing"]
+        held = _texts()[section]
+        texts = {
+            "title": held["title"],
+            "paper": held["paper"],
+            "ours": held["missing"],
         }
-        return cls(
-            key=section,
-            caption="",
-            verdict="not comparable",
-            numbers=numbers,
-            **_filled(texts, numbers),
-        )
+        filled = _filled(texts, numbers)
+        return cls(section, verdict="not comparable", numbers=numbers, **filled)
 
     @property
     def tables(self) -> dict[str, Columns]:
@@ -93,17 +88,12 @@ class Claim:
         key: str = "",
         **words: Any,
     ) -> Claim:
-        """A claim with the texts of ``claims.section`` of texts.toml.
+        """A claim with the texts of ``claims.section`` of texts.toml, and its key.
 
-        Args:
-            section: its name; the key too, where none is given.
-            exhibit: with the evidence, whose numbers the texts cite.
-            verdict: "not comparable" when None.
-            key: of the claim.
-            words: what else its texts cite.
+        The texts cite the numbers of the exhibit, which is the evidence, and the
+        ``words``. Without a verdict it is "not comparable".
         """
-        known = {**exhibit.numbers, **words}
-        filled = _filled(_texts()["claims"][section], known)
+        filled = _filled(_texts()["claims"][section], {**exhibit.numbers, **words})
         verdict = verdict or "not comparable"
         return cls(key=key or section, verdict=verdict, where=exhibit.key, **filled)
 
@@ -116,4 +106,29 @@ def _texts() -> dict[str, Any]:
 
 def _filled(texts: Mapping[str, str], known: Mapping[str, Any]) -> dict[str, Any]:
     """Texts on one line each, with the numbers in place of their names."""
-    return {k: " ".join(text.split()).format_map(known) for k, text in texts.items()}
+    return {
+        name: " ".join(text.split()).format_map(known)
+        for name, text in texts.items()
+        if name != "missing"
+    }
+
+
+def judge(true: Any, partly: Any = False) -> Verdict:
+    """What a claim that is true, or true in one of its senses, comes to."""
+    if true:
+        return "agrees"
+    return "agrees in part" if partly else "disagrees"
+
+
+def by_axis(values: Mapping[str, np.ndarray], name: str = "{}_{}_deg") -> Columns:
+    """Columns of (..., 3) arrays by name: pitch, yaw and roll of each, flattened."""
+    return {
+        name.format(key, axis): np.ravel(array[..., i])
+        for key, array in values.items()
+        for i, axis in enumerate(AXES)
+    }
+
+
+def from_rows(names: Sequence[str], rows: Sequence[Sequence[Any]]) -> dict[str, Any]:
+    """Columns by name of a table given row by row."""
+    return dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True))

@@ -40,18 +40,9 @@ class Interval:
         spec = spec or ".3g"
         return f"{self.value:{spec}} [{self.low:{spec}}, {self.high:{spec}}]"
 
-    def as_dict(self) -> dict[str, float]:
-        """For the JSON."""
-        return dataclasses.asdict(self)
-
 
 def mean_interval(values: ArrayLike, most: float = np.inf) -> Interval:
-    """Mean of independent values, with Student's t.
-
-    Args:
-        values: (E,) one per episode, at least two.
-        most: the largest value there can be; the interval ends there.
-    """
+    """Mean of (E,) independent values, two or more; no end of it is above ``most``."""
     sample = np.asarray(values, dtype=np.float64)
     mean, count = float(sample.mean()), len(sample)
     half = float(stats.t.ppf(0.975, count - 1) * stats.sem(sample))
@@ -59,24 +50,15 @@ def mean_interval(values: ArrayLike, most: float = np.inf) -> Interval:
 
 
 def median_interval(values: ArrayLike) -> Interval:
-    """Median of independent values, between two order statistics.
-
-    Args:
-        values: (E,) one per episode, at least six.
-    """
+    """Median of (E,) independent values, six or more, between two order statistics."""
     sample = np.asarray(values, dtype=np.float64)
     ends = stats.quantile_test(sample).confidence_interval(0.95)
-    return Interval(
-        float(np.median(sample)), float(ends.low), float(ends.high), len(sample)
-    )
+    middle = float(np.median(sample))
+    return Interval(middle, float(ends.low), float(ends.high), len(sample))
 
 
 def share_interval(hits: ArrayLike) -> Interval:
-    """Share of true values, with Wilson's interval.
-
-    Args:
-        hits: (E,) bool.
-    """
+    """Share of true values among (E,) bool, with Wilson's interval."""
     sample = np.asarray(hits, dtype=bool)
     found = stats.binomtest(int(sample.sum()), len(sample))
     ends = found.proportion_ci(0.95, "wilson")
@@ -121,33 +103,21 @@ class Paired:
     ratio_of_means: Interval  # mean a / mean b
     ratio_of_medians: Interval
 
-    def as_dict(self) -> dict[str, Any]:
-        """For the JSON."""
-        return dataclasses.asdict(self)
-
 
 def paired(
     a: ArrayLike, b: ArrayLike, rng: np.random.Generator, resamples: int = 2_000
 ) -> Paired:
-    """Compare two values per episode.
-
-    Args:
-        a: (E,) of one method.
-        b: (E,) of the other, on the same episodes.
-        rng: of the bootstrap behind the ratios.
-        resamples: of it.
-    """
+    """Compare two values per episode, (E,) each, on the same episodes."""
     first, second = np.asarray(a, np.float64), np.asarray(b, np.float64)
     if first.shape != second.shape or first.ndim != 1:
         raise ValueError(
             f"a and b must hold the same episodes, got {first.shape}, {second.shape}"
         )
-    means, medians = (
+    ratios = [
         bootstrap_interval(
             lambda x, y, of=of: of(x) / of(y), (first, second), rng, resamples
         )
         for of in (np.mean, np.median)
-    )
-    return Paired(
-        mean_interval(first - second), share_interval(first < second), means, medians
-    )
+    ]
+    lower = share_interval(first < second)
+    return Paired(mean_interval(first - second), lower, *ratios)

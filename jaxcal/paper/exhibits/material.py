@@ -1,6 +1,9 @@
-"""Datasets and selections that several exhibits draw on, each made once."""
+"""How much a report computes, from what, and what several exhibits draw on."""
 
 from __future__ import annotations
+
+import dataclasses
+import pathlib
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,13 +13,66 @@ from jaxcal.evaluation.methods import Progress, evaluate
 from jaxcal.evaluation.parameters import least_squares
 from jaxcal.evaluation.results import Evaluation, MethodResult
 from jaxcal.paper.datasets import make_dataset
-from jaxcal.paper.exhibits.settings import Settings
 
-__all__ = ["METHODS", "Material", "commands_deg"]
+__all__ = ["STUDIES", "Material", "Settings", "commands_deg"]
 
 Array = NDArray[np.float64]
 
 METHODS = ("policy", "random", "greedy", "exact")
+STUDIES = pathlib.Path(__file__).resolve().parents[3] / "studies"
+"""Where the repository keeps training runs"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """How much to compute; everything random depends on ``seed``."""
+
+    seed: int = 0
+    quick: bool = False
+    data: pathlib.Path | None = None  # real recordings in place of Datasets 4 and 5
+    studies: pathlib.Path = STUDIES  # kept training runs
+
+    def size(self, what: str) -> int:
+        """How much of it, see ``_SIZES``."""
+        return _SIZES[what][self.quick]
+
+    @property
+    def recorded(self) -> str:
+        """What Datasets 4 and 5 are, for titles."""
+        return "rig's simulator" if self.data is None else "rig recordings"
+
+    @property
+    def about_recordings(self) -> str:
+        """Where Datasets 4 and 5 come from, in a sentence."""
+        if self.data is not None:
+            return f"Datasets 4 and 5: recordings given as --data {self.data}."
+        return (
+            "Datasets 4 and 5: shipped recordings, made by the rig's own code against "
+            "its simulator (play, noise, a heading that drifts), not on a device."
+        )
+
+    @property
+    def command(self) -> str:
+        """What makes the same report again."""
+        words = ["python -m jaxcal.paper"]
+        words += [f"--seed {self.seed}"] if self.seed else []
+        words += ["--quick"] if self.quick else []
+        words += [f"--data {self.data}"] if self.data is not None else []
+        return " ".join(words)
+
+    def rng(self, *stream: int) -> np.random.Generator:
+        """A stream of its own for each use."""
+        sequence = np.random.SeedSequence(self.seed, spawn_key=stream)
+        return np.random.default_rng(sequence)
+
+
+_SIZES = {  # of a whole report, of a quick one
+    "episodes": (1_000, 200),  # of dataset2
+    "groups": (200, 40),  # of dataset0
+    "random_draws": (100, 30),  # per episode
+    "resamples": (2_000, 400),  # of a bootstrap
+    "repeats": (500, 100),  # simulated devices, or histories of one
+}
 
 
 def commands_deg(dataset: Dataset) -> Array:
@@ -44,13 +100,13 @@ class Material:
     def dataset(self, name: str) -> Dataset:
         """One of the paper's datasets, at the size of these settings."""
         if name not in self._datasets:
-            settings = self.settings
-            episodes = {"dataset0": settings.groups, "dataset2": settings.episodes}
+            given = self.settings
+            sized = {"dataset0": "groups", "dataset2": "episodes"}.get(name)
             self._datasets[name] = make_dataset(
                 name,
-                settings.seed,
-                episodes.get(name),
-                recordings=settings.data,
+                given.seed,
+                None if sized is None else given.size(sized),
+                recordings=given.data,
                 progress=self.progress,
             )
         return self._datasets[name]
@@ -62,11 +118,9 @@ class Material:
                 self.dataset(name),
                 4,
                 METHODS,
-                random_draws=self.settings.random_draws,
+                random_draws=self.settings.size("random_draws"),
                 seed=self.settings.seed,
-                progress=lambda task, *counts: self.progress(
-                    f"{name}: {task}", *counts
-                ),
+                progress=lambda task, *n: self.progress(f"{name}: {task}", *n),
             )
         return self._evaluations[name]
 
@@ -74,6 +128,14 @@ class Material:
         """What one method chose on a dataset."""
         found = self.evaluation(name).results
         return next(result for result in found if result.method == method)
+
+    def parameters(self, name: str, method: str) -> Array:
+        """(E, R, 12) identified from what one method chose, or from "all 50"."""
+        if method == "all 50":
+            return least_squares(*self.measured(name))[:, None]
+        found = self.result(name, method).parameters
+        assert found is not None
+        return found
 
     def measured(self, name: str) -> tuple[Array, Array]:
         """(E, M, 3) commands and (E, M, 3) readings of a dataset, in degrees."""
@@ -91,7 +153,3 @@ class Material:
             f" The episodes are draws from {distinct:,} postures and overlap: "
             "intervals over them say nothing about another recording."
         )
-
-    def all_parameters(self, name: str) -> Array:
-        """(E, 12) identified from every candidate of an episode."""
-        return least_squares(*self.measured(name))

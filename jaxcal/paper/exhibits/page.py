@@ -11,26 +11,17 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxcal import pages
-from jaxcal.evaluation.report import versions
+from jaxcal.evaluation.results import versions
 from jaxcal.paper.exhibits.exhibit import Claim, Exhibit, Verdict
-from jaxcal.paper.exhibits.settings import Settings
+from jaxcal.paper.exhibits.material import Settings
 
-__all__ = ["FORMAT", "VERSION", "json_document", "page"]
+__all__ = ["json_document", "page"]
 
-FORMAT = "jaxcal-reproduction"
-VERSION = 1
-
-_TONES: dict[Verdict, Literal["good", "fair", "bad", "neutral"]] = {
-    "agrees": "good",
-    "agrees in part": "fair",
-    "disagrees": "bad",
-    "not comparable": "neutral",
-}
-_PLURAL = {
-    "agrees": "agree",
-    "agrees in part": "agree in part",
-    "disagrees": "disagree",
-    "not comparable": "cannot be compared",
+_TONES: dict[Verdict, tuple[Literal["good", "fair", "bad", "neutral"], str]] = {
+    "agrees": ("good", "agree"),
+    "agrees in part": ("fair", "agree in part"),
+    "disagrees": ("bad", "disagree"),
+    "not comparable": ("neutral", "cannot be compared"),
 }
 
 
@@ -40,22 +31,15 @@ def page(
     images: Mapping[str, bytes],
     settings: Settings,
 ) -> str:
-    """One self-contained page.
-
-    Args:
-        exhibits: in the order they are shown.
-        claims: of the paper.
-        images: SVG files by figure name.
-        settings: that the exhibits were made with.
-    """
+    """One self-contained page; ``images`` are the SVG files by figure name."""
     count = Counter[str](claim.verdict for claim in claims)
-    summary = ", ".join(f"{count[v]} {_PLURAL[v]}" for v in _TONES if count[v])
+    said = [f"{count[v]} {plural}" for v, (_, plural) in _TONES.items() if count[v]]
     made_with = ", ".join(f"{name} {number}" for name, number in versions().items())
     intro = (
         "Hu, Celler, Mu and Su, “D-Optimality-Guided Reinforcement Learning for "
         "Efficient Open-Loop Calibration of a 3-DOF Ankle Rehabilitation Robot”: every "
         "figure and table reproduced from our own runs, each beside what the paper "
-        f"states. Of {len(claims)} claims, {summary}."
+        f"states. Of {len(claims)} claims, {', '.join(said)}."
     )
     code, about = pages.Code, settings.about_recordings
     small_print: list[pages.Inline] = [
@@ -65,24 +49,23 @@ def page(
         *(code("reproduction.json"), ", each figure as PNG and SVG and the robot's "),
         *("picture and film in ", code("figures/"), f". {made_with}."),
     ]
-    keys = {exhibit.key for exhibit in exhibits}
-    rows = [_claim_row(claim, claim.where in keys) for claim in claims]
+    rows = [
+        (
+            pages.Link(_typeset(claim.claim), f"#{claim.where}"),
+            *(_typeset(claim.paper), _typeset(claim.ours), _badge(claim.verdict)),
+        )
+        for claim in claims
+    ]
     table = pages.Table(("claim", "paper", "ours", "verdict"), rows, numeric=False)
-    sections = [_section(exhibit, images) for exhibit in exhibits]
+    first = pages.Section("Claim by claim", [table], "claims")
     return pages.render(
         pages.Page(
             "The paper, figure by figure",
-            [pages.Section("Claim by claim", [table], "claims"), *sections],
+            [first, *(_section(exhibit, images) for exhibit in exhibits)],
             [intro, pages.Text(small_print, "note")],
             contents=True,
         )
     )
-
-
-def _claim_row(claim: Claim, shown: bool) -> list[pages.Content]:
-    name = _typeset(claim.claim)
-    link = pages.Link(name, f"#{claim.where}") if shown else name
-    return [link, _typeset(claim.paper), _typeset(claim.ours), _badge(claim.verdict)]
 
 
 def _section(exhibit: Exhibit, images: Mapping[str, bytes]) -> pages.Section:
@@ -93,35 +76,29 @@ def _section(exhibit: Exhibit, images: Mapping[str, bytes]) -> pages.Section:
     if exhibit.rows:
         head, *body = exhibit.rows
         blocks.append(pages.Table(head, body, numeric=False))
-    blocks += [
-        pages.Figure(images[name], f"{exhibit.title}: {name.replace('_', ' ')}")
-        for name in exhibit.figures
-    ]
-    if exhibit.pictures:
-        blocks.append(pages.Row([_picture(exhibit, name) for name in exhibit.pictures]))
+    for name in exhibit.figures:
+        alt = f"{exhibit.title}: {name.replace('_', ' ')}"
+        blocks.append(pages.Figure(images[name], alt))
+    pictures = []
+    for name, data in exhibit.pictures.items():
+        still, link = name.endswith(".png"), pages.Link(name, f"figures/{name}")
+        alt = f"{exhibit.title}: {'picture' if still else 'film'}"
+        pictures.append(pages.Figure(data, alt, link, on_paper=still))
+    if pictures:
+        blocks.append(pages.Row(pictures))
     if exhibit.caption:
         blocks.append(pages.Text(_typeset(exhibit.caption), "note"))
-    if exhibit.data:
-        files: list[pages.Inline] = ["Data: "]
-        for name in exhibit.tables:
-            files += [pages.Link(name, f"data/{name}"), ", "]
-        blocks.append(pages.Text(files[:-1], "note"))
+    files: list[pages.Inline] = []
+    for name in exhibit.tables:
+        files += [", " if files else "Data: ", pages.Link(name, f"data/{name}")]
+    if files:
+        blocks.append(pages.Text(files, "note"))
     badge = None if exhibit.verdict is None else _badge(exhibit.verdict)
     return pages.Section(_typeset(exhibit.title), blocks, exhibit.key, badge)
 
 
-def _picture(exhibit: Exhibit, name: str) -> pages.Figure:
-    still = name.endswith(".png")
-    return pages.Figure(
-        exhibit.pictures[name],
-        f"{exhibit.title}: {'picture' if still else 'film'}",
-        pages.Link(name, f"figures/{name}"),
-        on_paper=still,
-    )
-
-
 def _badge(verdict: Verdict) -> pages.Badge:
-    return pages.Badge(verdict, _TONES[verdict])
+    return pages.Badge(verdict, _TONES[verdict][0])
 
 
 def _typeset(text: str) -> str:
@@ -138,18 +115,14 @@ def json_document(
     """
     data = None if settings.data is None else str(settings.data)
     document = {
-        "format": FORMAT,
-        "version": VERSION,
+        "format": "jaxcal-reproduction",
+        "version": 1,
         "settings": {"seed": settings.seed, "quick": settings.quick, "data": data},
         "versions": versions(),
         "claims": [dataclasses.asdict(claim) for claim in claims],
         "exhibits": {
             exhibit.key: {
-                "title": exhibit.title,
-                "caption": exhibit.caption,
-                "paper": exhibit.paper,
-                "ours": exhibit.ours,
-                "verdict": exhibit.verdict,
+                **{name: getattr(exhibit, name) for name in _AS_THEY_ARE},
                 "figures": list(exhibit.figures),
                 "pictures": list(exhibit.pictures),
                 "data": list(exhibit.tables),
@@ -161,16 +134,16 @@ def json_document(
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
+_AS_THEY_ARE = ("title", "caption", "paper", "ours", "verdict")
+
+
 def _plain(value: Any) -> Any:
     """JSON values of whatever the exhibits hold; what is not finite becomes null."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return _plain(dataclasses.asdict(value))
+        value = dataclasses.asdict(value)
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, np.ndarray | list | tuple):
         return [_plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    return value
+    value = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from jaxcal.information.regression import log_det_information, regression_matrix
-from jaxcal.paper.datasets import EPISODES, NUM_CANDIDATES, RANGES
-from jaxcal.paper.exhibits.columns import from_rows
-from jaxcal.paper.exhibits.exhibit import Exhibit
+from jaxcal.paper.constants import EPISODES, NUM_CANDIDATES, RANGES
+from jaxcal.paper.exhibits.exhibit import Exhibit, from_rows, judge
 from jaxcal.paper.exhibits.intervals import mean_interval
 from jaxcal.paper.exhibits.material import Material
 
@@ -29,53 +28,54 @@ def _network() -> dict[str, Any]:
     from jaxcal.learning.policies.build import build
     from jaxcal.learning.training import optimiser
     from jaxcal.paper.network import HEADS
-    from jaxcal.paper.preset import PAPER as config
+    from jaxcal.paper.preset import PAPER
 
-    network = build(config.network)
-    shapes = jax.eval_shape(
-        lambda: optimiser.init(config.ppo, config.tasks[0], network)
-    )
+    network = build(PAPER.network)
+    shapes = jax.eval_shape(lambda: optimiser.init(PAPER.ppo, PAPER.tasks[0], network))
     size = {
         name: sum(leaf.size for leaf in jax.tree.leaves(part))
         for name, part in shapes.params.items()
     }
-    heads = sum(size[name] for name in HEADS)
     total = sum(size.values())
-    return {
-        "parameters": total,
-        "shared": total - heads,
-        "shared_share": (total - heads) / total,
-        "by_layer": size,
-    }
+    shared = total - sum(size[name] for name in HEADS)
+    numbers = {"parameters": total, "shared": shared, "shared_share": shared / total}
+    return numbers | {"by_layer": size}
 
 
 def _table_2() -> Exhibit:
-    from jaxcal.paper.preset import PAPER as config
+    from jaxcal.paper.preset import PAPER
 
-    environment, ppo = config.tasks[0].environment, config.ppo
-    network, scale = _network(), environment.reward_scale
-    m, k = environment.num_candidates, environment.num_selected
-    episodes = ppo.num_episodes
-    rows: list[tuple[str, str, str]] = [
+    environment, ppo, network = PAPER.tasks[0].environment, PAPER.ppo, _network()
+    k, episodes = environment.num_selected, ppo.num_episodes
+    exact = [
         ("state, numbers", "210", str(environment.observation_size)),
-        ("actions", "50", str(m)),
+        ("actions", "50", str(environment.num_candidates)),
         ("decisions per episode", "4", str(k)),
-        ("terminal reward", "log det S / 10", f"log det S / {1 / scale:g}"),
-        ("hidden width", "768", str(config.network.width)),
-        ("parameters", "about 3.5 M", f"{network['parameters']:,}"),
-        ("shared", "about 71 %", f"{network['shared_share']:.1%}"),
+        (
+            *("terminal reward", "log det S / 10"),
+            f"log det S / {1 / environment.reward_scale:g}",
+        ),
+        ("hidden width", "768", str(PAPER.network.width)),
         ("episodes", "200,000", f"{episodes:,}"),
         ("decisions", "800,000", f"{episodes * k:,}"),
         ("episodes per update", "16", str(ppo.episodes_per_update)),
         ("epochs per update", "10", str(ppo.num_epochs)),
+    ]
+    about = [
+        ("parameters", "about 3.5 M", f"{network['parameters']:,}"),
+        ("shared", "about 71 %", f"{network['shared_share']:.1%}"),
+    ]
+    rows = [
+        *exact[:5],
+        *about,
+        *exact[5:],
         ("reward's range", "3.0 to 4.2", "see below"),
     ]
-    exact = [row for row in rows if "about" not in row[1] and "see" not in row[2]]
-    same = sum(row[1] == row[2] for row in exact)
+    same = sum(paper == ours for _, paper, ours in exact)
     return Exhibit.from_texts(
         "table_2",
         {"same": same, "exact": len(exact)},
-        verdict="agrees" if same == len(exact) else "disagrees",
+        verdict=judge(same == len(exact)),
         rows=[("", "paper", "ours"), *rows],
         data={"table_2": from_rows(("item", "paper", "ours"), rows)},
         numbers=network,
@@ -101,15 +101,15 @@ def _table_3(material: Material) -> Exhibit:
             size, used = data.num_candidates, f"{data.num_episodes:,}"
             outputs = 0 if data.measured is None else data.num_outputs
             width = data.num_inputs + outputs
-        ours = (EPISODES[name], size, width)
-        numbers[name] = {"paper": [episodes, 50, dim], "ours": list(ours)}
-        told = (f"{e:,} x {m}, {d}" for e, m, d in ((episodes, 50, dim), ours))
+        sizes = {"paper": [episodes, 50, dim], "ours": [EPISODES[name], size, width]}
+        numbers[name] = sizes
+        told = (f"{e:,} x {m}, {d}" for e, m, d in sizes.values())
         rows.append((name, kind, *told, used))
     same = all(entry["paper"] == entry["ours"] for entry in numbers.values())
     return Exhibit.from_texts(
         "table_3",
         {"recordings": material.settings.about_recordings},
-        verdict="agrees" if same else "agrees in part",
+        verdict=judge(same, True),
         rows=rows,
         numbers=numbers,
     )
@@ -119,17 +119,15 @@ def _reward(material: Material) -> Exhibit:
     corners = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
     sets = np.array(list(itertools.combinations(range(8), 4)))
     with np.errstate(divide="ignore"):
-        values = np.asarray(log_det_information(corners[sets]))
-    bound = float(values.max())
-    policy = material.result("dataset2", "policy").log_det[:, 0]
+        bound = float(np.max(log_det_information(corners[sets])))
+    reward = material.result("dataset2", "policy").log_det[:, 0] / 10.0
     best = material.evaluation("dataset2").reference
-    reward = policy / 10.0
     side = float(np.exp((36.0 - best.mean()) / 18.0))
-    words = {"count": len(policy), "bound": bound / 10, "side": side}
+    words = {"count": len(reward), "bound": bound / 10, "side": side}
     return Exhibit.from_texts(
         "reward_range",
         words | {"constant": RANGES.log_det_scale / 10},
-        verdict="disagrees" if bound / 10 < 3.0 else "agrees",
+        verdict=judge(bound / 10 >= 3.0),
         numbers={
             "largest_log_det_s_in_unit_cube": bound,
             "policy_reward": mean_interval(reward),
@@ -148,10 +146,9 @@ def _rank(material: Material) -> Exhibit:
         k: [int(np.linalg.matrix_rank(regression_matrix(c[:k]))) for c in sets]
         for k in (3, 4, 5)
     }
-    least = {k: min(values) for k, values in ranks.items()}
     return Exhibit.from_texts(
         "rank",
         {"count": len(sets)},
-        verdict="agrees" if least[4] == 12 and max(ranks[3]) < 12 else "disagrees",
-        numbers={f"rank_of_{k}": value for k, value in least.items()},
+        verdict=judge(min(ranks[4]) == 12 and max(ranks[3]) < 12),
+        numbers={f"rank_of_{k}": min(values) for k, values in ranks.items()},
     )

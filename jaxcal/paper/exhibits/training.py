@@ -13,6 +13,7 @@ import pathlib
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from jaxcal.evaluation.training_figure import (
@@ -20,19 +21,16 @@ from jaxcal.evaluation.training_figure import (
     read_metrics,
     training_curves,
 )
-from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict
-from jaxcal.paper.exhibits.figures.training import curves_over_seeds
+from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict, judge
 from jaxcal.paper.exhibits.intervals import mean_interval
 from jaxcal.paper.exhibits.material import Material
+from jaxcal.plots.style import COLOURS, GREY, band, boxes, panels
 
 __all__ = ["Run", "exhibits", "kept_runs", "plateau"]
 
 Array = NDArray[np.float64]
 
-SEEDS_FOLDER = "compact_seeds"
-PAPER_FOLDER = "paper"
 CLAIMED = 200_000  # episodes within which the paper's training converges
-_GRID = 100
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,13 +43,17 @@ class Run:
     rewards: Array  # of the last episodes
     rewards_are: str  # in words
 
+    @property
+    def finished(self) -> bool:
+        """Whether it ran as many episodes as were planned."""
+        return self.summary["episodes"] >= (self.summary["planned_episodes"] or CLAIMED)
+
 
 def exhibits(material: Material) -> list[Exhibit]:
     """The seeds of the compact preset, and the paper's network."""
     studies = material.settings.studies
-    seeds = kept_runs(studies / SEEDS_FOLDER)
-    paper = kept_runs(studies, PAPER_FOLDER)
-    return [_seeds(seeds, paper[0] if paper else None), _paper(paper)]
+    seeds, paper = kept_runs(studies / "compact_seeds"), kept_runs(studies, "paper")
+    return [_seeds(seeds, paper), _paper(paper)]
 
 
 def kept_runs(folder: pathlib.Path, pattern: str = "seed_*") -> list[Run]:
@@ -61,18 +63,16 @@ def kept_runs(folder: pathlib.Path, pattern: str = "seed_*") -> list[Run]:
         ValueError: a file of one cannot be understood.
     """
     found = []
-    for place in sorted(folder.glob(pattern)):
-        if not (place / "metrics.csv").is_file():
-            continue
-        metrics = read_metrics(place / "metrics.csv")
-        rewards, what = last_rewards(place, metrics)
-        found.append(Run(place, metrics, _summary(place, metrics), rewards, what))
+    for path in sorted(folder.glob(f"{pattern}/metrics.csv")):
+        metrics = read_metrics(path)
+        rewards, what = last_rewards(path.parent, metrics)
+        summary = _summary(path.with_name("summary.json"), metrics)
+        found.append(Run(path.parent, metrics, summary, rewards, what))
     return sorted(found, key=lambda run: run.summary["seed"])
 
 
-def _summary(folder: pathlib.Path, metrics: dict[str, Array]) -> dict[str, Any]:
+def _summary(path: pathlib.Path, metrics: dict[str, Array]) -> dict[str, Any]:
     """The summary of a run; what metrics.csv tells where there is none."""
-    path = folder / "summary.json"
     known: dict[str, Any] = {
         "seed": 0,
         "episodes": int(metrics["episodes"][-1]),
@@ -85,7 +85,7 @@ def _summary(folder: pathlib.Path, metrics: dict[str, Array]) -> dict[str, Any]:
     if path.is_file():
         try:
             held = json.loads(path.read_text(encoding="utf-8"))
-            known |= {name: held[name] for name in known}
+            return {name: held[name] for name in known}
         except (ValueError, KeyError, TypeError):
             raise ValueError(f"{path} is not the summary of a training run") from None
     return known
@@ -100,8 +100,7 @@ def plateau(run: Run) -> dict[str, float]:
     """
     reward, episodes = run.metrics["reward_mean"], run.metrics["episodes"]
     count = len(reward)
-    part = max(count // 10, 1)
-    window = max(count // 20, 1)
+    part, window = max(count // 10, 1), max(count // 20, 1)
     final = float(reward[-part:].mean())
     rise = final - float(reward[0])
     smooth = np.convolve(reward, np.ones(window) / window, mode="valid")
@@ -116,28 +115,38 @@ def plateau(run: Run) -> dict[str, float]:
     }
 
 
-def _seeds(runs: list[Run], paper: Run | None) -> Exhibit:
+def _converges(runs: list[Run], flat: list[dict[str, float]]) -> Verdict:
+    """Whether every run rose and became flat within the paper's episodes."""
+    if not all(run.finished and run.summary["episodes"] >= CLAIMED for run in runs):
+        return "not comparable"
+    rose = all(state["rise"] > 0 for state in flat)
+    settled = all(abs(state["last_tenth"]) < 0.02 for state in flat)
+    in_time = all(state["episode"] <= CLAIMED for state in flat)
+    return judge(rose and settled and in_time, rose and not settled)
+
+
+def _seeds(runs: list[Run], paper: list[Run]) -> Exhibit:
     if len(runs) < 2:
         return Exhibit.missing("figure_2", seeds=len(runs))
     grid = np.linspace(
         max(run.metrics["episodes"][0] for run in runs),
         min(run.metrics["episodes"][-1] for run in runs),
-        _GRID,
+        100,
     )
-    reward = np.array(
-        [np.interp(grid, r.metrics["episodes"], r.metrics["reward_mean"]) for r in runs]
-    )
-    bands = [mean_interval(column) for column in reward.T]
     columns: dict[str, Any] = {"episodes": grid}
-    for run, curve in zip(runs, reward, strict=True):
+    for run in runs:
+        curve = np.interp(grid, run.metrics["episodes"], run.metrics["reward_mean"])
         columns[f"reward_seed_{run.summary['seed']}"] = curve
-    columns["reward_mean"] = [b.value for b in bands]
-    columns["reward_low"] = [b.low for b in bands]
-    columns["reward_high"] = [b.high for b in bands]
+    bands = [
+        mean_interval(row) for row in zip(*list(columns.values())[1:], strict=True)
+    ]
+    for name, field in (("mean", "value"), ("low", "low"), ("high", "high")):
+        columns[f"reward_{name}"] = [getattr(found, field) for found in bands]
     flat = [plateau(run) for run in runs]
+    lengths = [run.summary["episodes"] for run in runs]
     numbers: dict[str, Any] = {
         "seeds": len(runs),
-        "episodes": [run.summary["episodes"] for run in runs],
+        "episodes": lengths,
         "plateau_episode": mean_interval([f["episode"] for f in flat]),
         "last_tenth_of_rise": [f["last_tenth"] for f in flat],
         "last_1000_reward_mean": mean_interval([r.rewards.mean() for r in runs]),
@@ -154,14 +163,18 @@ def _seeds(runs: list[Run], paper: Run | None) -> Exhibit:
             f"and the optimum is hit in {numbers['hit_rate']:.3f}."
         )
     rewards = {f"seed {run.summary['seed']}": run.rewards for run in runs}
-    rewards |= {"paper's network": paper.rewards} if paper else {}
-    least, most = min(numbers["episodes"]), max(numbers["episodes"])
-    length = f"{most:,}" if least == most else f"{least:,} to {most:,}"
+    if paper:
+        rewards["paper's network"] = paper[0].rewards
+    ends = dict.fromkeys((min(lengths), max(lengths)))
     return Exhibit.from_texts(
         "figure_2",
-        {"range": length, "caution": _caution(runs), "measured": text},
+        {
+            "range": " to ".join(f"{end:,}" for end in ends),
+            "caution": _caution(runs),
+            "measured": text,
+        },
         verdict=_converges(runs, flat),
-        figures={"figure_2_seeds": curves_over_seeds(runs, columns, rewards, paper)},
+        figures={"figure_2_seeds": _curves(runs, columns, rewards, paper)},
         data={
             "reward": columns,
             "last_rewards": {
@@ -173,41 +186,71 @@ def _seeds(runs: list[Run], paper: Run | None) -> Exhibit:
     )
 
 
-def _finished(run: Run) -> bool:
-    return run.summary["episodes"] >= (run.summary["planned_episodes"] or CLAIMED)
-
-
-def _converges(runs: list[Run], flat: list[dict[str, float]]) -> Verdict:
-    """Whether every run rose and became flat within the paper's episodes."""
-    if not all(_finished(r) and r.summary["episodes"] >= CLAIMED for r in runs):
-        return "not comparable"
-    if not all(state["rise"] > 0 for state in flat):
-        return "disagrees"
-    if all(abs(state["last_tenth"]) < 0.02 for state in flat):
-        in_time = all(state["episode"] <= CLAIMED for state in flat)
-        return "agrees" if in_time else "disagrees"
-    return "agrees in part"
-
-
 def _caution(runs: list[Run]) -> str:
     """Where the runs are shorter than the claim or cut off; else nothing."""
     parts = []
-    short = [r for r in runs if r.summary["episodes"] < CLAIMED]
+    short = [run for run in runs if run.summary["episodes"] < CLAIMED]
     if short:
         parts.append(f"{len(short)} of {len(runs)} runs are shorter than {CLAIMED:,}")
-    cut = [r for r in runs if not _finished(r)]
+    cut = [run for run in runs if not run.finished]
     if cut:
         parts.append(f"{len(cut)} not finished")
     return ", ".join(parts) + ". " if parts else ""
+
+
+def _curves(
+    runs: list[Run],
+    columns: dict[str, Any],
+    rewards: dict[str, Array],
+    paper: list[Run],
+) -> Figure:
+    """Reward with its band, last rewards by seed, and the share of the optimum."""
+    title = "Training of the compact preset"
+    figure, (left, middle, right) = panels((12.0, 3.8), title, (1, 3))
+    thin = {"color": GREY, "linewidth": 0.6, "alpha": 0.7}
+    for i, run in enumerate(runs):
+        x, y = run.metrics["episodes"] / 1e3, run.metrics["reward_mean"]
+        left.plot(x, y, label="one seed" if i == 0 else None, **thin)
+    ends = (columns[f"reward_{name}"] for name in ("mean", "low", "high"))
+    text = "mean; band: its 95 % interval"
+    band(left, columns["episodes"] / 1e3, *ends, color=COLOURS[0], label=text)
+    left.set_title(f"(a) reward, {len(runs)} seeds", fontsize=10)
+
+    colours = [COLOURS[0 if name.startswith("seed") else 1] for name in rewards]
+    boxes(middle, list(rewards.values()), colours, (5, 95))
+    short = [n.removeprefix("seed ").removesuffix("'s network") for n in rewards]
+    middle.set_xticks(range(1, len(rewards) + 1), short)
+    middle.set_xlabel("seed; box: quartiles, whiskers: 5 to 95 %")
+    middle.set_title("(b) reward, last 1,000 episodes", fontsize=10)
+
+    seed: dict[str, Any] = {"color": GREY, "linewidth": 1.0, "linestyle": "-"}
+    other: dict[str, Any] = {"color": COLOURS[1], "linewidth": 1.6, "linestyle": "--"}
+    labels = {"compact, one seed": (runs, seed), "paper's network": (paper, other)}
+    for label, (shown, look) in labels.items():
+        for i, run in enumerate(shown):
+            x = run.metrics["episodes"]
+            ratio = run.metrics.get("ratio_to_exact", np.full(len(x), np.nan))
+            known = np.isfinite(ratio)
+            name = None if i else label
+            right.plot(x[known] / 1e3, ratio[known], label=name, **look)
+    right.set_ylim(0.0, 1.02)
+    right.set_title("(c) share of the optimum, validation", fontsize=10)
+    right.set_ylabel("mean det S / det S*")
+    for axes in (left, middle):
+        axes.set_ylabel("reward (log det S / 10)")
+    for axes in (left, right):
+        axes.set_xlabel("training episodes (thousands)")
+        axes.legend(fontsize=8, frameon=False, loc="lower right")
+    return figure
 
 
 def _paper(runs: list[Run]) -> Exhibit:
     if not runs:
         return Exhibit.missing("figure_2_paper", present=False)
     run = runs[0]
-    held, flat, finished = run.summary, plateau(run), _finished(run)
+    held, flat = run.summary, plateau(run)
     took = "" if held["seconds"] is None else f" in {held['seconds'] / 3600:.2f} h"
-    took += "." if finished else ": not finished, so this is how far it went."
+    took += "." if run.finished else ": not finished, so this is how far it went."
     good, measured = held["dataset2"], ""
     ratio = run.metrics.get("ratio_to_exact", np.array([np.nan]))
     known = ratio[np.isfinite(ratio)]
@@ -224,18 +267,16 @@ def _paper(runs: list[Run]) -> Exhibit:
     return Exhibit.from_texts(
         "figure_2_paper",
         {
+            **{"took": took, "measured": measured, "rewards_are": run.rewards_are},
             "planned": held["planned_episodes"] or CLAIMED,
-            "took": took,
-            "measured": measured,
             "weights": "" if size is None else f", {size:,} weights",
-            "rewards_are": run.rewards_are,
         },
         verdict=_converges([run], [flat]),
         figures={"figure_2_paper": figure},
         data={"metrics": run.metrics, "last_rewards": {"reward": run.rewards}},
         numbers={
             "present": True,
-            "finished": finished,
+            "finished": run.finished,
             **held,
             **flat,
             "last_reward_mean": float(run.rewards.mean()),

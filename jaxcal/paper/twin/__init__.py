@@ -1,41 +1,25 @@
-"""The paper's robot, simulated: in closed form, in MuJoCo, and in pictures.
-
-``robot`` is what the robot is and its closed form (JAX); ``robot_model`` the same in
-MuJoCo; ``robot_pictures`` draws it. Names load on first use: the closed form needs no
-MuJoCo.
-"""
+"""The paper's robot, simulated: in closed form, in MuJoCo, and in pictures."""
 
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from jaxcal.paper.twin.robot import RobotConfig, joint_angles, measure, read_out
-    from jaxcal.paper.twin.robot_model import simulate, trajectory
-    from jaxcal.paper.twin.robot_pictures import animate, render
-
-__all__ = [
-    "RobotConfig",
-    "animate",
-    "joint_angles",
-    "measure",
-    "read_out",
-    "render",
-    "simulate",
-    "trajectory",
-]
-
-_HOME = {
+_HOMES = {  # loaded when first used: the closed form needs no MuJoCo
+    "RobotConfig": "robot",
     "animate": "robot_pictures",
+    "joint_angles": "robot",
+    "measure": "robot",
+    "read_out": "robot",
     "render": "robot_pictures",
     "simulate": "robot_model",
     "trajectory": "robot_model",
 }
 
+__all__ = list(_HOMES)  # the names above
+
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
+    if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    home = importlib.import_module(f"{__name__}.{_HOME.get(name, 'robot')}")
-    return getattr(home, name)
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

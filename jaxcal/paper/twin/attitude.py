@@ -11,15 +11,9 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
-__all__ = ["ORDERS", "angles_of", "require_order", "rotation_of"]
+__all__ = ["ORDERS", "angles_of", "rotation_of"]
 
 ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")
-
-
-def require_order(name: str, order: str) -> None:
-    """Refuse what is not one of ``ORDERS``, naming the field."""
-    if order not in ORDERS:
-        raise ValueError(f"{name} must be one of {', '.join(ORDERS)}, got {order!r}")
 
 
 def rotation_of(angles_deg: jax.Array, order: str) -> jax.Array:
@@ -56,7 +50,6 @@ def angles_of(matrix: jax.Array, order: str) -> jax.Array:
 
 
 def _axes(order: str) -> tuple[int, int, int]:
-    require_order("order", order)
     i, j, k = ("XYZ".index(letter) for letter in order)
     return i, j, k
 

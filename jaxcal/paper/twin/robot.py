@@ -25,20 +25,14 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers
-from jaxcal.paper.twin.attitude import ORDERS, angles_of, require_order, rotation_of
+from jaxcal.checks import numbers, one_of
+from jaxcal.paper.twin.attitude import ORDERS, angles_of, rotation_of
 
-__all__ = [
-    "ORDERS",
-    "RobotConfig",
-    "joint_angles",
-    "measure",
-    "play",
-    "read_out",
-]
+__all__ = ["ORDERS", "RobotConfig", "joint_angles", "measure", "play", "read_out"]
 
 Array = NDArray[np.float64]
-PerAxis = float | tuple[float, float, float]
+Triple = tuple[float, float, float]
+PerAxis = float | Triple
 """One number for all axes, or pitch, yaw and roll"""
 
 GRAVITY = 9.81  # m/s^2, along -y
@@ -59,45 +53,45 @@ class RobotConfig:
     the gap between the two stops of a joint, in joint degrees.
     """
 
-    scale: tuple[float, float, float] = (0.43, 0.71, 0.87)
-    bias_deg: tuple[float, float, float] = (3.1, -5.8, 2.41)
+    scale: Triple = (0.43, 0.71, 0.87)
+    bias_deg: Triple = (3.1, -5.8, 2.41)
     mechanism_order: str = "XYZ"  # axes from the base outwards
     read_out_order: str = "XYZ"  # of the Euler angles that are read
-    mounting_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    mounting_deg: Triple = (0.0, 0.0, 0.0)
     backlash_deg: PerAxis = 0.0
     compliance_deg_per_nm: PerAxis = 0.0  # of each joint
     load_kg: float = 1.0  # foot and plate; felt only through compliance
-    load_offset_m: tuple[float, float, float] = (0.0, -0.03, 0.05)  # from the ankle
+    load_offset_m: Triple = (0.0, -0.03, 0.05)  # from the ankle
     noise_std_deg: PerAxis = 0.0  # white, of each angle read
     drift_std_deg: PerAxis = 0.0  # step of the bias from a session to the next
     drift_seed: int = 0  # of that random walk
 
     def __post_init__(self) -> None:
-        require_order("mechanism_order", self.mechanism_order)
-        require_order("read_out_order", self.read_out_order)
+        for name in ("mechanism_order", "read_out_order"):
+            one_of(name, getattr(self, name), ORDERS)
         for name in ("scale", "bias_deg", "mounting_deg", "load_offset_m"):
             value = getattr(self, name)
             if np.shape(value) != (3,) or not np.isfinite(value).all():
                 raise ValueError(f"{name} must be three finite numbers, got {value!r}")
             object.__setattr__(self, name, tuple(float(v) for v in value))
         for name in _PER_AXIS:
-            value = np.asarray(getattr(self, name), dtype=np.float64)
-            if value.shape not in ((), (3,)) or not (value >= 0).all():
+            value = getattr(self, name)
+            if (
+                np.shape(value) not in ((), (3,))
+                or not np.greater_equal(value, 0).all()
+            ):
                 raise ValueError(
-                    f"{name} must be one number or three, none negative, got "
-                    f"{getattr(self, name)!r}"
+                    f"{name} must be one number or three, none negative, got {value!r}"
                 )
             if not np.isfinite(value).all():
-                raise ValueError(f"{name} must be finite, got {getattr(self, name)!r}")
-            plain = float(value) if value.ndim == 0 else tuple(map(float, value))
+                raise ValueError(f"{name} must be finite, got {value!r}")
+            plain = tuple(map(float, value)) if np.ndim(value) else float(value)
             object.__setattr__(self, name, plain)
         if not 0.0 <= self.load_kg < float("inf"):
             raise ValueError(f"load_kg must be finite and >= 0, got {self.load_kg}")
-        slender = (
-            np.radians(self.per_axis("compliance_deg_per_nm").max())
-            * (self.load_kg * GRAVITY)
-            * float(np.linalg.norm(self.load_offset_m))
-        )
+        arm = float(np.linalg.norm(self.load_offset_m))
+        slender = np.radians(self.per_axis("compliance_deg_per_nm").max())
+        slender *= self.load_kg * GRAVITY * arm
         if slender > _MAX_SLENDERNESS:
             raise ValueError(
                 "compliance_deg_per_nm x load_kg x load_offset_m must bend the robot "
@@ -126,13 +120,7 @@ def read_out(config: RobotConfig, commands_deg: ArrayLike | jax.Array) -> Any:
 
 
 def joint_angles(config: RobotConfig, commands_deg: ArrayLike | jax.Array) -> Any:
-    """(..., 3) where the joints settle, in degrees, without play and drift.
-
-    Args:
-        config: the robot.
-        commands_deg: (..., 3) pitch, yaw, roll in degrees.
-    """
-
+    """(..., 3) where the joints settle, in degrees, without play and drift."""
     return _in_its_precision(functools.partial(_joint_angles, config), commands_deg)
 
 
@@ -225,11 +213,10 @@ def _bent(config: RobotConfig, target_deg: jax.Array) -> jax.Array:
     dtype = target_deg.dtype
     softness = jnp.asarray(compliance, dtype)
     offset = jnp.asarray(config.load_offset_m, dtype)
-    weight = config.load_kg * GRAVITY
 
     def potential(joints: jax.Array) -> jax.Array:
         turned = rotation_of(jnp.rad2deg(joints), config.mechanism_order)
-        return weight * (turned[1] @ offset)
+        return config.load_kg * GRAVITY * (turned[1] @ offset)
 
     target = jnp.deg2rad(target_deg)
 
@@ -239,16 +226,14 @@ def _bent(config: RobotConfig, target_deg: jax.Array) -> jax.Array:
         slope = jnp.eye(3, dtype=dtype) + softness[:, None] * curvature
         return joints - jnp.linalg.solve(slope, excess)
 
-    joints = jax.lax.fori_loop(0, _NEWTON_STEPS, newton, target)
-    return jnp.rad2deg(joints)
+    return jnp.rad2deg(jax.lax.fori_loop(0, _NEWTON_STEPS, newton, target))
 
 
 def _seen(config: RobotConfig, joints_deg: jax.Array) -> jax.Array:
     """(3,) angles that the phone reads at joints (3,)."""
     turned = rotation_of(joints_deg, config.mechanism_order)
     if any(config.mounting_deg):
-        mounting = jnp.asarray(config.mounting_deg, joints_deg.dtype)
-        phone = rotation_of(mounting, "XYZ")
+        phone = rotation_of(jnp.asarray(config.mounting_deg, joints_deg.dtype), "XYZ")
         turned = phone.T @ turned @ phone
     return angles_of(turned, config.read_out_order)
 
@@ -258,10 +243,7 @@ def _seen(config: RobotConfig, joints_deg: jax.Array) -> jax.Array:
 
 def _each(function: Any, rows: jax.Array) -> jax.Array:
     """Apply a function of (3,) to (..., 3)."""
-    if rows.ndim < 1 or rows.shape[-1] != 3:
-        raise ValueError(f"commands must have shape (..., 3), got {rows.shape}")
-    flat = jax.vmap(function)(rows.reshape(-1, 3))
-    return flat.reshape(rows.shape)
+    return jnp.vectorize(function, signature="(k)->(k)")(rows)
 
 
 def _joint_angles(config: RobotConfig, commands: jax.Array) -> jax.Array:
@@ -277,19 +259,25 @@ def _read_out(config: RobotConfig, commands: jax.Array) -> jax.Array:
 def _measure(
     config: RobotConfig, commands: jax.Array, drift: jax.Array, noise: jax.Array
 ) -> jax.Array:
-    dtype = commands.dtype
-    driven = _each(lambda u: _driven(config, u), commands)
-    gap = jnp.asarray(config.per_axis("backlash_deg"), dtype)
-    start = jnp.asarray(config.bias_deg, dtype)
-    rows = driven.reshape(-1, *driven.shape[-2:])
-    loose = jax.vmap(play, (0, None, None))(rows, gap, start).reshape(driven.shape)
+    gap, start, level = (
+        jnp.asarray(values, commands.dtype)
+        for values in (
+            config.per_axis("backlash_deg"),
+            config.bias_deg,
+            config.per_axis("noise_std_deg"),
+        )
+    )
+    drag = jnp.vectorize(lambda q: play(q, gap, start), signature="(n,k)->(n,k)")
+    loose = drag(_each(lambda u: _driven(config, u), commands))
     read = _each(lambda q: _seen(config, _bent(config, q)), loose + drift)
-    level = jnp.asarray(config.per_axis("noise_std_deg"), dtype)
     return read + jnp.broadcast_to(level, noise.shape) * noise
 
 
 def _in_its_precision(function: Any, commands_deg: ArrayLike | jax.Array) -> Any:
     """JAX arrays as they are; everything else in float64, and back to numpy."""
+    shape = np.shape(commands_deg)
+    if shape[-1:] != (3,):
+        raise ValueError(f"commands must have shape (..., 3), got {shape}")
     if isinstance(commands_deg, jax.Array):
         if not jnp.issubdtype(commands_deg.dtype, jnp.floating):
             commands_deg = commands_deg.astype(jnp.float32)

@@ -1,7 +1,7 @@
 """The robot drawn by matplotlib, for machines where MuJoCo cannot draw.
 
-The boxes and rods of the compiled scene, in the perspective of its camera: every face
-is a polygon, and far ones are painted first.
+The boxes and rods of the compiled scene, in the perspective of its camera: a rod is a
+ribbon, a face of a box is cut into patches, and far ones are painted first.
 """
 
 from __future__ import annotations
@@ -35,28 +35,22 @@ class Drawing:
         import mujoco
         from matplotlib.figure import Figure
 
-        self._figure = Figure(figsize=(width / 100.0, height / 100.0), dpi=100)
-        self._axes = self._figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        figure = Figure(figsize=(width / 100.0, height / 100.0), dpi=100)
+        self._axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
         self._aspect = width / height
         self._zoom = 1.0 / np.tan(np.radians(model.cam_fovy[0]) / 2.0)
-        corners, geoms = [], []
-        for geom in range(model.ngeom):
-            box = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_BOX
-            faces = (_box_faces if box else _rod_faces)(model.geom_size[geom])
-            corners.append(faces)
-            geoms.append(np.full(len(faces), geom))
-        self._corners = np.concatenate(corners)  # (F, 4, 3) in the frames of the geoms
-        self._geom = np.concatenate(geoms)  # (F,) index of the geom of each face
-        normals = np.cross(
-            self._corners[:, 1] - self._corners[:, 0],
-            self._corners[:, 2] - self._corners[:, 1],
-        )
-        outward = np.sign((normals * self._corners[:, 0]).sum(axis=1, keepdims=True))
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        self._normals = normals * outward / length  # (F, 3)
-        self._colours = model.geom_rgba[self._geom, :3].astype(np.float64)
-        flat = (model.geom_type == mujoco.mjtGeom.mjGEOM_BOX) & (model.geom_bodyid == 3)
-        self._layer = _LAYER_M * (np.cumsum(flat) * flat)[self._geom]
+        self._colours = model.geom_rgba[:, :3].astype(np.float64)
+        self._size = model.geom_size
+        box = model.geom_type == mujoco.mjtGeom.mjGEOM_BOX
+        self._layer = _LAYER_M * np.cumsum(box & (model.geom_bodyid == 3))
+        self._rods = np.flatnonzero(~box)
+        patches = [
+            (i, *p) for i in np.flatnonzero(box) for p in _patches(self._size[i])
+        ]
+        of, corners, normals = zip(*patches, strict=True)
+        self._boxes = np.array(of)  # (F,) index of the geom of each patch
+        self._corners = np.array(corners)  # (F, 4, 3) in the frames of the geoms
+        self._normals = np.array(normals)  # (F, 3)
 
     def update_scene(self, data: Any, camera: str) -> None:
         """Take the state of ``mujoco.MjData``; there is one camera only."""
@@ -70,64 +64,60 @@ class Drawing:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.collections import PolyCollection
 
-        data = self._data
-        turns = data.geom_xmat.reshape(-1, 3, 3)[self._geom]
-        corners = self._corners @ np.matrix_transpose(turns)
-        corners += data.geom_xpos[self._geom][:, None]
-        normals = np.einsum("fij,fj->fi", turns, self._normals)
-        eye, camera = data.cam_xpos[0], data.cam_xmat[0].reshape(3, 3)
-        seen = ((eye - corners[:, 0]) * normals).sum(axis=1) > 0.0
-        placed = (corners[seen] - eye) @ camera  # to the right, up, backwards
-        depth = -placed[..., 2]
-        points = placed[..., :2] / depth[..., None] * self._zoom
+        data, boxes, rods = self._data, self._boxes, self._rods
+        turns, places = data.geom_xmat.reshape(-1, 3, 3), data.geom_xpos
+        corners = self._corners @ np.matrix_transpose(turns[boxes])
+        corners += places[boxes, None]
+        normals = np.einsum("fij,fj->fi", turns[boxes], self._normals)
+        seen = ((data.cam_xpos[0] - corners[:, 0]) * normals).sum(axis=1) > 0.0
+        faces, depth = self._projected(corners[seen])
         bright = 0.55 + 0.45 * np.abs(normals[seen] @ _LIGHT)
-        colours = np.minimum(bright[:, None] * self._colours[seen], 1.0)
-        far_first = np.argsort(self._layer[seen] - depth.mean(axis=1))
+        boxes = boxes[seen]
+        far = self._layer[boxes] - depth.mean(axis=1)
+
+        half = turns[rods, :, 2] * self._size[rods, 1, None]
+        ends, depth = self._projected(places[rods, None] + half[:, None] * [[-1], [1]])
+        along = ends[:, 1] - ends[:, 0]
+        across = np.stack([-along[:, 1], along[:, 0]], axis=1)
+        across /= np.linalg.norm(across, axis=1, keepdims=True) + 1e-12
+        wide = across[:, None] * (self._zoom * self._size[rods, :1] / depth)[..., None]
+        ribbons = np.concatenate([ends - wide, (ends + wide)[:, ::-1]], axis=1)
+
+        shapes = np.concatenate([faces, ribbons])
+        order = np.argsort(np.append(far, -depth.mean(axis=1)))
+        bright = np.append(bright, np.full(len(rods), 0.85))[:, None]
+        colours = np.minimum(bright * self._colours[np.append(boxes, rods)], 1.0)[order]
         axes = self._axes
         axes.clear()
         axes.set_axis_off()
         axes.set(xlim=(-self._aspect, self._aspect), ylim=(-1.0, 1.0))
-        axes.add_collection(
-            PolyCollection(
-                points[far_first],
-                facecolors=colours[far_first],
-                edgecolors=colours[far_first],
-                linewidths=0.4,
-            )
-        )
-        canvas = FigureCanvasAgg(self._figure)
+        look = {"facecolors": colours, "edgecolors": colours, "linewidths": 0.4}
+        axes.add_collection(PolyCollection(list(shapes[order]), **look))
+        canvas = FigureCanvasAgg(axes.figure)
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
+    def _projected(self, points: Array) -> tuple[Array, Array]:
+        """Places (..., 2) in the picture and depths (...) of points (..., 3)."""
+        camera = self._data.cam_xmat[0].reshape(3, 3)
+        placed = (points - self._data.cam_xpos[0]) @ camera  # right, up, backwards
+        depth = -placed[..., 2]
+        return placed[..., :2] / depth[..., None] * self._zoom, depth
 
-def _box_faces(half: Array) -> Array:
-    """(F, 4, 3) patches of a box with half sides (3,) about its centre."""
-    faces = []
+
+def _patches(half: Array) -> list[tuple[Array, Array]]:
+    """Corners (4, 3) and normals (3,) of the faces of a box about its centre."""
+    found = []
     for axis in range(3):
         j, k = (axis + 1) % 3, (axis + 2) % 3
-        for a, b in itertools.pairwise(_cuts(half[j])):
-            for c, d in itertools.pairwise(_cuts(half[k])):
-                patch = np.empty((4, 3))
+        for (a, b), (c, d) in itertools.product(_cuts(half[j]), _cuts(half[k])):
+            for side in (-1.0, 1.0):
+                patch = np.full((4, 3), side * half[axis])
                 patch[:, j], patch[:, k] = (a, b, b, a), (c, c, d, d)
-                for side in (-half[axis], half[axis]):
-                    patch[:, axis] = side
-                    faces.append(patch.copy())
-    return np.array(faces)
+                found.append((patch, side * np.eye(3)[axis]))
+    return found
 
 
-def _cuts(half: float) -> Array:
-    return np.linspace(-half, half, 1 + max(1, round(2.0 * half / _PATCH_M)))
-
-
-def _rod_faces(size: Array) -> Array:
-    """(14, 4, 3) faces of a prism of eight sides along z: radius, half length."""
-    turns = np.linspace(0.0, 2.0 * np.pi, 9)
-    low = np.stack([np.cos(turns), np.sin(turns), np.full(9, -1.0)], axis=1)
-    low *= [size[0], size[0], size[1]]
-    high = low * [1.0, 1.0, -1.0]
-    sides = np.stack([low[:-1], low[1:], high[1:], high[:-1]], axis=1)
-    ends = [end[cut] for end in (low, high) for cut in _CAP]
-    return np.concatenate([sides, ends])
-
-
-_CAP = ([0, 1, 2, 3], [0, 3, 4, 7], [4, 5, 6, 7])  # an octagon by its corners
+def _cuts(half: float) -> list[tuple[float, float]]:
+    ends = np.linspace(-half, half, 1 + max(1, round(2.0 * half / _PATCH_M)))
+    return list(itertools.pairwise(ends.tolist()))

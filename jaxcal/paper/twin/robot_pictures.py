@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import ctypes.util
 import importlib
-import io
 import itertools
 import os
 import pathlib
@@ -23,13 +22,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.checks import one_of
 from jaxcal.files import atomic_write
 from jaxcal.paper import command
 from jaxcal.paper.twin.robot import RobotConfig, joint_angles, read_out
 from jaxcal.paper.twin.robot_drawing import Drawing
 from jaxcal.paper.twin.robot_model import load_model, pose, trajectory
 from jaxcal.paper.twin.robot_parts import AXIS_COLOURS
-from jaxcal.progress import Progress
 
 __all__ = ["BACKENDS", "animate", "draw", "main", "render"]
 
@@ -63,7 +62,7 @@ def render(
     size: tuple[int, int] = (960, 720),
     backend: str = "auto",
 ) -> str:
-    """Write a picture of the robot at one command.
+    """Write a picture of the robot at one command; what drew it, as in ``draw``.
 
     Args:
         config: the robot.
@@ -72,9 +71,6 @@ def render(
         size: width and height in pixels, at most 1280 x 960.
         backend: mujoco, matplotlib, or auto: the first that works.
 
-    Returns:
-        What drew it: mujoco or matplotlib.
-
     Raises:
         OSError: the file cannot be written.
         RuntimeError: mujoco was asked for and cannot draw here.
@@ -82,7 +78,8 @@ def render(
     command_deg = np.asarray(commands_deg, dtype=np.float64).reshape(1, 3)
     with draw(config, size, backend) as (name, picture):
         image = picture(np.asarray(joint_angles(config, command_deg))[0])
-    _save(path, [_captioned(config, image, command_deg[0])], 0)
+    read = np.asarray(read_out(config, command_deg))
+    _save(path, [_captioned(image, command_deg[0], read[0])], 0)
     return name
 
 
@@ -101,7 +98,7 @@ def animate(
         config: the robot.
         path: of the GIF.
         commands_deg: (N, 3) pitch, yaw, roll in degrees, one second each.
-        size: as ``backend`` and what is returned and raised, see ``render``.
+        size: as ``backend``, what is returned and what is raised, see ``render``.
         backend: mujoco, matplotlib or auto.
         progress: told how many frames of how many are drawn.
     """
@@ -109,12 +106,13 @@ def animate(
     links = trajectory(
         config, way, hold_s=1.0 / _FRAMES_PER_S, frames_per_s=_FRAMES_PER_S
     )[1:]
+    read = np.asarray(read_out(config, way))
     with draw(config, size, backend) as (name, picture):
         frames: list[Any] = []
-        for angles, command_deg in zip(links, way, strict=True):
+        for angles, *told in zip(links, way, read, strict=True):
             if progress is not None:
                 progress("draw the film", len(frames), len(way))
-            frames.append(_captioned(config, picture(angles), command_deg))
+            frames.append(_captioned(picture(angles), *told))
     _save(path, frames, round(1000.0 / _FRAMES_PER_S))
     return name
 
@@ -126,23 +124,21 @@ def draw(
     """What draws, and a function from joint angles (3,) in degrees to an image."""
     import mujoco
 
-    if backend not in BACKENDS:
-        raise ValueError(
-            f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}"
-        )
+    one_of("backend", backend, BACKENDS)
     width, height = size
     if not (1 <= width <= 1280 and 1 <= height <= 960):
         raise ValueError(f"size must be within 1280 x 960 pixels, got {size}")
     model = load_model(config)
     data = mujoco.MjData(model)
-    try:
-        if backend == "matplotlib":
-            raise RuntimeError("not asked for")
-        canvas, name = _renderer(model, width, height), "mujoco"
-    except Exception as error:  # drivers fail in many ways
-        if backend == "mujoco":
-            why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-            raise RuntimeError(f"MuJoCo cannot draw here: {why}") from None
+    canvas, name = None, "mujoco"
+    if backend != "matplotlib":
+        try:
+            canvas = _renderer(model, width, height)
+        except Exception as error:  # drivers fail in many ways
+            if backend == "mujoco":
+                why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+                raise RuntimeError(f"MuJoCo cannot draw here: {why}") from None
+    if canvas is None:
         canvas, name = Drawing(model, width, height), "matplotlib"
 
     def picture(joints_deg: ArrayLike) -> Image:
@@ -165,8 +161,7 @@ def _renderer(model: Any, width: int, height: int) -> Any:
 
     if os.environ.get("MUJOCO_GL") or not sys.platform.startswith("linux"):
         return mujoco.Renderer(model, height, width)
-    found = (name for name in ("EGL", "OSMesa") if ctypes.util.find_library(name))
-    library = next(found, None)
+    library = next(filter(ctypes.util.find_library, ("EGL", "OSMesa")), None)
     if library is None:
         raise RuntimeError(
             "there is no EGL or OSMesa library (Debian: libegl1 and libgl1-mesa-dri)"
@@ -186,7 +181,7 @@ def _renderer(model: Any, width: int, height: int) -> Any:
 # -- captions and files ----------------------------------------------------------------
 
 
-def _captioned(config: RobotConfig, image: Image, command_deg: Array) -> Any:
+def _captioned(image: Image, command_deg: Array, read: Array) -> Any:
     """A pillow image that says what was commanded and what the phone reads."""
     from PIL import Image as Pillow
     from PIL import ImageDraw, ImageFont
@@ -195,32 +190,32 @@ def _captioned(config: RobotConfig, image: Image, command_deg: Array) -> Any:
     pen = ImageDraw.Draw(picture)
     size = max(11, picture.height // 30)
     font = ImageFont.load_default(size)
-    read = np.asarray(read_out(config, command_deg))
     rows = [("axis", "command", "phone", (60, 60, 60))]
     names = ("pitch", "yaw", "roll")
-    for name, letter, told, seen in zip(names, "XYZ", command_deg, read, strict=True):
-        red, green, blue = (round(255 * value) for value in AXIS_COLOURS[letter])
-        rows.append((name, f"{told:+.1f}°", f"{seen:+.1f}°", (red, green, blue)))
-    for line, (name, told, reached, colour) in enumerate(rows):
+    for name, rgb, *angles in zip(
+        names, AXIS_COLOURS.values(), command_deg, read, strict=True
+    ):
+        red, green, blue = (round(255 * value) for value in rgb)
+        told, reached = (f"{angle:+.1f}°" for angle in angles)
+        rows.append((name, told, reached, (red, green, blue)))
+    for line, (*texts, colour) in enumerate(rows):
         y = size * (0.6 + 1.35 * line)
-        pen.text((0.7 * size, y), name, colour, font)
-        for column, text in ((8.0, told), (12.5, reached)):
-            width = pen.textlength(text, font)
-            pen.text((column * size - width, y), text, colour, font)
+        for text, column, anchor in zip(
+            texts, (0.7, 8.0, 12.5), ("la", "ra", "ra"), strict=True
+        ):
+            pen.text((column * size, y), text, colour, font, anchor)
     return picture
 
 
 def _save(path: str | os.PathLike[str], frames: list[Any], frame_ms: int) -> None:
     """One frame as a PNG, several as a GIF that repeats."""
-    buffer = io.BytesIO()
-    if frame_ms == 0:
-        frames[0].save(buffer, "PNG", optimize=True)
-    else:
-        first, *rest = _in_one_palette(frames)
-        film = {"save_all": True, "append_images": rest, "duration": frame_ms}
-        first.save(buffer, "GIF", loop=0, optimize=False, **film)
     with atomic_write(path) as file:
-        file.write(buffer.getvalue())
+        if frame_ms == 0:
+            frames[0].save(file, "PNG", optimize=True)
+        else:
+            first, *rest = _in_one_palette(frames)
+            film = {"save_all": True, "append_images": rest, "duration": frame_ms}
+            first.save(file, "GIF", loop=0, optimize=False, **film)
 
 
 def _in_one_palette(frames: list[Any]) -> list[Any]:
@@ -249,8 +244,8 @@ def _smooth(postures_deg: Array) -> Array:
 def main(arguments: list[str] | None = None) -> int:
     """Write both; the exit code."""
     parser = command.Parser(
-        prog="python -m jaxcal.paper.twin.robot_pictures",
-        description="Write robot.png and robot.gif, a picture and a film of the robot.",
+        "python -m jaxcal.paper.twin.robot_pictures",
+        "Write robot.png and robot.gif, a picture and a film of the robot.",
     )
     parser.add_argument("folder", type=pathlib.Path, metavar="DIR")
     parser.add_argument("--backend", choices=BACKENDS, default="auto")
@@ -259,13 +254,11 @@ def main(arguments: list[str] | None = None) -> int:
     def write() -> None:
         config = RobotConfig(mechanism_order="YXZ", read_out_order="YXZ")
         options.folder.mkdir(parents=True, exist_ok=True)
-        path = options.folder / "robot.png"
-        name = render(config, path, backend=options.backend)
-        print(f"saved: {path}, drawn by {name}", flush=True)
-        path, progress = options.folder / "robot.gif", Progress()
-        name = animate(config, path, backend=options.backend, progress=progress)
-        progress.clear()
-        print(f"saved: {path}, drawn by {name}")
+        for make, file in ((render, "robot.png"), (animate, "robot.gif")):
+            path = options.folder / file
+            print(
+                f"saved: {path}, drawn by {make(config, path, backend=options.backend)}"
+            )
 
     return command.run(write, "robot_pictures", "files already named are complete")
 
