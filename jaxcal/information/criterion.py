@@ -73,8 +73,7 @@ class Criterion:
         too, which is zero to rounding.
         """
         if self.kind == "least":
-            values: Array = np.linalg.eigvalsh(self._scaled(information))
-            return values[..., 0]
+            return np.linalg.eigh(self._scaled(information))[0][..., 0]
         half, regular = self._half(information)
         if self.kind == "trace":
             phi = -(half * half).sum(axis=(-2, -1))
@@ -86,13 +85,13 @@ class Criterion:
         """G (..., p, p), a supergradient of phi at nonsingular M (..., p, p)."""
         if self.kind == "least":
             lowest = np.linalg.eigh(self._scaled(information))[1][..., :1]
-            factor: Array = np.linalg.solve(self.root, lowest)
-            return factor @ np.matrix_transpose(factor)
+            lowest = np.linalg.inv(self.root) @ lowest
+            return lowest @ np.matrix_transpose(lowest)
         solved = np.linalg.solve(information, self.root.T)
         inner = np.matrix_transpose(solved)
         if self.kind == "det":
             inner = np.linalg.solve(self.root @ solved, inner)
-        gradient: Array = solved @ inner
+        gradient = solved @ inner
         return (gradient + np.matrix_transpose(gradient)) / 2.0
 
     def reported(self, phi: Array | float) -> Array | float:
