@@ -194,7 +194,7 @@ def make_problems(
     model = Affine(n, m)
     cap, forced = _check_counts(mask, k, required, max_replicates, single)
     raw, root = model.blocks(array), np.zeros((0, n + 1))
-    blocks, prior, log_scale, singular = whiten(raw, mask, root)
+    blocks, prior, _, log_scale, singular = whiten(raw, mask, root)
     if singular.size:
         b = int(singular[0])
         where = "available ones" + _in_set(b, single)
@@ -268,7 +268,7 @@ def make_block_problem(
     m = 1 if num_outputs is None else whole_number("num_outputs", num_outputs, 1)
     forced = None if required is None else _leading_axis("required", required)
     cap, chosen = _check_counts(mask, k, forced, max_replicates, True)
-    white, whitened_prior, log_scale, singular = whiten(raw, mask, root)
+    white, whitened_prior, _, log_scale, singular = whiten(raw, mask, root)
     if singular.size:
         null = missing_directions(raw[0][mask[0]], root)
         names = tuple(f"theta{i + 1}" for i in range(p))
