@@ -1,4 +1,4 @@
-"""Problems from candidates of a model, from sets of affine candidates, or from blocks."""
+"""Problems from candidates of a model, sets of affine candidates, or blocks."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def make_problem(
     plain = parameters is None and shares_regressor(model, prior, noise)
     if plain and isinstance(model, Affine):
         wanted = wanted_criterion(criterion, None, (), "D")
-        std = 1.0 if noise is None or noise.std is None else float(noise.std)
+        std = None if noise is None else noise.std
         return _affine(model, array, rules, wanted, std, region, measured)[0]
     modelled = Modelled(model, prior, noise)
     default = "D" if isinstance(model, Affine) else "I"
@@ -202,7 +202,7 @@ def _affine(
     array: Array,
     rules: _Rules,
     wanted: Wanted,
-    std: float = 1.0,
+    std: ArrayLike | None = None,
     region: ArrayLike | None = None,
     measured: ArrayLike | None = None,
 ) -> list[Problem]:
@@ -210,7 +210,7 @@ def _affine(
 
     def blocks(commands: Array) -> Array:
         made = model.blocks(commands)
-        return made if std == 1.0 else made / std
+        return made if std is None else made / np.asarray(std)
 
     root = np.zeros((0, model.num_inputs + 1))
     if measured is not None:
@@ -289,7 +289,7 @@ def _refuse_blind(
 def _with_measured(root: Array, blocks: Array) -> Array:
     """Root of a precision with the information of blocks (N, q, p) added."""
     rows = np.concatenate([root, blocks.reshape(-1, root.shape[1])])
-    return np.linalg.qr(rows, mode="r") if len(rows) > root.shape[1] else rows
+    return np.linalg.qr(rows)[1] if len(rows) > root.shape[1] else rows
 
 
 def _as_blocks(

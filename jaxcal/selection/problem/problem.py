@@ -124,4 +124,5 @@ def values(problem: Problem, indices: Indices) -> tuple[Array, Array]:
         return log_det, log_det
     rows = problem.blocks[indices].reshape(len(indices), -1, problem.num_regressors)
     phi = criterion.value(np.matrix_transpose(rows) @ rows + problem.prior)
-    return criterion.reported(np.where(np.isneginf(log_det), -np.inf, phi)), log_det
+    value = criterion.reported(np.where(np.isneginf(log_det), -np.inf, phi))
+    return np.asarray(value), log_det
