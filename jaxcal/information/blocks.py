@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 __all__ = [
     "Whitened",
+    "largest_rank",
     "log_det_blocks",
     "missing_directions",
     "null_directions",
@@ -173,6 +174,16 @@ def rank_of_blocks(blocks: Array, root: Array) -> NDArray[np.int64]:
     """(...,) rank of the information of blocks (..., N, q, p) measured together."""
     rows, largest, _ = _stack(blocks, None, root)
     return rank_rule(rows, largest, blocks.shape[-3])[0]
+
+
+def largest_rank(blocks: Array) -> int:
+    """Of single blocks (N, q, p); the first is nearly always of full rank."""
+    full, none = min(blocks.shape[1:]), np.zeros((0, blocks.shape[2]))
+    for some in (blocks[:1], blocks):
+        rank = int(rank_of_blocks(some[:, None], none).max(initial=0))
+        if rank == full:
+            break
+    return rank
 
 
 def missing_directions(blocks: Array, root: Array) -> list[Array]:

@@ -59,6 +59,11 @@ class Problem:
         return self.blocks[:, 0]
 
     @property
+    def rank_one(self) -> bool:
+        """One reading per candidate and criterion D, which have kernels of their own."""
+        return self.blocks.shape[1] == 1 and self.criterion.name == "D"
+
+    @property
     def num_regressors(self) -> int:
         """p, n + 1 for the affine model."""
         return self.blocks.shape[2]
@@ -98,8 +103,7 @@ class Problem:
         wanted and all rows lie in one plane off the origin, as those of [u, 1] do: the
         optimum then uses vertices of the convex hull only.
         """
-        _, q, p = self.blocks.shape
-        if q > 1 or self.k != p or len(self.root) or self.criterion.name != "D":
+        if not self.rank_one or self.k != self.num_regressors or len(self.root):
             return False
         height = self.rows @ self.rows.sum(axis=0)
         return bool((np.abs(height - 1.0) <= _IN_PLANE)[self.available].all())

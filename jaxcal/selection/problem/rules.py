@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import require_finite, whole_number
-from jaxcal.information.blocks import rank_of_blocks
+from jaxcal.information.blocks import largest_rank, rank_of_blocks
 from jaxcal.selection.problem.problem import Problem
 
 __all__ = [
@@ -136,7 +136,7 @@ def check_k(
         regressors: the blocks are [u, 1].
     """
     q, p = raw.shape[2:]
-    most = 1 if q == 1 else _largest_rank(raw[mask])
+    most = 1 if q == 1 else largest_rank(raw[mask])
     fewest = -(-p // max(most, 1))
     k = fewest if k is None else whole_number("k", k, 1)
     known = int(rank_of_blocks(root[None], root[:0])) if len(root) else 0
@@ -153,16 +153,6 @@ def check_k(
         + (f" and {known} known beforehand" if known else "")
         + f", got {k}"
     )
-
-
-def _largest_rank(blocks: Array) -> int:
-    """Of blocks (N, q, p); the first is nearly always of full rank."""
-    full, none = min(blocks.shape[1:]), np.zeros((0, blocks.shape[2]))
-    for some in (blocks[:1], blocks):
-        rank = int(rank_of_blocks(some[:, None], none).max(initial=0))
-        if rank == full:
-            break
-    return rank
 
 
 def check_required_rank(problem: Problem, where: str) -> None:
