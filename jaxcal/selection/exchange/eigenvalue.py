@@ -71,9 +71,8 @@ def _best(
     lift = (blocks @ vectors[:, 0]) ** 2
     bound = np.where(free, sizes[0] + lift.sum(axis=1), -np.inf)
     # A block of q readings lifts no eigenvalue above the q-th next of before.
-    bound = np.minimum(
-        bound, np.append(sizes, np.inf)[min(blocks.shape[1], len(sizes))]
-    )
+    if blocks.shape[1] < len(sizes):
+        bound = np.minimum(bound, sizes[blocks.shape[1]])
     order = np.argsort(-bound)
     best = -1
     for first in range(0, len(order), _CHUNK):

@@ -12,6 +12,7 @@ from jaxcal.checks import axis_names, numbers, whole_number
 from jaxcal.information.blocks import missing_directions, prior_root, whiten
 from jaxcal.information.excitation import directions_in_words, require_excited
 from jaxcal.models.affine import Affine
+from jaxcal.models.identifiability import identifiability
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.problem.modelled import (
@@ -75,7 +76,7 @@ def make_problem(
         model = Affine(array.shape[1], whole_number("num_outputs", m, 1))
     elif num_outputs is not None:
         raise ValueError("num_outputs must not be given with a model, which has it")
-    elif array.shape[1] != model.num_inputs:
+    elif isinstance(model, Affine) and array.shape[1] != model.num_inputs:
         raise ValueError(
             f"candidates must have shape (M, {model.num_inputs}) for this model, got "
             f"{array.shape}"
@@ -93,6 +94,9 @@ def make_problem(
     wanted = wanted_criterion(criterion, parameters, modelled.names, default)
     raw = modelled.blocks(array[0], mask[0])[None]
     root = prior_root(modelled.precision)
+    if not np.diagonal(modelled.precision).all():
+        shown = [array[mask]] if measured is None else [array[mask], measured]
+        _require_identified(model, np.concatenate(shown), noise, prior)
     if measured is not None:
         root = _with_measured(root, modelled.blocks_at("measured", measured, True))
     if region is None and modelled.noise.command_std is not None:
@@ -247,7 +251,7 @@ def _whitened(
                 which = "available ones" + in_set(b, single)
                 used = candidates[b][mask[b]]
                 require_excited(used, names[:-1], "candidates", which)
-        _refuse_blind(raw[b][mask[b]], root, names or (), candidates is None)
+        _refuse_blind(raw[b][mask[b]], root, names or ())
     owned = [raw, root, white.blocks, white.prior, mask, forced]
     for each in owned if candidates is None else [*owned, candidates]:
         each.flags.writeable = False
@@ -267,22 +271,28 @@ def _whitened(
     return problems
 
 
-def _refuse_blind(
-    blocks: Array, root: Array, names: tuple[str, ...], bare: bool
+def _require_identified(
+    model: Model, commands: Array, noise: Noise | None, prior: Prior | None
 ) -> None:
+    """Refuse commands that, with the prior, leave parameters unknown; name them."""
+    prior = model.default_prior() if prior is None else prior
+    left = identifiability(model, commands, noise=noise, prior=prior).directions
+    if left:
+        raise ValueError(
+            "candidates must inform every parameter, but with what is known they say "
+            f"nothing of {'; '.join(each.words for each in left)}; give a prior "
+            "(jaxcal.Prior with finite std) or hold some (Prior with fixed=[name])"
+        )
+
+
+def _refuse_blind(blocks: Array, root: Array, names: tuple[str, ...]) -> None:
     """Raise for the directions that neither blocks (N, q, p) nor ``root`` inform."""
     null = missing_directions(blocks, root)
     raise ValueError(
-        f"{'blocks' if bare else 'candidates'} must inform every parameter, but the "
-        "available ones"
+        "blocks must inform every parameter, but the available ones"
         + (" and what is known" if len(root) else "")
         + directions_in_words(" say nothing of the direction{} ", null, names)
-        + "; give prior, "
-        + (
-            "a precision of what is known"
-            if bare
-            else "jaxcal.Prior(std=...), or hold some: Prior(..., fixed=[name])"
-        )
+        + "; give prior, a precision of what is known of them"
     )
 
 

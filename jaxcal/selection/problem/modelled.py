@@ -63,15 +63,16 @@ class Modelled:
 
     def blocks(self, candidates: Array, available: NDArray[np.bool_]) -> Array:
         """(M, q, p) of candidates (M, n), zero where not available."""
-        count, q = len(candidates), self.model.num_outputs
-        used = candidates[available]
+        count, used = len(candidates), candidates[available]
+        jacobian = self._jacobian("candidates", used)
+        q = jacobian.shape[1]
         slopes = None
         if self.noise.command_std is not None:
-            slopes = np.zeros((count, q, self.model.num_inputs))
+            slopes = np.zeros((count, q, candidates.shape[1]))
             slopes[available] = self.model.command_jacobian(used, self._mean)
-        white = self.noise.whitening(count, q, slopes)[available]
         blocks = np.zeros((count, q, len(self.names)))
-        blocks[available] = white @ self._jacobian("candidates", used)
+        white = self.noise.whitening(count, q, slopes)
+        blocks[available] = white[available] @ jacobian
         return blocks
 
     def blocks_at(self, argument: str, commands: ArrayLike, readings: bool) -> Array:
@@ -94,8 +95,8 @@ class Modelled:
             slopes = self.model.command_jacobian(points, self._mean)
         else:
             noise = dataclasses.replace(noise, command_std=None)
-        white = noise.whitening(len(points), self.model.num_outputs, slopes)
-        return white @ self._jacobian(argument, points)
+        jacobian = self._jacobian(argument, points)
+        return noise.whitening(*jacobian.shape[:2], slopes) @ jacobian
 
     def _jacobian(self, argument: str, commands: Array) -> Array:
         """(N, q, p) derivative by the free parameters, checked."""

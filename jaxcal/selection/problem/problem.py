@@ -60,7 +60,7 @@ class Problem:
 
     @property
     def rank_one(self) -> bool:
-        """One reading per candidate and criterion D, which have kernels of their own."""
+        """One reading per candidate, criterion D: these have kernels of their own."""
         return self.blocks.shape[1] == 1 and self.criterion.name == "D"
 
     @property
