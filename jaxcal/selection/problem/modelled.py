@@ -96,7 +96,8 @@ class Modelled:
         else:
             noise = dataclasses.replace(noise, command_std=None)
         jacobian = self._jacobian(argument, points)
-        return noise.whitening(*jacobian.shape[:2], slopes) @ jacobian
+        white = noise.whitening(len(points), jacobian.shape[1], slopes)
+        return white @ jacobian
 
     def _jacobian(self, argument: str, commands: Array) -> Array:
         """(N, q, p) derivative by the free parameters, checked."""
