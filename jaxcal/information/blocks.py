@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _EPS = float(np.finfo(np.float64).eps)
+_TINY = float(np.finfo(np.float64).tiny)
 
 
 def rank_rule(
@@ -52,22 +53,26 @@ def rank_rule(
     """
     num_rows, p = columns.shape[-2:]
     norms, flat, rounding = _norms(columns, largest, count or num_rows)
-    scaled = np.where(flat, 0.0, columns / np.where(flat, 1.0, norms))
-    singular = np.linalg.svd(scaled, compute_uv=False)
+    if flat.any():
+        columns, norms = np.where(flat, 0.0, columns), np.where(flat, 1.0, norms)
+    singular = np.linalg.svd(columns / norms, compute_uv=False)
     rank = (singular > rounding[..., None]).sum(axis=-1)
-    with np.errstate(divide="ignore"):
-        value = 2.0 * (np.log(singular).sum(axis=-1) + np.log(norms).sum(axis=(-1, -2)))
+    sizes = np.maximum(singular, _TINY)
+    value = 2.0 * (np.log(sizes).sum(axis=-1) + np.log(norms[..., 0, :]).sum(axis=-1))
     return rank, np.where(rank == p, value, -np.inf)
 
 
 def _norms(columns: Array, largest: Array, count: int) -> tuple[Array, Mask, Array]:
     """Column norms (..., 1, p), which are mere rounding, and the tolerance (...,)."""
-    norms = np.sqrt((columns * columns).sum(axis=-2, keepdims=True))
+    norms = np.sqrt(np.einsum("...ij,...ij->...j", columns, columns))
     resolution = _EPS * max(count, 1)
-    widths = largest[..., None, :]
-    flat = norms <= resolution * widths
-    rounding = (widths / np.where(flat, np.inf, norms)).max(axis=(-1, -2))
-    return norms, flat, resolution * np.maximum(8.0, rounding)
+    flat = norms <= resolution * largest
+    rounding = (largest / np.where(flat, np.inf, norms)).max(axis=-1)
+    return (
+        norms[..., None, :],
+        flat[..., None, :],
+        resolution * np.maximum(8.0, rounding),
+    )
 
 
 def null_directions(columns: Array, largest: Array) -> list[Array]:
@@ -125,25 +130,25 @@ def _stack(
     The third is the map (..., p, p) that was subtracted: rows are ``B - B @ shift``.
     """
     *batch, count, q, p = blocks.shape
-    number = count
-    first = blocks[..., :1, :, :]
-    same = blocks == first
-    if usable is not None:
+    if usable is None:
+        first = blocks[..., :1, :, :]
+        same = blocks == first
+        mean = blocks.mean(axis=-3)
+    else:
         weight = usable[..., None, None]
-        blocks = np.where(weight, blocks, 0.0)
-        number = usable.sum(axis=-1)[..., None, None]
+        blocks = blocks * weight
         at = usable.argmax(axis=-1)[..., None, None, None]
         first = np.take_along_axis(blocks, at, axis=-3)
         same = (blocks == first) | ~weight
+        mean = blocks.sum(axis=-3) / usable.sum(axis=-1)[..., None, None]
     same = same.all(axis=(-3, -2))[..., None, :]
-    constant = np.where(same, first[..., 0, :, :], 0.0)
-    mean = np.where(same, 0.0, blocks.sum(axis=-3) / number)
+    constant = first[..., 0, :, :] * same
     if q == 1:
         square = (constant * constant).sum(axis=-1, keepdims=True)
-        inverse = np.matrix_transpose(constant) / np.where(square > 0.0, square, 1.0)
+        inverse = np.matrix_transpose(constant) / np.maximum(square, _TINY)
     else:
         inverse = np.linalg.pinv(constant)
-    shift = inverse @ mean
+    shift = inverse @ (mean * ~same)
     centred = blocks - (constant @ shift)[..., None, :, :]
     if usable is not None:
         centred *= weight

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -30,7 +31,7 @@ class Wanted(NamedTuple):
         basis = white.basis[b]
         p = len(basis)
         if self.name == "D":
-            return Criterion("D", np.eye(p), self.times, float(white.log_scale[b]))
+            return Criterion("D", _identity(p), self.times, float(white.log_scale[b]))
         if self.name == "I":
             if self.region is None:
                 mean = (np.eye(p) - white.prior[b]) / readings
@@ -42,6 +43,13 @@ class Wanted(NamedTuple):
             return Criterion("I", np.sqrt(size[keep])[:, None] * vectors.T[keep])
         root = basis if self.positions is None else basis[self.positions]
         return Criterion(self.name, root, 1 if self.name == "E" else self.times)
+
+
+@functools.cache
+def _identity(p: int) -> Array:
+    identity = np.eye(p)
+    identity.flags.writeable = False
+    return identity
 
 
 def wanted_criterion(
