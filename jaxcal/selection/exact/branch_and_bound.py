@@ -104,8 +104,10 @@ def branch_and_bound(
         if not nodes and size:
             # Incumbents may use what the root rules out as no better than they are.
             alive = np.flatnonzero(highs[:size].any(axis=0) | counts.any(axis=0))
-            lows, highs, points = (a[:, alive] for a in (lows, highs, points))
-            counts = counts[:, alive]
+            lows, highs, points = (
+                np.ascontiguousarray(a[:, alive]) for a in (lows, highs, points)
+            )
+            counts = np.ascontiguousarray(counts[:, alive])
             problem = problem._replace(blocks=problem.blocks[alive])
             width = len(alive)
             if enough is not None:

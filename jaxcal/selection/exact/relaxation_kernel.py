@@ -64,7 +64,7 @@ def linear_gain(low, high, c, k, leverage):
         if c[i] > low[i]:
             least = min(least, leverage[i])
     if not (least < np.inf and most > -np.inf):
-        return 0.0, 0.0
+        return 0.0, most if most > -np.inf else least  # there is no other choice
     cut = 0.5 * (least + most)
     for _ in range(30):
         if most - least <= 1e-13 * abs(most):
