@@ -171,8 +171,11 @@ def process(
         if away > _WHOLE:
             whole = False
         if low[i] < high[i]:
-            # The most fractional; among whole ones the one nearest to changing.
-            this = away if away > _WHOLE else _WHOLE / (1.0 + abs(leverage[i] - cut))
+            # The nearest below a whole number: with it chosen the bound is sharper.
+            # Among whole ones the one nearest to changing.
+            this = _WHOLE / (1.0 + abs(leverage[i] - cut))
+            if away > _WHOLE:
+                this = c[i] - np.floor(c[i])
             if this > score:
                 score = this
                 branch = i
