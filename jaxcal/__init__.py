@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         log_det_information,
         regression_matrix,
     )
+    from jaxcal.models import Noise, Prior, identifiability
     from jaxcal.selection import Selection, score, select
     from jaxcal.selection.fastest import Motion, pareto_front, select_fastest
     from jaxcal.selection.plan import plan
@@ -26,8 +27,11 @@ if TYPE_CHECKING:
 __all__ = [
     "Calibration",
     "Motion",
+    "Noise",
+    "Prior",
     "Selection",
     "hat_matrix",
+    "identifiability",
     "identify",
     "information_matrix",
     "leverages",
@@ -45,6 +49,9 @@ __version__ = "0.1.0"
 _HOME = {
     "Calibration": "jaxcal.calibration",
     "identify": "jaxcal.calibration",
+    "Noise": "jaxcal.models",
+    "Prior": "jaxcal.models",
+    "identifiability": "jaxcal.models",
     "plan": "jaxcal.selection.plan",
     "Selection": "jaxcal.selection",
     "score": "jaxcal.selection",

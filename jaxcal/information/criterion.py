@@ -26,6 +26,7 @@ Atkinson, Donev and Tobias, Optimum Experimental Designs.
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +88,7 @@ class Criterion:
             lowest = np.linalg.eigh(self._scaled(information))[1][..., :1]
             lowest = np.linalg.inv(self.root) @ lowest
             return lowest @ np.matrix_transpose(lowest)
-        solved = np.linalg.solve(information, self.root.T)
+        solved: NDArray[Any] = np.linalg.solve(information, self.root.T)
         inner = np.matrix_transpose(solved)
         if self.kind == "det":
             inner = np.linalg.solve(self.root @ solved, inner)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import axis_letter, whole_number
 from jaxcal.information.regression import regression_matrix, regressors
+from jaxcal.models.model import as_commands, as_parameters
+from jaxcal.models.uncertainty import Prior
 
 __all__ = ["Affine"]
 
@@ -53,21 +56,36 @@ class Affine:
         slopes = np.eye(self.num_outputs, self.num_inputs)
         return np.concatenate([slopes.ravel(), np.zeros(self.num_outputs)])
 
-    def predict(self, commands: ArrayLike, parameters: ArrayLike) -> Array:
+    def predict(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
         """Outputs (N, m) at commands (N, n) for parameters (m (n + 1),)."""
-        return self.jacobian(commands) @ np.asarray(parameters, dtype=np.float64)
+        return self.jacobian(commands) @ as_parameters(self, parameters)
 
     def jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
         """(N, m, m (n + 1)) derivative of the outputs; ``parameters`` do not matter."""
+        commands = as_commands(commands, self.num_inputs)
         matrix = regression_matrix(commands, self.num_outputs)
         return matrix.reshape(-1, self.num_outputs, self.num_parameters)
+
+    def command_jacobian(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
+        """(N, m, n): the matrix A for every command."""
+        count = len(as_commands(commands, self.num_inputs))
+        slopes = as_parameters(self, parameters)[: self.num_outputs * self.num_inputs]
+        shape = (self.num_outputs, self.num_inputs)
+        return np.broadcast_to(slopes.reshape(shape), (count, *shape))
 
     def blocks(self, commands: ArrayLike) -> Array:
         """(..., N, 1, n + 1) information blocks [u, 1] of commands (..., N, n)."""
         return regressors(commands)[..., None, :]
 
-    def default_prior(self) -> Array:
-        """(m (n + 1), m (n + 1)) precision: zero, nothing is known beforehand."""
-        return np.zeros((self.num_parameters, self.num_parameters))
+    def default_prior(self) -> Prior:
+        """Nothing is known beforehand."""
+        return Prior(np.inf)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"kind": "affine", **dataclasses.asdict(self)}

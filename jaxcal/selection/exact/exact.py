@@ -78,7 +78,7 @@ def as_found(result: ExactResult, **record: Any) -> Found:
     """What the protocol wants to know."""
     return Found(
         indices=result.subsets[0],
-        log_det=float(result.log_dets[0]),
+        value=float(result.log_dets[0]),
         bound=result.bound,
         proven=result.proven,
         nodes=result.nodes,

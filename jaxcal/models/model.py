@@ -1,0 +1,90 @@
+"""What every model answers: ``y = f(u; theta)``, its derivatives, names and prior."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import numbers
+
+if TYPE_CHECKING:
+    from jaxcal.models.uncertainty import Prior
+
+__all__ = ["Model", "as_commands", "as_parameters"]
+
+Array = NDArray[np.float64]
+
+
+@runtime_checkable
+class Model(Protocol):
+    """n commands, p parameters, q outputs; everything is float64 in the caller's units.
+
+    ``parameters=None`` stands for ``nominal`` in every method.
+    """
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """p names of the parameters."""
+
+    @property
+    def nominal(self) -> Array:
+        """(p,) parameters of the machine as it was designed."""
+
+    @property
+    def num_inputs(self) -> int:
+        """n."""
+
+    @property
+    def num_outputs(self) -> int:
+        """q."""
+
+    @property
+    def num_parameters(self) -> int:
+        """p."""
+
+    def predict(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
+        """Outputs (N, q) at commands (N, n)."""
+
+    def jacobian(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
+        """(N, q, p) derivative of the outputs by the parameters."""
+
+    def command_jacobian(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
+        """(N, q, n) derivative of the outputs by the commands."""
+
+    def default_prior(self) -> Prior:
+        """What is known before measuring; infinite std where nothing is."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON with a ``kind``; :func:`jaxcal.models.from_dict` reads it."""
+
+
+def as_commands(commands: ArrayLike, num_inputs: int) -> Array:
+    """``commands`` as finite float64 (N, n)."""
+    array = numbers("commands", commands)
+    if array.ndim != 2 or array.shape[1] != num_inputs:
+        raise ValueError(
+            f"commands must have shape (N, {num_inputs}) for this model, "
+            f"got {array.shape}"
+        )
+    return array
+
+
+def as_parameters(model: Model, parameters: ArrayLike | None) -> Array:
+    """``parameters`` as finite float64 (p,); the nominal ones for None."""
+    if parameters is None:
+        return model.nominal
+    array = numbers("parameters", parameters)
+    if array.shape != (model.num_parameters,):
+        raise ValueError(
+            f"parameters must have shape ({model.num_parameters},) for this model, "
+            f"got {array.shape}"
+        )
+    return array
