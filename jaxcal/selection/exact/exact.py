@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.selection.exact.branch_and_bound import branch_and_bound, relaxed_bound
+from jaxcal.selection.exact.branch_and_bound import branch_and_bound
+from jaxcal.information.criterion import Criterion
 from jaxcal.selection.exact.volume import enumeration_cost, largest_volumes
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.greedy import greedy_indices
@@ -122,13 +123,14 @@ def solve_exact(
     first = np.array([members[0] for members in groups])
     found = branch_and_bound(
         problem.blocks[first],
-        problem.prior.copy(),
+        problem.prior,
+        Criterion("D", np.eye(problem.num_regressors)),
         _sums(problem.lower, groups),
         np.minimum(_sums(problem.upper, groups), problem.k),
         _sums(np.bincount(start, minlength=len(problem.blocks)), groups),
         best,
         deadline,
-        enough / problem.multiplicity,
+        None if enough == 0 else np.exp(-enough/problem.num_parameters),
     )
     subsets = [_expand(problem, groups, counts) for counts in found.counts]
     bound = None if found.proven else found.bound
@@ -158,13 +160,15 @@ def _relaxed(problem: Problem, start: Indices) -> float:
     """Upper bound on the whitened log det, from a selection (k,) to climb from."""
     keep = np.flatnonzero(problem.available)
     counts = np.bincount(start, minlength=len(problem.blocks))
-    return relaxed_bound(
+    return branch_and_bound(
         problem.blocks[keep],
-        problem.prior.copy(),
+        problem.prior,
+        Criterion("D", np.eye(problem.num_regressors)),
         problem.lower[keep],
         problem.upper[keep],
         counts[keep],
-    )
+        root_only=True,
+    ).bound
 
 
 def _pool(problem: Problem, hull: bool) -> Indices:
