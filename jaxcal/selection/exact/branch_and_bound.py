@@ -132,7 +132,7 @@ def _relaxation(
     from jaxcal.selection.exact.criterion_kernel import DS, TRACE, D, E, Relaxation
 
     k, root = int(start.sum()), criterion.root
-    rank = int(np.linalg.matrix_rank(blocks).max())
+    rank = 1 if blocks.shape[1] == 1 else int(np.linalg.matrix_rank(blocks).max())
     p = len(prior)
     scale, shift = 1.0, 0.0
     if criterion.kind == "det" and len(root) == p:

@@ -11,15 +11,15 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from jaxcal.information.linear_algebra import factor, gram_of
+from jaxcal.information.linear_algebra import gram_of
 from jaxcal.selection.exact.criterion_kernel import RANK, D, E, Local, evaluate
 from jaxcal.selection.exact.relaxation_kernel import relax
 
-__all__ = ["offer", "offer_swaps", "process", "search"]
+__all__ = ["offer_start", "process", "search"]
 
 _WHOLE = 1e-9  # a count this near a whole number is that number
 _SAME = 1e-7  # apart in value, selections are two without a look at their counts
-_SHARE = 0.05  # see relax: solving a node further rarely closes it
+_SINGULAR = 1e-12  # smallest over largest eigenvalue of what is known
 _SMOOTHING = 30.0  # of E at first, where the eigenvalue is about 1
 
 
@@ -113,12 +113,13 @@ def _kind_of(problem, low, local):
     if problem.kind != D or places >= p or places == 0:
         return problem.kind
     gram_of(problem.blocks, 1.0 * low, problem.prior, local.known)
-    log_det = factor(local.known, local.inverse)
-    if not log_det > -np.inf:
+    values, vectors = np.linalg.eigh(local.known)
+    if not values[0] > _SINGULAR * values[p - 1]:
         return problem.kind
-    local.half[:] = np.linalg.inv(np.linalg.cholesky(local.known))
+    for a in range(p):
+        local.half[a] = vectors[:, a] / np.sqrt(values[a])
     local.settings[2] = places
-    local.settings[3] = log_det
+    local.settings[3] = np.log(values).sum()
     return RANK
 
 

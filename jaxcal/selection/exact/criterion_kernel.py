@@ -35,6 +35,7 @@ __all__ = ["D", "DS", "E", "RANK", "TRACE", "Local", "Relaxation", "evaluate", "
 
 D, DS, TRACE, E, RANK = range(5)  # RANK: D in its sharper form
 
+_EPS = float(np.finfo(np.float64).eps)
 _FAST = {"reassoc", "contract", "nsz"}  # sums in any order, so in vector registers
 
 
@@ -54,7 +55,7 @@ class Local(NamedTuple):
 
     gram: NDArray[np.float64]  # (p, p) M
     gradient: NDArray[np.float64]  # (p, p) G
-    inverse: NDArray[np.float64]  # (p, p) W; for E and RANK a basis V, G = V diag V.T
+    inverse: NDArray[np.float64]  # (p, p) W; of E and RANK a basis V, G = V diag V.T
     bend: NDArray[np.float64]  # (p, p) curvature in that basis
     tail: NDArray[np.float64]  # (p,) direction of its last, rank-one part
     known: NDArray[np.float64]  # (p, p) P of RANK
@@ -140,7 +141,7 @@ def _spectral(kind, local):
             value += np.log1p(values[p - 1 - kept])
             kept += 1
         value += (places - kept) * np.log1p(rest / (places - kept))
-        base = value
+        base = value + p * _EPS * values[p - 1]  # what eigenvalues are rounded by
         for a in range(p):
             held = a >= p - kept
             slopes[a] = 1.0 / (1.0 + (values[a] if held else rest / (places - kept)))
