@@ -19,7 +19,7 @@ __all__ = ["default_restarts", "exchange_from", "exchange_indices", "solve"]
 
 Indices = NDArray[np.int64]
 
-_WORK = 3e8  # multiplications of the default starts of one problem, about 0.1 s
+_WORK = 7e6  # k M q^2 p of the default starts of one call, about 15 ms
 
 
 def solve(problem: Problem, *, seed: int, restarts: int | None) -> Found:
@@ -41,16 +41,15 @@ def default_restarts(problem: Problem) -> int:
 
     None of 12,000 distinct selections was missed (4, 8 or 12 of 50, three inputs) by
     200; replicates leave more local optima, and 1 in 1,000 selections of 12 was by 400.
-    Large problems get fewer, so that they take about 0.1 s.
+    Large problems of blocks get fewer, so that they take 10 to 30 ms.
     """
     most = 200 if problem.max_replicates == 1 else 400
     if problem.rank_one:
         return most
+    if problem.criterion.name == "E":  # not compiled, and from local optima of A
+        most = 20
     count, q, p = problem.blocks.shape
-    work = problem.k * count * q * q * p
-    if problem.criterion.name == "E":
-        return int(min(max(_WORK / (100 * work), 1.0), 20))
-    return int(min(max(_WORK / work, 1.0), most))
+    return int(min(max(_WORK / (problem.k * count * q * q * p), 1.0), most))
 
 
 def exchange_indices(
