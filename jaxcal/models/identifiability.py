@@ -2,10 +2,198 @@
 
 from __future__ import annotations
 
-from typing import Any
+import dataclasses
+import re
+from collections.abc import Sequence
 
-__all__ = ["identifiability"]
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.models.model import Model, as_commands
+from jaxcal.models.uncertainty import Noise, Prior
+
+__all__ = ["Direction", "Identifiability", "identifiability"]
+
+Array = NDArray[np.float64]
+
+# Of columns of length one. Derivatives are exact to about 1e-13 of the largest.
+_NULL, _ZERO, _FLAT = 1e-10, 1e-6, 16.0 * np.finfo(np.float64).eps
 
 
-def identifiability(*args: Any, **kwargs: Any) -> Any:
-    raise NotImplementedError("identifiability is being written")
+@dataclasses.dataclass(frozen=True, eq=False)
+class Direction:
+    """Parameters that can change together without any measurement showing it."""
+
+    names: tuple[str, ...]
+    words: str  # "theta6", "d2 = d3 = d4", "d1 with base z"
+    vectors: Array  # (k, p) changes that no candidate shows, in the parameters' units
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Identifiability:
+    """What candidates say of the parameters; printed, it reads as a short report."""
+
+    names: tuple[str, ...]  # the p parameters asked about
+    rank: int  # combinations of them that are identified
+    directions: tuple[Direction, ...]  # the rest, p - rank vectors in all
+    condition: float  # of the identified part, every column scaled to length one
+    num_candidates: int
+
+    @property
+    def identifiable(self) -> tuple[str, ...]:
+        """Parameters that are identified by themselves."""
+        tied = {name for direction in self.directions for name in direction.names}
+        return tuple(name for name in self.names if name not in tied)
+
+    def __str__(self) -> str:
+        lines = [
+            f"{self.rank} of {len(self.names)} parameters can be identified from "
+            f"{self.num_candidates} candidates (condition {self.condition:.3g})."
+        ]
+        alone = [each.words for each in self.directions if len(each.names) == 1]
+        tied = [each.words for each in self.directions if len(each.names) > 1]
+        if tied:
+            lines += ["Seen only in combination:", *(f"  {words}" for words in tied)]
+        if alone:
+            lines.append(f"Not seen at all: {', '.join(alone)}")
+        if self.identifiable:
+            lines.append(f"Identified by themselves: {', '.join(self.identifiable)}")
+        return "\n".join(lines)
+
+
+def identifiability(
+    model: Model,
+    candidates: ArrayLike,
+    *,
+    noise: Noise | None = None,
+    prior: Prior | None = None,
+    parameters: Sequence[str] | None = None,
+) -> Identifiability:
+    """Every direction of the parameters that no candidate excites, near the nominal.
+
+    Args:
+        model: with p parameters.
+        candidates: (N, n) commands.
+        noise: matters where commands are unknown in every measurement.
+        prior: counts as information where its std is finite; parameters that it fixes
+            are left out. Without one the measurements alone count.
+        parameters: names to ask about; the others are taken as known.
+    """
+    commands = as_commands(candidates, model.num_inputs)
+    if not len(commands):
+        raise ValueError("candidates must hold at least one row, got none")
+    jacobian = model.jacobian(commands)
+    if noise is not None:
+        slopes = None
+        if noise.command_std is not None:
+            slopes = model.command_jacobian(commands)
+        jacobian = noise.whitening(len(commands), model.num_outputs, slopes) @ jacobian
+    rows = jacobian.reshape(-1, model.num_parameters)
+    asked = np.ones(model.num_parameters, dtype=np.bool_)
+    if prior is not None:
+        resolved = prior.resolve(model)
+        rows = np.vstack([rows, np.sqrt(resolved.precision)])
+        asked &= resolved.free
+    if parameters is not None:
+        unknown = [name for name in parameters if name not in model.names]
+        if unknown:
+            raise ValueError(
+                f"parameters must be among {', '.join(model.names)}, got {unknown[0]!r}"
+            )
+        asked &= np.isin(model.names, list(parameters))
+    at = np.flatnonzero(asked)
+    names = tuple(model.names[i] for i in at)
+    std = np.sqrt(np.diagonal(model.default_prior().resolve(model).precision))[at]
+    scale = 1.0 / np.where(std > 0.0, std, 1.0)
+    # A triangle of p rows holds all that is needed of the N q.
+    columns = np.linalg.qr(rows[:, at] * scale, mode="r")
+    norms = np.linalg.norm(columns, axis=0)
+    seen = norms > _FLAT * norms.max(initial=0.0)
+    unit = columns / np.where(seen, norms, 1.0) * seen
+    groups = [[int(i)] for i in np.flatnonzero(~seen)]
+    classes = _parallel(unit, np.flatnonzero(seen))
+    groups += [group for group in classes if len(group) > 1]
+    vectors = [_of_class(unit, group, norms) for group in groups]
+    first = [group[0] for group in classes]
+    for vector in _sparse_null(unit[:, first]):
+        full = np.zeros((1, len(at)))
+        full[0, first] = vector / norms[first]
+        groups.append([int(i) for i in np.flatnonzero(full[0])])
+        vectors.append(full)
+    directions = []
+    for group, local in zip(groups, vectors, strict=True):
+        full = np.zeros((len(local), model.num_parameters))
+        full[:, at] = local * scale
+        full /= np.linalg.norm(full, axis=1, keepdims=True)
+        told = tuple(names[i] for i in group)
+        same = np.allclose(np.abs(full[np.abs(full) > 0.0]), np.sqrt(0.5))
+        directions.append(Direction(told, _in_words(told, same), full))
+    rank = len(at) - sum(len(vector) for vector in vectors)
+    size = np.linalg.svd(unit, compute_uv=False)
+    condition = float(size[0] / size[rank - 1]) if rank else np.inf
+    order = {name: i for i, name in enumerate(names)}
+    directions.sort(key=lambda direction: order[direction.names[0]])
+    return Identifiability(names, rank, tuple(directions), condition, len(commands))
+
+
+def _in_words(names: tuple[str, ...], same: bool) -> str:
+    """Names of one kind that act alike are equal; others are seen with each other."""
+    kinds = {re.sub(r"\d+", "", name) for name in names}
+    if len(names) > 1 and same and len(kinds) == 1:
+        return " = ".join(names)
+    *others, last = names[1:] or ("",)
+    rest = f"{', '.join(others)} and {last}" if others else last
+    return f"{names[0]} with {rest}" if rest else names[0]
+
+
+def _parallel(unit: Array, at: NDArray[np.int64]) -> list[list[int]]:
+    """Columns ``at`` in classes of those that are multiples of each other."""
+    classes: list[list[int]] = []
+    for i in at:
+        for group in classes:
+            first = unit[:, group[0]]
+            apart = unit[:, i] - (first @ unit[:, i]) * first
+            if np.linalg.norm(apart) < _NULL:
+                group.append(int(i))
+                break
+        else:
+            classes.append([int(i)])
+    return classes
+
+
+def _of_class(unit: Array, group: list[int], norms: Array) -> Array:
+    """(k, p) each member against the first; a column of zeros by itself."""
+    first, *others = group
+    vectors = np.zeros((max(len(others), 1), unit.shape[1]))
+    vectors[:, first] = 1.0
+    for row, i in enumerate(others):
+        sign = np.sign(unit[:, first] @ unit[:, i])
+        vectors[row, i] = -sign * norms[first] / norms[i]
+    return vectors
+
+
+def _sparse_null(columns: Array) -> Array:
+    """(k, m) a basis of the null space of columns (R, m) with few entries each."""
+    _, size, right = np.linalg.svd(columns)
+    rank = int((size > _NULL * size.max(initial=0.0)).sum())
+    null = right[rank:].copy()
+    for row in range(len(null)):  # reduced echelon form: a pivot of its own for each
+        pivot = int(np.abs(null[row]).argmax())
+        null[row] /= null[row, pivot]
+        others = np.arange(len(null)) != row
+        null[others] -= np.outer(null[others, pivot], null[row])
+    null[np.abs(null) < _ZERO * np.abs(null).max(axis=1, keepdims=True)] = 0.0
+    shorter = True
+    while shorter:  # combine two where that leaves fewer entries
+        shorter = False
+        for i, j in np.ndindex(len(null), len(null)):
+            for k in np.flatnonzero((null[i] != 0.0) & (null[j] != 0.0)):
+                if i == j:
+                    continue
+                trial = null[i] - null[i, k] / null[j, k] * null[j]
+                trial[np.abs(trial) < _ZERO * np.abs(trial).max()] = 0.0
+                if np.count_nonzero(trial) < np.count_nonzero(null[i]):
+                    null[i] = trial / np.abs(trial).max()
+                    shorter = True
+                    break
+    return null

@@ -7,16 +7,46 @@ from typing import Any
 
 from jaxcal.checks import one_of
 from jaxcal.models.affine import Affine
+from jaxcal.models.linear import Linear
 from jaxcal.models.model import Model
+from jaxcal.models.polynomial import Polynomial
+from jaxcal.models.serial import SerialChain
 
 __all__ = ["from_dict"]
+
+
+def _of_function(data: Mapping[str, Any]) -> Model:
+    raise ValueError(
+        f"a model of kind {data['kind']} holds a function, which a file cannot: "
+        "give the model itself, model=..."
+    )
 
 
 def _affine(data: Mapping[str, Any]) -> Affine:
     return Affine(data["num_inputs"], data["num_outputs"])
 
 
-_KINDS: dict[str, Callable[[Mapping[str, Any]], Model]] = {"affine": _affine}
+def _linear(data: Mapping[str, Any]) -> Model:
+    if data["features"] is None:
+        return _of_function(data)
+    return Linear(data["features"], data["num_outputs"], inputs=data["inputs"])
+
+
+def _polynomial(data: Mapping[str, Any]) -> Polynomial:
+    return Polynomial(data["degree"], data["num_inputs"], data["num_outputs"])
+
+
+def _serial_chain(data: Mapping[str, Any]) -> SerialChain:
+    return SerialChain.from_dh(**{key: data[key] for key in data if key != "kind"})
+
+
+_KINDS: dict[str, Callable[[Mapping[str, Any]], Model]] = {
+    "affine": _affine,
+    "jax": _of_function,
+    "linear": _linear,
+    "polynomial": _polynomial,
+    "serial_chain": _serial_chain,
+}
 
 
 def from_dict(data: Mapping[str, Any]) -> Model:

@@ -1,0 +1,129 @@
+"""Features of the commands from a formula such as ``1 + x + x:y + sin(2*pi*x/30)``.
+
+formulaic splits a formula into terms (``x*y`` is ``x + y + x:y``, ``0 +`` leaves out
+the constant). The factors are evaluated here, because formulaic would run them as
+Python: only arithmetic, numbers, pi, e and the functions below are read.
+"""
+
+from __future__ import annotations
+
+import ast
+import operator
+import re
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.extras import needs
+
+__all__ = ["Factor", "input_names", "parse"]
+
+Numbers = NDArray[Any]
+Factor = Callable[[Mapping[str, Numbers]], Any]  # values of the inputs by name
+
+_OPERATORS: dict[type, Callable[..., Any]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+    ast.USub: operator.neg,
+    ast.UAdd: operator.pos,
+}
+# All analytic but for abs, so that a complex step gives their derivative.
+_FUNCTIONS: dict[str, Callable[..., Any]] = {
+    "I": lambda x: x,
+    "abs": lambda x: np.where(np.real(x) < 0.0, -x, x),
+    **{
+        name: getattr(np, name)
+        for name in (
+            *("sin", "cos", "tan", "arcsin", "arccos", "arctan", "sinh", "cosh"),
+            *("tanh", "exp", "log", "log10", "sqrt"),
+        )
+    },
+}
+_CONSTANTS = {"pi": np.pi, "e": np.e}
+
+
+def parse(formula: str) -> tuple[dict[str, list[Factor]], set[str]]:
+    """Term -> its factors, in the order of the formula; and the names that they use.
+
+    Raises:
+        ValueError: formulaic cannot read it, or a factor holds something else.
+    """
+    with needs("models", "a formula"):
+        from formulaic import Formula
+        from formulaic.errors import FormulaicError
+
+    try:
+        terms = list(Formula(formula, _ordering="none"))
+        factors = [(str(term), [each.expr for each in term.factors]) for term in terms]
+    except (FormulaicError, AttributeError, SyntaxError) as error:
+        # A formula of two sides has no terms; a message is plain in its first line.
+        why = str(error).splitlines()[0] if isinstance(error, FormulaicError) else ""
+        raise ValueError(
+            f"features must be a formula of one side, got {formula!r}"
+            + (f": {why}" if why else "")
+        ) from error
+    used: set[str] = set()
+    return {
+        term: [_compile(each, used) for each in parts] for term, parts in factors
+    }, used
+
+
+def input_names(used: set[str]) -> tuple[str, ...]:
+    """x, y, z or u1, u2, ... up to the last one that a formula uses."""
+    if used and used <= set("xyz"):
+        return tuple("xyz"[: 1 + max(map("xyz".index, used))])
+    if used and all(re.fullmatch(r"u[1-9]\d*", name) for name in used):
+        last = max(int(name[1:]) for name in used)
+        return tuple(f"u{i + 1}" for i in range(last))
+    raise ValueError(
+        "inputs must be given, the names of all commands in their order, unless a "
+        "formula uses x, y, z or u1, u2, ...; this one uses "
+        f"{', '.join(sorted(used)) or 'none'}"
+    )
+
+
+def _compile(factor: str, used: set[str]) -> Factor:
+    """``factor`` as a function of the inputs; adds the names that it uses."""
+    try:
+        tree = ast.parse(factor.strip(), mode="eval").body
+    except SyntaxError as error:
+        raise ValueError(f"features must hold expressions, got {factor!r}") from error
+
+    def read(node: ast.AST) -> Factor:
+        match node:
+            case ast.Constant(value=int() | float() as number):
+                constant = np.float64(number)
+                return lambda values: constant
+            case ast.Name(id=name):
+                if name not in _CONSTANTS:
+                    used.add(name)
+                return lambda values: (
+                    values[name] if name in values else _CONSTANTS[name]
+                )
+            case ast.BinOp(left=left, op=op, right=right) if type(op) in _OPERATORS:
+                apply, first, second = _OPERATORS[type(op)], read(left), read(right)
+                return lambda values: apply(first(values), second(values))
+            case ast.UnaryOp(op=op, operand=operand) if type(op) in _OPERATORS:
+                apply, first = _OPERATORS[type(op)], read(operand)
+                return lambda values: apply(first(values))
+            case ast.Call(
+                func=(
+                    ast.Name(id=name)
+                    | ast.Attribute(value=ast.Name(id="np"), attr=name)
+                ),
+                args=[argument],
+                keywords=[],
+            ) if name in _FUNCTIONS:
+                apply, first = _FUNCTIONS[name], read(argument)
+                return lambda values: apply(first(values))
+        raise ValueError(
+            "features may hold + - * / **, numbers, pi, e and "
+            f"{', '.join(_FUNCTIONS)}, got {ast.unparse(node)!r} in {factor!r}"
+        )
+
+    return read(tree)

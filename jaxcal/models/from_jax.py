@@ -1,0 +1,166 @@
+"""Any function ``f(u, theta)`` written in JAX as a model."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import axis_names, numbers, table, whole_number
+from jaxcal.extras import needs
+from jaxcal.models.model import as_commands, as_parameters
+from jaxcal.models.uncertainty import Prior
+
+__all__ = ["FromJax"]
+
+Array = NDArray[np.float64]
+
+
+class FromJax:
+    """``y = f(u, theta)`` of one command; values and derivatives in float64 by JAX.
+
+    The first call with a number of commands compiles f for it; the caller's JAX
+    configuration stays as it is.
+
+    Args:
+        f: function of a command (n,) and parameters (p,) that returns (q,), or a scalar
+            for one output; written with ``jax.numpy``, without ``if`` on their values.
+        nominal: (p,) parameters of the machine as it was designed.
+        names: of the parameters; t1, t2, ... when not given.
+        num_inputs: n; that of the first commands when not given.
+    """
+
+    def __init__(
+        self,
+        f: Callable[[Any, Any], Any],
+        nominal: ArrayLike,
+        names: Sequence[str] | None = None,
+        num_inputs: int | None = None,
+    ) -> None:
+        if not callable(f):
+            raise ValueError(f"f must be a function of (u, theta), got {f!r}")
+        self.f = f
+        self.nominal = numbers("nominal", nominal)
+        if self.nominal.ndim != 1 or not len(self.nominal):
+            raise ValueError(f"nominal must have shape (p,), got {self.nominal.shape}")
+        p = self.num_parameters = len(self.nominal)
+        given = tuple(f"t{i + 1}" for i in range(p)) if names is None else names
+        self.names = axis_names("names", given, "t", p)
+        if len(set(self.names)) < p:
+            raise ValueError(f"names must differ, got {self.names}")
+        self._num_inputs: int | None = None
+        if num_inputs is not None:
+            self._trace(whole_number("num_inputs", num_inputs, 1))
+
+    @property
+    def num_inputs(self) -> int:
+        if self._num_inputs is None:
+            raise ValueError(
+                "num_inputs of this model is not known before its first commands: "
+                "FromJax(f, nominal, num_inputs=...)"
+            )
+        return self._num_inputs
+
+    @property
+    def num_outputs(self) -> int:
+        return self._num_outputs if self.num_inputs else 0
+
+    def predict(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
+        """Outputs (N, q) at commands (N, n)."""
+        outputs = self._run(0, commands, parameters)
+        for i, j in np.argwhere(~np.isfinite(outputs)):
+            raise ValueError(
+                f"f must be finite, got {outputs[i, j]} for output {j + 1} "
+                f"at command {i}"
+            )
+        return outputs
+
+    def jacobian(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
+        """(N, q, p)."""
+        slopes = self._run(1, commands, parameters)
+        for i, j, k in np.argwhere(~np.isfinite(slopes)):
+            raise ValueError(
+                f"the derivative of f by {self.names[k]!r} must be finite, got "
+                f"{slopes[i, j, k]} for output {j + 1} at command {i}"
+            )
+        return slopes
+
+    def command_jacobian(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
+        """(N, q, n)."""
+        slopes = self._run(2, commands, parameters)
+        for i, j, k in np.argwhere(~np.isfinite(slopes)):
+            raise ValueError(
+                f"the derivative of f by input {k + 1} must be finite, got "
+                f"{slopes[i, j, k]} for output {j + 1} at command {i}"
+            )
+        return slopes
+
+    def default_prior(self) -> Prior:
+        """Nothing is known beforehand."""
+        return Prior(np.inf)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The function itself cannot be written."""
+        return {
+            "kind": "jax",
+            "names": list(self.names),
+            "nominal": self.nominal.tolist(),
+        }
+
+    def _trace(self, num_inputs: int) -> None:
+        """Find q, and whether JAX can follow f at all."""
+        with needs("policy", "FromJax"):
+            import jax
+        with jax.enable_x64(True):
+            command = jax.ShapeDtypeStruct((num_inputs,), np.float64)
+            parameters = jax.ShapeDtypeStruct(self.nominal.shape, np.float64)
+            try:
+                result = jax.eval_shape(self.f, command, parameters)
+            except Exception as error:
+                raise ValueError(
+                    f"JAX cannot follow f for a command ({num_inputs},) and parameters "
+                    f"{self.nominal.shape}; write it with jax.numpy, without if on "
+                    f"values: {type(error).__name__}: {str(error).splitlines()[0]}"
+                ) from error
+        shape = getattr(result, "shape", None)
+        if shape is None or len(shape) > 1 or shape == (0,):
+            raise ValueError(
+                "f must return an array (q,) for one command, got "
+                f"{type(result).__name__ if shape is None else shape}"
+            )
+        self._num_inputs, self._num_outputs = num_inputs, shape[0] if shape else 1
+
+    @functools.cached_property
+    def _compiled(self) -> tuple[Callable[..., Any], ...]:
+        """f and its derivatives by parameters and commands, each of N commands."""
+        import jax
+        import jax.numpy as jnp
+
+        def f(command: jax.Array, parameters: jax.Array) -> jax.Array:
+            return jnp.atleast_1d(self.f(command, parameters))
+
+        return tuple(
+            jax.jit(jax.vmap(each, in_axes=(0, None)))
+            for each in (f, jax.jacfwd(f, argnums=1), jax.jacfwd(f, argnums=0))
+        )
+
+    def _run(
+        self, which: int, commands: ArrayLike, parameters: ArrayLike | None
+    ) -> Array:
+        if self._num_inputs is None:
+            self._trace(table("commands", commands).shape[1])
+        commands = as_commands(commands, self.num_inputs)
+        parameters = as_parameters(self, parameters)
+        import jax
+
+        with jax.enable_x64(True):
+            return np.array(self._compiled[which](commands, parameters))

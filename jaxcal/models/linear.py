@@ -1,0 +1,209 @@
+"""Models that are linear in their parameters: any features of the commands."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import axis_names, numbers, whole_number
+from jaxcal.models.formula import input_names, parse
+from jaxcal.models.model import as_commands, as_parameters
+from jaxcal.models.uncertainty import Prior
+
+__all__ = ["Linear", "input_letters"]
+
+Array = NDArray[np.float64]
+
+
+class Linear:
+    """``y_i = sum of theta_ij f_j(u)``: m outputs, each a sum of the same r features.
+
+    Parameters are named by the terms, output by output: "1", "x", "x:y"; with several
+    outputs "y1:1", "y1:x", ...
+
+    Args:
+        features: a formula, ``"1 + x + y + x:y + I(x**2) + sin(2*pi*x/30)"``, or a
+            function of commands (N, n) that returns (N, r).
+        num_outputs: m.
+        inputs: names of the n commands; with a function their number will do. By
+            default x, y, z or u1, u2, ... as the formula has them.
+        terms: names of the r features of a function; f1, f2, ... when not given.
+    """
+
+    def __init__(
+        self,
+        features: str | Callable[[Array], ArrayLike],
+        num_outputs: int = 1,
+        *,
+        inputs: Sequence[str] | int | None = None,
+        terms: Sequence[str] | None = None,
+    ) -> None:
+        self.num_outputs = whole_number("num_outputs", num_outputs, 1)
+        self.features = features
+        if isinstance(features, str):
+            if terms is not None:
+                raise ValueError("terms must be left out: a formula names its own")
+            self._factors, used = parse(features)
+            inputs = input_names(used) if inputs is None else inputs
+        elif not callable(features):
+            raise ValueError(
+                f"features must be a formula or a function, got {features!r}"
+            )
+        elif inputs is None:
+            raise ValueError(
+                "inputs must be given with a function: names of the commands, or "
+                "their number"
+            )
+        if not isinstance(inputs, Sequence):
+            inputs = input_letters(whole_number("inputs", inputs, 1))
+        self.inputs = axis_names("inputs", inputs, "u", len(inputs))
+        self.num_inputs = len(self.inputs)
+        if isinstance(features, str):
+            if unknown := used - set(self.inputs):
+                raise ValueError(
+                    f"features must use the inputs {', '.join(self.inputs)}, got "
+                    f"{min(unknown)!r} in {features!r}"
+                )
+            self.terms = tuple(self._factors)
+        else:
+            with np.errstate(all="ignore"):
+                count = self._call(np.zeros((1, self.num_inputs))).shape[1]
+            given = tuple(f"f{i + 1}" for i in range(count)) if terms is None else terms
+            self.terms = axis_names("terms", given, "f", count)
+        if not self.terms:
+            raise ValueError(f"features must hold at least one term, got {features!r}")
+
+    @property
+    def num_parameters(self) -> int:
+        """m r."""
+        return self.num_outputs * len(self.terms)
+
+    @functools.cached_property
+    def names(self) -> tuple[str, ...]:
+        if self.num_outputs == 1:
+            return self.terms
+        outputs = range(1, self.num_outputs + 1)
+        return tuple(f"y{i}:{term}" for i in outputs for term in self.terms)
+
+    @property
+    def nominal(self) -> Array:
+        """(p,) zeros: the model is linear, so any start will do."""
+        return np.zeros(self.num_parameters)
+
+    def predict(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
+        """Outputs (N, m) at commands (N, n), or at a data frame with their names."""
+        coefficients = as_parameters(self, parameters)
+        features = self._evaluate(self._commands(commands))
+        return features @ coefficients.reshape(self.num_outputs, -1).T
+
+    def jacobian(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
+        """(N, m, m r): the features; ``parameters`` do not matter."""
+        features = self._evaluate(self._commands(commands))
+        whole = np.einsum("ab,nr->nabr", np.eye(self.num_outputs), features)
+        return whole.reshape(-1, self.num_outputs, self.num_parameters)
+
+    def command_jacobian(
+        self, commands: ArrayLike, parameters: ArrayLike | None = None
+    ) -> Array:
+        """(N, m, n); of a function by differences, exact to about 1e-9."""
+        coefficients = as_parameters(self, parameters).reshape(self.num_outputs, -1)
+        slopes = self._slopes(self._commands(commands))
+        return np.einsum("mr,nri->nmi", coefficients, slopes)
+
+    def default_prior(self) -> Prior:
+        """Nothing is known beforehand."""
+        return Prior(np.inf)
+
+    def to_dict(self) -> dict[str, Any]:
+        """A function cannot be written: its dict names the terms only."""
+        return {
+            "kind": "linear",
+            "features": self.features if isinstance(self.features, str) else None,
+            "num_outputs": self.num_outputs,
+            "inputs": list(self.inputs),
+            "terms": list(self.terms),
+        }
+
+    def _commands(self, commands: Any) -> Array:
+        if hasattr(commands, "columns"):  # a data frame
+            missing = [name for name in self.inputs if name not in commands.columns]
+            if missing:
+                raise ValueError(
+                    f"commands must have the columns {', '.join(self.inputs)}, "
+                    f"{missing[0]!r} is missing"
+                )
+            commands = commands[list(self.inputs)].to_numpy()
+        return as_commands(commands, self.num_inputs)
+
+    def _evaluate(self, commands: Array) -> Array:
+        """(N, r), finite."""
+        with np.errstate(all="ignore"):
+            features = self._features(commands)
+        bad = np.argwhere(~np.isfinite(features))
+        if len(bad):
+            i, j = bad[0]
+            at = ", ".join(
+                f"{name} = {value:.6g}"
+                for name, value in zip(self.inputs, commands[i], strict=True)
+            )
+            raise ValueError(
+                f"features must be finite, {self.terms[j]!r} is {features[i, j]} at "
+                f"candidate {i} ({at})"
+            )
+        return features
+
+    def _features(self, commands: NDArray[Any]) -> NDArray[Any]:
+        if not isinstance(self.features, str):
+            return self._call(commands)
+        values = dict(zip(self.inputs, commands.T, strict=True))
+        columns = []
+        for factors in self._factors.values():
+            column = np.ones(len(commands), dtype=commands.dtype)
+            for factor in factors:
+                column = column * factor(values)
+            columns.append(column)
+        return np.stack(columns, axis=1)
+
+    def _call(self, commands: Array) -> Array:
+        assert callable(self.features)
+        features = numbers(
+            "what features returns", self.features(commands), finite=False
+        )
+        right = features.ndim == 2 and len(features) == len(commands)
+        known = getattr(self, "terms", None)
+        if not right or (known and features.shape[1] != len(known)):
+            rule = f"({len(commands)}, {len(known) if known else 'r'})"
+            raise ValueError(
+                f"features must return {rule} for commands {commands.shape}, "
+                f"got {features.shape}"
+            )
+        return features
+
+    def _slopes(self, commands: Array) -> Array:
+        """(N, r, n) derivative of the features."""
+        columns = []
+        for i in range(self.num_inputs):
+            step = np.zeros(self.num_inputs)
+            if isinstance(self.features, str):  # a complex step is exact
+                step[i] = 1e-30
+                columns.append(self._features(commands + 1j * step).imag / 1e-30)
+                continue
+            step[i] = 1e-6 * (np.abs(commands[:, i]).max(initial=0.0) or 1.0)
+            rise = self._evaluate(commands + step) - self._evaluate(commands - step)
+            columns.append(rise / (2.0 * step[i]))
+        return np.stack(columns, axis=-1)
+
+
+def input_letters(count: int) -> tuple[str, ...]:
+    """x, y, z; u1, u2, ... where there are more."""
+    return (
+        tuple("xyz"[:count]) if count <= 3 else tuple(f"u{i + 1}" for i in range(count))
+    )

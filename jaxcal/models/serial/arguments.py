@@ -1,0 +1,72 @@
+"""Checks of what describes an arm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import numbers, whole_number
+
+__all__ = ["joint_numbers", "load", "require_degrees", "transform", "triple"]
+
+Array = NDArray[np.float64]
+
+
+def require_degrees(rows: Array) -> None:
+    """Refuse a table whose right angles are in radians."""
+    angles = rows[:, [1, 3, 4]]
+    for turn, degrees in ((np.pi / 2, 90), (np.pi, 180)):
+        near = np.abs(np.abs(angles) - turn) < 2e-3
+        if near.any():
+            raise ValueError(
+                "angles of table must be in degrees, got "
+                f"{angles[near][0]:.6g} in row {int(np.argwhere(near)[0, 0]) + 1}, "
+                f"which looks like {degrees} degrees in radians"
+            )
+
+
+def transform(argument: str, given: ArrayLike | None) -> Array:
+    """(4, 4) of a translation (3,) or a transform (4, 4)."""
+    matrix = np.eye(4)
+    if given is None:
+        return matrix
+    array = numbers(argument, given)
+    if array.shape == (3,):
+        matrix[:3, 3] = array
+        return matrix
+    if array.shape != (4, 4):
+        raise ValueError(
+            f"{argument} must be a translation (3,) or a transform (4, 4), "
+            f"got {array.shape}"
+        )
+    error = np.abs(array[:3, :3] @ array[:3, :3].T - np.eye(3)).max()
+    if error > 1e-6 or np.linalg.det(array[:3, :3]) < 0.0:
+        raise ValueError(f"the rotation of {argument} must be a rotation matrix")
+    return array
+
+
+def triple(argument: str, given: ArrayLike) -> tuple[float, float, float]:
+    array = numbers(argument, given)
+    if array.shape != (3,):
+        raise ValueError(f"{argument} must have shape (3,), got {array.shape}")
+    x, y, z = array.tolist()
+    return x, y, z
+
+
+def joint_numbers(argument: str, given: Sequence[int], n: int) -> tuple[int, ...]:
+    result = tuple(whole_number(argument, joint, 1) for joint in given)
+    if len(set(result)) < len(result) or max(result, default=1) > n:
+        raise ValueError(f"{argument} must hold joints of 1 to {n} once, got {given!r}")
+    return result
+
+
+def load(
+    given: tuple[int, float, ArrayLike], n: int
+) -> tuple[int, float, tuple[float, float, float]]:
+    link, weight, centre = given
+    if whole_number("link of a load", link, 1) > n:
+        raise ValueError(f"link of a load must be at most {n}, got {link}")
+    weight = float(numbers("weight of a load", weight))
+    return int(link), weight, triple("centre of a load", centre)

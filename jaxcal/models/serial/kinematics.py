@@ -1,0 +1,82 @@
+"""A chain of rotations and translations, with the motion that each of them causes.
+
+A frame is (4, 3, N): its axes x, y, z and its origin, of N postures at once. The
+derivative of the tool by one step of the chain is geometric: a rotation about ``w``
+through ``o`` turns the tool by ``w`` and moves its point ``t`` by ``w x (t - o)``; a
+translation along ``w`` moves it by ``w``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["OF_BASE", "OF_ROW", "Step", "cross", "forward", "rotation_vector_rate"]
+
+Array = NDArray[np.float64]
+
+
+OF_BASE = 7  # steps of the base: three shifts, three turns, its nominal rotation
+OF_ROW = 5  # steps of a row of the table
+
+
+class Step(NamedTuple):
+    """One elementary transform about or along an axis of the frame reached so far."""
+
+    turns: bool  # a rotation, in degrees; else a translation
+    axis: int | None  # 0 x, 1 y, 2 z; None: ``value`` is a constant (3, 3) rotation
+    value: Array | float  # one number, or (N,)
+
+
+def cross(left: Array, right: Array) -> Array:
+    """Cross products of (..., 3, N): over the axis before the last."""
+    x, y, z = np.moveaxis(left, -2, 0)
+    u, v, w = np.moveaxis(right, -2, 0)
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-2)
+
+
+def forward(count: int, steps: Sequence[Step]) -> tuple[Array, Array, Array]:
+    """Frame after the last step, from the identity, and where each step acted.
+
+    Returns:
+        (4, 3, N) frame; (S, 3, N) axis w and (S, 3, N) origin o of each step.
+    """
+    frame = np.zeros((4, 3, count))
+    frame[[0, 1, 2], [0, 1, 2]] = 1.0
+    axes = np.zeros((len(steps), 3, count))
+    origins = np.empty_like(axes)
+    for i, (turns, axis, value) in enumerate(steps):
+        origins[i] = frame[3]
+        if axis is None:
+            frame[:3] = np.einsum("kj,kcn->jcn", value, frame[:3])
+            continue
+        axes[i] = frame[axis]
+        if not turns:
+            frame[3] += value * frame[axis]
+            continue
+        angle = np.radians(value)
+        cosine, sine = np.cos(angle), np.sin(angle)
+        j, k = (axis + 1) % 3, (axis + 2) % 3
+        turned = cosine * frame[j] + sine * frame[k]
+        frame[k] = cosine * frame[k] - sine * frame[j]
+        frame[j] = turned
+    return frame, axes, origins
+
+
+def rotation_vector_rate(vector: Array) -> Array:
+    """(N, 3, 3) derivative of rotation vectors r (N, 3), radians, by a turn w.
+
+    ``exp(r + dr) = exp(w) exp(r)`` to first order, dr this matrix times w.
+    """
+    angle = np.linalg.norm(vector, axis=-1)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    factor = 1.0 / safe**2 - 1.0 / (2.0 * safe * np.tan(safe / 2.0))
+    factor = np.where(small, 1.0 / 12.0, factor)[:, None, None]
+    hat = np.zeros((len(vector), 3, 3))
+    hat[:, [2, 0, 1], [1, 2, 0]] = vector
+    hat = hat - np.matrix_transpose(hat)
+    return np.eye(3) - 0.5 * hat + factor * (hat @ hat)
