@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration.result import Calibration
+from jaxcal.calibration.base import Calibration
+from jaxcal.calibration.result import AffineCalibration
 from jaxcal.checks import axis_names, noise_levels, relative_weights, table, text
 from jaxcal.information.excitation import require_excited
 
@@ -113,7 +114,7 @@ def identify(
 
     weighted_rows = root * np.column_stack([u, np.ones(len(u))])
     scaled = np.append(singular, np.sqrt(total))
-    return Calibration(
+    return AffineCalibration(
         matrix=matrix,
         bias=at_centre - matrix @ centre,
         residuals=residuals,

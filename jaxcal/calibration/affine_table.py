@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from jaxcal.calibration.fit import AffineFit
+from jaxcal.calibration.affine import AffineFit
 from jaxcal.checks import in_words
 
 __all__ = ["summary", "to_frame"]

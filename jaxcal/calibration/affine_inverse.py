@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration.fit import AffineFit
+from jaxcal.calibration.affine import AffineFit
 from jaxcal.checks import in_words, numbers
 from jaxcal.information.excitation import direction_in_words
 
