@@ -1,14 +1,14 @@
-"""A calibration as a table: printed, or as a pandas data frame."""
+"""An affine calibration as a table."""
 
 from __future__ import annotations
 
-import importlib
 from typing import Any
 
 from jaxcal.calibration.affine import AffineFit
+from jaxcal.calibration.table import in_lines
 from jaxcal.checks import in_words
 
-__all__ = ["summary", "to_frame"]
+__all__ = ["columns", "summary"]
 
 
 def summary(self: AffineFit) -> str:
@@ -20,7 +20,7 @@ def summary(self: AffineFit) -> str:
         f"{m} outputs ({', '.join(self.output_names)}), "
         f"{self.num_measurements} measurements"
     ]
-    table = _columns(self)
+    table = columns(self)
     cells = {
         "": table["parameter"],
         "meaning": [
@@ -36,10 +36,7 @@ def summary(self: AffineFit) -> str:
         ]
     if any(table["unit"]):
         cells["unit"] = table["unit"]
-    widths = [max(map(len, [name, *column])) for name, column in cells.items()]
-    for row in [list(cells), *zip(*cells.values(), strict=True)]:
-        padded = [f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)]
-        lines.append(("  " + "  ".join(padded)).rstrip())
+    lines += in_lines(cells)
     if self.residual_std is not None:
         fit = self.lack_of_fit()
         lines.append(
@@ -57,26 +54,9 @@ def summary(self: AffineFit) -> str:
     return "\n".join(lines)
 
 
-def to_frame(self: AffineFit) -> Any:
-    """One row per parameter: output, input, value, unit, std_error, low, high (95 %).
-
-    Returns:
-        A ``pandas.DataFrame``; the last three columns only where the noise is known.
-
-    Raises:
-        ImportError: pandas is not installed.
-    """
-    try:
-        pandas = importlib.import_module("pandas")
-    except ModuleNotFoundError:
-        raise ImportError(
-            "to_frame needs pandas, which is not installed: pip install pandas"
-        ) from None
-    return pandas.DataFrame(_columns(self)).set_index("parameter")
-
-
-def _columns(fit: AffineFit) -> dict[str, list[Any]]:
-    """Columns of m (n + 1) entries in the order of ``parameters``; input "" for b."""
+def columns(fit: AffineFit) -> dict[str, list[Any]]:
+    """parameter, output, input ("" for b), value, unit; where known also std_error,
+    low and high: m (n + 1) entries each."""
     m, n = fit.num_outputs, fit.num_inputs
     per = f"/{fit.command_unit}" if fit.command_unit else ""
     slope_unit = (fit.measured_unit or "1") + per if per else fit.measured_unit

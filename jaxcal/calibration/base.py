@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration import file
+from jaxcal.calibration import file, table
 from jaxcal.checks import numbers
 
 if TYPE_CHECKING:
@@ -95,7 +95,11 @@ class Calibration(abc.ABC):
 
     @abc.abstractmethod
     def command_for(
-        self, desired: ArrayLike, limits: ArrayLike | None = None
+        self,
+        desired: ArrayLike,
+        limits: ArrayLike | None = None,
+        *,
+        clip: bool = False,
     ) -> Array:
         """Commands (..., n) that reach outputs (..., m)."""
 
@@ -106,6 +110,10 @@ class Calibration(abc.ABC):
     @abc.abstractmethod
     def summary(self) -> str:
         """The calibration as a table of text."""
+
+    @abc.abstractmethod
+    def _columns(self) -> dict[str, list[Any]]:
+        """The table's columns, p entries each; the first is ``parameter``."""
 
     @abc.abstractmethod
     def to_dict(self) -> dict[str, Any]:
@@ -171,6 +179,17 @@ class Calibration(abc.ABC):
             commands, new_measurement=new_measurement
         )
         return centre - half, centre + half
+
+    def to_frame(self) -> Any:
+        """One row per parameter: value, unit, std_error, low and high (95 %), ...
+
+        Returns:
+            A ``pandas.DataFrame``; the last three only where the noise is known.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        return table.to_frame(self._columns())
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write a versioned JSON file atomically; see ``docs/calibration.md``.

@@ -18,7 +18,15 @@ import numpy as np
 
 from jaxcal.files import write_text
 
-__all__ = ["FORMAT", "Schema", "content_of", "fields", "read", "require_version", "write"]
+__all__ = [
+    "FORMAT",
+    "Schema",
+    "content_of",
+    "fields",
+    "read",
+    "require_version",
+    "write",
+]
 
 FORMAT = "jaxcal-calibration"
 
@@ -110,7 +118,9 @@ def fields(content: Mapping[str, Any], schema: Schema) -> dict[str, Any]:
         if found[key] is None and key in schema.may_be_null:
             continue
         array = _array(key, found[key], shape, sizes)
-        require(key not in schema.positive or bool((array > 0.0).all()), key, "be positive")
+        require(
+            key not in schema.positive or bool((array > 0.0).all()), key, "be positive"
+        )
         least = 0.0 if key in schema.not_negative else -np.inf
         require(bool((array >= least).all()), key, "not be negative")
         found[key] = array if shape else float(array)

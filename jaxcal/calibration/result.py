@@ -20,11 +20,13 @@ class AffineCalibration(AffineFit, version=affine_file.SCHEMA.version):
 
     command_for = affine_inverse.command_for
     summary = affine_table.summary
-    to_frame = affine_table.to_frame
+    _columns = affine_table.columns
     to_dict = affine_file.to_dict
 
     @classmethod
     def _fields(cls, content: Mapping[str, Any], model: object) -> dict[str, Any]:
         if model is not None:
-            raise ValueError("model must be left out: the file is an affine calibration")
+            raise ValueError(
+                "model must be left out: the file is an affine calibration"
+            )
         return affine_file.fields(content)

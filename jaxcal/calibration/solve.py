@@ -252,8 +252,8 @@ class _Search:
             self._estimate_levels()
         after = self.weights, np.log(self.level), np.log(self.size)
         return all(
-            np.abs(new - old).max() < 1e-6
-            for new, old in zip(after, before, strict=True)
+            np.abs(new - old).max() < limit
+            for new, old, limit in zip(after, before, (1e-6, 1e-4, 1e-4), strict=True)
         )
 
     def _estimate_levels(self) -> None:
@@ -262,8 +262,10 @@ class _Search:
         readings, prior = self._leverage()
         if task.sized.any():
             left = (1.0 - (prior**2).sum(axis=1))[task.sized[task.free]].sum()
-            square = float(np.sum(self.theta[task.sized] ** 2))
-            self.size = float(np.sqrt(square / max(left, 1e-6)))
+            found = np.sqrt(np.sum(self.theta[task.sized] ** 2) / max(left, 1e-6))
+            # A hundredth of the noise is as good as none, and reached in few steps.
+            noise = self.level / np.abs(np.diagonal(task.white, axis1=1, axis2=2))
+            self.size = max(float(found), 0.01 * float(np.median(noise)))
         freedom = self._freedom(readings)
         if task.known or freedom.sum() < 1.0:
             return
@@ -276,10 +278,10 @@ class _Search:
         self.level = np.broadcast_to(level, self.level.shape)
 
     def _leverage(self) -> tuple[Array, Array]:
-        """Roots of the hat matrix, of the readings (N, R, F) and of the prior (F, F)."""
+        """Roots of the hat matrix: of the readings (N, R, F), the prior (F, F)."""
         rows, right, _ = self._system(0.0)
         triangle, _ = _triangle(rows, right, _LEAST_DAMPING)
-        root = np.linalg.solve(triangle.T, rows.T).T
+        root = np.asarray(np.linalg.solve(triangle.T, rows.T).T, dtype=np.float64)
         width, count = rows.shape[1], len(self.weights)
         return root[:-width].reshape(count, -1, width), root[-width:]
 
@@ -319,5 +321,5 @@ def _triangle(rows: Array, right: Array, damping: float) -> tuple[Array, Array]:
     whole = np.zeros((len(rows) + width, width + 1))
     whole[: len(rows), :width], whole[: len(rows), width] = rows, right
     whole[len(rows) :, :width] = np.sqrt(damping) * np.eye(width)
-    triangle = np.linalg.qr(whole, mode="r")[:width]
+    triangle = np.asarray(np.linalg.qr(whole, mode="r"))[:width]
     return triangle[:, :width], triangle[:, width]

@@ -37,7 +37,7 @@ def fit(
     import jaxcal
 
     commands, measured = pairs(records)
-    fitted = jaxcal.identify(
+    fitted: Any = jaxcal.identify(
         commands,
         measured,
         noise_std=noise_std,
