@@ -28,8 +28,7 @@ def require_model(model: Any, commands: Array, measured: Array) -> None:
                 f"model must have a method {method} (see jaxcal.models.Model), got "
                 f"{model!r}"
             )
-    if len(commands):  # the first commands tell some models their number of inputs
-        model.predict(commands[:1], None)
+    model.predict(commands[:1], None)  # tells some models their number of inputs
     for name, table, count in (
         ("commands", commands, model.num_inputs),
         ("measured", measured, model.num_outputs),

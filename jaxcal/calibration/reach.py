@@ -150,13 +150,13 @@ class _Search:
         high = np.maximum(high, low + 1e-12 * self.spread)
         wanted, names = self.wanted[i], self.calibration.input_names
 
-        def gap(command: Array) -> Array:
+        def off(command: Array) -> Array:
             return (self.outputs(command[None])[0] - wanted) / self.size
 
         best = None
         for begin in (free, *self.nearest[i]):
             found = optimize.least_squares(
-                gap,
+                off,
                 np.clip(begin, low, high),
                 lambda command: self.slopes(command[None])[0] / self.spread,
                 (low, high),
@@ -177,7 +177,8 @@ class _Search:
                 f"desired {in_words(wanted)} needs {names[axis]} = {free[axis]:.6g}, "
                 f"outside its limits [{bounds[axis, 0]:.6g}, {bounds[axis, 1]:.6g}]"
             )
-        active = [name for name, at in zip(names, best.active_mask, strict=True) if at]
+        gap = np.minimum(best.x - low, high - best.x) < 1e-4 * self.spread
+        active = [name for name, at in zip(names, gap, strict=True) if at]
         raise ValueError(
             f"desired {in_words(wanted)} is out of reach; the nearest output found is "
             f"{in_words(self.outputs(best.x[None])[0])}"

@@ -27,6 +27,8 @@ Array = NDArray[np.float64]
 
 NU = 4.0  # degrees of freedom of Student's loss
 _LIMIT = 300  # iterations
+_PATIENCE = 20  # iterations that together must gain a thousandth of the cost
+_FLAT = 64.0 * float(np.finfo(np.float64).eps)  # of the largest derivative: rounding
 _LEAST_DAMPING = 1e-14  # keeps directions that nothing determines where they are
 
 
@@ -104,8 +106,13 @@ def solve(task: Task, start: Solution | None = None) -> Solution:
         start = solve(dataclasses.replace(task, student=False))
         start.weights = student_weight(start.deleted, start.left)
     search = _Search(task, start)
+    costs: list[float] = []
     for _ in range(_LIMIT):
+        costs.append(search.cost)
         done = search.step()
+        # Along a curved valley the search creeps: what is left there is no evidence.
+        if len(costs) > _PATIENCE and search.damping < 1e-3:
+            done |= costs[-_PATIENCE] - search.cost < 1e-3 * max(1.0, search.cost)
         if search.settle() and done:
             return search.solution()
     raise ValueError(
@@ -147,7 +154,10 @@ class _Search:
         """Derivatives at the present parameters, whitened at level 1."""
         task = self.task
         rows = derivative(task.model, self.commands, self.theta)
-        self.by_theta = task.white @ rows[..., task.free]
+        rows = rows[..., task.free]
+        largest = np.abs(rows).max(axis=(0, 1))
+        flat = largest <= _FLAT * largest.max(initial=0.0)
+        self.by_theta = task.white @ np.where(flat, 0.0, rows)
         if self.uncertain.any():
             inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
             rows = derivative(task.model, self.commands, self.theta, inputs)
@@ -162,6 +172,11 @@ class _Search:
         readings = _times(self.task.white, residuals) / self.level
         moved = (commands - self.task.commands)[:, self.uncertain] * self.command_root
         return np.asarray((readings**2).sum(axis=1) + (moved**2).sum(axis=1))
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares of readings, commands and prior, weighted."""
+        return self._cost(self.residuals, self.theta, self.commands)
 
     def _cost(self, residuals: Array, theta: Array, commands: Array) -> float:
         off = (theta - self.task.mean) ** 2 @ self._precision()
@@ -213,7 +228,7 @@ class _Search:
     def step(self) -> bool:
         """Move the parameters to a lower cost; True where they need not move."""
         task = self.task
-        cost = self._cost(self.residuals, self.theta, self.commands)
+        cost = self.cost
         while True:
             rows, right, scale = self._system(self.damping)
             triangle, target = _triangle(rows, right, self.damping)
@@ -236,7 +251,13 @@ class _Search:
                 self.damping, self.grow = max(shrunk, _LEAST_DAMPING), 2.0
                 self._linearise()
                 return False
-            if self.damping > 1e12:  # rounding is all that is left
+            if self.damping > 1e12:  # rounding is all that is left, or
+                slope = np.abs(rows.T @ right).max() / np.linalg.norm(right)
+                if slope > 1e-3:
+                    raise ValueError(
+                        "model.jacobian must be the derivative of model.predict: no "
+                        "step along it brings the measurements nearer"
+                    )
                 return True
             self.damping *= self.grow
             self.grow *= 2.0
