@@ -39,7 +39,7 @@ def brute_force(candidates, k, criterion, region=None, repeat=False):
 @pytest.mark.parametrize("criterion", ["G", "I"])
 @pytest.mark.parametrize("repeat", [False, True])
 def test_the_smallest_k_and_the_bounds_hold_against_brute_force(criterion, repeat):
-    for seed in range(4):
+    for seed in range(3):
         candidates = np.random.default_rng(seed).random((9, 2))
         best = {
             k: brute_force(candidates, k, criterion, repeat=repeat) for k in range(3, 7)
@@ -64,7 +64,7 @@ def test_the_smallest_k_and_the_bounds_hold_against_brute_force(criterion, repea
             assert 0.5 * np.sqrt(best[4]) > target
 
 
-@settings(max_examples=15)
+@settings(max_examples=10)
 @example(1398425, "G", 1, True)  # not even all fourteen are enough
 @given(st.integers(0, 2**31), st.sampled_from("GI"), st.integers(1, 3), st.booleans())
 def test_laws_of_a_plan(seed, criterion, cap, with_region):
@@ -102,7 +102,8 @@ def test_an_affine_map_changes_no_k_and_no_error(rng):
     candidates = rng.random((15, 3))
     mapped = candidates @ (rng.normal(size=(3, 3)) + 2 * np.eye(3)) * 1e4 + 3e4
     first, second = (
-        plan(c, target_accuracy=0.9, noise_std=1.0) for c in (candidates, mapped)
+        plan(c, target_accuracy=0.9, noise_std=1.0, design="exchange")
+        for c in (candidates, mapped)
     )
     assert first.k == second.k
     np.testing.assert_allclose(
@@ -144,8 +145,9 @@ def test_simulated_calibrations_err_as_planned(rng, criterion):
 
 def test_replicates_need_no_more_measurements(rng):
     candidates = rng.random((12, 3))
-    single = plan(candidates, target_accuracy=0.8, noise_std=1.0)
-    several = plan(candidates, target_accuracy=0.8, noise_std=1.0, max_replicates=4)
+    wanted = {"target_accuracy": 0.8, "noise_std": 1.0, "design": "exchange"}
+    single = plan(candidates, **wanted)
+    several = plan(candidates, max_replicates=4, **wanted)
     assert several.k <= single.k
 
 
@@ -182,8 +184,9 @@ def test_required_postures_in_a_plane_raise_the_least_k(rng):
 
 def test_each_output_has_its_own_target(rng):
     candidates = rng.random((15, 3))
-    strict = plan(candidates, target_accuracy=[9, 9, 0.9], noise_std=1.0)
-    loose = plan(candidates, target_accuracy=0.9, noise_std=[0.1, 0.1, 1.0])
+    quick = {"design": "exchange"}
+    strict = plan(candidates, target_accuracy=[9, 9, 0.9], noise_std=1.0, **quick)
+    loose = plan(candidates, target_accuracy=0.9, noise_std=[0.1, 0.1, 1.0], **quick)
     assert strict.k == loose.k
     assert strict.standard_error.shape == (3,)
 
@@ -241,7 +244,7 @@ def test_the_table_and_the_figure_show_every_row(rng):
 
 def test_a_masked_candidate_may_hold_anything(rng):
     candidates = rng.random((15, 3))
-    wanted = {"target_accuracy": 0.9, "noise_std": 1.0}
+    wanted = {"target_accuracy": 0.9, "noise_std": 1.0, "design": "exchange"}
     available = np.arange(15) != 4
     plain = plan(candidates, available=available, **wanted)
     candidates[4] = np.nan
