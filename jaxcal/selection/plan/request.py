@@ -69,8 +69,7 @@ def whole_problem(
         return problem, wanted @ basis
     if wanted.ndim != 2 or wanted.shape[1] != n or not len(wanted):
         raise ValueError(f"region must have shape (R, {n}), got {wanted.shape}")
-    assert problem.model is not None
-    return problem, problem.model.blocks(wanted) @ basis
+    return problem, np.c_[wanted, np.ones(len(wanted))][:, None] @ basis
 
 
 def fewest(problem: Problem) -> tuple[int, int]:
