@@ -236,15 +236,12 @@ def plan(
     def enough(found: Design) -> bool:
         return bool(found.variance.max() <= 1 + 1e-12)
 
-    # Cheap first: is the largest K enough at all?
-    last = design_of(max_k, "exchange", None)
     rows: list[PlanRow] = []
     chosen: PlanRow | None = None
-    previous: Indices | None = None
-    if enough(last) or bound_of(max_k) <= 1.0:
+    last: Design | None = None
+    if bound_of(max_k) <= 1 + 1e-12:  # else no K allowed is enough
         for k in range(least_k, max_k + 1):
-            last = design_of(k, design, previous)
-            previous = last.indices
+            last = design_of(k, design, None if last is None else last.indices)
             rows.append(
                 PlanRow(
                     k=k,
@@ -261,6 +258,7 @@ def plan(
             if chosen is not None and k >= chosen.k + more:
                 break
     if chosen is None:
+        last = last or design_of(max_k, "exchange", None)
         one = int((unit * np.sqrt(last.variance) / target).argmax())
         best, least = unit[one] * np.sqrt([last.variance.max(), bound_of(max_k)])
         raise ValueError(
