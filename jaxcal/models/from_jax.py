@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import axis_names, numbers, table, whole_number
 from jaxcal.extras import needs
 from jaxcal.models.model import as_commands, as_parameters
+from jaxcal.models.reads import entries_read, inputs_needed
 from jaxcal.models.uncertainty import Prior
 
 __all__ = ["FromJax"]
@@ -30,7 +31,8 @@ class FromJax:
             for one output; written with ``jax.numpy``, without ``if`` on their values.
         nominal: (p,) parameters of the machine as it was designed.
         names: of the parameters; t1, t2, ... when not given.
-        num_inputs: n; that of the first commands when not given.
+        num_inputs: n. When not given it is what f unpacks or reads by number, else
+            that of the first commands.
     """
 
     def __init__(
@@ -52,6 +54,11 @@ class FromJax:
         if len(set(self.names)) < p:
             raise ValueError(f"names must differ, got {self.names}")
         self._num_inputs: int | None = None
+        with needs("policy", "FromJax"):
+            import jax
+        if num_inputs is None:
+            with jax.enable_x64(True):
+                num_inputs = inputs_needed(f, p)
         if num_inputs is not None:
             self._trace(whole_number("num_inputs", num_inputs, 1))
 
@@ -86,8 +93,9 @@ class FromJax:
         """(N, q, p)."""
         slopes = self._run(1, commands, parameters)
         for i, j, k in np.argwhere(~np.isfinite(slopes)):
+            name = self.names[self._without_derivative(i, j, k, commands, parameters)]
             raise ValueError(
-                f"the derivative of f by {self.names[k]!r} must be finite, got "
+                f"the derivative of f by {name!r} must be finite, got "
                 f"{slopes[i, j, k]} for output {j + 1} at command {i}"
             )
         return slopes
@@ -118,8 +126,8 @@ class FromJax:
 
     def _trace(self, num_inputs: int) -> None:
         """Find q, and whether JAX can follow f at all."""
-        with needs("policy", "FromJax"):
-            import jax
+        import jax
+
         with jax.enable_x64(True):
             command = jax.ShapeDtypeStruct((num_inputs,), np.float64)
             parameters = jax.ShapeDtypeStruct(self.nominal.shape, np.float64)
@@ -131,6 +139,14 @@ class FromJax:
                     f"{self.nominal.shape}; write it with jax.numpy, without if on "
                     f"values: {type(error).__name__}: {str(error).splitlines()[0]}"
                 ) from error
+            sizes = (num_inputs, len(self.nominal))
+            for i, (name, size) in enumerate(zip(("u", "theta"), sizes, strict=True)):
+                read = entries_read(self.f, sizes, i)[0]
+                if read > size:
+                    raise ValueError(
+                        f"f reads {name}[{read - 1}], which {name} of {size} entries "
+                        "does not have"
+                    )
         shape = getattr(result, "shape", None)
         if shape is None or len(shape) > 1 or shape == (0,):
             raise ValueError(
@@ -152,6 +168,21 @@ class FromJax:
             jax.jit(jax.vmap(each, in_axes=(0, None)))
             for each in (f, jax.jacfwd(f, argnums=1), jax.jacfwd(f, argnums=0))
         )
+
+    def _without_derivative(
+        self, i: int, j: int, k: int, commands: ArrayLike, parameters: ArrayLike | None
+    ) -> int:
+        """The parameter to blame: forward derivatives of the others are 0 inf = nan."""
+        import jax
+
+        at = as_commands(commands, self.num_inputs)[i], as_parameters(self, parameters)
+        try:
+            with jax.enable_x64(True):
+                row = jax.jacrev(lambda *at: jax.numpy.ravel(self.f(*at))[j], 1)(*at)
+        except ValueError:  # f has a loop that JAX differentiates forward only
+            return k
+        bad = np.flatnonzero(~np.isfinite(np.asarray(row)))
+        return int(bad[0]) if len(bad) else k
 
     def _run(
         self, which: int, commands: ArrayLike, parameters: ArrayLike | None

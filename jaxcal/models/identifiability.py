@@ -177,12 +177,15 @@ def _sparse_null(columns: Array) -> Array:
     _, size, right = np.linalg.svd(columns)
     rank = int((size > _NULL * size.max(initial=0.0)).sum())
     null = right[rank:].copy()
-    for row in range(len(null)):  # reduced echelon form: a pivot of its own for each
+    for row in range(
+        len(null) if null.size else 0
+    ):  # reduced echelon form: a pivot of its own for each
         pivot = int(np.abs(null[row]).argmax())
         null[row] /= null[row, pivot]
         others = np.arange(len(null)) != row
         null[others] -= np.outer(null[others, pivot], null[row])
-    null[np.abs(null) < _ZERO * np.abs(null).max(axis=1, keepdims=True)] = 0.0
+    largest = np.abs(null).max(axis=1, keepdims=True, initial=0.0)
+    null[np.abs(null) < _ZERO * largest] = 0.0
     shorter = True
     while shorter:  # combine two where that leaves fewer entries
         shorter = False

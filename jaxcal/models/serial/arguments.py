@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers, whole_number
+from jaxcal.checks import in_words, numbers, whole_number
 
 __all__ = ["joint_numbers", "load", "require_degrees", "transform", "triple"]
 
@@ -15,16 +15,14 @@ Array = NDArray[np.float64]
 
 
 def require_degrees(rows: Array) -> None:
-    """Refuse a table whose right angles are in radians."""
-    angles = rows[:, [1, 3, 4]]
-    for turn, degrees in ((np.pi / 2, 90), (np.pi, 180)):
-        near = np.abs(np.abs(angles) - turn) < 2e-3
-        if near.any():
-            raise ValueError(
-                "angles of table must be in degrees, got "
-                f"{angles[near][0]:.6g} in row {int(np.argwhere(near)[0, 0]) + 1}, "
-                f"which looks like {degrees} degrees in radians"
-            )
+    """Refuse a table whose right angles are all in radians."""
+    alpha = rows[:, 1][rows[:, 1] != 0.0]
+    right = np.isclose(np.abs(alpha), np.pi / 2, atol=2e-3)
+    if alpha.size and (right | np.isclose(np.abs(alpha), np.pi, atol=2e-3)).all():
+        raise ValueError(
+            f"alpha of table must be in degrees, got {in_words(alpha)}, which looks "
+            "like right angles in radians"
+        )
 
 
 def transform(argument: str, given: ArrayLike | None) -> Array:

@@ -154,15 +154,20 @@ class Arm:
         """(N, q, S) derivative of the outputs by the steps ``at`` (S,)."""
         steps = self._steps(commands, parameters)
         frame, axes, origins = forward(len(commands), steps)
-        turns = np.array([step.turns for step in steps])[at]
-        axes, origins = axes[at], origins[at]
-        columns = axes.copy()
-        columns[turns] = np.radians(cross(axes[turns], frame[3] - origins[turns]))
-        position = np.ascontiguousarray(columns.transpose(2, 1, 0))
+        position = np.empty((len(commands), 3, len(at)))
+        for k, i in enumerate(at):
+            if steps[i].turns:
+                lever = np.radians(frame[3] - origins[i])
+                position[..., k] = cross(axes[i], lever).T
+            else:
+                position[..., k] = axes[i].T
         if self.output == "position":
             return position
         vector = np.radians(self._outputs(commands, frame)[:, 3:])
-        turn = (axes * turns[:, None, None]).transpose(2, 1, 0)
+        turn = np.zeros_like(position)
+        for k, i in enumerate(at):
+            if steps[i].turns:
+                turn[..., k] = axes[i].T
         return np.concatenate([position, rotation_vector_rate(vector) @ turn], axis=1)
 
     def _outputs(self, commands: Array, frame: Array) -> Array:

@@ -38,32 +38,34 @@ def cross(left: Array, right: Array) -> Array:
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-2)
 
 
-def forward(count: int, steps: Sequence[Step]) -> tuple[Array, Array, Array]:
+def forward(
+    count: int, steps: Sequence[Step]
+) -> tuple[Array, list[Array], list[Array]]:
     """Frame after the last step, from the identity, and where each step acted.
 
     Returns:
-        (4, 3, N) frame; (S, 3, N) axis w and (S, 3, N) origin o of each step.
+        (4, 3, N) frame; of each step the axis w (3, N) and the origin o (3, N).
     """
-    frame = np.zeros((4, 3, count))
-    frame[[0, 1, 2], [0, 1, 2]] = 1.0
-    axes = np.zeros((len(steps), 3, count))
-    origins = np.empty_like(axes)
-    for i, (turns, axis, value) in enumerate(steps):
-        origins[i] = frame[3]
+    frame = [np.repeat(np.eye(3)[i][:, None], count, axis=1) for i in range(3)]
+    origin = np.zeros((3, count))
+    axes, origins = [], []
+    for turns, axis, value in steps:
+        axes.append(frame[axis or 0])
+        origins.append(origin)
         if axis is None:
-            frame[:3] = np.einsum("kj,kcn->jcn", value, frame[:3])
+            frame = list(np.einsum("kj,kcn->jcn", value, frame))
+        elif np.ndim(value) == 0 and value == 0.0:
             continue
-        axes[i] = frame[axis]
-        if not turns:
-            frame[3] += value * frame[axis]
-            continue
-        angle = np.radians(value)
-        cosine, sine = np.cos(angle), np.sin(angle)
-        j, k = (axis + 1) % 3, (axis + 2) % 3
-        turned = cosine * frame[j] + sine * frame[k]
-        frame[k] = cosine * frame[k] - sine * frame[j]
-        frame[j] = turned
-    return frame, axes, origins
+        elif not turns:
+            origin = origin + value * frame[axis]
+        else:
+            angle = np.radians(value)
+            cosine, sine = np.cos(angle), np.sin(angle)
+            j, k = (axis + 1) % 3, (axis + 2) % 3
+            first, second = frame[j], frame[k]
+            frame[j] = cosine * first + sine * second
+            frame[k] = cosine * second - sine * first
+    return np.stack([*frame, origin]), axes, origins
 
 
 def rotation_vector_rate(vector: Array) -> Array:

@@ -42,8 +42,9 @@ def torque(
         (C, N) and (C, n, N), the latter per degree or unit of length.
     """
     count, n = commands.shape
-    _, axes, origins = forward(count, steps)
-    axes, origins = axes[moved], origins[moved]
+    _, all_axes, all_origins = forward(count, steps)
+    axes = np.stack([all_axes[i] for i in moved])
+    origins = np.stack([all_origins[i] for i in moved])
     turns = revolute[:, None, None]
     first = np.minimum(at[:, None], np.arange(n))
     second = np.maximum(at[:, None], np.arange(n))

@@ -1,0 +1,71 @@
+"""Which entries of its arguments a JAX function reads.
+
+JAX does not check indices: ``theta[7]`` of seven parameters is the last one. Tracing
+the function with longer arguments shows what it would read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+__all__ = ["entries_read", "inputs_needed"]
+
+_LONGER = 1000  # entries more; one in the second half is counted from the end
+
+
+def entries_read(
+    f: Callable[[Any, Any], Any], sizes: tuple[int, int], argument: int
+) -> tuple[int, bool]:
+    """One more than the last index read of an argument, and whether all are known.
+
+    (0, False) where f does not take longer arguments, as when it unpacks them.
+    """
+    import jax
+
+    longer = list(sizes)
+    longer[argument] += _LONGER
+    try:
+        traced = jax.make_jaxpr(f)(*(np.zeros(size) for size in longer)).jaxpr
+    except Exception:  # whatever f raises where a size does not fit
+        return 0, False
+    most = sizes[argument] + _LONGER // 2
+    return _read(traced, traced.invars[argument], most)
+
+
+def _read(traced: Any, variable: Any, most: int) -> tuple[int, bool]:
+    last, known = 0, True
+    for equation in traced.eqns:
+        for i, used in enumerate(equation.invars):
+            if used is not variable:
+                continue
+            inner = equation.params.get("jaxpr")
+            inner = getattr(inner, "jaxpr", inner)
+            if equation.primitive.name == "slice":
+                end = equation.params["limit_indices"][0]
+                found = (end, True) if end <= most else (0, False)
+            elif inner is not None and len(inner.invars) == len(equation.invars):
+                found = _read(inner, inner.invars[i], most)
+            else:
+                found = (0, False)
+            last, known = max(last, found[0]), known and found[1]
+    return last, known
+
+
+def inputs_needed(f: Callable[[Any, Any], Any], num_parameters: int) -> int | None:
+    """n of f(u (n,), theta), where it unpacks, multiplies or reads a fixed number."""
+    import jax
+
+    last, known = entries_read(f, (0, num_parameters), 0)
+    if last and known:
+        return last
+    fits = []
+    for n in range(1, 33):
+        try:
+            jax.eval_shape(f, np.zeros(n), np.zeros(num_parameters))
+        except Exception:  # whatever f raises where a size does not fit
+            continue
+        fits.append(n)
+    return fits[0] if len(fits) == 1 else None
