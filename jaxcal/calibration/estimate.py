@@ -238,5 +238,6 @@ def _covariance(
     covariance = np.zeros((size, size))
     covariance[np.ix_(free, free)] = root.T @ root
     null = np.zeros((int((~known).sum()), size))
-    null[:, free] = right[~known] / scale
+    exact = np.where(np.abs(right[~known]) < 1e-7, 0.0, right[~known])  # no rounding
+    null[:, free] = exact / scale
     return covariance, null if len(null) else None

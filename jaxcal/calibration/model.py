@@ -277,8 +277,7 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
                 if lost
             ]
             lines.append(
-                f"not determined ({len(self.unidentified)} combinations of "
-                f"{', '.join(named)}): held near the prior's mean; "
+                f"not determined, held near the prior's mean: {', '.join(named)}; "
                 "see identifiability()"
             )
         for row, weight in self.outliers.items():
