@@ -1,10 +1,7 @@
-"""Identify ``y = A u + b`` from measured postures, with honest uncertainty.
+"""``identify``: from measurements to a calibration, with honest uncertainty.
 
-``identify`` is weighted least squares by a singular value decomposition of centred and
-scaled regressors, so encoder pulses and degrees fit equally well. With as many postures
-as regressors (four for three inputs) the model fits exactly, no residual is left and no
-noise can be estimated; the calibration then says so and has no covariance, unless the
-noise was given.
+The affine model by itself is weighted least squares in closed form (``least_squares``);
+every other model, prior or loss is a search (``estimate``).
 """
 
 from __future__ import annotations
@@ -15,14 +12,18 @@ import json
 import platform
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration.result import Calibration
+from jaxcal.calibration.base import Calibration
+from jaxcal.calibration.least_squares import fit_affine
+from jaxcal.calibration.result import AffineCalibration
 from jaxcal.checks import axis_names, noise_levels, relative_weights, table, text
-from jaxcal.information.excitation import require_excited
+
+if TYPE_CHECKING:
+    from jaxcal.models import Model, Noise, Prior
 
 __all__ = ["identify"]
 
@@ -33,27 +34,51 @@ def identify(
     commands: ArrayLike,
     measured: ArrayLike,
     *,
+    model: Model | None = None,
+    prior: Prior | None = None,
+    noise: Noise | None = None,
     noise_std: ArrayLike | None = None,
     weights: ArrayLike | None = None,
-    common_noise: bool = False,
+    common_noise: bool | None = None,
+    loss: str | None = None,
+    discrepancy: int | None = None,
     input_names: Sequence[str] | None = None,
     output_names: Sequence[str] | None = None,
     command_unit: str = "",
     measured_unit: str = "",
     notes: Mapping[str, Any] | None = None,
 ) -> Calibration:
-    """Fit ``y = A u + b`` by weighted least squares.
+    """The parameters of ``y = f(u; theta)`` that the measurements make most probable.
+
+    The affine model without prior, student's loss, discrepancy or noise of another kind
+    than ``noise_std`` is fitted by weighted least squares in closed form, and refuses
+    commands that leave a direction unexcited. Every other fit starts at the prior's
+    mean and is of the most probable parameters, so directions that no measurement shows
+    stay there.
 
     Args:
-        commands: (N, n) what the device was told, in any unit; N >= n + 1.
+        commands: (N, n) what the device was told, in any unit.
         measured: (N, m) what it reached, in any unit.
-        noise_std: () or (m,) known standard deviation of a measurement of weight 1, in
-            the measured unit; estimated from the residuals when not given.
+        model: of :mod:`jaxcal.models`, or any object with its methods; affine when not
+            given.
+        prior: what is known beforehand; ``model.default_prior()`` when not given.
+        noise: of readings and commands; ``command_std`` makes the commands unknowns of
+            their measurement. The level of the readings is estimated where it is not
+            given.
+        noise_std: () or (m,) short for ``Noise(std=...)``: standard deviation of a
+            measurement of weight 1, in the measured unit.
         weights: (N,) a measurement of weight w has variance noise_std^2 / w (the number
             of readings averaged, say); 0 leaves it out. All 1 when not given.
         common_noise: estimate one noise level for all outputs (they must share a unit),
-            which has m times the degrees of freedom. With five postures of three axes
-            a 95 % interval is 3.2 standard errors wide instead of 12.7.
+            which has m times the degrees of freedom, or (False) one for each. When not
+            given: one for each of an affine fit; one for all of another model unless
+            the residuals contradict it (F test, 0.1 %).
+        loss: "gaussian" is least squares; "student" (4 degrees of freedom, of a
+            measurement as a whole) gives outliers little weight. "student" when not
+            given, but least squares where the closed form applies.
+        discrepancy: number of random features of a smooth function of the commands
+            that is added to every output, its size estimated: for a model that is not
+            exact, so that the intervals of predictions say so.
         input_names: n names; u_x, u_y, u_z or u_1 ... u_n when not given.
         output_names: m names, likewise y_x or y_1.
         command_unit: stored with the result.
@@ -61,7 +86,8 @@ def identify(
         notes: anything JSON can hold, stored under ``provenance["notes"]``.
 
     Returns:
-        The calibration; its covariance is None where N = n + 1 and no noise was given.
+        The calibration; its covariance is None where the noise is unknown: nothing was
+        given and no residual degree of freedom is left.
 
     Raises:
         ValueError: naming the argument, the rule and the value; for commands that leave
@@ -78,64 +104,61 @@ def identify(
     inputs = axis_names("input_names", input_names, "u", n)
     outputs = axis_names("output_names", output_names, "y", m)
     weight = relative_weights(weights, len(commands))
-    noise = noise_levels(noise_std, m)
-    if noise is not None and common_noise:
+    if noise is not None:
+        from jaxcal.models import Noise
+
+        if not isinstance(noise, Noise):
+            raise ValueError(
+                f"noise must be a jaxcal.Noise, got {type(noise).__name__}; a number "
+                "goes into noise_std"
+            )
+        if noise_std is not None:
+            raise ValueError("noise_std is short for noise: give one of them")
+        plain = noise.covariance is None and noise.command_std is None
+        if plain and np.ndim(0.0 if noise.std is None else noise.std) < 2:
+            noise_std, noise = noise.std, None
+    level = noise_levels(noise_std, m)
+    if level is not None and common_noise is not None:
         raise ValueError(
             "common_noise says how to estimate the noise and noise_std what it is: "
             "give one of them"
         )
-    used = weight > 0.0
-    u, y, w = commands[used], measured[used], weight[used]
-    require_excited(u, inputs)
+    about: dict[str, Any] = {
+        "input_names": inputs,
+        "output_names": outputs,
+        "command_unit": text("command_unit", command_unit),
+        "measured_unit": text("measured_unit", measured_unit),
+        "provenance": _provenance(commands, measured, weight, notes),
+    }
+    affine = model is None
+    if model is not None:
+        from jaxcal.calibration.estimate import require_model
+        from jaxcal.models import Affine
 
-    total = float(w.sum())
-    share = w / total
-    centre = share @ u
-    offset = u - centre
-    scale = np.sqrt(share @ offset**2)
-    at_centre = share @ y
-    root = np.sqrt(w)[:, None]
-    left, singular, right = np.linalg.svd(root * (offset / scale), full_matrices=False)
-    inverse = right.T / singular
-    slopes = inverse @ (left.T @ (root * (y - at_centre)))
-    matrix = (slopes / scale[:, None]).T
-    fitted = at_centre + ((commands - centre) / scale) @ slopes
-    residuals = measured - fitted
+        require_model(model, commands, measured)
+        affine = isinstance(model, Affine)
+    if affine and loss in (None, "gaussian"):
+        if prior is None and noise is None and discrepancy is None:
+            shared = bool(common_noise)
+            found = fit_affine(commands, measured, weight, level, shared, inputs)
+            return AffineCalibration(**found, **about)
 
-    dof = len(u) - (n + 1)
-    squares = share @ residuals[used] ** 2 * total
-    residual_std = np.sqrt(squares / dof) if dof else None
-    overall = float(np.sqrt(squares.sum() / (m * dof))) if dof else None
-    known, noise_dof = noise is not None, 0
-    if not known and dof:
-        noise = np.full(m, overall) if common_noise else residual_std
-        noise_dof = m * dof if common_noise else dof
+    from jaxcal.calibration.estimate import fit_model
+    from jaxcal.calibration.model import ModelCalibration
+    from jaxcal.models import Affine, Noise
 
-    weighted_rows = root * np.column_stack([u, np.ones(len(u))])
-    scaled = np.append(singular, np.sqrt(total))
-    return Calibration(
-        matrix=matrix,
-        bias=at_centre - matrix @ centre,
-        residuals=residuals,
-        noise_std=noise,
-        noise_known=known,
-        noise_dof=noise_dof,
-        residual_std=residual_std,
-        residual_std_overall=overall,
-        dof=dof,
-        condition_number=float(np.linalg.cond(weighted_rows)),
-        scaled_condition_number=float(scaled.max() / scaled.min()),
-        num_measurements=len(u),
-        centre=centre,
-        scale=scale,
-        slope_covariance=inverse @ inverse.T,
-        total_weight=total,
-        input_names=inputs,
-        output_names=outputs,
-        command_unit=text("command_unit", command_unit),
-        measured_unit=text("measured_unit", measured_unit),
-        provenance=_provenance(commands, measured, weight, notes),
+    found = fit_model(
+        commands,
+        measured,
+        weight,
+        model=Affine(n, m) if model is None else model,
+        prior=prior,
+        noise=Noise(std=level) if noise is None and level is not None else noise,
+        loss=loss or "student",
+        discrepancy=discrepancy,
+        common_noise=common_noise,
     )
+    return ModelCalibration(**found, **about)
 
 
 def _provenance(

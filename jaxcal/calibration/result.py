@@ -1,50 +1,32 @@
-"""``Calibration``: what ``identify`` returns and what users hold."""
+"""``AffineCalibration``: what ``identify`` returns for ``y = A u + b`` by itself."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from jaxcal.calibration import file, inverse, table
-from jaxcal.calibration.fit import AffineFit
+from jaxcal.calibration import affine_file, affine_inverse, affine_table
+from jaxcal.calibration.affine import AffineFit
 
-if TYPE_CHECKING:
-    from typing import Self
-
-__all__ = ["Calibration"]
+__all__ = ["AffineCalibration"]
 
 
-class Calibration(AffineFit):
-    """The identified map from commands u (n inputs) to postures y (m outputs).
+class AffineCalibration(AffineFit, version=affine_file.SCHEMA.version):
+    """The identified map ``y = A u + b``.
 
     Data, uncertainty and prediction are those of :class:`AffineFit`; the inverse map,
     the printed table and the file are functions of their own modules.
     """
 
-    command_for = inverse.command_for
-    summary = table.summary
-    __repr__ = table.summary
-    to_frame = table.to_frame
-    to_dict = file.to_dict
-    save = file.save
+    command_for = affine_inverse.command_for
+    summary = affine_table.summary
+    _columns = affine_table.columns
+    to_dict = affine_file.to_dict
 
     @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> Self:
-        """The inverse of ``to_dict``.
-
-        Raises:
-            ValueError: it is not a calibration, of another version, or damaged; the
-                message names the key.
-        """
-        return cls(**file.fields(content))
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a file that ``save`` wrote.
-
-        Raises:
-            OSError: it cannot be read.
-            ValueError: as of ``from_dict``; the message names the file too.
-        """
-        return cls(**file.read(path))
+    def _fields(cls, content: Mapping[str, Any], model: object) -> dict[str, Any]:
+        if model is not None:
+            raise ValueError(
+                "model must be left out: the file is an affine calibration"
+            )
+        return affine_file.fields(content)

@@ -1,67 +1,25 @@
-"""A calibration as a table: printed, or as a pandas data frame."""
+"""Columns as text or as a pandas data frame."""
 
 from __future__ import annotations
 
 import importlib
 from typing import Any
 
-from jaxcal.calibration.fit import AffineFit
-from jaxcal.checks import in_words
-
-__all__ = ["summary", "to_frame"]
+__all__ = ["in_lines", "to_frame"]
 
 
-def summary(self: AffineFit) -> str:
-    """A and b with their 95 % intervals, the noise and the fit, in a table of text."""
-    unit = f" {self.measured_unit}" if self.measured_unit else ""
-    n, m = self.num_inputs, self.num_outputs
-    lines = [
-        f"Calibration y = A u + b: {n} inputs ({', '.join(self.input_names)}), "
-        f"{m} outputs ({', '.join(self.output_names)}), "
-        f"{self.num_measurements} measurements"
-    ]
-    table = _columns(self)
-    cells = {
-        "": table["parameter"],
-        "meaning": [
-            f"{y} per {u}" if u else f"{y} at u = 0"
-            for y, u in zip(table["output"], table["input"], strict=True)
-        ],
-        "value": [f"{value: .6g}" for value in table["value"]],
-    }
-    if "low" in table:
-        cells["95 % interval"] = [
-            f"[{low: .6g}, {high: .6g}]"
-            for low, high in zip(table["low"], table["high"], strict=True)
-        ]
-    if any(table["unit"]):
-        cells["unit"] = table["unit"]
-    widths = [max(map(len, [name, *column])) for name, column in cells.items()]
-    for row in [list(cells), *zip(*cells.values(), strict=True)]:
+def in_lines(columns: dict[str, list[str]]) -> list[str]:
+    """A header and a line for each row, columns padded to the same width."""
+    widths = [max(map(len, [name, *column])) for name, column in columns.items()]
+    lines = []
+    for row in [list(columns), *zip(*columns.values(), strict=True)]:
         padded = [f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)]
         lines.append(("  " + "  ".join(padded)).rstrip())
-    if self.residual_std is not None:
-        fit = self.lack_of_fit()
-        lines.append(
-            f"residual std {in_words(self.residual_std)}{unit}, {self.dof} degrees of "
-            "freedom each" + ("" if fit is None else f"; lack-of-fit p = {fit:.3g}")
-        )
-    if self.noise_std is None:
-        lines.append(self._no_noise("intervals"))
-    else:
-        source = "as given" if self.noise_known else "from the residuals"
-        lines.append(f"noise std {in_words(self.noise_std)}{unit}, {source}")
-        if self.residual_std is None:
-            lines.append("no residual degree of freedom: the noise cannot be checked")
-    lines.append(f"condition number {self.condition_number:.4g}")
-    return "\n".join(lines)
+    return lines
 
 
-def to_frame(self: AffineFit) -> Any:
-    """One row per parameter: output, input, value, unit, std_error, low, high (95 %).
-
-    Returns:
-        A ``pandas.DataFrame``; the last three columns only where the noise is known.
+def to_frame(columns: dict[str, list[Any]]) -> Any:
+    """A ``pandas.DataFrame`` with the column ``parameter`` as its index.
 
     Raises:
         ImportError: pandas is not installed.
@@ -72,22 +30,4 @@ def to_frame(self: AffineFit) -> Any:
         raise ImportError(
             "to_frame needs pandas, which is not installed: pip install pandas"
         ) from None
-    return pandas.DataFrame(_columns(self)).set_index("parameter")
-
-
-def _columns(fit: AffineFit) -> dict[str, list[Any]]:
-    """Columns of m (n + 1) entries in the order of ``parameters``; input "" for b."""
-    m, n = fit.num_outputs, fit.num_inputs
-    per = f"/{fit.command_unit}" if fit.command_unit else ""
-    slope_unit = (fit.measured_unit or "1") + per if per else fit.measured_unit
-    columns: dict[str, list[Any]] = {
-        "parameter": list(fit.parameter_names),
-        "output": [y for y in fit.output_names for _ in range(n)] + [*fit.output_names],
-        "input": [*fit.input_names] * m + [""] * m,
-        "value": fit.parameters.tolist(),
-        "unit": [slope_unit] * (m * n) + [fit.measured_unit] * m,
-    }
-    if fit.standard_errors is not None:
-        columns["std_error"] = fit.standard_errors.tolist()
-        columns["low"], columns["high"] = fit.confidence_intervals().T.tolist()
-    return columns
+    return pandas.DataFrame(columns).set_index("parameter")

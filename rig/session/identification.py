@@ -44,7 +44,7 @@ def fit(
     if noise_std is None:
         noise_std = np.sqrt(np.mean([mean_variance(r) for r in records]))
     noise_std = max(1e-9, float(noise_std))
-    fitted = jaxcal.identify(
+    fitted: Any = jaxcal.identify(
         *pairs(records),
         noise_std=noise_std,
         input_names=AXIS_NAMES,

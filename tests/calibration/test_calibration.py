@@ -723,7 +723,7 @@ def remove(key: str) -> object:
     [
         (change("format", "other"), 'not a calibration: "format"'),
         (remove("format"), 'not a calibration: "format"'),
-        (change("version", 2), "version 2, this jaxcal reads version 1"),
+        (change("version", 3), "version 3, this jaxcal reads version 1"),
         (remove("version"), "version None"),
         (remove("matrix"), 'key "matrix" is missing'),
         (remove("provenance"), 'key "provenance" is missing'),

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration.fit import AffineFit
+from jaxcal.calibration.affine import AffineFit
 from jaxcal.checks import in_words, numbers
 from jaxcal.information.excitation import direction_in_words
 
-__all__ = ["command_for"]
+__all__ = ["command_for", "limits_of"]
 
 Array = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ def command_for(
             limit is not finite or has the wrong shape.
     """
     wanted = self._points("desired", desired, self.num_outputs)
-    bounds = None if limits is None else _limits(limits, self.input_names)
+    bounds = None if limits is None else limits_of(limits, self.input_names)
     at_centre = self.matrix @ self.centre + self.bias
     effect = self.matrix * self.scale  # (m, n) of one spread of each command
     rows = np.linalg.norm(effect, axis=1)
@@ -74,7 +74,7 @@ def command_for(
     return np.clip(command, low, high)
 
 
-def _limits(limits: ArrayLike, names: tuple[str, ...]) -> Array:
+def limits_of(limits: ArrayLike, names: tuple[str, ...]) -> Array:
     """(n, 2), least below greatest, with at least one finite command between them."""
     bounds = numbers("limits", limits, finite=False)
     if bounds.shape != (len(names), 2):

@@ -1,0 +1,79 @@
+"""A model and what it leaves out: a smooth function of the commands, unknown a priori.
+
+Random Fourier features (Rahimi and Recht, 2007) of a Matern-3/2 process as wide as the
+commands: ``y = f(u; theta) + sum of c_k sqrt(2 / D) cos(w_k u + b_k)``, the same D
+features with coefficients of their own for every output. The coefficients are normal
+with one size, which is estimated; where the size is small the model is good.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.models import Model
+
+__all__ = ["WithDiscrepancy"]
+
+Array = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class WithDiscrepancy:
+    """A model with p parameters as one with p + q D, as far as a fit needs it."""
+
+    model: Model
+    frequencies: Array  # (n, D) per command unit
+    phases: Array  # (D,)
+
+    @classmethod
+    def over(cls, model: Model, commands: Array, count: int) -> WithDiscrepancy:
+        """``count`` features drawn for commands (N, n); the same draw every time."""
+        rng = np.random.default_rng(0)
+        n = commands.shape[1]
+        spread = commands.std(axis=0) * np.sqrt(n)
+        heavy = np.sqrt(rng.chisquare(3.0, count) / 3.0)
+        draws = rng.normal(size=(n, count)) / heavy
+        inverse = np.where(spread > 0.0, 1.0 / np.where(spread > 0.0, spread, 1.0), 0.0)
+        phases = rng.uniform(0.0, 2.0 * np.pi, count)
+        return cls(model, draws * inverse[:, None], phases)
+
+    @property
+    def num_outputs(self) -> int:
+        return self.model.num_outputs
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        extra = range(self.num_outputs * len(self.phases))
+        return (*self.model.names, *(f"discrepancy {i + 1}" for i in extra))
+
+    def predict(self, commands: Array, parameters: Array) -> Array:
+        own, size = self._split(parameters)
+        phase = commands @ self.frequencies + self.phases
+        return self.model.predict(commands, own) + self._scale * np.cos(phase) @ size.T
+
+    def jacobian(self, commands: Array, parameters: Array) -> Array:
+        own, _ = self._split(parameters)
+        phase = commands @ self.frequencies + self.phases
+        features = self._scale * np.cos(phase)
+        extra = np.einsum("ij,nd->nijd", np.eye(self.num_outputs), features)
+        extra = extra.reshape(len(phase), self.num_outputs, -1)
+        return np.concatenate([self.model.jacobian(commands, own), extra], axis=-1)
+
+    def command_jacobian(self, commands: Array, parameters: Array) -> Array:
+        own, size = self._split(parameters)
+        phase = commands @ self.frequencies + self.phases
+        slopes = -self._scale * np.sin(phase)
+        extra = np.einsum("nd,qd,id->nqi", slopes, size, self.frequencies)
+        return self.model.command_jacobian(commands, own) + extra
+
+    @property
+    def _scale(self) -> float:
+        return float(np.sqrt(2.0 / len(self.phases)))
+
+    def _split(self, parameters: Array) -> tuple[Array, Array]:
+        """Parameters (p,) of the model and coefficients (q, D)."""
+        p = len(self.model.names)
+        return parameters[:p], parameters[p:].reshape(self.num_outputs, -1)

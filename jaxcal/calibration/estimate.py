@@ -1,0 +1,225 @@
+"""From the arguments of ``identify`` to the fit of a model and its covariance."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.calibration.discrepancy import WithDiscrepancy
+from jaxcal.calibration.solve import Solution, Task, solve, student_constants
+from jaxcal.checks import one_of, whole_number
+from jaxcal.models import Model, Noise, Prior
+
+__all__ = ["fit_model", "require_model"]
+
+Array = NDArray[np.float64]
+
+_NULL = 1e-10  # of the largest singular value: not determined
+
+
+def require_model(model: Any, commands: Array, measured: Array) -> None:
+    """Refuse what is no model, and a model of other commands or outputs."""
+    for method in ("predict", "jacobian", "default_prior"):
+        if not callable(getattr(model, method, None)):
+            raise ValueError(
+                f"model must have a method {method} (see jaxcal.models.Model), got "
+                f"{model!r}"
+            )
+    if not len(commands):
+        raise ValueError("commands must hold at least one row, got none")
+    model.predict(commands, None)  # tells some models their number of inputs
+    for name, table, count in (
+        ("commands", commands, model.num_inputs),
+        ("measured", measured, model.num_outputs),
+    ):
+        if table.shape[1] != count:
+            raise ValueError(
+                f"{name} must have {count} columns for this model, got {table.shape[1]}"
+            )
+
+
+def fit_model(
+    commands: Array,
+    measured: Array,
+    weights: Array,
+    *,
+    model: Model,
+    prior: Prior | None,
+    noise: Noise | None,
+    loss: str,
+    discrepancy: int | None,
+    common_noise: bool | None,
+) -> dict[str, Any]:
+    """The fields of a ``ModelCalibration`` but names, units and provenance."""
+    one_of("loss", loss, ("student", "gaussian"))
+    if prior is not None and not isinstance(prior, Prior):
+        raise ValueError(f"prior must be a jaxcal.Prior, got {type(prior).__name__}")
+    used = weights > 0.0
+    if not used.any():
+        raise ValueError("weights must be positive for one measurement at least")
+    white, known, spread = _noise_of(noise, weights, commands, measured.shape[1])
+    if known and common_noise is not None:
+        raise ValueError(
+            "common_noise says how to estimate the noise, and noise says what it is: "
+            "give one of them"
+        )
+    resolved = (prior or model.default_prior()).resolve(model)
+    whole, extra = model, np.zeros(0)
+    if discrepancy is not None:
+        features = whole_number("discrepancy", discrepancy, 1)
+        whole = WithDiscrepancy.over(model, commands[used], features)  # type: ignore[assignment]  # as far as a fit needs it
+        extra = np.zeros(features * measured.shape[1])
+    task = Task(
+        model=whole,
+        commands=commands[used],
+        measured=measured[used],
+        white=white[used],
+        mean=np.concatenate([resolved.mean, extra]),
+        precision=np.concatenate([np.diagonal(resolved.precision), extra]),
+        free=np.concatenate([resolved.free, extra == 0.0]),
+        sized=np.concatenate([resolved.free & False, extra == 0.0]),
+        command_std=spread,
+        known=known,
+        per_output=common_noise is False,
+        student=loss == "student",
+    )
+    found = solve(task)
+    if common_noise is None and _levels_differ(task, found):
+        task = dataclasses.replace(task, per_output=True)
+        found = solve(task, found)
+    fields = _fields(task, found, commands, measured, used)
+    return fields | {"model": model, "loss": loss}
+
+
+def _noise_of(
+    noise: Noise | None, weights: Array, commands: Array, q: int
+) -> tuple[Array, bool, Array]:
+    """Whitening (N, q, q), whether its level is known, and command_std (n,)."""
+    noise = noise or Noise()
+    readings = Noise(std=noise.std, covariance=noise.covariance)
+    white = readings.whitening(len(commands), q) * np.sqrt(weights)[:, None, None]
+    spread = np.asarray(0.0 if noise.command_std is None else noise.command_std)
+    n = commands.shape[1]
+    if spread.shape not in ((), (n,)):
+        raise ValueError(
+            f"command_std must be one number or ({n},), got {spread.shape}"
+        )
+    spread = np.broadcast_to(spread, (n,))
+    if np.isinf(spread).sum() >= q:
+        raise ValueError(
+            f"command_std must leave fewer unknown commands than the {q} readings of a "
+            f"measurement, got {int(np.isinf(spread).sum())}"
+        )
+    return white, noise.std is not None or noise.covariance is not None, spread
+
+
+def _levels_differ(task: Task, found: Solution) -> bool:
+    """Whether one level for all outputs contradicts their residuals (F test, 0.1 %)."""
+    q = len(found.freedom)
+    if task.known or q == 1 or found.freedom.min() < 1.0 or task.command_std.any():
+        return False
+    from scipy import special
+
+    white = (task.white @ found.residuals[..., None])[..., 0]
+    variance = found.weights @ white**2 / found.freedom
+    high, low = int(variance.argmax()), int(variance.argmin())
+    ratio = variance[high] / max(variance[low], np.finfo(np.float64).tiny)
+    chance = special.fdtrc(found.freedom[high], found.freedom[low], ratio)
+    return bool(chance * q * (q - 1) < 1e-3)
+
+
+def _fields(
+    task: Task,
+    found: Solution,
+    commands: Array,
+    measured: Array,
+    used: NDArray[np.bool_],
+) -> dict[str, Any]:
+    information = found.weights
+    if task.student:
+        _, mean, efficiency = student_constants(found.left)
+        information = efficiency * np.minimum(1.0, found.weights / mean)
+    rows = np.sqrt(information)[:, None, None] * found.rows
+    rows = rows.reshape(-1, rows.shape[-1])
+    covariance, null = _covariance(task, rows, found.precision[task.free], found.left)
+    freedom = float(found.freedom.sum())
+    noise_std: Array | None = _noise(task, found)
+    noise_dof = 0.0
+    if not task.known:
+        noise_dof = float(found.freedom.min()) if task.per_output else freedom
+        if freedom < 1.0 or noise_dof <= 0.0:
+            noise_std, noise_dof = None, 0.0
+    residuals = measured - task.model.predict(commands, found.parameters)
+    residuals[used] = found.residuals
+    estimated = None
+    if task.command_std.any():
+        estimated = commands.copy()
+        estimated[used] = found.commands
+    loss_weights, distance = np.zeros((2, len(commands)))
+    loss_weights[used], distance[used] = found.weights, found.deleted
+    features = task.model if isinstance(task.model, WithDiscrepancy) else None
+    return {
+        "estimate": found.parameters,
+        "joint_covariance": None if noise_std is None else covariance,
+        "unidentified": null,
+        "prior_mean": task.mean,
+        "prior_precision": found.precision,
+        "free": task.free.astype(np.float64),
+        "commands": commands,
+        "estimated_commands": estimated,
+        "residuals": residuals,
+        "loss_weights": loss_weights,
+        "distance": distance,
+        "dof": max(freedom, 0.0),
+        "square": float(found.distance.sum()),
+        "num_readings": found.left,
+        "noise_std": noise_std,
+        "noise_known": task.known,
+        "noise_dof": noise_dof,
+        "num_measurements": int(used.sum()),
+        "frequencies": features and features.frequencies,
+        "phases": features and features.phases,
+    }
+
+
+def _noise(task: Task, found: Solution) -> Array | None:
+    """(q,) of a reading of weight 1; root mean square where they were given apart."""
+    inverse = np.linalg.inv(task.white)
+    each = inverse @ np.matrix_transpose(inverse)
+    std = np.sqrt(np.diagonal(each, axis1=1, axis2=2).mean(axis=0))
+    return np.asarray(std * found.level)
+
+
+def _covariance(
+    task: Task, rows: Array, precision: Array, left: int
+) -> tuple[Array, Array | None]:
+    """(P, P) of what is determined, and directions (z, P) of what is not.
+
+    Raises:
+        ValueError: every reading is used up and parameters are still undetermined.
+    """
+    size, free = len(task.mean), np.flatnonzero(task.free)
+    scale = np.sqrt((rows**2).sum(axis=0) + precision)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    triangle = np.linalg.qr(
+        np.concatenate([rows, np.diag(np.sqrt(precision))]) / scale, "r"
+    )
+    _, singular, right = np.linalg.svd(triangle)
+    known = singular > _NULL * singular[0]
+    readings = left * len(task.commands)
+    if not known.all() and np.linalg.matrix_rank(rows / scale, _NULL) >= readings:
+        raise ValueError(
+            f"measured holds {readings} independent readings, too few for "
+            f"{len(free)} free parameters: {int((~known).sum())} combinations of them "
+            "stay unknown; measure more, or give a prior or fixed parameters"
+        )
+    root = right[known] / singular[known, None] / scale
+    covariance = np.zeros((size, size))
+    covariance[np.ix_(free, free)] = root.T @ root
+    null = np.zeros((int((~known).sum()), size))
+    exact = np.where(np.abs(right[~known]) < 1e-7, 0.0, right[~known])  # no rounding
+    null[:, free] = exact / scale
+    return covariance, null if len(null) else None

@@ -1,0 +1,347 @@
+"""The fit of any model: Levenberg-Marquardt for the most probable parameters.
+
+Rows of residuals, whitened: the readings, the prior (one row for each parameter) and,
+where commands are uncertain, the commands. Those are unknowns of their own measurement
+and are eliminated there by an orthogonal projection. Student's loss is iteratively
+reweighted least squares. A level of noise that was not given is estimated beside the
+parameters, from the residuals and the degrees of freedom that they really have.
+
+Sources: Marquardt, 1963, with the damping of Nielsen, 1999; Lange, Little and Taylor,
+1989 (Student); Foerstner, 1979, and MacKay, 1992 (levels of noise and prior).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.calibration.checked import derivative, predict
+from jaxcal.models import Model
+
+__all__ = ["NU", "Solution", "Task", "solve", "student_constants"]
+
+Array = NDArray[np.float64]
+
+NU = 4.0  # degrees of freedom of Student's loss
+_LIMIT = 300  # iterations
+_PATIENCE = 20  # iterations that together must gain a thousandth of the cost
+_FLAT = 64.0 * float(np.finfo(np.float64).eps)  # of the largest derivative: rounding
+_LEAST_DAMPING = 1e-14  # keeps directions that nothing determines where they are
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """N measurements of q outputs, P parameters of which F are free."""
+
+    model: Model
+    commands: Array  # (N, n)
+    measured: Array  # (N, q)
+    white: Array  # (N, q, q) whitening of the readings, at level 1
+    mean: Array  # (P,) of the prior
+    precision: Array  # (P,) of the prior, 0 where nothing is known
+    free: NDArray[np.bool_]  # (P,) False: held at the mean
+    sized: NDArray[np.bool_]  # (P,) coefficients whose prior size is estimated
+    command_std: Array  # (n,) 0 exact, inf unknown in every measurement
+    known: bool  # the level is 1; else it is estimated
+    per_output: bool  # one level for each output
+    student: bool
+
+
+@dataclasses.dataclass
+class Solution:
+    """Where a search stands."""
+
+    parameters: Array  # (P,)
+    commands: Array  # (N, n) as estimated; as given where they are exact
+    residuals: Array  # (N, q) measured less predicted at these commands
+    level: Array  # (q,) of the noise
+    size: float  # prior std of the ``sized`` coefficients
+    weights: Array  # (N,) of the loss, 1 for least squares
+    distance: Array  # (N,) squared, of each measurement from the fit, in noise
+    deleted: Array  # (N,) the same from the fit without that measurement
+    left: int  # readings of a measurement less its unknown commands
+    freedom: Array  # (q,) residual degrees of freedom of each output
+    rows: Array  # (N, R, F) whitened derivatives, commands eliminated, no weights
+    precision: Array  # (P,) of the prior
+
+
+@functools.lru_cache
+def student_constants(q: int) -> tuple[float, float, float]:
+    """Student's loss where the noise of q readings is normal.
+
+    Returns:
+        Mean weighted squared residual of a reading of unit noise; mean weight;
+        efficiency relative to least squares.
+    """
+    from scipy import special
+
+    node, share = special.roots_genlaguerre(60, q / 2.0 - 1.0)
+    share, square = share / share.sum(), 2.0 * node
+    weight = student_weight(square, q)
+    slope = share @ (weight - 2.0 * square * weight**2 / (NU + q) / q)
+    efficiency = slope**2 / (share @ (weight**2 * square) / q)
+    return float(share @ (weight * square) / q), float(share @ weight), efficiency
+
+
+def student_weight(square: Array, q: int) -> Array:
+    """Weights of measurements at squared distances ``square`` from the fit.
+
+    Of Student's distribution, scaled so that a residual of zero has weight one: where
+    no residual is large the fit is that of least squares.
+    """
+    return np.asarray((NU + q) / (NU + q + square))
+
+
+def solve(task: Task, start: Solution | None = None) -> Solution:
+    """The most probable parameters, from the prior's mean or from ``start``.
+
+    Raises:
+        ValueError: the model fails at the start, a derivative is not finite, or the
+            search does not converge.
+    """
+    if task.student and start is None:
+        start = solve(dataclasses.replace(task, student=False))
+        start.weights = student_weight(start.deleted, start.left)
+    search = _Search(task, start)
+    costs: list[float] = []
+    for _ in range(_LIMIT):
+        costs.append(search.cost)
+        done = search.step()
+        # Along a curved valley the search creeps: what is left there is no evidence.
+        if len(costs) > _PATIENCE and search.damping < 1e-3:
+            done |= costs[-_PATIENCE] - search.cost < 1e-3 * max(1.0, search.cost)
+        if search.settle() and done:
+            return search.solution()
+    raise ValueError(
+        f"identify did not converge in {_LIMIT} iterations: begin nearer, with "
+        "Prior(mean=...), narrow the prior, or fix parameters that the measurements "
+        "do not determine"
+    )
+
+
+def _times(matrices: Array, vectors: Array) -> Array:
+    return np.asarray((matrices @ vectors[..., None])[..., 0])
+
+
+class _Search:
+    """The state of a search, and its two moves: step (parameters), settle (levels)."""
+
+    def __init__(self, task: Task, start: Solution | None) -> None:
+        self.task = task
+        count, q = task.measured.shape
+        self.uncertain = task.command_std > 0.0
+        self.command_root = 1.0 / task.command_std[self.uncertain]  # 0: unknown
+        self.left = q - int(np.isinf(task.command_std).sum())  # readings, nuisance out
+        self.damping, self.grow = 1e-3, 2.0
+        self.floor = 1e-13 * np.abs(_times(task.white, task.measured)).max()
+        self.theta = task.mean if start is None else start.parameters
+        self.commands = task.commands if start is None else start.commands
+        self.residuals = task.measured - predict(task.model, self.commands, self.theta)
+        if start is None:
+            self.weights, self.level = np.ones(count), np.ones(q)
+            self.size = float(np.sqrt(np.mean(self.residuals**2)))
+            if not task.known:
+                first = np.sqrt(np.mean(_times(task.white, self.residuals) ** 2))
+                self.level = np.full(q, max(first, self.floor))
+        else:
+            self.weights, self.level, self.size = start.weights, start.level, start.size
+        self._linearise()
+
+    def _linearise(self) -> None:
+        """Derivatives at the present parameters, whitened at level 1."""
+        task = self.task
+        rows = derivative(task.model, self.commands, self.theta)
+        rows = rows[..., task.free]
+        largest = np.abs(rows).max(axis=(0, 1))
+        flat = largest <= _FLAT * largest.max(initial=0.0)
+        self.by_theta = task.white @ np.where(flat, 0.0, rows)
+        if self.uncertain.any():
+            inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
+            rows = derivative(task.model, self.commands, self.theta, inputs)
+            self.by_command = task.white @ rows[..., self.uncertain]
+
+    def _precision(self) -> Array:
+        """(P,) of the prior, with the size estimated of some coefficients."""
+        return np.where(self.task.sized, self.size**-2.0, self.task.precision)
+
+    def _distance(self, residuals: Array, commands: Array) -> Array:
+        """(N,) squared distance of each measurement from the fit, in noise."""
+        readings = _times(self.task.white, residuals) / self.level
+        moved = (commands - self.task.commands)[:, self.uncertain] * self.command_root
+        return np.asarray((readings**2).sum(axis=1) + (moved**2).sum(axis=1))
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares of readings, commands and prior, weighted."""
+        return self._cost(self.residuals, self.theta, self.commands)
+
+    def _cost(self, residuals: Array, theta: Array, commands: Array) -> float:
+        off = (theta - self.task.mean) ** 2 @ self._precision()
+        return float(self.weights @ self._distance(residuals, commands) + off)
+
+    def _reduce(self, damping: float) -> tuple[Array, Array]:
+        """Rows (N, R, F) and residuals (N, R), the commands eliminated."""
+        rows = self.by_theta / self.level[:, None]
+        right = _times(self.task.white, self.residuals) / self.level
+        k = len(self.command_root)
+        if not k:
+            return rows, right
+        own = self.by_command / self.level[:, None]
+        known = np.broadcast_to(np.diag(self.command_root), (len(own), k, k))
+        own = np.concatenate([own, known], axis=1)
+        length = np.sqrt((own**2).sum(axis=1))[:, :, None] * np.eye(k)
+        own = np.concatenate([own, np.sqrt(damping) * length], axis=1)
+        moved = (self.task.commands - self.commands)[:, self.uncertain]
+        right = np.concatenate([right, moved * self.command_root, 0.0 * moved], axis=1)
+        turn, triangle = np.linalg.qr(own, mode="complete")
+        turn = np.matrix_transpose(turn)
+        rows, right = turn[..., : rows.shape[1]] @ rows, _times(turn, right)
+        self._back = triangle[:, :k], rows[:, :k], right[:, :k]
+        return rows[:, k:], right[:, k:]
+
+    def _moved(self, step: Array) -> Array:
+        """(N, n) the commands after the parameters move by ``step`` (F,)."""
+        commands = self.commands
+        if len(self.command_root):
+            triangle, rows, right = self._back
+            own = np.linalg.solve(triangle, (right - rows @ step)[..., None])[..., 0]
+            commands = commands.copy()
+            commands[:, self.uncertain] += own
+        return commands
+
+    def _system(self, damping: float) -> tuple[Array, Array, Array]:
+        """Weighted rows (R, F) of readings and prior, residuals (R,), scale (F,)."""
+        free = self.task.free
+        root = np.sqrt(self._precision()[free])
+        weight = np.sqrt(self.weights)[:, None]
+        rows, right = self._reduce(damping)
+        rows = (weight[..., None] * rows).reshape(-1, len(root))
+        scale = np.sqrt((rows**2).sum(axis=0) + root**2)
+        scale = np.where(scale > 0.0, scale, 1.0)
+        rows = np.concatenate([rows, np.diag(root)]) / scale
+        off = root * (self.task.mean - self.theta)[free]
+        return rows, np.concatenate([(weight * right).ravel(), off]), scale
+
+    def step(self) -> bool:
+        """Move the parameters to a lower cost; True where they need not move."""
+        task = self.task
+        cost = self.cost
+        while True:
+            rows, right, scale = self._system(self.damping)
+            triangle, target = _triangle(rows, right, self.damping)
+            step = np.linalg.solve(triangle, target)
+            rest = rows @ step - right
+            gain = float(right @ right - rest @ rest)
+            # 1e-6 standard deviations; 1e-5 where convergence is linear.
+            if gain <= (1e-10 if task.student else 1e-12) + 1e-13 * cost:
+                return True
+            theta = self.theta.copy()
+            theta[task.free] += step / scale
+            commands = self._moved(step / scale)
+            residuals = task.measured - predict(
+                task.model, commands, theta, finite=False
+            )
+            after = self._cost(residuals, theta, commands)
+            ratio = (cost - after) / gain if np.isfinite(after) else -1.0
+            if ratio > 1e-4:
+                self.theta, self.commands, self.residuals = theta, commands, residuals
+                shrunk = self.damping * max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3)
+                self.damping, self.grow = max(shrunk, _LEAST_DAMPING), 2.0
+                self._linearise()
+                return False
+            if self.damping > 1e9:  # rounding is all that is left, or
+                slope = np.abs(rows.T @ right).max() / np.linalg.norm(right)
+                if slope > 1e-3:
+                    raise ValueError(
+                        "model.jacobian must be the derivative of model.predict: no "
+                        "step along it brings the measurements nearer"
+                    )
+                return True
+            self.damping *= self.grow
+            self.grow *= 2.0
+
+    def settle(self) -> bool:
+        """Weights and levels that follow from the residuals; True where they stay."""
+        task = self.task
+        before = self.weights, np.log(self.level), np.log(self.size)
+        if task.student:
+            distance = self._distance(self.residuals, self.commands)
+            self.weights = student_weight(distance, self.left)
+        if not task.known or task.sized.any():
+            self._estimate_levels()
+        after = self.weights, np.log(self.level), np.log(self.size)
+        return all(
+            np.abs(new - old).max() < limit
+            for new, old, limit in zip(after, before, (1e-6, 1e-4, 1e-4), strict=True)
+        )
+
+    def _estimate_levels(self) -> None:
+        """Sums of squares over the degrees of freedom that they have."""
+        task = self.task
+        readings, prior = self._leverage()
+        if task.sized.any():
+            left = (1.0 - (prior**2).sum(axis=1))[task.sized[task.free]].sum()
+            found = np.sqrt(np.sum(self.theta[task.sized] ** 2) / max(left, 1e-6))
+            # A hundredth of the noise is as good as none, and reached in few steps.
+            noise = self.level / np.abs(np.diagonal(task.white, axis1=1, axis2=2))
+            self.size = max(float(found), 0.01 * float(np.median(noise)))
+        freedom = self._freedom(readings)
+        if task.known or freedom.sum() < 1.0:
+            return
+        square = self.weights @ _times(task.white, self.residuals) ** 2
+        if not task.per_output or (freedom < 0.5).any():
+            square, freedom = square.sum(), freedom.sum()
+        if task.student:
+            square = square / student_constants(self.left)[0]
+        level = np.maximum(np.sqrt(square / freedom), self.floor)
+        self.level = np.broadcast_to(level, self.level.shape)
+
+    def _leverage(self) -> tuple[Array, Array]:
+        """Roots of the hat matrix: of the readings (N, R, F), the prior (F, F)."""
+        rows, right, _ = self._system(0.0)
+        triangle, _ = _triangle(rows, right, _LEAST_DAMPING)
+        root = np.asarray(np.linalg.solve(triangle.T, rows.T).T, dtype=np.float64)
+        width, count = rows.shape[1], len(self.weights)
+        return root[:-width].reshape(count, -1, width), root[-width:]
+
+    def _freedom(self, readings: Array) -> Array:
+        """(q,) residual degrees of freedom of each output."""
+        count, q = self.residuals.shape
+        used = (readings**2).sum(axis=-1)
+        if len(self.command_root):
+            return np.full(q, (count * self.left - used.sum()) / q)
+        return np.asarray(count - used.sum(axis=0))
+
+    def solution(self) -> Solution:
+        readings, _ = self._leverage()
+        rows, right = self._reduce(0.0)
+        gap = np.eye(rows.shape[1]) - readings @ np.matrix_transpose(readings)
+        gap += 1e-9 * np.eye(rows.shape[1])
+        deleted = np.linalg.solve(gap, right[..., None])[..., 0]
+        return Solution(
+            parameters=self.theta,
+            commands=self.commands,
+            residuals=self.residuals,
+            level=self.level,
+            size=self.size,
+            weights=self.weights,
+            distance=self._distance(self.residuals, self.commands),
+            deleted=np.maximum((right * deleted).sum(axis=1), 0.0),
+            left=self.left,
+            freedom=self._freedom(readings),
+            rows=rows,
+            precision=self._precision(),
+        )
+
+
+def _triangle(rows: Array, right: Array, damping: float) -> tuple[Array, Array]:
+    """R and ``Q.T right`` of the damped rows (R, F)."""
+    width = rows.shape[1]
+    whole = np.zeros((len(rows) + width, width + 1))
+    whole[: len(rows), :width], whole[: len(rows), width] = rows, right
+    whole[len(rows) :, :width] = np.sqrt(damping) * np.eye(width)
+    triangle = np.asarray(np.linalg.qr(whole, mode="r"))[:width]
+    return triangle[:, :width], triangle[:, width]

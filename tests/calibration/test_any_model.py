@@ -1,0 +1,578 @@
+"""identify with a model, a prior or a loss, against scipy, closed forms, simulation."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import optimize
+
+from jaxcal.calibration import Calibration, ModelCalibration, identify
+from jaxcal.models import Affine, FromJax, Linear, Noise, Polynomial, Prior
+
+
+class Wave:
+    """y = (a sin(b u + c) + d v, a cos(b u + c) + e v), nothing shows ``idle``."""
+
+    names = ("a", "b", "c", "d", "e", "idle")
+    nominal = np.array([1.0, 1.0, 0.0, 0.0, 1.0, 3.0])
+    num_inputs, num_outputs, num_parameters = 2, 2, 6
+
+    def predict(self, commands: Any, parameters: Any = None) -> np.ndarray:
+        a, b, c, d, e, _ = self.nominal if parameters is None else parameters
+        u, v = np.asarray(commands).T
+        turn = b * u + c
+        return np.column_stack([a * np.sin(turn) + d * v, a * np.cos(turn) + e * v])
+
+    def jacobian(self, commands: Any, parameters: Any = None) -> np.ndarray:
+        a, b, c, *_ = self.nominal if parameters is None else parameters
+        u, v = np.asarray(commands).T
+        s, k, zero = np.sin(b * u + c), np.cos(b * u + c), 0 * u
+        first = np.stack([s, a * k * u, a * k, v, zero, zero], axis=-1)
+        second = np.stack([k, -a * s * u, -a * s, zero, v, zero], axis=-1)
+        return np.stack([first, second], axis=1)
+
+    def command_jacobian(self, commands: Any, parameters: Any = None) -> np.ndarray:
+        a, b, c, d, e, _ = self.nominal if parameters is None else parameters
+        u = np.asarray(commands)[:, 0]
+        s, k = np.sin(b * u + c), np.cos(b * u + c)
+        first = np.stack([a * b * k, d + 0 * u], axis=-1)
+        return np.stack([first, np.stack([-a * b * s, e + 0 * u], axis=-1)], axis=1)
+
+    def default_prior(self) -> Prior:
+        return Prior(np.inf)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"kind": "wave"}
+
+
+TRUTH = np.array([2.0, 1.3, 0.4, 0.3, 0.8, 3.0])
+WAVE = Wave()
+
+
+def waves(seed: int, count: int = 12, noise: float = 0.05) -> tuple[Any, Any]:
+    rng = np.random.default_rng(seed)
+    commands = rng.uniform(-1.5, 1.5, (count, 2))
+    measured = WAVE.predict(commands, TRUTH)
+    return commands, measured + rng.normal(0, noise, measured.shape)
+
+
+# -- the estimate ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_least_squares_agrees_with_scipy(seed: int) -> None:
+    commands, measured = waves(seed)
+    rng = np.random.default_rng(seed)
+    root = np.tril(rng.normal(size=(12, 2, 2)) * 0.02) + 0.05 * np.eye(2)
+    covariance = root @ np.matrix_transpose(root)
+    weights = rng.uniform(0.5, 2, 12)
+    std = {"a": 0.5, "b": 0.3, "idle": 0.1}
+    found = identify(
+        commands,
+        measured,
+        model=WAVE,
+        prior=Prior(std),
+        noise=Noise(covariance=covariance),
+        weights=weights,
+        loss="gaussian",
+    )
+    precision = np.diag([0.5**-2, 0.3**-2, 0, 0, 0, 0.1**-2])
+    white = np.linalg.inv(np.linalg.cholesky(covariance / weights[:, None, None]))
+
+    def rows(theta: np.ndarray) -> np.ndarray:
+        off = (white @ (WAVE.predict(commands, theta) - measured)[..., None]).ravel()
+        return np.concatenate([off, np.sqrt(precision) @ (theta - WAVE.nominal)])
+
+    expected = optimize.least_squares(
+        rows, WAVE.nominal, ftol=1e-15, xtol=1e-15, gtol=1e-15
+    )
+    np.testing.assert_allclose(found.parameters, expected.x, atol=1e-7)
+    slopes = (white @ WAVE.jacobian(commands, expected.x)).reshape(-1, 6)
+    np.testing.assert_allclose(
+        found.covariance, np.linalg.inv(slopes.T @ slopes + precision), rtol=1e-5
+    )
+
+
+def test_students_loss_is_at_its_minimum() -> None:
+    commands, measured = waves(3)
+    measured[4] += [1.0, -0.7]
+    found = identify(commands, measured, model=WAVE, noise_std=0.05)
+
+    def loss(theta: np.ndarray) -> float:
+        off = (WAVE.predict(commands, [*theta, 3.0]) - measured) / 0.05
+        return float(6 * np.log1p((off**2).sum(axis=1) / 6).sum())
+
+    expected = optimize.minimize(loss, TRUTH[:5], method="BFGS", tol=1e-10).x
+    np.testing.assert_allclose(found.parameters[:5], expected, atol=2e-6)
+    assert list(found.outliers) == [4] and found.outliers[4] < 0.05
+    assert "outlier: measurement 4," in repr(found)
+    plain = identify(commands, measured, model=WAVE, noise_std=0.05, loss="gaussian")
+    error, plain_error = (
+        np.linalg.norm((each.parameters - TRUTH)[:5]) for each in (found, plain)
+    )
+    assert error < 0.1 < plain_error
+
+
+def test_a_linear_model_with_a_prior_has_a_closed_form() -> None:
+    rng = np.random.default_rng(0)
+    model = Polynomial(2, 2, 2)
+    p = model.num_parameters
+    commands = rng.uniform(-1, 1, (9, 2))
+    measured = rng.normal(size=(9, 2))
+    mean, std = rng.normal(size=p), rng.uniform(0.1, 2, p)
+    found = identify(
+        commands,
+        measured,
+        model=model,
+        prior=Prior(std, mean),
+        noise=Noise([0.2, 0.4]),
+        loss="gaussian",
+    )
+    rows = model.jacobian(commands) / np.array([0.2, 0.4])[:, None]
+    rows, right = rows.reshape(-1, p), (measured / [0.2, 0.4]).ravel()
+    information = rows.T @ rows + np.diag(std**-2)
+    expected = np.linalg.solve(information, rows.T @ right + mean / std**2)
+    np.testing.assert_allclose(found.parameters, expected, atol=1e-9)
+    np.testing.assert_allclose(
+        found.covariance, np.linalg.inv(information), rtol=1e-8, atol=1e-12
+    )
+    hat = rows @ np.linalg.solve(information, rows.T)
+    assert found.dof == pytest.approx(18 - np.trace(hat))
+
+
+def test_the_closed_form_of_the_affine_model_is_its_limit() -> None:
+    rng = np.random.default_rng(1)
+    commands = rng.uniform(-20, 20, (9, 3))
+    measured = commands * [0.4, 0.7, 0.9] + rng.normal(0, 0.1, (9, 3))
+    closed = identify(commands, measured, model=Affine(3, 3), noise=Noise(0.1))
+    assert not isinstance(closed, ModelCalibration)
+    assert np.array_equal(
+        closed.parameters, identify(commands, measured, noise_std=0.1).parameters
+    )
+    found = identify(
+        commands, measured, prior=Prior(1e6), noise=Noise(0.1), loss="gaussian"
+    )
+    assert isinstance(found, ModelCalibration)
+    np.testing.assert_allclose(found.matrix, closed.matrix, atol=1e-9)
+    np.testing.assert_allclose(found.bias, closed.bias, atol=1e-9)
+    np.testing.assert_allclose(found.covariance, closed.covariance, atol=1e-9)
+    np.testing.assert_allclose(
+        found.predict_std(commands), closed.predict_std(commands), rtol=1e-6
+    )
+    free = identify(
+        commands, measured, prior=Prior(1e6), loss="gaussian", common_noise=False
+    )
+    assert free.noise_dof == pytest.approx(5, abs=1e-3)
+    expected = identify(commands, measured)
+    np.testing.assert_allclose(free.noise_std, expected.noise_std, rtol=1e-4)
+
+
+def test_noise_is_estimated_beside_a_prior() -> None:
+    rng = np.random.default_rng(2)
+    model = Polynomial(3, 2)
+    p = model.num_parameters
+    commands = rng.uniform(-1, 1, (14, 2))
+    measured = model.predict(commands, rng.normal(0, 0.3, p)) + rng.normal(
+        0, 0.1, (14, 1)
+    )
+    found = identify(commands, measured, model=model, prior=Prior(0.3), loss="gaussian")
+    rows = model.jacobian(commands)[:, 0] / found.noise_std
+    hat = rows @ np.linalg.solve(rows.T @ rows + np.eye(p) / 0.09, rows.T)
+    square = (found.residuals**2).sum() / (14 - np.trace(hat))
+    assert found.noise_std[0] ** 2 == pytest.approx(square, rel=1e-3)
+    assert found.noise_dof == pytest.approx(14 - np.trace(hat), rel=1e-3)
+
+
+def test_outputs_in_different_units_get_a_level_each() -> None:
+    commands = waves(0, 30)[0]
+    unit = np.array([1.0, 1000.0])
+    model = Linear("x + y", 2)
+    rng = np.random.default_rng(0)
+    line = commands @ np.ones((2, 2)) + rng.normal(0, 0.1, (30, 2))
+    found = identify(commands, line * unit, model=model)
+    alone = identify(commands, line, model=model)
+    assert np.ptp(alone.noise_std) == 0.0
+    np.testing.assert_allclose(found.noise_std / unit, alone.noise_std, rtol=0.3)
+
+
+def test_weights_count_as_repeated_readings_and_zero_leaves_out() -> None:
+    commands, measured = waves(5)
+    measured[3] += 100.0
+    weights = np.arange(12) % 3 + 1
+    weights[3] = 0
+    options: dict[str, Any] = {"model": WAVE, "noise_std": 0.05, "loss": "gaussian"}
+    found = identify(commands, measured, weights=weights, **options)
+    repeated = identify(
+        np.repeat(commands, weights, axis=0),
+        np.repeat(measured, weights, axis=0),
+        **options,
+    )
+    np.testing.assert_allclose(found.parameters, repeated.parameters, atol=1e-9)
+    np.testing.assert_allclose(found.covariance, repeated.covariance, rtol=1e-6)
+    assert found.num_measurements == 11 and found.loss_weights[3] == 0.0
+    assert np.abs(found.residuals[3]).min() > 90 and not found.outliers
+
+
+# -- uncertain commands ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command_std", [[0.08, 0.02], [np.inf, 0.0], [np.inf, 0.03]])
+def test_uncertain_commands_are_estimated_beside_the_parameters(
+    command_std: list[float],
+) -> None:
+    commands, measured = waves(6, 14)
+    rng = np.random.default_rng(6)
+    told = commands + rng.normal(0, 0.05, commands.shape) * (np.array(command_std) > 0)
+    prior = Prior({"a": 0.5, "b": 0.02, "c": 0.1, "d": 0.1, "e": 0.3})
+    found = identify(
+        told,
+        measured,
+        model=WAVE,
+        prior=prior,
+        noise=Noise(0.05, command_std=command_std),
+        loss="gaussian",
+    )
+    root = 1.0 / np.where(np.array(command_std) > 0, command_std, 1e-9)
+    weak = np.sqrt(np.diagonal(prior.resolve(WAVE).precision))[:5]
+
+    def rows(x: np.ndarray) -> np.ndarray:
+        theta, moved = np.append(x[:5], 3.0), x[5:].reshape(told.shape) / (1 + root)
+        off = (WAVE.predict(told + moved, theta) - measured) / 0.05
+        return np.concatenate(
+            [off.ravel(), (moved * root).ravel(), weak * (x[:5] - WAVE.nominal[:5])]
+        )
+
+    start = np.concatenate([WAVE.nominal[:5], np.zeros(told.size)])
+    brute = optimize.least_squares(rows, start, ftol=1e-14, xtol=1e-14, gtol=1e-14)
+    np.testing.assert_allclose(found.parameters[:5], brute.x[:5], atol=1e-5)
+    full = np.linalg.inv(brute.jac.T @ brute.jac)[:5, :5]
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(found.covariance))[:5], np.sqrt(np.diag(full)), rtol=1e-3
+    )
+    moved = brute.x[5:].reshape(told.shape) / (1 + root)
+    np.testing.assert_allclose(found.estimated_commands, told + moved, atol=1e-5)
+
+
+# -- uncertainty -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"noise_std": 0.05, "loss": "gaussian"},
+        {"noise_std": 0.05},
+        {"loss": "gaussian"},
+        {},
+    ],
+)
+def test_intervals_cover_what_they_promise(options: dict[str, Any]) -> None:
+    rng = np.random.default_rng(4)
+    commands = rng.uniform(-1.5, 1.5, (8, 2))
+    exact = WAVE.predict(commands, TRUTH)
+    target = rng.uniform(-1.5, 1.5, (3, 2))
+    trials = 120
+    hits, reached = np.zeros(5), np.zeros((3, 2))
+    for _ in range(trials):
+        measured = exact + rng.normal(0, 0.05, exact.shape)
+        found = identify(commands, measured, model=WAVE, **options)
+        low, high = found.confidence_intervals().T
+        hits += ((low <= TRUTH) & (TRUTH <= high))[:5]
+        low, high = found.predict_interval(target)
+        expected = WAVE.predict(target, TRUTH)
+        reached += (low <= expected) & (expected <= high)
+    share = np.concatenate([hits, reached.ravel()]) / trials
+    # Four standard deviations below; Student's loss may promise a little less.
+    assert share.min() > 0.95 - 4 * np.sqrt(0.95 * 0.05 / trials)
+    assert share.mean() < 0.99
+
+
+def test_without_freedom_the_noise_is_unknown() -> None:
+    rng = np.random.default_rng(0)
+    model = Polynomial(2, 1)
+    commands = np.array([[-1.0], [0.0], [1.0]])
+    found = identify(commands, rng.normal(size=(3, 1)), model=model)
+    np.testing.assert_allclose(found.residuals, 0, atol=1e-9)
+    assert found.covariance is None and found.noise_std is None
+    for call in (found.confidence_intervals, lambda: found.predict_std(commands)):
+        with pytest.raises(ValueError, match="noise is unknown"):
+            call()
+    assert "noise is unknown" in repr(found) and "[" not in repr(found)
+
+
+def test_what_nothing_determines_is_named_and_has_no_interval() -> None:
+    commands, measured = waves(7)
+    wide = identify(commands, measured, model=WAVE, noise_std=0.05, discrepancy=9)
+    assert np.isfinite(wide.predict_std(commands)).all()
+    found = identify(commands, measured, model=WAVE, noise_std=0.05)
+    assert found.parameters[5] == 3.0 and np.isinf(found.standard_errors[5])
+    assert np.isfinite(found.standard_errors[:5]).all()
+    assert np.isfinite(found.predict_std(commands)).all()
+    assert found.from_data.tolist() == [1, 1, 1, 1, 1, 0]
+    assert "not determined, held near the prior's mean: idle;" in repr(found)
+    assert found.identifiability().directions[0].words == "idle"
+    short = Linear("x + y + x:y", 1)
+    flat = commands * [1.0, 0.0]
+    found = identify(flat, measured[:, :1], model=short, noise_std=0.1)
+    lost = np.isinf(found.standard_errors)
+    assert [n for n, gone in zip(short.names, lost, strict=True) if gone] == [
+        "y",
+        "x:y",
+    ]
+    std = found.predict_std([[1.0, 0.0], [1.0, 1.0]])
+    assert np.isfinite(std[0, 0]) and np.isinf(std[1, 0])
+    with pytest.raises(ValueError, match="4 independent readings, too few for 6 free"):
+        identify(commands[:2], measured[:2], model=WAVE, noise_std=0.05)
+
+
+def test_a_prior_holds_what_the_measurements_do_not_say() -> None:
+    commands, measured = waves(7)
+    prior = Prior({"idle": 0.5, "d": 1e-3}, mean={"idle": 7.0, "d": 0.3}, fixed=["e"])
+    found = identify(commands, measured, model=WAVE, prior=prior, noise_std=0.05)
+    assert found.parameters[5] == 7.0 and found.standard_errors[5] == pytest.approx(0.5)
+    assert found.parameters[4] == 1.0 and found.standard_errors[4] == 0.0
+    assert found.from_data[4] == found.from_data[5] == 0.0
+    assert found.from_data[3] < 0.05 and found.from_data[0] > 0.99
+    assert "(1 fixed)" in repr(found)
+
+
+def test_lack_of_fit_is_small_where_the_model_is_wrong() -> None:
+    commands, measured = waves(8, 20)
+    good = identify(commands, measured, model=WAVE, noise_std=0.05).lack_of_fit()
+    bad = identify(
+        commands, measured + commands**2, model=WAVE, noise_std=0.05
+    ).lack_of_fit()
+    assert good > 0.01 and bad < 1e-6
+
+
+def test_a_discrepancy_makes_the_bands_honest() -> None:
+    rng = np.random.default_rng(3)
+    commands = rng.uniform(-1, 1, (40, 1))
+    test = np.linspace(-0.9, 0.9, 60)[:, None]
+
+    def truth(u: np.ndarray) -> np.ndarray:
+        return 2 * u + 0.3 * np.sin(4 * u)
+
+    measured = truth(commands) + rng.normal(0, 0.02, (40, 1))
+    line = Polynomial(1, 1)
+    share = []
+    for discrepancy in (None, 30):
+        found = identify(
+            commands, measured, model=line, noise_std=0.02, discrepancy=discrepancy
+        )
+        low, high = found.predict_interval(test)
+        share.append(float(((low <= truth(test)) & (truth(test) <= high)).mean()))
+        assert len(found.parameters) == len(found.covariance) == 2
+    assert share[0] < 0.3 and share[1] > 0.9
+    slopes = (found.predict(test + 1e-6) - found.predict(test - 1e-6)) / 2e-6
+    whole = found._whole.command_jacobian(test, found.estimate)
+    np.testing.assert_allclose(whole[..., 0], slopes, rtol=1e-5, atol=1e-6)
+    exact = identify(
+        commands,
+        2 * commands + rng.normal(0, 0.02, (40, 1)),
+        model=line,
+        noise_std=0.02,
+        discrepancy=30,
+    )
+    assert exact.predict_std(test).max() < found.predict_std(test).max() / 2
+
+
+# -- the inverse -----------------------------------------------------------------------
+
+
+def test_command_for_inverts_predict() -> None:
+    commands, measured = waves(9)
+    found = identify(
+        commands, measured, model=WAVE, noise_std=0.05, input_names=["pan", "reach"]
+    )
+    wanted = found.predict(commands[:6].reshape(2, 3, 2))
+    back = found.command_for(wanted)
+    assert back.shape == (2, 3, 2)
+    np.testing.assert_allclose(found.predict(back), wanted, atol=1e-8)
+    limits = [[-1.5, 1.5], [-1.5, 1.5]]
+    inside = found.command_for(wanted, limits)
+    np.testing.assert_allclose(found.predict(inside), wanted, atol=1e-8)
+    assert (np.abs(inside) <= 1.5).all()
+    near = found.command_for(wanted[0, 0], start=commands[0])
+    np.testing.assert_allclose(near, commands[0], atol=1e-8)
+
+
+def test_what_is_out_of_reach_or_beyond_the_limits_is_named() -> None:
+    rng = np.random.default_rng(0)
+    commands = rng.uniform(-1, 1, (12, 2))
+    measured = commands * 2.0 + 0.3 * commands**3 + rng.normal(0, 1e-3, (12, 2))
+    found = identify(commands, measured, model=Polynomial(3, 2, 2), noise_std=1e-3)
+    wanted = found.predict([0.5, 0.9])
+    with pytest.raises(ValueError, match=r"needs u_2 = 0\.9.*, outside its limits"):
+        found.command_for(wanted, [[-1, 1], [-0.5, 0.5]])
+    held = found.command_for(wanted, [[-1, 1], [-0.5, 0.5]], clip=True)
+    assert held[1] == pytest.approx(0.5)
+    wave = identify(*waves(9), model=WAVE, noise_std=0.05)
+    with pytest.raises(ValueError, match=r"desired \(50, 0\) is out of reach; the nea"):
+        wave.command_for([50.0, 0.0])
+    with pytest.raises(ValueError, match=r"out of reach.* at the limit of u_2"):
+        wave.command_for([50.0, 0.0], [[-3, 3], [-2, 2]])
+    with pytest.raises(ValueError, match="desired must be finite"):
+        found.command_for([np.nan, 0.0])
+    flat = identify(commands, measured[:, :1], model=Linear("x", inputs=["x", "y"]))
+    with pytest.raises(ValueError, match="at most as many outputs as inputs"):
+        identify(
+            commands[:, :1], measured, model=Affine(1, 2), loss="student"
+        ).command_for([0.0, 0.0])
+    assert flat.predict(flat.command_for([0.5]))[0] == pytest.approx(0.5)
+
+
+def test_no_inverse_where_the_outputs_do_not_respond() -> None:
+    rng = np.random.default_rng(0)
+    commands = rng.uniform(-1, 1, (12, 2))
+    twins = commands[:, :1] @ np.ones((1, 2))
+    found = identify(commands, twins, model=Affine(2, 2), loss="student")
+    with pytest.raises(ValueError, match="near singular"):
+        found.command_for([0.1, 0.1])
+
+
+# -- the file, and bad input -----------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"noise_std": 0.1},
+        {"discrepancy": 5},
+        {"prior": Prior({"1": 0.1}, fixed=["x"])},
+        {"noise": Noise(0.1, command_std=[0.1, 0.0])},
+    ],
+)
+def test_a_file_holds_every_bit(
+    tmp_path: pathlib.Path, options: dict[str, Any]
+) -> None:
+    rng = np.random.default_rng(0)
+    commands = rng.uniform(-1, 1, (12, 2))
+    measured = commands[:, :1] ** 2 + rng.normal(0, 0.1, (12, 1))
+    model = Linear("1 + x + y + I(x**2)")
+    found = identify(commands, measured, model=model, notes={"arm": 3}, **options)
+    found.save(tmp_path / "c.json")
+    back = Calibration.load(tmp_path / "c.json")
+    assert isinstance(back, ModelCalibration)
+    assert back.to_dict() == found.to_dict() and repr(back) == repr(found)
+    assert np.array_equal(back.predict(commands), found.predict(commands))
+    assert np.array_equal(back.predict_std(commands), found.predict_std(commands))
+    content = json.loads((tmp_path / "c.json").read_text())
+    assert content["version"] == 2 and content["model"]["kind"] == "linear"
+    for edit, message in (
+        ({"loss": 3}, '"loss" must be'),
+        ({"estimate": [1.0]}, '"prior_mean" must have shape|"joint_covariance" must'),
+        ({"model": {"kind": "odd"}}, "kind of the model"),
+        ({"noise_dof": -1.0}, '"noise_dof" must not be negative'),
+        ({"noise_std": None}, "contradict"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Calibration.from_dict({**content, **edit})
+
+
+def test_a_function_is_given_to_load(tmp_path: pathlib.Path) -> None:
+    model = Linear(lambda u: np.column_stack([u, u**2]), inputs=1, terms=["p", "q"])
+    commands = np.linspace(-1, 1, 9)[:, None]
+    found = identify(commands, commands + 0.1 * commands**2, model=model)
+    found.save(tmp_path / "c.json")
+    with pytest.raises(ValueError, match=r"c\.json: .* give the model itself, model="):
+        Calibration.load(tmp_path / "c.json")
+    back = Calibration.load(tmp_path / "c.json", model=model)
+    np.testing.assert_array_equal(back.predict([[0.3]]), found.predict([[0.3]]))
+    with pytest.raises(ValueError, match=r"parameters of the file, \['p', 'q'\]"):
+        Calibration.load(tmp_path / "c.json", model=Polynomial(1, 1))
+
+
+def test_only_an_affine_model_has_a_matrix() -> None:
+    found = identify(*waves(0), model=WAVE)
+    with pytest.raises(AttributeError, match="matrix: only an affine model"):
+        _ = found.matrix
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        _ = found.nothing
+
+
+def broken(method: str, answer: Any) -> Any:
+    model = Wave()
+    setattr(model, method, lambda commands, parameters=None: answer(len(commands)))
+    return model
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"model": 3}, "model must have a method predict"),
+        (
+            {"model": Affine(3, 2), "loss": "student"},
+            r"commands must have shape \(N, 3\) for this mo",
+        ),
+        ({"model": Polynomial(1, 2, 3)}, "measured must have 3 columns"),
+        (
+            {"model": broken("predict", lambda n: np.zeros((n, 3)))},
+            r"model.predict must return \(12, 2\), got \(12, 3\)",
+        ),
+        (
+            {"model": broken("predict", lambda n: np.full((n, 2), np.nan))},
+            r"model.predict must be finite, got \(nan, nan\) for the command",
+        ),
+        (
+            {"model": broken("jacobian", lambda n: np.zeros((n, 2, 5)))},
+            r"model.jacobian must return \(12, 2, 6\), got \(12, 2, 5\)",
+        ),
+        (
+            {"model": broken("jacobian", lambda n: np.full((n, 2, 6), np.inf))},
+            "model.jacobian must be finite, got inf by a for the command",
+        ),
+        ({"prior": 1.0}, "prior must be a jaxcal.Prior, got float"),
+        ({"prior": Prior({"zz": 1.0})}, "must name parameters of the model"),
+        ({"noise": Noise(1.0), "noise_std": 1.0}, "give one of them"),
+        ({"noise": Noise(np.ones((3, 2)))}, r"std of the noise must be .* \(3, 2\)"),
+        ({"noise": Noise(1.0, command_std=[1, 2, 3])}, "command_std must be one"),
+        ({"noise": Noise(1.0, command_std=np.inf)}, "must leave fewer unknown"),
+        ({"noise_std": 1.0, "common_noise": True}, "give one of them"),
+        ({"noise": 0.1}, "noise must be a jaxcal.Noise, got float; a number goes"),
+        ({"loss": "huber"}, "loss must be one of student, gaussian"),
+        ({"discrepancy": 0}, "discrepancy must be at least 1, got 0"),
+        ({"weights": np.zeros(12)}, "weights must be positive for one"),
+    ],
+)
+def test_bad_arguments_are_named(options: dict[str, Any], message: str) -> None:
+    commands, measured = waves(0)
+    with pytest.raises(ValueError, match=message):
+        identify(commands, measured, **({"model": WAVE} | options))
+
+
+def test_a_search_that_fails_says_what_to_try() -> None:
+    commands, measured = waves(0)
+    rng = np.random.default_rng(0)
+    model = broken("jacobian", lambda n: rng.normal(size=(n, 2, 6)))
+    with pytest.raises(ValueError, match=r"did not converge|must be the deriva"):
+        identify(commands, measured, model=model, loss="gaussian")
+
+
+def test_a_function_in_jax_is_identified_and_inverted() -> None:
+    jnp = pytest.importorskip("jax.numpy")
+
+    def decay(u: Any, theta: Any) -> Any:
+        return jnp.array([theta[0] * jnp.exp(-theta[1] * u[0]) + jnp.log(theta[2])])
+
+    model = FromJax(decay, [1.0, 1.0, 0.2], ["size", "rate", "floor"])
+    commands = np.linspace(0, 3, 10)[:, None]
+    rng = np.random.default_rng(0)
+    measured = 2.0 * np.exp(-0.7 * commands) + np.log(3.0)
+    measured += rng.normal(0, 1e-3, measured.shape)
+    found = identify(commands, measured, model=model)
+    np.testing.assert_allclose(found.parameters, [2.0, 0.7, 3.0], rtol=0.05)
+    assert found.command_for([2.0])[0] == pytest.approx(
+        -np.log((2.0 - np.log(3.0)) / 2.0) / 0.7, abs=0.01
+    )
+
+
+def test_level_of_students_loss_is_that_of_normal_noise() -> None:
+    rng = np.random.default_rng(0)
+    commands = rng.uniform(-1, 1, (400, 1))
+    measured = commands + rng.normal(0, 0.3, (400, 1))
+    found = identify(commands, measured, model=Polynomial(1, 1))
+    assert abs(found.noise_std[0] - 0.3) < 4 * 0.3 / np.sqrt(2 * 400)
