@@ -22,6 +22,7 @@ ROWS = (
     "throughput",
     "optimum",
     "exchange",
+    "blocks",
     "decision",
     "startup",
     "memory",

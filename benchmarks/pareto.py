@@ -18,12 +18,12 @@ import pathlib
 
 import numpy as np
 
+from jaxcal.plots.selection import pareto_figure
 from jaxcal.selection import select
 from jaxcal.selection.fastest import (
     Motion,
     ParetoFront,
     fastest_tour,
-    pareto_figure,
     pareto_front,
     select_fastest,
     travel_times,

@@ -18,16 +18,17 @@ import time
 import numpy as np
 from pareto import HOME, MOTION
 
-from jaxcal.selection.fastest.api import make_solver
+from jaxcal.selection.fastest.api import make_search
 from jaxcal.selection.fastest.lookahead import PRICES, complete
-from jaxcal.selection.fastest.task import Task, log_det_of_rows, make_task
+from jaxcal.selection.fastest.task import Task, make_task
 
 SHARES = (0.8, 0.9, 0.95, 0.99)
 
 
 def greedy_runs(task: Task) -> np.ndarray:
     """(32, K) greedy choices by gain less weighted time, with a ridge of 0.01."""
-    rows, p = task.rows, task.rows.shape[1]
+    rows = task.blocks[:, 0]
+    p = rows.shape[1]
     x = rows / np.sqrt((rows**2).sum() / rows.size)
     out = []
     for price in PRICES / task.times.mean():
@@ -52,7 +53,7 @@ def greedy_seconds(task: Task, finish: bool) -> list[float]:
         if finish:
             found = complete(task, runs, wanted)
         else:
-            enough = [run for run in runs if log_det_of_rows(task.rows[run]) >= wanted]
+            enough = [run for run in runs if task.log_det(run) >= wanted]
             found = min(enough, key=lambda run: task.tour(run)[1], default=None)
         found = task.optimum if found is None else found
         out.append(task.tour(found)[1] + task.settle)
@@ -84,15 +85,15 @@ def main() -> None:
         spent[name] = spent.get(name, 0.0) + took
 
     def asked(task: Task, method: str, num: int | None = None) -> list[float]:
-        solve = make_solver(task, method, num=num, seed=None)
+        solve = make_search(task, method, num, None)
         found = [solve(task.wanted(share, None)) for share in SHARES]
-        return [task.tour(one.chosen)[1] + task.settle for one in found]
+        return [task.tour(one.indices)[1] + task.settle for one in found]
 
     begun = time.perf_counter()
     for i, candidates in enumerate(sets):
         if arguments.limit and time.perf_counter() - begun > arguments.limit:
             break
-        task = make_task(candidates, arguments.k, MOTION, HOME, None, None, None, 60.0)
+        task = make_task(candidates, arguments.k, MOTION, start=HOME)
         assert task.exact.proven
         note("D-optimum in its best order", lambda t=task: optimum_seconds(t))
         note("exact", lambda t=task: asked(t, "exact"))

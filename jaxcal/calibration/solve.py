@@ -235,7 +235,8 @@ class _Search:
             step = np.linalg.solve(triangle, target)
             rest = rows @ step - right
             gain = float(right @ right - rest @ rest)
-            if gain <= 1e-12 + 1e-13 * cost:
+            # 1e-6 standard deviations; 1e-5 where convergence is linear.
+            if gain <= (1e-10 if task.student else 1e-12) + 1e-13 * cost:
                 return True
             theta = self.theta.copy()
             theta[task.free] += step / scale
@@ -251,7 +252,7 @@ class _Search:
                 self.damping, self.grow = max(shrunk, _LEAST_DAMPING), 2.0
                 self._linearise()
                 return False
-            if self.damping > 1e12:  # rounding is all that is left, or
+            if self.damping > 1e9:  # rounding is all that is left, or
                 slope = np.abs(rows.T @ right).max() / np.linalg.norm(right)
                 if slope > 1e-3:
                     raise ValueError(

@@ -56,7 +56,7 @@ def plan_figure(plan: Any) -> Figure:
         ("least_error", "no design below", "", ":", GREY),
     )
     for field, label, marker, style, colour in series:
-        values = [getattr(row, field)[worst] for row in plan.rows]
+        values = [plan.worst(getattr(row, field)) for row in plan.rows]
         axes.plot(ks, values, marker=marker, linestyle=style, color=colour, label=label)
     target = plan.target_accuracy[worst]
     axes.axhline(target, color=BLACK, linewidth=0.8, label="target")

@@ -11,7 +11,7 @@ import pytest
 from scipy import optimize
 
 from jaxcal.calibration import Calibration, ModelCalibration, identify
-from jaxcal.models import Affine, Linear, Noise, Polynomial, Prior
+from jaxcal.models import Affine, FromJax, Linear, Noise, Polynomial, Prior
 
 
 class Wave:
@@ -305,12 +305,14 @@ def test_without_freedom_the_noise_is_unknown() -> None:
 
 def test_what_nothing_determines_is_named_and_has_no_interval() -> None:
     commands, measured = waves(7)
+    wide = identify(commands, measured, model=WAVE, noise_std=0.05, discrepancy=9)
+    assert np.isfinite(wide.predict_std(commands)).all()
     found = identify(commands, measured, model=WAVE, noise_std=0.05)
     assert found.parameters[5] == 3.0 and np.isinf(found.standard_errors[5])
     assert np.isfinite(found.standard_errors[:5]).all()
     assert np.isfinite(found.predict_std(commands)).all()
     assert found.from_data.tolist() == [1, 1, 1, 1, 1, 0]
-    assert "not determined (1 combinations of idle)" in repr(found)
+    assert "not determined, held near the prior's mean: idle;" in repr(found)
     assert found.identifiability().directions[0].words == "idle"
     short = Linear("x + y + x:y", 1)
     flat = commands * [1.0, 0.0]
@@ -530,6 +532,7 @@ def broken(method: str, answer: Any) -> Any:
         ({"noise": Noise(1.0, command_std=[1, 2, 3])}, "command_std must be one"),
         ({"noise": Noise(1.0, command_std=np.inf)}, "must leave fewer unknown"),
         ({"noise_std": 1.0, "common_noise": True}, "give one of them"),
+        ({"noise": 0.1}, "noise must be a jaxcal.Noise, got float; a number goes"),
         ({"loss": "huber"}, "loss must be one of student, gaussian"),
         ({"discrepancy": 0}, "discrepancy must be at least 1, got 0"),
         ({"weights": np.zeros(12)}, "weights must be positive for one"),
@@ -547,6 +550,24 @@ def test_a_search_that_fails_says_what_to_try() -> None:
     model = broken("jacobian", lambda n: rng.normal(size=(n, 2, 6)))
     with pytest.raises(ValueError, match=r"did not converge|must be the deriva"):
         identify(commands, measured, model=model, loss="gaussian")
+
+
+def test_a_function_in_jax_is_identified_and_inverted() -> None:
+    jnp = pytest.importorskip("jax.numpy")
+
+    def decay(u: Any, theta: Any) -> Any:
+        return jnp.array([theta[0] * jnp.exp(-theta[1] * u[0]) + jnp.log(theta[2])])
+
+    model = FromJax(decay, [1.0, 1.0, 0.2], ["size", "rate", "floor"])
+    commands = np.linspace(0, 3, 10)[:, None]
+    rng = np.random.default_rng(0)
+    measured = 2.0 * np.exp(-0.7 * commands) + np.log(3.0)
+    measured += rng.normal(0, 1e-3, measured.shape)
+    found = identify(commands, measured, model=model)
+    np.testing.assert_allclose(found.parameters, [2.0, 0.7, 3.0], rtol=0.05)
+    assert found.command_for([2.0])[0] == pytest.approx(
+        -np.log((2.0 - np.log(3.0)) / 2.0) / 0.7, abs=0.01
+    )
 
 
 def test_level_of_students_loss_is_that_of_normal_noise() -> None:

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 import jaxcal
 from jaxcal.information.regression import log_det_gram
+from jaxcal.plots.selection import pareto_figure
 from jaxcal.selection.fastest import (
     Motion,
     fastest_tour,
-    pareto_figure,
     pareto_front,
     select_fastest,
     travel_times,
@@ -293,3 +293,42 @@ def test_cost_loads_neither_jax_nor_matplotlib():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert result.stdout.strip() == "[]"
+
+
+@settings(max_examples=8)
+@given(st.integers(0, 2**31), st.sampled_from([0.8, 0.95]), st.booleans())
+def test_blocks_are_visited_as_by_brute_force(seed, least, known):
+    rng = np.random.default_rng(seed)
+    candidates = rng.uniform(-20, 20, (8, 3))
+    blocks = rng.normal(size=(8, 2, 5))
+    prior = np.diag([0.0, 1.0, 0.0, 0.5, 0.0]) if known else np.zeros((5, 5))
+    runs = []
+    for subset in itertools.combinations(range(8), 4):
+        rows = blocks[list(subset)].reshape(-1, 5)
+        orders = itertools.permutations(subset)
+        least_seconds = min(seconds_of(candidates, o, None) for o in orders)
+        runs.append((np.linalg.slogdet(rows.T @ rows + prior)[1], least_seconds))
+    value, taken = np.array(runs).T
+    given = {"blocks": blocks, "prior": prior, "least_efficiency": least}
+    found = select_fastest(candidates, 4, motion=MOTION, **given)
+    enough = value >= value.max() + 5 * np.log(least) - 1e-9
+    assert found.proven
+    assert found.seconds == pytest.approx(taken[enough].min(), abs=1e-8)
+    assert found.efficiency >= least - 1e-9
+    near = select_fastest(candidates, 4, motion=MOTION, method="heuristic", **given)
+    assert near.seconds >= found.seconds - 1e-9 and near.efficiency >= least - 1e-9
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"prior": np.eye(5), "blocks": None}, "prior must come with blocks"),
+        ({"candidates": np.zeros((7, 3))}, r"candidates must have shape \(8, n\)"),
+        ({"method": "lookahead"}, 'method must be "exact" or "heuristic" with blocks'),
+    ],
+)
+def test_bad_requests_with_blocks_are_named(rng, change, message):
+    given = {"candidates": rng.random((8, 3)), "blocks": rng.normal(size=(8, 2, 5))}
+    given |= change
+    with pytest.raises(ValueError, match=message):
+        select_fastest(given.pop("candidates"), motion=MOTION, **given)

@@ -45,13 +45,22 @@ def whitened(problems):
     return np.stack([p.rows[:, :-1] * np.sqrt(p.available.sum()) for p in problems])
 
 
+def drawn_parameters(network, *call):
+    """Random weights; flax's own initialisation compiles for seconds."""
+    shapes = jax.eval_shape(network.init, jax.random.key(0), *call)["params"]
+    rng = np.random.default_rng(1)
+    return jax.tree.map(
+        lambda leaf: (0.3 * rng.normal(size=leaf.shape)).astype(np.float32), shapes
+    )
+
+
 SHAPES = [  # M, n, k, masked, required, decoding
-    (20, 3, 4, 0.0, 0, "greedy"),
     (16, 3, 6, 0.3, 2, "greedy"),
     (12, 2, 3, 0.2, 0, "first"),
     *(
         pytest.param(*shape, marks=pytest.mark.slow)
         for shape in (
+            (20, 3, 4, 0.0, 0, "greedy"),
             (50, 3, 4, 0.0, 0, "greedy"),
             (50, 3, 12, 0.0, 0, "greedy"),
             (30, 4, 7, 0.2, 1, "first"),
@@ -102,9 +111,16 @@ VARIANTS = [
 ]
 
 
-@pytest.mark.parametrize("config", VARIANTS)
-@pytest.mark.parametrize(("n", "k", "made"), [(2, 3, 0), (3, 6, 2), (3, 6, 4)])
-def test_the_scores_are_those_of_jax_in_double_precision(rng, key, config, n, k, made):
+@pytest.mark.parametrize(
+    ("config", "n", "k", "made"),
+    [
+        (VARIANTS[0], 3, 6, 2),
+        (VARIANTS[0], 3, 6, 4),
+        (VARIANTS[1], 2, 3, 0),
+        (VARIANTS[2], 2, 3, 0),
+    ],
+)
+def test_the_scores_are_those_of_jax_in_double_precision(rng, config, n, k, made):
     problems, _, available, _ = drawn(rng, 5, 14, n, k, masked=0.3)
     if config is None:
         held = checkpoint.load()
@@ -112,25 +128,29 @@ def test_the_scores_are_those_of_jax_in_double_precision(rng, key, config, n, k,
     else:
         points = jnp.zeros((1, 14, n)), jnp.ones((1, 14), bool)
         chosen = jnp.full((1, k), -1)
-        init = build(config).init(key, *points, chosen, points[1])
-        scale = np.random.default_rng(1)
-        params = jax.tree.map(
-            lambda leaf: np.float32(leaf + 0.3 * scale.normal(size=leaf.shape)),
-            init["params"],
-        )
+        params = drawn_parameters(build(config), *points, chosen, points[1])
     network = build(config)
     chosen = np.full((5, k), -1)
     chosen[:, :made] = np.arange(made)
     free = available.copy()
     free[:, :made] = False
+
+    @jax.jit  # operation by operation takes three times as long to compile
+    def scored(points, usable, chosen, free):
+        view = network.candidate_features(points, usable)
+        memory = networks.encode(network, double, view)
+        return memory, decoding.logits_at(
+            network, double, view, memory, chosen, free, made
+        )[0]
+
     with jax.enable_x64(True):
         double = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), params)
-        view = network.candidate_features(
-            jnp.asarray(whitened(problems)), jnp.asarray(available)
+        memory, logits = scored(
+            jnp.asarray(whitened(problems)),
+            jnp.asarray(available),
+            jnp.asarray(chosen, jnp.int32),
+            jnp.asarray(free),
         )
-        memory = networks.encode(network, double, view)
-        given = view, memory, jnp.asarray(chosen, jnp.int32), jnp.asarray(free)
-        logits, _ = decoding.logits_at(network, double, *given, made)
     ours = CompactNetwork(dataclasses.asdict(config), weights.flat(params))
     x = np.stack([p.rows.T * np.sqrt(p.available.sum()) for p in problems])
     own = ours._encoded(np.ascontiguousarray(x), available)
@@ -149,7 +169,7 @@ def test_the_look_ahead_is_greedy_choice_by_determinants(rng, spanned):
     active = np.arange(m) != 3
     y[:, ~active] = 0.0
     values = np.empty((4, m))
-    look_ahead(y, active, spanned, depth, values)
+    look_ahead(y, active, spanned, depth, False, None, values)
 
     def log_volume(subset):
         gram = y[:, subset].T @ y[:, subset] + spanned * np.eye(len(subset))
@@ -167,7 +187,7 @@ def test_the_look_ahead_is_greedy_choice_by_determinants(rng, spanned):
 def test_of_many_candidates_the_512_of_largest_gain_are_starts(rng):
     y = rng.normal(size=(4, 1100))
     values = np.empty((4, 1100))
-    look_ahead(y, np.ones(1100, bool), False, 2, values)
+    look_ahead(y, np.ones(1100, bool), False, 2, False, None, values)
     started = values[1] > -30.0
     assert started.sum() == 512
     square = (y**2).sum(axis=0)
@@ -179,7 +199,7 @@ def test_samples_are_drawn_from_the_policy(rng):
     network = build(config)
     problems, _, available, _ = drawn(rng, 1, 6, 2, 3)
     begin = jnp.zeros((1, 6, 2)), jnp.ones((1, 6), bool), jnp.full((1, 3), -1)
-    params = network.init(jax.random.key(0), *begin, begin[1])["params"]
+    params = drawn_parameters(network, *begin, begin[1])
     policy = CompactNetwork(dataclasses.asdict(config), weights.flat(params))
     picks = policy(problems * 4000, "samples", 1, seed=1)
     x = np.ascontiguousarray(problems[0].rows.T)[None] * np.sqrt(6)
@@ -251,7 +271,7 @@ def papers(tmp_path_factory):
     config = NetworkConfig(kind="paper", width=16)
     network = build(config)
     points = jnp.zeros((1, 10, 3)), jnp.ones((1, 10), bool), jnp.full((1, 4), -1)
-    params = network.init(jax.random.key(0), *points, points[1])["params"]
+    params = drawn_parameters(network, *points, points[1])
     environment = dataclasses.asdict(SelectionConfig(num_candidates=10))
     folder = tmp_path_factory.mktemp("paper")
     meta = {
@@ -263,12 +283,12 @@ def papers(tmp_path_factory):
 
 
 def test_a_papers_pick_depends_on_no_other_set(rng, papers):
-    inside = rng.uniform(0.3, 0.6, size=(8, 10, 3))
-    outside = 100.0 * rng.uniform(size=(8, 10, 3))
+    inside = rng.uniform(0.3, 0.6, size=(7, 10, 3))
+    outside = 100.0 * rng.uniform(size=(1, 10, 3))
     settings = dict(jax.config.values)
     alone = select_batch(inside, 4, checkpoint=papers)
     mixed = select_batch(np.concatenate([inside, outside]), 4, checkpoint=papers)
-    np.testing.assert_array_equal(mixed[:8], alone)
+    np.testing.assert_array_equal(mixed[:7], alone)
     assert dict(jax.config.values) == settings  # the caller's own
 
 

@@ -31,9 +31,7 @@ def drawn(seed, m=12):
 
 def task_of(candidates, k=4, **given):
     given = {"available": None, "required": None} | given
-    return make_task(
-        candidates, k, MOTION, HOME, num_outputs=None, time_limit=60.0, **given
-    )
+    return make_task(candidates, k, MOTION, start=HOME, **given)
 
 
 def every_run(candidates, k=4, start=HOME):
@@ -55,7 +53,7 @@ def every_run(candidates, k=4, start=HOME):
 
 def run_of(task, price, num=1):
     """(num, k) runs at one price of a mean move, into the pool."""
-    x = task.rows * np.sqrt(len(task.rows))
+    x = np.ascontiguousarray(task.blocks[:, 0].T) * np.sqrt(len(task.blocks))
     each = np.array([price / task.times.mean()])
     return rule._runs(x, task.times, task.start, each, task.fixed, task.k, num)
 
@@ -64,7 +62,7 @@ def worth_of(task, price, order):
     """log det of the run's whitened rows less the tolls of its moves."""
     toll = price / task.times.mean()
     moves = sum(task.times[i, j] for i, j in itertools.pairwise(order))
-    x = task.rows[list(order)] * np.sqrt(len(task.rows))
+    x = task.blocks[list(order), 0] * np.sqrt(len(task.blocks))
     gram = x @ x.T if len(order) <= x.shape[1] else x.T @ x
     return np.linalg.slogdet(gram)[1] - toll * (task.start[order[0]] + moves)
 
@@ -137,7 +135,7 @@ def test_the_last_two_of_a_run_are_the_soonest_pair_that_will_do(rng):
 
 
 def task_value(task, chosen):
-    x = task.rows[list(chosen)]
+    x = task.blocks[list(chosen), 0]
     return np.linalg.slogdet(x.T @ x)[1]
 
 

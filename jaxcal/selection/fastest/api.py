@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import time
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,17 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import numbers, one_of, share, whole_number
 from jaxcal.information.criteria import d_efficiency
 from jaxcal.selection.fastest.motion import Motion
-from jaxcal.selection.fastest.task import Found, Solver, Task, make_task
+from jaxcal.selection.fastest.task import Search, Task, make_task
 from jaxcal.selection.solvers import checked_seed
 
-__all__ = ["METHODS", "FastSelection", "answer", "make_solver", "select_fastest"]
+__all__ = ["METHODS", "FastSelection", "answer", "make_search", "select_fastest"]
 
-# Module of each method; its ``solver`` takes the task and the options named here.
-METHODS = {
-    "exact": ("jaxcal.selection.fastest.exact", ("seed",)),
-    "heuristic": ("jaxcal.selection.fastest.local_search", ("seed",)),
-    "lookahead": ("jaxcal.selection.fastest.lookahead", ("num",)),
-}
+# The option of each method; the module of the same name has ``search(task, option)``.
+METHODS = {"exact": "seed", "heuristic": "seed", "lookahead": "num"}
 
 _LEAST_EFFICIENCY = 0.95  # where neither one nor a weight is given
 _MOST_EXACT = 12  # postures that the exact search accepts
@@ -56,6 +51,8 @@ def select_fastest(
     least_efficiency: float | None = None,
     weight: float | None = None,
     start: ArrayLike | None = None,
+    blocks: ArrayLike | None = None,
+    prior: ArrayLike | None = None,
     available: ArrayLike | None = None,
     required: ArrayLike | None = None,
     num_outputs: int | None = None,
@@ -68,13 +65,16 @@ def select_fastest(
 
     Args:
         candidates: (M, n) commands that could be measured, in any unit.
-        k: postures to choose, distinct; n + 1 when not given.
+        k: postures to choose, distinct; the fewest that identify when not given.
         motion: speeds and accelerations in the candidates' unit, settle time.
         least_efficiency: in (0, 1], against the proven D-optimum; 0.95 when neither
             this nor a weight is given.
         weight: instead of it, what a second is worth: the run with the largest
             ``log(efficiency) - weight * seconds`` among those found ("lookahead" only).
         start: (n,) where the device stands; it begins at any posture when not given.
+        blocks: (M, q, p) information of the candidates under another model than the
+            affine one, as in :func:`select`; "exact" and "heuristic" only.
+        prior: with blocks, (p, p) precision of what is known beforehand.
         available: (M,) bool, True where a candidate may be chosen.
         required: (r,) candidates that must be among the chosen.
         num_outputs: m; changes log det S, not the answer.
@@ -106,21 +106,14 @@ def select_fastest(
         method = method or "lookahead"
         if method != "lookahead":
             raise ValueError(f"method must be lookahead with a weight, got {method!r}")
-    least = share(
-        "least_efficiency",
-        _LEAST_EFFICIENCY if least_efficiency is None else least_efficiency,
-    )
+    given = _LEAST_EFFICIENCY if least_efficiency is None else least_efficiency
+    least = share("least_efficiency", given)
     task = make_task(
-        candidates, k, motion, start, available, required, num_outputs, time_limit
-    )
-    if weight is not None:
-        from jaxcal.selection.fastest.lookahead import most_worth
-
-        options = _options("lookahead", num=num, seed=seed)
-        begun = time.perf_counter()
-        chosen = most_worth(task, float(weight), **options)
-        return _selection(task, Found(chosen, "lookahead"), 0.0, begun)
-    found = answer(task, make_solver(task, method, num=num, seed=seed), least)
+        candidates, k, motion, start=start, time_limit=time_limit, blocks=blocks,
+        prior=prior, available=available, required=required, num_outputs=num_outputs,
+    )  # fmt: skip
+    search = make_search(task, method, num, seed, weight)
+    found = answer(task, search, 0.0 if weight is not None else least)
     if found is None:
         raise ValueError(
             f"least_efficiency must be reachable, got {least:g}; the optimum is only "
@@ -129,52 +122,48 @@ def select_fastest(
     return found
 
 
-def make_solver(task: Task, method: str | None, **given: Any) -> Solver:
-    """The solver of ``method``, or of the one that suits k; its options are checked."""
+def make_search(
+    task: Task,
+    method: str | None,
+    num: int | None,
+    seed: int | np.random.Generator | None,
+    weight: float | None = None,
+) -> Search:
+    """The search of ``method``, or of the one that suits k; its option is checked."""
     if method is None:
         method = "exact" if task.k <= _EXACT_BY_DEFAULT else "heuristic"
     one_of("method", method, tuple(METHODS))
     if method == "exact" and task.k > _MOST_EXACT:
         raise ValueError(f"k must be at most {_MOST_EXACT} with exact, got {task.k}")
-    options = _options(method, **given)
-    module = importlib.import_module(METHODS[method][0])
-    solver: Solver = module.solver(task, **options)
-    return solver
-
-
-def _options(method: str, *, num: Any, seed: Any) -> dict[str, int]:
-    """The options that a method reads, checked; any other that is given is refused."""
-    checked = {
-        "num": 8 if num is None else whole_number("num", num, 1),
-        "seed": 0 if seed is None else checked_seed(seed),
-    }
-    reads = METHODS[method][1]
     for name, value in (("num", num), ("seed", seed)):
-        if value is not None and name not in reads:
-            others = [other for other in METHODS if name in METHODS[other][1]]
+        if value is not None and name != METHODS[method]:
+            others = [other for other in METHODS if METHODS[other] == name]
             raise ValueError(
                 f'{name} is not an option of method "{method}" '
                 f"(it is of {', '.join(others)})"
             )
-    return {name: checked[name] for name in reads}
+    if method == "lookahead":
+        option = 8 if num is None else whole_number("num", num, 1)
+    else:
+        option = 0 if seed is None else checked_seed(seed)
+    module = importlib.import_module(f"jaxcal.selection.fastest.{method}")
+    search: Search = module.search(task, option, *([] if weight is None else [weight]))
+    return search
 
 
 def answer(
-    task: Task, solver: Solver, least: float, above: float | None = None
+    task: Task, search: Search, least: float, above: float | None = None
 ) -> FastSelection | None:
     """The fastest run with efficiency ``least``, and log det S over ``above``.
 
-    None where the solver finds no subset with that determinant.
+    None where the search finds no subset with that determinant.
     """
     begun = time.perf_counter()
-    found = solver(task.wanted(least, above))
-    return None if found is None else _selection(task, found, least, begun)
-
-
-def _selection(task: Task, found: Found, least: float, begun: float) -> FastSelection:
-    """A subset of the pool, in its best order and with everything to be said of it."""
+    found = search(task.wanted(least, above) if least else -np.inf)
+    if found is None:
+        return None
     problem = task.problem
-    tour, travel = task.tour(found.chosen)
+    tour, travel = task.tour(found.indices)
     indices = task.pool[tour]
     log_det = problem.log_det(indices)
     bound = max(task.exact.bound, log_det)
@@ -183,14 +172,12 @@ def _selection(task: Task, found: Found, least: float, begun: float) -> FastSele
         seconds=travel + task.settle,
         travel_seconds=travel,
         log_det=log_det,
-        efficiency=d_efficiency(
-            log_det, bound, problem.num_outputs * problem.num_regressors
-        ),
+        efficiency=d_efficiency(log_det, bound, problem.num_parameters),
         least_efficiency=least,
         proven=found.proven and task.exact.proven,
-        method=found.method,
+        method=str(found.method),
         bound=bound,
         bound_proven=task.exact.proven,
-        nodes=found.nodes,
+        nodes=found.nodes or 0,
         search_seconds=time.perf_counter() - begun,
     )

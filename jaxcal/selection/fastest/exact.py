@@ -19,82 +19,79 @@ import numpy as np
 from numba import njit
 
 from jaxcal.information.linear_algebra import add_block, factor
-from jaxcal.selection.fastest.local_search import local_search
-from jaxcal.selection.fastest.task import (
-    SAME_TIME,
-    Found,
-    Solver,
-    Task,
-    log_det_of_rows,
-)
+from jaxcal.selection.fastest.heuristic import local_search
+from jaxcal.selection.fastest.task import SAME_TIME, Search, Task
 from jaxcal.selection.fastest.tour_kernel import extend
+from jaxcal.selection.solver import Found
 
-__all__ = ["solver"]
+__all__ = ["search"]
 
 _CHUNK = 20_000  # nodes between checks of the clock
 
 
-def solver(task: Task, seed: int) -> Solver:
+def search(task: Task, seed: int) -> Search:
     """The compiled search, started from the local search, within the time limit."""
 
     def solve(wanted: float) -> Found | None:
         start, seconds = local_search(task, wanted, np.random.default_rng(seed))
-        k, rows = task.k, task.rows
+        k, prior = task.k, task.problem.prior
         chosen = np.zeros(k, np.int64) if start is None else np.sort(start)
-        value = -np.inf if start is None else log_det_of_rows(rows[chosen])
+        value = -np.inf if start is None else task.log_det(chosen)
         best = np.array([seconds, value])
         state, stack = np.array([-1, 0]), np.zeros(k + 1, np.int64)
         tours = np.full((1 << k, k), np.inf)
-        relaxed = rows[task.optimum].T @ rows[task.optimum]
+        relaxed = task.information(task.optimum) - prior
         deadline = time.perf_counter() + task.time_limit
         complete = False
         while not complete and time.perf_counter() < deadline:
             complete = _search(
-                rows, task.times, task.start, task.fixed, k, relaxed, wanted, tours,
-                stack, state, best, chosen, _CHUNK,
+                task.blocks, np.array(prior), task.times, task.start, task.fixed, k,
+                relaxed, wanted, tours, stack, state, best, chosen, _CHUNK,
             )  # fmt: skip
         if not np.isfinite(best[0]):
             return None
-        return Found(chosen, "exact", bool(complete), int(state[1]))
+        return Found(chosen, proven=bool(complete), nodes=int(state[1]), method="exact")
 
     return solve
 
 
 @njit(cache=True, nogil=True)
-def _gram(rows, chosen, count, gram):
-    """``gram`` (p, p) of the first ``count`` of ``chosen``, all into rows (M, p)."""
-    gram[:] = 0.0
+def _gram(blocks, prior, chosen, count, gram):
+    """``gram`` (p, p): prior and the first ``count`` of ``chosen``, into blocks."""
+    gram[:] = prior
     for c in range(count):
-        add_block(gram, rows[:, None, :], chosen[c], 1.0)
+        add_block(gram, blocks, chosen[c], 1.0)
 
 
 @njit(cache=True, nogil=True)
-def _bound(rows, chosen, count, first, k, relaxed, gram, inverse, gains):
+def _bound(blocks, prior, chosen, count, first, k, relaxed, gram, inverse, gains):
     """Upper bound on log det of the held with k - count more from ``first`` on.
 
     Args:
-        rows: (M, p) float64.
+        blocks: (M, q, p) float64.
+        prior: (p, p) float64 information beforehand.
         chosen: (k + 1,) int64, of which the first ``count`` are held.
         count, first, k: see above.
-        relaxed: (p, p) Gram matrix of the D-optimum.
+        relaxed: (p, p) information of the D-optimum without the prior.
         gram, inverse: (p, p) room to work in.
         gains: (k,) likewise.
     """
-    num_rows, p = rows.shape
+    num_blocks, q, p = blocks.shape
     more = k - count
-    if num_rows - first < more:
+    if num_blocks - first < more:
         return -np.inf
-    _gram(rows, chosen, count, gram)
+    _gram(blocks, prior, chosen, count, gram)
     log_det = factor(gram + (more / k) * relaxed, inverse)
     if log_det == -np.inf:
         return np.inf
     trace = (inverse * gram).sum()
     gains[:more] = -1.0  # the largest so far, ascending
-    for j in range(first, num_rows):
+    for j in range(first, num_blocks):
         gain = 0.0
-        for a in range(p):
-            for b in range(p):
-                gain += rows[j, a] * inverse[a, b] * rows[j, b]
+        for r in range(q):
+            for a in range(p):
+                for b in range(p):
+                    gain += blocks[j, r, a] * inverse[a, b] * blocks[j, r, b]
         if gain <= gains[0]:
             continue
         place = 0
@@ -107,19 +104,21 @@ def _bound(rows, chosen, count, first, k, relaxed, gram, inverse, gains):
 
 @njit(cache=True, nogil=True)
 def _search(
-    rows, times, start, fixed, k, relaxed, wanted, tours, chosen, state, best,
-    best_chosen, limit,
+    blocks, prior, times, start, fixed, k, relaxed, wanted, tours, chosen, state,
+    best, best_chosen, limit,
 ):  # fmt: skip
     """Go on with the search for at most ``limit`` nodes.
 
     Args:
-        rows: (M, p) float64 whitened regressors.
+        blocks: (M, q, p) float64 whitened.
+        prior: (p, p) float64 information beforehand.
         times: (M, M) float64 seconds, a metric.
         start: (M,) float64 seconds to each from the start, zero where there is none.
-        fixed: postures in every subset, the first of ``rows``; fewer than k.
+        fixed: postures in every subset, the first of ``blocks``; fewer than k.
         k: postures in all.
-        relaxed: (p, p) Gram matrix of a good selection of k; any leaves the bound true.
-        wanted: log det(X_s.T X_s) a subset must have.
+        relaxed: (p, p) information of a good selection of k, without the prior; any
+            leaves the bound true.
+        wanted: log det a subset must have.
         tours: (2^k, k) float64, see ``extend``.
         chosen: (k + 1,) int64, the subset on the stack.
         state: (2,) int64 depth, -1 at first, and nodes so far.
@@ -131,7 +130,7 @@ def _search(
     Returns:
         Whether the search is complete.
     """
-    num_rows, p = rows.shape
+    num_blocks, _, p = blocks.shape
     gram = np.empty((p, p))
     inverse = np.empty((p, p))
     gains = np.empty(k)
@@ -145,7 +144,7 @@ def _search(
     done = 0
     while depth >= fixed:
         chosen[depth] += 1
-        if chosen[depth] + (k - depth) > num_rows:
+        if chosen[depth] + (k - depth) > num_blocks:
             depth -= 1
             continue
         if done >= limit:
@@ -158,7 +157,7 @@ def _search(
         if least > best[0] + SAME_TIME:
             continue
         if depth == k - 1:
-            _gram(rows, chosen, k, gram)
+            _gram(blocks, prior, chosen, k, gram)
             log_det = factor(gram, inverse)
             if log_det >= wanted and (
                 least < best[0] - SAME_TIME or log_det > best[1] + 1e-12
@@ -167,8 +166,9 @@ def _search(
                 best_chosen[:] = chosen[:k]
             continue
         bound = _bound(
-            rows, chosen, depth + 1, chosen[depth] + 1, k, relaxed, gram, inverse, gains
-        )
+            blocks, prior, chosen, depth + 1, chosen[depth] + 1, k, relaxed, gram,
+            inverse, gains,
+        )  # fmt: skip
         if bound < wanted or (least > best[0] - SAME_TIME and bound <= best[1]):
             continue
         depth += 1

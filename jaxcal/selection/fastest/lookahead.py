@@ -16,9 +16,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from jaxcal.selection.fastest.refill import refills
-from jaxcal.selection.fastest.task import Found, Solver, Task, log_det_of_rows
+from jaxcal.selection.fastest.task import Search, Task
+from jaxcal.selection.policy.kernel import conditional, look_ahead
+from jaxcal.selection.solver import Found
 
-__all__ = ["complete", "lookahead_runs", "most_worth", "solver"]
+__all__ = ["PRICES", "complete", "lookahead_runs", "search"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -28,41 +30,47 @@ Indices = NDArray[np.int64]
 PRICES = np.concatenate([[0.0], np.geomspace(0.02, 6.0, 31)])
 
 _DEPTH = 12  # most choices to look ahead
-_ALL_START = 1024  # candidates up to which every one is looked ahead from;
-_STARTS = 512  # of more candidates, those of largest gain
-_LEAST_GAIN = 1e-5  # of a whitened row; anything below counts as this much
 _LARGEST_TOLL = 600.0  # exp(-600) is still a normal number
 _ENDINGS = 30  # endings of a run that are put in their best order,
 _SUBSETS = 100  # and of all runs together
 
 
-def solver(task: Task, num: int) -> Solver:
-    """The look-ahead runs of a task, completed at each determinant asked for."""
+def search(task: Task, num: int, weight: float | None = None) -> Search:
+    """The look-ahead runs of a task, completed at each determinant asked for.
+
+    With ``weight`` the run of most worth, at any determinant.
+    """
+    if task.blocks.shape[1] > 1 or task.problem.prior.any():
+        raise ValueError(
+            'method must be "exact" or "heuristic" with blocks of several rows or a '
+            'prior, got "lookahead"'
+        )
 
     @functools.cache
     def runs() -> Indices:
         return lookahead_runs(task, PRICES, num)
 
     def solve(wanted: float) -> Found | None:
+        if weight is not None:
+            return Found(_most_worth(task, weight, num), method="lookahead")
         chosen = complete(task, runs(), wanted)
         if chosen is not None:
-            return Found(chosen, "lookahead")
-        if log_det_of_rows(task.rows[task.optimum]) >= wanted:
-            return Found(task.optimum, "exact")
+            return Found(chosen, method="lookahead")
+        if task.log_det(task.optimum) >= wanted:
+            return Found(task.optimum, method="exact")
         return None
 
     return solve
 
 
-def most_worth(task: Task, weight: float, num: int) -> Indices:
+def _most_worth(task: Task, weight: float, num: int) -> Indices:
     """(k,) the run found of largest log D-efficiency less ``weight`` a second."""
-    p = task.rows.shape[1]
+    p = task.problem.num_regressors
     prices = np.append(PRICES[1:], weight * p * task.times.mean())
     runs = lookahead_runs(task, prices, num)
     subsets = np.unique(np.sort(runs, axis=1), axis=0)
     worth = [
-        log_det_of_rows(task.rows[chosen]) / p - weight * task.tour(chosen)[1]
-        for chosen in subsets
+        task.log_det(chosen) / p - weight * task.tour(chosen)[1] for chosen in subsets
     ]
     return subsets[int(np.argmax(worth))]
 
@@ -82,8 +90,8 @@ def lookahead_runs(task: Task, prices: Array, num: int) -> Indices:
     longest = max(task.times.max(), task.start.max()) or 1.0
     each = np.minimum(prices / mean, _LARGEST_TOLL / longest)
     # Rows of unit mean square, as [u, 1] has them in whitened coordinates.
-    rows = task.rows * np.sqrt(len(task.rows))
-    runs = _runs(rows, task.times, task.start, each, task.fixed, task.k, num)
+    x = np.ascontiguousarray(task.problem.rows[task.pool].T) * np.sqrt(len(task.pool))
+    runs = _runs(x, task.times, task.start, each, task.fixed, task.k, num)
     return np.unique(runs, axis=0)
 
 
@@ -93,7 +101,7 @@ def complete(task: Task, runs: Indices, wanted: float) -> Indices | None:
     Args:
         task: the postures and the times between them.
         runs: (R, k) in the order of choice, required postures first.
-        wanted: least log det(X_s.T X_s).
+        wanted: least whitened log det.
 
     Returns:
         (k,) subset; None where no run gets there.
@@ -106,7 +114,7 @@ def complete(task: Task, runs: Indices, wanted: float) -> Indices | None:
     best, least = None, np.inf
     for subset in sorted(soonest, key=lambda s: soonest[s])[:_SUBSETS]:
         chosen = np.array(subset)
-        if log_det_of_rows(task.rows[chosen]) >= wanted:
+        if task.log_det(chosen) >= wanted:
             seconds = task.tour(chosen)[1]
             if seconds < least:
                 best, least = chosen, seconds
@@ -114,20 +122,20 @@ def complete(task: Task, runs: Indices, wanted: float) -> Indices | None:
 
 
 @njit(cache=True, nogil=True)
-def _runs(rows, times, start, prices, fixed, k, num):
+def _runs(x, times, start, prices, fixed, k, num):
     """(W num, k) int64 runs: for each price the best ``num`` first postures, completed.
 
     Args:
-        rows: (M, p) float64 whitened regressors of unit mean square.
+        x: (p, M) float64 whitened regressors of unit mean square.
         times: (M, M) float64 seconds.
         start: (M,) float64 seconds from the start.
         prices: (W,) float64 log det(Z.T Z) a second.
-        fixed: postures chosen already, the first of ``rows``, visited in that order;
+        fixed: postures chosen already, the first of ``x``, visited in that order;
             fewer than k.
         k: postures in all.
         num: first postures.
     """
-    m = len(rows)
+    m = len(start)
     runs = np.empty((len(prices) * num, k), np.int64)
     chosen = np.arange(k)
     free = np.ones(m, np.bool_)
@@ -138,87 +146,24 @@ def _runs(rows, times, start, prices, fixed, k, num):
         free[:] = True
         free[:fixed] = False
         chosen[:fixed] = np.arange(fixed)
-        values = _values(rows, tolls, factors, entry, free, chosen, fixed, k)
-        firsts = np.argsort(-values, kind="mergesort")
+        ends = _ends(x, tolls, factors, entry, free, chosen[:fixed], k)
+        firsts = np.argsort(-ends, kind="mergesort")
         for turn in range(num):
             chosen[fixed] = firsts[turn] if turn < m - fixed else firsts[0]
             for count in range(fixed + 1, k):
                 free[:] = True
                 free[chosen[:count]] = False
-                values = _values(rows, tolls, factors, entry, free, chosen, count, k)
-                chosen[count] = values.argmax()
+                ends = _ends(x, tolls, factors, entry, free, chosen[:count], k)
+                chosen[count] = ends.argmax()
             runs[w * num + turn] = chosen
     return runs
 
 
 @njit(cache=True, nogil=True)
-def _values(rows, tolls, factors, entry, free, chosen, count, k):
-    """(M,) log gain less tolls to the end of the run, by the candidate chosen next.
-
-    Args:
-        rows: (M, p) float64.
-        tolls: (M, M) float64 price times seconds.
-        factors: (M, M) float64 ``exp(-tolls)``.
-        entry: (M,) float64 tolls from the start.
-        free: (M,) bool, may be chosen.
-        chosen: (k,) int64, of which the first ``count`` are chosen.
-        count: choices made.
-        k: choices in all.
-    """
-    m, p = rows.shape
-    # With k = p a choice multiplies det by what is left of its row outside the span of
-    # the others. With more it multiplies the ridged det by 1 + its squared length in
-    # the metric of the chosen.
-    spanned = k > p
-    rest = rows.copy()
-    if spanned:
-        rest /= np.sqrt(0.01 if count < p else 1e-6)
-    for c in range(count):
-        _take(rest, chosen[c], spanned)
-    gains = (rest * rest).sum(axis=1)
-    least = np.sort(gains)[m - _STARTS] if m > _ALL_START else 0.0
-    values = np.full(m, -np.inf)
-    depth = min(_DEPTH, k - count)
-    base = 1.0 if spanned else 0.0
-    open_ = free.copy()
-    for first in range(m):
-        if not free[first] or gains[first] < least:
-            continue
-        value = np.log(max(base + gains[first], _LEAST_GAIN))
-        value -= tolls[chosen[count - 1], first] if count else entry[first]
-        z = rest.copy()
-        open_[:] = free
-        here = first
-        for _ in range(1, depth):
-            open_[here] = False
-            _take(z, here, spanned)
-            best, most = -1, -1.0
-            for j in range(m):
-                if open_[j]:
-                    gain = base
-                    for a in range(p):
-                        gain += z[j, a] * z[j, a]
-                    gain = max(gain, _LEAST_GAIN) * factors[here, j]
-                    if gain > most:
-                        best, most = j, gain
-            value += np.log(most)
-            here = best
-        values[first] = value
-    return values
-
-
-@njit(cache=True, nogil=True)
-def _take(rest, i, spanned):
-    """Shorten all of ``rest`` (M, p) along row i, which is chosen, in place."""
-    m, p = rest.shape
-    along = rest[i].copy()
-    size = (along * along).sum()
-    if size < 1e-12:
-        return
-    share = (1.0 - 1.0 / np.sqrt(1.0 + size)) / size if spanned else 1.0 / size
-    for j in range(m):
-        inner = 0.0
-        for a in range(p):
-            inner += rest[j, a] * along[a]
-        for a in range(p):
-            rest[j, a] -= share * inner * along[a]
+def _ends(x, tolls, factors, start, free, chosen, k):
+    """(M,) log gain less tolls to the end of the run, by the candidate chosen next."""
+    values = np.empty((4, len(free)))
+    depth = min(_DEPTH, k - len(chosen))
+    y = conditional(x, chosen, free, k)
+    look_ahead(y, free, k > len(x), depth, False, factors, values)
+    return values[3] - (tolls[chosen[-1]] if len(chosen) else start)

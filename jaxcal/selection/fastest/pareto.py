@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxcal.checks import share, whole_number
-from jaxcal.selection.fastest.api import FastSelection, answer, make_solver
+from jaxcal.selection.fastest.api import FastSelection, answer, make_search
 from jaxcal.selection.fastest.motion import Motion
 from jaxcal.selection.fastest.task import SAME_TIME, make_task
 
@@ -30,38 +31,32 @@ def pareto_front(
     *,
     motion: Motion,
     least_efficiency: float = 0.7,
-    start: ArrayLike | None = None,
-    available: ArrayLike | None = None,
-    required: ArrayLike | None = None,
-    num_outputs: int | None = None,
     method: str | None = None,
-    time_limit: float = 60.0,
     max_points: int = 200,
     num: int | None = None,
     seed: int | np.random.Generator | None = None,
+    **rules: Any,
 ) -> ParetoFront:
     """Time against D-efficiency, from ``least_efficiency`` up to the D-optimum.
 
     Each point is the fastest run more efficient than the point before it.
 
     Args:
-        candidates, k, motion, start, available, required, num_outputs, method, num,
-            seed: as in :func:`select_fastest`.
+        candidates, k, motion, method, num, seed: as in :func:`select_fastest`.
         least_efficiency: where to cut the front off, in (0, 1].
-        time_limit: seconds for each point.
         max_points: points after which to stop; the front is then not proven.
+        rules: ``start``, ``blocks``, ``prior``, ``available``, ``required``,
+            ``num_outputs``, as there, and ``time_limit``, seconds for each point.
     """
     least_efficiency = share("least_efficiency", least_efficiency)
     max_points = whole_number("max_points", max_points, 1)
-    task = make_task(
-        candidates, k, motion, start, available, required, num_outputs, time_limit
-    )
-    solver = make_solver(task, method, num=num, seed=seed)
+    task = make_task(candidates, k, motion, **rules)
+    search = make_search(task, method, num, seed)
     points: list[FastSelection] = []
     complete = False
     while len(points) < max_points and not complete:
         above = points[-1].log_det if points else None
-        point = answer(task, solver, least_efficiency, above)
+        point = answer(task, search, least_efficiency, above)
         if point is None:
             complete = True
         else:

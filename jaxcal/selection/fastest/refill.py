@@ -11,7 +11,7 @@ __all__ = ["refills"]
 
 Indices = NDArray[np.int64]
 
-_RIDGE = 1e-8  # of the whitened Gram matrix of fewer postures than parameters
+_RIDGE = 1e-8  # of the whitened information of fewer postures than identify
 
 
 def refills(
@@ -24,26 +24,26 @@ def refills(
 
     Args:
         task: the postures and the times between them.
-        kept: (k - 2,) or (k - 1,) postures in the order visited.
-        wanted: least log det(X_s.T X_s), met to 1e-6.
+        kept: (k - 1,) postures in the order visited; (k - 2,) with blocks of one row.
+        wanted: least whitened log det, met to 1e-6.
         most: completions to return.
 
     Returns:
         Seconds and (k,) subset of each, ascending.
     """
-    rows, times, begin = task.rows, task.times, task.start
+    times, begin = task.times, task.start
     legs = np.concatenate([begin[kept[:1]], times[kept[:-1], kept[1:]], [0.0]])
-    others = np.setdiff1d(np.arange(len(rows)), kept)
-    lower = np.linalg.cholesky(
-        rows[kept].T @ rows[kept] + _RIDGE * np.eye(rows.shape[1])
-    )
-    y = np.linalg.solve(lower, rows[others].T).T
-    factor = 1.0 + (y * y).sum(axis=1)  # of the determinant
+    others = np.setdiff1d(np.arange(len(task.blocks)), kept)
+    _, q, p = task.blocks.shape
+    lower = np.linalg.cholesky(task.information(kept) + _RIDGE * np.eye(p))
+    y = np.linalg.solve(lower, task.blocks[others].reshape(-1, p).T).T.reshape(-1, q, p)
+    # Factor of the determinant.
+    factor = np.linalg.det(np.eye(q) + y @ np.matrix_transpose(y))
     into = np.vstack([begin[others], times[np.ix_(kept, others)]])
     onward = np.vstack([times[np.ix_(kept, others)], np.zeros(len(others))])
     seconds = (into + onward - legs[:, None]).min(axis=0)
     if len(kept) == task.k - 2:
-        factor = np.outer(factor, factor) - (y @ y.T) ** 2
+        factor = np.outer(factor, factor) - (y[:, 0] @ y[:, 0].T) ** 2
         last = into[-1][:, None] + times[np.ix_(others, others)]
         seconds = np.minimum(np.minimum(last, last.T), seconds[:, None] + seconds)
         factor[np.tril_indices(len(others))] = 0.0

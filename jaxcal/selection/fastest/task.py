@@ -1,4 +1,4 @@
-"""What every search for a fast run reads: rows, times between postures, the optimum."""
+"""What every search for a fast run reads: blocks, times between postures, optimum."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,14 +14,18 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import numbers, seconds
 from jaxcal.selection.exact.exact import ExactResult, solve_exact
 from jaxcal.selection.fastest.motion import Motion, travel_times
-from jaxcal.selection.problem import Problem, make_problem
+from jaxcal.selection.problem import Problem, make_block_problem, make_problem
+from jaxcal.selection.solver import Found
 
-__all__ = ["SAME_TIME", "Found", "Solver", "Task", "log_det_of_rows", "make_task"]
+__all__ = ["SAME_TIME", "Search", "Task", "make_task"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 SAME_TIME = 1e-9  # seconds: two runs this close take as long
+
+# From the whitened log det wanted to the fastest subset (into the pool) found.
+Search = Callable[[float], Found | None]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -29,7 +34,7 @@ class Task:
 
     problem: Problem
     pool: Indices  # (P,) candidates, the required first, then by falling leverage
-    rows: Array  # (P, p) whitened regressors
+    blocks: Array  # (P, q, p) whitened
     times: Array  # (P, P) seconds from each to each
     start: Array  # (P,) seconds to each from the start; 0 where there is none
     settle: float  # seconds at all k postures together
@@ -63,19 +68,27 @@ class Task:
         place = np.argsort(self.pool)
         return place[np.searchsorted(self.pool, indices, sorter=place)]
 
+    def information(self, chosen: Indices) -> Array:
+        """(p, p) whitened information of postures of the pool, with the prior."""
+        rows = self.blocks[chosen].reshape(-1, self.blocks.shape[2])
+        return rows.T @ rows + self.problem.prior
+
+    def log_det(self, chosen: Indices) -> float:
+        """log det of it; -inf where singular."""
+        sign, value = np.linalg.slogdet(self.information(chosen))
+        return float(value) if sign > 0 else -np.inf
+
     def wanted(self, least: float, above: float | None) -> float:
-        """log det(X_s.T X_s) of an efficiency ``least``, and of log det S > ``above``.
+        """``log_det`` of an efficiency ``least``, and of log det S > ``above``.
 
         A bound that is not the optimum asks too much of a subset, never too little.
         """
-        m, scale = self.problem.num_outputs, self.problem.log_scale
+        m, scale = self.problem.multiplicity, self.problem.log_scale
+        p = self.problem.num_regressors
         # The optimum itself must meet its own value.
-        value = (
-            self.exact.bound / m - scale + self.rows.shape[1] * np.log(least) - 1e-12
-        )
-        return float(
-            value if above is None else max(value, above / m - scale + SAME_TIME)
-        )
+        value = self.exact.bound / m - scale + p * np.log(least) - 1e-12
+        more = -np.inf if above is None else above / m - scale + SAME_TIME
+        return float(max(value, more))
 
     def tour(self, chosen: Indices) -> tuple[Indices, float]:
         """``chosen`` (k,) in the best order found, and its seconds of travel."""
@@ -87,50 +100,40 @@ class Task:
         return chosen[order], float(seconds)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Found:
-    """A subset that one search returns."""
-
-    chosen: Indices  # (k,) into the pool
-    method: str
-    proven: bool = False  # against the determinant asked for
-    nodes: int = 0
-
-
-# A search: from the log det(X_s.T X_s) wanted to the fastest subset found.
-Solver = Callable[[float], Found | None]
-
-
-def log_det_of_rows(rows: Array) -> float:
-    """log det(X.T X) of whitened rows (k, p); -inf where singular."""
-    sign, value = np.linalg.slogdet(rows.T @ rows)
-    return float(value) if sign > 0 else -np.inf
-
-
 def make_task(
     candidates: ArrayLike,
     k: int | None,
     motion: Motion,
-    start: ArrayLike | None,
-    available: ArrayLike | None,
-    required: ArrayLike | None,
-    num_outputs: int | None,
-    time_limit: float,
+    *,
+    start: ArrayLike | None = None,
+    time_limit: float = 60.0,
+    blocks: ArrayLike | None = None,
+    prior: ArrayLike | None = None,
+    **rules: Any,
 ) -> Task:
-    """Check the arguments of ``select_fastest`` and find the D-optimum."""
-    problem = make_problem(
-        candidates, k, available=available, required=required, num_outputs=num_outputs
-    )
+    """Check the arguments of ``select_fastest``; ``rules`` are those of a problem."""
+    if blocks is not None:
+        problem = make_block_problem(blocks, k, prior=prior, **rules)
+        points = numbers("candidates", candidates)
+        if points.ndim != 2 or len(points) != len(problem.blocks):
+            raise ValueError(
+                f"candidates must have shape ({len(problem.blocks)}, n), a command for "
+                f"each block, got {points.shape}"
+            )
+    elif prior is not None:
+        raise ValueError("prior must come with blocks, whose parameters it is about")
+    else:
+        problem = make_problem(candidates, k, **rules)
+        assert problem.candidates is not None
+        points = problem.candidates
     if not isinstance(motion, Motion):
         raise ValueError(f"motion must be a Motion, got {motion!r}")
-    limit = seconds("time_limit", time_limit)
-    free = np.setdiff1d(np.flatnonzero(problem.available), problem.required)
-    leverage = (problem.rows[free] ** 2).sum(axis=1)
-    pool = np.concatenate([problem.required, free[np.argsort(-leverage)]])
-    if len(problem.required) == problem.k:
-        pool = problem.required
-    assert problem.candidates is not None
-    points = problem.candidates[pool]
+    pool = problem.required
+    if len(pool) < problem.k:
+        free = np.setdiff1d(np.flatnonzero(problem.available), pool)
+        leverage = (problem.blocks[free] ** 2).sum(axis=(1, 2))
+        pool = np.concatenate([pool, free[np.argsort(-leverage)]])
+    points = points[pool]
     begin = np.zeros(len(pool))
     if start is not None:
         where = numbers("start", start)
@@ -139,13 +142,12 @@ def make_task(
                 f"start must have shape {points.shape[1:]}, got {where.shape}"
             )
         begin = travel_times(where[None], points, motion)[0]
-    times = travel_times(points, points, motion)
     return Task(
         problem=problem,
         pool=pool,
-        rows=np.ascontiguousarray(problem.rows[pool]),
-        times=times,
+        blocks=np.ascontiguousarray(problem.blocks[pool]),
+        times=travel_times(points, points, motion),
         start=begin,
         settle=float(motion.settle) * problem.k,
-        time_limit=limit,
+        time_limit=seconds("time_limit", time_limit),
     )

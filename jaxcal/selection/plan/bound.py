@@ -1,14 +1,15 @@
-"""What no design of K measurements beats: lower bounds on G and I.
+"""What no design of K measurements beats: lower bounds on the variances of a region.
 
 For weights w over the region with W = sum of w z z.T and any positive definite M0,
-convexity and the best scaling of M0 give for every design M of K measurements
+convexity and the best scaling of M0 give for every design M of K measurements and a
+prior P
 
-    trace(W M^-1) >= trace(W M0^-1)^2 / (largest sum of K gains x.T M0^-1 W M0^-1 x),
+    trace(W M^-1) >= trace(W M0^-1)^2 / (trace(G P) + largest sum of K trace(B G B.T))
 
-and the largest variance is at least every weighted mean of it. For G the weights are
-those of the D-optimal measure of the region, which make the bound p / K where the
-region is the candidates and replicates are free (Kiefer and Wolfowitz 1960). Source:
-Pukelsheim, Optimal Design of Experiments, chapter 9.
+with ``G = M0^-1 W M0^-1``, and the largest variance is at least every weighted mean of
+it. For G the weights are those of the D-optimal measure of the region, which make the
+bound p / K where the region is the candidates and replicates are free (Kiefer and
+Wolfowitz 1960). Source: Pukelsheim, Optimal Design of Experiments, chapter 9.
 """
 
 from __future__ import annotations
@@ -30,17 +31,17 @@ def region_weighting(points: Array, criterion: str) -> Array:
     """(p, p) W, the sum of w z z.T over the region, of weights that sum to 1.
 
     Args:
-        points: (R, p) whitened regressors of the region.
-        criterion: "G", weights of the D-optimal measure of the region by Titterington's
-            steps w <- w (z.T W^-1 z) / p, or "I", equal weights.
+        points: (R, s, p) whitened rows of the region.
+        criterion: "I", equal weights, or "G", those of the D-optimal measure of the
+            region by Titterington's steps w <- w (z.T W^-1 z) / p.
     """
-    num_points, p = points.shape
-    weight = np.full(num_points, 1.0 / num_points)
+    rows = points.reshape(-1, points.shape[-1])
+    weight = np.full(len(rows), 1.0 / len(rows))
     for _ in range(_ITERATIONS if criterion == "G" else 0):
-        inverse = np.linalg.pinv((points * weight[:, None]).T @ points, hermitian=True)
-        weight *= np.einsum("ra,ab,rb->r", points, inverse, points) / p
+        inverse = np.linalg.pinv((rows * weight[:, None]).T @ rows, hermitian=True)
+        weight *= np.einsum("ra,ab,rb->r", rows, inverse, rows)
         weight /= weight.sum()
-    return (points * weight[:, None]).T @ points
+    return (rows * weight[:, None]).T @ rows
 
 
 def lower_bound(problem: Problem, weighting: Array, k: int) -> float:
@@ -49,16 +50,18 @@ def lower_bound(problem: Problem, weighting: Array, k: int) -> float:
     M0 is the relaxed minimiser, from multiplicative steps on counts that are clipped
     to their limits; whatever M0 they end in, the bound holds.
     """
-    rows, lower = problem.rows, problem.lower
+    blocks, lower = problem.blocks, problem.lower
+    rows = blocks.reshape(-1, blocks.shape[2])
     upper = np.where(problem.available, min(problem.max_replicates, k), 0)
     count = np.where(problem.available, k / problem.available.sum(), 0.0)
     best = 0.0
     for iteration in range(_ITERATIONS):
-        gram = (rows * count[:, None]).T @ rows
-        inverse = np.linalg.pinv(gram, hermitian=True)
-        gain = np.einsum("ma,ab,mb->m", rows, inverse @ weighting @ inverse, rows)
+        counts = np.repeat(count, blocks.shape[1])[:, None]
+        inverse = np.linalg.pinv((rows * counts).T @ rows + problem.prior)
+        slope = inverse @ weighting @ inverse
+        gain = np.einsum("mqa,ab,mqb->m", blocks, slope, blocks)
         if iteration % 10 == 0 or iteration == _ITERATIONS - 1:
-            most = _largest_sum(gain, lower, upper, k)
+            most = _largest_sum(gain, lower, upper, k) + (slope * problem.prior).sum()
             best = max(best, float(np.trace(weighting @ inverse)) ** 2 / most)
         count = _scaled_to(count * np.sqrt(np.maximum(gain, 0.0)), lower, upper, k)
     return best

@@ -1,4 +1,4 @@
-"""The best design of one size by G or I: exchange on the criterion itself.
+"""The best design of one size for a region: exchange on the criterion itself.
 
 It starts from the D-optimal selection (exact where time allows), the greedy one, the
 design of one measurement less plus its best addition, and random ones. It proves
@@ -20,15 +20,15 @@ from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.greedy import greedy_indices
 from jaxcal.selection.problem import Problem
 
-__all__ = ["CRITERIA", "Design", "best_design", "criterion_of"]
+__all__ = ["CRITERIA", "Design", "best_design", "variances_of"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-# Over the variances of the region, for unit noise.
+# Over the region, of the variances of an output; of several the worst counts.
 CRITERIA: dict[str, Callable[..., Any]] = {"G": np.max, "I": np.mean}
 
-_RANDOM_STARTS = 4
+_RANDOM_STARTS = 4  # where a candidate gives one reading: swaps of more take longer
 _D_RESTARTS = 50  # of the exchange that looks for the D-optimal selection
 
 
@@ -37,31 +37,35 @@ class Design:
     """The best design of one K that was found."""
 
     indices: Indices  # (k,) sorted
-    variance: float  # the criterion for unit noise
-    d_optimal: float  # the criterion of the D-optimal selection
+    variance: Array  # (s,) the criterion of each output for unit noise
+    d_optimal: Array  # (s,) that of the D-optimal selection
     method: str  # "exact": a D-optimal selection of exact; else "exchange"
     proven: bool  # the design is a proven D-optimum
 
 
-def criterion_of(rows: Array, indices: Indices, points: Array, criterion: str) -> float:
-    """The criterion of a design for unit noise; inf where it is singular.
+def variances_of(problem: Problem, indices: Indices, points: Array, how: str) -> Array:
+    """(s,) the criterion of each output of a design; inf where it is singular.
 
     Args:
-        rows: (M, p) whitened regressors of the candidates.
-        indices: (k,) into rows.
-        points: (R, p) whitened regressors of the region.
-        criterion: "G" or "I".
+        problem: whitened blocks and prior.
+        indices: (k,) the design.
+        points: (R, s, p) whitened rows of the region.
+        how: "G" or "I".
     """
-    singular, right = np.linalg.svd(rows[indices])[1:]
+    rows = problem.blocks[indices].reshape(-1, points.shape[-1])
+    if problem.prior.any():
+        size, vectors = np.linalg.eigh(problem.prior)
+        rows = np.vstack([rows, np.sqrt(np.maximum(size, 0.0))[:, None] * vectors.T])
+    singular, right = np.linalg.svd(rows)[1:]
     if len(singular) < rows.shape[1] or singular[-1] <= 1e-7 * singular[0]:
-        return np.inf
-    return float(CRITERIA[criterion](((points @ (right.T / singular)) ** 2).sum(1)))
+        return np.full(points.shape[1], np.inf)
+    return np.asarray(CRITERIA[how](((points @ (right.T / singular)) ** 2).sum(2), 0))
 
 
 def best_design(
     problem: Problem,
     points: Array,
-    criterion: str,
+    how: str,
     design: str,
     time_limit: float,
     previous: Indices | None,
@@ -71,8 +75,8 @@ def best_design(
 
     Args:
         problem: candidates, limits and k.
-        points: (R, p) whitened regressors of the region.
-        criterion: "G" or "I".
+        points: (R, s, p) whitened rows of the region.
+        how: the criterion, "G" or "I".
         design: of the D-optimal selection: "exact" or "exchange".
         time_limit: seconds of exact.
         previous: (k - 1,) the design of one measurement less.
@@ -86,34 +90,39 @@ def best_design(
         optimal = exchange_indices(problem, _D_RESTARTS, seed)
     starts = [optimal, greedy_indices(problem)]
     if previous is not None:
-        starts.append(_with_best_addition(problem, previous, points, criterion))
+        more = _room(problem, previous)
+        values = _after(problem, previous, [None], more, points, how)[0]
+        starts.append(np.append(previous, more[int(values.argmin())]))
     rng = np.random.default_rng([seed, problem.k])
-    room = np.repeat(np.arange(len(problem.rows)), problem.upper - problem.lower)
-    for _ in range(_RANDOM_STARTS):
+    room = np.repeat(np.arange(len(problem.blocks)), problem.upper - problem.lower)
+    for _ in range(_RANDOM_STARTS if problem.blocks.shape[1] == 1 else 0):
         some = rng.permutation(room)[: problem.k - len(problem.required)]
         starts.append(np.concatenate([problem.required, some]))
-    base = criterion_of(problem.rows, optimal, points, criterion)
-    best, value = optimal, base
+    best, value = optimal, variances_of(problem, optimal, points, how).max()
     for start in starts:
-        indices, reached = _exchange(problem, start, points, criterion)
+        indices, reached = _exchange(problem, start, points, how)
         if reached < value * (1.0 - 1e-12):
             best, value = indices, reached
     best = np.sort(best)
     same = np.array_equal(best, np.sort(optimal))
-    method = "exact" if same and design == "exact" else "exchange"
-    return Design(best, value, base, method, same and proven)
+    return Design(
+        best,
+        variances_of(problem, best, points, how),
+        variances_of(problem, optimal, points, how),
+        "exact" if same and design == "exact" else "exchange",
+        same and proven,
+    )
 
 
 def _exchange(
-    problem: Problem, start: Indices, points: Array, criterion: str
+    problem: Problem, start: Indices, points: Array, how: str
 ) -> tuple[Indices, float]:
     """Swap one posture at a time, the best swap first, until none lowers the criterion.
 
     The required candidates stay, one measurement of each. A singular start stays too.
     """
-    rows = problem.rows
     chosen = np.array(start)
-    value = criterion_of(rows, chosen, points, criterion)
+    value = variances_of(problem, chosen, points, how).max()
     while np.isfinite(value):
         fixed = [int(np.flatnonzero(chosen == i)[0]) for i in problem.required]
         free = np.setdiff1d(np.arange(len(chosen)), fixed)
@@ -121,76 +130,55 @@ def _exchange(
         more = _room(problem, chosen)
         if not len(free) or not len(more):
             break
-        values = _after_swaps(
-            rows[chosen], rows[chosen[free]], rows[more], points, criterion
-        )
+        values = _after(problem, chosen, list(chosen[free]), more, points, how)
         i, j = divmod(int(values.argmin()), len(more))
         tried = chosen.copy()
         tried[free[i]] = more[j]
-        reached = criterion_of(rows, tried, points, criterion)
+        reached = variances_of(problem, tried, points, how).max()
         if not reached < value * (1.0 - 1e-9):
             break
         chosen, value = tried, reached
     return chosen, value
 
 
-def _after_swaps(
-    design: Array, out: Array, new: Array, points: Array, criterion: str
+def _after(
+    problem: Problem,
+    chosen: Indices,
+    out: list[int | None],
+    new: Indices,
+    points: Array,
+    how: str,
 ) -> Array:
-    """(free, more) criterion after each swap, by the Woodbury identity.
+    """(out, new) criterion after taking one out (None: nothing) and one in.
 
-    Taking x_i out and x_j in changes the variance v at z by ``-((1 - d_i) a_j^2 +
-    2 d_ij a_i a_j - (1 + d_j) a_i^2) / D`` with a = z.T M^-1 x, d likewise between the
-    two, and ``D = (1 - d_i)(1 + d_j) + d_ij^2`` the factor of the determinant.
-
-    Args:
-        design: (k, p) rows measured.
-        out: (free, p) those of them that may be swapped.
-        new: (more, p) rows that may come in.
-        points: (R, p) the region.
-        criterion: "G" or "I".
+    By the Woodbury identity: with U the blocks that go and come, V = M^-1 and S = -1
+    for a row that goes, 1 for one that comes, the variance at z falls by
+    ``a.T (S + U V U.T)^-1 a``, a = U V z, and that matrix is singular where the design
+    becomes so.
     """
-    inverse = np.linalg.inv(design.T @ design)
-    v = _variances(points, inverse)
-    a_out, a_new = points @ inverse @ out.T, points @ inverse @ new.T
-    d_out, d_new, d_both = (
-        _variances(out, inverse),
-        _variances(new, inverse),
-        out @ inverse @ new.T,
-    )
-    values = np.full(d_both.shape, np.inf)
-    for i in range(len(out)):
-        factor = (1.0 - d_out[i]) * (1.0 + d_new) + d_both[i] ** 2
-        sound = factor > 1e-9
-        a_i, a_j = a_out[:, i : i + 1], a_new[:, sound]
-        less = (
-            (1.0 - d_out[i]) * a_j**2
-            + 2.0 * d_both[i, sound] * a_i * a_j
-            - (1.0 + d_new[sound]) * a_i**2
-        )
-        values[i, sound] = CRITERIA[criterion](
-            v[:, None] - less / factor[sound], axis=0
-        )
+    blocks, (regions, outputs, p) = problem.blocks, points.shape
+    held = blocks[chosen].reshape(-1, p)
+    inverse = np.linalg.inv(held.T @ held + problem.prior)
+    rows = points.reshape(-1, p)
+    before = np.einsum("np,pq,nq->n", rows, inverse, rows)
+    values = np.full((len(out), len(new)), np.inf)
+    q = blocks.shape[1]
+    for row, i in enumerate(out):
+        gone = blocks[[] if i is None else [i]].reshape(-1, p)
+        u = np.empty((len(new), len(gone) + q, p))
+        u[:, : len(gone)], u[:, len(gone) :] = gone, blocks[new]
+        scaled = u @ inverse
+        sign = np.r_[-np.ones(len(gone)), np.ones(q)]
+        inner = np.diag(sign) + scaled @ np.matrix_transpose(u)
+        sound = np.abs(np.linalg.det(inner)) > 1e-9
+        along = scaled[sound] @ rows.T
+        less = (along * np.linalg.solve(inner[sound], along)).sum(axis=1)
+        after = (before - less).reshape(-1, regions, outputs)
+        values[row, sound] = CRITERIA[how](after, 1).max(axis=1)
     return values
-
-
-def _with_best_addition(
-    problem: Problem, previous: Indices, points: Array, criterion: str
-) -> Indices:
-    """One more measurement: ``v - a_j^2 / (1 + d_j)`` is the variance after j."""
-    design, more = problem.rows[previous], _room(problem, previous)
-    new, inverse = problem.rows[more], np.linalg.inv(design.T @ design)
-    less = (points @ inverse @ new.T) ** 2 / (1.0 + _variances(new, inverse))
-    value = CRITERIA[criterion](_variances(points, inverse)[:, None] - less, axis=0)
-    return np.append(previous, more[int(value.argmin())])
-
-
-def _variances(rows: Array, inverse: NDArray[np.floating]) -> Array:
-    """(N,) ``x.T M^-1 x`` of rows (N, p)."""
-    return np.asarray(np.einsum("ip,pq,iq->i", rows, inverse, rows))
 
 
 def _room(problem: Problem, indices: Indices) -> Indices:
     """Candidates that may be chosen once more."""
-    counts = np.bincount(indices, minlength=len(problem.rows))
+    counts = np.bincount(indices, minlength=len(problem.blocks))
     return np.flatnonzero(counts < problem.upper)

@@ -10,8 +10,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 import pathlib
-from collections.abc import Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,13 +29,9 @@ DECODINGS = ("greedy", "samples", "first", "exchange")
 Indices = NDArray[np.int64]
 
 
-class Network(Protocol):
-    """Chooses for problems of one shape: the same M, n, k and number of required."""
-
-    def __call__(
-        self, problems: Sequence[Problem], decoding: str, num: int, seed: int
-    ) -> Indices:
-        """(B, k) indices, the required first, then in the order of choice."""
+# From problems of one M, n, k and number of required, decoding, num and seed to (B, k)
+# indices, the required first, then in the order of choice.
+Network = Callable[[Sequence[Problem], str, int, int], Indices]
 
 
 @dataclasses.dataclass(frozen=True)

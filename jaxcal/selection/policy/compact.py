@@ -7,7 +7,7 @@ candidates, K choices in all, p regressors, w width of the network. Weights are 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -29,6 +29,7 @@ _RULE = 20.0  # multiple of the look-ahead in the rule that ``trust`` weighs
 _UNLEARNED = 2  # choices at the end that the look-ahead makes alone: they are exact
 _SHARP = 60.0  # inverse temperature of those
 _ONE = np.float32(1.0)
+_ONE_THREAD = 2**18  # multiplications up to which OpenBLAS uses one thread
 
 
 class _Sets(NamedTuple):
@@ -51,6 +52,26 @@ class _Decision(NamedTuple):
     moments: Array32  # (E, p (p + 1) / 2, M)
     ahead: Array  # (E, M)
     active: Array32  # (E, M) 1 or 0
+
+
+def _in_pieces(call: Callable[[slice], Indices], count: int, size: int) -> Indices:
+    """``call`` on slices of ``size`` of ``count``, on every core, joined."""
+    parts = [slice(begin, begin + size) for begin in range(0, count, size)]
+    if len(parts) == 1:
+        return call(parts[0])
+    # The kernel and numpy's products release the interpreter.
+    with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+        return np.concatenate(list(pool.map(call, parts)))
+
+
+def _product(a: Array32, b: Array32) -> Array32:
+    """``a @ b`` by rows of ``a``, few enough that BLAS starts no thread of its own.
+
+    Its threads wait for each other, so a busy core made a product 20 times slower.
+    """
+    size = max(1, _ONE_THREAD // (a.shape[-1] * b.shape[-1]))
+    begins = range(0, a.shape[-2], size)
+    return np.concatenate([a[..., i : i + size, :] @ b for i in begins], axis=-2)
 
 
 class CompactNetwork:
@@ -77,18 +98,12 @@ class CompactNetwork:
         tries = 1 if decoding == "greedy" else num
         size = max(1, _ROWS // (len(problems[0].rows) * tries))
 
-        def piece(begin: int) -> Indices:
-            some = problems[begin : begin + size]
-            draws = range(begin, begin + len(some)) if decoding == "samples" else ()
+        def piece(part: slice) -> Indices:
+            draws = range(len(problems))[part] if decoding == "samples" else ()
             streams = [np.random.default_rng((seed, b)) for b in draws]
-            return self._choose(some, decoding, num, streams)
+            return self._choose(problems[part], decoding, num, streams)
 
-        begins = range(0, len(problems), size)
-        if len(begins) == 1:
-            return piece(0)
-        # The kernel and numpy's products release the interpreter.
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            return np.concatenate(list(pool.map(piece, begins)))
+        return _in_pieces(piece, len(problems), size)
 
     def _choose(
         self,
@@ -123,7 +138,13 @@ class CompactNetwork:
         if decoding == "first":
             sets.chosen[:, r] = firsts.ravel()
             np.put_along_axis(sets.free, firsts.reshape(-1, 1), False, axis=1)
-        tries = self._completed(sets, first, generators).reshape(batch, num, k)
+
+        def piece(part: slice) -> Indices:
+            some = _Sets._make(each[part] for each in sets)
+            return self._completed(some, first, generators)
+
+        size = batch * num if generators else max(1, _ROWS // x.shape[2])
+        tries = _in_pieces(piece, batch * num, size).reshape(batch, num, k)
         picked = np.take_along_axis(rows[:, None], tries[..., None], axis=2)
         sign, value = np.linalg.slogdet(np.matrix_transpose(picked) @ picked)
         best = np.where(sign > 0, value, -np.inf).argmax(axis=1)
@@ -140,7 +161,7 @@ class CompactNetwork:
         chosen, free = sets.chosen, sets.free
         each = np.arange(len(chosen))
         for count in range(first, chosen.shape[1]):
-            scores = self._scores(sets, count)
+            scores = self._scores(sets, count, best_only=not generators)
             if generators:
                 shape = (len(each) // len(generators), free.shape[1])
                 # The largest of scores plus Gumbel noise is a draw from their softmax.
@@ -164,13 +185,18 @@ class CompactNetwork:
             h = self._round(name, h, seen)
         return h
 
-    def _scores(self, sets: _Sets, count: int) -> Array:
-        """(E, M) scores of the next choice after ``count``; lowest where not free."""
+    def _scores(self, sets: _Sets, count: int, best_only: bool = False) -> Array:
+        """(E, M) scores of the next choice after ``count``; lowest where not free.
+
+        With ``best_only`` all but the best may be too low where nothing is learned.
+        """
         x, h, chosen, free = sets
         p, k = x.shape[1], chosen.shape[1]
         left = k - count
-        seen = self._described(x, chosen[:, :count].copy(), free, k, left)
-        if left <= self._unlearned:
+        exact = left <= self._unlearned
+        only = exact and best_only
+        seen = self._described(x, chosen[:, :count].copy(), free, k, left, only)
+        if exact:
             return np.where(free, _SHARP * seen.ahead, -np.inf)
         each = np.arange(len(h))[:, None]
         mean = h[each, chosen[:, :count]].sum(axis=1) / np.float32(max(count, 1))
@@ -182,7 +208,8 @@ class CompactNetwork:
         g *= seen.active[..., None]
         for name in self._decoder:
             g = self._round(name, g, seen)
-        learned = self._normalised("final_norm", g) @ self._weights["actor.kernel"]
+        g = self._normalised("final_norm", g)
+        learned = np.einsum("emw,wo->emo", g, self._weights["actor.kernel"])
         rule = _RULE * seen.ahead
         if self._close_up:
             for scale in CLOSE:
@@ -191,14 +218,20 @@ class CompactNetwork:
         return np.where(free, scores, -np.inf)
 
     def _described(
-        self, x: Array, chosen: Indices, active: Mask, k: int, depth: int
+        self,
+        x: Array,
+        chosen: Indices,
+        active: Mask,
+        k: int,
+        depth: int,
+        best_only: bool = False,
     ) -> _Decision:
         episodes, p, m = x.shape
         features = np.empty((episodes, m, 16 if self._close_up else 13), np.float32)
         moments = np.empty((episodes, p * (p + 1) // 2, m), np.float32)
         ahead = np.empty((episodes, m))
         depth = min(depth, self._lookahead)
-        describe(x, chosen, active, k, depth, features, moments, ahead)
+        describe(x, chosen, active, k, depth, best_only, features, moments, ahead)
         return _Decision(features, moments, ahead, active.astype(np.float32))
 
     def _round(self, name: str, h: Array32, seen: _Decision) -> Array32:
@@ -206,16 +239,17 @@ class CompactNetwork:
         weights, width = self._weights, h.shape[2]
         mix = weights[f"{name}.mix.kernel"]
         u = self._normalised(f"{name}.norm", h)
-        active = seen.active[:, None]
-        mean = (active @ u)[:, 0] / np.maximum(active.sum(axis=2), _ONE)
+        number = np.maximum(seen.active.sum(axis=1), _ONE)[:, None]
+        mean = (u * seen.active[..., None]).sum(axis=1) / number
         shared = mean @ weights[f"{name}.pool.kernel"] + weights[f"{name}.mix.bias"]
-        inner = u @ mix[:width]
+        inner = _product(u, mix[:width])
         if self._messages:
-            sent = seen.moments @ (u @ weights[f"{name}.send.kernel"])
-            inner += np.matrix_transpose(seen.moments) @ (sent @ mix[width:])
+            sent: Array32 = seen.moments @ _product(u, weights[f"{name}.send.kernel"])
+            sent = sent @ mix[width:]
+            inner += _product(np.matrix_transpose(seen.moments), sent)
         inner += shared[:, None]
         np.maximum(inner, 0.0, out=inner)
-        out: Array32 = np.matmul(inner, weights[f"{name}.out.kernel"])
+        out = _product(inner, weights[f"{name}.out.kernel"])
         out += weights[f"{name}.out.bias"]
         out *= seen.active[..., None]
         out += h
@@ -224,7 +258,7 @@ class CompactNetwork:
     def _dense(self, name: str, each: Array32, shared: Array32) -> Array32:
         """(E, M, w) layer of (E, M, a) numbers of candidates beside (E, b) shared."""
         kernel, split = self._weights[f"{name}.kernel"], each.shape[2]
-        out = each @ kernel[:split]
+        out = _product(each, kernel[:split])
         out += (shared @ kernel[split:] + self._weights[f"{name}.bias"])[:, None]
         return out
 

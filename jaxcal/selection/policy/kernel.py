@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["CLOSE", "describe", "look_ahead"]
+__all__ = ["CLOSE", "conditional", "describe", "look_ahead"]
 
 Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
@@ -41,6 +41,7 @@ def describe(
     active: Mask,
     k: int,
     depth: int,
+    best_only: bool,
     features: Array32,
     moments: Array32,
     ahead: Array,
@@ -53,6 +54,7 @@ def describe(
         active: (E, M) True where a candidate counts.
         k: choices in all.
         depth: choices to look ahead, the next included; at least 1.
+        best_only: write ``ahead`` alone, and that as ``look_ahead`` says.
         features: (E, M, F) written, 0 where not active; the close-ups if F = 16.
         moments: (E, p (p + 1) / 2, M) written: second moments of what is left of the
             candidates, scaled so that messages keep their size.
@@ -61,14 +63,17 @@ def describe(
     episodes, p, m = x.shape
     values = np.empty((4, m))
     for b in range(episodes):
-        y = _conditional(x[b], chosen[b], active[b], k)
-        look_ahead(y, active[b], k > p, depth, values)
+        y = conditional(x[b], chosen[b], active[b], k)
+        look_ahead(y, active[b], k > p, depth, best_only, None, values)
         for d in range(4):
             best = _LOWEST
             for j in range(m):
                 best = max(best, values[d, j])
             for j in range(m):
                 values[d, j] = max(values[d, j] - best, _LOWEST)
+        ahead[b] = values[3]
+        if best_only:
+            continue
         number, total = 0, 0.0
         for j in range(m):
             number += active[b, j]
@@ -77,7 +82,6 @@ def describe(
         mean_square = max(total / max(number, 1), 1e-8)
         scale = 1.0 / (mean_square * math.sqrt(max(number, 1)))
         for j in range(m):
-            ahead[b, j] = values[3, j]
             square, f = 0.0, 0
             for c in range(p):
                 square += y[c, j] * y[c, j]
@@ -104,7 +108,7 @@ def describe(
 
 
 @_compiled
-def _conditional(x: Array, chosen: Indices, active: Mask, k: int) -> Any:
+def conditional(x: Array, chosen: Indices, active: Mask, k: int) -> Any:
     """(p, M) what is left of every active candidate once some are chosen, 0 elsewhere.
 
     With k = p every choice is a new direction, which leaves the other candidates. With
@@ -150,7 +154,15 @@ def _conditional(x: Array, chosen: Indices, active: Mask, k: int) -> Any:
 
 
 @_compiled
-def look_ahead(y: Array, active: Mask, spanned: bool, depth: int, values: Array) -> Any:
+def look_ahead(
+    y: Array,
+    active: Mask,
+    spanned: bool,
+    depth: int,
+    best_only: bool,
+    factors: Array | None,
+    values: Array,
+) -> Any:
     """Log of the factor by which the determinant grows over 1, 2, 3 and all choices,
     the first of them a given candidate and the others greedy.
 
@@ -164,8 +176,12 @@ def look_ahead(y: Array, active: Mask, spanned: bool, depth: int, values: Array)
         spanned: True where choosing i multiplies the determinant by ``1 + |y_i|^2``,
             False where by ``|y_i|^2``.
         depth: choices to look at, the start included; at least 1.
+        best_only: skip the starts that cannot lead furthest: gains only fall.
+        factors: (M, M), at most 1, what a move from each to each multiplies gains by
+            (the toll of its time); None where moves cost nothing.
         values: (4, M) written: after ``min(d, depth)`` choices for d = 1, 2, 3 and
-            ``depth``; -30 where not active, and after the first where not a start.
+            ``depth``; -30 (with factors ``-inf``) where not active, and after the first
+            where skipped.
     """
     p, m = y.shape
     base = 1.0 if spanned else 0.0
@@ -176,15 +192,20 @@ def look_ahead(y: Array, active: Mask, spanned: bool, depth: int, values: Array)
     for c in range(p):
         for j in range(m):
             square[j] += y[c, j] * y[c, j]
-    values[:] = _LOWEST
+    values[:] = _LOWEST if factors is None else -np.inf
     for j in range(m):
         if active[j]:
             values[0, j] = math.log(max(base + square[j], _LEAST_GAIN))
         else:
             square[j] = -1.0
     least = _least_start(square) if m > _ALL_START else 0.0
+    best, each = _LOWEST, 0.0
+    if best_only:
+        each = math.log(max(base + square.max(), _LEAST_GAIN))
     for i in range(m):
-        if square[i] < least:
+        if square[i] < least or (
+            best_only and values[0, i] + (depth - 1) * each < best
+        ):
             continue
         gains[:] = square
         reached, newest = values[0, i], i
@@ -205,14 +226,23 @@ def look_ahead(y: Array, active: Mask, spanned: bool, depth: int, values: Array)
                 rows[d, j] = row[j]
                 gains[j] -= row[j] * row[j]
                 gain = max(gain, gains[j])
-            newest = 0
-            while newest < m - 1 and gains[newest] != gain:
-                newest += 1
-            reached += math.log(max(base + gain, _LEAST_GAIN))
+            if factors is None:
+                newest = 0
+                while newest < m - 1 and gains[newest] != gain:
+                    newest += 1
+                reached += math.log(max(base + gain, _LEAST_GAIN))
+            else:
+                here, most = newest, -1.0
+                for j in range(m):
+                    grown = max(base + gains[j], _LEAST_GAIN) * factors[here, j]
+                    if gains[j] > -0.5 and grown > most:  # -1 where taken
+                        most, newest = grown, j
+                reached += math.log(most)
             if d < 3:
                 values[d, i] = reached
         for d in range(min(depth, 3), 4):
             values[d, i] = reached
+        best = max(best, reached)
 
 
 @_compiled

@@ -7,15 +7,10 @@ from numpy.typing import NDArray
 
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.fastest.refill import refills
-from jaxcal.selection.fastest.task import (
-    SAME_TIME,
-    Found,
-    Solver,
-    Task,
-    log_det_of_rows,
-)
+from jaxcal.selection.fastest.task import SAME_TIME, Search, Task
+from jaxcal.selection.solver import Found
 
-__all__ = ["local_search", "solver"]
+__all__ = ["local_search", "search"]
 
 Indices = NDArray[np.int64]
 
@@ -25,7 +20,7 @@ _KICK_TRIES = 50  # swaps drawn until one keeps the determinant
 _TRIED = 8  # most promising swaps that are put in their best order
 
 
-def solver(task: Task, seed: int) -> Solver:
+def search(task: Task, seed: int) -> Search:
     """Local search from several subsets, then from random changes of the best."""
 
     def solve(wanted: float) -> Found | None:
@@ -37,7 +32,7 @@ def solver(task: Task, seed: int) -> Solver:
             chosen, seconds = _shortened(task, _kicked(task, best, wanted, rng), wanted)
             if seconds < least - SAME_TIME:
                 best, least = chosen, seconds
-        return Found(best, "heuristic")
+        return Found(best, method="heuristic")
 
     return solve
 
@@ -47,7 +42,7 @@ def local_search(
 ) -> tuple[Indices | None, float]:
     """The fastest subset (k,) found from near-optimal ones, and its seconds of travel.
 
-    None and infinity where no start has the log det(X_s.T X_s) ``wanted``.
+    None and infinity where no start has the log det ``wanted``.
     """
     starts = [task.optimum] + [
         task.positions(exchange_indices(task.problem, 1, int(rng.integers(2**31))))
@@ -55,7 +50,7 @@ def local_search(
     ]
     best, least = None, np.inf
     for start in starts:
-        if log_det_of_rows(task.rows[start]) >= wanted:
+        if task.log_det(start) >= wanted:
             chosen, seconds = _shortened(task, start, wanted)
             if seconds < least - SAME_TIME:
                 best, least = chosen, seconds
@@ -68,11 +63,11 @@ def _kicked(
     """Up to two random swaps that keep the determinant, to leave a local optimum."""
     for _ in range(2):
         free = np.flatnonzero(chosen >= task.fixed)
-        others = np.setdiff1d(np.arange(len(task.rows)), chosen)
+        others = np.setdiff1d(np.arange(len(task.blocks)), chosen)
         for _ in range(_KICK_TRIES if len(free) and len(others) else 0):
             tried = chosen.copy()
             tried[rng.choice(free)] = rng.choice(others)
-            if log_det_of_rows(task.rows[tried]) >= wanted:
+            if task.log_det(tried) >= wanted:
                 chosen = tried
                 break
     return chosen
@@ -88,7 +83,7 @@ def _shortened(task: Task, start: Indices, wanted: float) -> tuple[Indices, floa
             for swap in refills(task, np.delete(tour, i), wanted, _TRIED + 1)
         ]
         for _, tried in sorted(swaps, key=lambda swap: swap[0])[:_TRIED]:
-            if log_det_of_rows(task.rows[tried]) >= wanted:
+            if task.log_det(tried) >= wanted:
                 shorter, reached = task.tour(tried)
                 if reached < seconds - SAME_TIME:
                     tour, seconds = shorter, reached
