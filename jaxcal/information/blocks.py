@@ -11,10 +11,14 @@ the last place of the numbers given, so encoder pulses far from zero keep their 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
+    "Whitened",
+    "largest_rank",
     "log_det_blocks",
     "missing_directions",
     "null_directions",
@@ -28,6 +32,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _EPS = float(np.finfo(np.float64).eps)
+_TINY = float(np.finfo(np.float64).tiny)
 
 
 def rank_rule(
@@ -48,22 +53,26 @@ def rank_rule(
     """
     num_rows, p = columns.shape[-2:]
     norms, flat, rounding = _norms(columns, largest, count or num_rows)
-    scaled = np.where(flat, 0.0, columns / np.where(flat, 1.0, norms))
-    singular = np.linalg.svd(scaled, compute_uv=False)
+    if flat.any():
+        columns, norms = np.where(flat, 0.0, columns), np.where(flat, 1.0, norms)
+    singular = np.linalg.svd(columns / norms, compute_uv=False)
     rank = (singular > rounding[..., None]).sum(axis=-1)
-    with np.errstate(divide="ignore"):
-        value = 2.0 * (np.log(singular).sum(axis=-1) + np.log(norms).sum(axis=(-1, -2)))
+    sizes = np.maximum(singular, _TINY)
+    value = 2.0 * (np.log(sizes).sum(axis=-1) + np.log(norms[..., 0, :]).sum(axis=-1))
     return rank, np.where(rank == p, value, -np.inf)
 
 
 def _norms(columns: Array, largest: Array, count: int) -> tuple[Array, Mask, Array]:
     """Column norms (..., 1, p), which are mere rounding, and the tolerance (...,)."""
-    norms = np.sqrt((columns * columns).sum(axis=-2, keepdims=True))
+    norms = np.sqrt(np.einsum("...ij,...ij->...j", columns, columns))
     resolution = _EPS * max(count, 1)
-    widths = largest[..., None, :]
-    flat = norms <= resolution * widths
-    rounding = (widths / np.where(flat, np.inf, norms)).max(axis=(-1, -2))
-    return norms, flat, resolution * np.maximum(8.0, rounding)
+    flat = norms <= resolution * largest
+    rounding = (largest / np.where(flat, np.inf, norms)).max(axis=-1)
+    return (
+        norms[..., None, :],
+        flat[..., None, :],
+        resolution * np.maximum(8.0, rounding),
+    )
 
 
 def null_directions(columns: Array, largest: Array) -> list[Array]:
@@ -75,8 +84,8 @@ def null_directions(columns: Array, largest: Array) -> list[Array]:
     norms, flat, tolerance = _norms(columns, largest, len(columns))
     norms, flat = norms[0], flat[0]
     scaled = np.where(flat, 0.0, columns / np.where(flat, 1.0, norms))
-    _, singular, right = np.linalg.svd(scaled)
-    singular = np.concatenate([singular, np.zeros(max(0, p - len(singular)))])
+    scaled = np.pad(scaled, ((0, max(0, p - len(scaled))), (0, 0)))
+    _, singular, right = np.linalg.svd(scaled, full_matrices=False)
     null = [np.eye(p)[i] for i in np.flatnonzero(flat)]
     free = right[singular <= tolerance][:, ~flat]
     if free.size:
@@ -113,28 +122,33 @@ def prior_root(precision: Array) -> Array:
     return np.sqrt(values[keep])[:, None] * vectors.T[keep] * scale
 
 
-def _stack(blocks: Array, usable: Mask | None, root: Array) -> tuple[Array, Array]:
-    """Centred rows (..., N q + r, p) of blocks and prior, and the largest entries."""
+def _stack(
+    blocks: Array, usable: Mask | None, root: Array
+) -> tuple[Array, Array, Array]:
+    """Centred rows (..., N q + r, p) of blocks and prior, and the largest entries.
+
+    The third is the map (..., p, p) that was subtracted: rows are ``B - B @ shift``.
+    """
     *batch, count, q, p = blocks.shape
-    number = count
-    first = blocks[..., :1, :, :]
-    same = blocks == first
-    if usable is not None:
+    if usable is None:
+        first = blocks[..., :1, :, :]
+        same = blocks == first
+        mean = blocks.mean(axis=-3)
+    else:
         weight = usable[..., None, None]
-        blocks = np.where(weight, blocks, 0.0)
-        number = usable.sum(axis=-1)[..., None, None]
+        blocks = blocks * weight
         at = usable.argmax(axis=-1)[..., None, None, None]
         first = np.take_along_axis(blocks, at, axis=-3)
         same = (blocks == first) | ~weight
+        mean = blocks.sum(axis=-3) / usable.sum(axis=-1)[..., None, None]
     same = same.all(axis=(-3, -2))[..., None, :]
-    constant = np.where(same, first[..., 0, :, :], 0.0)
-    mean = np.where(same, 0.0, blocks.sum(axis=-3) / number)
+    constant = first[..., 0, :, :] * same
     if q == 1:
         square = (constant * constant).sum(axis=-1, keepdims=True)
-        inverse = np.matrix_transpose(constant) / np.where(square > 0.0, square, 1.0)
+        inverse = np.matrix_transpose(constant) / np.maximum(square, _TINY)
     else:
         inverse = np.linalg.pinv(constant)
-    shift = inverse @ mean
+    shift = inverse @ (mean * ~same)
     centred = blocks - (constant @ shift)[..., None, :, :]
     if usable is not None:
         centred *= weight
@@ -144,7 +158,7 @@ def _stack(blocks: Array, usable: Mask | None, root: Array) -> tuple[Array, Arra
         moved = root - root @ shift
         rows = np.concatenate([rows, np.broadcast_to(moved, (*batch, *root.shape))], -2)
         largest = np.maximum(largest, np.abs(root).max(axis=0))
-    return rows, largest
+    return rows, largest, shift
 
 
 def log_det_blocks(blocks: Array, root: Array) -> Array:
@@ -157,24 +171,42 @@ def log_det_blocks(blocks: Array, root: Array) -> Array:
     Returns:
         (...,) natural log; -inf where singular.
     """
-    rows, largest = _stack(blocks, None, root)
+    rows, largest, _ = _stack(blocks, None, root)
     return rank_rule(rows, largest, blocks.shape[-3])[1]
 
 
 def rank_of_blocks(blocks: Array, root: Array) -> NDArray[np.int64]:
     """(...,) rank of the information of blocks (..., N, q, p) measured together."""
-    rows, largest = _stack(blocks, None, root)
+    rows, largest, _ = _stack(blocks, None, root)
     return rank_rule(rows, largest, blocks.shape[-3])[0]
+
+
+def largest_rank(blocks: Array) -> int:
+    """Of single blocks (N, q, p); the first is nearly always of full rank."""
+    full, none = min(blocks.shape[1:]), np.zeros((0, blocks.shape[2]))
+    for some in (blocks[:1], blocks):
+        rank = int(rank_of_blocks(some[:, None], none).max(initial=0))
+        if rank == full:
+            break
+    return rank
 
 
 def missing_directions(blocks: Array, root: Array) -> list[Array]:
     """Directions (p,) that neither blocks (N, q, p) nor the prior say anything of."""
-    return null_directions(*_stack(blocks, None, root))
+    return null_directions(*_stack(blocks, None, root)[:2])
 
 
-def whiten(
-    blocks: Array, usable: Mask, root: Array
-) -> tuple[Array, Array, Array, NDArray[np.int64]]:
+class Whitened(NamedTuple):
+    """S sets of blocks in coordinates where everything together has information I."""
+
+    blocks: Array  # (S, M, q, p), zero where not usable
+    prior: Array  # (S, p, p) precision
+    basis: Array  # (S, p, p): raw blocks times it are whitened
+    log_scale: Array  # (S,) log det of unwhitened less whitened information
+    singular: NDArray[np.int64]  # the sets whose information is; the rest is not theirs
+
+
+def whiten(blocks: Array, usable: Mask, root: Array) -> Whitened:
     """Blocks in coordinates where everything measured at once has information I.
 
     With T = prior + sum of the usable ``B_i.T @ B_i`` = R.T R the whitened block is
@@ -185,29 +217,44 @@ def whiten(
         blocks: (S, M, q, p) of S sets.
         usable: (S, M) which count.
         root: (r, p) of the prior precision.
-
-    Returns:
-        Whitened blocks (S, M, q, p), zero where not usable; the prior's precision
-        (S, p, p) in the same coordinates; log det T (S,); the sets that are singular.
     """
     num_sets, count, q, p = blocks.shape
-    rows, largest = _stack(blocks, None if usable.all() else usable, root)
-    scale = np.abs(rows).max(axis=1, keepdims=True)
-    orthonormal, r = np.linalg.qr(rows / np.where(scale == 0.0, 1.0, scale))
-    pivots = np.abs(np.diagonal(r, axis1=1, axis2=2))
+    everything = bool(usable.all())
+    rows, largest, shift = _stack(blocks, None if everything else usable, root)
+    norms = np.sqrt(np.einsum("sij,sij->sj", rows, rows))[:, None]
+    scale = np.where(norms == 0.0, 1.0, norms)
+    scaled = rows / scale
+    triangle = _triangle(scaled)
+    pivots = np.abs(np.diagonal(triangle, axis1=1, axis2=2))
     # A cheap test first: only a set that looks nearly singular pays for the rule.
-    doubtful = (scale[:, 0] < 1e-6 * largest).any(axis=1)
-    if pivots.shape[1] < p:
-        return blocks, blocks, np.zeros(num_sets), np.arange(num_sets)
-    doubtful |= (pivots < 1e-6).any(axis=1)
-    doubtful |= usable.sum(axis=1) * q + len(root) < p
+    doubtful = (norms[:, 0] < 1e-6 * largest).any(axis=1) | (pivots < 1e-6).any(axis=1)
     at = np.flatnonzero(doubtful)
     if at.size:
         at = at[np.isneginf(rank_rule(rows[at], largest[at], count)[1])]
+        triangle[at] = np.eye(p)
+    inverse = np.linalg.inv(triangle)
     with np.errstate(divide="ignore"):
         log_scale = 2.0 * np.log(pivots * scale[:, 0]).sum(axis=1)
-    white = orthonormal[:, : count * q].reshape(num_sets, count, q, p)
-    if not usable.all():  # zero but for rounding
-        white = white * usable[..., None, None]
-    of_prior = orthonormal[:, count * q :]
-    return white, np.matrix_transpose(of_prior) @ of_prior, log_scale, at
+    white = scaled @ inverse
+    of_prior = white[:, count * q :]
+    basis = inverse / np.matrix_transpose(scale)
+    return Whitened(
+        white[:, : count * q].reshape(num_sets, count, q, p),
+        np.matrix_transpose(of_prior) @ of_prior,
+        basis - shift @ basis,
+        log_scale,
+        at,
+    )
+
+
+def _triangle(rows: Array) -> Array:
+    """R (S, p, p) with ``R.T @ R = rows.T @ rows``, rows (S, R, p) of unit columns."""
+    p = rows.shape[-1]
+    try:  # twice as fast, and as exact where the columns are far from dependent
+        lower = np.linalg.cholesky(np.matrix_transpose(rows) @ rows)
+        if np.diagonal(lower, axis1=1, axis2=2).min() > 1e-3:
+            return np.matrix_transpose(lower)
+    except np.linalg.LinAlgError:
+        pass
+    short = max(0, p - rows.shape[1])
+    return np.linalg.qr(np.pad(rows, ((0, 0), (0, short), (0, 0))))[1]

@@ -19,8 +19,9 @@ name      definition, noise of unit variance on every output             better
 ``O5``    1 / (1/s_1 + ... + 1/s_L)                                       larger
 ========  =============================================================  ==========
 
-``s_i`` are the L = m p singular values of the regression matrix. D, A, E and O1 to O5
-depend on the unit of the commands; I and G do not, and neither does a ratio of two D.
+``s_i`` are the L = m p singular values of the regression matrix, the roots of the
+eigenvalues of S. D, A, E and O1 to O5 depend on the unit of the commands; I and G do
+not, and neither does a ratio of two D.
 
 Sources: Atkinson, Donev and Tobias, Optimum Experimental Designs (D, A, I, E, G);
 Nahvi and Hollerbach, The noise amplification index for optimal pose selection in robot
@@ -34,9 +35,10 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.information.blocks import log_det_blocks, whiten
 from jaxcal.information.regression import log_det_gram, regressors
 
-__all__ = ["Criteria", "criteria", "d_efficiency"]
+__all__ = ["Criteria", "block_criteria", "criteria", "d_efficiency"]
 
 Array = NDArray[np.float64]
 
@@ -95,36 +97,38 @@ def criteria(
             "commands must be (N, n) and region (R, n) with the same n, got "
             f"{z[..., :-1].shape} and {where[..., :-1].shape}"
         )
-    log_det = float(log_det_gram(z[:, :-1]))
-    if np.isneginf(log_det):
+    m = z.shape[1] - 1 if num_outputs is None else num_outputs
+    if np.isneginf(log_det_gram(z[:, :-1])):
         raise ValueError(
             "commands must not all lie in one plane: the information matrix of these "
             f"{len(z)} postures is singular"
         )
-    num_postures, p = z.shape
-    m = p - 1 if num_outputs is None else num_outputs
-    s = np.linalg.svd(z, compute_uv=False)
-    geometric_mean = float(np.exp(log_det / (2 * p)))
-    variance = _prediction_variance(z[:, :-1], where[:, :-1])
+    return block_criteria(z[:, None], np.zeros((0, z.shape[1])), where[:, None], m)
+
+
+def block_criteria(blocks: Array, root: Array, region: Array, times: int) -> Criteria:
+    """Every criterion of information that is not singular.
+
+    Args:
+        blocks: (N, q, p) measured.
+        root: (r, p) of the prior precision, r = 0 without one.
+        region: (R, q, p) where predictions are wanted, for I and G.
+        times: m, how often the eigenvalues of the information count.
+    """
+    p = blocks.shape[2]
+    s = np.linalg.svd(np.concatenate([blocks.reshape(-1, p), root]), compute_uv=False)
+    white = whiten(blocks[None], np.ones((1, len(blocks)), dtype=np.bool_), root)
+    variance = ((region @ white.basis[0]) ** 2).sum(axis=-1)
+    geometric_mean = float(np.exp(log_det_blocks(blocks, root) / (2 * p)))
     return Criteria(
         D=geometric_mean**2,
-        A=float(m * np.sum(s**-2.0)),
+        A=float(times * np.sum(s**-2.0)),
         I=float(variance.mean()),
         E=float(s[-1] ** 2),
         G=float(variance.max()),
-        O1=geometric_mean / float(np.sqrt(num_postures)),
+        O1=geometric_mean / float(np.sqrt(len(blocks))),
         O2=float(s[-1] / s[0]),
         O3=float(s[-1]),
         O4=float(s[-1] ** 2 / s[0]),
-        O5=float(1.0 / (m * np.sum(1.0 / s))),
+        O5=float(1.0 / (times * np.sum(1.0 / s))),
     )
-
-
-def _prediction_variance(commands: Array, region: Array) -> Array:
-    """(R,) ``z.T G^-1 z``, about the centroid to keep the digits of far commands."""
-    centre = commands.mean(axis=0)
-    offset = commands - centre
-    scale = np.abs(offset).max(axis=0)
-    r = np.linalg.qr(offset / scale)[1]
-    t = np.linalg.solve(r.T, ((region - centre) / scale).T)
-    return 1.0 / len(commands) + np.sum(t**2, axis=0)

@@ -10,8 +10,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxcal.checks import one_of, seconds
+from jaxcal.models.model import Model
+from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.exact.exact import TIME_LIMIT, solve_exact
-from jaxcal.selection.problem import Problem, make_block_problem, make_problem
+from jaxcal.selection.problem import (
+    Problem,
+    make_block_problem,
+    make_problem,
+    values,
+)
 from jaxcal.selection.result import Selection, Subset
 from jaxcal.selection.solver import Found
 from jaxcal.selection.solvers import SOLVERS, checked_options
@@ -19,7 +26,7 @@ from jaxcal.selection.solvers import SOLVERS, checked_options
 __all__ = ["score", "select"]
 
 _REFERENCES = ("bound", "exact")
-_PROVEN = 1e-9  # log det S this near a proven optimum is that optimum
+_PROVEN = 1e-9  # a value this near a proven optimum, relative above 1, is that optimum
 
 
 def select(
@@ -27,8 +34,14 @@ def select(
     k: int | None = None,
     method: str = "auto",
     *,
+    model: Model | None = None,
     blocks: ArrayLike | None = None,
-    prior: ArrayLike | None = None,
+    prior: Prior | ArrayLike | None = None,
+    noise: Noise | None = None,
+    criterion: str | None = None,
+    parameters: Sequence[str | int] | None = None,
+    region: ArrayLike | None = None,
+    measured: ArrayLike | None = None,
     names: Sequence[str] | None = None,
     available: ArrayLike | None = None,
     required: ArrayLike | None = None,
@@ -44,19 +57,30 @@ def select(
     decoding: str = "greedy",
     num: int = 16,
 ) -> Selection:
-    """Choose the k candidates whose information matrix has the largest determinant.
+    """Choose the k candidates whose measurements say most about the parameters.
 
     Args:
-        candidates: (M, n) commands that could be measured, in any unit, of the affine
-            model ``y = A u + b``; an array or a data frame, whose labels are kept. Rows
-            that are not available may hold NaN.
+        candidates: (M, n) commands that could be measured, in any unit; an array or a
+            data frame, whose labels are kept. Rows that are not available may hold NaN.
         k: candidates to choose; the fewest that identify (n + 1) when not given.
         method: "auto" (the cheapest way to an answer proven to have
             ``least_efficiency``), "exact" (proven), "exchange" (near-optimal),
-            "greedy", "random" or "policy" (the trained network).
+            "greedy", "random" or "policy" (the trained network; affine model, D).
+        model: of ``jaxcal.models``; ``y = A u + b`` when not given.
         blocks: (M, q, p) instead of candidates, for any model: candidate i gives q
             readings ``B_i theta`` with noise of unit variance.
-        prior: with blocks, (p, p) precision of what is known of theta beforehand.
+        prior: a ``jaxcal.Prior`` of the model's parameters, its own default when not
+            given; with blocks, (p, p) precision of what is known of theta beforehand.
+        noise: a ``jaxcal.Noise``; of unit variance when not given.
+        criterion: "D" (joint uncertainty of the parameters), "A" (sum of their
+            variances), "I" (mean variance of the predictions over ``region``), "E" (the
+            worst-known combination), "Ds" or "As" (of ``parameters`` alone). D for the
+            affine model and for blocks, I for other models.
+        parameters: names or indices of the parameters of interest, for Ds and As.
+        region: (R, n) commands, or (R, q, p) blocks, at which predictions are wanted,
+            for I; the available candidates when not given.
+        measured: (N, n) commands, or (N, q, p) blocks, measured already: their
+            information is there, and k counts the new ones.
         names: (M,) names of the candidates, for the answer.
         available: (M,) bool, True where a candidate may be chosen; all when not given.
         required: (r,) candidates that must be among the chosen.
@@ -64,14 +88,14 @@ def select(
         num_outputs: m, as many as inputs when not given; log det S is m times that of
             the (n + 1) x (n + 1) matrix. With blocks, how often log det counts, 1.
         reference: what ``bound`` and ``efficiency`` are measured against, "bound" (the
-            cheapest upper bound, computed when read) or "exact" (the proven optimum).
+            cheapest bound, computed when read) or "exact" (the proven optimum).
         seed: whole number or numpy Generator; of all methods but greedy.
-        restarts: random starts of exchange (200, or 400 with replicates, when not
-            given), and of the one that starts exact and auto (30).
+        restarts: starts of exchange, and of the one that starts exact and auto; see
+            ``exchange.default_restarts`` for how many when not given, 30 with these.
         time_limit: seconds after which exact and auto return the best found with a true
             ``bound``, not proven; 10 when not given, ``math.inf`` for none.
         best: of exact, how many best subsets to prove, in ``alternatives``.
-        least_efficiency: of auto, the D-efficiency in (0, 1] that suffices.
+        least_efficiency: of auto, the efficiency in (0, 1] that suffices.
         checkpoint: of policy, folder of a trained one; that which ships when not given.
         decoding: of policy, how it chooses, see ``jaxcal.selection.policy``.
         num: of policy, decodings tried, where ``decoding`` tries several.
@@ -92,23 +116,13 @@ def select(
     also = ("time_limit",) if reference == "exact" else ()
     options = checked_options(method, given, also)
     start = time.perf_counter()
-    rules: dict[str, Any] = {
-        "available": available,
-        "required": required,
-        "max_replicates": max_replicates,
-        "num_outputs": num_outputs,
-    }
-    if (candidates is None) == (blocks is None):
-        got = "neither" if blocks is None else "both"
-        raise ValueError(f"either candidates or blocks must be given, got {got}")
-    axes = None
-    if blocks is not None:
-        problem = make_block_problem(blocks, k, prior=prior, **rules)
-    elif prior is not None:
-        raise ValueError("prior must come with blocks, whose parameters it is about")
-    else:
-        names, axes = _labels(candidates, names)
-        problem = make_problem(candidates, k, **rules)  # type: ignore[arg-type]  # not None
+    names, axes = _labels(candidates, names)
+    problem = _problem(
+        candidates, k, blocks, model=model, prior=prior, noise=noise,
+        criterion=criterion, parameters=parameters, region=region, measured=measured,
+        available=available, required=required, max_replicates=max_replicates,
+        num_outputs=num_outputs,
+    )  # fmt: skip
     names = _checked_names(names, len(problem.blocks))
     found = SOLVERS[method].solve(problem, **options)
     return _selection(
@@ -117,7 +131,7 @@ def select(
 
 
 def score(
-    candidates: ArrayLike,
+    candidates: ArrayLike | None,
     indices: ArrayLike,
     *,
     available: ArrayLike | None = None,
@@ -125,11 +139,12 @@ def score(
     reference: str = "bound",
     max_replicates: int | None = None,
     time_limit: float | None = None,
+    **about: Any,
 ) -> Selection:
     """Judge a subset made elsewhere as if a solver had returned it.
 
     Args:
-        candidates: (M, n), in any unit; an array or a data frame.
+        candidates: (M, n), in any unit; an array or a data frame. None with blocks.
         indices: (k,) the subset; repeated entries are replicates.
         available: (M,) bool, True where a candidate could have been chosen.
         num_outputs: m; as many as inputs when not given.
@@ -137,6 +152,8 @@ def score(
         max_replicates: the cap that the optimum is allowed; as often as the subset
             repeats a candidate when not given.
         time_limit: seconds for ``reference="exact"``, 10 when not given.
+        about: model, blocks, prior, noise, criterion, parameters, region and measured,
+            as in :func:`select`.
 
     Raises:
         ValueError: also where the subset is singular.
@@ -152,8 +169,10 @@ def score(
             f"{subset.shape} and dtype {subset.dtype}"
         )
     if len(subset) == 0:
-        raise ValueError("indices must name at least n + 1 candidates, got none")
-    num_candidates = len(np.atleast_1d(np.asarray(candidates, dtype=object)))
+        raise ValueError("indices must name at least one candidate, got none")
+    blocks = about.pop("blocks", None)
+    offered = candidates if blocks is None else blocks
+    num_candidates = len(np.atleast_1d(np.asarray(offered, dtype=object)))
     outside = (subset < 0) | (subset >= num_candidates)
     if outside.any():
         raise ValueError(
@@ -161,13 +180,11 @@ def score(
         )
     repeats = int(np.unique(subset, return_counts=True)[1].max())
     names, axes = _labels(candidates, None)
-    problem = make_problem(
-        candidates,
-        len(subset),
-        available=available,
-        max_replicates=repeats if max_replicates is None else max_replicates,
-        num_outputs=num_outputs,
-    )
+    cap = repeats if max_replicates is None else max_replicates
+    problem = _problem(
+        candidates, len(subset), blocks, available=available, max_replicates=cap,
+        num_outputs=num_outputs, **about,
+    )  # fmt: skip
     if repeats > problem.max_replicates:
         raise ValueError(
             f"indices must repeat a candidate at most {problem.max_replicates} times, "
@@ -183,6 +200,22 @@ def score(
     )
 
 
+def _problem(
+    candidates: ArrayLike | None, k: int | None, blocks: ArrayLike | None, **given: Any
+) -> Problem:
+    """The problem of candidates and a model, or of blocks."""
+    if (candidates is None) == (blocks is None):
+        got = "neither" if blocks is None else "both"
+        raise ValueError(f"either candidates or blocks must be given, got {got}")
+    if candidates is not None:
+        return make_problem(candidates, k, **given)
+    if given.pop("model", None) is not None:
+        raise ValueError("model must come with candidates, not with blocks")
+    if isinstance(given.get("prior"), Prior):
+        raise ValueError("prior must be a (p, p) precision with blocks, got a Prior")
+    return make_block_problem(blocks, k, **given)  # type: ignore[arg-type]  # not None
+
+
 def _selection(
     problem: Problem,
     found: Found,
@@ -193,9 +226,11 @@ def _selection(
     **labels: tuple[str, ...] | None,
 ) -> Selection:
     """Judge what a solver found; with ``reference="exact"`` also find the optimum."""
-    indices, log_det = found.indices, found.log_det
-    if log_det is None:
-        log_det = problem.log_det(indices)
+    indices, value = found.indices, found.value
+    if value is None or problem.criterion.name != "D":
+        value, log_det = (float(each[0]) for each in values(problem, indices[None]))
+    else:
+        log_det = value
     if np.isneginf(log_det):
         name = "indices" if method == "score" else "method"
         what = "" if method == "score" else f", which {method!r} returned"
@@ -208,11 +243,14 @@ def _selection(
     if reference == "exact" and not proven:
         deadline = time.perf_counter() + (time_limit or TIME_LIMIT)
         optimum = solve_exact(problem, deadline=deadline)
-        bound = optimum.bound if bound is None else min(bound, optimum.bound)
-        proven = optimum.proven and log_det >= optimum.bound - _PROVEN
-    subsets = found.alternatives or ((indices, log_det),)
+        bounds = [optimum.bound] if bound is None else [optimum.bound, bound]
+        bound = min(bounds) if problem.criterion.larger_is_better else max(bounds)
+        near = abs(value - optimum.bound) <= _PROVEN * max(1.0, abs(optimum.bound))
+        proven = optimum.proven and near
+    subsets = found.alternatives or ((indices, value),)
     return Selection(
         indices=indices,
+        value=value,
         log_det=log_det,
         method=found.method or method,
         proven=proven,

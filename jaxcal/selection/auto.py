@@ -7,11 +7,9 @@ as soon as its bound proves the best selection found (by exchange, at first) to 
 
 from __future__ import annotations
 
-import math
 import time
 
 from jaxcal.checks import share
-from jaxcal.information.criteria import d_efficiency
 from jaxcal.selection.exact.exact import (
     STARTING_RESTARTS,
     TIME_LIMIT,
@@ -44,24 +42,24 @@ def solve(
     """
     limit = time_limit or TIME_LIMIT
     restarts = restarts or STARTING_RESTARTS
-    enough = -problem.num_parameters * math.log(least_efficiency)
     deadline = time.perf_counter() + limit
-    result = solve_exact(problem, 1, deadline, restarts, seed, enough)
-    log_det = float(result.log_dets[0])
-    proven_share = d_efficiency(log_det, result.bound, problem.num_parameters)
+    result = solve_exact(problem, 1, deadline, restarts, seed, least_efficiency)
+    name = f"{problem.criterion.name}-efficiency"
+    proven_share = problem.criterion.efficiency(float(result.values[0]), result.bound)
+    close = proven_share >= least_efficiency
     if result.proven:
         reason = "the exact search proved this optimum"
-    elif result.bound - log_det <= enough:
+    elif close:
         reason = (
-            f"the bound proves a D-efficiency of at least {proven_share:.6f}, and "
+            f"the bound proves a {name} of at least {proven_share:.6f}, and "
             f"{least_efficiency:g} was asked for"
         )
     else:
         reason = (
-            f"the exact search ran out of time after {limit:g} s with a D-efficiency "
+            f"the exact search ran out of time after {limit:g} s with a {name} "
             f"of at least {proven_share:.6f} proven; {least_efficiency:g} was asked for"
         )
-    stopped = not result.proven and result.bound - log_det <= enough
+    stopped = not result.proven and close
     return as_found(
         result,
         method="exchange" if stopped else "exact",

@@ -67,10 +67,10 @@ def _solve(
     assert solve_many is not None, method
     found = solve_many(problems, **options)
     indices = np.stack([one.indices for one in found])
-    if found[0].log_det is None:
+    if found[0].value is None:
         values = log_dets(problems, indices[:, None])[:, 0]
     else:
-        values = np.array([one.log_det for one in found])
+        values = np.array([one.value for one in found])
     singular = np.flatnonzero(np.isneginf(values))
     if singular.size:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Greedy selection: one posture at a time, the largest gain in log det first."""
+"""Greedy selection: one candidate at a time, the largest gain first."""
 
 from __future__ import annotations
 
@@ -23,8 +23,10 @@ def solve(problem: Problem) -> Found:
 
 def solve_many(problems: list[Problem]) -> list[Found]:
     """All problems of a batch at once; they share their shapes."""
+    if not problems[0].rank_one:
+        return [solve(problem) for problem in problems]
     picks = _greedy(
-        np.stack([problem.blocks for problem in problems]),
+        np.stack([problem.rows for problem in problems]),
         np.stack([problem.prior for problem in problems]),
         np.stack([problem.upper for problem in problems]),
         problems[0].k,
@@ -34,23 +36,31 @@ def solve_many(problems: list[Problem]) -> list[Found]:
 
 
 def greedy_indices(problem: Problem) -> Indices:
-    """(k,) candidates in the order picked, the required ones first."""
-    return solve_many([problem])[0].indices
+    """(k,) candidates in the order picked, the required ones first.
+
+    For E the gain is that in the sum of the variances, which is at most p times and at
+    least once the largest: an incomplete selection has no least eigenvalue to raise.
+    """
+    if problem.rank_one:
+        return solve_many([problem])[0].indices
+    from jaxcal.selection.exchange.blocks import Blocks
+
+    return Blocks(problem).greedy()
 
 
 def _greedy(
-    blocks: Array, prior: Array, upper: Indices, k: int, required: Indices
+    rows: Array, prior: Array, upper: Indices, k: int, required: Indices
 ) -> Indices:
     """Complete partial selections greedily, a batch at a time.
 
-    The gain of candidate i is ``det(I + B_i V B_i.T)``, V the inverse of ridge, prior
-    and what is chosen. As the ridge goes to zero the first gains are the volumes that
-    blocks add outside the span of the chosen, the later ones those without a ridge.
-    Whitened blocks leave 1/M of some block outside every incomplete span, so with one
-    reading per candidate the result is never singular.
+    The gain of candidate i is ``x_i.T V x_i``, V the inverse of ridge, prior and what
+    is chosen. As the ridge goes to zero the first gains are the lengths that rows add
+    outside the span of the chosen, the later ones those without a ridge. Whitened rows
+    leave 1/M of some row outside every incomplete span, so the result is never
+    singular.
 
     Args:
-        blocks: (B, M, q, p) whitened.
+        rows: (B, M, p) whitened.
         prior: (B, p, p).
         upper: (B, M) how often each candidate may be chosen.
         k: candidates per set.
@@ -59,27 +69,20 @@ def _greedy(
     Returns:
         (B, k), the required first, then in the order picked.
     """
-    num_sets, num_candidates, q, p = blocks.shape
+    num_sets, num_candidates, p = rows.shape
     each = np.arange(num_sets)
     room = upper.copy()
     np.subtract.at(room, (each[:, None], required), 1)
-    chosen = np.take_along_axis(blocks, required[..., None, None], axis=1)
-    rows = blocks.reshape(num_sets, -1, p)
-    kept = chosen.reshape(num_sets, -1, p)
+    kept = np.take_along_axis(rows, required[..., None], axis=1)
     gram = np.matrix_transpose(kept) @ kept + prior
     gram = gram + (_RIDGE * p / num_candidates) * np.eye(p)
     picks = np.zeros((num_sets, k), dtype=np.int64)
     picks[:, : required.shape[1]] = required
     for step in range(required.shape[1], k):
-        scaled = rows @ np.linalg.inv(gram)
-        if q == 1:
-            gain = np.einsum("bmp,bmp->bm", scaled, rows)
-        else:
-            inner = scaled.reshape(blocks.shape) @ np.matrix_transpose(blocks)
-            gain = np.linalg.slogdet(np.eye(q) + inner)[1]
+        gain = np.einsum("bmp,bmp->bm", rows @ np.linalg.inv(gram), rows)
         pick = np.where(room > 0, gain, -np.inf).argmax(axis=1)
-        block = blocks[each, pick]
-        gram = gram + np.matrix_transpose(block) @ block
+        row = rows[each, pick]
+        gram = gram + row[:, :, None] * row[:, None]
         room[each, pick] -= 1
         picks[:, step] = pick
     return picks

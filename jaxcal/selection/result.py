@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.checks import axis_names
-from jaxcal.information.criteria import Criteria, criteria, d_efficiency
+from jaxcal.information.criteria import Criteria, block_criteria
 from jaxcal.selection.problem import Problem
 
 if TYPE_CHECKING:
@@ -20,12 +20,26 @@ __all__ = ["BatchSelection", "Selection", "Subset"]
 
 Indices = NDArray[np.int64]
 
+_VALUES = {  # what is printed before the value of a criterion; V is a covariance
+    "D": "log det S",
+    "A": "trace V",
+    "I": "mean variance",
+    "E": "eigenvalue",
+    "Ds": "log det V^-1",
+    "As": "trace V",
+}
+
 
 class Subset(NamedTuple):
     """One subset and its worth."""
 
     indices: Indices  # (k,)
-    log_det: float  # natural log det S, in the candidates' unit
+    value: float  # of the criterion
+
+    @property
+    def log_det(self) -> float:
+        """``value`` under the name it has where the criterion is D."""
+        return self.value
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -36,7 +50,8 @@ class Selection:
     """
 
     indices: Indices  # (k,) into the candidates, in the order picked
-    log_det: float  # natural log det S, in the candidates' unit
+    value: float  # of the criterion, in the caller's units
+    log_det: float  # natural log det S, the value of D, whatever the criterion
     method: str  # the solver that answered, or "score" for a subset made elsewhere
     proven: bool  # True: no selection is better by more than 1e-9
     seconds: float  # wall time of the solver
@@ -55,9 +70,9 @@ class Selection:
             indices.flags.writeable = False
 
     @property
-    def value(self) -> float:
-        """Of the criterion, D: ``log_det``."""
-        return self.log_det
+    def criterion(self) -> str:
+        """D, A, I, E, Ds or As."""
+        return self.problem.criterion.name
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -67,38 +82,38 @@ class Selection:
 
     @cached_property
     def bound(self) -> float:
-        """Upper bound on log det S of every selection allowed.
+        """No selection allowed has a better value: an upper bound, of A, As, I a lower.
 
         The proven optimum where the solver or ``reference="exact"`` gave one, or where
         k = n + 1 makes it cheap; otherwise the concave relaxation.
         """
-        if self.known_bound is not None:
-            return max(self.known_bound, self.log_det)
-        from jaxcal.selection.exact.exact import upper_bound
+        bound = self.known_bound
+        if bound is None:
+            from jaxcal.selection.exact.exact import upper_bound
 
-        return max(upper_bound(self.problem), self.log_det)
+            bound = upper_bound(self.problem)
+        better = max if self.problem.criterion.larger_is_better else min
+        return better(bound, self.value)
 
     @property
     def gap(self) -> float:
-        """``bound - log_det``, zero where optimality is proven."""
-        return self.bound - self.log_det
+        """How far the value is from ``bound``, zero where optimality is proven."""
+        return abs(self.bound - self.value)
 
     @property
     def efficiency(self) -> float:
-        """D-efficiency against ``bound``: at least this share of the best possible."""
-        return d_efficiency(self.log_det, self.bound, self.problem.num_parameters)
+        """Against ``bound``: at least this share of the best possible value.
+
+        ``exp((value - bound) / s)`` for s parameters of interest (D, Ds), else a ratio.
+        """
+        return self.problem.criterion.efficiency(self.value, self.bound)
 
     @cached_property
-    def criteria(self) -> Criteria | None:
-        """D, A, I, E, G and O1 to O5; I and G over the available candidates.
-
-        None where blocks were given, not candidates.
-        """
-        candidates = self.problem.candidates
-        if candidates is None:
-            return None
-        region = candidates[self.problem.available]
-        return criteria(candidates[self.indices], region, self.problem.num_outputs)
+    def criteria(self) -> Criteria:
+        """D, A, I, E, G and O1 to O5; I and G over the available candidates."""
+        problem = self.problem
+        chosen, region = problem.raw[self.indices], problem.raw[problem.available]
+        return block_criteria(chosen, problem.root, region, problem.multiplicity)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, text and lists, as a JSON file takes them."""
@@ -108,6 +123,8 @@ class Selection:
             "indices": self.indices.tolist(),
             "labels": list(self.labels),
             "candidates": chosen,
+            "criterion": self.criterion,
+            "value": self.value,
             "log_det": self.log_det,
             "bound": self.bound,
             "efficiency": self.efficiency,
@@ -157,13 +174,14 @@ class Selection:
             for row in (head, *cells)
         ]
         count = int(self.problem.available.sum())
-        best = "proven optimal" if self.proven else f"upper bound {self.bound:.6g}"
+        side = "upper" if self.problem.criterion.larger_is_better else "lower"
+        best = "proven optimal" if self.proven else f"{side} bound {self.bound:.6g}"
         extra = "" if self.seed is None else f", seed {self.seed}"
         lines = [
             f"{len(self.indices)} of {count} candidates, method {self.method}",
             *lines,
-            f"log det S     {self.log_det:.6g} ({best})",
-            f"D-efficiency  {self.efficiency:.6f}"
+            f"{_VALUES[self.criterion]:13} {self.value:.6g} ({best})",
+            f"{self.criterion + '-efficiency':13} {self.efficiency:.6f}"
             + ("" if self.proven else " or more"),
             f"time          {1e3 * self.seconds:.3g} ms{extra}",
         ]

@@ -25,8 +25,8 @@ class Found:
     """A solver's answer; what it leaves out is judged by the caller."""
 
     indices: NDArray[np.int64]  # (k,) in the order picked
-    log_det: float | None = None  # natural log det S, in the caller's units
-    bound: float | None = None  # upper bound on log det S of every selection allowed
+    value: float | None = None  # of the criterion, as reported to the caller
+    bound: float | None = None  # no selection allowed has a better value
     proven: bool = False  # no selection is better by more than 1e-9
     nodes: int | None = None  # branch-and-bound nodes, or subsets enumerated
     alternatives: tuple[tuple[NDArray[np.int64], float], ...] = ()  # best first

@@ -45,6 +45,11 @@ def _policy(
             'blocks cannot be used with method "policy", which is trained on '
             "candidates of the affine model; use auto, exact or exchange"
         )
+    if not problem.rank_one or len(problem.root) or problem.raw[0, 0, -1] != 1.0:
+        raise ValueError(
+            'method must be auto, exact or exchange here: "policy" is trained on the '
+            "affine model, criterion D and nothing known beforehand"
+        )
     if problem.max_replicates > 1:
         raise ValueError(
             'max_replicates must be 1 with method "policy", which picks distinct '

@@ -2,9 +2,9 @@
 
 k = n + 1 affine postures: the absolute determinant is convex in each posture, so only
 vertices of the convex hull matter, and :mod:`jaxcal.selection.exact.volume` finds the
-largest volume. Everything else (more postures, blocks, priors, many runners-up) goes to
-branch and bound, started from the exchange. The runner-up need not lie on the hull, so
-``best`` > 1 does without it.
+largest volume. Everything else (more postures, blocks, priors, other criteria, many
+runners-up) goes to branch and bound, started from the exchange. The runner-up need not
+lie on the hull, so ``best`` > 1 does without it.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.selection.exact.branch_and_bound import branch_and_bound, relaxed_bound
+from jaxcal.selection.exact.branch_and_bound import branch_and_bound
 from jaxcal.selection.exact.volume import enumeration_cost, largest_volumes
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.greedy import greedy_indices
-from jaxcal.selection.problem import Problem, log_dets, make_block_problem
+from jaxcal.selection.problem import Problem, make_block_problem, values
 from jaxcal.selection.solver import Found, in_threads
 
 __all__ = ["STARTING_RESTARTS", "ExactResult", "solve", "solve_exact", "upper_bound"]
@@ -41,8 +41,8 @@ class ExactResult:
     """The best selections and the proof."""
 
     subsets: Indices  # (found, k), each sorted, best first; none of them singular
-    log_dets: Array  # (found,) natural log det S
-    bound: float  # upper bound on log det S of every selection, log_dets[0] if proven
+    values: Array  # (found,) of the criterion, as reported
+    bound: float  # no selection has a better value; values[0] if proven
     nodes: int  # branch-and-bound nodes, or subsets enumerated
     proven: bool
 
@@ -77,11 +77,11 @@ def as_found(result: ExactResult, **record: Any) -> Found:
     """What the protocol wants to know."""
     return Found(
         indices=result.subsets[0],
-        log_det=float(result.log_dets[0]),
+        value=float(result.values[0]),
         bound=result.bound,
         proven=result.proven,
         nodes=result.nodes,
-        alternatives=tuple(zip(result.subsets, result.log_dets.tolist(), strict=True)),
+        alternatives=tuple(zip(result.subsets, result.values.tolist(), strict=True)),
         **record,
     )
 
@@ -92,7 +92,7 @@ def solve_exact(
     deadline: float | None = None,
     restarts: int = STARTING_RESTARTS,
     seed: int = 0,
-    enough: float = 0.0,
+    enough: float | None = None,
 ) -> ExactResult:
     """The ``best`` selections, or the best found by ``deadline`` and a true bound.
 
@@ -101,7 +101,7 @@ def solve_exact(
         best: how many selections to prove.
         deadline: ``time.perf_counter()`` at which to stop.
         restarts, seed: of the exchange that starts branch and bound.
-        enough: gap in log det S at which to stop, unless the proof is cheap.
+        enough: efficiency in (0, 1] at which to stop, unless the proof is cheap.
     """
     if problem.simplex:
         pool = _pool(problem, hull=best == 1)
@@ -112,23 +112,27 @@ def solve_exact(
                 start = np.sort(exchange_indices(problem, restarts, seed))
                 relaxed = _relaxed(problem, start)
                 result = _result(problem, [start], best, relaxed, 1)
-                if result.bound - result.log_dets[0] <= enough:
+                value = float(result.values[0])
+                if problem.criterion.efficiency(value, result.bound) >= enough:
                     return result
             return _enumerate(problem, pool, best, deadline)
-    if deadline is not None and not _load.cache_info().currsize:
-        deadline += _load()
+    if deadline is not None:
+        misses = _load.cache_info().misses
+        seconds = _load(problem.rank_one)
+        deadline += seconds if _load.cache_info().misses > misses else 0.0
     start = exchange_indices(problem, restarts, seed)
     groups = _groups(problem, merge=best == 1)
     first = np.array([members[0] for members in groups])
     found = branch_and_bound(
         problem.blocks[first],
-        problem.prior.copy(),
+        problem.prior,
+        problem.criterion,
         _sums(problem.lower, groups),
         np.minimum(_sums(problem.upper, groups), problem.k),
         _sums(np.bincount(start, minlength=len(problem.blocks)), groups),
         best,
         deadline,
-        enough / problem.multiplicity,
+        enough,
     )
     subsets = [_expand(problem, groups, counts) for counts in found.counts]
     bound = None if found.proven else found.bound
@@ -136,35 +140,41 @@ def solve_exact(
 
 
 @functools.cache
-def _load() -> float:
+def _load(rank_one: bool) -> float:
     """Compile or load the search; seconds it took, which no time limit should count."""
     begun = time.perf_counter()
-    solve_exact(make_block_problem(np.eye(2)[[0, 1, 0, 1], None], 3), best=9)
+    blocks = np.eye(2)[[0, 1, 0, 1], None].repeat(1 if rank_one else 2, axis=1)
+    solve_exact(make_block_problem(blocks, 3), best=9)
     return time.perf_counter() - begun
 
 
 def upper_bound(problem: Problem) -> float:
-    """Upper bound on log det S: the optimum where that is cheap, or the relaxation."""
+    """The value that no selection betters: the optimum if cheap, or the relaxation's.
+
+    As reported: of A, As and I a lower bound.
+    """
     if problem.simplex:
         pool = _pool(problem, hull=True)
         free = problem.k - len(problem.required)
         if enumeration_cost(len(pool), free) <= _CHEAP:
             return _enumerate(problem, pool, 1, None).bound
     relaxed = _relaxed(problem, greedy_indices(problem))
-    return problem.multiplicity * (relaxed + problem.log_scale)
+    return float(problem.criterion.reported(relaxed))
 
 
 def _relaxed(problem: Problem, start: Indices) -> float:
-    """Upper bound on the whitened log det, from a selection (k,) to climb from."""
+    """Upper bound on phi of the criterion, from a selection (k,) to climb from."""
     keep = np.flatnonzero(problem.available)
     counts = np.bincount(start, minlength=len(problem.blocks))
-    return relaxed_bound(
+    return branch_and_bound(
         problem.blocks[keep],
-        problem.prior.copy(),
+        problem.prior,
+        problem.criterion,
         problem.lower[keep],
         problem.upper[keep],
         counts[keep],
-    )
+        root_only=True,
+    ).bound
 
 
 def _pool(problem: Problem, hull: bool) -> Indices:
@@ -223,22 +233,22 @@ def _result(
 ) -> ExactResult:
     """Values in the caller's unit, singular subsets left out, best first.
 
-    ``relaxed`` bounds the whitened log det from above; None where the first is proven.
+    ``relaxed`` bounds phi from above; None where the first is proven.
     """
-    chosen = np.stack(subsets)
-    values = log_dets([problem], chosen[None])[0]
-    order = np.argsort(-values, kind="stable")[:best]
-    order = order[np.isfinite(values[order])]
+    chosen, criterion = np.stack(subsets), problem.criterion
+    value, log_det = values(problem, chosen)
+    better = max if criterion.larger_is_better else min
+    order = np.argsort(-value if better is max else value, kind="stable")[:best]
+    order = order[np.isfinite(log_det[order])]
     if not order.size:
         raise ValueError(
             f"{problem.subject} must allow an invertible selection, but the best, "
             f"{chosen[0].tolist()}, is singular"
         )
-    top = float(values[order[0]])
-    bound = top
+    bound = float(value[order[0]])
     if relaxed is not None:
-        bound = max(top, problem.multiplicity * (relaxed + problem.log_scale))
-    return ExactResult(chosen[order], values[order], bound, nodes, relaxed is None)
+        bound = better(bound, float(criterion.reported(relaxed)))
+    return ExactResult(chosen[order], value[order], bound, nodes, relaxed is None)
 
 
 def _groups(problem: Problem, merge: bool) -> list[Indices]:

@@ -1,8 +1,9 @@
-"""Fedorov exchange with random restarts: near-optimal in milliseconds, no proof.
+"""Fedorov exchange with restarts: near-optimal in milliseconds, no proof.
 
-Each start is a random selection that is not singular; each chosen posture in turn is
-swapped for the candidate that raises det most, until no swap helps. Source: Fedorov,
-Theory of Optimal Experiments, 1972; Cook and Nachtsheim 1980 for one posture at a time.
+Each chosen candidate in turn is swapped for the one that raises the criterion most,
+until no swap helps; the starts are the greedy selection and random ones that are not
+singular. Source: Fedorov, Theory of Optimal Experiments, 1972; Cook and Nachtsheim 1980
+for one candidate at a time.
 """
 
 from __future__ import annotations
@@ -10,15 +11,20 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.selection.exchange.blocks import Blocks
 from jaxcal.selection.problem import Problem
 from jaxcal.selection.solver import Found, in_threads
 
 __all__ = ["default_restarts", "exchange_from", "exchange_indices", "solve"]
 
+Indices = NDArray[np.int64]
+
+_WORK = 7e6  # k M q^2 p of the default starts of one call, about 15 ms
+
 
 def solve(problem: Problem, *, seed: int, restarts: int | None) -> Found:
     """The solver "exchange"."""
-    restarts = restarts or default_restarts(problem.max_replicates)
+    restarts = restarts or default_restarts(problem)
     indices = exchange_indices(problem, restarts, seed)
     return Found(indices, seed=seed, restarts=restarts)
 
@@ -30,52 +36,65 @@ def solve_many(
     return in_threads(problems, lambda p: solve(p, seed=seed, restarts=restarts))
 
 
-def default_restarts(max_replicates: int) -> int:
-    """Random starts that found the proven optimum of nearly all sets of 50 tried.
+def default_restarts(problem: Problem) -> int:
+    """Starts that found the proven optimum of nearly all small problems tried.
 
-    None of 12,000 distinct selections was missed (4, 8 or 12 of 50); replicates leave
-    more local optima, and 1 in 1,000 selections of 12 was.
+    None of 12,000 distinct selections was missed (4, 8 or 12 of 50, three inputs) by
+    200; replicates leave more local optima, and 1 in 1,000 selections of 12 was by 400.
+    Large problems of blocks get fewer, so that they take 10 to 30 ms.
     """
-    return 200 if max_replicates == 1 else 400
+    most = 200 if problem.max_replicates == 1 else 400
+    if problem.rank_one:
+        return most
+    if problem.criterion.name == "E":  # not compiled, and from local optima of A
+        most = 20
+    count, q, p = problem.blocks.shape
+    return int(min(max(_WORK / (problem.k * count * q * q * p), 1.0), most))
 
 
 def exchange_indices(
     problem: Problem, restarts: int | None = None, seed: int = 0
-) -> NDArray[np.int64]:
+) -> Indices:
     """(k,) the best local optimum, required candidates first."""
     if restarts is None:
-        restarts = default_restarts(problem.max_replicates)
-    from jaxcal.selection.exchange.kernel import exchange_starts
+        restarts = default_restarts(problem)
+    if problem.criterion.name == "E":
+        from jaxcal.selection.exchange.eigenvalue import exchange_eigenvalue
 
-    usable = np.flatnonzero(problem.available)
-    blocks = problem.blocks[usable]
-    _, q, p = blocks.shape
-    span = np.zeros((0, p))
-    if len(problem.root):
-        values, vectors = np.linalg.eigh(problem.prior)
-        span = np.ascontiguousarray(vectors.T[values > 1e-6])
-    full = 1 if q == 1 else int(np.linalg.matrix_rank(blocks, tol=1e-9).max())
-    chosen, log_det, _ = exchange_starts(
-        blocks,
-        np.ascontiguousarray(blocks.transpose(1, 2, 0)),
-        problem.prior.copy(),
-        span,
-        full,
-        problem.upper[usable],
-        np.searchsorted(usable, problem.required),
-        problem.k,
-        restarts,
-        np.uint64(seed % 2**64),
-    )
-    if not np.isfinite(log_det):
+        chosen, phi = exchange_eigenvalue(problem, restarts, seed)
+    elif problem.rank_one:
+        chosen, phi = _exchange_rows(problem, restarts, seed)
+    else:
+        chosen, phi = Blocks(problem).exchanged(restarts, seed)
+    if not np.isfinite(phi):
         raise ValueError(
             f"{problem.subject} must allow an invertible selection, "
             "but every start was singular"
         )
-    return usable[chosen]
+    return chosen
 
 
-def exchange_from(problem: Problem, indices: ArrayLike) -> NDArray[np.int64]:
+def _exchange_rows(problem: Problem, restarts: int, seed: int) -> tuple[Indices, float]:
+    """For one reading per candidate, from random starts alone."""
+    from jaxcal.selection.exchange.rows_kernel import exchange_rows
+    from jaxcal.selection.exchange.starts import RIDGE
+
+    usable = np.flatnonzero(problem.available)
+    blocks, prior = problem.blocks[usable], problem.prior.copy()
+    span = np.zeros((0, problem.num_regressors))
+    if len(problem.root):
+        values, vectors = np.linalg.eigh(prior)
+        span = np.ascontiguousarray(vectors.T[values > 1e-6])
+    chosen, log_det = exchange_rows(
+        blocks, np.ascontiguousarray(blocks.transpose(1, 2, 0)), prior,
+        prior + RIDGE * np.eye(len(prior)), span, 1, problem.upper[usable],
+        np.searchsorted(usable, problem.required), problem.k, restarts,
+        np.uint64(seed % 2**64),
+    )  # fmt: skip
+    return usable[chosen], log_det
+
+
+def exchange_from(problem: Problem, indices: ArrayLike) -> Indices:
     """The local optimum that a given selection climbs to; never worse than it was.
 
     Args:
@@ -85,28 +104,28 @@ def exchange_from(problem: Problem, indices: ArrayLike) -> NDArray[np.int64]:
     Returns:
         (k,) the required candidates first.
     """
-    from jaxcal.selection.exchange.kernel import climb
-
     rest = np.asarray(indices, dtype=np.int64).tolist()
     for i in problem.required.tolist():
         if i not in rest:
             raise ValueError(f"indices must hold every required candidate, got no {i}")
         rest.remove(i)
     chosen = np.array([*problem.required, *rest], dtype=np.int64)
-    blocks = problem.blocks.copy()
-    p = problem.num_regressors
-    log_det = climb(
-        blocks,
-        np.ascontiguousarray(blocks.transpose(1, 2, 0)),
-        problem.upper,
-        len(problem.required),
-        chosen,
-        np.bincount(chosen, minlength=len(blocks)),
-        problem.prior.copy(),
-        np.empty((p, p)),
-        np.empty((p, p)),
-    )
-    if not np.isfinite(log_det):
+    if problem.criterion.name == "E":
+        from jaxcal.selection.exchange.eigenvalue import climb_eigenvalue
+
+        chosen, phi = climb_eigenvalue(problem, chosen)
+    elif problem.rank_one:
+        from jaxcal.selection.exchange.rows_kernel import climb_rows
+
+        blocks, prior = problem.blocks.copy(), problem.prior.copy()
+        phi = climb_rows(
+            blocks, np.ascontiguousarray(blocks.transpose(1, 2, 0)), problem.upper,
+            len(problem.required), chosen, np.bincount(chosen, minlength=len(blocks)),
+            prior, np.empty_like(prior), np.empty_like(prior),
+        )  # fmt: skip
+    else:
+        chosen, phi = Blocks(problem).climbed(chosen)
+    if not np.isfinite(phi):
         raise ValueError(
             "indices must give an invertible information matrix, but that of "
             f"{chosen.tolist()} is singular"

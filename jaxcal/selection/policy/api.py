@@ -16,10 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.checks import whole_number
 from jaxcal.extras import needs
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.weights import Weights
-from jaxcal.selection.problem import Problem, make_problems, whole_number
+from jaxcal.selection.problem import Problem, make_problems
 
 __all__ = ["DECODINGS", "Policy", "load_policy", "select_batch"]
 

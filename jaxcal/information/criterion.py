@@ -1,0 +1,127 @@
+"""The criterion of a selection: one concave function of the information matrix.
+
+``V = C M^-1 C.T`` is the covariance of the combinations ``C theta`` that matter, M the
+information (p, p). Every criterion is written as a concave phi(M) to be maximised:
+
+========  ===========================  ======  ===========================  ==========
+kind      phi                          names   reported value               efficiency
+========  ===========================  ======  ===========================  ==========
+``det``   -log det V                   D, Ds   log det V^-1, larger better  e^((v-b)/s)
+``trace`` -trace V                     A I As  trace V, smaller better      b / v
+``least`` smallest eigenvalue of       E       the same, larger better      v / b
+          ``C^-T M C^-1``
+========  ===========================  ======  ===========================  ==========
+
+v is the value of a selection, b that of the optimum or a bound on it, s the rows of C.
+C is the identity for D, A and E, picks the parameters of interest for Ds and As, and
+for I ``C.T @ C`` is the mean of ``J.T @ J`` over a region: V's trace is then the mean
+variance of the predictions there. At any M0, with G the gradient,
+
+    phi(M) <= phi(M0) + trace(G (M - M0)).
+
+Sources: Pukelsheim, Optimal Design of Experiments (concavity, subsets of parameters);
+Atkinson, Donev and Tobias, Optimum Experimental Designs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["CRITERIA", "KINDS", "Criterion"]
+
+Array = NDArray[np.float64]
+
+KINDS = {
+    "D": "det",
+    "Ds": "det",
+    "A": "trace",
+    "As": "trace",
+    "I": "trace",
+    "E": "least",
+}
+CRITERIA = tuple(KINDS)
+
+_EPS = float(np.finfo(np.float64).eps)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Criterion:
+    """A criterion in the coordinates of ``root``; the table above defines the kinds."""
+
+    name: str  # a name of CRITERIA
+    root: Array  # C (s, p), of full row rank; square for "least"
+    times: int = 1  # how often log det V or trace V counts: outputs of equal blocks
+    offset: float = 0.0  # added to phi of "det" where C was changed by a factor
+
+    @property
+    def kind(self) -> str:
+        """``det``, ``trace`` or ``least``."""
+        return KINDS[self.name]
+
+    @property
+    def larger_is_better(self) -> bool:
+        """Of the reported value."""
+        return self.kind != "trace"
+
+    def value(self, information: Array) -> Array:
+        """phi (...,) of information matrices (..., p, p).
+
+        -inf where M is singular to rounding, for "least" its smallest eigenvalue then
+        too, which is zero to rounding.
+        """
+        if self.kind == "least":
+            return np.linalg.eigh(self._scaled(information))[0][..., 0]
+        half, regular = self._half(information)
+        if self.kind == "trace":
+            phi = -(half * half).sum(axis=(-2, -1))
+        else:
+            phi = -np.linalg.slogdet(half @ np.matrix_transpose(half))[1]
+        return np.where(regular, phi, -np.inf)
+
+    def gradient(self, information: Array) -> Array:
+        """G (..., p, p), a supergradient of phi at nonsingular M (..., p, p)."""
+        if self.kind == "least":
+            lowest = np.linalg.eigh(self._scaled(information))[1][..., :1]
+            lowest = np.linalg.inv(self.root) @ lowest
+            return lowest @ np.matrix_transpose(lowest)
+        solved: NDArray[Any] = np.linalg.solve(information, self.root.T)
+        inner = np.matrix_transpose(solved)
+        if self.kind == "det":
+            inner = np.linalg.solve(self.root @ solved, inner)
+        gradient = solved @ inner
+        return (gradient + np.matrix_transpose(gradient)) / 2.0
+
+    def reported(self, phi: Array | float) -> Array | float:
+        """The value as the caller reads it."""
+        if self.kind == "det":
+            return self.times * (phi + self.offset)
+        return -self.times * phi if self.kind == "trace" else phi
+
+    def efficiency(self, value: float, bound: float) -> float:
+        """Share in (0, 1] of the best possible, of reported values."""
+        if self.kind == "det":
+            return float(np.exp((value - bound) / (self.times * len(self.root))))
+        return float(bound / value if self.kind == "trace" else value / bound)
+
+    def enough(self, phi: float, efficiency: float) -> float:
+        """The largest phi of a bound that proves ``efficiency`` of a selection."""
+        if self.kind == "det":
+            return phi - len(self.root) * float(np.log(efficiency))
+        return phi * efficiency if self.kind == "trace" else phi / efficiency
+
+    def _scaled(self, information: Array) -> Array:
+        """``C^-T M C^-1``."""
+        inverse = np.linalg.inv(self.root)
+        return inverse.T @ information @ inverse
+
+    def _half(self, information: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """H (..., s, p) with ``H @ H.T = V``, and where M is not singular."""
+        values, vectors = np.linalg.eigh(information)
+        p = values.shape[-1]
+        regular = values[..., 0] > 8.0 * p * _EPS * values[..., -1]
+        scale = np.where(regular[..., None], values, 1.0)
+        return self.root @ vectors / np.sqrt(scale)[..., None, :], regular

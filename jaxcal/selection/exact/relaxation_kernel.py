@@ -1,0 +1,298 @@
+"""Compiled relaxation of a node: counts may be real numbers between their bounds.
+
+The criterion phi is concave, so at any counts c, with leverages d,
+
+    phi(any c') <= phi(c) + max over c' of sum of (c'_i - c_i) d_i
+
+within the bounds and sum k: a true bound wherever the climb stops, tight at the relaxed
+optimum. The climb is Newton's, on the fractional counts and those the leverages ask to
+move; what it wants is a small quadratic programme, solved by an active set.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from jaxcal.information.linear_algebra import gram_of
+from jaxcal.selection.exact.criterion_kernel import (
+    FAST,
+    OPTIONS,
+    E,
+    evaluate,
+    hessian,
+)
+
+__all__ = ["linear_gain", "relax"]
+
+_SOLVED = 1e-11  # a bound this far above the value is solved
+_MAX_STEPS = 80
+_FRACTIONAL = 400  # counts that a Newton step moves at most
+_RIDGE = 1e-10  # share of the largest curvature
+_ROUNDING = 1e-12  # of a count that is whole
+_SHARPEST = 1e5  # smoothing of E, where the eigenvalue is about 1
+
+
+@njit(**FAST)
+def _leverages(blocks, gradient, low, high, leverage):
+    """Fill leverage (M,), ``trace(B_i G B_i.T)``, where the count is not fixed."""
+    num_blocks, q, p = blocks.shape
+    reach = np.empty(p)
+    for i in range(num_blocks):
+        leverage[i] = 0.0
+        if low[i] < high[i]:
+            for r in range(q):
+                reach[:] = 0.0
+                for a in range(p):
+                    weight = blocks[i, r, a]
+                    for b in range(p):
+                        reach[b] += weight * gradient[a, b]
+                for a in range(p):
+                    leverage[i] += reach[a] * blocks[i, r, a]
+
+
+@njit(**OPTIONS)
+def linear_gain(low, high, c, k, leverage):
+    """Largest ``sum of (c'_i - c_i) d_i`` within the bounds, and its multiplier.
+
+    The multiplier minimises ``k cut + sum of max(low_i (d_i - cut), high_i (d_i -
+    cut))``, by bisection; any value of it gives a true bound.
+    """
+    least, most = np.inf, -np.inf
+    for i in range(len(c)):
+        if c[i] < high[i]:
+            most = max(most, leverage[i])
+        if c[i] > low[i]:
+            least = min(least, leverage[i])
+    if not (least < np.inf and most > -np.inf):
+        return 0.0, most if most > -np.inf else least  # there is no other choice
+    cut = 0.5 * (least + most)
+    for _ in range(30):
+        if most - least <= 1e-13 * abs(most):
+            break
+        room = 0
+        for i in range(len(c)):
+            room += high[i] if leverage[i] > cut else low[i]
+        if room > k:
+            least = cut
+        elif room < k:
+            most = cut
+        else:
+            break
+        cut = 0.5 * (least + most)
+    gain, total = 0.0, 0.0
+    for i in range(len(c)):
+        slope = leverage[i] - cut
+        total += c[i]
+        gain += ((high[i] if slope > 0.0 else low[i]) - c[i]) * slope
+    return gain + (k - total) * cut, cut
+
+
+@njit(**OPTIONS)
+def _working_set(low, high, c, leverage, cut, extra):
+    """Counts to move: the fractional ones and ``extra`` of those that should move."""
+    num_blocks = len(c)
+    wish = np.zeros(num_blocks)
+    fractional = 0
+    largest = 0.0
+    for i in range(num_blocks):
+        slope = leverage[i] - cut
+        if low[i] < c[i] < high[i]:
+            fractional += 1
+        if low[i] < high[i] and (c[i] < high[i] if slope > 0.0 else c[i] > low[i]):
+            wish[i] = abs(slope)
+            largest = max(largest, wish[i])
+    if fractional <= _FRACTIONAL:
+        for i in range(num_blocks):
+            if low[i] < c[i] < high[i]:
+                wish[i] = 0.0
+    else:
+        fractional, extra = 0, _FRACTIONAL
+    least = largest
+    for _ in range(40):
+        count = 0
+        for i in range(num_blocks):
+            count += wish[i] > 0.5 * least
+        if count > extra:
+            break
+        least *= 0.5
+    which = np.empty(fractional + extra, dtype=np.int64)
+    size = 0
+    for i in range(num_blocks):
+        inside = fractional > 0 and low[i] < c[i] < high[i]
+        if inside or (wish[i] > 0.0 and wish[i] >= least and size < len(which)):
+            which[size] = i
+            size += 1
+    return which[:size]
+
+
+@njit(**FAST)
+def _solve(matrix, which, size, x, y, lower):
+    """x and y (m,) become their solutions by ``matrix`` at ``which[:size]``."""
+    for a in range(size):
+        for b in range(a + 1):
+            total = matrix[which[a], which[b]]
+            for c in range(b):
+                total -= lower[a, c] * lower[b, c]
+            if a == b:
+                lower[a, a] = np.sqrt(max(total, 1e-3 * _RIDGE * matrix[0, 0]))
+            else:
+                lower[a, b] = total / lower[b, b]
+        for c in range(a):
+            x[a] -= lower[a, c] * x[c]
+            y[a] -= lower[a, c] * y[c]
+        x[a] /= lower[a, a]
+        y[a] /= lower[a, a]
+    for a in range(size - 1, -1, -1):
+        x[a] /= lower[a, a]
+        y[a] /= lower[a, a]
+        for c in range(a):
+            x[c] -= lower[a, c] * x[a]
+            y[c] -= lower[a, c] * y[a]
+
+
+@njit(**FAST)
+def _quadratic_step(curvature, slope, least, most, move):
+    """Maximise ``slope.x - x.curvature.x / 2``, sum x = 0, least <= x <= most.
+
+    Args:
+        curvature: (m, m) positive semidefinite; its diagonal is raised a little.
+        slope: (m,), changed to the slope at the solution.
+        least, most: (m,), zero between them.
+        move: (m,) filled with x.
+    """
+    m = len(slope)
+    lower = np.empty((m, m))
+    x, ones = np.empty(m), np.empty(m)
+    free = np.empty(m, dtype=np.int64)
+    side = np.zeros(m, dtype=np.int64)  # -1, 1 where held at that bound
+    largest = 0.0
+    for i in range(m):
+        largest = max(largest, curvature[i, i])
+        move[i] = 0.0
+    for i in range(m):
+        curvature[i, i] += _RIDGE * largest
+    for _ in range(4 * m + 8):
+        size = 0
+        for i in range(m):
+            if side[i] == 0:
+                free[size] = i
+                x[size], ones[size] = slope[i], 1.0
+                size += 1
+        cut = 0.0
+        if size:
+            _solve(curvature, free, size, x, ones, lower)
+            cut = x[:size].sum() / ones[:size].sum()
+            part, hit, at = 1.0, -1, 0
+            for f in range(size):
+                i = free[f]
+                x[f] -= cut * ones[f]
+                room = (most[i] if x[f] > 0.0 else least[i]) - move[i]
+                if abs(x[f]) * part > abs(room):
+                    part, hit, at = abs(room / x[f]), f, 1 if x[f] > 0.0 else -1
+            if size > 1:
+                for f in range(size):
+                    move[free[f]] += part * x[f]
+                    weight = part * x[f]
+                    for i in range(m):
+                        slope[i] -= weight * curvature[free[f], i]
+                if hit >= 0:
+                    i = free[hit]
+                    side[i] = at
+                    move[i] = most[i] if at > 0 else least[i]
+                    continue
+        # At rest on this face: let go of the count that pulls most from its bound.
+        pull, best, other = 1e-9 * abs(cut), -1, -1
+        up, down = -np.inf, np.inf
+        for i in range(m):
+            wish = side[i] * (cut - slope[i])
+            if side[i] and size and wish > pull:
+                pull, best = wish, i
+            if side[i] < 0 and slope[i] > up and not size:
+                up, best = slope[i], i
+            if side[i] > 0 and slope[i] < down and not size:
+                down, other = slope[i], i
+        if not size:
+            if best < 0 or other < 0 or not up > down:
+                break
+            side[other] = 0
+        if best < 0:
+            break
+        side[best] = 0
+
+
+@njit(**OPTIONS)
+def _spread(low, high, c, k):
+    """Share what the lower bounds leave in proportion to the room of each count."""
+    room = max((high - low).sum(), 1)
+    c[:] = low + (k - low.sum()) * (high - low) / room
+
+
+@njit(inline="always")
+def relax(problem, kind, low, high, c, goal, share, local, leverage):
+    """Climb the relaxation of a node until it is pruned, or solved well enough.
+
+    Args:
+        problem: a Relaxation.
+        kind: its kind, or RANK, for which ``local`` has been set.
+        low, high, c: (M,) bounds, and the counts to start from, changed in place.
+        goal: a bound at or below it ends the climb.
+        share: so does a bound this share of its distance to the goal from solved.
+        local: a Local.
+        leverage: (M,) filled.
+
+    Returns:
+        The bound, -inf where every selection of the node is singular, and its
+        multiplier.
+    """
+    blocks, k = problem.blocks, problem.k
+    p = blocks.shape[2]
+    gram_of(blocks, c, problem.prior, local.gram)
+    value, base = evaluate(kind, problem.root, local)
+    if not value > -np.inf:
+        _spread(low, high, c, k)
+        gram_of(blocks, c, problem.prior, local.gram)
+        value, base = evaluate(kind, problem.root, local)
+        if not value > -np.inf:
+            return value, 0.0
+    bound, cut = np.inf, 0.0
+    for step in range(_MAX_STEPS):
+        _leverages(blocks, local.gradient, low, high, leverage)
+        gain, cut = linear_gain(low, high, c, k, leverage)
+        bound = base + gain
+        enough = max(_SOLVED, share * (value - goal))
+        if bound <= goal or bound - value <= enough or step == _MAX_STEPS - 1:
+            break
+        if kind == E and gain <= 0.3 * (base - value):
+            if local.settings[1] >= _SHARPEST:
+                break
+            local.settings[1] *= 4.0
+            value, base = evaluate(kind, problem.root, local)
+            continue
+        which = _working_set(low, high, c, leverage, cut, max(32, 2 * p))
+        m = len(which)
+        curvature, move = np.empty((m, m)), np.empty(m)
+        hessian(kind, blocks, which, local, curvature)
+        slope = leverage[which]
+        _quadratic_step(
+            curvature, slope, low[which] - c[which], high[which] - c[which], move
+        )
+        promised = 0.0
+        for i in range(m):
+            promised += move[i] * leverage[which[i]]
+        before, part = c[which], 1.0
+        while True:
+            for i in range(m):
+                j = which[i]
+                c[j] = before[i] + part * move[i]
+                if abs(c[j] - np.round(c[j])) < _ROUNDING:
+                    c[j] = np.round(c[j])
+            gram_of(blocks, c, problem.prior, local.gram)
+            after, base = evaluate(kind, problem.root, local)
+            if after >= value + 1e-4 * part * promised or part < 1e-6:
+                break
+            part *= 0.5
+        if not after > value:
+            break
+        value = after
+    return bound, cut

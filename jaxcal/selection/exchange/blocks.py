@@ -1,0 +1,93 @@
+"""Greedy and exchange on blocks, for every criterion; front of ``blocks_kernel``."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.information.blocks import largest_rank
+from jaxcal.selection.problem import Problem
+
+__all__ = ["Blocks"]
+
+Indices = NDArray[np.int64]
+
+_RIDGE = {"det": 1e-9, "trace": 1e-6, "least": 1e-6}  # of the mean leverage
+
+
+class Blocks:
+    """The available candidates of a problem as the compiled kernels take them.
+
+    E is treated as A, the sum of the variances, which is at most p times the largest:
+    an incomplete selection has no least eigenvalue to raise.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        from jaxcal.selection.exchange import blocks_kernel as kernel
+
+        self._usable = np.flatnonzero(problem.available)
+        self._blocks = problem.blocks[self._usable]
+        self._columns = np.ascontiguousarray(self._blocks.transpose(1, 2, 0))
+        self._prior, self._k = problem.prior.copy(), problem.k
+        self._known = bool(len(problem.root))
+        self._upper = problem.upper[self._usable]
+        self._required = np.searchsorted(self._usable, problem.required)
+        criterion = problem.criterion
+        self._kind = kernel.TRACE
+        if criterion.kind == "det":
+            self._kind = kernel.DET if criterion.name == "D" else kernel.SUBSET
+        self._root = criterion.root.copy()
+        ridge = _RIDGE[criterion.kind] * self._prior.shape[0] / len(self._blocks)
+        self._ridge = np.array([ridge, 0.0])
+
+    def greedy(self) -> Indices:
+        """(k,) the required, then one at a time by the largest gain."""
+        return self._usable[self._from(self._required, False)[0]]
+
+    def climbed(self, start: Indices) -> tuple[Indices, float]:
+        """The local optimum that ``start`` (k,), required first, climbs to; its phi."""
+        chosen, phi = self._from(np.searchsorted(self._usable, start), True)
+        return self._usable[chosen], phi
+
+    def exchanged(self, restarts: int, seed: int) -> tuple[Indices, float]:
+        """The best local optimum from greedy and ``restarts - 1`` random starts."""
+        best, phi = self._from(self._required, True)
+        if restarts > 1 or not phi > -np.inf:
+            for start in self._random(max(restarts - 1, 1), seed):
+                chosen, found = self._from(start, True)
+                if not np.isfinite(phi) or found > phi + 1e-10 * abs(phi):
+                    best, phi = chosen, found
+        return self._usable[best], phi
+
+    def _from(self, start: Indices, climbs: bool) -> tuple[Indices, float]:
+        from jaxcal.selection.exchange.blocks_kernel import grow_and_climb
+        from jaxcal.selection.exchange.starts import RIDGE
+
+        chosen = np.zeros(self._k, dtype=np.int64)
+        chosen[: len(start)] = start
+        size, phi = len(start), -np.inf
+        for swapping in (0.0, RIDGE, 0.0):  # swaps may mend a singular start
+            self._ridge[1] = swapping
+            phi = grow_and_climb(
+                self._kind, self._root, self._blocks, self._columns, self._prior,
+                self._upper, self._ridge, len(self._required), chosen, size, climbs,
+            )  # fmt: skip
+            if not climbs or (not swapping and phi > -np.inf):
+                break
+            size = self._k
+        return chosen, float(phi)
+
+    def _random(self, count: int, seed: int) -> list[Indices]:
+        from jaxcal.selection.exchange.starts import random_starts
+
+        p = self._prior.shape[0]
+        span = np.zeros((0, p))
+        if self._known:
+            values, vectors = np.linalg.eigh(self._prior)
+            span = np.ascontiguousarray(vectors.T[values > 1e-6])
+        return list(
+            random_starts(
+                self._blocks, self._upper, self._required, span,
+                largest_rank(self._blocks), self._k, count, np.uint64(seed % 2**64),
+            )
+        )  # fmt: skip

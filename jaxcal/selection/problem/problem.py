@@ -1,0 +1,132 @@
+"""A selection problem, checked once, in coordinates no unit or axis can distort.
+
+Solvers read whitened information blocks: candidate i adds ``B_i.T @ B_i`` to the
+prior's precision, and with everything available measured at once the sum is the
+identity (see :mod:`jaxcal.information.blocks`). A solver that reads nothing else picks
+the same candidates in pulses, degrees or [0, 1]. The criterion is carried into the same
+coordinates. Postures of the affine model are blocks [u, 1] that count once per output.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.information.blocks import log_det_blocks
+from jaxcal.information.criterion import Criterion
+from jaxcal.models.model import Model
+
+__all__ = ["Problem", "log_dets", "values"]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+_IN_PLANE = 1e-7  # of whitened rows of height one above the origin
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Problem:
+    """Choose ``k`` of M candidates so that a criterion of the information is best.
+
+    All arrays are the problem's own and cannot be written to.
+    """
+
+    blocks: Array  # (M, q, p) whitened information blocks, zero where not available
+    prior: Array  # (p, p) precision known beforehand, in the same coordinates
+    k: int  # candidates to choose
+    available: Mask  # (M,) True where a candidate may be chosen
+    required: Indices  # (r,) candidates that must be chosen, r <= k
+    max_replicates: int  # how often one candidate may be chosen
+    criterion: Criterion  # in the same coordinates
+    multiplicity: int  # how often log det of the blocks counts
+    log_scale: float  # log det of unwhitened less whitened information, of any choice
+    raw: Array  # (M, q, p) blocks in the caller's numbers
+    root: Array  # (r, p) root of the caller's prior precision, with what was measured
+    candidates: Array | None = None  # (M, n) in the caller's unit, where there are any
+    model: Model | None = None  # what made blocks of the candidates
+
+    @property
+    def rows(self) -> Array:
+        """(M, p) the blocks of a problem with one reading per candidate."""
+        if self.blocks.shape[1] != 1:
+            raise ValueError(
+                "rows exist for one reading per candidate only, but blocks have "
+                f"{self.blocks.shape[1]}"
+            )
+        return self.blocks[:, 0]
+
+    @property
+    def rank_one(self) -> bool:
+        """One reading per candidate, criterion D: these have kernels of their own."""
+        return self.blocks.shape[1] == 1 and self.criterion.name == "D"
+
+    @property
+    def num_regressors(self) -> int:
+        """p, n + 1 for the affine model."""
+        return self.blocks.shape[2]
+
+    @property
+    def num_outputs(self) -> int:
+        """m of the affine model: its multiplicity."""
+        return self.multiplicity
+
+    @property
+    def num_parameters(self) -> int:
+        """Size of the whole information matrix S."""
+        return self.multiplicity * self.num_regressors
+
+    @property
+    def subject(self) -> str:
+        """The argument that errors are about."""
+        return "blocks" if self.candidates is None else "candidates"
+
+    @property
+    def lower(self) -> Indices:
+        """(M,) how often each candidate must be chosen."""
+        lower = np.zeros(len(self.blocks), dtype=np.int64)
+        lower[self.required] = 1
+        return lower
+
+    @property
+    def upper(self) -> Indices:
+        """(M,) how often each candidate may be chosen."""
+        return np.where(self.available, min(self.max_replicates, self.k), 0)
+
+    @property
+    def simplex(self) -> bool:
+        """The k = p chosen span a simplex, and det is its squared volume.
+
+        True where each candidate gives one reading, nothing is known beforehand, D is
+        wanted and all rows lie in one plane off the origin, as those of [u, 1] do: the
+        optimum then uses vertices of the convex hull only.
+        """
+        if not self.rank_one or self.k != self.num_regressors or len(self.root):
+            return False
+        height = self.rows @ self.rows.sum(axis=0)
+        return bool((np.abs(height - 1.0) <= _IN_PLANE)[self.available].all())
+
+    def log_det(self, indices: Indices) -> float:
+        """log det S of a subset, natural, in the caller's units; -inf if singular."""
+        return float(log_dets([self], np.asarray(indices)[None, None])[0, 0])
+
+
+def log_dets(problems: list[Problem], indices: Indices) -> Array:
+    """log det S (S, R) of subsets (S, R, k) of S problems made together."""
+    chosen = [problem.raw[of] for problem, of in zip(problems, indices, strict=True)]
+    value = log_det_blocks(np.stack(chosen), problems[0].root)
+    return problems[0].multiplicity * value
+
+
+def values(problem: Problem, indices: Indices) -> tuple[Array, Array]:
+    """Reported value of the criterion, and log det S, of subsets (R, k): (R,) each."""
+    log_det = log_dets([problem], indices[None])[0]
+    criterion = problem.criterion
+    if criterion.name == "D":
+        return log_det, log_det
+    rows = problem.blocks[indices].reshape(len(indices), -1, problem.num_regressors)
+    phi = criterion.value(np.matrix_transpose(rows) @ rows + problem.prior)
+    value = criterion.reported(np.where(np.isneginf(log_det), -np.inf, phi))
+    return np.asarray(value), log_det

@@ -1,0 +1,168 @@
+"""Checks of which candidates may be chosen and how many, over a batch of sets.
+
+``single`` leaves the batch axis, which is there all the same, out of error messages.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import require_finite, whole_number
+from jaxcal.information.blocks import largest_rank, rank_of_blocks
+from jaxcal.selection.problem.problem import Problem
+
+__all__ = [
+    "check_available",
+    "check_counts",
+    "check_k",
+    "check_required_rank",
+    "in_set",
+    "usable_numbers",
+]
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+def usable_numbers(name: str, array: Array, mask: Mask, single: bool) -> Array:
+    """A copy, finite where available; what is not finite elsewhere becomes zero."""
+    own = np.array(array, order="C")
+    bad = ~np.isfinite(own)
+    if bad.any():
+        hidden = bad & ~mask.reshape(*mask.shape, *[1] * (own.ndim - 2))
+        own[hidden] = 0.0
+        require_finite(name, own[0] if single else own)
+    return own
+
+
+def in_set(b: int | np.integer[Any], single: bool) -> str:
+    return "" if single else f" in set {int(b)}"
+
+
+def _leading_axis(name: str, values: ArrayLike) -> NDArray[Any]:
+    try:
+        return np.array(values)[None]
+    except ValueError as error:
+        raise ValueError(
+            f"{name} must be one array, got {type(values).__name__} of mixed lengths"
+        ) from error
+
+
+def check_available(
+    available: ArrayLike | None, shape: tuple[int, ...], single: bool
+) -> Mask:
+    """(S, M) where ``shape`` is (S, M), or (M,) of a single set."""
+    if single:
+        shape = (1, *shape)
+    if available is None:
+        return np.ones(shape, dtype=np.bool_)
+    mask = _leading_axis("available", available) if single else np.array(available)
+    if mask.dtype != np.bool_:
+        raise ValueError(
+            "available must be an array of bool (True = may be chosen), "
+            f"got dtype {mask.dtype}"
+        )
+    if mask.shape != shape:
+        want, got = (shape[1:], mask.shape[1:]) if single else (shape, mask.shape)
+        raise ValueError(f"available must have shape {want}, got {got}")
+    return mask
+
+
+def check_counts(
+    mask: Mask, k: int, required: ArrayLike | None, max_replicates: int, single: bool
+) -> tuple[int, Indices]:
+    """The cap on replicates and the required candidates (B, r)."""
+    cap = whole_number("max_replicates", max_replicates, 1)
+    count = mask.sum(axis=1)
+    if (count == 0).any():
+        raise ValueError(f"available must leave at least {k} candidates, got none")
+    short = np.flatnonzero(count * cap < k)
+    if short.size:
+        have = int(count[short[0]])
+        raise ValueError(
+            f"k must not exceed what is available: {have} candidates"
+            + (f", each at most {cap} times" if cap > 1 else "")
+            + f"{in_set(short[0], single)}, got {k}"
+        )
+    return cap, _check_required(required, mask, k, single)
+
+
+def _check_required(
+    required: ArrayLike | None, mask: Mask, k: int, single: bool
+) -> Indices:
+    num_sets, num_candidates = mask.shape
+    if required is None or np.size(required) == 0:
+        return np.zeros((num_sets, 0), dtype=np.int64)
+    given = _leading_axis("required", required) if single else np.asarray(required)
+    if given.ndim != 2 or len(given) != num_sets:
+        want, got = ("(r,)", given.shape[1:]) if single else ("(B, r)", given.shape)
+        raise ValueError(f"required must have shape {want}, got {got}")
+    if not np.issubdtype(given.dtype, np.integer):
+        raise ValueError(f"required must hold whole numbers, got dtype {given.dtype}")
+    forced = given.astype(np.int64)
+    if forced.shape[1] > k:
+        raise ValueError(
+            f"required must name at most k = {k} candidates, got {forced.shape[1]}"
+        )
+    outside = (forced < 0) | (forced >= num_candidates)
+    if outside.any():
+        raise ValueError(
+            f"required must lie in [0, {num_candidates}), got {forced[outside][0]}"
+        )
+    ordered = np.sort(forced, axis=1)
+    twice = ordered[:, 1:][ordered[:, 1:] == ordered[:, :-1]]
+    if twice.size:
+        raise ValueError(f"required must not repeat a candidate, got {twice[0]} twice")
+    masked = ~np.take_along_axis(mask, forced, axis=1)
+    if masked.any():
+        raise ValueError(
+            f"required must be available, got {forced[masked][0]}, which is masked"
+        )
+    return forced
+
+
+def check_k(
+    k: int | None, raw: Array, mask: Mask, root: Array, regressors: bool
+) -> int:
+    """k, by default the fewest candidates that identify every parameter alone.
+
+    Args:
+        k: as asked for.
+        raw, mask, root: blocks (S, M, q, p), available (S, M), what is known (r, p).
+        regressors: the blocks are [u, 1].
+    """
+    q, p = raw.shape[2:]
+    most = 1 if q == 1 else largest_rank(raw[mask])
+    fewest = -(-p // max(most, 1))
+    k = fewest if k is None else whole_number("k", k, 1)
+    known = int(rank_of_blocks(root[None], root[:0])) if len(root) else 0
+    if k * most + known >= p:
+        return k
+    if regressors and not known:
+        raise ValueError(
+            f"k must be at least {p}, the number of regressors of {p - 1} inputs and a "
+            f"bias, got {k}"
+        )
+    raise ValueError(
+        f"k must be at least {-(-(p - known) // max(most, 1))} for {p} parameters, at "
+        f"most {most} of them from a candidate"
+        + (f" and {known} known beforehand" if known else "")
+        + f", got {k}"
+    )
+
+
+def check_required_rank(problem: Problem, where: str) -> None:
+    """Enough free choices must remain to complete the span of the required ones."""
+    r, p = len(problem.required), problem.num_regressors
+    rank = int(rank_of_blocks(problem.raw[problem.required], problem.root))
+    room = (problem.k - r) * problem.blocks.shape[1]
+    if p - rank > room:
+        raise ValueError(
+            f"required must leave room for an invertible selection: the {r} required "
+            f"candidates{where} span {rank} of {p} regressors, so at least {p - rank} "
+            f"more are needed, got room for {room} (k = {problem.k})"
+        )

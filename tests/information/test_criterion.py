@@ -1,0 +1,111 @@
+"""Each criterion against its definition, its gradient against finite differences."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from jaxcal.information.criterion import CRITERIA, Criterion
+
+P = 4
+PICK = np.eye(P)[[0, 2]]
+
+
+def information(rng, count=6):
+    rows = rng.normal(size=(count, P))
+    return rows.T @ rows
+
+
+def made(name, rng, times=1):
+    root = np.eye(P)
+    if name == "I":
+        root = rng.normal(size=(P, P))
+    elif name in ("Ds", "As"):
+        root = PICK
+    elif name == "E":
+        root = np.eye(P) + 0.2 * rng.normal(size=(P, P))
+    return Criterion(name, root, times)
+
+
+def definition(criterion, m):
+    """The reported value, by the inverse and numpy alone."""
+    v = criterion.root @ np.linalg.inv(m) @ criterion.root.T
+    if criterion.name in ("D", "Ds"):
+        return -criterion.times * np.log(np.linalg.det(v))
+    if criterion.name == "E":
+        return 1.0 / np.linalg.eigvalsh(v)[-1]
+    return criterion.times * np.trace(v)
+
+
+@pytest.mark.parametrize("name", CRITERIA)
+def test_value_is_the_definition_for_one_and_for_a_batch(name):
+    rng = np.random.default_rng(0)
+    criterion = made(name, rng, times=3)
+    matrices = np.stack([information(rng) for _ in range(5)])
+    values = criterion.reported(criterion.value(matrices))
+    assert values.shape == (5,)
+    for value, m in zip(values, matrices, strict=True):
+        assert value == pytest.approx(definition(criterion, m), rel=1e-10)
+        assert criterion.reported(criterion.value(m)) == pytest.approx(value)
+
+
+@pytest.mark.parametrize("name", CRITERIA)
+def test_gradient_is_that_of_finite_differences(name):
+    rng = np.random.default_rng(1)
+    criterion = made(name, rng)
+    m = information(rng)
+    gradient = criterion.gradient(m)
+    step = 1e-6
+    for a in range(P):
+        for b in range(P):
+            change = np.zeros((P, P))
+            change[a, b] += step
+            change[b, a] += step
+            slope = criterion.value(m + change) - criterion.value(m - change)
+            expected = np.trace(gradient @ change) / step
+            assert slope / (2 * step) == pytest.approx(expected, rel=1e-5, abs=1e-7)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), name=st.sampled_from(CRITERIA))
+def test_the_tangent_is_above_and_information_never_hurts(seed, name):
+    rng = np.random.default_rng(seed)
+    criterion = made(name, rng)
+    at, other = information(rng), information(rng)
+    tangent = criterion.value(at) + np.trace(criterion.gradient(at) @ (other - at))
+    assert criterion.value(other) <= tangent + 1e-9 * (1.0 + abs(tangent))
+    more = criterion.value(at + other)
+    assert more >= criterion.value(at) - 1e-9 * abs(more)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    name=st.sampled_from(CRITERIA),
+    share=st.floats(0.05, 1.0),
+)
+def test_enough_is_the_bound_that_proves_the_share(seed, name, share):
+    rng = np.random.default_rng(seed)
+    criterion = made(name, rng, times=2)
+    phi = float(criterion.value(information(rng)))
+    bound = criterion.enough(phi, share)
+    found = criterion.efficiency(criterion.reported(phi), criterion.reported(bound))
+    assert found == pytest.approx(share)
+    assert bound >= phi - 1e-12
+
+
+@pytest.mark.parametrize("name", CRITERIA)
+def test_singular_information_is_never_a_finite_good_value(name):
+    rng = np.random.default_rng(2)
+    value = made(name, rng).value(information(rng, count=3))
+    assert abs(value) < 1e-12 if name == "E" else np.isneginf(value)
+
+
+def test_a_factor_of_the_root_is_given_back_by_the_offset():
+    rng = np.random.default_rng(3)
+    m, factor = information(rng), rng.normal(size=(2, 2))
+    offset = 2.0 * np.log(abs(np.linalg.det(factor)))
+    changed = Criterion("Ds", factor @ PICK, 2, offset)
+    plain = Criterion("Ds", PICK, 2)
+    expected = plain.reported(plain.value(m))
+    assert changed.reported(changed.value(m)) == pytest.approx(expected)
