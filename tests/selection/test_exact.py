@@ -177,8 +177,9 @@ def test_hull_enumeration_and_branch_and_bound_agree_on_a_sphere():
     enumerated = solve_exact(problem)
     start = np.bincount(exchange_indices(problem, 5), minlength=40)
     branched = branch_and_bound(
-        problem.blocks.copy(), problem.prior.copy(), problem.lower, problem.upper, start
-    )
+        problem.blocks, problem.prior, problem.criterion, problem.lower, problem.upper,
+        start,
+    )  # fmt: skip
     assert branched.proven
     assert problem.log_det(enumerated.subsets[0]) == pytest.approx(
         problem.log_det(np.flatnonzero(branched.counts[0])), abs=1e-8
@@ -262,7 +263,7 @@ def test_one_more_candidate_or_more_replicates_never_lower_the_optimum(size):
 
 @laws
 @given(sizes)
-def test_the_bound_without_numba_is_an_upper_bound(size):
+def test_the_relaxation_is_an_upper_bound(size):
     seed, m, k = size
     for cap in (1, k):
         problem = make_problem(uniform(seed, m), k, max_replicates=cap)
