@@ -1,6 +1,7 @@
 """The exact solver against brute force over the full 12 x 12 matrix, and its laws."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -285,7 +286,7 @@ def test_there_is_a_time_limit_by_default(monkeypatch, method):
     """600 postures on a sphere: the proof would not end in any reasonable time."""
     for module in (exact_module, auto_module):
         monkeypatch.setattr(module, "TIME_LIMIT", 0.2)
-    extra = {"least_efficiency": 1.0} if method == "auto" else {}
+    extra: dict[str, Any] = {"least_efficiency": 1.0} if method == "auto" else {}
     found = select(sphere(0, 600), 8, method, **extra)
     assert not found.proven
     assert found.seconds < 5.0
