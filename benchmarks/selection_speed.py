@@ -26,8 +26,9 @@ def branched_log_det(problem: Problem) -> float:
     """The optimum by branch and bound alone."""
     start = np.bincount(exchange_indices(problem, 20, 1), minlength=len(problem.rows))
     found = branch_and_bound(
-        problem.blocks.copy(), problem.prior.copy(), problem.lower, problem.upper, start
-    )
+        problem.blocks, problem.prior, problem.criterion, problem.lower, problem.upper,
+        start,
+    )  # fmt: skip
     counts = found.counts[0]
     return problem.log_det(np.repeat(np.arange(len(counts)), counts))
 

@@ -111,9 +111,11 @@ def solve(task: Task, start: Solution | None = None) -> Solution:
         costs.append(search.cost)
         done = search.step()
         # Along a curved valley the search creeps: what is left there is no evidence.
-        if len(costs) > _PATIENCE and search.damping < 1e-3:
-            done |= costs[-_PATIENCE] - search.cost < 1e-3 * max(1.0, search.cost)
-        if search.settle() and done:
+        creeps = len(costs) > _PATIENCE and search.damping < 1e-3
+        if creeps:
+            gain = costs[-_PATIENCE] - search.cost
+            creeps = gain < 1e-3 * max(1.0, search.cost)
+        if search.settle(100.0 if creeps else 1.0) and (done or creeps):
             return search.solution()
     raise ValueError(
         f"identify did not converge in {_LIMIT} iterations: begin nearer, with "
@@ -263,8 +265,11 @@ class _Search:
             self.damping *= self.grow
             self.grow *= 2.0
 
-    def settle(self) -> bool:
-        """Weights and levels that follow from the residuals; True where they stay."""
+    def settle(self, slack: float) -> bool:
+        """Weights and levels that follow from the residuals; True where they stay.
+
+        ``slack`` times 1e-6 of a weight and 1e-4 of a level are no change.
+        """
         task = self.task
         before = self.weights, np.log(self.level), np.log(self.size)
         if task.student:
@@ -274,7 +279,7 @@ class _Search:
             self._estimate_levels()
         after = self.weights, np.log(self.level), np.log(self.size)
         return all(
-            np.abs(new - old).max() < limit
+            np.abs(new - old).max() < slack * limit
             for new, old, limit in zip(after, before, (1e-6, 1e-4, 1e-4), strict=True)
         )
 

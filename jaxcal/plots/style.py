@@ -26,11 +26,13 @@ def as_files(figure: Figure, *suffixes: str) -> list[bytes]:
     """The figure as files of these kinds, "png" or "svg"; the same every time.
 
     The constrained layout makes room for the tick labels of the drawing before, so the
-    first drawing of a figure can cut a label off: the figure is drawn once more.
+    first drawing of a figure can cut a label off: it is laid out twice, and then stays.
     """
     found = []
     with rc_context({"svg.hashsalt": "jaxcal"}):
         figure.draw_without_rendering()
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")
         for suffix in suffixes:
             buffer = io.BytesIO()
             metadata: dict[str, Any] = {"Date": None} if suffix == "svg" else {}

@@ -1,6 +1,7 @@
 """The exact solver against brute force over the full 12 x 12 matrix, and its laws."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -177,8 +178,9 @@ def test_hull_enumeration_and_branch_and_bound_agree_on_a_sphere():
     enumerated = solve_exact(problem)
     start = np.bincount(exchange_indices(problem, 5), minlength=40)
     branched = branch_and_bound(
-        problem.blocks.copy(), problem.prior.copy(), problem.lower, problem.upper, start
-    )
+        problem.blocks, problem.prior, problem.criterion, problem.lower, problem.upper,
+        start,
+    )  # fmt: skip
     assert branched.proven
     assert problem.log_det(enumerated.subsets[0]) == pytest.approx(
         problem.log_det(np.flatnonzero(branched.counts[0])), abs=1e-8
@@ -262,7 +264,7 @@ def test_one_more_candidate_or_more_replicates_never_lower_the_optimum(size):
 
 @laws
 @given(sizes)
-def test_the_bound_without_numba_is_an_upper_bound(size):
+def test_the_relaxation_is_an_upper_bound(size):
     seed, m, k = size
     for cap in (1, k):
         problem = make_problem(uniform(seed, m), k, max_replicates=cap)
@@ -284,7 +286,7 @@ def test_there_is_a_time_limit_by_default(monkeypatch, method):
     """600 postures on a sphere: the proof would not end in any reasonable time."""
     for module in (exact_module, auto_module):
         monkeypatch.setattr(module, "TIME_LIMIT", 0.2)
-    extra = {"least_efficiency": 1.0} if method == "auto" else {}
+    extra: dict[str, Any] = {"least_efficiency": 1.0} if method == "auto" else {}
     found = select(sphere(0, 600), 8, method, **extra)
     assert not found.proven
     assert found.seconds < 5.0

@@ -187,7 +187,8 @@ def _postures(material: Material) -> Exhibit:
         material.progress("number of postures", step, len(POSTURES))
         draw = settings.rng(9, step)
         order = np.argsort(draw.random(unit.shape[:2]), axis=1)[:, :k]
-        best = exchange_batch(unit, k=k, seed=settings.seed).indices
+        restarts = 20 if settings.quick else None
+        best = exchange_batch(unit, k, seed=settings.seed, restarts=restarts).indices
         for choice, indices in (("D-optimal", best), ("random", order)):
             used = pick(commands, indices)
             variance = _mean_variance(pick(z, indices), z).mean()

@@ -269,7 +269,7 @@ def relax(problem, kind, low, high, c, goal, share, local, leverage):
             local.settings[1] *= 4.0
             value, base = evaluate(kind, problem.root, local)
             continue
-        which = _working_set(low, high, c, leverage, cut, max(32, 2 * p))
+        which = _working_set(low, high, c, leverage, cut, 2 * p + 4)
         m = len(which)
         curvature, move = np.empty((m, m)), np.empty(m)
         hessian(kind, blocks, which, local, curvature)
