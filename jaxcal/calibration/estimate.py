@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from jaxcal.calibration.discrepancy import WithDiscrepancy
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
 from jaxcal.checks import one_of, whole_number
-from jaxcal.models import Model, Noise, Prior
+from jaxcal.models import Model, Noise, Prior, SerialChain
 
 __all__ = ["fit_model", "require_model"]
 
@@ -66,6 +66,12 @@ def fit_model(
             "common_noise says how to estimate the noise, and noise says what it is: "
             "give one of them"
         )
+    _require_unit(model, commands[used], measured[used])
+    if spread.any() and isinstance(model, SerialChain) and model.num_outputs == 6:
+        raise ValueError(
+            "command_std must not be given with output='pose': the orientations are "
+            "compared with those of the commands given; raise the std of the noise"
+        )
     resolved = (prior or model.default_prior()).resolve(model)
     whole, extra = model, np.zeros(0)
     if discrepancy is not None:
@@ -92,6 +98,22 @@ def fit_model(
         found = solve(task, found)
     fields = _fields(task, found, commands, measured, used)
     return fields | {"model": model, "loss": loss}
+
+
+def _require_unit(model: Any, commands: Array, measured: Array) -> None:
+    """Refuse millimetres for metres, radians for degrees: an arm is not off tenfold."""
+    if not isinstance(model, SerialChain):
+        return
+    spread = []
+    for points in (measured[:, :3], model.predict(commands)[:, :3]):
+        apart = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+        spread.append(float(np.median(apart)))
+    if max(spread) > max(10.0 * min(spread), 0.01 * model.length):
+        raise ValueError(
+            "measured must be in the unit of the model's lengths and commands in "
+            f"degrees: measured positions spread over {spread[0]:g}, those predicted "
+            f"over {spread[1]:g}"
+        )
 
 
 def _noise_of(

@@ -71,7 +71,8 @@ def select(
             readings ``B_i theta`` with noise of unit variance.
         prior: a ``jaxcal.Prior`` of the model's parameters, its own default when not
             given; with blocks, (p, p) precision of what is known of theta beforehand.
-        noise: a ``jaxcal.Noise``; of unit variance when not given.
+        noise: a ``jaxcal.Noise``; when not given ``model.default_noise()`` where the
+            model has one (an arm), else of unit variance.
         criterion: "D" (joint uncertainty of the parameters), "A" (sum of their
             variances), "I" (mean variance of the predictions over ``region``), "E" (the
             worst-known combination), "Ds" or "As" (of ``parameters`` alone). D for the
@@ -208,6 +209,15 @@ def _problem(
         got = "neither" if blocks is None else "both"
         raise ValueError(f"either candidates or blocks must be given, got {got}")
     if candidates is not None:
+        model = given.get("model")
+        if model is not None:
+            if isinstance(model, type) or not hasattr(model, "default_prior"):
+                raise ValueError(
+                    "model must be of jaxcal.models, or an object with the methods of "
+                    f"jaxcal.models.Model, got {model!r}"
+                )
+            if given.get("noise") is None and hasattr(model, "default_noise"):
+                given["noise"] = model.default_noise()
         return make_problem(candidates, k, **given)
     if given.pop("model", None) is not None:
         raise ValueError("model must come with candidates, not with blocks")

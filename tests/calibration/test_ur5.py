@@ -75,3 +75,19 @@ def test_no_search_fails_with_a_vague_prior_from_afar() -> None:
             JOINTS[at], MEASURED[at], model=ARM, prior=prior, noise_std=0.1
         )
         assert np.abs(found.residuals).max() < 0.1
+
+
+@pytest.mark.parametrize("noise_std", [0.1, None])
+@pytest.mark.parametrize("count", [12, 20, 40])
+def test_without_any_prior_the_search_ends(count: int, noise_std: float | None) -> None:
+    for seed in range(3):  # the valley d2 = d3 = d4 is closed by second-order terms
+        at = np.random.default_rng(seed).choice(1000, count, replace=False)
+        found = identify(
+            JOINTS[at],
+            MEASURED[at],
+            model=ARM,
+            prior=Prior(np.inf),
+            noise_std=noise_std,
+        )
+        assert error(found) < 1.0
+        assert found.unidentified is not None

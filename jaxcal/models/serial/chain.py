@@ -22,7 +22,7 @@ from jaxcal.models.serial.arguments import (
 )
 from jaxcal.models.serial.arm import Arm
 from jaxcal.models.serial.kinematics import forward
-from jaxcal.models.uncertainty import Prior
+from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["SerialChain"]
 
@@ -33,6 +33,7 @@ _COLUMNS = ("a", "alpha", "d", "theta", "beta")
 # 0.5 degrees a joint, 0.12 m and 1.7 degrees of the base and the tool.
 _LENGTH, _ANGLE, _GEAR = 2.5e-3, 0.5, 5e-3  # share of the links' length; degrees; ratio
 _MOUNTING, _MOUNTING_ANGLE = 0.1, 1.7
+_NOISE = 1e-4  # of the links' length, radians: 0.12 mm on a UR5
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -227,11 +228,21 @@ class SerialChain(Arm):
             result += np.einsum("nqc,cjn->nqj", columns[..., at], rate)
         return result
 
+    @functools.cached_property
+    def length(self) -> float:
+        """Of the links and the tool together; 0 where the table holds no length."""
+        links = np.hypot(self.table[:, 0], self.table[:, 2]).sum()
+        return float(links + np.linalg.norm(self.tool[:3, 3]))
+
+    def default_noise(self) -> Noise:
+        """What ``select`` takes where no noise is given, in the unit of the arm."""
+        angle = np.degrees(_NOISE)
+        std = [_NOISE * (self.length or 1.0)] * 3 + [angle] * 3
+        return Noise(std=std[: self.num_outputs])
+
     def default_prior(self) -> Prior:
         """Loose knowledge of any arm, by the length of its links; see the constants."""
-        length = np.hypot(self.table[:, 0], self.table[:, 2]).sum()
-        length += np.linalg.norm(self.tool[:3, 3])
-        length = length or np.inf  # axes of unknown stroke alone
+        length = self.length or np.inf  # axes of unknown stroke alone
         joint = [_LENGTH * length, _ANGLE, _LENGTH * length, _ANGLE, _ANGLE]
         mounting = [_MOUNTING * length] * 3 + [_MOUNTING_ANGLE] * 3
         torque = length * sum(abs(weight) for _, weight, _ in self.loads)
