@@ -1,0 +1,39 @@
+"""The UR5 example: its claims hold on two sub-pools."""
+
+from __future__ import annotations
+
+import importlib.util
+import pathlib
+
+import numpy as np
+import pytest
+
+FILE = pathlib.Path(__file__).parents[2] / "examples" / "ur5" / "ur5.py"
+
+
+@pytest.fixture(scope="module")
+def ur5():
+    spec = importlib.util.spec_from_file_location("ur5_example", FILE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_eight_chosen_poses_do_what_the_thesis_needed_a_thousand_for(ur5, monkeypatch):
+    monkeypatch.setattr(ur5, "RULES", ("random", "I"))
+    monkeypatch.setattr(ur5, "COUNTS", (8,))
+    found = ur5.study(pools=4, draws=4)
+    chosen, random = found["I", 8].mean(axis=0), found["random", 8].mean(axis=0)
+    assert chosen[2] < 0.18 < random[2]
+    assert (chosen < random).all()
+
+
+def test_students_loss_takes_no_harm_from_one_outlier(ur5):
+    means = ur5.outliers(pools=2)
+    assert means["student"] < 0.16 < 0.3 < means["gaussian"]
+
+
+def test_the_uncalibrated_arm_is_off_by_millimetres(ur5):
+    angles, reached = ur5.load("ur5_random_20.csv")
+    off = np.linalg.norm(ur5.arm().predict(angles) - reached, axis=1)
+    assert off.mean() == pytest.approx(2.566, abs=0.005)  # the thesis' own figure
