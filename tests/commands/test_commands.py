@@ -15,6 +15,7 @@ import pytest
 
 import jaxcal
 from jaxcal.commands import main
+from jaxcal.commands.model import read_model
 from jaxcal.models import SerialChain
 
 MATRIX = np.array([[0.43, 0.02, 0.0], [0.0, 0.71, 0.01], [0.03, 0.0, 0.87]])
@@ -231,3 +232,13 @@ def test_a_bad_model_is_one_line(arm, candidates, capsys, text, message):
         file.write(text)
     assert main(["select", candidates, "--model", arm[1]]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_an_arm_is_read_from_urdf(tmp_path):
+    path = tmp_path / "arm.URDF"
+    path.write_text(
+        '<robot name="arm"><link name="a"/><link name="b"/><joint name="turn" '
+        'type="revolute"><parent link="a"/><child link="b"/>'
+        '<origin xyz="0.3 0 0.1" rpy="0 0 0"/><axis xyz="0 0 1"/></joint></robot>'
+    )
+    assert read_model(str(path)).to_dict() == SerialChain.from_urdf(path).to_dict()
