@@ -1,4 +1,4 @@
-"""``jaxcal identify``: fit ``y = A u + b`` to measurements and save the calibration.
+"""``jaxcal identify``: fit a model to measurements and save the calibration.
 
 Columns that begin with u_ are commands, those with y_ what was measured; --inputs and
 --outputs name others.
@@ -9,7 +9,8 @@ from __future__ import annotations
 import argparse
 
 from jaxcal.calibration import identify
-from jaxcal.commands.plan import numbers
+from jaxcal.commands.model import add_model, read_model
+from jaxcal.commands.select import numbers
 from jaxcal.commands.tables import read_table, write_json
 
 __all__ = ["add_arguments", "run"]
@@ -21,6 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("file", metavar="FILE", help="measurements: .csv, .npz or -")
     add("--inputs", metavar="A,B", help="columns of commands")
     add("--outputs", metavar="C,D", help="columns of measurements")
+    add_model(parser)
     noise = "standard deviation of a measurement, where it is known"
     add("--noise", type=numbers, metavar="S", help=noise)
     add("--weights", metavar="W", help="column of relative weights")
@@ -39,6 +41,7 @@ def run(arguments: argparse.Namespace) -> None:
     calibration = identify(
         table.columns(inputs),
         table.columns(outputs),
+        model=read_model(arguments.model),
         noise_std=noise[0] if noise and len(noise) == 1 else noise,
         weights=table.columns([arguments.weights])[:, 0] if arguments.weights else None,
         input_names=inputs,

@@ -15,7 +15,7 @@ _HERE = {  # command: one line of help
     "select": "choose the few rows of a table worth measuring",
     "score": "judge a choice made elsewhere",
     "plan": "how many measurements a wanted accuracy takes",
-    "identify": "fit y = A u + b to measurements and save the calibration",
+    "identify": "fit y = A u + b, or a model, to measurements and save the calibration",
     "predict": "where a calibrated machine goes for given commands",
     "command": "what to command to reach given outputs",
 }
@@ -27,6 +27,7 @@ _EPILOG = """\
 examples:
   jaxcal select candidates.csv -k 4                 the four rows to measure
   jaxcal select candidates.csv -k 6 --csv > plan.csv
+  jaxcal select candidates.csv -k 30 --model arm.urdf --noise 0.0001
   jaxcal identify measured.csv --out calibration.json
   jaxcal command calibration.json targets.csv --limits=-20,20
   jaxcal COMMAND --help                             options of one command

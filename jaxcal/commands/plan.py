@@ -5,19 +5,18 @@ from __future__ import annotations
 import argparse
 import dataclasses
 
-from jaxcal.arguments import several
-from jaxcal.commands.select import add_candidates
+from jaxcal.commands.model import add_model, read_model
+from jaxcal.commands.select import add_candidates, numbers
 from jaxcal.commands.tables import add_output, read_table, written
 from jaxcal.selection.plan import plan
 
-__all__ = ["add_arguments", "numbers", "run"]
-
-numbers = several(float, "numbers")
+__all__ = ["add_arguments", "run"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Flags of the command."""
     add_candidates(parser)
+    add_model(parser)
     add = parser.add_argument
     accuracy = "standard error that a prediction may have; one number or one per output"
     add("--accuracy", type=numbers, required=True, metavar="E", help=accuracy)
@@ -42,6 +41,7 @@ def run(arguments: argparse.Namespace) -> None:
         table.columns(table.inputs(arguments.columns)),
         target_accuracy=accuracy,
         noise_std=noise,
+        model=read_model(arguments.model),
         criterion=arguments.criterion,
         available=table.available(),
         max_replicates=arguments.max_replicates,

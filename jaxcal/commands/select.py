@@ -10,13 +10,24 @@ import argparse
 from typing import Any
 
 from jaxcal.arguments import several
+from jaxcal.commands.model import add_model, read_model
 from jaxcal.commands.tables import Table, add_output, read_table, written
+from jaxcal.information.criterion import CRITERIA
+from jaxcal.models import Noise
 from jaxcal.selection import Selection, select
 
-__all__ = ["add_arguments", "add_candidates", "run", "show", "whole_numbers"]
+__all__ = [
+    "add_arguments",
+    "add_candidates",
+    "numbers",
+    "run",
+    "show",
+    "whole_numbers",
+]
 
 _OPTIONS = ("seed", "restarts", "time_limit", "best", "checkpoint", "decoding", "num")
 
+numbers = several(float, "numbers")
 whole_numbers = several(int, "whole numbers")
 
 
@@ -40,6 +51,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("-k", "--k", type=int, metavar="K", help="rows to choose")
     methods = "auto (the cheapest proof), exact, exchange, greedy, random or policy"
     add("--method", default="auto", help=methods)
+    add_model(parser)
+    criterion = "D for y = A u + b, I for another model"
+    add("--criterion", choices=CRITERIA, help=criterion)
+    names = "of Ds and As: the parameters of interest"
+    add("--parameters", type=lambda x: x.split(","), metavar="A,B", help=names)
+    noise = "standard deviation of a measurement; one number or one per output"
+    add("--noise", type=numbers, metavar="S", help=noise)
     required = "rows, counted from 0, that must be chosen"
     add("--required", type=whole_numbers, metavar="I,J", help=required)
     add("--seed", type=int, help="of methods that draw at random; 0")
@@ -58,11 +76,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Choose and print."""
     table = read_table(arguments.file)
+    noise = arguments.noise
     options = {n: getattr(arguments, n) for n in (*_OPTIONS, "least_efficiency")}
     selection = select(
         table.frame(table.inputs(arguments.columns)),
         arguments.k,
         arguments.method,
+        model=read_model(arguments.model),
+        criterion=arguments.criterion,
+        parameters=arguments.parameters,
+        noise=noise and Noise(noise[0] if len(noise) == 1 else noise),
         available=table.available(),
         required=arguments.required,
         max_replicates=arguments.max_replicates,

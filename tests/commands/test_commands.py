@@ -13,7 +13,10 @@ import sys
 import numpy as np
 import pytest
 
+import jaxcal
 from jaxcal.commands import main
+from jaxcal.commands.model import read_model
+from jaxcal.models import SerialChain
 
 MATRIX = np.array([[0.43, 0.02, 0.0], [0.0, 0.71, 0.01], [0.03, 0.0, 0.87]])
 BIAS = np.array([3.1, -5.8, 2.41])
@@ -171,3 +174,71 @@ def test_select_in_a_pipe_loads_no_jax(commands):
     )
     assert len(parsed(done.stdout)) == 4
     assert done.stderr.strip() == "[]"
+
+
+@pytest.fixture
+def arm(tmp_path):
+    model = SerialChain.from_dh([(0, 90, 150, 0), (300, 0, 0, 0), (250, 0, 0, 0)])
+    path = tmp_path / "arm.json"
+    path.write_text(json.dumps(model.to_dict()))
+    return model, str(path)
+
+
+def test_a_model_goes_through_every_command(tmp_path, arm, capsys):
+    model, path = arm
+    rng = np.random.default_rng(0)
+    commands = rng.uniform(20.0, 80.0, (12, 3))
+    truth = model.nominal + 0.1 * rng.normal(size=model.num_parameters)
+    rows = np.concatenate([commands, model.predict(commands, truth)], axis=1)
+    table, out = tmp_path / "measured.csv", str(tmp_path / "calibration.json")
+    header = "u_1,u_2,u_3,y_x,y_y,y_z"
+    table.write_text(
+        "\n".join([header, *(",".join(map(repr, r)) for r in rows.tolist())])
+    )
+    flags = [str(table), "--model", path, "--noise", "0.01"]
+
+    assert main(["select", *flags, "-k", "4", "--criterion", "D", "--json"]) == 0
+    chosen = json.loads(capsys.readouterr().out)
+    wanted = jaxcal.select(
+        commands, 4, model=model, criterion="D", noise=jaxcal.Noise(0.01)
+    )
+    assert sorted(chosen["indices"]) == sorted(wanted.indices.tolist())
+
+    assert main(["plan", *flags, "--accuracy", "0.02", "--csv"]) == 0
+    assert float(parsed(capsys.readouterr().out)[-1]["standard_error"]) <= 0.02
+
+    assert main(["identify", *flags, "--out", out]) == 0
+    assert "tool x" in capsys.readouterr().out
+    assert main(["predict", out, str(table), "--std"]) == 0
+    text = capsys.readouterr().out
+    there = np.array([[float(v) for v in row.values()] for row in parsed(text)])
+    np.testing.assert_allclose(there[:, :3], rows[:, 3:], atol=0.05)
+    assert (there[:, 3:] > 0.0).all()
+    reached = tmp_path / "y.csv"
+    reached.write_text(text)
+    inverse = ["command", out, str(reached), "--limits=0,100"]
+    assert main([*inverse, "--columns", "y_x,y_y,y_z"]) == 0
+    back = parsed(capsys.readouterr().out)
+    again = np.array([[float(v) for v in row.values()] for row in back])
+    np.testing.assert_allclose(model.predict(again, truth), rows[:, 3:], atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("[]", "JSON object"), ('{"kind": "jax"}', "model=..."), ("{", "arm.json: ")],
+)
+def test_a_bad_model_is_one_line(arm, candidates, capsys, text, message):
+    with open(arm[1], "w") as file:
+        file.write(text)
+    assert main(["select", candidates, "--model", arm[1]]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_an_arm_is_read_from_urdf(tmp_path):
+    path = tmp_path / "arm.URDF"
+    path.write_text(
+        '<robot name="arm"><link name="a"/><link name="b"/><joint name="turn" '
+        'type="revolute"><parent link="a"/><child link="b"/>'
+        '<origin xyz="0.3 0 0.1" rpy="0 0 0"/><axis xyz="0 0 1"/></joint></robot>'
+    )
+    assert read_model(str(path)).to_dict() == SerialChain.from_urdf(path).to_dict()

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 import jaxcal
 from jaxcal.information.regression import log_det_gram
+from jaxcal.models import Affine, Noise, Polynomial, SerialChain
 from jaxcal.plots.selection import pareto_figure
 from jaxcal.selection.fastest import (
     Motion,
@@ -322,7 +323,8 @@ def test_blocks_are_visited_as_by_brute_force(seed, least, known):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"prior": np.eye(5), "blocks": None}, "prior must come with blocks"),
+        ({"prior": np.eye(5), "blocks": None}, "prior must be a jaxcal.Prior"),
+        ({"model": Affine(3, 3)}, "model must come without blocks"),
         ({"candidates": np.zeros((7, 3))}, r"candidates must have shape \(8, n\)"),
         ({"method": "lookahead"}, 'method must be "exact" or "heuristic" with blocks'),
     ],
@@ -332,3 +334,33 @@ def test_bad_requests_with_blocks_are_named(rng, change, message):
     given |= change
     with pytest.raises(ValueError, match=message):
         select_fastest(given.pop("candidates"), motion=MOTION, **given)
+
+
+@pytest.mark.parametrize(
+    ("model", "k"),
+    [(SerialChain.from_dh([(9, 90, 5, 0)] * 3), 2), (Polynomial(2, 3, 1), 4)],
+)
+def test_any_model_is_visited_as_by_brute_force(rng, model, k):
+    candidates = rng.uniform(-20, 20, (8, 3))
+    measured = rng.uniform(-20, 20, (7, 3))
+    rows, before = (model.jacobian(c) / 0.1 for c in (candidates, measured))
+    known = model.default_prior().resolve(model).precision
+    known = known + np.einsum("kqa,kqb->ab", before, before)
+    runs = []
+    for subset in itertools.combinations(range(8), k):
+        some = rows[list(subset)]
+        orders = itertools.permutations(subset)
+        least_seconds = min(seconds_of(candidates, o, None) for o in orders)
+        added = np.einsum("kqa,kqb->ab", some, some)
+        runs.append((np.linalg.slogdet(known + added)[1], least_seconds))
+    value, taken = np.array(runs).T
+    given = {"model": model, "noise": Noise(0.1), "measured": measured}
+    found = select_fastest(candidates, k, motion=MOTION, least_efficiency=0.99, **given)
+    enough = value >= value.max() + len(known) * np.log(0.99) - 1e-9
+    assert found.proven
+    assert found.seconds == pytest.approx(taken[enough].min(), abs=1e-8)
+    assert found.log_det == pytest.approx(
+        value[(taken == taken[enough].min()) & enough].max()
+    )
+    front = pareto_front(candidates, k, motion=MOTION, least_efficiency=0.99, **given)
+    assert front.points[0].seconds == pytest.approx(found.seconds)

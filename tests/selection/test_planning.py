@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 import jaxcal
 from jaxcal.information.criteria import criteria
+from jaxcal.models import Affine, Noise, Polynomial, Prior, SerialChain
 from jaxcal.plots.selection import plan_figure
 from jaxcal.selection.plan import plan
 
@@ -215,7 +216,7 @@ def test_out_of_reach_names_the_best_achievable(rng):
         ({"max_k": 3}, "max_k must be at least 4, got 3"),
         ({"max_k": 13}, "max_k must not exceed the 12 measurements allowed, got 13"),
         ({"more": -1}, "more must be at least 0, got -1"),
-        ({"region": np.zeros((3, 2))}, r"region must have shape \(R, 3\), got"),
+        ({"region": np.zeros((3, 2))}, r"region must have shape \(N, 3\)"),
         ({"required": [40]}, "required must lie in"),
         ({"candidates": np.zeros(3)}, r"candidates must have shape \(M, n\)"),
         ({"candidates": np.zeros((9, 3))}, "candidates must vary"),
@@ -354,6 +355,8 @@ def test_the_first_k_is_one_that_identifies():
         ({"noise_std": 1.0}, "blocks must come without candidates, noise_std"),
         ({"region": np.zeros((3, 2))}, r"region must have shape \(R, m, 3\), got"),
         ({"blocks": None}, "candidates and noise_std must be given, or else blocks"),
+        ({"parameters": [0]}, "parameters must come with criterion parameters"),
+        ({"noise": Noise(1.0)}, "blocks must come without candidates"),
         ({"target_accuracy": [1.0, 2.0, 3.0]}, r"target_accuracy must be one number"),
     ],
 )
@@ -361,3 +364,86 @@ def test_bad_requests_with_blocks_are_named(rng, change, message):
     given = {"blocks": rng.normal(size=(8, 2, 3)), "target_accuracy": 1.0} | change
     with pytest.raises(ValueError, match=message):
         plan(**given)
+
+
+def an_arm(rng):
+    """Two joints, 19 parameters, three outputs of unequal noise."""
+    model = SerialChain.from_dh([(100, 0, 50, 0), (80, 90, 0, 0)])
+    names = [name for name in model.names if name.startswith("base")]
+    prior = Prior(model.default_prior().std, fixed=names)
+    return model, prior, Noise([0.1, 0.2, 0.1]), rng.uniform(-90, 90, (8, 2))
+
+
+def a_polynomial(rng):
+    """Six parameters of which nothing is known, one output."""
+    return Polynomial(2, 2, 1), None, Noise(0.1), rng.random((8, 2))
+
+
+@pytest.mark.parametrize("criterion", ["G", "I", "parameters"])
+@pytest.mark.parametrize("make", [an_arm, a_polynomial])
+def test_any_model_is_planned_as_by_brute_force(make, criterion):
+    rng = np.random.default_rng(1)
+    model, prior, noise, candidates = make(rng)
+    measured, region = candidates[:4] + 0.01, candidates[:3] + 0.3
+    known = (prior or model.default_prior()).resolve(model)
+    asked = [model.names.index(name) for name in known_names(model, known)[:2]]
+
+    def jacobian(commands):
+        return model.jacobian(commands)[..., known.free]
+
+    def variances(indices):
+        """(outputs,) summed up by the criterion, in the outputs' unit."""
+        rows = np.concatenate([jacobian(measured), jacobian(candidates[list(indices)])])
+        rows = rows / np.atleast_1d(noise.std)[:, None]
+        information = np.einsum("kqa,kqb->ab", rows, rows)
+        information += known.precision[np.ix_(known.free, known.free)]
+        cov = np.linalg.inv(information)
+        if criterion == "parameters":
+            return np.diagonal(cov)[asked]
+        at = jacobian(region)
+        v = np.einsum("rop,pq,roq->ro", at, cov, at)
+        return v.max(0) if criterion == "G" else v.mean(0)
+
+    best = {
+        k: min(np.sqrt(variances(s).max()) for s in itertools.combinations(range(8), k))
+        for k in (2, 3, 4)
+    }
+    given = {"criterion": criterion, "parameters": known_names(model, known)[:2]}
+    if criterion != "parameters":
+        given = {"criterion": criterion, "region": region}
+    found = plan(
+        candidates,
+        model=model,
+        prior=prior,
+        noise=noise,
+        measured=measured,
+        target_accuracy=best[3] * 1.0001,
+        more=1,
+        **given,
+    )
+    assert found.k == 3
+    for row in found.rows[-2:]:
+        truth = np.sqrt(variances(row.indices))
+        np.testing.assert_allclose(row.standard_error, truth, rtol=1e-7)
+        assert row.least_error.max() <= best[row.k] * (1 + 1e-9)
+        assert truth.max() <= best[row.k] * 1.02
+    assert found.names[found.hardest_output] in found.table()
+
+
+def known_names(model, known):
+    return [n for n, free in zip(model.names, known.free, strict=True) if free]
+
+
+def test_the_affine_model_given_is_that_which_is_meant(rng):
+    candidates, noise = rng.random((12, 2)), [0.1, 0.3]
+    wanted = {"target_accuracy": 0.3, "measured": candidates[:3]}
+    one = plan(candidates, noise_std=noise, **wanted)
+    same = plan(candidates, model=Affine(2, 2), noise=Noise(noise), **wanted)
+    full = plan(
+        candidates, model=Affine(2, 2), noise=Noise(covariance=np.diag(noise) ** 2),
+        **wanted,
+    )  # fmt: skip
+    assert one.k == same.k == full.k
+    np.testing.assert_array_equal(one.standard_error, same.standard_error)
+    np.testing.assert_allclose(one.standard_error, full.standard_error, rtol=1e-6)
+    assert full.noise_std is None and "noise" not in full.table()

@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers, one_of, share, whole_number
 from jaxcal.information.criteria import d_efficiency
+from jaxcal.models.model import Model
+from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.fastest.motion import Motion
 from jaxcal.selection.fastest.task import Search, Task, make_task
 from jaxcal.selection.solvers import checked_seed
@@ -51,8 +53,11 @@ def select_fastest(
     least_efficiency: float | None = None,
     weight: float | None = None,
     start: ArrayLike | None = None,
+    model: Model | None = None,
     blocks: ArrayLike | None = None,
-    prior: ArrayLike | None = None,
+    prior: Prior | ArrayLike | None = None,
+    noise: Noise | None = None,
+    measured: ArrayLike | None = None,
     available: ArrayLike | None = None,
     required: ArrayLike | None = None,
     num_outputs: int | None = None,
@@ -72,9 +77,8 @@ def select_fastest(
         weight: instead of it, what a second is worth: the run with the largest
             ``log(efficiency) - weight * seconds`` among those found ("lookahead" only).
         start: (n,) where the device stands; it begins at any posture when not given.
-        blocks: (M, q, p) information of the candidates under another model than the
-            affine one, as in :func:`select`; "exact" and "heuristic" only.
-        prior: with blocks, (p, p) precision of what is known beforehand.
+        model, blocks, prior, noise, measured: as in :func:`select`. Several readings
+            per candidate, a prior or measurements: "exact" and "heuristic" only.
         available: (M,) bool, True where a candidate may be chosen.
         required: (r,) candidates that must be among the chosen.
         num_outputs: m; changes log det S, not the answer.
@@ -109,8 +113,9 @@ def select_fastest(
     given = _LEAST_EFFICIENCY if least_efficiency is None else least_efficiency
     least = share("least_efficiency", given)
     task = make_task(
-        candidates, k, motion, start=start, time_limit=time_limit, blocks=blocks,
-        prior=prior, available=available, required=required, num_outputs=num_outputs,
+        candidates, k, motion, start=start, time_limit=time_limit, model=model,
+        blocks=blocks, prior=prior, noise=noise, measured=measured,
+        available=available, required=required, num_outputs=num_outputs,
     )  # fmt: skip
     search = make_search(task, method, num, seed, weight)
     found = answer(task, search, 0.0 if weight is not None else least)

@@ -42,8 +42,8 @@ def search(task: Task, num: int, weight: float | None = None) -> Search:
     """
     if task.blocks.shape[1] > 1 or task.problem.prior.any():
         raise ValueError(
-            'method must be "exact" or "heuristic" with blocks of several rows or a '
-            'prior, got "lookahead"'
+            'method must be "exact" or "heuristic" with blocks of several rows, a '
+            'prior or measurements, got "lookahead"'
         )
 
     @functools.cache

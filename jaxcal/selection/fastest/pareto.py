@@ -45,8 +45,9 @@ def pareto_front(
         candidates, k, motion, method, num, seed: as in :func:`select_fastest`.
         least_efficiency: where to cut the front off, in (0, 1].
         max_points: points after which to stop; the front is then not proven.
-        rules: ``start``, ``blocks``, ``prior``, ``available``, ``required``,
-            ``num_outputs``, as there, and ``time_limit``, seconds for each point.
+        rules: ``start``, ``model``, ``blocks``, ``prior``, ``noise``, ``measured``,
+            ``available``, ``required``, ``num_outputs``, as there, and ``time_limit``,
+            seconds for each point.
     """
     least_efficiency = share("least_efficiency", least_efficiency)
     max_points = whole_number("max_points", max_points, 1)

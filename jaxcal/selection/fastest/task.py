@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers, seconds
+from jaxcal.models.model import Model
 from jaxcal.selection.exact.exact import ExactResult, solve_exact
 from jaxcal.selection.fastest.motion import Motion, travel_times
 from jaxcal.selection.problem import Problem, make_block_problem, make_problem
@@ -107,23 +108,23 @@ def make_task(
     *,
     start: ArrayLike | None = None,
     time_limit: float = 60.0,
+    model: Model | None = None,
     blocks: ArrayLike | None = None,
-    prior: ArrayLike | None = None,
     **rules: Any,
 ) -> Task:
     """Check the arguments of ``select_fastest``; ``rules`` are those of a problem."""
     if blocks is not None:
-        problem = make_block_problem(blocks, k, prior=prior, **rules)
+        if model is not None:
+            raise ValueError("model must come without blocks")
+        problem = make_block_problem(blocks, k, **rules)
         points = numbers("candidates", candidates)
         if points.ndim != 2 or len(points) != len(problem.blocks):
             raise ValueError(
                 f"candidates must have shape ({len(problem.blocks)}, n), a command for "
                 f"each block, got {points.shape}"
             )
-    elif prior is not None:
-        raise ValueError("prior must come with blocks, whose parameters it is about")
     else:
-        problem = make_problem(candidates, k, **rules)
+        problem = make_problem(candidates, k, model=model, criterion="D", **rules)
         assert problem.candidates is not None
         points = problem.candidates
     if not isinstance(motion, Motion):

@@ -20,14 +20,17 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import one_of, seconds, whole_number
+from jaxcal.models.model import Model
+from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.plan.bound import lower_bound, region_weighting
 from jaxcal.selection.plan.designs import Design, best_design, variances_of
-from jaxcal.selection.plan.request import fewest, level, whole_problem
+from jaxcal.selection.plan.request import fewest, make_request
 from jaxcal.selection.solvers import checked_seed
 
 __all__ = ["Plan", "PlanRow", "plan"]
@@ -67,7 +70,8 @@ class Plan:
     indices: Indices  # (k,) sorted, into the candidates
     standard_error: Array  # (m,) predicted by the criterion, measured unit
     target_accuracy: Array  # (m,) measured unit
-    noise_std: Array  # (m,) measured unit
+    noise_std: Array | None  # one an output, measured unit; None where Noise says more
+    names: tuple[str, ...]  # (m,) of the parameters, or output 1, ...
     criterion: str  # "G", "I" or "parameters"
     smallest_proven: bool  # no design of fewer measurements reaches the target
     rows: tuple[PlanRow, ...]  # every K tried, in order
@@ -97,12 +101,13 @@ class Plan:
     def table(self) -> str:
         """K against accuracy, a line each, of the output that is furthest from it."""
         worst = self.hardest_output
-        what = f"{self.summary} standard error of a prediction, output {worst + 1}"
+        what = f"{self.summary} standard error of a prediction, {self.names[worst]}"
         if self.criterion == "parameters":
-            what = f"standard error of parameter {worst + 1}"
+            what = f"standard error of parameter {self.names[worst]}"
+        elif self.noise_std is not None:
+            what += f", noise {self.noise_std[worst]:g}"
         lines = [
-            f"{what}, noise {self.noise_std[worst]:g}, target "
-            f"{self.target_accuracy[worst]:g}",
+            f"{what}, target {self.target_accuracy[worst]:g}",
             "   K  distinct  standard error  no design below  D-optimal     design",
         ]
         for row in self.rows:
@@ -124,9 +129,13 @@ def plan(
     target_accuracy: ArrayLike,
     noise_std: ArrayLike | None = None,
     criterion: str = "G",
+    parameters: Sequence[str | int] | None = None,
     region: ArrayLike | None = None,
+    model: Model | None = None,
     blocks: ArrayLike | None = None,
-    prior: ArrayLike | None = None,
+    prior: Prior | ArrayLike | None = None,
+    noise: Noise | None = None,
+    measured: ArrayLike | None = None,
     available: ArrayLike | None = None,
     required: ArrayLike | None = None,
     max_replicates: int = 1,
@@ -140,20 +149,26 @@ def plan(
     """The smallest number of measurements that predicts accurately enough.
 
     Args:
-        candidates: (M, n) commands that could be measured, in any unit, of the affine
-            model.
+        candidates: (M, n) commands that could be measured, in any unit.
         target_accuracy: () or (m,) standard error a prediction may have, measured unit;
-            with "parameters" () or (p,), that of each parameter.
+            with "parameters" () or (s,), that of each parameter of interest.
         noise_std: () or (m,) standard deviation of one measurement, measured unit.
             Noise is taken as white: measuring a posture twice halves its variance.
         criterion: "G", the largest standard error over the region, "I", the root of
-            the mean variance over it, or, with blocks, "parameters", the standard error
-            of the parameters themselves. It must hold for every output or parameter.
+            the mean variance over it, or "parameters", the standard error of the
+            parameters themselves. It must hold for every output or parameter.
+        parameters: names or indices of the s parameters of interest; all when not
+            given.
         region: (R, n) commands at which predictions are wanted, with blocks (R, m, p)
             what is predicted, ``region @ theta``; what is available when not given.
+        model: of ``jaxcal.models``; ``y = A u + b`` when not given.
         blocks: (M, q, p) instead of candidates and noise, for any model: candidate i
             gives q readings ``B_i theta`` with noise of unit variance.
-        prior: with blocks, (p, p) precision of what is known of theta beforehand.
+        prior: a ``jaxcal.Prior`` of the model's parameters, its own default when not
+            given; with blocks, (p, p) precision of what is known of theta beforehand.
+        noise: a ``jaxcal.Noise`` instead of ``noise_std``.
+        measured: (N, n) commands, or (N, q, p) blocks, measured already; K counts the
+            new ones.
         available: (M,) bool, True where a candidate may be measured.
         required: (r,) candidates that must be measured.
         max_replicates: how often one candidate may be measured.
@@ -178,40 +193,12 @@ def plan(
     limit = seconds("time_limit", time_limit)
     more, start = whole_number("more", more, 0), checked_seed(seed)
     how = "I" if criterion == "I" else "G"
-    if blocks is None:
-        if candidates is None or noise_std is None or prior is not None:
-            raise ValueError("candidates and noise_std must be given, or else blocks")
-        if criterion == "parameters":
-            raise ValueError("criterion parameters must come with blocks")
-        m = None if num_outputs is None else whole_number("num_outputs", num_outputs, 1)
-        for value in (noise_std, target_accuracy):
-            if m is None and np.ndim(value) == 1 and np.size(value):
-                m = np.size(value)
-        m = m or (np.shape(candidates) or (1,))[-1]
-        noise = level("noise_std", noise_std, m)
-        target = level("target_accuracy", target_accuracy, m)
-        scale = np.array([(target / noise).min()])  # the outputs share one regressor
-        unit = noise * scale
-    else:
-        if candidates is not None or noise_std is not None or num_outputs is not None:
-            raise ValueError(
-                "blocks must come without candidates, noise_std and num_outputs: they "
-                "are in units of the noise"
-            )
-        m = None
-        if criterion == "parameters":
-            region = np.eye(np.shape(blocks)[-1] if np.ndim(blocks) else 1)[None]
-    problem, points = whole_problem(
-        candidates, blocks, region, max_replicates, prior=prior, available=available,
-        required=required, num_outputs=m,
+    problem, points, unit, target, level, names = make_request(
+        candidates, blocks, criterion, target_accuracy, noise_std, model=model,
+        noise=noise, num_outputs=num_outputs, parameters=parameters, region=region,
+        prior=prior, measured=measured, available=available, required=required,
+        max_replicates=max_replicates,
     )  # fmt: skip
-    if blocks is not None:
-        target = level("target_accuracy", target_accuracy, points.shape[1])
-        scale, unit, noise = target, target, np.ones(len(target))
-    points = points / scale[:, None]  # 1 is accurate enough
-    if how == "I" and len(points) > points.shape[2]:  # fewer rows, the same mean
-        root = np.linalg.qr(np.moveaxis(points, 1, 0))[1]
-        points = np.moveaxis(root, 0, 1) * np.sqrt(root.shape[1] / len(points))
     total, (identify, least_k) = problem.k, fewest(problem)
     if max_k is None:
         max_k = min(total, max(_LARGEST_K, least_k))
@@ -272,7 +259,8 @@ def plan(
         indices=chosen.indices,
         standard_error=chosen.standard_error,
         target_accuracy=target,
-        noise_std=noise,
+        noise_std=level,
+        names=names,
         criterion=criterion,
         smallest_proven=chosen.k == identify or bound_of(chosen.k - 1) > 1.0,
         rows=tuple(rows),

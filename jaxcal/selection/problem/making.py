@@ -252,7 +252,7 @@ def _whitened(
                 used = candidates[b][mask[b]]
                 require_excited(used, names[:-1], "candidates", which)
         _refuse_blind(raw[b][mask[b]], root, names or ())
-    owned = [raw, root, white.blocks, white.prior, mask, forced]
+    owned = [raw, root, *white[:3], mask, forced]
     for each in owned if candidates is None else [*owned, candidates]:
         each.flags.writeable = False
     readings = mask.sum(axis=1) * raw.shape[2]
@@ -260,7 +260,7 @@ def _whitened(
         Problem(
             white.blocks[b], white.prior[b], k, mask[b], forced[b], cap,
             wanted.whitened(white, b, int(readings[b])), wanted.times,
-            float(white.log_scale[b]), raw[b], root,
+            float(white.log_scale[b]), raw[b], white.basis[b], root,
             None if candidates is None else candidates[b], model,
         )
         for b in range(len(raw))

@@ -44,6 +44,7 @@ class Problem:
     multiplicity: int  # how often log det of the blocks counts
     log_scale: float  # log det of unwhitened less whitened information, of any choice
     raw: Array  # (M, q, p) blocks in the caller's numbers
+    basis: Array  # (p, p) raw blocks times it are whitened
     root: Array  # (r, p) root of the caller's prior precision, with what was measured
     candidates: Array | None = None  # (M, n) in the caller's unit, where there are any
     model: Model | None = None  # what made blocks of the candidates
