@@ -62,7 +62,7 @@ def table(name: str, values: ArrayLike) -> Array:
     table = numbers(name, values)
     if table.ndim != 2 or table.shape[1] < 1:
         raise ValueError(
-            f"{name} must have shape (N, {'n' if name == 'commands' else 'm'}), "
+            f"{name} must have shape (N, {'m' if name == 'measured' else 'n'}), "
             f"got {table.shape}"
         )
     return table

@@ -31,8 +31,8 @@ class FromJax:
             for one output; written with ``jax.numpy``, without ``if`` on their values.
         nominal: (p,) parameters of the machine as it was designed.
         names: of the parameters; t1, t2, ... when not given.
-        num_inputs: n. When not given it is what f unpacks or reads by number, else
-            that of the first commands.
+        num_inputs: n. When not given it is what f unpacks or multiplies, else that of
+            the first commands.
     """
 
     def __init__(
@@ -141,7 +141,7 @@ class FromJax:
                 ) from error
             sizes = (num_inputs, len(self.nominal))
             for i, (name, size) in enumerate(zip(("u", "theta"), sizes, strict=True)):
-                read = entries_read(self.f, sizes, i)[0]
+                read = entries_read(self.f, sizes, i)
                 if read > size:
                     raise ValueError(
                         f"f reads {name}[{read - 1}], which {name} of {size} entries "

@@ -9,7 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.models.model import Model, as_commands
+from jaxcal.checks import table
+from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["Direction", "Identifiability", "identifiability"]
@@ -79,7 +80,7 @@ def identifiability(
             are left out. Without one the measurements alone count.
         parameters: names to ask about; the others are taken as known.
     """
-    commands = as_commands(candidates, model.num_inputs)
+    commands = table("candidates", candidates)
     if not len(commands):
         raise ValueError("candidates must hold at least one row, got none")
     jacobian = model.jacobian(commands)

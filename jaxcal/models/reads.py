@@ -18,10 +18,10 @@ _LONGER = 1000  # entries more; one in the second half is counted from the end
 
 def entries_read(
     f: Callable[[Any, Any], Any], sizes: tuple[int, int], argument: int
-) -> tuple[int, bool]:
-    """One more than the last index read of an argument, and whether all are known.
+) -> int:
+    """One more than the last index read of an argument, as far as it can be seen.
 
-    (0, False) where f does not take longer arguments, as when it unpacks them.
+    0 where f does not take longer arguments, as when it unpacks them.
     """
     import jax
 
@@ -30,13 +30,13 @@ def entries_read(
     try:
         traced = jax.make_jaxpr(f)(*(np.zeros(size) for size in longer)).jaxpr
     except Exception:  # whatever f raises where a size does not fit
-        return 0, False
+        return 0
     most = sizes[argument] + _LONGER // 2
     return _read(traced, traced.invars[argument], most)
 
 
-def _read(traced: Any, variable: Any, most: int) -> tuple[int, bool]:
-    last, known = 0, True
+def _read(traced: Any, variable: Any, most: int) -> int:
+    last = 0
     for equation in traced.eqns:
         for i, used in enumerate(equation.invars):
             if used is not variable:
@@ -45,22 +45,19 @@ def _read(traced: Any, variable: Any, most: int) -> tuple[int, bool]:
             inner = getattr(inner, "jaxpr", inner)
             if equation.primitive.name == "slice":
                 end = equation.params["limit_indices"][0]
-                found = (end, True) if end <= most else (0, False)
+                last = max(last, end if end <= most else 0)
             elif inner is not None and len(inner.invars) == len(equation.invars):
-                found = _read(inner, inner.invars[i], most)
-            else:
-                found = (0, False)
-            last, known = max(last, found[0]), known and found[1]
-    return last, known
+                last = max(last, _read(inner, inner.invars[i], most))
+    return last
 
 
 def inputs_needed(f: Callable[[Any, Any], Any], num_parameters: int) -> int | None:
-    """n of f(u (n,), theta), where it unpacks, multiplies or reads a fixed number."""
+    """n of f(u (n,), theta), where it takes one size alone: it unpacks or multiplies.
+
+    The last entry that f reads does not say: a column of the commands may be unused.
+    """
     import jax
 
-    last, known = entries_read(f, (0, num_parameters), 0)
-    if last and known:
-        return last
     fits = []
     for n in range(1, 33):
         try:
