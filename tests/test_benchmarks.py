@@ -133,3 +133,17 @@ def test_a_quick_run_is_not_judged(quick, said):
     shown = report.as_json(row) | {"quick": quick}
     assert said in report.text(shown)
     assert ("MISSED" in report.text(shown)) is not quick
+
+
+def test_figarohs_relaxation_reaches_the_known_optimum_and_its_weights():
+    """The D-optimal measure of a parabola: a third each at both ends and the middle."""
+    from benchmarks.peers import figaroh
+
+    u = np.linspace(-1.0, 1.0, 21)
+    powers = np.stack([np.ones_like(u), u, u**2, 2.0 * u], axis=1)  # one too many
+    blocks = figaroh.identified(powers[:, None])
+    assert blocks.shape == (21, 1, 3)
+    weight, gap = figaroh.relaxed_weights(blocks, 1e-6)
+    assert gap < 1e-6
+    assert figaroh.chosen(weight).tolist() == [0, 10, 20]
+    np.testing.assert_allclose(weight[[0, 10, 20]], 1 / 3, atol=1e-4)

@@ -1,116 +1,258 @@
-"""Which poses of an arm to measure: ``select(blocks=)`` against FIGAROH's rule.
+"""Which poses of a measured UR5: time against the figures wanted, and FIGAROH's rule.
 
-FIGAROH (https://github.com/thanhndv212/figaroh) relaxes the D-optimal design to weights
-that sum to one, without a number of poses, and measures every pose whose weight is
-above 1e-5. Here on a UR5 whose joints, base and tool have 39 parameters, of which 25
-can be identified; both are given those, in units of 0.1 mm of noise.
+The arm, its 1,000 poses and their measurements are those of examples/ur5; a pose is a
+block of 3 readings of 39 parameters, known beforehand as the default prior says, with
+0.1 mm of noise. FIGAROH's rule (benchmarks/peers/figaroh.py) chooses its own number of
+poses, which jaxcal and random choices are given too.
 """
 
 from __future__ import annotations
 
 import functools
 import statistics
+import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.harness import Budget, Line, Row, Verdict, interleaved
-from jaxcal import select
+from benchmarks.harness import ROOT, Budget, Line, Row, Verdict
+from benchmarks.peers import figaroh
+from jaxcal import identify, select
+from jaxcal.models import Noise, SerialChain
+from jaxcal.selection.exact import branch_and_bound as search
+from jaxcal.selection.exchange.exchange import default_restarts, exchange_indices
+from jaxcal.selection.greedy import greedy_indices
+from jaxcal.selection.problem import Problem, make_problem
 
 NAME = "blocks"
-TITLE = "Poses of an arm, against relaxation without a number of poses"
+TITLE = "Poses of a measured UR5, and FIGAROH's rule"
 
-LEAST_WEIGHT = 1e-5
-_RULE = "FIGAROH's rule, NumPy"
 _NOISE = 0.1  # mm
-_A = np.array([0.0, -425.0, -392.25, 0.0, 0.0, 0.0])  # mm
-_D = np.array([89.159, 0.0, 0.0, 109.15, 94.65, 82.3])
-_TOOL = np.array([30.0, 20.0, 50.0])
-_ALPHA = np.deg2rad([90.0, 0.0, 0.0, 90.0, -90.0, 0.0])
+_TABLE = [
+    (0, 90, 89.159, 0),
+    (-425, 0, 0, 0),
+    (-392.25, 0, 0, 0),
+    (0, 90, 109.15, 0),
+    (0, -90, 94.56, 0),
+    (0, 0, 82.3, 0),
+]
+_PROOFS = ((1000, 20, 15.0), (200, 12, 8.0), (50, 8, 3.0))  # M, K, seconds wanted
+_LONGEST = 40.0  # seconds of a proof
 
 Array = NDArray[np.float64]
 
 
-def _move(axis: int, angle: Any, shift: Any) -> Any:
-    """(..., 4, 4) rotation about an axis and translation along it."""
-    angle, shift = np.broadcast_arrays(angle, shift)
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    out = np.zeros((*angle.shape, 4, 4), complex) + np.eye(4)
-    out[..., i, i] = out[..., j, j] = np.cos(angle)
-    out[..., j, i] = np.sin(angle)
-    out[..., i, j] = -np.sin(angle)
-    out[..., axis, 3] = shift
-    return out
+def arm() -> SerialChain:
+    return SerialChain.from_dh(_TABLE, tool=(0, 0, 31))
 
 
-def _positions(joints: Array, change: Any) -> Any:
-    """(M, 3) mm; ``change`` (39,) of a, d, alpha, theta, beta, base and tool."""
-    a, d, alpha, theta, beta = change[:30].reshape(5, 6)
-    pose = np.eye(4, dtype=complex)
-    for axis in range(3):
-        pose = pose @ _move(axis, change[33 + axis], change[30 + axis])
-    for i in range(6):
-        pose = pose @ _move(2, joints[:, i] + theta[i], _D[i] + d[i])
-        pose = pose @ _move(0, _ALPHA[i] + alpha[i], _A[i] + a[i])
-        pose = pose @ _move(1, beta[i], 0.0)
-    return (pose @ np.append(_TOOL + change[36:], 1.0))[:, :3]
+def poses(name: str) -> tuple[Array, Array]:
+    """Joint angles (N, 6) in degrees and measured points (N, 3) in mm."""
+    path = ROOT / "examples" / "ur5" / name
+    rows = np.loadtxt(path, delimiter=",", skiprows=1)
+    return rows[:, 7:13], rows[:, 1:4] + rows[:, 4:7]
 
 
-def arm_blocks(count: int, seed: int) -> Array:
-    """(count, 3, 25) derivatives over the noise, by the complex step."""
-    joints = np.random.default_rng(seed).uniform(-np.pi, np.pi, (count, 6))
-    steps = 1e-20j * np.eye(39)
-    columns = [_positions(joints, step).imag / 1e-20 for step in steps]
-    blocks = np.stack(columns, axis=-1) / _NOISE
-    size = np.sqrt((blocks**2).sum(axis=(0, 1)))
-    right = np.linalg.svd((blocks / size).reshape(-1, 39), full_matrices=False)[2]
-    return np.asarray(blocks / size @ right[:25].T)
-
-
-def relaxed_rule(blocks: Array, iterations: int) -> NDArray[np.int64]:
-    """Poses of weight above 1e-5 in the D-optimal measure (multiplicative steps)."""
-    kept = np.arange(len(blocks))
-    weight = np.full(len(kept), 1.0 / len(kept))
-    for _ in range(iterations):
-        rows = blocks[kept].reshape(-1, blocks.shape[2])
-        gram = (rows * np.repeat(weight, 3)[:, None]).T @ rows
-        gain = (rows @ np.linalg.inv(gram) * rows).sum(axis=1)
-        weight = weight * gain.reshape(-1, 3).sum(axis=1) / blocks.shape[2]
-        stays = weight > 0.01 * LEAST_WEIGHT
-        kept, weight = kept[stays], weight[stays]
-    return kept[weight > LEAST_WEIGHT]
+def cpu_seconds(call: Callable[[], Any], rounds: int) -> float:
+    """Median CPU seconds of a warm call: these calls use one thread."""
+    call()
+    seconds = []
+    for _ in range(rounds):
+        begun = time.process_time()
+        call()
+        seconds.append(time.process_time() - begun)
+    return statistics.median(seconds)
 
 
 def run(budget: Budget) -> Row:
     row = Row(NAME, TITLE)
-    blocks = arm_blocks(300, 1)
-    iterations = budget.pick(20_000, 2_000)
-    theirs = relaxed_rule(blocks, iterations)
-    k = len(theirs)
-    case = f"M = 300, K = {k}"
-    options: dict[str, dict[str, Any]] = {"exchange": {"restarts": 5}, "greedy": {}}
-    calls = {
-        f"jaxcal {method}": functools.partial(
-            select, None, k, method, blocks=blocks, **more
-        )
-        for method, more in options.items()
-    }
-    log_det = {who: call().log_det for who, call in calls.items()}
-    rows = blocks[theirs].reshape(-1, blocks.shape[2])
-    log_det[_RULE] = float(np.linalg.slogdet(rows.T @ rows)[1])
-    rule = functools.partial(relaxed_rule, blocks, iterations)
-    seconds = interleaved({**calls, _RULE: rule}, budget.pick(3, 1), warm=0)
-    best = max(log_det.values())
-    for who, taken in seconds.items():
-        efficiency = float(np.exp((log_det[who] - best) / rows.shape[1]))
-        note = f"D-efficiency {efficiency:.4f} of the best found"
-        row.lines.append(Line(case, who, 1e3 * statistics.median(taken), "ms", note))
-    ratio = float(np.exp((log_det["jaxcal exchange"] - log_det[_RULE]) / rows.shape[1]))
-    row.verdicts.append(Verdict(f"{case}: D-efficiency over the rule's", ratio, 1.0))
+    joints, measured = poses("ur5_grid_1000.csv")
+    for criterion in ("D", "I"):
+        _searches(row, joints, criterion, budget)
+        _relaxation(row, joints, criterion, budget)
+    for criterion in ("D", "I"):
+        _proofs(row, joints, criterion, budget)
+    _against_figaroh(row, joints, measured, budget)
     row.notes.append(
-        "the rule has no number of poses: K is what it chose, and its poses are meant "
-        "to be measured by weight, not once each; its time is that of "
-        f"{iterations} multiplicative steps, not of FIGAROH's own solver"
+        "times are CPU seconds of the process, in which every call uses one thread, so "
+        "that a shared machine does not change them; set OPENBLAS_NUM_THREADS=1"
     )
     return row
+
+
+def _problem(joints: Array, k: int, criterion: str) -> Problem:
+    return make_problem(
+        joints, k, model=arm(), noise=Noise(_NOISE), criterion=criterion
+    )
+
+
+def _searches(row: Row, joints: Array, criterion: str, budget: Budget) -> None:
+    rounds = budget.pick(9, 2)
+    making = cpu_seconds(lambda: _problem(joints, 20, criterion), rounds)
+    case = f"{criterion}, M = 1,000"
+    row.lines.append(Line(case, "model to blocks", 1e3 * making, "ms", "once a call"))
+    for k in (8, 20):
+        problem = _problem(joints, k, criterion)
+        starts = default_restarts(problem)
+        alone: dict[str, tuple[Callable[[], Any], float]] = {
+            "greedy": (functools.partial(greedy_indices, problem), 3.0),
+            "exchange": (functools.partial(exchange_indices, problem), 15.0),
+        }
+        for method, (solver, wanted) in alone.items():
+            whole = functools.partial(
+                select, joints, k, method, model=arm(), noise=Noise(_NOISE),
+                criterion=criterion,
+            )  # fmt: skip
+            seconds, all_of_it = (cpu_seconds(c, rounds) for c in (solver, whole))
+            case = f"{criterion}, K = {k} of 1,000"
+            who = f"{method}, starts: {starts}" if method == "exchange" else method
+            note = f"value {whole().value:.5g}"
+            row.lines += [
+                Line(case, f"{who}, solver alone", 1e3 * seconds, "ms", note),
+                Line(case, f"{who}, whole select", 1e3 * all_of_it, "ms", note),
+            ]
+            for what, value in (("solver", seconds), ("select", all_of_it)):
+                title = f"{case}: {method}, {what}"
+                row.verdicts.append(Verdict(title, 1e3 * value, wanted, False, "ms"))
+
+
+def _relaxation(row: Row, joints: Array, criterion: str, budget: Budget) -> None:
+    """The bound at the root, and how far above the relaxed optimum it stops."""
+    for k in (8, 20):
+        problem = _problem(joints, k, criterion)
+        start = np.bincount(greedy_indices(problem), minlength=len(joints))
+        solve = functools.partial(
+            search.branch_and_bound, problem.blocks, problem.prior, problem.criterion,
+            problem.lower, problem.upper, start, root_only=True,
+        )  # fmt: skip
+        usual = search._SHARE
+        try:  # to the end instead of to a share of the distance to the incumbent
+            search._SHARE = 0.0
+            bound = solve().bound
+            seconds = cpu_seconds(solve, budget.pick(5, 1))
+        finally:
+            search._SHARE = usual
+        case = f"{criterion}, K = {k} of 1,000"
+        note = f"solved to 1e-10; bound {problem.criterion.reported(bound):.6g}"
+        row.lines.append(Line(case, "relaxation", 1e3 * seconds, "ms", note))
+        row.verdicts.append(
+            Verdict(f"{case}: relaxation", 1e3 * seconds, 250.0, False, "ms")
+        )
+
+
+def _proofs(row: Row, joints: Array, criterion: str, budget: Budget) -> None:
+    rng = np.random.default_rng(0)
+    limit = budget.pick(int(_LONGEST), 2)
+    for count, k, wanted in _PROOFS:
+        pool = joints if count == 1000 else joints[rng.choice(1000, count, False)]
+        call = functools.partial(
+            select, pool, k, "exact", model=arm(), noise=Noise(_NOISE),
+            criterion=criterion,
+        )  # fmt: skip
+        call(time_limit=0.01)  # compiled
+        begun = time.process_time()
+        found = call(time_limit=float(limit))
+        seconds = time.process_time() - begun
+        case = f"{criterion}, K = {k} of {count:,}"
+        note = f"proven, value {found.value:.5g}"
+        if not found.proven:
+            note = f"open, efficiency at least {found.efficiency:.4f}"
+        row.lines.append(Line(case, "exact, whole select", seconds, "s", note))
+        row.verdicts.append(
+            Verdict(
+                f"{case}: proof", seconds if found.proven else None, wanted, False, "s",
+                "" if found.proven else f"{note} after {limit} s",
+            )
+        )  # fmt: skip
+
+
+def _against_figaroh(row: Row, joints: Array, measured: Array, budget: Budget) -> None:
+    """D-efficiency and error elsewhere at the rule's own K, on pools of 300 and 1,000.
+
+    D-efficiency is that of the combinations that can be identified, without a prior;
+    errors are of the arm identified from the chosen poses, with the default prior.
+    """
+    rng = np.random.default_rng(1)
+    chain = arm()
+    slopes = chain.jacobian(joints) / _NOISE
+    pools = [rng.choice(1000, 300, replace=False) for _ in range(budget.pick(20, 1))]
+    for title, some in (("M = 300", pools), ("M = 1,000", [np.arange(1000)])):
+        figures: dict[str, list[list[float]]] = {}
+        sizes, gaps, seconds = [], [], []
+        for pool in some:
+            blocks = figaroh.identified(slopes[pool])
+            begun = time.process_time()
+            weight, gap = figaroh.relaxed_weights(blocks)
+            seconds.append(time.process_time() - begun)
+            rule = figaroh.chosen(weight)
+            k = len(rule)
+            sizes.append(k)
+            gaps.append(gap)
+            model: dict[str, Any] = {"model": chain, "noise": Noise(_NOISE)}
+            plain = select(blocks=blocks, k=k, method="exchange", restarts=10)
+            ways = {"FIGAROH's rule": [rule], "jaxcal exchange, D": [plain.indices]}
+            for criterion in ("D", "I"):
+                ways[f"jaxcal exchange, {criterion}, default prior"] = [
+                    select(
+                        joints[pool], k, "exchange", criterion=criterion, **model
+                    ).indices
+                ]
+            draws = 3 if len(some) > 1 else 20
+            ways["random"] = [rng.choice(len(pool), k, False) for _ in range(draws)]
+            best = plain.log_det
+            for who, subsets in ways.items():
+                each = [
+                    _judged(blocks, best, subset, joints, measured, pool, chain)
+                    for subset in subsets
+                ]
+                figures.setdefault(who, []).append(np.mean(each, axis=0).tolist())
+        mean = {who: np.mean(values, axis=0) for who, values in figures.items()}
+        case = f"{title}, K = {min(sizes)}" + (
+            f" to {max(sizes)}" if max(sizes) > min(sizes) else ""
+        )
+        for who, (efficiency, rest, worst, test) in mean.items():
+            note = (
+                f"D-efficiency against jaxcal's D; held-out error mean {rest:.4f}, "
+                f"largest {worst:.3f}, on the test poses {test:.4f} mm"
+            )
+            row.lines.append(Line(case, who, float(efficiency), "", note))
+        theirs = mean["FIGAROH's rule"]
+        row.lines.append(
+            Line(
+                case, "FIGAROH's relaxation, solved here",
+                1e3 * statistics.median(seconds), "ms",
+                f"duality gap at most {max(gaps):.1g} of log det",
+            )
+        )  # fmt: skip
+        row.verdicts += [
+            Verdict(f"{case}: D-efficiency over the rule's", 1.0 / theirs[0], 1.0),
+            Verdict(
+                f"{case}: the rule's held-out error over ours (I)",
+                theirs[1] / mean["jaxcal exchange, I, default prior"][1],
+                1.0,
+            ),
+        ]
+
+
+def _judged(
+    blocks: Array,
+    best: float,
+    subset: NDArray[np.int64],
+    joints: Array,
+    measured: Array,
+    pool: NDArray[np.int64],
+    chain: SerialChain,
+) -> tuple[float, float, float, float]:
+    """D-efficiency; mean and largest error on the other poses, mean on the test's."""
+    rows = blocks[subset].reshape(-1, blocks.shape[2])
+    log_det = float(np.linalg.slogdet(rows.T @ rows)[1])
+    chosen = pool[subset]
+    found = identify(joints[chosen], measured[chosen], model=chain, noise_std=_NOISE)
+    rest = np.setdiff1d(np.arange(len(joints)), chosen)
+    test_joints, test = poses("ur5_random_20.csv")
+    error = np.linalg.norm(found.predict(joints[rest]) - measured[rest], axis=1)
+    elsewhere = np.linalg.norm(found.predict(test_joints) - test, axis=1)
+    efficiency = float(np.exp((log_det - best) / rows.shape[1]))
+    return efficiency, float(error.mean()), float(error.max()), float(elsewhere.mean())
