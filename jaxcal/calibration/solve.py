@@ -140,14 +140,15 @@ class _Search:
         self.command_root = 1.0 / task.command_std[self.uncertain]  # 0: unknown
         self.left = q - int(np.isinf(task.command_std).sum())  # readings, nuisance out
         self.damping, self.grow = 1e-3, 2.0
-        self.floor = 1e-13 * np.abs(_times(task.white, task.measured)).max()
+        largest = float(np.abs(_times(task.white, task.measured)).max())
+        self.floor = 1e-13 * largest or 1e-100
         self.freedom = np.zeros(q)
         self.theta = task.mean if start is None else start.parameters
         self.commands = task.commands if start is None else start.commands
         self.residuals = task.measured - predict(task.model, self.commands, self.theta)
         if start is None:
             self.weights, self.level = np.ones(count), np.ones(q)
-            self.size = float(np.sqrt(np.mean(self.residuals**2)))
+            self.size = float(np.sqrt(np.mean(self.residuals**2))) or 1.0
             if not task.known:
                 first = np.sqrt(np.mean(_times(task.white, self.residuals) ** 2))
                 self.level = np.full(q, max(first, self.floor))

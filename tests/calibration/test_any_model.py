@@ -576,3 +576,10 @@ def test_level_of_students_loss_is_that_of_normal_noise() -> None:
     measured = commands + rng.normal(0, 0.3, (400, 1))
     found = identify(commands, measured, model=Polynomial(1, 1))
     assert abs(found.noise_std[0] - 0.3) < 4 * 0.3 / np.sqrt(2 * 400)
+
+
+@pytest.mark.parametrize("given", [{"noise_std": 0.1}, {}])
+def test_measurements_without_any_error_are_no_error(given):
+    model = Polynomial(1, 1)
+    found = identify([[0.0], [1.0], [2.0]], [[0.0]] * 3, model=model, **given)
+    np.testing.assert_allclose(found.parameters, 0.0, atol=1e-12)
