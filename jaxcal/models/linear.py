@@ -133,7 +133,10 @@ class Linear:
         }
 
     def _commands(self, commands: Any) -> Array:
-        return as_commands(by_name(self, commands), self.num_inputs)
+        commands = by_name(self, commands)
+        if hasattr(commands, "to_numpy"):
+            commands = commands.to_numpy()
+        return as_commands(commands, self.num_inputs)
 
     def _evaluate(self, commands: Array) -> Array:
         """(N, r), finite."""
