@@ -93,6 +93,10 @@ def identify(
         ValueError: naming the argument, the rule and the value; for commands that leave
             a direction unexcited, naming that direction.
     """
+    if model is not None:
+        from jaxcal.models.model import by_name
+
+        commands = by_name(model, commands)
     commands = table("commands", commands)
     measured = table("measured", measured)
     if len(commands) != len(measured):

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import axis_names, numbers, whole_number
 from jaxcal.models.formula import input_names, parse
-from jaxcal.models.model import as_commands, as_parameters
+from jaxcal.models.model import as_commands, as_parameters, by_name
 from jaxcal.models.uncertainty import Prior
 
 __all__ = ["Linear", "input_letters"]
@@ -133,14 +133,9 @@ class Linear:
         }
 
     def _commands(self, commands: Any) -> Array:
-        if hasattr(commands, "columns"):  # a data frame
-            missing = [name for name in self.inputs if name not in commands.columns]
-            if missing:
-                raise ValueError(
-                    f"commands must have the columns {', '.join(self.inputs)}, "
-                    f"{missing[0]!r} is missing"
-                )
-            commands = commands[list(self.inputs)].to_numpy()
+        commands = by_name(self, commands)
+        if hasattr(commands, "to_numpy"):
+            commands = commands.to_numpy()
         return as_commands(commands, self.num_inputs)
 
     def _evaluate(self, commands: Array) -> Array:

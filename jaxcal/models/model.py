@@ -12,7 +12,7 @@ from jaxcal.checks import numbers
 if TYPE_CHECKING:
     from jaxcal.models.uncertainty import Prior
 
-__all__ = ["Model", "as_commands", "as_parameters"]
+__all__ = ["Model", "as_commands", "as_parameters", "by_name"]
 
 Array = NDArray[np.float64]
 
@@ -88,3 +88,17 @@ def as_parameters(model: Model, parameters: ArrayLike | None) -> Array:
             f"got {array.shape}"
         )
     return array
+
+
+def by_name(model: Any, commands: Any) -> Any:
+    """Of a data frame the columns that the model names, in its order; else as given."""
+    inputs = getattr(model, "inputs", None)
+    if not inputs or not hasattr(commands, "columns"):
+        return commands
+    missing = [name for name in inputs if name not in commands.columns]
+    if missing:
+        raise ValueError(
+            f"commands must have the columns {', '.join(inputs)}, "
+            f"{missing[0]!r} is missing"
+        )
+    return commands[list(inputs)]

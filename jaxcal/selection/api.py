@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxcal.checks import one_of, seconds
-from jaxcal.models.model import Model
+from jaxcal.models.model import Model, by_name
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.exact.exact import TIME_LIMIT, solve_exact
 from jaxcal.selection.problem import (
@@ -117,6 +117,7 @@ def select(
     also = ("time_limit",) if reference == "exact" else ()
     options = checked_options(method, given, also)
     start = time.perf_counter()
+    candidates = by_name(model, candidates)
     names, axes = _labels(candidates, names)
     problem = _problem(
         candidates, k, blocks, model=model, prior=prior, noise=noise,
@@ -180,6 +181,7 @@ def score(
             f"indices must lie in [0, {num_candidates}), got {subset[outside][0]}"
         )
     repeats = int(np.unique(subset, return_counts=True)[1].max())
+    candidates = by_name(about.get("model"), candidates)
     names, axes = _labels(candidates, None)
     cap = repeats if max_replicates is None else max_replicates
     problem = _problem(

@@ -1,4 +1,4 @@
-"""An arm in metres is the same arm in millimetres; other units are refused."""
+"""Metres and millimetres give the same picks; wrong units and names are refused."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 import jaxcal
 from jaxcal import Noise
-from jaxcal.models import SerialChain
+from jaxcal.models import Linear, SerialChain
 
 TABLE = np.array([[0, 90, 400, 0], [500, 0, 0, 0], [0, 90, 0, 0], [0, 0, 450, 0.0]])
 JOINTS = np.random.default_rng(0).uniform(-120, 120, (60, 4))
@@ -46,3 +46,17 @@ def test_a_pose_with_uncertain_commands_is_refused() -> None:
 def test_what_is_no_model_is_refused(model: object) -> None:
     with pytest.raises(ValueError, match="model must be"):
         jaxcal.select(JOINTS, 6, model=model)  # type: ignore[arg-type]  # the point
+
+
+def test_columns_of_a_data_frame_are_taken_by_name() -> None:
+    pandas = pytest.importorskip("pandas")
+    grid = np.random.default_rng(0).uniform(-1, 1, (30, 2))
+    model = Linear("1 + x + y + I(x**3)", inputs=["x", "y"])
+    frame = pandas.DataFrame(grid, columns=["x", "y"])[["y", "x"]]
+    picked = jaxcal.select(frame, 5, "greedy", model=model)
+    expected = jaxcal.select(grid, 5, "greedy", model=model)
+    np.testing.assert_array_equal(picked.indices, expected.indices)
+    found = jaxcal.identify(frame, model.predict(grid, [1, 2, 3, 4]), model=model)
+    np.testing.assert_allclose(found.parameters, [1, 2, 3, 4])
+    with pytest.raises(ValueError, match="'x' is missing"):
+        jaxcal.select(frame.rename(columns={"x": "a"}), 5, "greedy", model=model)
