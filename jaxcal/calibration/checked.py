@@ -16,10 +16,19 @@ Array = NDArray[np.float64]
 def predict(
     model: Model, commands: Array, parameters: Array, *, finite: bool = True
 ) -> Array:
-    """(N, q) outputs; with ``finite`` a ValueError names the first that is not."""
+    """(N, q) outputs; with ``finite`` a ValueError names the first that is not.
+
+    Without it, as for trial steps, NaN stands for what the model refuses to answer.
+    """
+    shape = (len(commands), model.num_outputs)
     with np.errstate(all="ignore"):
-        found = np.asarray(model.predict(commands, parameters), dtype=np.float64)
-    _require_shape("predict", found, (len(commands), model.num_outputs))
+        try:
+            found = np.asarray(model.predict(commands, parameters), dtype=np.float64)
+        except ValueError:
+            if finite:
+                raise
+            return np.full(shape, np.nan)
+    _require_shape("predict", found, shape)
     bad = np.flatnonzero(~np.isfinite(found).all(axis=1))
     if finite and bad.size:
         raise ValueError(

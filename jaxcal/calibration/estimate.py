@@ -28,7 +28,9 @@ def require_model(model: Any, commands: Array, measured: Array) -> None:
                 f"model must have a method {method} (see jaxcal.models.Model), got "
                 f"{model!r}"
             )
-    model.predict(commands[:1], None)  # tells some models their number of inputs
+    if not len(commands):
+        raise ValueError("commands must hold at least one row, got none")
+    model.predict(commands, None)  # tells some models their number of inputs
     for name, table, count in (
         ("commands", commands, model.num_inputs),
         ("measured", measured, model.num_outputs),

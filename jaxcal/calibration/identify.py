@@ -104,10 +104,18 @@ def identify(
     inputs = axis_names("input_names", input_names, "u", n)
     outputs = axis_names("output_names", output_names, "y", m)
     weight = relative_weights(weights, len(commands))
-    if noise is not None and noise_std is not None:
-        raise ValueError("noise_std is short for noise: give one of them")
-    if noise is not None and noise.covariance is None and noise.command_std is None:
-        if np.ndim(0.0 if noise.std is None else noise.std) < 2:
+    if noise is not None:
+        from jaxcal.models import Noise
+
+        if not isinstance(noise, Noise):
+            raise ValueError(
+                f"noise must be a jaxcal.Noise, got {type(noise).__name__}; a number "
+                "goes into noise_std"
+            )
+        if noise_std is not None:
+            raise ValueError("noise_std is short for noise: give one of them")
+        plain = noise.covariance is None and noise.command_std is None
+        if plain and np.ndim(0.0 if noise.std is None else noise.std) < 2:
             noise_std, noise = noise.std, None
     level = noise_levels(noise_std, m)
     if level is not None and common_noise is not None:

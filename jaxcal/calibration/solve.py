@@ -251,7 +251,7 @@ class _Search:
                 self.damping, self.grow = max(shrunk, _LEAST_DAMPING), 2.0
                 self._linearise()
                 return False
-            if self.damping > 1e12:  # rounding is all that is left, or
+            if self.damping > 1e9:  # rounding is all that is left, or
                 slope = np.abs(rows.T @ right).max() / np.linalg.norm(right)
                 if slope > 1e-3:
                     raise ValueError(

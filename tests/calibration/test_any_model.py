@@ -11,7 +11,7 @@ import pytest
 from scipy import optimize
 
 from jaxcal.calibration import Calibration, ModelCalibration, identify
-from jaxcal.models import Affine, Linear, Noise, Polynomial, Prior
+from jaxcal.models import Affine, FromJax, Linear, Noise, Polynomial, Prior
 
 
 class Wave:
@@ -530,6 +530,7 @@ def broken(method: str, answer: Any) -> Any:
         ({"noise": Noise(1.0, command_std=[1, 2, 3])}, "command_std must be one"),
         ({"noise": Noise(1.0, command_std=np.inf)}, "must leave fewer unknown"),
         ({"noise_std": 1.0, "common_noise": True}, "give one of them"),
+        ({"noise": 0.1}, "noise must be a jaxcal.Noise, got float; a number goes"),
         ({"loss": "huber"}, "loss must be one of student, gaussian"),
         ({"discrepancy": 0}, "discrepancy must be at least 1, got 0"),
         ({"weights": np.zeros(12)}, "weights must be positive for one"),
@@ -547,6 +548,24 @@ def test_a_search_that_fails_says_what_to_try() -> None:
     model = broken("jacobian", lambda n: rng.normal(size=(n, 2, 6)))
     with pytest.raises(ValueError, match=r"did not converge|must be the deriva"):
         identify(commands, measured, model=model, loss="gaussian")
+
+
+def test_a_function_in_jax_is_identified_and_inverted() -> None:
+    jnp = pytest.importorskip("jax.numpy")
+
+    def decay(u: Any, theta: Any) -> Any:
+        return jnp.array([theta[0] * jnp.exp(-theta[1] * u[0]) + jnp.log(theta[2])])
+
+    model = FromJax(decay, [1.0, 1.0, 0.2], ["size", "rate", "floor"])
+    commands = np.linspace(0, 3, 10)[:, None]
+    rng = np.random.default_rng(0)
+    measured = 2.0 * np.exp(-0.7 * commands) + np.log(3.0)
+    measured += rng.normal(0, 1e-3, measured.shape)
+    found = identify(commands, measured, model=model)
+    np.testing.assert_allclose(found.parameters, [2.0, 0.7, 3.0], rtol=0.05)
+    assert found.command_for([2.0])[0] == pytest.approx(
+        -np.log((2.0 - np.log(3.0)) / 2.0) / 0.7, abs=0.01
+    )
 
 
 def test_level_of_students_loss_is_that_of_normal_noise() -> None:
