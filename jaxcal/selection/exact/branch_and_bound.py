@@ -71,13 +71,12 @@ def branch_and_bound(
             proof has had a fair try.
         root_only: stop at the bound of the relaxation.
     """
-    from jaxcal.selection.exact.branch_kernel import offer_start, search
+    from jaxcal.selection.exact.branch_kernel import search
 
     problem, scale, shift = _relaxation(blocks, prior, criterion, start)
     num_blocks, q, p = blocks.shape
     best_counts = np.zeros((best, num_blocks), dtype=np.int64)
     best_values = np.full(best, -np.inf)
-    offer_start(problem, lower, upper, start.copy(), best_counts, best_values)
     width = num_blocks
     alive = np.arange(num_blocks)
     lows, highs = _first(lower, 64), _first(upper, 64)
@@ -87,9 +86,13 @@ def branch_and_bound(
     while size:
         bound = max(bounds[:size].max(), best_values[0])
         late = deadline is not None and time.perf_counter() > deadline
-        close = enough is not None and nodes >= free and (
-            scale * bound + shift
-            <= criterion.enough(float(scale * best_values[0] + shift), enough)
+        close = (
+            enough is not None
+            and nodes >= free
+            and (
+                scale * bound + shift
+                <= criterion.enough(float(scale * best_values[0] + shift), enough)
+            )
         )
         if nodes and (late or close or root_only):
             break

@@ -12,7 +12,13 @@ import numpy as np
 from numba import njit
 
 from jaxcal.information.linear_algebra import gram_of
-from jaxcal.selection.exact.criterion_kernel import RANK, D, E, Local, evaluate
+from jaxcal.selection.exact.criterion_kernel import (
+    OPTIONS,
+    RANK,
+    D,
+    Local,
+    evaluate,
+)
 from jaxcal.selection.exact.relaxation_kernel import relax
 
 __all__ = ["offer_start", "process", "search"]
@@ -23,7 +29,7 @@ _SINGULAR = 1e-12  # smallest over largest eigenvalue of what is known
 _SMOOTHING = 30.0  # of E at first, where the eigenvalue is about 1
 
 
-@njit(cache=True, nogil=True)
+@njit(**OPTIONS)
 def _new_local(p):
     square = np.empty((6, p, p))
     return Local(
@@ -32,16 +38,15 @@ def _new_local(p):
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@njit(inline="always")
 def value_of(problem, counts, local):
     """The criterion of a selection, -inf where it is singular."""
     gram_of(problem.blocks, 1.0 * counts, problem.prior, local.gram)
-    if problem.kind == E:
-        return np.linalg.eigvalsh(local.gram)[0]
+    local.settings[1] = np.inf  # E itself
     return evaluate(problem.kind, problem.root, local)[0]
 
 
-@njit(cache=True, nogil=True)
+@njit(**OPTIONS)
 def offer(problem, counts, local, best_counts, best_values):
     """Insert a selection into the sorted list of the best, once."""
     value = value_of(problem, counts, local)
@@ -60,16 +65,13 @@ def offer(problem, counts, local, best_counts, best_values):
     best_counts[r] = counts
 
 
-@njit(cache=True, nogil=True)
-def offer_start(problem, low, high, counts, best_counts, best_values):
+@njit(inline="always")
+def offer_start(problem, low, high, counts, local, best_counts, best_values):
     """Offer a selection and, where several are wanted, all one swap away from it."""
     num_blocks = len(counts)
-    local = _new_local(problem.blocks.shape[2])
     offer(problem, counts, local, best_counts, best_values)
-    if len(best_values) == 1:
-        return
     for i in range(num_blocks):
-        if counts[i] > low[i]:
+        if counts[i] > low[i] and len(best_values) > 1:
             counts[i] -= 1
             for j in range(num_blocks):
                 if j != i and counts[j] < high[j]:
@@ -79,7 +81,7 @@ def offer_start(problem, low, high, counts, best_counts, best_values):
             counts[i] += 1
 
 
-@njit(cache=True, nogil=True)
+@njit(**OPTIONS)
 def _balance(low, high, c, k, leverage):
     """Move c into its bounds and back to sum k, keeping it near where it was."""
     num_blocks = len(c)
@@ -104,7 +106,7 @@ def _balance(low, high, c, k, leverage):
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(**OPTIONS)
 def _kind_of(problem, low, local):
     """RANK where what is still to be chosen has too few readings for D to be sharp."""
     local.settings[1] = _SMOOTHING
@@ -123,7 +125,7 @@ def _kind_of(problem, low, local):
     return RANK
 
 
-@njit(cache=True, nogil=True)
+@njit(inline="always")
 def process(
     problem, low, high, c, slack, share, best_counts, best_values, local, leverage
 ):
@@ -191,7 +193,7 @@ def process(
     return bound, branch
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def search(
     problem, slack, share, lows, highs, weights, bounds, size,
     best_counts, best_values, widest, node_limit,
@@ -219,6 +221,10 @@ def search(
     leverage = np.empty(num_blocks)
     last = len(best_values) - 1
     nodes = 0
+    if not best_values[0] > -np.inf:  # the root, and its weights are the start
+        low[:], high[:] = lows[0], highs[0]
+        counts = np.round(weights[0]).astype(np.int64)
+        offer_start(problem, low, high, counts, local, best_counts, best_values)
     while size > 0 and nodes < node_limit and size + 2 <= room:
         pick = size - 1
         if size <= widest:

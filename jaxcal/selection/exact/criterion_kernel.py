@@ -31,12 +31,30 @@ from numpy.typing import NDArray
 
 from jaxcal.information.linear_algebra import factor
 
-__all__ = ["D", "DS", "E", "RANK", "TRACE", "Local", "Relaxation", "evaluate", "hessian"]
+__all__ = [
+    "DS",
+    "FAST",
+    "OPTIONS",
+    "RANK",
+    "TRACE",
+    "D",
+    "E",
+    "Local",
+    "Relaxation",
+    "evaluate",
+    "hessian",
+]
 
 D, DS, TRACE, E, RANK = range(5)  # RANK: D in its sharper form
 
 _EPS = float(np.finfo(np.float64).eps)
-_FAST = {"reassoc", "contract", "nsz"}  # sums in any order, so in vector registers
+# Inner functions: a caller that is compiled includes them, so they need no entry from
+# Python; what has one place to be called from is inlined, which compiles it once.
+OPTIONS = {
+    "cache": True, "nogil": True, "error_model": "numpy", "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+}  # fmt: skip
+FAST = OPTIONS | {"fastmath": {"reassoc", "contract", "nsz"}}  # sums in any order
 
 
 class Relaxation(NamedTuple):
@@ -63,7 +81,7 @@ class Local(NamedTuple):
     settings: NDArray[np.float64]  # (4,) weight of the tail, b of E, t, log det P
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@njit(**FAST)
 def _multiply(x, y, out):
     """``out = x @ y``."""
     for a in range(len(x)):
@@ -75,7 +93,7 @@ def _multiply(x, y, out):
                 out[a, b] += weight * y[c, b]
 
 
-@njit(cache=True, nogil=True)
+@njit(**OPTIONS)
 def evaluate(kind, root, local):
     """Fill ``local`` at ``local.gram``.
 
@@ -108,7 +126,7 @@ def evaluate(kind, root, local):
     return value, value
 
 
-@njit(cache=True, nogil=True)
+@njit(inline="always")
 def _spectral(kind, local):
     """:func:`evaluate` of E and RANK, by eigenvalues."""
     p = len(local.gram)
@@ -118,7 +136,9 @@ def _spectral(kind, local):
         values, vectors = np.linalg.eigh(local.gram)
         local.inverse[:] = vectors
         b = local.settings[1]
-        slopes[:] = np.exp(-b * (values - values[0]))
+        for a in range(p):
+            apart = values[a] - values[0]
+            slopes[a] = np.exp(-b * apart) if apart > 0.0 else 1.0
         total = slopes.sum()
         slopes /= total
         value, base = values[0] - np.log(total) / b, (slopes * values).sum()
@@ -160,9 +180,9 @@ def _spectral(kind, local):
     return value, base
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@njit(**FAST)
 def hessian(kind, blocks, which, local, out):
-    """Fill ``out`` (m, m), less the Hessian over the counts of blocks ``which`` (m,)."""
+    """Fill ``out`` (m, m): minus the Hessian over the counts of ``which`` (m,)."""
     m, q, p = len(which), blocks.shape[1], blocks.shape[2]
     by_inverse = np.zeros((m, q, p))
     by_gradient = by_inverse
@@ -199,7 +219,7 @@ def hessian(kind, blocks, which, local, out):
             out[j, i] = total
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@njit(**FAST)
 def _spectral_hessian(turned, local, out):
     """:func:`hessian` of blocks turned into the basis V, (m, q, p)."""
     m, q, p = turned.shape

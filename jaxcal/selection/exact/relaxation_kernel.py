@@ -16,7 +16,8 @@ from numba import njit
 
 from jaxcal.information.linear_algebra import gram_of
 from jaxcal.selection.exact.criterion_kernel import (
-    _FAST,
+    FAST,
+    OPTIONS,
     E,
     evaluate,
     hessian,
@@ -32,7 +33,7 @@ _ROUNDING = 1e-12  # of a count that is whole
 _SHARPEST = 1e5  # smoothing of E, where the eigenvalue is about 1
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@njit(**FAST)
 def _leverages(blocks, gradient, low, high, leverage):
     """Fill leverage (M,), ``trace(B_i G B_i.T)``, where the count is not fixed."""
     num_blocks, q, p = blocks.shape
@@ -50,7 +51,7 @@ def _leverages(blocks, gradient, low, high, leverage):
                     leverage[i] += reach[a] * blocks[i, r, a]
 
 
-@njit(cache=True, nogil=True)
+@njit(**OPTIONS)
 def linear_gain(low, high, c, k, leverage):
     """Largest ``sum of (c'_i - c_i) d_i`` within the bounds, and its multiplier.
 
@@ -87,7 +88,7 @@ def linear_gain(low, high, c, k, leverage):
     return gain + (k - total) * cut, cut
 
 
-@njit(cache=True, nogil=True)
+@njit(**OPTIONS)
 def _working_set(low, high, c, leverage, cut, extra):
     """Counts to move: the fractional ones and ``extra`` of those that should move."""
     num_blocks = len(c)
@@ -125,7 +126,7 @@ def _working_set(low, high, c, leverage, cut, extra):
     return which[:size]
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@njit(**FAST)
 def _solve(matrix, which, size, x, y, lower):
     """x and y (m,) become their solutions by ``matrix`` at ``which[:size]``."""
     for a in range(size):
@@ -150,7 +151,7 @@ def _solve(matrix, which, size, x, y, lower):
             y[c] -= lower[a, c] * y[a]
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)
+@njit(**FAST)
 def _quadratic_step(curvature, slope, least, most, move):
     """Maximise ``slope.x - x.curvature.x / 2``, sum x = 0, least <= x <= most.
 
@@ -220,14 +221,14 @@ def _quadratic_step(curvature, slope, least, most, move):
         side[best] = 0
 
 
-@njit(cache=True, nogil=True)
+@njit(**OPTIONS)
 def _spread(low, high, c, k):
     """Share what the lower bounds leave in proportion to the room of each count."""
     room = max((high - low).sum(), 1)
     c[:] = low + (k - low.sum()) * (high - low) / room
 
 
-@njit(cache=True, nogil=True)
+@njit(inline="always")
 def relax(problem, kind, low, high, c, goal, share, local, leverage):
     """Climb the relaxation of a node until it is pruned, or solved well enough.
 
