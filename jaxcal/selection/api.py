@@ -91,7 +91,7 @@ def select(
             cheapest bound, computed when read) or "exact" (the proven optimum).
         seed: whole number or numpy Generator; of all methods but greedy.
         restarts: starts of exchange, and of the one that starts exact and auto; see
-            ``jaxcal.selection.exchange.default_restarts`` for how many when not given.
+            ``exchange.default_restarts`` for how many when not given, 30 with these.
         time_limit: seconds after which exact and auto return the best found with a true
             ``bound``, not proven; 10 when not given, ``math.inf`` for none.
         best: of exact, how many best subsets to prove, in ``alternatives``.

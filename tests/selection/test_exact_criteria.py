@@ -192,3 +192,35 @@ def test_corners_of_the_cube_are_d_and_a_optimal_for_first_order() -> None:
         assert best.proven
         assert (np.abs(cube[best.indices]) == 1.0).all()
         assert found.log_det(best.indices) == pytest.approx(4 * np.log(8.0))
+
+
+def test_the_mixture_design_of_algdesigns_vignette() -> None:
+    """``optFederov(~-1+.^2, expand.mixture(4,3), nTrials=8)``: D 0.03623366."""
+    thirds = [
+        (a, b, 3 - a - b) for c in range(4) for b in range(4 - c) for a in [3 - b - c]
+    ]
+    x, y, z = np.array(thirds).T / 3.0
+    blocks = np.column_stack([x, y, z, x * y, x * z, y * z])[:, None]
+    found = select(blocks=blocks, k=8, method="exact")
+    assert found.proven
+    # D is det(X.T X / N)^(1 / p) there.
+    assert np.exp(found.log_det / 6) / 8 == pytest.approx(0.03623366, rel=1e-6)
+
+
+@pytest.mark.parametrize(("name", "theirs"), [("D", 3.675919), ("I", 8.096772)])
+def test_the_response_surface_of_algdesigns_vignette(name: str, theirs: float) -> None:
+    """``optFederov(~quad(.), gen.factorial(5,3), nTrials=15)``, and criterion="I"."""
+    levels = np.arange(-2.0, 3.0)
+    x, y, z = np.array(list(itertools.product(levels, repeat=3))).T
+    columns = [0 * x + 1, x, y, z, x * x, y * y, z * z, x * y, x * z, y * z]
+    blocks = np.column_stack(columns)[:, None]
+    limit = 60.0 if name == "D" else 1.0
+    found = select(
+        blocks=blocks, k=15, method="exact", criterion=name, time_limit=limit
+    )
+    if name == "D":  # theirs is optimal
+        assert found.proven
+        assert np.exp(found.value / 10) / 15 == pytest.approx(theirs, rel=1e-6)
+    else:
+        assert 15 * found.value <= theirs * (1 + 1e-6)
+        assert 15 * found.bound >= 7.5  # "7.57" of the continuous design

@@ -151,8 +151,8 @@ def _relaxation(
         else:
             kind, inverse = E, np.linalg.inv(root) / np.sqrt(scale)
             blocks, prior = blocks @ inverse, inverse.T @ prior @ inverse
-    arrays = (np.array(each, order="C") for each in (blocks, prior, root))
-    return Relaxation(kind, *arrays, k, rank), scale, shift
+    blocks, prior, root = (np.array(each, order="C") for each in (blocks, prior, root))
+    return Relaxation(kind, blocks, prior, root, k, rank), scale, shift
 
 
 def _first(row: NDArray[Any], room: int) -> NDArray[Any]:

@@ -226,22 +226,27 @@ def _falls(grown, cross, out, work, left, gain):
     Args:
         grown, cross: H_jj and H_ij (q, q, M).
         work, gain: as ``_ratios`` left them, changed.
-        left: (2, q, q, M) work space.
+        left: (3, q, q, M) work space.
     """
-    regular = gain > 1e-14  # not singular without i
+    part, lost, regular = left[0], left[1], left[2, 0, 0]
+    for j in range(len(gain)):
+        regular[j] = gain[j]
     gain[:] = 0.0
     _dots(gain, 1.0, work[0], grown)
     if out == _NONE:
         return
-    solved, part, lost = work[1], left[0], left[1]
-    _plus(part, -1.0, cross, np.zeros(cross.shape[:2]))
+    solved, there = work[1], np.zeros(cross.shape[:2])
+    _plus(part, -1.0, cross, there)
     _times(part, 1.0, solved, grown)
-    _plus(lost, 0.0, cross, np.ascontiguousarray(grown[:, :, out]))
+    for r in range(len(grown)):
+        for s in range(len(grown)):
+            there[r, s] = grown[r, s, out]
+    _plus(lost, 0.0, cross, there)
     _times(lost, 1.0, part, solved)
     _times(lost, -1.0, solved, cross)
     _dots(gain, -1.0, work[2], lost)
     for j in range(len(gain)):
-        if not regular[j]:
+        if not regular[j] > 1e-14:  # singular without i
             gain[j] = -np.inf
 
 
@@ -252,7 +257,7 @@ def _gains(
 ):  # fmt: skip
     """gain_j (M,): the rise of phi when j comes in and ``out``, if any, goes.
 
-    ``block`` is that of ``out``; cross (2, q, q, M), work (5, q, q, M) and det (M,) are
+    ``block`` is that of ``out``; cross (2, q, q, M), work (6, q, q, M) and det (M,) are
     work space.
     """
     if out != _NONE:
@@ -395,7 +400,7 @@ def grow_and_climb(
     k = len(chosen)
     shape = (q, q, num_blocks)
     grown, grown_other = np.empty(shape), np.empty(shape)
-    cross, work = np.empty((2, *shape)), np.empty((5, *shape))
+    cross, work = np.empty((2, *shape)), np.empty((6, *shape))
     gain, det = np.empty(num_blocks), np.empty(num_blocks)
     gram, inverse, other = np.empty((p, p)), np.empty((p, p)), np.empty((p, p))
     counts = np.zeros(num_blocks, dtype=np.int64)

@@ -77,17 +77,19 @@ def exchange_indices(
 def _exchange_rows(problem: Problem, restarts: int, seed: int) -> tuple[Indices, float]:
     """For one reading per candidate, from random starts alone."""
     from jaxcal.selection.exchange.rows_kernel import exchange_rows
+    from jaxcal.selection.exchange.starts import RIDGE
 
     usable = np.flatnonzero(problem.available)
-    blocks = problem.blocks[usable]
+    blocks, prior = problem.blocks[usable], problem.prior.copy()
     span = np.zeros((0, problem.num_regressors))
     if len(problem.root):
-        values, vectors = np.linalg.eigh(problem.prior)
+        values, vectors = np.linalg.eigh(prior)
         span = np.ascontiguousarray(vectors.T[values > 1e-6])
     chosen, log_det = exchange_rows(
-        blocks, np.ascontiguousarray(blocks.transpose(1, 2, 0)), problem.prior.copy(),
-        span, 1, problem.upper[usable], np.searchsorted(usable, problem.required),
-        problem.k, restarts, np.uint64(seed % 2**64),
+        blocks, np.ascontiguousarray(blocks.transpose(1, 2, 0)), prior,
+        prior + RIDGE * np.eye(len(prior)), span, 1, problem.upper[usable],
+        np.searchsorted(usable, problem.required), problem.k, restarts,
+        np.uint64(seed % 2**64),
     )  # fmt: skip
     return usable[chosen], log_det
 

@@ -16,7 +16,7 @@ from jaxcal.information.linear_algebra import (
     row_cross,
     row_products,
 )
-from jaxcal.selection.exchange.starts import RIDGE, random_start, seeded
+from jaxcal.selection.exchange.starts import random_start, seeded
 
 __all__ = ["climb_rows", "exchange_rows"]
 
@@ -103,9 +103,11 @@ def climb_rows(blocks, columns, upper, num_fixed, chosen, counts, prior, gram, i
 
 @njit(cache=True, nogil=True)
 def exchange_rows(
-    blocks, columns, prior, span, full, upper, required, k, restarts, seed
+    blocks, columns, prior, ridged, span, full, upper, required, k, restarts, seed
 ):
     """Best local optimum over random starts; see ``random_start`` for the arguments.
+
+    ``ridged`` (p, p) is the prior and a little more, to climb from a singular start.
 
     Returns:
         (k,) chosen, the required first, and its log det.
@@ -117,7 +119,6 @@ def exchange_rows(
     counts = np.zeros(num_blocks, dtype=np.int64)
     chosen, best_chosen = np.empty(k, dtype=np.int64), np.empty(k, dtype=np.int64)
     fixed = len(required)
-    ridged = prior + RIDGE * np.eye(p)
     best = -np.inf
     for _ in range(restarts):
         random_start(
@@ -133,5 +134,6 @@ def exchange_rows(
                 break
         if log_det > best + 1e-10:
             best = log_det
-            best_chosen[:] = chosen
+            for r in range(k):
+                best_chosen[r] = chosen[r]
     return best_chosen, best
