@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from jaxcal.models import Model
 
@@ -41,49 +41,30 @@ class WithDiscrepancy:
         return cls(model, draws * inverse[:, None], phases)
 
     @property
-    def num_inputs(self) -> int:
-        return self.model.num_inputs
-
-    @property
     def num_outputs(self) -> int:
         return self.model.num_outputs
 
     @property
-    def num_parameters(self) -> int:
-        return self.model.num_parameters + self.num_outputs * len(self.phases)
-
-    @property
     def names(self) -> tuple[str, ...]:
-        extra = range(self.num_parameters - self.model.num_parameters)
+        extra = range(self.num_outputs * len(self.phases))
         return (*self.model.names, *(f"discrepancy {i + 1}" for i in extra))
 
-    @property
-    def nominal(self) -> Array:
-        extra = self.num_parameters - self.model.num_parameters
-        return np.concatenate([self.model.nominal, np.zeros(extra)])
-
-    def predict(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def predict(self, commands: Array, parameters: Array) -> Array:
         own, size = self._split(parameters)
-        phase = np.asarray(commands) @ self.frequencies + self.phases
+        phase = commands @ self.frequencies + self.phases
         return self.model.predict(commands, own) + self._scale * np.cos(phase) @ size.T
 
-    def jacobian(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def jacobian(self, commands: Array, parameters: Array) -> Array:
         own, _ = self._split(parameters)
-        phase = np.asarray(commands) @ self.frequencies + self.phases
+        phase = commands @ self.frequencies + self.phases
         features = self._scale * np.cos(phase)
         extra = np.einsum("ij,nd->nijd", np.eye(self.num_outputs), features)
         extra = extra.reshape(len(phase), self.num_outputs, -1)
         return np.concatenate([self.model.jacobian(commands, own), extra], axis=-1)
 
-    def command_jacobian(
-        self, commands: ArrayLike, parameters: ArrayLike | None = None
-    ) -> Array:
+    def command_jacobian(self, commands: Array, parameters: Array) -> Array:
         own, size = self._split(parameters)
-        phase = np.asarray(commands) @ self.frequencies + self.phases
+        phase = commands @ self.frequencies + self.phases
         slopes = -self._scale * np.sin(phase)
         extra = np.einsum("nd,qd,id->nqi", slopes, size, self.frequencies)
         return self.model.command_jacobian(commands, own) + extra
@@ -92,8 +73,7 @@ class WithDiscrepancy:
     def _scale(self) -> float:
         return float(np.sqrt(2.0 / len(self.phases)))
 
-    def _split(self, parameters: ArrayLike | None) -> tuple[Array, Array]:
+    def _split(self, parameters: Array) -> tuple[Array, Array]:
         """Parameters (p,) of the model and coefficients (q, D)."""
-        given = np.asarray(self.nominal if parameters is None else parameters)
-        p = self.model.num_parameters
-        return given[:p], given[p:].reshape(self.num_outputs, -1)
+        p = len(self.model.names)
+        return parameters[:p], parameters[p:].reshape(self.num_outputs, -1)

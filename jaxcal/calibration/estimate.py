@@ -60,78 +60,60 @@ def fit_model(
     used = weights > 0.0
     if not used.any():
         raise ValueError("weights must be positive for one measurement at least")
+    white, known, spread = _noise_of(noise, weights, commands, measured.shape[1])
+    if known and common_noise is not None:
+        raise ValueError(
+            "common_noise says how to estimate the noise, and noise says what it is: "
+            "give one of them"
+        )
     resolved = (prior or model.default_prior()).resolve(model)
-    whole, extra = model, 0
+    whole, extra = model, np.zeros(0)
     if discrepancy is not None:
         features = whole_number("discrepancy", discrepancy, 1)
         whole = WithDiscrepancy.over(model, commands[used], features)  # type: ignore[assignment]  # as far as a fit needs it
-        extra = features * measured.shape[1]
-    task = _task(commands, measured, weights, noise, whole, common_noise)
-    task = dataclasses.replace(
-        task,
-        mean=np.concatenate([resolved.mean, np.zeros(extra)]),
-        precision=np.concatenate([np.diagonal(resolved.precision), np.zeros(extra)]),
-        free=np.concatenate([resolved.free, np.ones(extra, dtype=np.bool_)]),
-        sized=np.arange(len(resolved.mean) + extra) >= len(resolved.mean),
+        extra = np.zeros(features * measured.shape[1])
+    task = Task(
+        model=whole,
+        commands=commands[used],
+        measured=measured[used],
+        white=white[used],
+        mean=np.concatenate([resolved.mean, extra]),
+        precision=np.concatenate([np.diagonal(resolved.precision), extra]),
+        free=np.concatenate([resolved.free, extra == 0.0]),
+        sized=np.concatenate([resolved.free & False, extra == 0.0]),
+        command_std=spread,
+        known=known,
+        per_output=common_noise is False,
         student=loss == "student",
     )
     found = solve(task)
     if common_noise is None and _levels_differ(task, found):
         task = dataclasses.replace(task, per_output=True)
         found = solve(task, found)
-    return _fields(task, found, commands, measured, used) | {
-        "model": model,
-        "loss": loss,
-    }
+    fields = _fields(task, found, commands, measured, used)
+    return fields | {"model": model, "loss": loss}
 
 
-def _task(
-    commands: Array,
-    measured: Array,
-    weights: Array,
-    noise: Noise | None,
-    model: Model,
-    common_noise: bool | None,
-) -> Task:
-    """The measurements of positive weight, whitened; no prior yet."""
-    count, q = measured.shape
+def _noise_of(
+    noise: Noise | None, weights: Array, commands: Array, q: int
+) -> tuple[Array, bool, Array]:
+    """Whitening (N, q, q), whether its level is known, and command_std (n,)."""
     noise = noise or Noise()
-    known = noise.std is not None or noise.covariance is not None
-    if known and common_noise is not None:
-        raise ValueError(
-            "common_noise says how to estimate the noise, and noise says what it is: "
-            "give one of them"
-        )
     readings = Noise(std=noise.std, covariance=noise.covariance)
-    white = readings.whitening(count, q) * np.sqrt(weights)[:, None, None]
+    white = readings.whitening(len(commands), q) * np.sqrt(weights)[:, None, None]
     spread = np.asarray(0.0 if noise.command_std is None else noise.command_std)
-    if spread.shape not in ((), (commands.shape[1],)):
+    n = commands.shape[1]
+    if spread.shape not in ((), (n,)):
         raise ValueError(
-            f"command_std must be one number or ({commands.shape[1]},), "
-            f"got {spread.shape}"
+            f"command_std must be one number or ({n},), got {spread.shape}"
         )
-    spread = np.broadcast_to(spread, commands.shape[1:])
+    spread = np.broadcast_to(spread, (n,))
     if np.isinf(spread).sum() >= q:
         raise ValueError(
             f"command_std must leave fewer unknown commands than the {q} readings of a "
             f"measurement, got {int(np.isinf(spread).sum())}"
         )
-    used = weights > 0.0
-    nothing = np.zeros(0)
-    return Task(
-        model=model,
-        commands=commands[used],
-        measured=measured[used],
-        white=white[used],
-        mean=nothing,
-        precision=nothing,
-        free=nothing.astype(np.bool_),
-        sized=nothing.astype(np.bool_),
-        command_std=spread,
-        known=known,
-        per_output=common_noise is False,
-        student=False,
-    )
+    return white, noise.std is not None or noise.covariance is not None, spread
 
 
 def _levels_differ(task: Task, found: Solution) -> bool:
@@ -238,5 +220,6 @@ def _covariance(
     covariance = np.zeros((size, size))
     covariance[np.ix_(free, free)] = root.T @ root
     null = np.zeros((int((~known).sum()), size))
-    null[:, free] = right[~known] / scale
+    exact = np.where(np.abs(right[~known]) < 1e-7, 0.0, right[~known])  # no rounding
+    null[:, free] = exact / scale
     return covariance, null if len(null) else None

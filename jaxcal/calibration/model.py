@@ -85,7 +85,7 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
     @property
     def parameters(self) -> Array:
         """(p,) of the model."""
-        return self.estimate[: self.model.num_parameters]
+        return self.estimate[: len(self.names)]
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -95,7 +95,7 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
     @property
     def covariance(self) -> Array | None:
         """(p, p) of ``parameters``, directions that nothing determines held fixed."""
-        p = self.model.num_parameters
+        p = len(self.names)
         return None if self.joint_covariance is None else self.joint_covariance[:p, :p]
 
     @property
@@ -127,19 +127,16 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
     @property
     def matrix(self) -> Array:
         """(m, n) A of an affine model."""
-        return self._affine("matrix")[: self.num_outputs * self.num_inputs].reshape(
-            self.num_outputs, self.num_inputs
-        )
+        if not isinstance(self.model, Affine):
+            raise AttributeError("matrix")  # the base class says what it means
+        return self.parameters[: -self.num_outputs].reshape(self.num_outputs, -1)
 
     @property
     def bias(self) -> Array:
         """(m,) b of an affine model."""
-        return self._affine("bias")[self.num_outputs * self.num_inputs :]
-
-    def _affine(self, name: str) -> Array:
         if not isinstance(self.model, Affine):
-            raise AttributeError(name)  # the base class says what it means
-        return self.parameters
+            raise AttributeError("bias")
+        return self.parameters[-self.num_outputs :]
 
     # -- the fit -----------------------------------------------------------------------
 
@@ -277,8 +274,7 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
                 if lost
             ]
             lines.append(
-                f"not determined ({len(self.unidentified)} combinations of "
-                f"{', '.join(named)}): held near the prior's mean; "
+                f"not determined, held near the prior's mean: {', '.join(named)}; "
                 "see identifiability()"
             )
         for row, weight in self.outliers.items():

@@ -305,12 +305,14 @@ def test_without_freedom_the_noise_is_unknown() -> None:
 
 def test_what_nothing_determines_is_named_and_has_no_interval() -> None:
     commands, measured = waves(7)
+    wide = identify(commands, measured, model=WAVE, noise_std=0.05, discrepancy=9)
+    assert np.isfinite(wide.predict_std(commands)).all()
     found = identify(commands, measured, model=WAVE, noise_std=0.05)
     assert found.parameters[5] == 3.0 and np.isinf(found.standard_errors[5])
     assert np.isfinite(found.standard_errors[:5]).all()
     assert np.isfinite(found.predict_std(commands)).all()
     assert found.from_data.tolist() == [1, 1, 1, 1, 1, 0]
-    assert "not determined (1 combinations of idle)" in repr(found)
+    assert "not determined, held near the prior's mean: idle;" in repr(found)
     assert found.identifiability().directions[0].words == "idle"
     short = Linear("x + y + x:y", 1)
     flat = commands * [1.0, 0.0]

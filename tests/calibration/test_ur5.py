@@ -1,0 +1,77 @@
+"""A real arm, a UR5 measured by a laser tracker: examples/ur5, lengths in mm."""
+
+from __future__ import annotations
+
+import pathlib
+
+import numpy as np
+import pytest
+
+from jaxcal.calibration import identify
+from jaxcal.models import Prior, SerialChain
+
+DATA = pathlib.Path(__file__).parents[2] / "examples" / "ur5"
+ARM = SerialChain.from_dh(
+    [
+        *([0, 90, 89.159, 0], [-425, 0, 0, 0], [-392.25, 0, 0, 0]),
+        *([0, 90, 109.15, 0], [0, -90, 94.65, 0], [0, 0, 82.3, 0]),
+    ],
+    tool=[0, 0, 31.0],
+)
+
+
+def poses(name: str) -> tuple[np.ndarray, np.ndarray]:
+    table = np.loadtxt(DATA / name, delimiter=",", skiprows=1)
+    return table[:, 7:13], table[:, 1:4] + table[:, 4:7]
+
+
+JOINTS, MEASURED = poses("ur5_grid_1000.csv")
+TEST_JOINTS, TEST = poses("ur5_random_20.csv")
+
+
+def error(found: object) -> float:
+    predicted = found.predict(TEST_JOINTS)  # type: ignore[attr-defined]  # calibration
+    return float(np.linalg.norm(predicted - TEST, axis=1).mean())
+
+
+@pytest.mark.parametrize("loss", ["gaussian", "student"])
+def test_all_poses_leave_a_tenth_of_a_millimetre(loss: str) -> None:
+    found = identify(JOINTS, MEASURED, model=ARM, noise_std=0.1, loss=loss)
+    assert error(found) < 0.102
+    assert found.from_data[ARM.names.index("a2")] > 0.99
+    assert found.from_data[ARM.names.index("theta6")] < 0.01
+    back = found.command_for(TEST, start=TEST_JOINTS)
+    np.testing.assert_allclose(found.predict(back), TEST, atol=1e-6)
+    assert np.abs(back - TEST_JOINTS).max() < 0.1
+
+
+def test_one_outlier_in_twelve_poses_is_named_and_costs_little() -> None:
+    rng = np.random.default_rng(0)
+    clean, least, student = [], [], []
+    for _ in range(6):
+        at = rng.choice(1000, 12, replace=False)
+        spoilt, row, way = MEASURED[at].copy(), rng.integers(12), rng.normal(size=3)
+        spoilt[row] += 5.0 * way / np.linalg.norm(way)
+        found = identify(JOINTS[at], spoilt, model=ARM, noise_std=0.1)
+        assert list(found.outliers) == [row] and found.outliers[row] < 0.1
+        student.append(error(found))
+        clean.append(
+            error(identify(JOINTS[at], MEASURED[at], model=ARM, noise_std=0.1))
+        )
+        found = identify(JOINTS[at], spoilt, model=ARM, noise_std=0.1, loss="gaussian")
+        least.append(error(found))
+    assert np.mean(student) < 1.25 * np.mean(clean) < 0.3 < np.mean(least)
+
+
+def test_no_search_fails_with_a_vague_prior_from_afar() -> None:
+    rng = np.random.default_rng(1)
+    std = np.asarray(ARM.default_prior().std)
+    for _ in range(8):
+        at = rng.choice(1000, 8, replace=False)
+        far = ARM.nominal.copy()
+        far[30:] += std[30:] * rng.normal(size=9)  # base and tool
+        prior = Prior(30 * std, far)
+        found = identify(
+            JOINTS[at], MEASURED[at], model=ARM, prior=prior, noise_std=0.1
+        )
+        assert np.abs(found.residuals).max() < 0.1
