@@ -131,8 +131,10 @@ def save(found: dict[str, Array], folder: pathlib.Path) -> None:
             rms = np.sqrt((rows**2).mean(axis=0))
             write([rule, len(rows), *(f"{x:.5f}" for x in rms)])
     figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
-    axes.boxplot([found[rule][:, 1] for rule in RULES], tick_labels=RULES, whis=(5, 95))
-    axes.set(ylabel="error of measured forces, % of rated", ylim=(0.0, None))
+    errors = [found[rule][:, 1] for rule in RULES]
+    axes.boxplot(errors, whis=(5, 95), showfliers=False)
+    axes.set_xticks(range(1, len(RULES) + 1), RULES, rotation=20)
+    axes.set(ylabel="error of measured forces, % of rated", yscale="log")
     figure.savefig(folder / "errors.png", dpi=160)
 
 

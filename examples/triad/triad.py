@@ -138,7 +138,8 @@ def save(found: dict[tuple[str, int, str], Array], folder: pathlib.Path) -> None
         for rule in RULES:
             counts = [k for k in COUNTS if (tilt, k, rule) in found]
             rms = [np.sqrt((found[tilt, k, rule][:, 2] ** 2).mean()) for k in counts]
-            axes.plot(counts, rms, "o-", label=rule)
+            style = "kx" if rule == "textbook" else "o-"
+            axes.plot(counts, rms, style, label=rule, zorder=3 + (style == "kx"))
         axes.set(
             title=f"tilt: {tilt}", xlabel="orientations", yscale="log",
             ylabel="error in all directions, mg", xticks=COUNTS,
