@@ -240,6 +240,9 @@ def _whitened(
 ) -> list[Problem]:
     """The problems of blocks (S, M, q, p); ``names`` is None for blocks [u, 1]."""
     k, mask, required, max_replicates, single = rules
+    readings = mask.sum(axis=1) * raw.shape[2]
+    if raw.shape[2] > raw.shape[3]:  # as much information in p rows, at q^3 less cost
+        raw = np.linalg.qr(raw, mode="r")
     k = check_k(k, raw, mask, root, regressors=names is None)
     cap, forced = check_counts(mask, k, required, max_replicates, single)
     white = whiten(raw, mask, root)
@@ -255,7 +258,6 @@ def _whitened(
     owned = [raw, root, *white[:3], mask, forced]
     for each in owned if candidates is None else [*owned, candidates]:
         each.flags.writeable = False
-    readings = mask.sum(axis=1) * raw.shape[2]
     problems = [
         Problem(
             white.blocks[b], white.prior[b], k, mask[b], forced[b], cap,

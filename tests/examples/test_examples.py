@@ -1,0 +1,110 @@
+"""Each example runs in a few seconds and its claim holds against the known truth."""
+
+import csv
+import importlib.util
+import pathlib
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+import jaxcal
+
+EXAMPLES = pathlib.Path(__file__).parents[2] / "examples"
+
+
+def load(name):
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / name / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def quick(name, folder):
+    """What a quick run found, and the rows that it wrote."""
+    found = load(name).main(["--quick", "--out", str(folder)])
+    assert (folder / "errors.png").stat().st_size > 5_000
+    with (folder / "errors.csv").open(newline="") as file:
+        return found, list(csv.DictReader(file))
+
+
+def rms(rows):
+    return np.sqrt((rows**2).mean(axis=0))
+
+
+def test_force_sensor_loads_beat_one_axis_at_a_time(tmp_path):
+    found, rows = quick("force_sensor", tmp_path)
+    assert [row["loads"] for row in rows] == list(found)
+    for rule in ("D", "I"):
+        assert (rms(found[rule]) < 0.6 * rms(found["one axis at a time"])).all()
+        assert (rms(found[rule]) < 0.9 * rms(found["random, 50 N"])).all()
+
+
+def test_force_sensor_loads_are_a_weight_on_a_lever():
+    example = load("force_sensor")
+    loads, rows = example.wrenches()
+    assert loads.shape == (100, 6) and len(set(rows)) == 100
+    assert (np.abs(loads) <= example.RATED * (1.0 + 1e-12)).all()
+    # a force and its moment about the origin are perpendicular
+    assert np.abs((loads[:, :3] * loads[:, 3:]).sum(axis=1)).max() < 1e-12
+
+
+def test_camera_views_beat_covering_the_image(tmp_path):
+    found, rows = quick("camera", tmp_path)
+    assert [row["views"] for row in rows] == list(found)
+    for rule in ("random", "cover the image"):
+        assert rms(found["I"])[3] < 0.9 * rms(found[rule])[3]
+        assert rms(found["I"])[0] < rms(found[rule])[0]
+
+
+def test_camera_fit_is_the_joint_fit_of_all_poses():
+    """Oracle: scipy's least squares over 6 + 6 x 10 unknowns and its own rotations."""
+    example = load("camera")
+    rng = np.random.default_rng(3)
+    true = example.views(rng, 10, example.NOMINAL)
+    rough = true + rng.normal(size=true.shape) * ([0.02] * 3 + [0.005] * 3)
+    pixels = example.MODEL.predict(true) + rng.normal(0.0, 0.2, (10, 70))
+
+    def residuals(unknowns):
+        focal, centre, (k1, k2) = unknowns[:2], unknowns[2:4], unknowns[4:6]
+        off = []
+        for pose, seen in zip(unknowns[6:].reshape(10, 6), pixels, strict=True):
+            at = Rotation.from_rotvec(pose[:3]).apply(example.CORNERS) + pose[3:]
+            xy = at[:, :2] / at[:, 2:]
+            square = (xy**2).sum(axis=1, keepdims=True)
+            xy = xy * (1.0 + k1 * square + k2 * square**2)
+            off.append((focal * xy + centre).ravel() - seen)
+        return np.concatenate(off)
+
+    start = np.concatenate([example.NOMINAL, rough.ravel()])
+    joint = least_squares(residuals, start, x_scale="jac", xtol=1e-14, ftol=1e-14)
+    fit = jaxcal.identify(
+        rough, pixels, model=example.MODEL, noise=example.NOISE, loss="gaussian"
+    )
+    error = np.sqrt(np.diag(np.linalg.inv(joint.jac.T @ joint.jac))[:6]) * 0.2
+    assert np.abs(fit.parameters - joint.x[:6]).max() < 1e-3 * error.max()
+    np.testing.assert_allclose(fit.standard_errors, error, rtol=1e-3)
+
+
+def test_tcp_error_is_lower_with_i_on_every_arm(tmp_path):
+    found, rows = quick("tcp", tmp_path)
+    assert [row["poses"] for row in rows] == list(found)
+    for rule in ("random", "expert", "spread", "D", "A"):
+        assert (found["I"][:, 0] < found[rule][:, 0]).all()
+    for standard, true in (rows.T for rows in found.values()):
+        assert 0.7 < (true / standard).mean() < 1.3  # the errors stated are the errors
+
+
+def test_triad_needs_no_better_than_the_textbook_but_four_will_do(tmp_path):
+    found, rows = quick("triad", tmp_path)
+    assert len(rows) == len(found)
+    everywhere = 2
+    textbook = rms(found["any", 6, "textbook"])[everywhere]
+    assert rms(found["any", 6, "I"])[everywhere] == pytest.approx(textbook, rel=0.15)
+    four = rms(found["any", 4, "I"])[everywhere]
+    assert textbook < four < 1.5 * textbook
+    example = load("triad")
+    assert 0.95 < example.efficiency(180.0) <= 1.0
+    # six positions: the bias is a mean of six readings of each axis
+    assert rms(found["any", 6, "textbook"])[0] == pytest.approx(1 / 6**0.5, rel=0.2)
