@@ -2,6 +2,7 @@
 
 import itertools
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -336,3 +337,19 @@ def test_bad_criteria_are_one_clear_error():
         method="policy",
         criterion="A",
     )
+
+
+def test_k_is_by_default_enough_to_identify():
+    """ceil(p / q) is three here, but every third of a frequency is singular."""
+    model = FromJax(
+        lambda u, t: u[0] * jnp.stack([jnp.cos(u[1] * t[4]), jnp.sin(u[1] * t[4])])
+        + jnp.stack([t[0] + t[1] * u[0], t[2] + t[3] * u[0]]),
+        [0.1, 1.0, 0.2, 1.0, 0.7],
+    )
+    u = np.random.default_rng(0).uniform(0.5, 2.0, size=(20, 2))
+    found = select(u, model=model, method="exchange", criterion="D")
+    assert np.isfinite(found.log_det)
+    alone = np.zeros((6, 2, 3))  # two readings, of which four candidates see one thing
+    alone[:4, :, 0] = 1.0
+    alone[4, 0, 1] = alone[5, 1, 2] = 1.0
+    assert len(select(blocks=alone, method="greedy").indices) == 3

@@ -137,8 +137,9 @@ def check_k(
     """
     q, p = raw.shape[2:]
     most = 1 if q == 1 else largest_rank(raw[mask])
-    fewest = -(-p // max(most, 1))
-    k = fewest if k is None else whole_number("k", k, 1)
+    if k is None:
+        k = p if regressors else _cover(raw[mask])
+    k = whole_number("k", k, 1)
     known = int(rank_of_blocks(root[None], root[:0])) if len(root) else 0
     if k * most + known >= p:
         return k
@@ -153,6 +154,24 @@ def check_k(
         + (f" and {known} known beforehand" if known else "")
         + f", got {k}"
     )
+
+
+def _cover(blocks: Array) -> int:
+    """How many blocks (N, q, p), widest first, span what all of them span."""
+    norms = np.sqrt((blocks**2).sum(axis=(0, 1)))
+    rest = blocks / np.where(norms > 0.0, norms, 1.0)
+    count, least = 0, 0.0
+    while True:
+        size = np.linalg.svd(rest, compute_uv=False)
+        least = least or 1e-9 * float(size.max())
+        rank = (size > least).sum(axis=1)
+        if not rank.any():
+            return max(count, 1)
+        volume = np.log(np.where(size > least, size, 1.0)).sum(axis=1)
+        widest = int(np.where(rank == rank.max(), volume, -np.inf).argmax())
+        basis = np.linalg.svd(rest[widest], full_matrices=False)[2][: rank.max()]
+        rest = rest - (rest @ basis.T) @ basis
+        count += 1
 
 
 def check_required_rank(problem: Problem, where: str) -> None:
