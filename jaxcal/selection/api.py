@@ -94,7 +94,9 @@ def select(
         restarts: starts of exchange, and of the one that starts exact and auto; see
             ``exchange.default_restarts`` for how many when not given, 30 with these.
         time_limit: seconds after which exact and auto return the best found with a true
-            ``bound``, not proven; 10 when not given, ``math.inf`` for none.
+            ``bound``, not proven; ``math.inf`` for none. When not given 10, and 2 for
+            auto with more than one reading per candidate, a prior or another criterion
+            than D.
         best: of exact, how many best subsets to prove, in ``alternatives``.
         least_efficiency: of auto, the efficiency in (0, 1] that suffices.
         checkpoint: of policy, folder of a trained one; that which ships when not given.

@@ -353,3 +353,9 @@ def test_k_is_by_default_enough_to_identify():
     alone[:4, :, 0] = 1.0
     alone[4, 0, 1] = alone[5, 1, 2] = 1.0
     assert len(select(blocks=alone, method="greedy").indices) == 3
+
+
+def test_a_region_without_criterion_i_is_refused():
+    blocks = np.random.default_rng(0).normal(size=(9, 2, 3))
+    with pytest.raises(ValueError, match="region.*must come with criterion I.*got.*D"):
+        select(blocks=blocks, k=3, region=blocks[:2])

@@ -86,12 +86,12 @@ def make_problem(
     rules = _Rules(k, mask, required, max_replicates)
     plain = parameters is None and shares_regressor(model, prior, noise)
     if plain and isinstance(model, Affine):
-        wanted = wanted_criterion(criterion, None, (), "D")
+        wanted = wanted_criterion(criterion, None, (), "D", region)
         std = None if noise is None else noise.std
         return _affine(model, array, rules, wanted, std, region, measured)[0]
     modelled = Modelled(model, prior, noise)
     default = "D" if isinstance(model, Affine) else "I"
-    wanted = wanted_criterion(criterion, parameters, modelled.names, default)
+    wanted = wanted_criterion(criterion, parameters, modelled.names, default, region)
     raw = modelled.blocks(array[0], mask[0])[None]
     root = prior_root(modelled.precision)
     if not np.diagonal(modelled.precision).all():
@@ -192,7 +192,7 @@ def make_block_problem(
     if measured is not None:
         root = _with_measured(root, _as_blocks("measured", measured, noise, q, p))
     names = tuple(f"theta{i + 1}" for i in range(p))
-    wanted = wanted_criterion(criterion, parameters, names, "D")
+    wanted = wanted_criterion(criterion, parameters, names, "D", region)
     if num_outputs is not None:
         wanted = wanted._replace(times=whole_number("num_outputs", num_outputs, 1))
     if region is not None:

@@ -57,6 +57,7 @@ def wanted_criterion(
     parameters: Sequence[str | int] | None,
     names: tuple[str, ...],
     default: str,
+    region: object = None,
 ) -> Wanted:
     """The criterion asked for, checked.
 
@@ -65,8 +66,14 @@ def wanted_criterion(
         parameters: names or indices of those of interest: for Ds and As, no others.
         names: (p,) of all free parameters.
         default: the criterion where none is asked for.
+        region: as given by the caller, refused unless the criterion is I.
     """
     name = default if name is None else one_of("criterion", name, CRITERIA)
+    if region is not None and name != "I":
+        raise ValueError(
+            "region, where predictions are wanted, must come with criterion I, "
+            f"got criterion {name}"
+        )
     if (name in ("Ds", "As")) != (parameters is not None):
         raise ValueError(
             "parameters, those of interest, must be given with criterion Ds or As, "
