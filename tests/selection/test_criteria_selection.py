@@ -322,7 +322,9 @@ def test_bad_criteria_are_one_clear_error():
     refused("parameters must be indices or names", criterion="As", parameters=[4])
     refused("parameters must be indices .*'x'", criterion="As", parameters=["x"])
     refused("parameters must name some once", criterion="As", parameters=[1, 1])
-    refused(r"region must have shape \(N, 2, 4\)", region=np.ones((3, 4)))
+    refused(
+        r"region must have shape \(N, 2, 4\)", region=np.ones((3, 4)), criterion="I"
+    )
     refused(r"measured must have shape \(N, 2, 4\)", measured=np.ones((3, 1, 4)))
     refused("prior must be a .* precision with blocks", prior=jaxcal.Prior(1.0))
     refused("model must come with candidates", model=Affine(3, 3))
@@ -342,8 +344,10 @@ def test_bad_criteria_are_one_clear_error():
 def test_k_is_by_default_enough_to_identify():
     """ceil(p / q) is three here, but every third of a frequency is singular."""
     model = FromJax(
-        lambda u, t: u[0] * jnp.stack([jnp.cos(u[1] * t[4]), jnp.sin(u[1] * t[4])])
-        + jnp.stack([t[0] + t[1] * u[0], t[2] + t[3] * u[0]]),
+        lambda u, t: (
+            u[0] * jnp.stack([jnp.cos(u[1] * t[4]), jnp.sin(u[1] * t[4])])
+            + jnp.stack([t[0] + t[1] * u[0], t[2] + t[3] * u[0]])
+        ),
         [0.1, 1.0, 0.2, 1.0, 0.7],
     )
     u = np.random.default_rng(0).uniform(0.5, 2.0, size=(20, 2))
