@@ -185,11 +185,12 @@ def _pool(problem: Problem, hull: bool) -> Indices:
     n = problem.num_regressors - 1
     if not hull or n > _LARGEST_HULL_DIMENSION or len(pool) <= n + 2:
         return pool
-    # Whitened postures lie in the plane of height x @ ones_at = 1: turned so that it is
-    # the last axis, the other axes are coordinates in that plane.
-    rows = problem.rows
-    ones_at = rows.sum(axis=0)
-    points = rows[pool] @ np.linalg.qr(ones_at[:, None], mode="complete")[0][:, 1:]
+    # Whitened postures lie in a plane across the sum of all rows: reflected so that it
+    # is the first axis, the other axes are coordinates in that plane.
+    rows, mirror = problem.rows[pool], problem.rows.sum(axis=0)
+    mirror[0] += np.copysign(np.sqrt(mirror @ mirror), mirror[0])
+    mirror *= np.sqrt(2.0 / (mirror @ mirror))
+    points = rows[:, 1:] - (rows @ mirror)[:, None] * mirror[1:]
     if n == 1:
         return pool[np.unique([points.argmin(), points.argmax()])]
     from scipy.spatial import ConvexHull, QhullError
