@@ -151,6 +151,7 @@ def _relaxation(
             kind, inverse = E, np.linalg.inv(root) / np.sqrt(scale)
             blocks, prior = blocks @ inverse, inverse.T @ prior @ inverse
     blocks, prior, root = (np.array(each, order="C") for each in (blocks, prior, root))
-    if kind == D and blocks.shape[1] == 1 and not prior.any():
-        root = None  # readings enough for D at nearly every node: less to compile
-    return Relaxation(kind, blocks, prior, root, k, rank), scale, shift
+    # Affine postures are enough for D at nearly every node: half as much to compile.
+    plain = kind == D and blocks.shape[1] == 1 and not prior.any()
+    made = Relaxation(kind, blocks, prior, None if plain else root, k, rank)
+    return made, scale, shift
