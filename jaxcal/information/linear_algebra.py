@@ -9,9 +9,8 @@ import numpy as np
 from numba import njit
 
 __all__ = [
+    "INNER",
     "add_block",
-    "block_cross",
-    "block_products",
     "draw",
     "factor",
     "gram_of",
@@ -19,8 +18,15 @@ __all__ = [
     "row_products",
 ]
 
+# Inner functions: a caller that is compiled includes them, so they need no entry from
+# Python, which takes as long to compile as they do.
+INNER = {
+    "cache": True, "nogil": True, "error_model": "numpy", "no_cpython_wrapper": True,
+    "no_cfunc_wrapper": True,
+}  # fmt: skip
 
-@njit(cache=True, nogil=True)
+
+@njit(**INNER)
 def gram_of(blocks, counts, prior, gram):
     """``gram = prior + sum of counts_i B_i.T B_i`` of blocks (M, q, p)."""
     num_blocks, q, p = blocks.shape
@@ -38,7 +44,7 @@ def gram_of(blocks, counts, prior, gram):
             gram[b, a] = gram[a, b]
 
 
-@njit(cache=True, nogil=True)
+@njit(**INNER)
 def add_block(gram, blocks, i, weight):
     """``gram += weight B_i.T B_i`` of blocks (M, q, p)."""
     _, q, p = blocks.shape
@@ -49,7 +55,7 @@ def add_block(gram, blocks, i, weight):
                 gram[a, b] += scaled * blocks[i, r, b]
 
 
-@njit(cache=True, nogil=True)
+@njit(**INNER)
 def row_products(x, y, inverse, same, out):
     """``out_j = x[:, j] inverse y[:, j]``, (M,), x and y (p, M); ``same``: y is x."""
     p, num_blocks = x.shape
@@ -62,7 +68,7 @@ def row_products(x, y, inverse, same, out):
                 out[j] += w * x[a, j] * y[b, j]
 
 
-@njit(cache=True, nogil=True)
+@njit(**INNER)
 def row_cross(x, inverse, y, i, out):
     """``out_j = x[:, j] inverse y[i]``, (M,), of x (p, M) and y (N, p)."""
     p, num_blocks = x.shape
@@ -76,23 +82,7 @@ def row_cross(x, inverse, y, i, out):
             out[j] += total * x[a, j]
 
 
-@njit(cache=True, nogil=True)
-def block_products(columns, inverse, out):
-    """Lower triangles of ``B_j inverse B_j.T``, (q, q, M), of columns (q, p, M)."""
-    for r in range(len(columns)):
-        for s in range(r + 1):
-            row_products(columns[r], columns[s], inverse, r == s, out[r, s])
-
-
-@njit(cache=True, nogil=True)
-def block_cross(columns, inverse, block, out):
-    """``block inverse B_j.T``, (q, q, M), of columns (q, p, M)."""
-    for r in range(len(columns)):
-        for s in range(len(columns)):
-            row_cross(columns[s], inverse, block, r, out[r, s])
-
-
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def factor(gram, inverse):
     """Log det of a positive definite matrix, and its inverse; -inf where singular."""
     p = gram.shape[0]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,55 +75,54 @@ def branch_and_bound(
 
     problem, scale, shift = _relaxation(blocks, prior, criterion, start)
     num_blocks, q, p = blocks.shape
-    best_counts = np.zeros((best, num_blocks), dtype=np.int64)
+    best_counts = np.zeros((best, num_blocks))
     best_values = np.full(best, -np.inf)
     width = num_blocks
     alive = np.arange(num_blocks)
-    lows, highs = _first(lower, 64), _first(upper, 64)
-    points, bounds = _first(start.astype(np.float64), 64), np.full(64, np.inf)
+    nodes, bounds = np.empty((64, 3, num_blocks)), np.full(64, np.inf)
+    nodes[0] = lower, upper, start
     counts = best_counts
-    size, nodes, free, bound = 1, 0, _ALL, np.inf
+    size, done, free, bound = 1, 0, _ALL, np.inf
     while size:
         bound = max(bounds[:size].max(), best_values[0])
         late = deadline is not None and time.perf_counter() > deadline
         close = (
             enough is not None
-            and nodes >= free
+            and done >= free
             and (
                 scale * bound + shift
                 <= criterion.enough(float(scale * best_values[0] + shift), enough)
             )
         )
-        if nodes and (late or close or root_only):
+        if done and (late or close or root_only):
             break
         if size + 2 > len(bounds):
-            lows, highs, points, bounds = map(_grown, (lows, highs, points, bounds))
-        chunk = _CHUNK if deadline is not None or nodes >= free else free - nodes
-        size, done = search(
-            problem, TOLERANCE, _SHARE, lows, highs, points, bounds, size,
-            counts, best_values, max(256, _MEMORY // (24 * width)),
-            chunk if nodes else 1,
-        )  # fmt: skip
-        if not nodes and size:
-            # Incumbents may use what the root rules out as no better than they are.
-            alive = np.flatnonzero(highs[:size].any(axis=0) | counts.any(axis=0))
-            lows, highs, points = (
-                np.ascontiguousarray(a[:, alive]) for a in (lows, highs, points)
+            nodes, bounds = (
+                np.concatenate([a, np.empty_like(a)]) for a in (nodes, bounds)
             )
+        chunk = _CHUNK if deadline is not None or done >= free else free - done
+        size, more = search(
+            problem, TOLERANCE, _SHARE, nodes, bounds, size, counts, best_values,
+            max(256, _MEMORY // (24 * width)), chunk if done else 1,
+        )  # fmt: skip
+        if not done and size:
+            # Incumbents may use what the root rules out as no better than they are.
+            alive = np.flatnonzero(nodes[:size, 1].any(axis=0) | counts.any(axis=0))
+            nodes = np.ascontiguousarray(nodes[:, :, alive])
             counts = np.ascontiguousarray(counts[:, alive])
             problem = problem._replace(blocks=problem.blocks[alive])
             width = len(alive)
             if enough is not None:
                 free = int(_FREE / (width * q * p * p))
-        nodes += done
+        done += more
     proven = size == 0
     found = np.isfinite(best_values)
     best_counts[:, alive] = counts
     return BranchResult(
-        best_counts[found],
+        best_counts[found].astype(np.int64),
         scale * best_values[found] + shift,
         float(scale * (best_values[0] if proven else bound) + shift),
-        nodes,
+        done,
         proven,
     )
 
@@ -152,16 +151,7 @@ def _relaxation(
             kind, inverse = E, np.linalg.inv(root) / np.sqrt(scale)
             blocks, prior = blocks @ inverse, inverse.T @ prior @ inverse
     blocks, prior, root = (np.array(each, order="C") for each in (blocks, prior, root))
-    return Relaxation(kind, blocks, prior, root, k, rank), scale, shift
-
-
-def _first(row: NDArray[Any], room: int) -> NDArray[Any]:
-    """(room, M) whose first row is ``row``."""
-    return _grown(row[None], room)
-
-
-def _grown(array: NDArray[Any], room: int = 0) -> NDArray[Any]:
-    """Twice as many rows, or ``room``."""
-    grown = np.empty((room or 2 * len(array), *array.shape[1:]), dtype=array.dtype)
-    grown[: len(array)] = array
-    return grown
+    # Affine postures are enough for D at nearly every node: half as much to compile.
+    plain = kind == D and blocks.shape[1] == 1 and not prior.any()
+    made = Relaxation(kind, blocks, prior, None if plain else root, k, rank)
+    return made, scale, shift

@@ -3,7 +3,8 @@
 A node bounds the count of every candidate, ``low_i <= c_i <= high_i``, sum k, and is
 closed where the bound of its relaxation is no better than the incumbents. Forcing one
 count away from the side the multiplier of that bound puts it on costs |d_i - cut| a
-unit, d the leverages, which tightens ``low`` and ``high`` (reduced-cost fixing).
+unit, d the leverages, which tightens ``low`` and ``high`` (reduced-cost fixing). All
+counts are float64, whole or not, which compiles every function once.
 """
 
 from __future__ import annotations
@@ -11,12 +12,12 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from jaxcal.information.linear_algebra import gram_of
+from jaxcal.information.linear_algebra import INNER, gram_of
 from jaxcal.selection.exact.criterion_kernel import (
-    OPTIONS,
     RANK,
     D,
     Local,
+    eigen,
     evaluate,
 )
 from jaxcal.selection.exact.relaxation_kernel import relax
@@ -29,7 +30,7 @@ _SINGULAR = 1e-12  # smallest over largest eigenvalue of what is known
 _SMOOTHING = 30.0  # of E at first, where the eigenvalue is about 1
 
 
-@njit(**OPTIONS)
+@njit(inline="always")
 def _new_local(p):
     square = np.empty((6, p, p))
     return Local(
@@ -41,12 +42,12 @@ def _new_local(p):
 @njit(inline="always")
 def value_of(problem, counts, local):
     """The criterion of a selection, -inf where it is singular."""
-    gram_of(problem.blocks, 1.0 * counts, problem.prior, local.gram)
+    gram_of(problem.blocks, counts, problem.prior, local.gram)
     local.settings[1] = np.inf  # E itself
     return evaluate(problem.kind, problem.root, local)[0]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def offer(problem, counts, local, best_counts, best_values):
     """Insert a selection into the sorted list of the best, once."""
     value = value_of(problem, counts, local)
@@ -54,15 +55,20 @@ def offer(problem, counts, local, best_counts, best_values):
     if not value > best_values[size - 1]:
         return
     for r in range(size):
-        if abs(best_values[r] - value) < _SAME and (best_counts[r] == counts).all():
+        same = abs(best_values[r] - value) < _SAME
+        for i in range(len(counts)):
+            same = same and best_counts[r, i] == counts[i]
+        if same:
             return
     r = size - 1
     while r > 0 and best_values[r - 1] < value:
         best_values[r] = best_values[r - 1]
-        best_counts[r] = best_counts[r - 1]
+        for i in range(len(counts)):
+            best_counts[r, i] = best_counts[r - 1, i]
         r -= 1
     best_values[r] = value
-    best_counts[r] = counts
+    for i in range(len(counts)):
+        best_counts[r, i] = counts[i]
 
 
 @njit(inline="always")
@@ -81,13 +87,22 @@ def offer_start(problem, low, high, counts, local, best_counts, best_values):
             counts[i] += 1
 
 
-@njit(**OPTIONS)
-def _balance(low, high, c, k, leverage):
+@njit(**INNER)
+def _copy(node, out):
+    """A loop: slice assignments take numba seconds to compile."""
+    for a in range(len(node)):
+        for i in range(node.shape[1]):
+            out[a, i] = node[a, i]
+
+
+@njit(inline="always")
+def _balance(node, k, leverage):
     """Move c into its bounds and back to sum k, keeping it near where it was."""
+    low, high, c = node[0], node[1], node[2]
     num_blocks = len(c)
     total = 0.0
     for i in range(num_blocks):
-        c[i] = min(max(c[i], float(low[i])), float(high[i]))
+        c[i] = min(max(c[i], low[i]), high[i])
         total += c[i]
     while abs(total - k) > 1e-12:
         best = -1
@@ -101,27 +116,34 @@ def _balance(low, high, c, k, leverage):
             return False
         before = c[best]
         moved = before + (k - total)
-        c[best] = min(max(moved, float(low[best])), float(high[best]))
+        c[best] = min(max(moved, low[best]), high[best])
         total += c[best] - before
     return True
 
 
-@njit(**OPTIONS)
-def _kind_of(problem, low, local):
+@njit(**INNER)
+def _kind_of(problem, root, low, local):
     """RANK where what is still to be chosen has too few readings for D to be sharp."""
+    if root is None:
+        return problem.kind
     local.settings[1] = _SMOOTHING
     p = problem.blocks.shape[2]
-    places = (problem.k - low.sum()) * problem.rank
+    left = problem.k
+    for i in range(len(low)):
+        left -= low[i]
+    places = left * problem.rank
     if problem.kind != D or places >= p or places == 0:
         return problem.kind
-    gram_of(problem.blocks, 1.0 * low, problem.prior, local.known)
-    values, vectors = np.linalg.eigh(local.known)
+    gram_of(problem.blocks, low, problem.prior, local.known)
+    values = np.empty(p)
+    eigen(local.known, values, local.half)
     if not values[0] > _SINGULAR * values[p - 1]:
         return problem.kind
+    local.settings[2], local.settings[3] = places, 0.0
     for a in range(p):
-        local.half[a] = vectors[:, a] / np.sqrt(values[a])
-    local.settings[2] = places
-    local.settings[3] = np.log(values).sum()
+        local.settings[3] += np.log(values[a])
+        for b in range(p):
+            local.half[a, b] /= np.sqrt(values[a])
     return RANK
 
 
@@ -145,16 +167,16 @@ def process(
     num_blocks, k = len(c), problem.k
     last = len(best_values) - 1
     goal = best_values[last] + slack
-    kind = _kind_of(problem, low, local)
+    kind = _kind_of(problem, problem.root, low, local)
     bound, cut = relax(problem, kind, low, high, c, goal, share, local, leverage)
     if bound <= goal:
         return -np.inf, -1
-    total_low, total_high = 0, 0
+    total_low, total_high = 0.0, 0.0
     for i in range(num_blocks):
         if low[i] < high[i]:
             slope = leverage[i] - cut
             if (bound - goal) < abs(slope) * (high[i] - low[i]):
-                units = np.int64((bound - goal) / abs(slope))
+                units = np.floor((bound - goal) / abs(slope))
                 if slope < 0.0:
                     high[i] = low[i] + units
                 else:
@@ -165,12 +187,13 @@ def process(
         return -np.inf, -1
     settled = total_low == k or total_high == k
     if settled:
-        c[:] = low if total_low == k else high
+        for i in range(num_blocks):
+            c[i] = low[i] if total_low == k else high[i]
     whole = True
     branch = -1
     score = -1.0
     for i in range(num_blocks):
-        away = abs(c[i] - np.round(c[i]))
+        away = abs(c[i] - np.floor(c[i] + 0.5))
         if away > _WHOLE:
             whole = False
         if low[i] < high[i]:
@@ -183,11 +206,12 @@ def process(
                 score = this
                 branch = i
     if whole:
-        counts = np.empty(num_blocks, dtype=np.int64)
+        total = 0.0
         for i in range(num_blocks):
-            counts[i] = np.int64(np.round(c[i]))
-        if counts.sum() == k:
-            offer(problem, counts, local, best_counts, best_values)
+            c[i] = np.floor(c[i] + 0.5)
+            total += c[i]
+        if total == k:
+            offer(problem, c, local, best_counts, best_values)
     if settled or bound <= best_values[last] + slack:
         return -np.inf, -1
     return bound, branch
@@ -195,15 +219,16 @@ def process(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def search(
-    problem, slack, share, lows, highs, weights, bounds, size,
-    best_counts, best_values, widest, node_limit,
+    problem, slack, share, nodes, bounds, size, best_counts, best_values, widest,
+    node_limit,
 ):  # fmt: skip
     """Branch until no open node is left, the room is full or the nodes are spent.
 
     Args:
         problem: a Relaxation of M candidates.
         slack, share: see :func:`process`.
-        lows, highs, weights, bounds: (room, M) x 3 and (room,) open nodes.
+        nodes, bounds: (room, 3, M) and (room,) open nodes: lower and upper bounds of
+            the counts, and counts to start from.
         size: open nodes at the start.
         best_counts, best_values: incumbents, changed in place.
         widest: open nodes up to which the best bound goes first, then the newest.
@@ -212,56 +237,42 @@ def search(
     Returns:
         Open nodes left and nodes processed.
     """
-    num_blocks, _, p = problem.blocks.shape
-    room = len(bounds)
-    local = _new_local(p)
-    low = np.empty(num_blocks, dtype=np.int64)
-    high = np.empty(num_blocks, dtype=np.int64)
-    c = np.empty(num_blocks)
-    leverage = np.empty(num_blocks)
-    last = len(best_values) - 1
-    nodes = 0
+    room, last = len(bounds), len(best_values) - 1
+    local = _new_local(problem.blocks.shape[2])
+    node = np.empty(nodes.shape[1:])
+    low, high, c = node[0], node[1], node[2]
+    leverage = np.empty(len(c))
+    done = 0
     if not best_values[0] > -np.inf:  # the root, and its weights are the start
-        low[:], high[:] = lows[0], highs[0]
-        counts = np.round(weights[0]).astype(np.int64)
-        offer_start(problem, low, high, counts, local, best_counts, best_values)
-    while size > 0 and nodes < node_limit and size + 2 <= room:
+        _copy(nodes[0], node)
+        offer_start(problem, low, high, c, local, best_counts, best_values)
+    while size > 0 and done < node_limit and size + 2 <= room:
         pick = size - 1
         if size <= widest:
             for r in range(size):
                 if bounds[r] > bounds[pick]:
                     pick = r
         parent = bounds[pick]
-        low[:] = lows[pick]
-        high[:] = highs[pick]
-        c[:] = weights[pick]
+        _copy(nodes[pick], node)
         size -= 1
         if pick != size:
-            lows[pick] = lows[size]
-            highs[pick] = highs[size]
-            weights[pick] = weights[size]
+            _copy(nodes[size], nodes[pick])
             bounds[pick] = bounds[size]
         if parent <= best_values[last] + slack:
             continue
-        nodes += 1
+        done += 1
         bound, branch = process(
             problem, low, high, c, slack, share, best_counts, best_values, local,
             leverage,
         )  # fmt: skip
         if branch < 0:
             continue
-        bound = min(bound, parent)
-        split = np.int64(np.floor(c[branch] + _WHOLE))
-        split = min(max(split, low[branch]), high[branch] - 1)
+        split = np.floor(c[branch] + _WHOLE)
+        split = min(max(split, low[branch]), high[branch] - 1.0)
         for side in range(2):
-            lows[size] = low
-            highs[size] = high
-            weights[size] = c
-            bounds[size] = bound
-            if side == 0:
-                highs[size, branch] = split
-            else:
-                lows[size, branch] = split + 1
-            if _balance(lows[size], highs[size], weights[size], problem.k, leverage):
+            _copy(node, nodes[size])
+            bounds[size] = min(bound, parent)
+            nodes[size, 1 - side, branch] = split + side
+            if _balance(nodes[size], problem.k, leverage):
                 size += 1
-    return size, nodes
+    return size, done

@@ -29,18 +29,18 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from jaxcal.information.linear_algebra import factor
+from jaxcal.information.linear_algebra import INNER, factor
 
 __all__ = [
     "DS",
     "FAST",
-    "OPTIONS",
     "RANK",
     "TRACE",
     "D",
     "E",
     "Local",
     "Relaxation",
+    "eigen",
     "evaluate",
     "hessian",
 ]
@@ -48,13 +48,7 @@ __all__ = [
 D, DS, TRACE, E, RANK = range(5)  # RANK: D in its sharper form
 
 _EPS = float(np.finfo(np.float64).eps)
-# Inner functions: a caller that is compiled includes them, so they need no entry from
-# Python; what has one place to be called from is inlined, which compiles it once.
-OPTIONS = {
-    "cache": True, "nogil": True, "error_model": "numpy", "no_cpython_wrapper": True,
-    "no_cfunc_wrapper": True,
-}  # fmt: skip
-FAST = OPTIONS | {"fastmath": {"reassoc", "contract", "nsz"}}  # sums in any order
+FAST = INNER | {"fastmath": {"reassoc", "contract", "nsz"}}  # sums in any order
 
 
 class Relaxation(NamedTuple):
@@ -63,7 +57,7 @@ class Relaxation(NamedTuple):
     kind: int
     blocks: NDArray[np.float64]  # (M, q, p)
     prior: NDArray[np.float64]  # (p, p)
-    root: NDArray[np.float64]  # (s, p) C of DS and TRACE
+    root: NDArray[np.float64] | None  # (s, p) C of DS and TRACE; None: D, never RANK
     k: int  # selections in all
     rank: int  # of one block, at most
 
@@ -82,18 +76,30 @@ class Local(NamedTuple):
 
 
 @njit(**FAST)
-def _multiply(x, y, out):
-    """``out = x @ y``."""
+def _dots(x, y, out):
+    """``out = x @ y.T``."""
     for a in range(len(x)):
-        for b in range(y.shape[1]):
-            out[a, b] = 0.0
-        for c in range(len(y)):
-            weight = x[a, c]
-            for b in range(y.shape[1]):
-                out[a, b] += weight * y[c, b]
+        for b in range(len(y)):
+            total = 0.0
+            for c in range(x.shape[1]):
+                total += x[a, c] * y[b, c]
+            out[a, b] = total
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
+def eigen(matrix, values, vectors):
+    """Eigenvalues, smallest first, and eigenvectors in rows; loops copy them.
+
+    A slice assignment of two axes takes numba seconds to compile.
+    """
+    found, columns = np.linalg.eigh(matrix)
+    for a in range(len(values)):
+        values[a] = found[a]
+        for b in range(len(values)):
+            vectors[a, b] = columns[b, a]
+
+
+@njit(**INNER)
 def evaluate(kind, root, local):
     """Fill ``local`` at ``local.gram``.
 
@@ -101,28 +107,38 @@ def evaluate(kind, root, local):
         The value to climb by, -inf where M is singular, and the value to which the
         linear gain is added for a bound; they differ for E only.
     """
-    if kind >= E:
+    inverse, gradient = local.inverse, local.gradient
+    if root is not None and kind >= E:
         return _spectral(kind, local)
-    value = factor(local.gram, local.inverse)
-    if kind == D or not value > -np.inf:
-        local.gradient[:] = local.inverse
+    value = factor(local.gram, inverse)
+    if root is None or kind == D or not value > -np.inf:
+        for a in range(len(inverse)):
+            for b in range(len(inverse)):
+                gradient[a, b] = inverse[a, b]
         return value, value
+    return _covariance(kind, root, local)
+
+
+@njit(inline="always")
+def _covariance(kind, root, local):
+    """:func:`evaluate` of DS and TRACE, W being there."""
+    inverse, gradient = local.inverse, local.gradient
     s, p = root.shape
-    reach = np.empty((s, p))
-    _multiply(root, local.inverse, reach)
-    if kind == TRACE:
-        value = 0.0
-        for a in range(s):
-            for b in range(p):
-                value -= reach[a, b] * root[a, b]
-        _multiply(reach.T.copy(), reach, local.gradient)
-        return value, value
+    reach, scaled = np.empty((p, s)), np.empty((p, s))
+    _dots(inverse, root, reach)
     covariance, precision = np.empty((s, s)), np.empty((s, s))
-    _multiply(reach, root.T.copy(), covariance)
-    value = -factor(covariance, precision)
-    scaled = np.empty((s, p))
-    _multiply(precision, reach, scaled)
-    _multiply(reach.T.copy(), scaled, local.gradient)
+    value = 0.0
+    for r in range(s):
+        for t in range(s):
+            covariance[r, t] = 0.0
+            precision[r, t] = 1.0 if r == t else 0.0
+            for a in range(p):
+                covariance[r, t] += root[r, a] * reach[a, t]
+        value -= covariance[r, r]
+    if kind == DS:
+        value = -factor(covariance, precision)
+    _dots(reach, precision, scaled)
+    _dots(scaled, reach, gradient)
     return value, value
 
 
@@ -130,44 +146,59 @@ def evaluate(kind, root, local):
 def _spectral(kind, local):
     """:func:`evaluate` of E and RANK, by eigenvalues."""
     p = len(local.gram)
-    bend, tail = local.bend, local.tail
-    slopes = np.empty(p)
+    bend, tail, settings = local.bend, local.tail, local.settings
+    basis, gradient = local.inverse, local.gradient
+    slopes, own, values = np.empty(p), np.empty(p), np.empty(p)
+    vectors = np.empty((p, p))
+    value, base = 0.0, 0.0
     if kind == E:
-        values, vectors = np.linalg.eigh(local.gram)
-        local.inverse[:] = vectors
-        b = local.settings[1]
+        eigen(local.gram, values, vectors)
+        b = settings[1]
+        total = 0.0
         for a in range(p):
             apart = values[a] - values[0]
             slopes[a] = np.exp(-b * apart) if apart > 0.0 else 1.0
-        total = slopes.sum()
-        slopes /= total
-        value, base = values[0] - np.log(total) / b, (slopes * values).sum()
-        tail[:] = slopes
-        local.settings[0] = b
-        own = -b * slopes
+            total += slopes[a]
+        for a in range(p):
+            slopes[a] /= total
+            base += slopes[a] * values[a]
+            tail[a] = slopes[a]
+            own[a] = -b * slopes[a]
+            for c in range(p):
+                basis[a, c] = vectors[c, a]
+        value = values[0] - np.log(total) / b
+        settings[0] = b
     else:
-        left, extra = np.empty((p, p)), np.empty((p, p))
-        _multiply(local.half, local.gram - local.known, left)
-        _multiply(left, local.half.T.copy(), extra)
-        values, vectors = np.linalg.eigh(extra)  # smallest first
-        _multiply(local.half.T.copy(), vectors.copy(), local.inverse)
-        values = np.maximum(values, 0.0)
-        places = int(local.settings[2])
+        for a in range(p):
+            for c in range(p):
+                bend[a, c] = local.gram[a, c] - local.known[a, c]
+        _dots(local.half, bend, basis)
+        _dots(basis, local.half, bend)
+        eigen(bend, values, vectors)
+        rest = 0.0
+        for a in range(p):
+            values[a] = max(values[a], 0.0)
+            rest += values[a]
+            for c in range(p):
+                basis[a, c] = 0.0
+                for d in range(p):
+                    basis[a, c] += local.half[d, a] * vectors[c, d]
+        places = int(settings[2])
         kept = 0
-        rest = values.sum()
-        value = local.settings[3]
+        value = settings[3]
         while kept < places - 1 and values[p - 1 - kept] * (places - kept) > rest:
             rest -= values[p - 1 - kept]
             value += np.log1p(values[p - 1 - kept])
             kept += 1
-        value += (places - kept) * np.log1p(rest / (places - kept))
+        rest /= places - kept
+        value += (places - kept) * np.log1p(rest)
         base = value + p * _EPS * values[p - 1]  # what eigenvalues are rounded by
         for a in range(p):
             held = a >= p - kept
-            slopes[a] = 1.0 / (1.0 + (values[a] if held else rest / (places - kept)))
+            slopes[a] = 1.0 / (1.0 + (values[a] if held else rest))
             tail[a] = 0.0 if held else slopes[a]
-        local.settings[0] = -1.0 / (places - kept)
-        own = np.where(tail == 0.0, -slopes * slopes, 0.0)
+            own[a] = -slopes[a] * slopes[a] if held else 0.0
+        settings[0] = -1.0 / (places - kept)
     for a in range(p):
         for c in range(a):
             apart = values[a] - values[c]
@@ -176,30 +207,24 @@ def _spectral(kind, local):
             else:
                 bend[a, c] = 0.5 * (own[a] + own[c])
         bend[a, a] = own[a]
-    _multiply(local.inverse * slopes, local.inverse.T.copy(), local.gradient)
+        for c in range(p):
+            vectors[a, c] = basis[a, c] * slopes[c]
+    _dots(vectors, basis, gradient)
     return value, base
 
 
 @njit(**FAST)
-def hessian(kind, blocks, which, local, out):
+def hessian(kind, root, blocks, which, local, out):
     """Fill ``out`` (m, m): minus the Hessian over the counts of ``which`` (m,)."""
-    m, q, p = len(which), blocks.shape[1], blocks.shape[2]
-    by_inverse = np.zeros((m, q, p))
-    by_gradient = by_inverse
-    if kind == DS or kind == TRACE:
-        by_gradient = np.zeros((m, q, p))
-    for i in range(m):
-        for r in range(q):
-            for a in range(p):
-                weight = blocks[which[i], r, a]
-                for b in range(p):
-                    by_inverse[i, r, b] += weight * local.inverse[a, b]
-                if kind == DS or kind == TRACE:
-                    for b in range(p):
-                        by_gradient[i, r, b] += weight * local.gradient[a, b]
-    if kind >= E:
-        _spectral_hessian(by_inverse, local, out)
+    m = len(which)
+    turned = _turned(blocks, which, local.inverse)
+    if root is not None and kind >= E:
+        _spectral_hessian(turned, local, out)
         return
+    other = turned
+    if root is not None and kind != D:
+        other = _turned(blocks, which, local.gradient)
+    _, q, p = turned.shape
     for i in range(m):
         for j in range(i + 1):
             total = 0.0
@@ -207,16 +232,30 @@ def hessian(kind, blocks, which, local, out):
                 for r in range(q):
                     y = 0.0
                     for a in range(p):
-                        y += by_inverse[i, r, a] * blocks[which[j], s, a]
-                    if kind == D:
+                        y += turned[i, r, a] * blocks[which[j], s, a]
+                    if root is None or kind == D:
                         total += y * y
-                        continue
-                    x = 0.0
-                    for a in range(p):
-                        x += by_gradient[i, r, a] * blocks[which[j], s, a]
-                    total += 2.0 * x * y - (x * x if kind == DS else 0.0)
+                    else:
+                        x = 0.0
+                        for a in range(p):
+                            x += other[i, r, a] * blocks[which[j], s, a]
+                        total += 2.0 * x * y - (x * x if kind == DS else 0.0)
             out[i, j] = total
             out[j, i] = total
+
+
+@njit(**INNER)
+def _turned(blocks, which, matrix):
+    """``B_i @ matrix`` (m, q, p) of the blocks of ``which``."""
+    _, q, p = blocks.shape
+    turned = np.zeros((len(which), q, p))
+    for i in range(len(which)):
+        for r in range(q):
+            for a in range(p):
+                weight = blocks[which[i], r, a]
+                for b in range(p):
+                    turned[i, r, b] += weight * matrix[a, b]
+    return turned
 
 
 @njit(**FAST)

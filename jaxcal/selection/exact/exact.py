@@ -118,7 +118,7 @@ def solve_exact(
             return _enumerate(problem, pool, best, deadline)
     if deadline is not None:
         misses = _load.cache_info().misses
-        seconds = _load(problem.rank_one)
+        seconds = _load(problem.rank_one, bool(len(problem.root)))
         deadline += seconds if _load.cache_info().misses > misses else 0.0
     start = exchange_indices(problem, restarts, seed)
     groups = _groups(problem, merge=best == 1)
@@ -140,11 +140,12 @@ def solve_exact(
 
 
 @functools.cache
-def _load(rank_one: bool) -> float:
+def _load(rank_one: bool, known: bool) -> float:
     """Compile or load the search; seconds it took, which no time limit should count."""
     begun = time.perf_counter()
     blocks = np.eye(2)[[0, 1, 0, 1], None].repeat(1 if rank_one else 2, axis=1)
-    solve_exact(make_block_problem(blocks, 3), best=9)
+    prior = np.eye(2) if known else None
+    solve_exact(make_block_problem(blocks, 3, prior=prior), best=9)
     return time.perf_counter() - begun
 
 
@@ -185,11 +186,12 @@ def _pool(problem: Problem, hull: bool) -> Indices:
     n = problem.num_regressors - 1
     if not hull or n > _LARGEST_HULL_DIMENSION or len(pool) <= n + 2:
         return pool
-    # Whitened postures lie in the plane of height x @ ones_at = 1: turned so that it is
-    # the last axis, the other axes are coordinates in that plane.
-    rows = problem.rows
-    ones_at = rows.sum(axis=0)
-    points = rows[pool] @ np.linalg.qr(ones_at[:, None], mode="complete")[0][:, 1:]
+    # Whitened postures lie in a plane across the sum of all rows: reflected so that it
+    # is the first axis, the other axes are coordinates in that plane.
+    rows, mirror = problem.rows[pool], problem.rows.sum(axis=0)
+    mirror[0] += np.copysign(np.sqrt(mirror @ mirror), mirror[0])
+    mirror *= np.sqrt(2.0 / (mirror @ mirror))
+    points = rows[:, 1:] - (rows @ mirror)[:, None] * mirror[1:]
     if n == 1:
         return pool[np.unique([points.argmin(), points.argmax()])]
     from scipy.spatial import ConvexHull, QhullError

@@ -14,10 +14,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from jaxcal.information.linear_algebra import gram_of
+from jaxcal.information.linear_algebra import INNER, gram_of
 from jaxcal.selection.exact.criterion_kernel import (
     FAST,
-    OPTIONS,
     E,
     evaluate,
     hessian,
@@ -33,7 +32,7 @@ _ROUNDING = 1e-12  # of a count that is whole
 _SHARPEST = 1e5  # smoothing of E, where the eigenvalue is about 1
 
 
-@njit(**FAST)
+@njit(inline="always")
 def _leverages(blocks, gradient, low, high, leverage):
     """Fill leverage (M,), ``trace(B_i G B_i.T)``, where the count is not fixed."""
     num_blocks, q, p = blocks.shape
@@ -42,7 +41,8 @@ def _leverages(blocks, gradient, low, high, leverage):
         leverage[i] = 0.0
         if low[i] < high[i]:
             for r in range(q):
-                reach[:] = 0.0
+                for b in range(p):
+                    reach[b] = 0.0
                 for a in range(p):
                     weight = blocks[i, r, a]
                     for b in range(p):
@@ -51,7 +51,7 @@ def _leverages(blocks, gradient, low, high, leverage):
                     leverage[i] += reach[a] * blocks[i, r, a]
 
 
-@njit(**OPTIONS)
+@njit(inline="always")
 def linear_gain(low, high, c, k, leverage):
     """Largest ``sum of (c'_i - c_i) d_i`` within the bounds, and its multiplier.
 
@@ -70,7 +70,7 @@ def linear_gain(low, high, c, k, leverage):
     for _ in range(30):
         if most - least <= 1e-13 * abs(most):
             break
-        room = 0
+        room = 0.0
         for i in range(len(c)):
             room += high[i] if leverage[i] > cut else low[i]
         if room > k:
@@ -88,7 +88,7 @@ def linear_gain(low, high, c, k, leverage):
     return gain + (k - total) * cut, cut
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _working_set(low, high, c, leverage, cut, extra):
     """Counts to move: the fractional ones and ``extra`` of those that should move."""
     num_blocks = len(c)
@@ -116,17 +116,17 @@ def _working_set(low, high, c, leverage, cut, extra):
         if count > extra:
             break
         least *= 0.5
-    which = np.empty(fractional + extra, dtype=np.int64)
-    size = 0
+    room, size = fractional + extra, 0
+    which = np.empty(room, dtype=np.int64)
     for i in range(num_blocks):
         inside = fractional > 0 and low[i] < c[i] < high[i]
-        if inside or (wish[i] > 0.0 and wish[i] >= least and size < len(which)):
+        if inside or (wish[i] > 0.0 and wish[i] >= least and size < room):
             which[size] = i
             size += 1
     return which[:size]
 
 
-@njit(**FAST)
+@njit(inline="always")
 def _solve(matrix, which, size, x, y, lower):
     """x and y (m,) become their solutions by ``matrix`` at ``which[:size]``."""
     for a in range(size):
@@ -182,7 +182,11 @@ def _quadratic_step(curvature, slope, least, most, move):
         cut = 0.0
         if size:
             _solve(curvature, free, size, x, ones, lower)
-            cut = x[:size].sum() / ones[:size].sum()
+            total, weight = 0.0, 0.0
+            for f in range(size):
+                total += x[f]
+                weight += ones[f]
+            cut = total / weight
             part, hit, at = 1.0, -1, 0
             for f in range(size):
                 i = free[f]
@@ -221,11 +225,15 @@ def _quadratic_step(curvature, slope, least, most, move):
         side[best] = 0
 
 
-@njit(**OPTIONS)
+@njit(inline="always")
 def _spread(low, high, c, k):
     """Share what the lower bounds leave in proportion to the room of each count."""
-    room = max((high - low).sum(), 1)
-    c[:] = low + (k - low.sum()) * (high - low) / room
+    room, fixed = 0.0, 0.0
+    for i in range(len(c)):
+        room += high[i] - low[i]
+        fixed += low[i]
+    for i in range(len(c)):
+        c[i] = low[i] + (k - fixed) * (high[i] - low[i]) / max(room, 1.0)
 
 
 @njit(inline="always")
@@ -247,14 +255,16 @@ def relax(problem, kind, low, high, c, goal, share, local, leverage):
     """
     blocks, k = problem.blocks, problem.k
     p = blocks.shape[2]
-    gram_of(blocks, c, problem.prior, local.gram)
-    value, base = evaluate(kind, problem.root, local)
-    if not value > -np.inf:
-        _spread(low, high, c, k)
+    value, base = -np.inf, -np.inf
+    for attempt in range(2):
+        if attempt == 1:
+            _spread(low, high, c, k)
         gram_of(blocks, c, problem.prior, local.gram)
         value, base = evaluate(kind, problem.root, local)
-        if not value > -np.inf:
-            return value, 0.0
+        if value > -np.inf:
+            break
+    if not value > -np.inf:
+        return value, 0.0
     bound, cut = np.inf, 0.0
     for step in range(_MAX_STEPS):
         _leverages(blocks, local.gradient, low, high, leverage)
@@ -263,7 +273,7 @@ def relax(problem, kind, low, high, c, goal, share, local, leverage):
         enough = max(_SOLVED, share * (value - goal))
         if bound <= goal or bound - value <= enough or step == _MAX_STEPS - 1:
             break
-        if kind == E and gain <= 0.3 * (base - value):
+        if problem.root is not None and kind == E and gain <= 0.3 * (base - value):
             if local.settings[1] >= _SHARPEST:
                 break
             local.settings[1] *= 4.0
@@ -271,22 +281,24 @@ def relax(problem, kind, low, high, c, goal, share, local, leverage):
             continue
         which = _working_set(low, high, c, leverage, cut, 2 * p + 4)
         m = len(which)
-        curvature, move = np.empty((m, m)), np.empty(m)
-        hessian(kind, blocks, which, local, curvature)
-        slope = leverage[which]
-        _quadratic_step(
-            curvature, slope, low[which] - c[which], high[which] - c[which], move
-        )
-        promised = 0.0
+        curvature, move, before = np.empty((m, m)), np.empty(m), np.empty(m)
+        slope, least, most = np.empty(m), np.empty(m), np.empty(m)
+        for i in range(m):
+            j = which[i]
+            before[i], slope[i] = c[j], leverage[j]
+            least[i], most[i] = low[j] - c[j], high[j] - c[j]
+        hessian(kind, problem.root, blocks, which, local, curvature)
+        _quadratic_step(curvature, slope, least, most, move)
+        promised, part = 0.0, 1.0
         for i in range(m):
             promised += move[i] * leverage[which[i]]
-        before, part = c[which], 1.0
         while True:
             for i in range(m):
                 j = which[i]
                 c[j] = before[i] + part * move[i]
-                if abs(c[j] - np.round(c[j])) < _ROUNDING:
-                    c[j] = np.round(c[j])
+                whole = np.floor(c[j] + 0.5)
+                if abs(c[j] - whole) < _ROUNDING:
+                    c[j] = whole
             gram_of(blocks, c, problem.prior, local.gram)
             after, base = evaluate(kind, problem.root, local)
             if after >= value + 1e-4 * part * promised or part < 1e-6:

@@ -23,7 +23,7 @@ __all__ = ["climb_rows", "exchange_rows"]
 _IMPROVES = 1.0 + 1e-11  # a swap must raise det by more than rounding
 
 
-@njit(cache=True, nogil=True)
+@njit(inline="always")
 def _best_row(leverage, inner, out, counts, upper):
     """The j, or -1, that raises det most when swapped for ``out``.
 
@@ -43,7 +43,7 @@ def _best_row(leverage, inner, out, counts, upper):
     return best
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def climb_rows(blocks, columns, upper, num_fixed, chosen, counts, prior, gram, inverse):
     """Swap each chosen posture for its best replacement until none helps.
 
@@ -101,7 +101,7 @@ def climb_rows(blocks, columns, upper, num_fixed, chosen, counts, prior, gram, i
     return log_det
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def exchange_rows(
     blocks, columns, prior, ridged, span, full, upper, required, k, restarts, seed
 ):

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from jaxcal.information.linear_algebra import draw
+from jaxcal.information.linear_algebra import INNER, draw
 
 __all__ = ["RIDGE", "random_start", "random_starts", "seeded"]
 
 RIDGE = 1e-6  # of the information of all candidates, to climb from a singular start
 
 
-@njit(cache=True, nogil=True)
+@njit(inline="always")
 def seeded(seed):
     """(1,) uint64 state of the generator :func:`draw` for a seed."""
     state = np.empty(1, dtype=np.uint64)
@@ -26,7 +26,7 @@ def seeded(seed):
     return state
 
 
-@njit(cache=True, nogil=True)
+@njit(inline="always")
 def random_start(
     blocks, upper, required, span, full, k, state, order, basis, chosen, counts
 ):
@@ -43,7 +43,8 @@ def random_start(
         chosen, counts: (k,) and (M,), filled.
     """
     num_blocks, p = len(blocks), blocks.shape[2]
-    counts[:] = 0
+    for a in range(num_blocks):
+        counts[a] = 0
     size = len(required)
     for r in range(size):
         chosen[r] = required[r]
@@ -78,7 +79,7 @@ def random_start(
             size += 1
 
 
-@njit(cache=True, nogil=True)
+@njit(**INNER)
 def _extend(blocks, i, basis, rank, least):
     """Add to the basis the rows of block i of which over ``least`` is new; the rank."""
     _, q, p = blocks.shape
