@@ -257,4 +257,6 @@ def _triangle(rows: Array) -> Array:
     except np.linalg.LinAlgError:
         pass
     short = max(0, p - rows.shape[1])
-    return np.linalg.qr(np.pad(rows, ((0, 0), (0, short), (0, 0))), mode="r")
+    return np.asarray(
+        np.linalg.qr(np.pad(rows, ((0, 0), (0, short), (0, 0))), mode="r")
+    )

@@ -361,5 +361,15 @@ def test_k_is_by_default_enough_to_identify():
 
 def test_a_region_without_criterion_i_is_refused():
     blocks = np.random.default_rng(0).normal(size=(9, 2, 3))
-    with pytest.raises(ValueError, match="region.*must come with criterion I.*got.*D"):
+    with pytest.raises(ValueError, match=r"region.* must come with .* got criterion D"):
         select(blocks=blocks, k=3, region=blocks[:2])
+
+
+@pytest.mark.parametrize("name", ["D", "A", "I", "E"])
+def test_exchange_where_all_are_required_returns_them(name):
+    blocks = np.random.default_rng(0).normal(size=(9, 2, 3))
+    found = select(
+        blocks=blocks, k=2, required=[8, 5], prior=np.eye(3), method="exchange",
+        criterion=name, restarts=3,
+    )  # fmt: skip
+    assert sorted(found.indices) == [5, 8]

@@ -424,7 +424,7 @@ def grow_and_climb(
                     return value
                 value = now
                 same = abs(value - expected) <= _SAME * max(1.0, abs(value))
-                if same and since == k - num_fixed:
+                if k == num_fixed or (same and since == k - num_fixed):
                     return value
                 for r in range(k):
                     kept[r] = chosen[r]

@@ -242,7 +242,7 @@ def _whitened(
     k, mask, required, max_replicates, single = rules
     readings = mask.sum(axis=1) * raw.shape[2]
     if raw.shape[2] > raw.shape[3]:  # as much information in p rows, at q^3 less cost
-        raw = np.linalg.qr(raw, mode="r")
+        raw = np.asarray(np.linalg.qr(raw, mode="r"))
     k = check_k(k, raw, mask, root, regressors=names is None)
     cap, forced = check_counts(mask, k, required, max_replicates, single)
     white = whiten(raw, mask, root)
