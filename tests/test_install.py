@@ -32,6 +32,14 @@ assert not found, found
 """
 HEAVY = ("jax", "flax", "orbax", "brax", "mujoco", "matplotlib", "pymodbus", "pydantic")
 
+FORMULA = """
+import jaxcal.models as m
+try:
+    print(m.Linear("1 + x + I(x**2)").names)
+except ImportError as error:
+    print(error)
+"""
+
 # extra: packages that must not come with it; commands and what their output must hold
 CASES = {
     "": (
@@ -40,7 +48,12 @@ CASES = {
             (["jaxcal", "train"], 2, "pip install 'jaxcal[policy]'"),
             (["jaxcal-rig", "calibrate", "--simulate"], 2, "pip install 'jaxcal[rig]'"),
             (["jaxcal", "evaluate"], 2, "pip install 'jaxcal["),
+            (["python", "-c", FORMULA], 0, "pip install 'jaxcal[models]'"),
         ],
+    ),
+    "models": (
+        HEAVY,
+        [(["python", "-c", FORMULA], 0, "I(x ** 2)")],
     ),
     "policy": (
         ("brax", "mujoco", "matplotlib", "pymodbus"),
