@@ -1,9 +1,9 @@
 """The paper's network and its PPO update in plain PyTorch, as one would write it.
 
-The same function as ``jaxcal.paper.network.PaperNetwork`` (keys are made for every
-candidate, as attention is usually written; ``folded=True`` takes the query to the
-candidates instead, as jaxcal does) and the same update as the ``paper`` preset: 16
-episodes, 10 epochs, Adam, clipped by global norm, averaged weights.
+It computes the same function as ``jaxcal.paper.network.PaperNetwork`` and the same
+update as the ``paper`` preset: 16 episodes, 10 epochs, Adam, clipping by global norm,
+averaged weights. Attention projects every candidate to a key, as usual; with
+``folded=True`` the key projection is applied to the query instead, as in jaxcal.
 """
 
 from __future__ import annotations

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration import file, reach, table
+from jaxcal.calibration import file, table
+from jaxcal.calibration.affine_inverse import limits_of
 from jaxcal.calibration.base import Calibration
 from jaxcal.calibration.checked import derivative, predict
 from jaxcal.calibration.discrepancy import WithDiscrepancy
+from jaxcal.calibration.reach import reach
 from jaxcal.checks import in_words
 from jaxcal.models import Affine, Model, from_dict, identifiability
 from jaxcal.models.identifiability import Identifiability
@@ -77,8 +79,6 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
     num_readings: int  # of a measurement, less its unknown commands
     frequencies: Array | None  # (n, D) of the discrepancy
     phases: Array | None  # (D,)
-
-    command_for = reach.command_for
 
     # -- parameters --------------------------------------------------------------------
 
@@ -198,6 +198,58 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
         return std.reshape(*points.shape[:-1], self.num_outputs)
 
     # -- inside ------------------------------------------------------------------------
+
+    def command_for(
+        self,
+        desired: ArrayLike,
+        limits: ArrayLike | None = None,
+        *,
+        start: ArrayLike | None = None,
+        clip: bool = False,
+        max_condition: float = 1e6,
+    ) -> Array:
+        """Commands that reach desired outputs, by Newton's method from several starts.
+
+        Args:
+            desired: (..., m) in the measured unit; m at most n. Where m is less than n
+                the command is the one that Newton's method finds near the start.
+            limits: (n, 2) least and greatest command of each input, if any.
+            start: (n,) or (..., n) where the search begins; the measured command whose
+                output is nearest when not given.
+            clip: where the limits leave no exact command, the one within them whose
+                output is nearest, instead of refusing.
+            max_condition: greatest condition number of the derivative by the commands,
+                in units of their spread and with rows of equal size, that is accepted.
+
+        Returns:
+            (..., n) in the command unit.
+
+        Raises:
+            ValueError: a desired output is out of reach, or needs a command beyond its
+                limits; an output does not respond there; m exceeds n.
+        """
+        n, m = self.num_inputs, self.num_outputs
+        wanted = self._points("desired", desired, m)
+        if m > n:
+            raise ValueError(
+                f"command_for needs at most as many outputs as inputs, got {m} and {n}"
+            )
+        begin = None
+        if start is not None:
+            points = self._points("start", start, n)
+            begin = np.broadcast_to(points, (*wanted.shape[:-1], n)).reshape(-1, n)
+        commands = reach(
+            self._whole,
+            self.estimate,
+            self.commands,
+            wanted.reshape(-1, m),
+            self.input_names,
+            begin=begin,
+            bounds=None if limits is None else limits_of(limits, self.input_names),
+            clip=clip,
+            max_condition=max_condition,
+        )
+        return commands.reshape(*wanted.shape[:-1], n)
 
     @property
     def _whole(self) -> Model:

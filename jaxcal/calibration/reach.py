@@ -2,68 +2,47 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from jaxcal.calibration.affine_inverse import limits_of
 from jaxcal.calibration.checked import derivative, predict
 from jaxcal.checks import in_words
 from jaxcal.information.excitation import direction_in_words
+from jaxcal.models import Model
 
-if TYPE_CHECKING:
-    from jaxcal.calibration.model import ModelCalibration
-
-__all__ = ["command_for"]
+__all__ = ["reach"]
 
 Array = NDArray[np.float64]
 
 _STARTS, _STEPS, _REACHED = 6, 60, 1e-9  # of the outputs' spread over the measurements
 
 
-def command_for(
-    self: ModelCalibration,
-    desired: ArrayLike,
-    limits: ArrayLike | None = None,
+def reach(
+    model: Model,
+    parameters: Array,
+    known: Array,
+    wanted: Array,
+    names: tuple[str, ...],
     *,
-    start: ArrayLike | None = None,
-    clip: bool = False,
-    max_condition: float = 1e6,
+    begin: Array | None,
+    bounds: Array | None,
+    clip: bool,
+    max_condition: float,
 ) -> Array:
-    """Commands that reach desired outputs, by Newton's method from several starts.
+    """Commands (P, n) that reach outputs ``wanted`` (P, q), by Newton's method.
 
     Args:
-        desired: (..., m) in the measured unit; m at most n. Where m is less than n the
-            command is the one that Newton's method finds near the start.
-        limits: (n, 2) least and greatest command of each input, if any.
-        start: (n,) or (..., n) where the search begins; the measured command whose
-            output is nearest when not given.
-        clip: where the limits leave no exact command, the one within them whose output
-            is nearest, instead of refusing.
-        max_condition: greatest condition number of the derivative by the commands, in
-            units of their spread and with rows of equal size, that is accepted.
-
-    Returns:
-        (..., n) in the command unit.
-
-    Raises:
-        ValueError: a desired output is out of reach, or needs a command beyond its
-            limits; an output does not respond there; m exceeds n.
+        model, parameters: what answers, and its parameters as identified.
+        known: (N, n) commands that were measured; their outputs give the scale, and
+            the nearest are where further searches begin.
+        names: n names of the inputs, for errors.
+        begin: (P, n) where the first search begins; the nearest when None.
+        bounds: (n, 2) limits of the commands, or None.
+        clip, max_condition: as for :meth:`ModelCalibration.command_for`.
     """
-    wanted = self._points("desired", desired, self.num_outputs)
-    if self.num_outputs > self.num_inputs:
-        raise ValueError(
-            "command_for needs at most as many outputs as inputs, got "
-            f"{self.num_outputs} and {self.num_inputs}"
-        )
-    bounds = None if limits is None else limits_of(limits, self.input_names)
-    search = _Search(self, wanted.reshape(-1, self.num_outputs))
-    begin = search.nearest[:, 0]
-    if start is not None:
-        points = self._points("start", start, self.num_inputs)
-        begin = np.broadcast_to(points, (*wanted.shape[:-1], self.num_inputs))
-        begin = begin.reshape(-1, self.num_inputs)
+    search = _Search(model, parameters, known, wanted, names)
+    if begin is None:
+        begin = search.nearest[:, 0]
     commands, reached = search.newton(begin)
     for k in range(search.nearest.shape[1]):
         if reached.all():
@@ -86,16 +65,21 @@ def command_for(
         commands = np.clip(commands, low, high)
     if not clip:
         search.require_regular(commands, max_condition)
-    return commands.reshape(*wanted.shape[:-1], self.num_inputs)
+    return commands
 
 
 class _Search:
     """Outputs and derivatives in units of their spread over the measurements."""
 
-    def __init__(self, calibration: ModelCalibration, wanted: Array) -> None:
-        self.calibration, self.wanted = calibration, wanted
-        self.model, self.theta = calibration._whole, calibration.estimate
-        known = calibration.commands
+    def __init__(
+        self,
+        model: Model,
+        theta: Array,
+        known: Array,
+        wanted: Array,
+        names: tuple[str, ...],
+    ) -> None:
+        self.model, self.theta, self.wanted, self.names = model, theta, wanted, names
         outputs = predict(self.model, known, self.theta)
         self.spread = np.where(np.ptp(known, axis=0) > 0.0, known.std(axis=0), 1.0)
         moved = np.ptp(outputs, axis=0) > 0.0
@@ -109,8 +93,7 @@ class _Search:
 
     def slopes(self, commands: Array) -> Array:
         """(P, q, n) in units of the spreads."""
-        names = self.calibration.input_names
-        by = derivative(self.model, commands, self.theta, names)
+        by = derivative(self.model, commands, self.theta, self.names)
         return by * self.spread / self.size[:, None]
 
     def newton(self, begin: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -148,7 +131,7 @@ class _Search:
 
         low, high = bounds.T
         high = np.maximum(high, low + 1e-12 * self.spread)
-        wanted, names = self.wanted[i], self.calibration.input_names
+        wanted, names = self.wanted[i], self.names
 
         def off(command: Array) -> Array:
             return (self.outputs(command[None])[0] - wanted) / self.size
@@ -192,7 +175,7 @@ class _Search:
         _, size, right = np.linalg.svd(slopes / np.where(rows > 0.0, rows, 1.0))
         for i in np.flatnonzero(~(size[:, -1] * max_condition >= size[:, 0])):
             unseen = direction_in_words(
-                right[i, size.shape[1] - 1] * self.spread, self.calibration.input_names
+                right[i, size.shape[1] - 1] * self.spread, self.names
             )
             raise ValueError(
                 f"the model is near singular at the command {in_words(commands[i])}: "

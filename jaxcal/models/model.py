@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers
-
-if TYPE_CHECKING:
-    from jaxcal.models.uncertainty import Prior
+from jaxcal.models.uncertainty import Prior
 
 __all__ = ["Model", "as_commands", "as_parameters", "by_name"]
 

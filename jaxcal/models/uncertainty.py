@@ -4,17 +4,29 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import in_words, numbers, whole_number
-from jaxcal.models.model import Model
 
 __all__ = ["Noise", "Prior", "ResolvedPrior"]
 
 Array = NDArray[np.float64]
 Named = ArrayLike | Mapping[str, float]
+
+
+class Parametric(Protocol):
+    """What a prior is about: any model, by its parameters."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """p names."""
+
+    @property
+    def nominal(self) -> Array:
+        """(p,) values of the machine as it was designed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +68,7 @@ class Prior:
                 f"fixed=[name] holds a parameter), got {in_words(std[~(std > 0.0)])}"
             )
 
-    def resolve(self, model: Model) -> ResolvedPrior:
+    def resolve(self, model: Parametric) -> ResolvedPrior:
         """The prior of ``model``'s parameters, checked against its names."""
         names = model.names
         for name in self.fixed:

@@ -306,39 +306,58 @@ def test_a_selection_says_by_which_criterion(capsys):
     )
 
 
-def refused(message, **change):
+U = np.random.default_rng(0).random((9, 3))
+BARE = {"blocks": None, "candidates": U}
+HELD = jaxcal.Prior(1.0, fixed=("a11", "a12", "a13", "b1"))
+
+
+@pytest.mark.parametrize(
+    ("message", "change"),
+    [
+        (
+            r"criterion must be one of D, Ds, A, As, I, E, got 'D\+A'",
+            {"criterion": "D+A"},
+        ),
+        ("criterion must be one of", {"criterion": ["D", "A"]}),
+        ("parameters, those of interest, must be given", {"criterion": "Ds"}),
+        ("and with no other, got .*'D'", {"parameters": [0]}),
+        (
+            "parameters must be indices or names",
+            {"criterion": "As", "parameters": [4]},
+        ),
+        ("parameters must be indices .*'x'", {"criterion": "As", "parameters": ["x"]}),
+        (
+            "parameters must name some once",
+            {"criterion": "As", "parameters": [1, 1]},
+        ),
+        (
+            r"region must have shape \(N, 2, 4\)",
+            {"region": np.ones((3, 4)), "criterion": "I"},
+        ),
+        (
+            "region, where .* must come with criterion I, got criterion D",
+            {"region": np.ones((3, 2, 4))},
+        ),
+        (r"measured must have shape \(N, 2, 4\)", {"measured": np.ones((3, 1, 4))}),
+        ("prior must be a .* precision with blocks", {"prior": jaxcal.Prior(1.0)}),
+        ("model must come with candidates", {"model": Affine(3, 3)}),
+        (
+            "num_outputs must not be given",
+            BARE | {"model": Affine(3, 3), "num_outputs": 3},
+        ),
+        (r"candidates must have shape \(M, 2\)", BARE | {"model": Affine(2, 2)}),
+        ("prior must leave", BARE | {"model": Affine(3, 1), "prior": HELD}),
+        (r"measured must have shape \(N, 3\)", BARE | {"measured": U[:, :2]}),
+        (
+            '"policy" is trained on the affine model',
+            BARE | {"method": "policy", "criterion": "A"},
+        ),
+    ],
+)
+def test_bad_criteria_are_one_clear_error(message, change):
     blocks, _ = drawn(0, 8, 2, 4)
     with pytest.raises(ValueError, match=message):
         select(**{"blocks": blocks, "method": "greedy", **change})
-
-
-def test_bad_criteria_are_one_clear_error():
-    u = np.random.default_rng(0).random((9, 3))
-    bare = {"blocks": None, "candidates": u}
-    refused("criterion must be one of D, Ds, A, As, I, E, got 'D\\+A'", criterion="D+A")
-    refused("criterion must be one of", criterion=["D", "A"])
-    refused("parameters, those of interest, must be given", criterion="Ds")
-    refused("and with no other, got .*'D'", parameters=[0])
-    refused("parameters must be indices or names", criterion="As", parameters=[4])
-    refused("parameters must be indices .*'x'", criterion="As", parameters=["x"])
-    refused("parameters must name some once", criterion="As", parameters=[1, 1])
-    refused(
-        r"region must have shape \(N, 2, 4\)", region=np.ones((3, 4)), criterion="I"
-    )
-    refused(r"measured must have shape \(N, 2, 4\)", measured=np.ones((3, 1, 4)))
-    refused("prior must be a .* precision with blocks", prior=jaxcal.Prior(1.0))
-    refused("model must come with candidates", model=Affine(3, 3))
-    refused("num_outputs must not be given", **bare, model=Affine(3, 3), num_outputs=3)
-    refused(r"candidates must have shape \(M, 2\)", **bare, model=Affine(2, 2))
-    refused("prior must leave", **bare, model=Affine(3, 1),
-            prior=jaxcal.Prior(1.0, fixed=("a11", "a12", "a13", "b1")))  # fmt: skip
-    refused(r"measured must have shape \(N, 3\)", **bare, measured=u[:, :2])
-    refused(
-        '"policy" is trained on the affine model',
-        **bare,
-        method="policy",
-        criterion="A",
-    )
 
 
 def test_k_is_by_default_enough_to_identify():
@@ -357,12 +376,6 @@ def test_k_is_by_default_enough_to_identify():
     alone[:4, :, 0] = 1.0
     alone[4, 0, 1] = alone[5, 1, 2] = 1.0
     assert len(select(blocks=alone, method="greedy").indices) == 3
-
-
-def test_a_region_without_criterion_i_is_refused():
-    blocks = np.random.default_rng(0).normal(size=(9, 2, 3))
-    with pytest.raises(ValueError, match=r"region.* must come with .* got criterion D"):
-        select(blocks=blocks, k=3, region=blocks[:2])
 
 
 @pytest.mark.parametrize("name", ["D", "A", "I", "E"])
