@@ -10,9 +10,10 @@ from jaxcal.selection.problem import Problem
 
 __all__ = ["Blocks"]
 
+Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-_RIDGE = {"det": 1e-9, "trace": 1e-6, "least": 1e-6}  # of the mean leverage
+SHARES = (0.1, 0.3, 0.03, 1.0)
 
 
 class Blocks:
@@ -27,52 +28,66 @@ class Blocks:
 
         self._usable = np.flatnonzero(problem.available)
         self._blocks = problem.blocks[self._usable]
-        self._columns = np.ascontiguousarray(self._blocks.transpose(1, 2, 0))
+        count, q, p = self._blocks.shape
+        groups = -(-count // kernel.WIDE)
+        padded = np.zeros((groups * kernel.WIDE, q, p))
+        padded[:count] = self._blocks
+        self._columns = np.ascontiguousarray(
+            padded.reshape(groups, kernel.WIDE, q, p).transpose(0, 2, 3, 1)
+        )
         self._prior, self._k = problem.prior.copy(), problem.k
         self._known = bool(len(problem.root))
-        self._upper = problem.upper[self._usable]
+        self._upper = np.zeros(groups * kernel.WIDE, dtype=np.int64)
+        self._upper[:count] = problem.upper[self._usable]
         self._required = np.searchsorted(self._usable, problem.required)
         criterion = problem.criterion
         self._kind = kernel.TRACE
         if criterion.kind == "det":
             self._kind = kernel.DET if criterion.name == "D" else kernel.SUBSET
         self._root = criterion.root.copy()
-        ridge = _RIDGE[criterion.kind] * self._prior.shape[0] / len(self._blocks)
-        self._ridge = np.array([ridge, 0.0])
 
-    def greedy(self) -> Indices:
+    def greedy(self, share: float = SHARES[0]) -> Indices:
         """(k,) the required, then one at a time by the largest gain."""
-        return self._usable[self._from(self._required, False)[0]]
+        return self._usable[self._from(self._required, share, False)[0]]
 
     def climbed(self, start: Indices) -> tuple[Indices, float]:
         """The local optimum that ``start`` (k,), required first, climbs to; its phi."""
-        chosen, phi = self._from(np.searchsorted(self._usable, start), True)
+        chosen, phi = self._from(np.searchsorted(self._usable, start), 0.0, True)
         return self._usable[chosen], phi
 
     def exchanged(self, restarts: int, seed: int) -> tuple[Indices, float]:
         """The best local optimum from greedy and ``restarts - 1`` random starts."""
-        best, phi = self._from(self._required, True)
-        if restarts > 1 or not phi > -np.inf:
-            for start in self._random(max(restarts - 1, 1), seed):
-                chosen, found = self._from(start, True)
+        best, phi = self._required, -np.inf
+        for share in SHARES[:restarts]:
+            chosen, found = self._from(self._required, share, True)
+            if not np.isfinite(phi) or found > phi + 1e-10 * abs(phi):
+                best, phi = chosen, found
+        more = restarts - len(SHARES)
+        if more > 0 or not phi > -np.inf:
+            for start in self._random(max(more, 1), seed):
+                chosen, found = self._from(start, 0.0, True)
                 if not np.isfinite(phi) or found > phi + 1e-10 * abs(phi):
                     best, phi = chosen, found
         return self._usable[best], phi
 
-    def _from(self, start: Indices, climbs: bool) -> tuple[Indices, float]:
+    def _from(self, start: Indices, share: float, climbs: bool) -> tuple[Indices, float]:
         from jaxcal.selection.exchange.blocks_kernel import grow_and_climb
         from jaxcal.selection.exchange.starts import RIDGE
 
         chosen = np.zeros(self._k, dtype=np.int64)
         chosen[: len(start)] = start
         size, phi = len(start), -np.inf
-        for swapping in (0.0, RIDGE, 0.0):  # swaps may mend a singular start
-            self._ridge[1] = swapping
+        unit = np.eye(len(self._prior))
+        growing = self._prior + share * self._k / len(self._blocks) * (
+            unit - self._prior
+        )
+        for ridge in (0.0, RIDGE, 0.0):  # swaps may mend a singular start
             phi = grow_and_climb(
-                self._kind, self._root, self._blocks, self._columns, self._prior,
-                self._upper, self._ridge, len(self._required), chosen, size, climbs,
+                self._kind, self._root, self._blocks, self._columns, growing,
+                self._prior + ridge * unit, self._upper, len(self._required), chosen,
+                size, climbs,
             )  # fmt: skip
-            if not climbs or (not swapping and phi > -np.inf):
+            if not climbs or (not ridge and phi > -np.inf):
                 break
             size = self._k
         return chosen, float(phi)
@@ -87,7 +102,7 @@ class Blocks:
             span = np.ascontiguousarray(vectors.T[values > 1e-6])
         return list(
             random_starts(
-                self._blocks, self._upper, self._required, span,
+                self._blocks, self._upper[: len(self._blocks)], self._required, span,
                 largest_rank(self._blocks), self._k, count, np.uint64(seed % 2**64),
             )
         )  # fmt: skip
