@@ -13,7 +13,13 @@ __all__ = ["Blocks"]
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-SHARES = (0.1, 0.3, 0.03, 1.0)
+# While a selection grows, a share of the information that k mean candidates give stands
+# in for those that are not chosen yet: this one, less where k candidates have fewer
+# readings than there are parameters, and in further starts of the exchange others.
+_SHARE = 0.2
+_FURTHER = (1.0, 0.03)
+_MENDING = 10  # random starts where all greedy ones are singular
+_RANK_FIRST = 1e-7  # every direction that nothing is known of outweighs the rest
 
 
 class Blocks:
@@ -45,43 +51,56 @@ class Blocks:
         if criterion.kind == "det":
             self._kind = kernel.DET if criterion.name == "D" else kernel.SUBSET
         self._root = criterion.root.copy()
+        self._share = _SHARE * min(1.0, self._k * q / p) ** 6
 
-    def greedy(self, share: float = SHARES[0]) -> Indices:
-        """(k,) the required, then one at a time by the largest gain."""
-        return self._usable[self._from(self._required, share, False)[0]]
+    def greedy(self) -> Indices:
+        """(k,) the required, then one at a time by the largest gain.
+
+        A selection that is singular is mended by swaps, as in the exchange.
+        """
+        for share in (self._share, _RANK_FIRST):
+            chosen, phi = self._from(self._required, share, False)
+            if phi > -np.inf:
+                return self._usable[chosen]
+        return self.exchanged(1, 0)[0]
 
     def climbed(self, start: Indices) -> tuple[Indices, float]:
         """The local optimum that ``start`` (k,), required first, climbs to; its phi."""
-        chosen, phi = self._from(np.searchsorted(self._usable, start), 0.0, True)
+        chosen, phi = self._from(np.searchsorted(self._usable, start), 1.0, True)
         return self._usable[chosen], phi
 
     def exchanged(self, restarts: int, seed: int) -> tuple[Indices, float]:
-        """The best local optimum from greedy and ``restarts - 1`` random starts."""
+        """The best local optimum from greedy selections and then random starts."""
         best, phi = self._required, -np.inf
-        for share in SHARES[:restarts]:
-            chosen, found = self._from(self._required, share, True)
-            if not np.isfinite(phi) or found > phi + 1e-10 * abs(phi):
-                best, phi = chosen, found
-        more = restarts - len(SHARES)
-        if more > 0 or not phi > -np.inf:
-            for start in self._random(max(more, 1), seed):
-                chosen, found = self._from(start, 0.0, True)
-                if not np.isfinite(phi) or found > phi + 1e-10 * abs(phi):
-                    best, phi = chosen, found
+        shares = (self._share, *_FURTHER)[:restarts]
+        for share in shares:
+            best, phi = self._better(best, phi, self._required, share)
+        more = max(restarts - len(shares), 0 if phi > -np.inf else _MENDING)
+        for start in self._random(more, seed) if more else ():
+            best, phi = self._better(best, phi, start, 1.0)
         return self._usable[best], phi
 
-    def _from(self, start: Indices, share: float, climbs: bool) -> tuple[Indices, float]:
+    def _better(
+        self, best: Indices, phi: float, start: Indices, share: float
+    ) -> tuple[Indices, float]:
+        chosen, found = self._from(start, share, True)
+        if not np.isfinite(phi) or found > phi + 1e-10 * abs(phi):
+            return chosen, found
+        return best, phi
+
+    def _from(
+        self, start: Indices, share: float, climbs: bool
+    ) -> tuple[Indices, float]:
         from jaxcal.selection.exchange.blocks_kernel import grow_and_climb
         from jaxcal.selection.exchange.starts import RIDGE
 
         chosen = np.zeros(self._k, dtype=np.int64)
         chosen[: len(start)] = start
         size, phi = len(start), -np.inf
-        unit = np.eye(len(self._prior))
-        growing = self._prior + share * self._k / len(self._blocks) * (
-            unit - self._prior
-        )
-        for ridge in (0.0, RIDGE, 0.0):  # swaps may mend a singular start
+        unit, weight = np.eye(len(self._prior)), share * self._k / len(self._blocks)
+        growing = (1.0 - weight) * self._prior + weight * unit
+        # Swaps may mend a singular start, the more surely the smaller the ridge.
+        for ridge in (0.0, RIDGE, 0.0, 1e-4 * RIDGE, 0.0):
             phi = grow_and_climb(
                 self._kind, self._root, self._blocks, self._columns, growing,
                 self._prior + ridge * unit, self._upper, len(self._required), chosen,

@@ -37,6 +37,7 @@ _IMPROVES = 1e-11  # by which a swap must raise phi, relative above 1
 _SAME = 1e-9  # how far phi summed over swaps may be from phi computed at the end
 _CANCELLED = 1e-3  # fall of the largest leverage that costs up to six digits of X
 _LEAST = 1e-14  # a determinant below it is that of a singular matrix
+_UNKNOWN = 1e13  # variance, in that of all candidates together, of mere rounding
 _NONE = -1
 _FUSED = {**INNER, "fastmath": {"contract"}}  # a product and a sum in one operation
 
@@ -81,7 +82,12 @@ def _value(kind, root, information, inverse, other):
         inverse, other: V and X (p, p), filled.
     """
     value = factor(information, inverse)
-    if kind == DET or not value > -np.inf:
+    if not value > -np.inf:
+        return value
+    for a in range(len(inverse)):
+        if inverse[a, a] > _UNKNOWN:
+            return -np.inf
+    if kind == DET:
         return value
     half = _product(root, inverse)
     other[:] = 0.0
@@ -428,6 +434,16 @@ def _largest(grown):
     return largest
 
 
+@njit(**INNER)
+def _sum(known, blocks, chosen, gram):
+    """``gram = known + sum of B_i.T B_i`` of the chosen."""
+    for a in range(len(gram)):
+        for b in range(len(gram)):
+            gram[a, b] = known[a, b]
+    for i in chosen:
+        add_block(gram, blocks, i, 1.0)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def grow_and_climb(
     kind, root, blocks, columns, growing, swapping, upper, num_fixed, chosen, size,
@@ -446,7 +462,7 @@ def grow_and_climb(
         climbs: whether to swap, until no swap helps.
 
     Returns:
-        phi of the local optimum, if it climbs; -inf from a singular start.
+        phi of the selection; -inf where it, or the start of the swaps, is singular.
     """
     num_groups, q, p, _ = columns.shape
     k = len(chosen)
@@ -470,12 +486,7 @@ def grow_and_climb(
         if not grows and since == k - num_fixed:
             stale = True
         if stale:
-            known = growing if grows else swapping
-            for a in range(p):
-                for b in range(p):
-                    gram[a, b] = known[a, b]
-            for i in chosen[:size]:
-                add_block(gram, blocks, i, 1.0)
+            _sum(growing if grows else swapping, blocks, chosen[:size], gram)
             now = _value(kind, root, gram, matrices[0], matrices[1])
             if not grows:
                 if not now > value:  # rounding promised more than there is
@@ -550,4 +561,5 @@ def grow_and_climb(
         largest = _largest(grown)
         stale = largest < _CANCELLED * peak
         peak = max(peak, largest)
-    return value
+    _sum(swapping, blocks, chosen, gram)
+    return _value(kind, root, gram, matrices[0], matrices[1])
