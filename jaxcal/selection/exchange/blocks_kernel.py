@@ -74,7 +74,7 @@ def _transposed(matrix):
 
 @njit(**_FUSED)
 def _value(kind, root, information, inverse, other):
-    """phi of the information (p, p), -inf where singular.
+    """phi of the information (p, p), -inf where singular to rounding.
 
     Args:
         kind: DET, SUBSET or TRACE.
@@ -364,7 +364,7 @@ def _change(
     """Carry V, X and all that is kept over to other blocks chosen.
 
     Args:
-        changed: (r, p) rows of the block that comes in, then of that which goes, if any.
+        changed: (r, p) the block that comes in, then that which goes, if any.
         num_crossed: leading rows of ``cross`` (groups, 2, r, q, WIDE) to be filled.
         matrices: (2, p, p) V and X.
         work: (r, q, WIDE).

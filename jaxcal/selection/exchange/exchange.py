@@ -2,8 +2,8 @@
 
 Each chosen candidate in turn is swapped for the one that raises the criterion most,
 until no swap helps. Rank-one problems start from random selections that are not
-singular, all others from greedy ones first. Source: Fedorov, Theory of Optimal Experiments, 1972; Cook and Nachtsheim 1980
-for one candidate at a time.
+singular, all others from greedy ones first. Source: Fedorov, Theory of Optimal
+Experiments, 1972; Cook and Nachtsheim 1980 for one candidate at a time.
 """
 
 from __future__ import annotations
