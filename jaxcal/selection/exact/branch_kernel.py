@@ -86,7 +86,7 @@ def _copy(node, out):
             out[a, i] = node[a, i]
 
 
-@njit(inline="always")
+@njit(**INNER)
 def _balance(node, k, leverage):
     """Move c into its bounds and back to sum k, keeping it near where it was."""
     low, high, c = node[0], node[1], node[2]
@@ -112,7 +112,7 @@ def _balance(node, k, leverage):
     return True
 
 
-@njit(inline="always")
+@njit(**INNER)
 def _kind_of(problem, root, low, local):
     """Set P; RANK or RANK_TRACE where too few readings are left for the natural bound.
 

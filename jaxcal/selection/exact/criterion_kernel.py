@@ -95,27 +95,32 @@ def evaluate(kind, root, local):
         The value to climb by, -inf where M is singular, and the value to which the
         linear gain is added for a bound; they differ by rounding, and for E.
     """
-    if root is not None and kind == E:
-        return evaluate_spectrum(LEAST, local)
-    if root is not None and kind == RANK:
-        return evaluate_spectrum(LOG_DET, local)
     inverse, gradient = local.inverse, local.gradient
-    value = factor(local.gram, inverse)
-    if root is None or kind == D or not value > -np.inf:
-        for a in range(len(inverse)):
-            for b in range(len(inverse)):
-                gradient[a, b] = inverse[a, b]
+    value, base = 0.0, 0.0
+    if root is None:
+        value = factor(local.gram, gradient)
         return value, value
-    if kind != RANK_TRACE:
-        value = _covariance(kind, root, inverse, gradient)
-        return value, value
-    few = local.share[: int(local.settings[5])]
-    value = _covariance(TRACE, few, inverse, local.reach)
-    other, base = evaluate_spectrum(SHARES, local)
-    for a in range(len(inverse)):
-        for b in range(len(inverse)):
-            gradient[a, b] += local.reach[a, b]
-    return value + other, value + base
+    if kind != E and kind != RANK:
+        value = factor(local.gram, inverse)
+        base = value
+        if kind == D or not value > -np.inf:
+            for a in range(len(inverse)):
+                for b in range(len(inverse)):
+                    gradient[a, b] = inverse[a, b]
+            return value, value
+        few = kind == RANK_TRACE
+        rows = local.share[: int(local.settings[5])] if few else root
+        value = _covariance(kind, rows, inverse, local.reach if few else gradient)
+        base = value
+    if kind >= E:
+        form = LEAST if kind == E else LOG_DET if kind == RANK else SHARES
+        other, bound = evaluate_spectrum(form, local)
+        value, base = value + other, base + bound
+        if kind == RANK_TRACE:
+            for a in range(len(inverse)):
+                for b in range(len(inverse)):
+                    gradient[a, b] += local.reach[a, b]
+    return value, base
 
 
 @njit(**FAST)
@@ -161,16 +166,17 @@ def hessian(kind, root, blocks, which, local, out):
     for i in range(m):
         for j in range(m):
             out[i, j] = 0.0
-    if root is not None and (kind == E or kind == RANK or kind == RANK_TRACE):
-        spectral_hessian(_turned(blocks, which, local.basis), local, out)
-        if kind != RANK_TRACE:
-            return
-    turned = _turned(blocks, which, local.inverse)
-    other = turned
-    if root is not None and kind == RANK_TRACE:
-        other = _turned(blocks, which, local.reach)
-    elif root is not None and kind != D:
-        other = _turned(blocks, which, local.gradient)
+    if root is None:
+        turned = _turned(blocks, which, local.gradient)
+        other = turned
+    else:
+        if kind >= E:
+            spectral_hessian(_turned(blocks, which, local.basis), local, out)
+            if kind != RANK_TRACE:
+                return
+        turned = _turned(blocks, which, local.inverse)
+        few = kind == RANK_TRACE
+        other = _turned(blocks, which, local.reach if few else local.gradient)
     _, q, p = turned.shape
     for i in range(m):
         for j in range(i + 1):

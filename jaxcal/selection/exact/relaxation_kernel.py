@@ -36,7 +36,7 @@ _TUNES = 2  # of mu of RANK_TRACE in one node
 _SHARPEST = 1e5  # smoothing of E, where the eigenvalue is about 1
 
 
-@njit(inline="always")
+@njit(**INNER)
 def _leverages(blocks, gradient, low, high, leverage):
     """Fill leverage (M,), ``trace(B_i G B_i.T)``, where the count is not fixed."""
     num_blocks, q, p = blocks.shape
@@ -55,7 +55,7 @@ def _leverages(blocks, gradient, low, high, leverage):
                     leverage[i] += reach[a] * blocks[i, r, a]
 
 
-@njit(inline="always")
+@njit(**INNER)
 def linear_gain(low, high, c, k, leverage):
     """Largest ``sum of (c'_i - c_i) d_i`` within the bounds, and its multiplier.
 
@@ -229,7 +229,7 @@ def _quadratic_step(curvature, slope, least, most, move):
         side[best] = 0
 
 
-@njit(inline="always")
+@njit(**INNER)
 def _spread(low, high, c, k):
     """Share what the lower bounds leave in proportion to the room of each count."""
     room, fixed = 0.0, 0.0
@@ -294,7 +294,7 @@ def relax(problem, kind, low, high, c, goal, share, local, leverage):
     if not value > -np.inf:
         return value, 0.0
     bound, cut = np.inf, 0.0
-    tunes = _TUNES if kind == RANK_TRACE else 0
+    tunes = _TUNES
     for step in range(_MAX_STEPS):
         _leverages(blocks, local.gradient, low, high, leverage)
         gain, cut = linear_gain(low, high, c, k, leverage)
@@ -302,21 +302,25 @@ def relax(problem, kind, low, high, c, goal, share, local, leverage):
         enough = max(_SOLVED, share * (value - goal))
         if bound <= goal or step == _MAX_STEPS - 1:
             break
-        if bound - value <= enough or (tunes == _TUNES and step == 0):
-            if tunes == 0:
+        solved = bound - value <= enough
+        changed = False
+        if problem.root is None:
+            pass
+        elif kind == RANK_TRACE:
+            changed = tunes > 0 and (solved or step == 0)
+            if changed:
+                tunes -= 1
+                kind = RANK_TRACE if share_out(local, best_place(local)) else TRACE
+        elif kind == E and not solved:
+            changed = gain <= 0.3 * (base - value)
+            if changed and local.settings[1] >= _SHARPEST:
                 break
-            tunes -= 1
-            if not share_out(local, best_place(local)):
-                kind = TRACE
-                tunes = 0
+            local.settings[1] *= 4.0 if changed else 1.0
+        if changed:
             value, base = evaluate(kind, problem.root, local)
             continue
-        if problem.root is not None and kind == E and gain <= 0.3 * (base - value):
-            if local.settings[1] >= _SHARPEST:
-                break
-            local.settings[1] *= 4.0
-            value, base = evaluate(kind, problem.root, local)
-            continue
+        if solved:
+            break
         which = _working_set(low, high, c, leverage, cut, 2 * p + 4)
         m = len(which)
         curvature, move, before = np.empty((m, m)), np.empty(m), np.empty(m)

@@ -219,7 +219,10 @@ def evaluate_spectrum(kind, local):
         for a in range(p):
             for c in range(p):
                 bend[a, c] = local.gram[a, c]
-        eigen(bend, values, rows)
+    else:
+        _between(local.half, local.rest, bend)
+    eigen(bend, values, vectors)
+    if kind == LEAST:
         b = settings[1]
         total = 0.0
         for a in range(p):
@@ -231,11 +234,11 @@ def evaluate_spectrum(kind, local):
             base += slopes[a] * values[a]
             tail[a] = slopes[a]
             own[a] = -b * slopes[a]
+            for c in range(p):
+                rows[a, c] = vectors[a, c]
         value = values[0] - np.log(total) / b
         settings[0] = b
     else:
-        _between(local.half, local.rest, bend)
-        eigen(bend, values, vectors)
         _back(local.half, vectors, rows)
         rest = 0.0
         for a in range(p):
