@@ -69,7 +69,7 @@ def offer_start(problem, low, high, counts, local, best_counts, best_values):
     swaps = num_blocks * num_blocks if len(best_values) > 1 else 1
     for swap in range(swaps):  # from i to j; the first is none
         i, j = swap // num_blocks, swap % num_blocks
-        if i != j and counts[i] > low[i] and counts[j] < high[j] or swap == 0:
+        if (i != j and counts[i] > low[i] and counts[j] < high[j]) or swap == 0:
             counts[i] -= 1
             counts[j] += 1
             value = value_of(problem, counts, local)

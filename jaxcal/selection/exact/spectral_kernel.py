@@ -36,6 +36,7 @@ __all__ = [
     "LEAST",
     "LOG_DET",
     "SHARES",
+    "best_place",
     "evaluate_spectrum",
     "share_out",
     "spectral_hessian",
@@ -46,6 +47,7 @@ __all__ = [
 LEAST, LOG_DET, SHARES = range(3)
 
 _EPS = float(np.finfo(np.float64).eps)
+_ROUNDING = 1e-6  # of a reading, in what eigenvectors take
 _SINGULAR = 1e-12  # least reciprocal of the condition of P
 
 
@@ -181,7 +183,8 @@ def best_place(local):
     """Of the eigenvalues of W the best mu at the present N; -1 for the natural bound.
 
     The bound is convex and piecewise linear in mu, with slope minus the total that the
-    eigenvectors above mu lose by N, plus what F allows the t readings to take.
+    eigenvectors above mu lose by N, plus what F allows the t readings to take. At a
+    whole selection several are best, and the largest serves its neighbours.
     """
     p = len(local.weights)
     allowed = local.settings[2] - local.settings[6]
@@ -193,7 +196,7 @@ def best_place(local):
                 total += local.inverse[a, b] * local.lines[j, b]
             taken -= local.lines[j, a] * total
         allowed -= taken
-        if allowed < 0.0:
+        if allowed < _ROUNDING * local.settings[2]:
             return j
     return -1
 
