@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
+from jaxcal.commands.main import main
 from jaxcal.information.criterion import Criterion
 from jaxcal.selection import select
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
@@ -159,6 +160,18 @@ def test_a_first_use_says_once_that_it_compiles(
         with announced("compiling, once"):
             two(1.0)
     assert [record.getMessage() for record in caplog.records] == ["compiling, once"]
+
+
+def test_the_console_shows_what_the_library_logs(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = logging.getLogger("jaxcal.selection.exact.first_use")
+    monkeypatch.setattr(
+        "jaxcal.commands.select.run", lambda arguments: log.info("compiling, once")
+    )
+    for _ in range(2):
+        assert main(["select", "-", "-k", "4"]) == 0
+        assert capsys.readouterr() == ("", "compiling, once\n")
 
 
 def monomials(points: Array) -> Array:
