@@ -1,8 +1,8 @@
 """The raw data of a record: the quaternion and the stamp of every reading.
 
 All else a record says of the phone is derived from them, so a wrong order, sign or
-mounting that is found later needs no new recording. Runs of version 1 kept the angles of
-every reading (``raw_deg``); their attitudes follow from those.
+mounting that is found later needs no new recording. Runs of version 1 kept the angles
+of every reading (``raw_deg``); their attitudes follow from those.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ DIGITS = 8  # of a quaternion: 1e-6 degrees
 
 
 def raw_fields(readings: Sequence[Reading]) -> dict[str, Any]:
-    """``quaternions`` (samples, 4), x y z w, and ``stamps`` (samples,), Unix seconds."""
+    """``quaternions`` (samples, 4), x y z w, and ``stamps`` (samples,), Unix time."""
     turns = Rotation.from_matrix([reading.matrix for reading in readings])
     clock = time.time() - time.monotonic()
     return {

@@ -119,8 +119,9 @@ class RigConfig(Section):
         """
         data = self.described()
         del data["bus"]
-        for name in ("host", "port", "transport", "stale_s"):
+        for name in ("host", "port", "transport", "allow", "stale_s"):
             del data["imu"][name]
+        del data["session"]["drift_limit_deg"]
         text = json.dumps(data, sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()
 

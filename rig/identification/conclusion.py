@@ -9,7 +9,7 @@ import numpy as np
 
 from rig.config import AXIS_NAMES, RigConfig
 from rig.identification.drift import estimate_drift, without_drift
-from rig.identification.fit import fit, held_out_errors, uncertainty
+from rig.identification.fit import fit, held_out_errors, pairs, uncertainty
 from rig.identification.noise import (
     autocorrelation_time,
     correlation,
@@ -43,11 +43,15 @@ def conclude(
     drift = estimate_drift(visits, phi, config.session.drift_limit_deg)
     chosen = without_drift(evidence.chosen, drift, zero, frame)
     found = without_drift(evidence.held_out, drift, zero, frame)
-    held_out, off = held_out_errors(config, evidence.held, {r["name"]: r for r in found})
+    held_out, off = held_out_errors(
+        config, evidence.held, {r["name"]: r for r in found}
+    )
     limits = uncertainty(fit(chosen), chosen, held_out, zero, phi)
     shared = {
         "zero_pulses": zero["pulses"],
+        "zero_attitude": zero["attitude"],
         "fingerprint": config.fingerprint(),
+        "device": config.device_fingerprint(),
         "postures": [record["name"] for record in chosen],
     }
     notes = notes | shared
@@ -72,6 +76,7 @@ def conclude(
         **shared,
         "orders": order_residuals(config, frame, chosen + held_out),
         **off,
+        **(_predicted(calibration, held_out) if held_out else {}),
         "drift": None if drift is None else dataclasses.asdict(drift),
         "drift_deg": None,
     }
@@ -79,3 +84,11 @@ def conclude(
         last = evidence.references[-1]["measured_deg"]
         summary["drift_deg"] = float(np.abs(last).max())
     return calibration, summary
+
+
+def _predicted(calibration: Any, held_out: list[Record]) -> dict[str, float]:
+    """Errors of the prediction at held-out postures, degrees."""
+    commands, measured = pairs(held_out)
+    off = measured - calibration.predict(commands)
+    rms, worst = np.sqrt((off**2).mean()), np.abs(off).max()
+    return {"prediction_rms": float(rms), "prediction_max": float(worst)}

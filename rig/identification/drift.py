@@ -14,7 +14,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rig.attitude import Array, Frame
-from rig.config import AXIS_NAMES
 from rig.identification.noise import mean_variance
 from rig.outputs.journal import Record
 
@@ -34,17 +33,9 @@ class Drift:
     rate_deg_per_min: list[float]  # (3,)
     turn_deg_per_min: list[float]  # (3,) rotation vector in the phone's world
     corrected: bool  # linear, and taken out of the measurements
-    limit_deg: float
-
-    @property
-    def left_deg(self) -> float:
-        """What is in the measurements still."""
-        return float(self.bend_deg or 0.0) if self.corrected else self.size_deg
-
-    @property
-    def over(self) -> bool:
-        """It is over session.drift_limit_deg."""
-        return self.left_deg > self.limit_deg
+    left_deg: float  # what is in the measurements still
+    limit_deg: float  # session.drift_limit_deg
+    over: bool  # what is left is over the limit
 
 
 def estimate_drift(visits: list[Record], phi: Array, limit_deg: float) -> Drift | None:
@@ -74,6 +65,7 @@ def estimate_drift(visits: list[Record], phi: Array, limit_deg: float) -> Drift 
         noise = SIGNIFICANT * np.sqrt(weights**2 @ variance)
         straight = off <= np.maximum(np.maximum(noise, STRAIGHT * end.max()), least)
         corrected = bool(there.any() and straight.all())
+    left = bend if corrected and bend is not None else size
     return Drift(
         minutes=time.round(4).tolist(),
         angles_deg=angles.tolist(),
@@ -82,7 +74,9 @@ def estimate_drift(visits: list[Record], phi: Array, limit_deg: float) -> Drift 
         rate_deg_per_min=_slope(time, angles),
         turn_deg_per_min=_slope(time, turns.as_rotvec(degrees=True)),
         corrected=corrected,
+        left_deg=left,
         limit_deg=limit_deg,
+        over=left > limit_deg,
     )
 
 
@@ -109,26 +103,3 @@ def without_drift(
             {**record, "attitude": attitude.tolist(), "measured_deg": measured.tolist()}
         )
     return found
-
-
-def drift_text(drift: Drift) -> str:
-    """What was found, in one sentence or two."""
-    worst = int(np.argmax(np.abs(drift.angles_deg).max(axis=0)))
-    rate = drift.rate_deg_per_min[worst]
-    text = (
-        f"the zero posture read up to {drift.size_deg:.4f} deg from zero "
-        f"({AXIS_NAMES[worst]}) in {len(drift.minutes) - 1} later visits"
-    )
-    if drift.corrected:
-        text += (
-            f"; the drift is linear, {rate:+.4f} deg/min, and was taken out: "
-            f"{drift.left_deg:.4f} deg are left"
-        )
-    if drift.over:
-        kind = "" if drift.bend_deg is None else "not linear, "
-        text += (
-            f". This is {kind}over session.drift_limit_deg ({drift.limit_deg:g}): "
-            "look for a loose phone, play, or a magnetic heading near the motors, and "
-            "calibrate again"
-        )
-    return text

@@ -6,6 +6,8 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+from scipy import special
+from scipy.optimize import brentq
 
 from rig.attitude import Array
 from rig.config import AXIS_NAMES, RigConfig
@@ -34,7 +36,7 @@ def fit(
         notes: stored in the calibration's file.
         zero_variance: (3,) degrees squared, of the zero reference. It shifts every
             posture equally, so it adds to the variance of the outputs' mean; the file
-            has one such number, so the axes' mean ratio to the noise is taken.
+            has one such number, so the ratio of the axes' sums is taken.
     """
     import jaxcal
 
@@ -72,8 +74,8 @@ def uncertainty(
 
     Four postures leave no residual, so the noise is taken from what they did not fit:
     the prediction errors at held-out postures (which also hold play, slow noise and
-    drift), each made smaller by the share its own prediction variance has in it, pooled
-    with the residuals of the chosen where there are more than four. Without held-out
+    drift), each made smaller by the share its own prediction variance has in it, with
+    the residuals of the chosen where there are more than four. Without held-out
     postures only the scatter of single readings is known, which is too optimistic;
     ``basis`` says which it was. The noise of the zero reference shifts all postures
     equally and leaves no trace in them, so it is added to the bias from the zero's own
@@ -90,34 +92,37 @@ def uncertainty(
         noise_std_deg (3,), zero_std_deg (3,), dof of an axis, basis, and (3, 4)
         half-widths of [A | b] in degrees.
     """
-    from scipy import stats
-
     inverse = calibration.unit_covariance  # of (slopes, bias), for noise of 1 degree
     commands, measured = pairs(chosen)
     squares = ((measured - calibration.predict(commands)) ** 2).sum(axis=0)
     dof = len(chosen) - 4
     basis = ["residuals of the chosen postures"] if dof else []
+    shared = np.zeros(4)  # of a parameter's variance: seen in the noise estimate too
     if held_out:
         u, y = pairs(held_out)
         rows = np.column_stack([u, np.ones(len(u))])
         # Prediction errors share the fitted parameters: whiten them by their joint
         # covariance, I + Z (Z_s' Z_s)^-1 Z', up to the noise variance looked for.
-        covariance = np.eye(len(u)) + rows @ inverse @ rows.T
-        off = y - calibration.predict(u)
-        white = np.linalg.solve(np.linalg.cholesky(covariance), off)
+        joint = np.eye(len(u)) + rows @ inverse @ rows.T
+        white = np.linalg.solve(
+            np.linalg.cholesky(joint), y - calibration.predict(u)
+        )  # fmt: skip
         squares += (white**2).sum(axis=0)
         dof += len(u)
         basis.append("held-out predictions")
+        gain = inverse @ rows.T @ np.linalg.solve(joint, rows @ inverse)
+        shared = np.diag(gain) / np.diag(inverse)
+    levels = (0.95, 1.0 - 0.05 / (3 * len(inverse)))
     if dof:
-        variance, law = squares / dof, stats.t(dof)
+        variance = squares / dof
+        one, all_twelve = (_half_widths(level, shared, dof) for level in levels)
     else:
         variance = np.mean([mean_variance(r, phi) for r in chosen], axis=0)
-        law = stats.norm()
+        one, all_twelve = (special.ndtri(0.5 + 0.5 * level) for level in levels)
         basis = ["scatter of single readings only"]
     of_zero = mean_variance(zero, phi)
     spread = np.outer(variance, np.diag(inverse))
     spread[:, 3] += of_zero
-    one, all_twelve = law.ppf([1 - 0.05 / 2, 1 - 0.05 / 2 / spread.size])
     return {
         "noise_std_deg": np.sqrt(variance).tolist(),
         "zero_std_deg": np.sqrt(of_zero).tolist(),
@@ -126,6 +131,29 @@ def uncertainty(
         "ci95": (all_twelve * np.sqrt(spread)).tolist(),
         "ci95_each": (one * np.sqrt(spread)).tolist(),
     }
+
+
+def _half_widths(level: float, shared: Array, dof: int) -> Array:
+    """Half-widths, in standard errors, of intervals of probability ``level``.
+
+    The errors of the parameters are part of the prediction errors from which the noise
+    is estimated, so Student's t is too wide: for the share f of a parameter's variance
+    that the estimate has seen, the ratio is ``sqrt(1 - f) t + sqrt(f dof) c``, with t
+    of Student and c one coordinate of a random unit vector in ``dof`` dimensions,
+    independent of each other.
+    """
+    middles, half = (np.arange(200) + 0.5) / 200, 0.5 * (dof - 1)
+    c = np.sign(middles - 0.5)  # in one dimension
+    if dof > 1:
+        c = 2.0 * special.betaincinv(half, half, middles) - 1.0
+
+    def excess(width: float, f: float) -> float:
+        ends = np.array([[width], [-width]]) - np.sqrt(f * dof) * c
+        above, below = special.stdtr(dof, ends / np.sqrt(1.0 - f))
+        return float(np.mean(above - below)) - level
+
+    widest = 2.0 * special.stdtrit(dof, 0.5 + 0.5 * level)
+    return np.array([brentq(excess, 0.0, widest, args=(f,)) for f in shared])
 
 
 def errors(records: list[Record], desired: Array) -> dict[str, Any]:

@@ -2,9 +2,10 @@
 
 A phone's fused attitude is filtered, so neighbouring readings err alike and n of them
 average out less than n independent ones. The noise is taken for a first-order
-autoregression, whose correlation after k readings is ``phi ** k``; phi is found from the
-scatter of the readings about their means, all records together. Source: Sokal, Monte
-Carlo methods in statistical mechanics, 1989, section 3 (integrated autocorrelation time).
+autoregression, whose correlation after k readings is ``phi ** k``; phi is found from
+the scatter of the readings about their means, all records together. Source: Sokal,
+Monte Carlo methods in statistical mechanics, 1989, section 3 (integrated
+autocorrelation time).
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ MOST = 0.999  # of phi; a thousand readings are then one
 
 
 def autocorrelation_time(phi: Array) -> Array:
-    """Readings that tell as much as one: ``1 + 2 sum phi^k = (1 + phi) / (1 - phi)``."""
+    """Readings that tell as much as one: ``1 + 2 sum phi^k``, all k from 1 on."""
     return (1.0 + phi) / (1.0 - phi)
 
 
@@ -68,7 +69,7 @@ def _expected(phi: float, lengths: Array) -> tuple[float, float]:
     """Sums of squares and of neighbours' products about the means, unit variance."""
     at_none = at_one = 0.0
     for n, times in zip(*np.unique(lengths, return_counts=True), strict=True):
-        share = float(mean_share(np.float64(phi), n))
+        share = float(mean_share(np.array(phi), n))
         # A first and a last reading, of which each has one neighbour only.
         ends = (1.0 - phi**n) / (1.0 - phi) / n
         at_none += times * n * (1.0 - share)

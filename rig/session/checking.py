@@ -11,9 +11,9 @@ from jaxcal.files import atomic_write
 from rig.attitude import Array
 from rig.config.axis import Pulses
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
+from rig.identification.fit import pairs
 from rig.outputs.console import error_text, numbers
 from rig.session.calibrate import visit_pairs
-from rig.session.identification import pairs
 from rig.session.planning import draw, draw_held_out
 from rig.session.run import Run
 

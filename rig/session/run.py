@@ -23,9 +23,10 @@ from rig.guard.limits import check_plan
 from rig.guard.signals import Signals
 from rig.outputs.console import event_lines, numbers
 from rig.outputs.journal import Record
+from rig.readings import frame_at
 from rig.session.device import Device
 from rig.session.folder import RunFolder
-from rig.session.measuring import Observer, frame_at
+from rig.session.measuring import Observer
 from rig.session.motion import Motion
 
 STREAM_WAIT_S = 60.0  # time to start the app on the phone
@@ -88,7 +89,8 @@ class Run(RunFolder):
             return self.device
         config = self.config
         self.confirm(self)
-        imu, bus = Imu(config.imu), Bus(config.bus, config.silence_s, self.emit)
+        imu = Imu(config.imu, report=self.emit)
+        bus = Bus(config.bus, config.silence_s, self.emit)
         self.device = Device(config, bus, imu, self.signals, self.emit)
         imu.open()
         self.say(f"IMU: waiting for the phone on port {imu.port} ({config.imu.format})")

@@ -1,0 +1,87 @@
+"""refit, report, export and trend: what is made of runs that were recorded."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+from typing import Any
+
+from rig.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
+from rig.sessions import recorded
+
+
+def refit(args: argparse.Namespace) -> int:
+    """Identify a recorded calibration anew, into a folder of its own."""
+    from rig.identification.conclusion import conclude
+    from rig.identification.refit import changed_config, reread
+    from rig.outputs.console import recalibrate, summary_lines
+    from rig.outputs.journal import read_journal
+    from rig.outputs.report import write_report
+    from rig.session.folder import JOURNAL, RunFolder, new_run_folder
+
+    then, start = recorded(args)
+    if start["mode"] != "calibrate":
+        raise Refused(f"{args.run} is a {start['mode']} run; refit takes a calibration")
+    wanted = {
+        "mechanism.order": args.order,
+        "imu.order": args.imu_order,
+        "imu.signs": args.signs and tuple(args.signs),
+        "imu.mounting_deg": args.mounting and tuple(args.mounting),
+    }
+    now, changed = changed_config(then, wanted)
+    records, evidence = reread(read_journal(args.run / JOURNAL), then, now)
+    calibration, summary = conclude(now, evidence, {"refit_of": args.run.name})
+    if changed:
+        summary.pop("after", None)  # compensated by another calibration than this
+    summary |= {
+        "mode": "refit",
+        "refit_of": args.run.name,
+        "changed": changed,
+        "was": _saved(args.run / "summary.json", "A", "b"),
+        "simulated": start["simulated"],
+    }
+    folder = new_run_folder(args.run.resolve().parent, "refit")
+    begun = {key: start[key] for key in ("simulated", "maps_from")}
+    run = RunFolder(now, folder, "refit", {**begun, "inputs": {"run": args.run.name}})
+    try:
+        for record in records:
+            fields = {k: v for k, v in record.items() if k not in ("seq", "event")}
+            run.emit(record["event"], **fields)
+        calibration.save(folder / "calibration.json")
+        run.save_pairs()
+        run.save_summary(summary)
+        run.emit("end", sync=True, code=EXIT_OK, reason="")
+        write_report(folder, run.journal.records)
+    finally:
+        run.journal.close()
+    print(f"{args.run.name} identified anew from {len(evidence.chosen)} postures:")
+    for key, (old, new) in changed.items():
+        print(f"  {key}: {_toml(new)} in place of {_toml(old)}. Set it in rig.toml too")
+    if not changed:
+        print("  no key was changed")
+    limit = now.session.verify_limit_deg
+    print(*summary_lines(summary, limit), sep="\n")
+    print(f"saved: {folder}/calibration.json, pairs.csv, summary.json, report.html")
+    return EXIT_RECALIBRATE if recalibrate(summary, limit) else EXIT_OK
+
+
+def _toml(value: Any) -> str:
+    return json.dumps(value)  # of texts and lists the same
+
+
+def _saved(path: pathlib.Path, *keys: str) -> dict[str, Any] | None:
+    if not path.is_file():
+        return None
+    summary = json.loads(path.read_text(encoding="utf-8"))
+    return {key: summary[key] for key in keys}
+
+
+def report(args: argparse.Namespace) -> int:
+    """Write report.html of a run of any kind, also of an unfinished one."""
+    from rig.outputs.journal import read_journal
+    from rig.outputs.report import write_report
+    from rig.session.folder import JOURNAL
+
+    print(write_report(args.run, read_journal(args.run / JOURNAL)))
+    return EXIT_OK
