@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import pathlib
+import sys
 from typing import Any
 
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
 from rig.sessions import recorded
+
+Record = dict[str, Any]
 
 
 def refit(args: argparse.Namespace) -> int:
@@ -16,10 +19,10 @@ def refit(args: argparse.Namespace) -> int:
     from rig.identification.conclusion import conclude
     from rig.identification.refit import changed_config, reread
     from rig.outputs.console import recalibrate, summary_lines
-    from rig.outputs.journal import read_journal
     from rig.outputs.report import write_report
-    from rig.session.folder import JOURNAL, RunFolder, new_run_folder
+    from rig.session.folder import RunFolder, new_run_folder
 
+    held = _records(args.run)
     then, start = recorded(args)
     if start["mode"] != "calibrate":
         raise Refused(f"{args.run} is a {start['mode']} run; refit takes a calibration")
@@ -30,7 +33,7 @@ def refit(args: argparse.Namespace) -> int:
         "imu.mounting_deg": args.mounting and tuple(args.mounting),
     }
     now, changed = changed_config(then, wanted)
-    records, evidence = reread(read_journal(args.run / JOURNAL), then, now)
+    records, evidence = reread(held, then, now)
     calibration, summary = conclude(now, evidence, {"refit_of": args.run.name})
     if changed:
         summary.pop("after", None)  # compensated by another calibration than this
@@ -66,6 +69,19 @@ def refit(args: argparse.Namespace) -> int:
     return EXIT_RECALIBRATE if recalibrate(summary, limit) else EXIT_OK
 
 
+def _records(run: pathlib.Path) -> list[Record]:
+    from rig.outputs.journal import JournalError, read_journal
+    from rig.session.folder import JOURNAL
+
+    try:
+        records = read_journal(run / JOURNAL)
+    except JournalError as error:
+        raise Refused(str(error)) from None
+    if not records or records[0]["event"] != "start":
+        raise Refused(f"{run} holds no run")
+    return records
+
+
 def _toml(value: Any) -> str:
     return json.dumps(value)  # of texts and lists the same
 
@@ -79,9 +95,42 @@ def _saved(path: pathlib.Path, *keys: str) -> dict[str, Any] | None:
 
 def report(args: argparse.Namespace) -> int:
     """Write report.html of a run of any kind, also of an unfinished one."""
-    from rig.outputs.journal import read_journal
     from rig.outputs.report import write_report
-    from rig.session.folder import JOURNAL
 
-    print(write_report(args.run, read_journal(args.run / JOURNAL)))
+    print(write_report(args.run, _records(args.run)))
     return EXIT_OK
+
+
+def export(args: argparse.Namespace) -> int:
+    """Print or write the inverse map of a run's calibration."""
+    from jaxcal.files import write_text
+    from rig.outputs.export import LANGUAGES, load_inverse
+
+    inverse = load_inverse(args.run, _records(args.run))
+    for text in inverse.warnings:
+        print(f"WARNING: {text}", file=sys.stderr)
+    text = LANGUAGES[args.to](inverse)
+    if args.out is None:
+        print(text, end="")
+    else:
+        write_text(args.out, text)
+        print(f"{args.out}: SHA-256 of the numbers {inverse.checksum}")
+    return EXIT_OK
+
+
+def trend(args: argparse.Namespace) -> int:
+    """Compare the calibrations in a folder, device by device; also as trend.html."""
+    from rig.outputs.trend import read_runs, trend_lines, write_trend
+
+    if not args.folder.is_dir():
+        raise Refused(f"{args.folder} is no folder")
+    devices, skipped = read_runs(args.folder)
+    for text in skipped:
+        print(f"left out: {text}", file=sys.stderr)
+    if not devices:
+        raise Refused(f"{args.folder} holds no finished calibration or verification")
+    for device in devices:
+        print(*trend_lines(device), sep="\n")
+    print(f"saved: {write_trend(args.folder, devices)}")
+    again = any(device.reasons for device in devices)
+    return EXIT_RECALIBRATE if again else EXIT_OK

@@ -65,6 +65,7 @@ def conclude(
     count = config.settle.samples
     summary = {
         "schema": 1,
+        "measured_at": zero["time"],
         "axes": list(AXIS_NAMES),
         "unit": "deg",
         "A": np.asarray(calibration.matrix).tolist(),

@@ -1,7 +1,8 @@
-"""A recorded calibration identified anew: other orders, signs or mounting, same readings.
+"""A recorded calibration identified anew: same readings, other orders or mounting.
 
-The phone's angles are what was recorded, whatever was made of them: a reading's attitude
-is taken apart under the order and signs of then and put together under those of now.
+The phone's angles are what was recorded, whatever was made of them: the attitude of a
+reading is taken apart under the order and signs of then and put together under those of
+now.
 """
 
 from __future__ import annotations

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
+from jaxcal.pages import Figure, Text
 from rig.attitude import Array
 from rig.config import AXIS_NAMES
 from rig.outputs.journal import Record
@@ -15,6 +17,22 @@ MARKERS = {
     "goto": "*",
 }  # fmt: skip
 PLANES = ((0, 1), (0, 2), (1, 2))
+
+
+def drawn(
+    draw: Callable[[Any, Any], None], data: Any, size: tuple[float, float], alt: str
+) -> Any:
+    """A block of a page: the figure, or words where matplotlib is not installed."""
+    try:
+        import matplotlib.figure
+
+        from jaxcal.plots import as_bytes
+    except ModuleNotFoundError:
+        missing = "no figure: matplotlib is not installed (pip install 'jaxcal[study]')"
+        return Text(f"{alt}: {missing}", "note")
+    figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
+    draw(figure, data)
+    return Figure(as_bytes(figure, "png"), alt)
 
 
 def errors(figure: Any, summary: Record) -> None:
@@ -56,3 +74,19 @@ def readings(figure: Any, off: list[Array]) -> None:
             axis.plot(place, values[:, column], ".", markersize=2)
         axis.set_ylabel(f"{name} [deg]")
     axes[-1].set_xlabel("reading, posture by posture, less the posture's mean")
+
+
+def parameters(figure: Any, runs: list[Record]) -> None:
+    """A and b with their intervals, calibration after calibration."""
+    axes = figure.subplots(3, 4, sharex=True)
+    values = np.array([np.column_stack([r["A"], r["b"]]) for r in runs])
+    wide = np.array([r["ci95"] for r in runs])
+    days = np.array([r["time"] for r in runs]) / 86400.0
+    for row, name in enumerate(AXIS_NAMES):
+        for column, source in enumerate((*(f"u {each}" for each in AXIS_NAMES), "b")):
+            axis = axes[row, column]
+            y, e = values[:, row, column], wide[:, row, column]
+            axis.errorbar(days - days[0], y, e, fmt="o-", capsize=3, markersize=4)
+            axis.set_title(f"{name}: {source}", fontsize=9)
+    for axis in axes[-1]:
+        axis.set_xlabel("days")

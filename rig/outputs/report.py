@@ -9,12 +9,11 @@ from __future__ import annotations
 import datetime
 import json
 import pathlib
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from jaxcal.pages import Figure, Page, Section, Strong, Table, Text, write_page
+from jaxcal.pages import Page, Section, Strong, Table, Text, write_page
 from rig.config import AXIS_NAMES
 from rig.faults import Refused
 from rig.outputs import figures
@@ -26,6 +25,7 @@ from rig.outputs.console import (
     numbers,
     recalibrate,
 )
+from rig.outputs.figures import drawn as _drawn
 from rig.outputs.journal import Record, measured_postures
 from rig.readings import angles, recorded_frame
 
@@ -199,18 +199,3 @@ def _moved(summary: Record) -> Table:
     ]
     head = ["changed by", *(f"u {name}" for name in AXIS_NAMES), "b"]
     return Table(head, rows)
-
-
-def _drawn(
-    draw: Callable[[Any, Any], None], data: Any, size: tuple[float, float], alt: str
-) -> Any:
-    try:
-        import matplotlib.figure
-
-        from jaxcal.plots import as_bytes
-    except ModuleNotFoundError:
-        missing = "no figure: matplotlib is not installed (pip install 'jaxcal[study]')"
-        return Text(f"{alt}: {missing}", "note")
-    figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
-    draw(figure, data)
-    return Figure(as_bytes(figure, "png"), alt)

@@ -75,7 +75,8 @@ class RunFolder:
             self.emit("resume", sync=True, **provenance)
             return
         config = self.config.described()
-        start = {"config": config, **provenance, **start}
+        device = self.config.device_fingerprint()
+        start = {"config": config, "device": device, **provenance, **start}
         self.emit(
             "start", sync=True, schema=1, mode=mode, fingerprint=fingerprint, **start
         )
