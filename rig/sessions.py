@@ -72,10 +72,6 @@ def run_session(args: argparse.Namespace) -> int:
     # With --zero the operator put the device into its zero posture.
     zero_at = kept_zero.pulses if kept_zero and not args.zero else None
     dry_run = getattr(args, "dry_run", False)
-    record = DeviceRecord.load(config.device_path)
-    if start["simulated"] is None and not dry_run:
-        if text := record.missing(config):
-            raise Refused(text)
     with contextlib.ExitStack() as stack:
         simulator, text = None, config.text
         if start["simulated"] is not None:
@@ -84,6 +80,9 @@ def run_session(args: argparse.Namespace) -> int:
         lock = BusLock(config.bus)
         if not dry_run:
             stack.enter_context(lock.acquire(args.command))
+        record = DeviceRecord.load(config.device_path)
+        if simulator is None and not dry_run and (lack := record.missing(config)):
+            raise Refused(lack)
         if resumed:
             folder = args.run
         else:
