@@ -15,6 +15,7 @@ from typing import Literal
 from rig.config.registers import (
     Alarm,
     CommTimeout,
+    Homing,
     Move,
     Position,
     Read,
@@ -60,7 +61,14 @@ class RegisterMap(Section):
         None,
     )
     limits: Writes | None = key("`write` with `min` and `max` in pulses", None)
+    set_zero: Writes | None = key("`write`: the present position becomes 0", None)
+    home: Homing | None = key(
+        "`write`: start the drive's own homing; `homed`: bits once it is done", None
+    )
     identity: dict[str, Read] = key("registers that `identify` prints", {})
+    recognise: dict[str, tuple[int, int]] = key(
+        "of identity registers: [lowest, highest] that a drive of this family holds", {}
+    )
 
     @property
     def digest(self) -> str:
@@ -71,6 +79,8 @@ class RegisterMap(Section):
     def broken_rules(self) -> Iterator[str]:
         if self.stop.place_of("position"):
             yield "stop.write: must not write a position"
+        for name in sorted(self.recognise.keys() - self.identity.keys()):
+            yield f"recognise.{name}: is no register of identity"
 
 
 def available_maps() -> list[str]:
