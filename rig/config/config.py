@@ -2,13 +2,17 @@
 
 import hashlib
 import json
+import pathlib
+import tomllib
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import PrivateAttr
 
 from rig.config.axis import AXIS_NAMES, Axis, Pulses, Scale
+from rig.config.maps import RegisterMap
 from rig.config.schema import Section, key
 from rig.config.settings import (
     BusSettings,
@@ -18,6 +22,17 @@ from rig.config.settings import (
     SessionSettings,
     SettleSettings,
 )
+
+PHONE = (
+    "format", "columns", "quaternion_columns", "unit", "order", "signs", "mounting_deg"
+)  # fmt: skip
+
+
+def _family(register_map: RegisterMap) -> str:
+    data = tomllib.loads(register_map.text)
+    parts = [data.get(name) for name in ("word_order", "units", "position", "move")]
+    text = json.dumps(parts, sort_keys=True)
+    return f"{register_map.name} ({hashlib.sha256(text.encode()).hexdigest()[:8]})"
 
 
 class RigConfig(Section):
@@ -31,6 +46,16 @@ class RigConfig(Section):
     motion: MotionSettings = MotionSettings()
     session: SessionSettings = SessionSettings()
     output: str = key("every run makes its own folder in here", "runs")
+    device: str = key(
+        "record of how the device was commissioned, relative to this file",
+        "device.json",
+    )
+    _folder: pathlib.Path = PrivateAttr(pathlib.Path())
+
+    @property
+    def device_path(self) -> pathlib.Path:
+        """The device's record; ``device`` is relative to the configuration's folder."""
+        return self._folder / self.device
 
     @property
     def letters(self) -> tuple[str, str, str]:
@@ -68,7 +93,7 @@ class RigConfig(Section):
 
     def described(self) -> dict[str, Any]:
         """Everything as JSON values, in the layout of run folders of version 1."""
-        data = self.model_dump(exclude={"mechanism", "output", "axes"})
+        data = self.model_dump(exclude={"mechanism", "output", "axes", "device"})
         imu, session = data["imu"], data["session"]
         imu["quaternion"] = imu.pop("quaternion_columns")
         imu["angle_unit"] = imu.pop("unit")
@@ -98,6 +123,21 @@ class RigConfig(Section):
             del data["imu"][name]
         text = json.dumps(data, sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()
+
+    def device_fingerprint(self) -> dict[str, Any]:
+        """Key of rig.toml to value, of all that says which place a pulse count means.
+
+        Of a map it is the part that turns counts into places: one that learns another
+        register by an update is the same family.
+        """
+        found: dict[str, Any] = {}
+        for axis in self.axes:
+            scale = axis.model_dump(include={*Scale.model_fields, "unit", "rotates"})
+            values = {"map": _family(axis.map), **scale}
+            found |= {f"axes.{axis.name}.{name}": values[name] for name in values}
+        found["mechanism.order"] = self.mechanism.order
+        imu = self.imu.model_dump(mode="json", include=set(PHONE))
+        return found | {f"imu.{name}": imu[name] for name in PHONE}
 
     def broken_rules(self) -> Iterator[str]:
         motion, session = self.motion, self.session
