@@ -15,7 +15,6 @@ from typing import Literal
 from rig.config.registers import (
     Alarm,
     CommTimeout,
-    Homing,
     Move,
     Position,
     Read,
@@ -62,9 +61,6 @@ class RegisterMap(Section):
     )
     limits: Writes | None = key("`write` with `min` and `max` in pulses", None)
     set_zero: Writes | None = key("`write`: the present position becomes 0", None)
-    home: Homing | None = key(
-        "`write`: start the drive's own homing; `homed`: bits once it is done", None
-    )
     identity: dict[str, Read] = key("registers that `identify` prints", {})
     recognise: dict[str, tuple[int, int]] = key(
         "of identity registers: [lowest, highest] that a drive of this family holds", {}

@@ -202,12 +202,6 @@ class CommTimeout(Writes):
     per_s: Positive  # register counts for one second
 
 
-class Homing(Writes):
-    """The drive's own way home."""
-
-    homed: Predicate | None = None  # where no bit says it, a standing drive is
-
-
 class Units(Section):
     """Units of the speed and acceleration registers, and their counts for 1."""
 

@@ -1,0 +1,246 @@
+"""What small moves of three drives say about a device: axes, signs, gearing, placement.
+
+Everything is taken from rotations of the phone against its attitude at the start, so
+neither the heading of the phone's world nor the zero posture enters. A rotation vector
+is (3,) degrees in the phone's own frame at the start.
+
+A drive's axis there, with its sign, is the direction of its rotation vector for
+positive pulses. With the three axes alone, a phone that is placed differently cannot be
+told from drives whose names and signs are exchanged, so one of the two is taken as
+known: the configured placement (as good as ``NEAREST``), or names and signs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rig.attitude import ORDERS, Array, euler_to_matrix, matrix_to_euler
+from rig.config import AXIS_NAMES, RigConfig
+from rig.faults import MotionFault
+
+NEAREST = 0.7  # cosine: an axis within 45 degrees of where it is expected
+UNITS = ("X", "Y", "Z")
+CLEAR = 4.0  # standard deviations that make a difference a finding
+
+
+@dataclasses.dataclass(frozen=True)
+class Stand:
+    """The device measured at one place."""
+
+    pulses: Array  # (3,)
+    attitude: Array  # (3, 3) phone to its world
+    std_deg: float  # of the mean
+
+    @classmethod
+    def of(cls, record: Mapping[str, Any]) -> Stand:
+        """From what ``Observer.measure`` returns."""
+        std = float(np.max(record["std_deg"])) / np.sqrt(record["samples"])
+        return cls(
+            np.array(record["pulses"], dtype=np.float64),
+            np.array(record["attitude"]),
+            std,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Findings:
+    """Of the drives in the order of the configuration's axes, unless said otherwise."""
+
+    joints: tuple[int, ...]  # for each drive: the axis that it turns
+    deg_per_pulse: Array  # (3,) of the phone, > 0 where pulses turn the joint positive
+    backlash_deg: Array  # (3,) at the phone
+    cross_talk: Array  # (3, 3) rotation about joint i, a share of drive j's own
+    axes: Array  # (3, 3) columns: of each drive in the phone's frame
+    off_deg: Array  # (3,) each axis from where the placement that was found puts it
+    mounting: Array  # (3, 3) phone to end-effector, nearest to the three axes
+    turned_deg: float  # that from the configured one
+    mirrored: bool  # the axes are left-handed where the configured ones are right-handed
+    order: str | None  # axes of the mechanism from the base outwards; None: not clear
+    skew_deg: float  # largest departure of two axes from a right angle
+    phone_orders: dict[str, float]  # that, if the phone's angles had another order
+
+
+def turn(base: Array, attitude: Array) -> Array:
+    """(3,) rotation vector in degrees from one attitude to another, in the former."""
+    return Rotation.from_matrix(base.T @ attitude).as_rotvec(degrees=True)
+
+
+def rate(start: Stand, end: Stand, drive: int, base: Array) -> Array:
+    """(3,) degrees for one pulse of a drive, between two places on one way."""
+    way = end.pulses[drive] - start.pulses[drive]
+    return (turn(base, end.attitude) - turn(base, start.attitude)) / way
+
+
+def find(
+    config: RigConfig,
+    stands: Mapping[str, Stand],
+    names_known: bool = False,
+) -> Findings:
+    """Read the findings from the places that ``axes.measure`` went to.
+
+    Args:
+        config: as the moves were made.
+        stands: ``start``; of each axis NAME ``NAME:look``, ``:plus``, ``:back``,
+            ``:minus``, ``:up``; of each pair ``A+B+`` and ``A-B+``.
+        names_known: units and directions are as configured, and the phone may be placed
+            in any way; otherwise the phone is placed about as configured.
+
+    Raises:
+        MotionFault: an axis turned nothing, or the axes fit no three joints.
+    """
+    base = stands["start"].attitude
+    rates, backlash = np.empty((3, 3)), np.empty(3)  # columns: drives
+    for j, name in enumerate(AXIS_NAMES):
+        look, plus, back, minus, up = (
+            stands[f"{name}:{part}"] for part in ("look", "plus", "back", "minus", "up")
+        )
+        # On the way up and on the way down the play is taken up: no reversal between.
+        ways = ((look, plus), (back, minus))
+        weights = [abs(float(b.pulses[j] - a.pulses[j])) for a, b in ways]
+        each = [rate(a, b, j, base) for a, b in ways]
+        rates[:, j] = np.average(each, axis=0, weights=weights)
+        direction = rates[:, j] / np.linalg.norm(rates[:, j])
+        backlash[j] = (turn(base, back.attitude) - turn(base, up.attitude)) @ direction
+        backlash[j] *= np.sign(plus.pulses[j] - look.pulses[j])
+    size = np.linalg.norm(rates, axis=0)
+    axes = rates / size
+    joints, signs, mounting = _placed(config, axes, names_known)
+    expected = _expected(config)[:, joints] * signs
+    found = mounting @ axes
+    cosine = np.clip((found * expected).sum(axis=0), -1.0, 1.0)
+    share = _expected(config).T @ mounting @ rates
+    own = share[list(joints), range(3)]
+    told = euler_to_matrix(config.imu.mounting_deg, "ZYX")
+    return Findings(
+        joints=joints,
+        deg_per_pulse=signs * size,
+        backlash_deg=backlash,
+        cross_talk=share / own,
+        axes=axes,
+        off_deg=np.degrees(np.arccos(cosine)),
+        mounting=mounting,
+        turned_deg=float(np.linalg.norm(turn(told, mounting))),
+        mirrored=bool(np.linalg.det(axes) * np.linalg.det(_expected(config)) < 0),
+        order=_chain(config, stands, rates, joints),
+        skew_deg=_skew(axes),
+        phone_orders=_phone_orders(config, stands),
+    )
+
+
+def _expected(config: RigConfig) -> Array:
+    """(3, 3) columns: axis of each joint in the end-effector's frame."""
+    return np.eye(3)[:, [UNITS.index(letter) for letter in config.letters]]
+
+
+def _placed(
+    config: RigConfig, axes: Array, names_known: bool
+) -> tuple[tuple[int, ...], Array, Array]:
+    """Joint and sign of each drive, and the mounting that fits them best."""
+    expected = _expected(config)
+    joints: tuple[int, ...] = (0, 1, 2)
+    # Pulses of a drive with direction -1 turn the joint the negative way.
+    signs = np.array([float(axis.direction) for axis in config.axes])
+    if names_known:
+        if np.linalg.det(axes * signs) * np.linalg.det(expected) < 0:
+            raise MotionFault(
+                "the three axes are mirrored: one direction is wrong, or all three. "
+                "Jog each axis, and set axes.*.direction of the one that turns the "
+                "negative way"
+            )
+    else:
+        told = euler_to_matrix(config.imu.mounting_deg, "ZYX")
+        cosines = expected.T @ told @ axes  # rows: joints
+        joints = max(
+            itertools.permutations(range(3)),
+            key=lambda order: np.abs(cosines[order, range(3)]).sum(),
+        )
+        own = cosines[joints, range(3)]
+        signs = np.sign(own)
+        if np.abs(own).min() < NEAREST:
+            unit = config.axes[int(np.abs(own).argmin())].unit
+            raise MotionFault(
+                f"unit {unit} turns the phone about an axis more than 45 deg from "
+                "every joint's, so the phone is not placed as imu.mounting_deg says. "
+                "Correct that roughly; or, where you have seen that every unit turns "
+                "its own joint the right way, use --names-known"
+            )
+    fitted, _ = Rotation.align_vectors((expected[:, joints] * signs).T, axes.T)
+    return joints, signs, fitted.as_matrix()
+
+
+def _chain(
+    config: RigConfig,
+    stands: Mapping[str, Stand],
+    rates: Array,
+    joints: tuple[int, ...],
+) -> str | None:
+    """Axes from the base outwards, where the combined moves tell them.
+
+    With A nearer to the base the phone turns by exp(a) exp(b), otherwise by exp(b)
+    exp(a). The two differ by a x b: half of it, up or down, in the direction in which
+    neither turns alone. From A- to A+ at the same B that component changes by a x b.
+    """
+    base = stands["start"]
+    inner = [0, 0, 0]
+    for a, b in itertools.combinations(range(3), 2):
+        names = AXIS_NAMES[a], AXIS_NAMES[b]
+        high, low = (stands[f"{names[0]}{s}{names[1]}+"] for s in "+-")
+        normal = np.cross(rates[:, a], rates[:, b])
+        scale = np.linalg.norm(normal)
+        difference = turn(base.attitude, high.attitude) - turn(
+            base.attitude, low.attitude
+        )
+        seen = difference @ normal / scale
+        ways = (high.pulses - low.pulses)[a], (high.pulses - base.pulses)[b]
+        whole = np.radians(ways[0] * ways[1] * scale) / 2.0
+        noise = np.hypot(high.std_deg, low.std_deg)
+        if not abs(whole) / 2 < abs(seen) < 2 * abs(whole) or abs(seen) < CLEAR * noise:
+            return None
+        inner[a if seen * whole > 0 else b] += 1
+    if sorted(inner) != [0, 1, 2]:
+        return None
+    letters = [config.letters[joints[drive]] for drive in np.argsort(inner)[::-1]]
+    return "".join(letters)
+
+
+def _skew(axes: Array) -> float:
+    """Largest departure of two of three unit columns from a right angle, degrees."""
+    cosines = (axes.T @ axes)[np.triu_indices(3, 1)]
+    return float(np.degrees(np.arcsin(np.clip(np.abs(cosines), 0.0, 1.0))).max())
+
+
+def _phone_orders(config: RigConfig, stands: Mapping[str, Stand]) -> dict[str, float]:
+    """Skew of the axes for each order that the phone's angles could be in.
+
+    Read in a wrong order the axes of a tilted phone are not at right angles; those of
+    a phone that lies level are, so a small figure proves nothing.
+    """
+    told = config.imu.order
+    if told is None or config.imu.format == "sensorlogger":
+        return {}
+    angles = {
+        name: matrix_to_euler(stand.attitude, told) for name, stand in stands.items()
+    }
+    found = {}
+    for order in ORDERS:
+        sequence = [told.index(letter) for letter in order]
+        read = {
+            name: dataclasses.replace(
+                stand, attitude=euler_to_matrix(angles[name][sequence], order)
+            )
+            for name, stand in stands.items()
+        }
+        base = read["start"].attitude
+        columns = [
+            rate(read[f"{name}:minus"], read[f"{name}:plus"], j, base)
+            for j, name in enumerate(AXIS_NAMES)
+        ]
+        axes = np.array(columns).T
+        found[order] = _skew(axes / np.linalg.norm(axes, axis=0))
+    return found
