@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import tomllib
 from collections.abc import Sequence
 from typing import Any
 
@@ -46,13 +47,15 @@ def proposals(
         told: pulses for one turn by each drive's own word, None where it has none.
     """
     changes: list[Change] = []
+    tables = tomllib.loads(config.text)["axes"]
+    written = {table["name"]: table["map"] for table in tables}  # a name or a path
     for drive, joint in enumerate(found.joints):
         source, axis = config.axes[drive], config.axes[joint]
         at = f"axes.{axis.name}"
         values = {name: getattr(source, name) for name in OF_DRIVE}
-        values["map"] = source.map.written
+        values["map"] = written[source.name]
         old = {name: getattr(axis, name) for name in OF_DRIVE} | {
-            "map": axis.map.written
+            "map": written[axis.name]
         }
         reasons = dict.fromkeys(OF_DRIVE, f"unit {source.unit} turns {axis.name}")
         if told[drive] not in (None, values["pulses_per_rev"]):

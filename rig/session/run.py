@@ -86,6 +86,16 @@ class Run(RunFolder):
             raise PlanOnly
         if self.device is not None:
             return self.device
+        device = self.arm()
+        if self.frame is None or self.zero_pulses is None or not self.postures():
+            self._zero(device)
+        else:
+            self.observer.zeroed(self.frame, self.zero_pulses)
+            self._check_reference(self.zero_pulses)
+        return device
+
+    def arm(self) -> Device:
+        """Open bus and phone and arm; MotionFault, BusError, ImuError: not fit."""
         config = self.config
         self.confirm(self)
         imu, bus = Imu(config.imu), Bus(config.bus, config.silence_s, self.emit)
@@ -99,11 +109,6 @@ class Run(RunFolder):
         self.device.arm(self._reset_alarms)
         self.motion, self.observer = Motion(self.device), Observer(self.device)
         self.say(f"armed: {len(config.axes)} drives on {config.bus.where}")
-        if self.frame is None or self.zero_pulses is None or not self.postures():
-            self._zero(self.device)
-        else:
-            self.observer.zeroed(self.frame, self.zero_pulses)
-            self._check_reference(self.zero_pulses)
         return self.device
 
     def _zero(self, device: Device) -> None:
@@ -190,6 +195,11 @@ class Run(RunFolder):
         )
 
     # The end
+
+    @property
+    def to_go_on(self) -> str:
+        """The command that goes on after a pause or a fault."""
+        return f"python -m rig resume {self.folder}"
 
     def stop(self, reason: str, latch: bool = True) -> None:
         """Stop every unit; before the device is about to be armed there is no need."""

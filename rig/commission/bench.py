@@ -1,0 +1,110 @@
+"""The armed device of a moving step, under the guards of a session and slower."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+from rig.attitude import Array, angle_between_deg
+from rig.config import RigConfig
+from rig.config.axis import Axis
+from rig.device.drives import Drive
+from rig.device.record import DeviceRecord
+from rig.faults import MotionFault
+from rig.session.device import Device
+from rig.session.folder import new_run_folder
+from rig.session.motion import Motion
+from rig.session.run import Run
+
+SLOW_DEG_S = 5.0
+
+
+class SmallMotion(Motion):
+    """Moves that stop where the phone turns further than they may turn it.
+
+    The gearing is not proved yet: a drive may turn its joint ten times as far as it is
+    told, and neither its own counts nor the limits show that.
+    """
+
+    def __init__(self, device: Device) -> None:
+        super().__init__(device)
+        self.origin: Array | None = None  # (3, 3) attitude to stay near
+        self.allowed_deg = 0.0
+
+    def _check_attitude(self) -> None:
+        super()._check_attitude()
+        if self.origin is None:
+            return
+        turned = angle_between_deg(self.origin, self.device.imu.latest().matrix)
+        if turned > self.allowed_deg:
+            raise MotionFault(
+                f"the phone turned {turned:.1f} deg in a move that may turn it "
+                f"{self.allowed_deg:.1f}. Check pulses_per_rev and reduction, and that "
+                "the phone is fixed"
+            )
+
+
+class Bench(Run):
+    """A run that commissions. It has a folder and a journal; it is not resumed."""
+
+    def __init__(
+        self,
+        config: RigConfig,
+        step: str,
+        record: DeviceRecord,
+        say: Callable[[str], None],
+        *,
+        folder: pathlib.Path | None = None,
+        again: str = "",
+        full_speed: bool = False,
+        start: dict[str, Any] | None = None,
+        reset_alarms: bool = False,
+    ) -> None:
+        self.record = record
+        self.plain = config  # as it stands in the file
+        self.again = again
+        folder = folder or new_run_folder(pathlib.Path(config.output), step)
+        moved = config if full_speed else slowed(config)
+        # Every way to a place is straight, so that play is seen and not made a bias.
+        motion = config.motion.model_copy(update={"approach_overshoot_deg": 0.0})
+        moved = moved.model_copy(update={"motion": motion})
+        super().__init__(
+            moved, folder, step, say, start=start, reset_alarms=reset_alarms
+        )
+
+    def arm(self) -> Device:
+        """Open, arm; nothing is zeroed, and the moves are small ones."""
+        if self.device is None:
+            super().arm()
+            assert self.device is not None
+            self.small = SmallMotion(self.device)
+        return self.device
+
+    @property
+    def to_go_on(self) -> str:
+        return self.again
+
+
+def slowed(config: RigConfig) -> RigConfig:
+    """The same with axes that are no faster than a person can follow."""
+    axes = tuple(_slow(axis) for axis in config.axes)
+    return config.model_copy(update={"axes": axes})
+
+
+def _slow(axis: Axis) -> Axis:
+    speed = min(SLOW_DEG_S, axis.speed_deg_s)
+    while speed < axis.speed_deg_s:
+        slow = axis.model_copy(update={"speed_deg_s": speed})
+        try:
+            slow.motion_counts()
+            return slow
+        except ValueError:  # slower than the drive's register can say
+            speed *= 2.0
+    return axis
+
+
+def pulses_per_rev(drive: Drive) -> int | None:
+    """Pulses for one motor turn by the drive's own word; None where it has none."""
+    read = drive.axis.map.pulses_per_rev
+    return None if read is None else drive.read(read)
