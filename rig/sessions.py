@@ -24,7 +24,10 @@ if TYPE_CHECKING:
     from rig.session.run import Run
     from rig.simulator import Simulator
 
-SIMULATION = ("transport", "noise", "backlash", "drift", "speedup", "rate")
+SIMULATION = (
+    "transport", "noise", "backlash", "drift", "speedup", "rate", "reversed", "swapped",
+    "gearing", "lost_origin", "realistic",
+)  # fmt: skip
 
 
 def load(args: argparse.Namespace) -> RigConfig:
@@ -40,14 +43,9 @@ def make_simulator(
     config: RigConfig, options: dict[str, Any], faults: list[str]
 ) -> Simulator:
     """A simulated rig as the options of the command line describe it."""
-    from rig.simulator import Simulator, Truth, parse_fault
+    from rig.simulator import Simulator, parse_fault, truth_of
 
-    truth = Truth(
-        noise_deg=options["noise"],
-        backlash_deg=options["backlash"],
-        drift_deg_per_min=options["drift"],
-        seed=config.session.seed,
-    )
+    truth = truth_of(options, config.session.seed)
     return Simulator(
         config,
         truth,
