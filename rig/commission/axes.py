@@ -6,8 +6,8 @@ import itertools
 
 import numpy as np
 
-from rig.commission.bench import Bench, pulses_per_rev
-from rig.commission.findings import Findings, Stand, find, turn
+from rig.commission.bench import Bench
+from rig.commission.findings import CLEAR, Findings, Stand, find, turn
 from rig.commission.proposals import Change, lines, proposals
 from rig.config import AXIS_NAMES
 from rig.config.axis import Pulses
@@ -18,6 +18,7 @@ LOOK_DEG = 0.5  # the first move of an axis whose gearing is not proved
 REACH_DEG = 3.0  # each way
 PAIR_DEG = 6.0  # commanded at most, so that the phone turns about REACH_DEG
 ALLOWED_DEG = 9.0  # the phone may turn in any of these
+PAIR_STD_DEG = 0.03  # two rotations of REACH_DEG in either order are 0.16 deg apart
 ROOM_DEG = 0.2  # left to a limit
 SEEN_DEG = 0.03  # the phone must turn at least this much in a whole move
 SEEN_SIGMA = 6.0
@@ -31,7 +32,7 @@ def check_axes(run: Bench, names_known: bool) -> tuple[Findings, list[Change]]:
     stands = measure(run)
     found = find(run.config, stands, names_known)
     device = run.arm()
-    told = [pulses_per_rev(drive) for drive in device.drives]
+    told = [drive.pulses_per_rev() for drive in device.drives]
     changes = proposals(run.config, found, told)
     ratios = [
         float(abs(each * axis.pulses_per_deg))
@@ -67,7 +68,7 @@ def measure(run: Bench) -> dict[str, Stand]:
     stands: dict[str, Stand] = {}
     run.planned = 1 + 5 * 3 + 2 * 3
 
-    def visit(name: str, offset: dict[int, float]) -> Stand:
+    def visit(name: str, offset: dict[int, float], samples: int = 0) -> Stand:
         """Stand at degrees away from the start, and measure."""
         target = list(start)
         for axis, way in offset.items():
@@ -75,13 +76,13 @@ def measure(run: Bench) -> dict[str, Stand]:
         pitch, yaw, roll = target
         run.signals.check_pause()
         run.small.move_to((pitch, yaw, roll), name)
-        measured = run.observer.measure((pitch, yaw, roll), name)
+        measured = run.observer.measure((pitch, yaw, roll), name, samples or None)
         run.emit("stand", sync=True, name=name, **measured)
         stands[name] = Stand.of(measured)
         return stands[name]
 
     run.say(f"axes: {run.planned} places, each axis up to {REACH_DEG:g} deg either way")
-    base = visit("start", {})
+    base = visit("start", {}, 4 * config.settle.samples)
     run.small.origin, run.small.allowed_deg = base.attitude, ALLOWED_DEG
     pair = [0.0, 0.0, 0.0]
     for j, name in enumerate(AXIS_NAMES):
@@ -93,7 +94,7 @@ def measure(run: Bench) -> dict[str, Stand]:
             visit(f"{name}:look", {j: reach / 4})
         plus = visit(f"{name}:plus", {j: reach})
         turned = float(np.linalg.norm(turn(base.attitude, plus.attitude)))
-        if turned < max(SEEN_DEG, SEEN_SIGMA * plus.std_deg):
+        if turned < max(SEEN_DEG, SEEN_SIGMA * base.std_deg / plus.samples**0.5):
             axis = config.axes[j]
             raise MotionFault(
                 f"unit {axis.unit} turned its motor by {reach:g} deg of {name}, and "
@@ -105,10 +106,12 @@ def measure(run: Bench) -> dict[str, Stand]:
         visit(f"{name}:up", {j: 0.0})
         pair[j] = min(PAIR_DEG, REACH_DEG * reach / turned, _room(run, start, j))
         run.say(f"  {name}: {reach:.2f} deg commanded, the phone turned {turned:.3f}")
+    wanted = int(np.ceil(2.0 * (CLEAR * base.std_deg / PAIR_STD_DEG) ** 2))
+    samples = min(max(wanted, config.settle.samples), 8 * config.settle.samples)
     for a, b in itertools.combinations(range(3), 2):
         for sign in "-+":
             way = pair[a] if sign == "+" else -pair[a]
-            visit(f"{AXIS_NAMES[a]}{sign}{AXIS_NAMES[b]}+", {a: way, b: pair[b]})
+            visit(f"{AXIS_NAMES[a]}{sign}{AXIS_NAMES[b]}+", {a: way, b: pair[b]}, samples)
     run.small.move_to(start, "back")
     return stands
 

@@ -9,7 +9,6 @@ from typing import Any
 from rig.attitude import Array, angle_between_deg
 from rig.config import RigConfig
 from rig.config.axis import Axis
-from rig.device.drives import Drive
 from rig.device.record import DeviceRecord
 from rig.faults import MotionFault
 from rig.session.device import Device
@@ -103,8 +102,3 @@ def _slow(axis: Axis) -> Axis:
             speed *= 2.0
     return axis
 
-
-def pulses_per_rev(drive: Drive) -> int | None:
-    """Pulses for one motor turn by the drive's own word; None where it has none."""
-    read = drive.axis.map.pulses_per_rev
-    return None if read is None else drive.read(read)

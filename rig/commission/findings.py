@@ -26,6 +26,9 @@ from rig.faults import MotionFault
 
 NEAREST = 0.7  # cosine: an axis within 45 degrees of where it is expected
 UNITS = ("X", "Y", "Z")
+# A smaller turn of the phone cannot be told from cross-coupling of the axes, and the
+# linear calibration takes it up as such.
+MOUNTING_DEG = 3.0
 CLEAR = 4.0  # standard deviations that make a difference a finding
 
 
@@ -35,16 +38,17 @@ class Stand:
 
     pulses: Array  # (3,)
     attitude: Array  # (3, 3) phone to its world
-    std_deg: float  # of the mean
+    std_deg: float  # of one reading
+    samples: int
 
     @classmethod
     def of(cls, record: Mapping[str, Any]) -> Stand:
         """From what ``Observer.measure`` returns."""
-        std = float(np.max(record["std_deg"])) / np.sqrt(record["samples"])
         return cls(
             np.array(record["pulses"], dtype=np.float64),
             np.array(record["attitude"]),
-            std,
+            float(np.max(record["std_deg"])),
+            int(record["samples"]),
         )
 
 
@@ -56,14 +60,13 @@ class Findings:
     deg_per_pulse: Array  # (3,) of the phone, > 0 where pulses turn the joint positive
     backlash_deg: Array  # (3,) at the phone
     cross_talk: Array  # (3, 3) rotation about joint i, a share of drive j's own
-    axes: Array  # (3, 3) columns: of each drive in the phone's frame
+    axes: Array  # (3, 3) columns: of each drive's joint in the phone's frame
     off_deg: Array  # (3,) each axis from where the placement that was found puts it
     mounting: Array  # (3, 3) phone to end-effector, nearest to the three axes
     turned_deg: float  # that from the configured one
     mirrored: bool  # the axes are left-handed where the configured ones are right-handed
     order: str | None  # axes of the mechanism from the base outwards; None: not clear
     skew_deg: float  # largest departure of two axes from a right angle
-    phone_orders: dict[str, float]  # that, if the phone's angles had another order
 
 
 def turn(base: Array, attitude: Array) -> Array:
@@ -92,7 +95,7 @@ def find(
             in any way; otherwise the phone is placed about as configured.
 
     Raises:
-        MotionFault: an axis turned nothing, or the axes fit no three joints.
+        MotionFault: the axes fit no three joints, or the readings are no rotations.
     """
     base = stands["start"].attitude
     rates, backlash = np.empty((3, 3)), np.empty(3)  # columns: drives
@@ -111,25 +114,34 @@ def find(
     size = np.linalg.norm(rates, axis=0)
     axes = rates / size
     joints, signs, mounting = _placed(config, axes, names_known)
+    order = _chain(config, stands, rates, joints)
+    mirrored = np.linalg.det(axes * _directions(config) @ _expected(config)) < 0
+    if mirrored and order is None and not names_known:
+        raise MotionFault(
+            "the axes are mirrored, and the phone is too noisy to tell whether a "
+            "direction is wrong or imu.signs. Raise settle.samples, or jog each axis, "
+            "correct axes.*.direction and imu.signs, and use --names-known"
+        )
     expected = _expected(config)[:, joints] * signs
     found = mounting @ axes
     cosine = np.clip((found * expected).sum(axis=0), -1.0, 1.0)
-    share = _expected(config).T @ mounting @ rates
-    own = share[list(joints), range(3)]
     told = euler_to_matrix(config.imu.mounting_deg, "ZYX")
+    turned = float(np.linalg.norm(turn(told, mounting)))
+    kept = told if turned <= MOUNTING_DEG else mounting
+    share = _expected(config).T @ kept @ rates
+    own = share[list(joints), range(3)]
     return Findings(
         joints=joints,
         deg_per_pulse=signs * size,
         backlash_deg=backlash,
         cross_talk=share / own,
-        axes=axes,
+        axes=axes * signs,
         off_deg=np.degrees(np.arccos(cosine)),
         mounting=mounting,
-        turned_deg=float(np.linalg.norm(turn(told, mounting))),
-        mirrored=bool(np.linalg.det(axes) * np.linalg.det(_expected(config)) < 0),
-        order=_chain(config, stands, rates, joints),
+        turned_deg=turned,
+        mirrored=bool(mirrored),
+        order=order,
         skew_deg=_skew(axes),
-        phone_orders=_phone_orders(config, stands),
     )
 
 
@@ -138,14 +150,18 @@ def _expected(config: RigConfig) -> Array:
     return np.eye(3)[:, [UNITS.index(letter) for letter in config.letters]]
 
 
+def _directions(config: RigConfig) -> Array:
+    """(3,) the configured ones of the drives."""
+    return np.array([float(axis.direction) for axis in config.axes])
+
+
 def _placed(
     config: RigConfig, axes: Array, names_known: bool
 ) -> tuple[tuple[int, ...], Array, Array]:
     """Joint and sign of each drive, and the mounting that fits them best."""
     expected = _expected(config)
     joints: tuple[int, ...] = (0, 1, 2)
-    # Pulses of a drive with direction -1 turn the joint the negative way.
-    signs = np.array([float(axis.direction) for axis in config.axes])
+    signs = _directions(config)
     if names_known:
         if np.linalg.det(axes * signs) * np.linalg.det(expected) < 0:
             raise MotionFault(
@@ -187,7 +203,7 @@ def _chain(
     neither turns alone. From A- to A+ at the same B that component changes by a x b.
     """
     base = stands["start"]
-    inner = [0, 0, 0]
+    inner, fits = [0, 0, 0], True
     for a, b in itertools.combinations(range(3), 2):
         names = AXIS_NAMES[a], AXIS_NAMES[b]
         high, low = (stands[f"{names[0]}{s}{names[1]}+"] for s in "+-")
@@ -199,12 +215,20 @@ def _chain(
         seen = difference @ normal / scale
         ways = (high.pulses - low.pulses)[a], (high.pulses - base.pulses)[b]
         whole = np.radians(ways[0] * ways[1] * scale) / 2.0
-        noise = np.hypot(high.std_deg, low.std_deg)
-        if not abs(whole) / 2 < abs(seen) < 2 * abs(whole) or abs(seen) < CLEAR * noise:
-            return None
+        noise = base.std_deg * np.sqrt(1 / high.samples + 1 / low.samples)
+        if CLEAR * noise > abs(whole) / 2:
+            return None  # too noisy to tell
+        fits &= abs(whole) / 2 < abs(seen) < 2 * abs(whole)
         inner[a if seen * whole > 0 else b] += 1
-    if sorted(inner) != [0, 1, 2]:
-        return None
+    if not fits or sorted(inner) != [0, 1, 2]:
+        orders = _phone_orders(config, stands)
+        hint = ", ".join(f"{order} {skew:.0f}" for order, skew in orders.items())
+        raise MotionFault(
+            "the phone's readings do not combine as rotations of three joints do. "
+            "Check imu.order, imu.columns and imu.signs, and that the phone is fixed; "
+            "nothing was corrected"
+            + (hint and f". Axes from right angles in deg, by order: {hint}")
+        )
     letters = [config.letters[joints[drive]] for drive in np.argsort(inner)[::-1]]
     return "".join(letters)
 

@@ -10,14 +10,11 @@ from typing import Any
 import numpy as np
 
 from rig.attitude import matrix_to_euler
-from rig.commission.findings import Findings
+from rig.commission.findings import MOUNTING_DEG, Findings
 from rig.config import AXIS_NAMES, RigConfig
 
 # Measured against commanded: what A may take up, and what only a wrong gearing does.
 SOUND_RATIO = (0.4, 1.5)
-# A smaller turn of the phone cannot be told from cross-coupling of the axes, and the
-# linear calibration takes it up as such.
-MOUNTING_DEG = 3.0
 DIGITS = 4  # of a reduction that was measured
 SKEW_DEG = 20.0  # axes of a sound device read at right angles but for cross-coupling
 OF_DRIVE = ("unit", "map", "pulses_per_rev", "comm_timeout_s")  # go with the cable
@@ -138,17 +135,12 @@ def lines(config: RigConfig, found: Findings) -> list[str]:
     text.append(f"  joints from the base outwards: {order}")
     if found.mirrored:
         text.append(
-            "  note: the axes are mirrored against the configuration. A direction, two "
-            "exchanged drives or a wrong imu.signs do that: watch that each axis moves "
-            "as its name says"
+            "  note: the axes are mirrored against the configuration: a direction is "
+            "wrong, or two drives are exchanged"
         )
     if found.skew_deg > SKEW_DEG:
-        orders = ", ".join(
-            f"{order} {skew:.0f}" for order, skew in found.phone_orders.items()
-        )
         text.append(
             f"  WARNING: the axes read {found.skew_deg:.0f} deg away from right angles. "
             "Check imu.order, imu.columns and imu.signs"
-            + (orders and f". By order of the phone's angles: {orders}")
         )
     return text
