@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -97,20 +97,7 @@ def find(
     Raises:
         MotionFault: the axes fit no three joints, or the readings are no rotations.
     """
-    base = stands["start"].attitude
-    rates, backlash = np.empty((3, 3)), np.empty(3)  # columns: drives
-    for j, name in enumerate(AXIS_NAMES):
-        look, plus, back, minus, up = (
-            stands[f"{name}:{part}"] for part in ("look", "plus", "back", "minus", "up")
-        )
-        # On the way up and on the way down the play is taken up: no reversal between.
-        ways = ((look, plus), (back, minus))
-        weights = [abs(float(b.pulses[j] - a.pulses[j])) for a, b in ways]
-        each = [rate(a, b, j, base) for a, b in ways]
-        rates[:, j] = np.average(each, axis=0, weights=weights)
-        direction = rates[:, j] / np.linalg.norm(rates[:, j])
-        backlash[j] = (turn(base, back.attitude) - turn(base, up.attitude)) @ direction
-        backlash[j] *= np.sign(plus.pulses[j] - look.pulses[j])
+    rates, backlash = _rates(stands)
     size = np.linalg.norm(rates, axis=0)
     axes = rates / size
     joints, signs, mounting = _placed(config, axes, names_known)
@@ -143,6 +130,25 @@ def find(
         order=order,
         skew_deg=_skew(axes),
     )
+
+
+def _rates(stands: Mapping[str, Stand]) -> tuple[Array, Array]:
+    """(3, 3) columns: rotation vector for one pulse of each drive; (3,) play."""
+    base = stands["start"].attitude
+    rates, backlash = np.empty((3, 3)), np.empty(3)
+    for j, name in enumerate(AXIS_NAMES):
+        look, plus, back, minus, up = (
+            stands[f"{name}:{part}"] for part in ("look", "plus", "back", "minus", "up")
+        )
+        # On the way up and on the way down the play is taken up: no reversal between.
+        ways = ((look, plus), (back, minus))
+        weights = [abs(float(b.pulses[j] - a.pulses[j])) for a, b in ways]
+        each = [rate(a, b, j, base) for a, b in ways]
+        rates[:, j] = np.average(each, axis=0, weights=weights)
+        direction = rates[:, j] / np.linalg.norm(rates[:, j])
+        backlash[j] = (turn(base, back.attitude) - turn(base, up.attitude)) @ direction
+        backlash[j] *= np.sign(plus.pulses[j] - look.pulses[j])
+    return rates, backlash
 
 
 def _expected(config: RigConfig) -> Array:
@@ -196,75 +202,78 @@ def _chain(
     rates: Array,
     joints: tuple[int, ...],
 ) -> str | None:
-    """Axes from the base outwards, where the combined moves tell them.
+    """Axes from the base outwards; None where the phone is too noisy to tell."""
+    inner = _inner(stands, rates)
+    if inner is None:
+        return None
+    if not inner:
+        others = ", ".join(_combining(config, stands))
+        raise MotionFault(
+            "the phone's readings do not combine as rotations of three joints do: "
+            "imu.order, imu.columns or imu.signs is wrong, or the phone is loose. "
+            "Nothing was corrected"
+            + (others and f". They would combine with {others}")
+        )
+    letters = [config.letters[joints[drive]] for drive in np.argsort(inner)[::-1]]
+    return "".join(letters)
+
+
+def _inner(stands: Mapping[str, Stand], rates: Array) -> list[int] | None:
+    """For each drive how many joints its own carries; [] where nothing fits.
 
     With A nearer to the base the phone turns by exp(a) exp(b), otherwise by exp(b)
     exp(a). The two differ by a x b: half of it, up or down, in the direction in which
     neither turns alone. From A- to A+ at the same B that component changes by a x b.
+    Angles read in a wrong order or with wrong signs turn like a mirror image, and
+    combine like nothing. None: the phone is too noisy to tell.
     """
     base = stands["start"]
-    inner, fits = [0, 0, 0], True
+    inner = [0, 0, 0]
     for a, b in itertools.combinations(range(3), 2):
-        names = AXIS_NAMES[a], AXIS_NAMES[b]
-        high, low = (stands[f"{names[0]}{s}{names[1]}+"] for s in "+-")
+        high, low = (stands[f"{AXIS_NAMES[a]}{s}{AXIS_NAMES[b]}+"] for s in "+-")
         normal = np.cross(rates[:, a], rates[:, b])
         scale = np.linalg.norm(normal)
-        difference = turn(base.attitude, high.attitude) - turn(
-            base.attitude, low.attitude
-        )
-        seen = difference @ normal / scale
+        change = turn(base.attitude, high.attitude) - turn(base.attitude, low.attitude)
+        seen = change @ normal / scale
         ways = (high.pulses - low.pulses)[a], (high.pulses - base.pulses)[b]
         whole = np.radians(ways[0] * ways[1] * scale) / 2.0
         noise = base.std_deg * np.sqrt(1 / high.samples + 1 / low.samples)
         if CLEAR * noise > abs(whole) / 2:
-            return None  # too noisy to tell
-        fits &= abs(whole) / 2 < abs(seen) < 2 * abs(whole)
+            return None
+        if not abs(whole) / 2 < abs(seen) < 2 * abs(whole):
+            return []
         inner[a if seen * whole > 0 else b] += 1
-    if not fits or sorted(inner) != [0, 1, 2]:
-        orders = _phone_orders(config, stands)
-        hint = ", ".join(f"{order} {skew:.0f}" for order, skew in orders.items())
-        raise MotionFault(
-            "the phone's readings do not combine as rotations of three joints do. "
-            "Check imu.order, imu.columns and imu.signs, and that the phone is fixed; "
-            "nothing was corrected"
-            + (hint and f". Axes from right angles in deg, by order: {hint}")
-        )
-    letters = [config.letters[joints[drive]] for drive in np.argsort(inner)[::-1]]
-    return "".join(letters)
+    return inner if sorted(inner) == [0, 1, 2] else []
+
+
+def _combining(config: RigConfig, stands: Mapping[str, Stand]) -> Iterator[str]:
+    """Other orders or signs of the phone's angles under which the readings combine."""
+    told, signs = config.imu.order, np.array(config.imu.signs)
+    if told is None or config.imu.format == "sensorlogger":
+        return
+    sent = {
+        name: matrix_to_euler(stand.attitude, told) * signs
+        for name, stand in stands.items()
+    }
+    tries = [(f'imu.order = "{order}"', order, signs) for order in ORDERS]
+    tries += [
+        (f"imu.signs = {list(other)}", told, np.array(other))
+        for other in itertools.product((-1, 1), repeat=3)
+    ]
+    for text, order, other in tries:
+        sequence = [told.index(letter) for letter in order]
+        read = {
+            name: dataclasses.replace(
+                stand,
+                attitude=euler_to_matrix((sent[name] * other)[sequence], order),
+            )
+            for name, stand in stands.items()
+        }
+        if _inner(read, _rates(read)[0]):
+            yield text
 
 
 def _skew(axes: Array) -> float:
     """Largest departure of two of three unit columns from a right angle, degrees."""
     cosines = (axes.T @ axes)[np.triu_indices(3, 1)]
     return float(np.degrees(np.arcsin(np.clip(np.abs(cosines), 0.0, 1.0))).max())
-
-
-def _phone_orders(config: RigConfig, stands: Mapping[str, Stand]) -> dict[str, float]:
-    """Skew of the axes for each order that the phone's angles could be in.
-
-    Read in a wrong order the axes of a tilted phone are not at right angles; those of
-    a phone that lies level are, so a small figure proves nothing.
-    """
-    told = config.imu.order
-    if told is None or config.imu.format == "sensorlogger":
-        return {}
-    angles = {
-        name: matrix_to_euler(stand.attitude, told) for name, stand in stands.items()
-    }
-    found = {}
-    for order in ORDERS:
-        sequence = [told.index(letter) for letter in order]
-        read = {
-            name: dataclasses.replace(
-                stand, attitude=euler_to_matrix(angles[name][sequence], order)
-            )
-            for name, stand in stands.items()
-        }
-        base = read["start"].attitude
-        columns = [
-            rate(read[f"{name}:minus"], read[f"{name}:plus"], j, base)
-            for j, name in enumerate(AXIS_NAMES)
-        ]
-        axes = np.array(columns).T
-        found[order] = _skew(axes / np.linalg.norm(axes, axis=0))
-    return found
