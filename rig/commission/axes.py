@@ -17,7 +17,6 @@ from rig.faults import MotionFault, Refused
 LOOK_DEG = 0.5  # the first move of an axis whose gearing is not proved
 REACH_DEG = 3.0  # each way
 PAIR_DEG = 6.0  # commanded at most, so that the phone turns about REACH_DEG
-ALLOWED_DEG = 9.0  # the phone may turn in any of these
 PAIR_STD_DEG = 0.03  # two rotations of REACH_DEG in either order are 0.16 deg apart
 ROOM_DEG = 0.2  # left to a limit
 SEEN_DEG = 0.03  # the phone must turn at least this much in a whole move
@@ -83,7 +82,7 @@ def measure(run: Bench) -> dict[str, Stand]:
 
     run.say(f"axes: {run.planned} places, each axis up to {REACH_DEG:g} deg either way")
     base = visit("start", {}, 4 * config.settle.samples)
-    run.small.origin, run.small.allowed_deg = base.attitude, ALLOWED_DEG
+    run.small.stay_near(base.attitude, REACH_DEG)
     pair = [0.0, 0.0, 0.0]
     for j, name in enumerate(AXIS_NAMES):
         look = visit(f"{name}:look", {j: LOOK_DEG})

@@ -17,6 +17,9 @@ from rig.session.motion import Motion
 from rig.session.run import Run
 
 SLOW_DEG_S = 5.0
+# The phone may turn by this factor of what is commanded, and always by so much: a first
+# move of half a degree is to show a gearing that is ten times what it should be.
+ALLOWED_FACTOR, LEAST_ALLOWED_DEG = 2.0, 9.0
 
 
 class SmallMotion(Motion):
@@ -28,14 +31,22 @@ class SmallMotion(Motion):
 
     def __init__(self, device: Device) -> None:
         super().__init__(device)
-        self.origin: Array | None = None  # (3, 3) attitude to stay near
         self.allowed_deg = 0.0
+        self.meanwhile: Callable[[], None] | None = None  # called at every poll
+        self._origin: Array | None = None  # (3, 3)
+
+    def stay_near(self, attitude: Array, commanded_deg: float) -> None:
+        """Moves of so many degrees begin at this attitude of the phone."""
+        self._origin = attitude
+        self.allowed_deg = max(LEAST_ALLOWED_DEG, ALLOWED_FACTOR * commanded_deg)
 
     def _check_attitude(self) -> None:
+        if self.meanwhile is not None:
+            self.meanwhile()
         super()._check_attitude()
-        if self.origin is None:
+        if self._origin is None:
             return
-        turned = angle_between_deg(self.origin, self.device.imu.latest().matrix)
+        turned = angle_between_deg(self._origin, self.device.imu.latest().matrix)
         if turned > self.allowed_deg:
             raise MotionFault(
                 f"the phone turned {turned:.1f} deg in a move that may turn it "
@@ -79,6 +90,10 @@ class Bench(Run):
             assert self.device is not None
             self.small = SmallMotion(self.device)
         return self.device
+
+    def device_guard(self, moving: bool = False) -> None:
+        """The loop is alive; StopRequested where a stop was asked for."""
+        self.arm().guard(moving)
 
     @property
     def to_go_on(self) -> str:
