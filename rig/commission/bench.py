@@ -65,6 +65,7 @@ class Bench(Run):
         record: DeviceRecord,
         say: Callable[[str], None],
         *,
+        plain: RigConfig | None = None,
         folder: pathlib.Path | None = None,
         again: str = "",
         full_speed: bool = False,
@@ -72,7 +73,7 @@ class Bench(Run):
         reset_alarms: bool = False,
     ) -> None:
         self.record = record
-        self.plain = config  # as it stands in the file
+        self.plain = plain or config  # as it stands in the file
         self.again = again
         folder = folder or new_run_folder(pathlib.Path(config.output), step)
         moved = config if full_speed else slowed(config)

@@ -30,6 +30,8 @@ class Change:
     reason: str
 
     def __str__(self) -> str:
+        if self.new is None:
+            return f"{self.key} is taken out (is {self.old!r}): {self.reason}"
         return f"{self.key} = {self.new!r} (is {self.old!r}): {self.reason}"
 
 
@@ -85,6 +87,14 @@ def proposals(
                     f"{SOUND_RATIO[0]:g} to {SOUND_RATIO[1]:g}",
                 )
             )  # fmt: skip
+    for table in tables:
+        at, scales = f"axes.{table['name']}", ("pulses_per_rev", "reduction", "direction")
+        if any(change.key == f"{at}.{name}" for change in changes for name in scales):
+            changes += [
+                Change(f"{at}.{name}", table[name], None, "pulses have a new scale")
+                for name in ("min_pulses", "max_pulses")
+                if name in table
+            ]
     if found.turned_deg > MOUNTING_DEG:
         angles = matrix_to_euler(found.mounting, "ZYX").round(2) + 0.0
         changes.append(

@@ -23,6 +23,7 @@ class Found:
     unit: int
     families: tuple[str, ...]  # maps all of whose registers answer as they should
     identity: dict[str, int]  # registers of the first of them
+    pulses_per_rev: int | None = None  # by its own word
 
     def __str__(self) -> str:
         if not self.families:
