@@ -11,6 +11,7 @@ from rig.config import RigConfig
 from rig.config.axis import Axis
 from rig.device.record import DeviceRecord
 from rig.faults import MotionFault
+from rig.session.checks import check_record
 from rig.session.device import Device
 from rig.session.folder import new_run_folder
 from rig.session.motion import Motion
@@ -68,21 +69,28 @@ class Bench(Run):
         plain: RigConfig | None = None,
         folder: pathlib.Path | None = None,
         again: str = "",
+        homed: bool = True,
         full_speed: bool = False,
         start: dict[str, Any] | None = None,
         reset_alarms: bool = False,
     ) -> None:
-        self.record = record
         self.plain = plain or config  # as it stands in the file
         self.again = again
+        self.homed = homed
         folder = folder or new_run_folder(pathlib.Path(config.output), step)
         moved = config if full_speed else slowed(config)
         # Every way to a place is straight, so that play is seen and not made a bias.
         motion = config.motion.model_copy(update={"approach_overshoot_deg": 0.0})
         moved = moved.model_copy(update={"motion": motion})
         super().__init__(
-            moved, folder, step, say, start=start, reset_alarms=reset_alarms
-        )
+            moved, folder, step, say,
+            record=record, start=start, reset_alarms=reset_alarms,
+        )  # fmt: skip
+
+    def check_device(self, device: Device) -> None:
+        """Homed drives are where they were left; the gearing is still to be checked."""
+        if self.homed:
+            check_record(self.plain, device.drives, self.record)
 
     def arm(self) -> Device:
         """Open, arm; nothing is zeroed, and the moves are small ones."""

@@ -65,12 +65,9 @@ def home(run: Bench, here: bool, confirm: Callable[[str], None]) -> None:
         else:
             _go_home(run, drive)
     positions = list(device.positions())
-    bits = [_homed(drive) for drive in device.drives]
-    run.emit("homed", sync=True, here=here, positions=positions, homed=bits)
-    run.record.reach(
-        HOMED, run.plain, how="here" if here else "drive", positions=positions,
-        homed_bit=bits,
-    )  # fmt: skip
+    how = "here" if here else "drive"
+    run.emit("homed", sync=True, how=how, pulses=positions)
+    run.record.reach(HOMED, run.plain, how=how, pulses=positions)
     run.say(f"home: the drives count {positions} pulses")
 
 
@@ -105,7 +102,8 @@ def _go_home(run: Bench, drive: Drive) -> None:
         run.device_guard(moving=True)
         status = drive.sound()
         waited = time.monotonic() - begun
-        if not status.moving and waited > ANSWER_S and _homed(drive) is not False:
+        done = axis.map.homed is None or drive.homed(status.word)
+        if not status.moving and waited > ANSWER_S and done:
             break
         if time.monotonic() > end:
             raise MotionFault(
@@ -114,12 +112,6 @@ def _go_home(run: Bench, drive: Drive) -> None:
             )
         time.sleep(POLL_S)
     run.device_guard()
-
-
-def _homed(drive: Drive) -> bool | None:
-    """The drive's own word; None where the map knows no such bit."""
-    bits = drive.axis.map.homed
-    return None if bits is None else bits.holds(drive.status().word)
 
 
 def zero(run: Bench, confirm: Callable[[str], None]) -> None:
@@ -133,38 +125,40 @@ def zero(run: Bench, confirm: Callable[[str], None]) -> None:
     samples = ZERO_FACTOR * run.config.settle.samples
     measured = run.observer.measure(target, "zero", samples)
     run.emit("zero", sync=True, **measured)
-    run.record.reach(
-        ZEROED, run.plain, pulses=list(target), attitude=measured["attitude"],
-        run=run.folder.name,
-    )  # fmt: skip
+    zero = {"pulses": list(target), "attitude": measured["attitude"]}
+    run.record.reach(ZEROED, run.plain, **zero)
 
 
-def identity(drives: list[Drive]) -> dict[str, dict[str, int | str | None]]:
-    """Of each axis what stays the same for one drive: unit, family, pulses per turn.
+def identity(drives: list[Drive]) -> dict[str, dict[str, int | str]]:
+    """Of each axis the identity registers of its drive that do not change.
+
+    Signed registers are left out: they are measurements, such as a temperature.
 
     Raises:
         Refused: a unit does not answer as the family that is configured.
     """
-    found: dict[str, dict[str, int | str | None]] = {}
+    found: dict[str, dict[str, int | str]] = {}
     for drive in drives:
         axis = drive.axis
         try:
             values = drive.identity()
-            told = drive.pulses_per_rev()
+            drive.status()
         except BusError as error:
             raise Refused(
                 f"{axis.name} (unit {axis.unit}) does not answer as {axis.map.name} "
                 f"does: {error}. Run `jaxcal-rig scan`"
             ) from None
         for name, (low, high) in axis.map.recognise.items():
-            if not isinstance(values[name], int) or not low <= values[name] <= high:
+            value = values[name]
+            if not isinstance(value, int) or not low <= value <= high:
                 raise Refused(
                     f"{axis.name} (unit {axis.unit}) is no {axis.map.name}: {name} is "
-                    f"{values[name]}, not in [{low}, {high}]. Run `jaxcal-rig scan`"
+                    f"{value}, not in [{low}, {high}]. Run `jaxcal-rig scan`"
                 )
+        kinds = axis.map.identity
         found[axis.name] = {
-            "unit": axis.unit,
-            "map": axis.map.name,
-            "pulses_per_rev": told,
+            name: value
+            for name, value in values.items()
+            if kinds[name].type.startswith("u")
         }
     return found

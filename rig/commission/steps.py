@@ -77,7 +77,8 @@ class Place:
         with BusLock(config.bus).acquire(name) as lock:
             bench = Bench(
                 config, name, self.record, self.say,
-                folder=self.folder, full_speed=self.full_speed, plain=self.config,
+                folder=self.folder, plain=self.config, homed=limits,
+                full_speed=self.full_speed,
                 again=f"jaxcal-rig {name}", reset_alarms=self.reset_alarms,
                 start={"simulated": None, "inputs": {}, "maps_from": ""},
             )  # fmt: skip
@@ -96,8 +97,9 @@ def identify(place: Place) -> None:
     """The configured units answer as the configured families: IDENTIFIED."""
     with place.bus("scan") as drives:
         found = identity(drives)
-    place.record.reach(IDENTIFIED, place.config, **found)
-    each = ", ".join(f"{name} is unit {found[name]['unit']}" for name in AXIS_NAMES)
+    place.record.reach(IDENTIFIED, place.config, identity=found)
+    units = {axis.name: axis.unit for axis in place.config.axes}
+    each = ", ".join(f"{name} is unit {units[name]}" for name in AXIS_NAMES)
     place.say(f"IDENTIFIED: {each}")
 
 

@@ -103,6 +103,11 @@ class Drive:
         read = self.axis.map.pulses_per_rev
         return None if read is None else self._read(read)
 
+    def homed(self, word: int) -> bool:
+        """Whether a status word says that the drive is homed."""
+        bits = self.axis.map.homed
+        return bits is not None and bits.holds(word)
+
     def _read(self, read: Read, retries: int | None = None) -> int:
         unit, order = self.axis.unit, self.axis.map.word_order
         words = self.bus.read_words(unit, read.address, read.count, retries)
