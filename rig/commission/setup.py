@@ -118,7 +118,7 @@ def go(place: steps.Place, given: Given) -> int:
         steps.identify(place)
     say("5 imu")
     stream = steps.look_at_phone(place)
-    _pin(place, stream.sender)
+    pin(place, stream.sender)
     if record.missing(place.config, HOMED):
         say("6 jog and home")
         if not operator.yes:
@@ -141,7 +141,7 @@ def go(place: steps.Place, given: Given) -> int:
     return EXIT_OK
 
 
-def _pin(place: steps.Place, sender: str) -> None:
+def pin(place: steps.Place, sender: str) -> None:
     """Only this phone is listened to from now on."""
     if not sender or sender in place.config.imu.allow:
         return

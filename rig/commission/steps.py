@@ -22,7 +22,13 @@ from rig.device.bus import Bus
 from rig.device.drives import Drive
 from rig.device.imu import Imu
 from rig.device.lock import BusLock
-from rig.device.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
+from rig.device.record import (
+    HOMED,
+    IDENTIFIED,
+    SIGN_CHECKED,
+    STATES,
+    DeviceRecord,
+)
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault, Refused
 from rig.outputs.journal import Record
 from rig.session.run import STREAM_WAIT_S
@@ -43,6 +49,7 @@ class Place:
     path: pathlib.Path | None = None  # rig.toml, where there is one to correct
     folder: pathlib.Path | None = None  # of the run; a new one where not given
     full_speed: bool = False  # of a simulated device
+    locked: bool = False  # the caller holds the bus
     reset_alarms: bool = False
     on_imu_port: Callable[[int], object] = lambda port: None
     listeners: tuple[Callable[[Record], None], ...] = ()
@@ -62,11 +69,15 @@ class Place:
         if text := self.record.missing(self.config, through):
             raise Refused(text)
 
+    def _lock(self, what: str) -> BusLock:
+        lock = BusLock(self.config.bus)
+        return lock if self.locked else lock.acquire(what)
+
     @contextlib.contextmanager
     def bus(self, what: str) -> Iterator[list[Drive]]:
         """The drives, to be read; nobody else writes meanwhile."""
         config = self.config
-        with BusLock(config.bus).acquire(what), Bus(config.bus, config.silence_s) as bus:
+        with self._lock(what), Bus(config.bus, config.silence_s) as bus:
             yield [Drive(bus, axis) for axis in config.axes]
 
     def run(
@@ -74,7 +85,7 @@ class Place:
     ) -> int:
         """Run a step that moves or writes; returns the exit code."""
         config = self.config if limits else unlimited(self.config)
-        with BusLock(config.bus).acquire(name) as lock:
+        with self._lock(name) as lock:
             bench = Bench(
                 config, name, self.record, self.say,
                 folder=self.folder, plain=self.config, homed=limits,
@@ -200,20 +211,29 @@ def take_zero(place: Place) -> int:
     return place.run("zero", lambda run: zero(run, confirm))
 
 
-def commission(place: Place) -> int:
-    """Pass a simulated device through all states before a session; the exit code.
+def begin_simulated(place: Place, through: str) -> None:
+    """Take a simulated device through the states up to one, as a real one is taken.
 
     Its drives keep their counts: they are homed as they stand.
+
+    Raises:
+        MotionFault: its axes are not as configured.
     """
-    identify(place)
-    place.record.reach(HOMED, place.config, how="simulated")
-
-    def procedure(run: Bench) -> None:
-        _, changes = check_axes(run, False)
-        if changes:
-            raise MotionFault(
-                "the configuration does not say what the device does: "
-                + "; ".join(map(str, changes))
-            )
-
-    return place.run("axes", procedure)
+    states = STATES[: STATES.index(through) + 1] if through else ()
+    if IDENTIFIED in states:
+        identify(place)
+    if HOMED in states:
+        with place.bus("home") as drives:
+            pulses = [drive.status().position for drive in drives]
+        place.record.reach(HOMED, place.config, how="as they stand", pulses=pulses)
+    if SIGN_CHECKED not in states:
+        return
+    wrong: list[Change] = []
+    code = place.run("axes", lambda run: wrong.extend(check_axes(run, False)[1]))
+    if wrong:
+        raise MotionFault(
+            "the configuration does not say what the device does: "
+            + "; ".join(map(str, wrong))
+        )
+    if code:
+        raise MotionFault("the axis check of the simulated device did not end well")
