@@ -106,6 +106,56 @@ TO: Options = {
     }
 }
 
+YES: Options = {
+    "--yes": _flag("confirm everything and take every default"),
+    "--reset-alarms": _flag("before arming"),
+}
+STEP: Options = CONFIG | YES
+BUS: Options = {
+    "--bus": {
+        "metavar": "BUS",
+        "help": "rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT; without it "
+        "that of rig.toml",
+    },
+    "--units": {"type": int, "default": 16, "help": "ids 1 to this (default 16)"},
+}
+TCP: Options = {
+    "--tcp": {
+        "action": "append",
+        "default": [],
+        "metavar": "HOST[:PORT]",
+        "help": "does anything answer there",
+    }
+}
+SECONDS: Options = {"--seconds": _number(1.0, 600.0, 5.0, "to look at the stream")}
+JOG: Options = {
+    "axis": {"choices": ("pitch", "yaw", "roll")},
+    "step": {
+        "type": _within(-3.0, 3.0),
+        "nargs": "?",
+        "help": "degrees, at most 3; without it the axis moves while a key is held",
+    },
+}
+HERE: Options = {
+    "--here": _flag("where the device stands is home; otherwise the drives' own homing")
+}
+NAMES_KNOWN: Options = {
+    "--names-known": _flag(
+        "every unit was seen to turn its own joint the right way; the phone may be "
+        "placed in any way"
+    )
+}
+SETUP: Options = {
+    "--imu": {"metavar": "APP[:PORT]", "help": "hyperimu, sensorlogger or lines"},
+    "--home": {"choices": ("here", "drive"), "default": "here", "help": "how"},
+    "--set": {
+        "action": "append",
+        "default": [],
+        "metavar": "KEY=VALUE",
+        "help": "of the new rig.toml, such as axes.pitch.reduction=50",
+    },
+}
+
 
 def make_parser() -> argparse.ArgumentParser:
     """The parser of every command."""
@@ -125,6 +175,16 @@ def make_parser() -> argparse.ArgumentParser:
         for option, given in (SIMULATOR if simulated else {}).items():
             group.add_argument(option, **given)
 
+    text = "from cables to a device that may be calibrated; writes rig.toml"
+    add("setup", text, STEP | BUS | SETUP | NAMES_KNOWN, False)
+    add("ports", "list serial ports, and what answers on TCP", TCP, False)
+    add("scan", "which units answer, and of which family; reads only", CONFIG | BUS)
+    add("imu", "what to type into the phone, and what it sends", STEP | SECONDS)
+    add("jog", "move one axis by hand", JOG | STEP)
+    add("home", "make the drives' counts mean a place", HERE | STEP)
+    text = "check what turns, which way, how far; correct rig.toml"
+    add("axes", text, NAMES_KNOWN | STEP)
+    add("zero", "measure the zero posture", STEP)
     add("calibrate", "choose, visit, identify, verify and save", SESSION)
     text = "record random postures (Datasets 4 and 5)"
     add("collect", text, _count(50) | SESSION)

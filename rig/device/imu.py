@@ -30,6 +30,7 @@ class Imu:
         self.settings = settings
         self.port = settings.port
         self.connections = 0
+        self.sender = ""  # address of the phone, once it sent
         self._parser = Parser(settings)
         self._ring: deque[Reading] = deque(maxlen=RING)
         self._lock = threading.Lock()
@@ -102,6 +103,12 @@ class Imu:
             recent = itertools.takewhile(lambda r: r.time >= start, newest)
             return [*recent][::-1]
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """Records that were accepted, and those dropped by reason."""
+        with self._lock:
+            return dict(self._parser.counts)
+
     def check_fault(self) -> None:
         """Raise ImuError where the stream was found not to be trusted."""
         if self._fault:
@@ -127,9 +134,9 @@ class Imu:
                     ) from None
             time.sleep(0.01)
 
-    def _take_body(self, body: bytes) -> None:
+    def _take_body(self, body: bytes, sender: str) -> None:
         with self._lock:
-            self.connections = 1
+            self.connections, self.sender = 1, sender
             self._store(self._parser.body(body, time.monotonic()))
 
     def _store(self, readings: list[Reading]) -> None:
@@ -162,6 +169,7 @@ class Imu:
         on a new one, so a silent connection is given up for the next.
         """
         self.connections += 1
+        self.sender = connection.getpeername()[0]
         splitter = LineSplitter()
         connection.settimeout(0.1)
         heard = time.monotonic()
@@ -187,7 +195,7 @@ class Imu:
 
 
 def _make_web(
-    take: Callable[[bytes], None], host: str, port: int
+    take: Callable[[bytes, str], None], host: str, port: int
 ) -> http.server.HTTPServer:
     class Handler(http.server.BaseHTTPRequestHandler):
         timeout = 5.0
@@ -199,7 +207,7 @@ def _make_web(
                 self.send_error(413)
                 self.close_connection = True
                 return
-            take(self.rfile.read(int(length)))
+            take(self.rfile.read(int(length)), self.client_address[0])
             self.send_response(200)
             self.send_header("Content-Length", "0")
             self.end_headers()

@@ -235,6 +235,11 @@ class Run(RunFolder):
 
     # The end
 
+    @property
+    def to_go_on(self) -> str:
+        """The command that goes on after a pause or a fault."""
+        return f"python -m rig resume {self.folder}"
+
     def stop(self, reason: str, latch: bool = True) -> None:
         """Stop every unit; before the device is about to be armed there is no need."""
         if self.device is not None and self.signals.armed:
