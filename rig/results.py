@@ -8,6 +8,8 @@ import pathlib
 import sys
 from typing import Any
 
+from jaxcal.files import write_text
+from rig.config import parse_config
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
 from rig.sessions import recorded
 
@@ -16,8 +18,9 @@ Record = dict[str, Any]
 
 def refit(args: argparse.Namespace) -> int:
     """Identify a recorded calibration anew, into a folder of its own."""
+    from rig.commission.toml import set_values
     from rig.identification.conclusion import conclude
-    from rig.identification.refit import changed_config, reread
+    from rig.identification.refit import require_angles, reread
     from rig.outputs.console import recalibrate, summary_lines
     from rig.outputs.report import write_report
     from rig.session.folder import RunFolder, new_run_folder
@@ -29,10 +32,20 @@ def refit(args: argparse.Namespace) -> int:
     wanted = {
         "mechanism.order": args.order,
         "imu.order": args.imu_order,
-        "imu.signs": args.signs and tuple(args.signs),
-        "imu.mounting_deg": args.mounting and tuple(args.mounting),
+        "imu.signs": args.signs,
+        "imu.mounting_deg": args.mounting,
     }
-    now, changed = changed_config(then, wanted)
+    old = {
+        "mechanism.order": then.mechanism.order,
+        "imu.order": then.imu.order,
+        "imu.signs": [*then.imu.signs],
+        "imu.mounting_deg": [*then.imu.mounting_deg],
+    }
+    new = {k: v for k, v in wanted.items() if v is not None and v != old[k]}
+    require_angles(then.imu, new)
+    text = set_values(then.text, new)
+    now = parse_config(text, pathlib.Path(start["maps_from"]), str(args.run))
+    changed = {key: [old[key], value] for key, value in new.items()}
     records, evidence = reread(held, then, now)
     calibration, summary = conclude(now, evidence, {"refit_of": args.run.name})
     if changed:
@@ -45,6 +58,7 @@ def refit(args: argparse.Namespace) -> int:
         "simulated": start["simulated"],
     }
     folder = new_run_folder(args.run.resolve().parent, "refit")
+    write_text(folder / "rig.toml", text)
     begun = {key: start[key] for key in ("simulated", "maps_from")}
     run = RunFolder(now, folder, "refit", {**begun, "inputs": {"run": args.run.name}})
     try:
@@ -59,10 +73,9 @@ def refit(args: argparse.Namespace) -> int:
     finally:
         run.journal.close()
     print(f"{args.run.name} identified anew from {len(evidence.chosen)} postures:")
-    for key, (old, new) in changed.items():
-        print(f"  {key}: {_toml(new)} in place of {_toml(old)}. Set it in rig.toml too")
-    if not changed:
-        print("  no key was changed")
+    for key, (was, value) in changed.items():
+        print(f"  {key} = {json.dumps(value)}  # was {json.dumps(was)}")
+    print("  no key was changed" if not changed else "  Set these in your rig.toml too")
     limit = now.session.verify_limit_deg
     print(*summary_lines(summary, limit), sep="\n")
     print(f"saved: {folder}/calibration.json, pairs.csv, summary.json, report.html")
@@ -82,10 +95,6 @@ def _records(run: pathlib.Path) -> list[Record]:
     return records
 
 
-def _toml(value: Any) -> str:
-    return json.dumps(value)  # of texts and lists the same
-
-
 def _saved(path: pathlib.Path, *keys: str) -> dict[str, Any] | None:
     if not path.is_file():
         return None
@@ -103,7 +112,6 @@ def report(args: argparse.Namespace) -> int:
 
 def export(args: argparse.Namespace) -> int:
     """Print or write the inverse map of a run's calibration."""
-    from jaxcal.files import write_text
     from rig.outputs.export import LANGUAGES, load_inverse
 
     inverse = load_inverse(args.run, _records(args.run))

@@ -27,22 +27,17 @@ class Imu:
 
     Args:
         settings: of the phone.
-        sender: the address found when the device was set up; ``imu.allow`` goes before.
         report: called with the event ``sender_refused``, its ``address`` and
             ``reason``, once for each address, on the receiving thread.
     """
 
     def __init__(
-        self,
-        settings: ImuSettings,
-        sender: str | None = None,
-        report: Callable[..., Any] | None = None,
+        self, settings: ImuSettings, report: Callable[..., Any] | None = None
     ) -> None:
         self.settings = settings
         self.port = settings.port
         self._report = report
-        allowed = settings.allow or ((sender,) if sender else ())
-        self._senders = Senders(allowed, self._refused)
+        self._senders = Senders(settings.allow, self._refused)
         self.connections = 0
         self._parser = Parser(settings)
         self._ring: deque[Reading] = deque(maxlen=RING)
@@ -122,6 +117,12 @@ class Imu:
             newest = reversed(self._ring)
             recent = itertools.takewhile(lambda r: r.time >= start, newest)
             return [*recent][::-1]
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Records that were accepted, and those dropped by reason."""
+        with self._lock:
+            return dict(self._parser.counts)
 
     def check_fault(self) -> None:
         """Raise ImuError where the stream was found not to be trusted."""

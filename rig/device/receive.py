@@ -36,10 +36,7 @@ class Senders:
         """It may be heard; otherwise it is refused."""
         if self._allowed and address not in self._allowed:
             known = ", ".join(self._allowed)
-            self.refuse(
-                address,
-                f"{known} is allowed (imu.allow, or the phone found by `setup`)",
-            )
+            self.refuse(address, f"imu.allow names {known}")
         elif self.phone and address != self.phone:
             self.refuse(address, f"{self.phone} is the phone of this session")
         else:

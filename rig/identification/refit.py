@@ -21,34 +21,15 @@ from rig.outputs.journal import Record, measured_postures
 from rig.readings import DIGITS, attitudes, frame_at
 
 
-def changed_config(
-    config: RigConfig, changes: dict[str, Any]
-) -> tuple[RigConfig, dict[str, Any]]:
-    """The configuration with other values, and of each key that differs old and new.
-
-    Args:
-        config: as recorded.
-        changes: ``mechanism.order``, ``imu.order``, ``imu.signs``,
-            ``imu.mounting_deg``; None where one stays.
-
-    Raises:
-        Refused: the phone sent quaternions, which have neither order nor signs.
-    """
-    found, sections = {}, {"imu": config.imu, "mechanism": config.mechanism}
-    for name, value in changes.items():
-        table, key = name.split(".")
-        old = getattr(sections[table], key)
-        if value is None or value == old:
-            continue
-        if name in ("imu.order", "imu.signs") and _quaternions(config.imu):
+def require_angles(imu: ImuSettings, changes: dict[str, Any]) -> None:
+    """Refused where the phone sent quaternions, which have neither order nor signs."""
+    for name in changes.keys() & {"imu.order", "imu.signs"}:
+        if _quaternions(imu):
             raise Refused(
-                f"{name} cannot be changed to {value}: this phone sent quaternions, "
-                "which have neither order nor signs. Look at mechanism.order and "
-                "imu.mounting_deg"
+                f"{name} cannot be changed to {changes[name]}: this phone sent "
+                "quaternions, which have neither order nor signs. Look at "
+                "mechanism.order and imu.mounting_deg"
             )
-        sections[table] = sections[table].model_copy(update={key: value})
-        found[name] = [old, value]
-    return config.model_copy(update=sections), found
 
 
 def _quaternions(imu: ImuSettings) -> bool:

@@ -71,8 +71,9 @@ def read_runs(folder: pathlib.Path) -> tuple[list[Device], list[str]]:
             skipped.append(f"{path.parent}: {error}")
             continue
         run = {
-            "time": summary.get("measured_at", start["time"]), "name": path.parent.name, "mode": start["mode"],
-            "summary": summary, "limit_deg": limit, "fingerprint": device,
+            "time": summary.get("measured_at", start["time"]),
+            "name": path.parent.name, "mode": start["mode"], "summary": summary,
+            "limit_deg": limit, "fingerprint": device,
         }  # fmt: skip
         found.setdefault(json.dumps(device, sort_keys=True), []).append(run)
     return [_device(runs) for runs in found.values()], skipped

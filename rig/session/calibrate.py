@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 
 from rig.attitude import Array
+from rig.device.record import SIGN_CHECKED
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault
 from rig.guard.limits import check_plan
 from rig.identification.conclusion import Evidence, conclude
 from rig.identification.fit import fit, held_out_errors
 from rig.outputs.console import plan_lines, recalibrate, summary_lines
 from rig.outputs.journal import Record
+from rig.session.checks import check_matrix
 from rig.session.planning import (
     Choice,
     choose,
@@ -37,6 +39,7 @@ def calibrate(run: Run) -> int:
     chosen = _visit_chosen(run, candidates, choice)
     run.emit("phase", phase="saving")
     first = fit(chosen)
+    _check_gains(run, first.matrix)
     first.save(run.folder / "calibration.partial.json")
     held = _held_out(run, first)
     run.planned = session.k + 2 * len(held) + 2
@@ -111,6 +114,15 @@ def _visit_chosen(run: Run, candidates: Array, choice: Choice) -> list[Record]:
             f"  selected again without {index}: log det {choice.log_det:.4f}, "
             f"{len(records)} measured postures kept"
         )
+
+
+def _check_gains(run: Run, matrix: Any) -> None:
+    """Refuse a fit whose axes are reversed or exchanged: the sign check is void."""
+    try:
+        run.say(*(f"WARNING: {text}" for text in check_matrix(matrix)))
+    except MotionFault as fault:
+        run.record.void(SIGN_CHECKED, str(fault))
+        raise
 
 
 def _held_out(run: Run, calibration: Any) -> list[Any]:

@@ -41,7 +41,7 @@ def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
             code, event, reason = 130, "stopped", "SIGINT"
         except Refused as error:
             reason = str(error)
-            if not run.journal.events("command"):
+            if not run.signals.armed or not run.journal.events("command"):
                 code, event = EXIT_BAD_INPUT, "refused"
         except Fault as error:
             reason = str(error)
@@ -59,6 +59,6 @@ def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
     if event != "end":
         run.say(f"{event}: {reason}")
         if event != "refused":
-            run.say(f"to go on: python -m rig resume {run.folder}")
+            run.say(f"to go on: {run.to_go_on}")
     run.close()
     return code

@@ -347,20 +347,16 @@ def test_a_second_sender_is_refused_reported_and_never_mixed_in(second):
         assert angles_of(imu) == {10.0}
 
 
-@pytest.mark.parametrize("listed", [True, False])
-def test_only_the_phone_of_the_setup_or_of_the_list_is_heard(listed):
-    settings, told = changed(PLAIN, port=0), []
-    if listed:  # which goes before what was found at setup
-        settings = changed(settings, allow=("127.0.0.2",))
-    sender = "127.0.0.3" if listed else "127.0.0.2"
-    with Imu(settings, sender, lambda event, **more: told.append(more)) as imu:
+def test_only_an_address_that_is_allowed_is_heard():
+    settings, told = changed(PLAIN, port=0, allow=("127.0.0.2",)), []
+    with Imu(settings, lambda event, **more: told.append(more)) as imu:
         assert streaming(imu, 40).wait(5.0)
         ended = streaming(imu, 10, "127.0.0.2")
         wait_for(lambda: imu.sender)
         ended.set()
         assert angles_of(imu) == {10.0} and imu.sender == "127.0.0.2"
     assert [each["address"] for each in told] == ["127.0.0.1"]
-    assert "127.0.0.2 is allowed" in told[0]["reason"]
+    assert "127.0.0.2" in told[0]["reason"]
 
 
 def test_whoever_connects_and_says_nothing_does_not_become_the_phone():
