@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import pathlib
 import tomllib
 from collections.abc import Iterator
@@ -23,9 +24,37 @@ from rig.config.settings import (
     SettleSettings,
 )
 
+POLLS, HICCUP_S = 4, 0.25  # of the motion loop's heartbeat
 PHONE = (
     "format", "columns", "quaternion_columns", "unit", "order", "signs", "mounting_deg"
 )  # fmt: skip
+# Where bus and phone are reached, and when a session gives up or says that it is good,
+# may change between a run and its resumption.
+UNMEASURED = {
+    "imu": ("host", "port", "transport", "stale_s"),
+    "motion": (
+        "poll_s", "deadline_factor", "deadline_slack_s", "stall_s", "following_deg",
+        "envelope_margin_deg", "max_disagreement_deg", "heartbeat_s", "mirror_limits",
+    ),
+    "settle": ("timeout_s",),
+    "session": ("verify_limit_deg", "reference_tolerance_deg", "max_unreachable"),
+}  # fmt: skip
+
+
+def measured_by(described: dict[str, Any]) -> dict[str, Any]:
+    """``section.key`` to value, of all in ``RigConfig.described`` but the above.
+
+    How the device moves and is measured must not change between a run and its
+    resumption: that is what is left.
+    """
+    tables = json.loads(json.dumps(described, default=str))
+    axes = {f"axes.{axis['name']}": axis for axis in tables.pop("axes")}
+    found = {"mechanism_order": tables.pop("mechanism_order")}
+    del tables["bus"]
+    for name, table in (tables | axes).items():
+        spared = ("comm_timeout_s",) if name in axes else UNMEASURED.get(name, ())
+        found |= {f"{name}.{key}": table[key] for key in table if key not in spared}
+    return found
 
 
 def _family(register_map: RegisterMap) -> str:
@@ -78,6 +107,47 @@ class RigConfig(Section):
         """Silence between frames that the slowest of the drives wants."""
         return max(axis.map.inter_frame_s for axis in self.axes)
 
+    @property
+    def shortest_step_s(self) -> float:
+        """Time of a step of ``motion.max_step_deg`` on the quickest axis."""
+        motions = [axis.drive_motion for axis in self.axes]
+        step = self.motion.max_step_deg
+        return min(
+            step / speed + speed / accel
+            if step * accel > speed * speed
+            else 2.0 * math.sqrt(step / accel)  # it never reaches its speed
+            for speed, accel in motions
+        )
+
+    @property
+    def heartbeat_s(self) -> float:
+        """How long the motion loop may be silent while something moves.
+
+        Between two signs of life lies at most one exchange, which may have to connect
+        first, and the pause between polls; POLLS of these are allowed for, and a
+        computer that pauses for HICCUP_S.
+        """
+        longest = max(POLLS * self.motion.poll_s, HICCUP_S) + 2.0 * self.bus.timeout_s
+        return self.motion.heartbeat_s or longest
+
+    @property
+    def comm_timeouts_s(self) -> dict[str, float]:
+        """Axis to seconds, of the drives that watch their line.
+
+        Unless configured, a drive waits longer than the heartbeat, by one read with
+        all its tries.
+        """
+        default = self.heartbeat_s + self._slowest_read_s
+        return {
+            axis.name: axis.comm_timeout_s or default
+            for axis in self.axes
+            if axis.map.comm_timeout
+        }
+
+    @property
+    def _slowest_read_s(self) -> float:
+        return self.bus.timeout_s * (self.bus.read_retries + 1)
+
     def to_pulses(self, angles_deg: Any) -> Pulses:
         """Whole pulses of (3,) degrees."""
         a, b, c = (
@@ -112,16 +182,8 @@ class RigConfig(Section):
         return {**data, "axes": axes, "mechanism_order": self.mechanism.order}
 
     def fingerprint(self) -> str:
-        """SHA-256 of what a measurement depends on.
-
-        Where the bus and the phone are reached may change between a run and its
-        resumption; how the device moves and is measured may not.
-        """
-        data = self.described()
-        del data["bus"]
-        for name in ("host", "port", "transport", "stale_s"):
-            del data["imu"][name]
-        text = json.dumps(data, sort_keys=True, default=str)
+        """SHA-256 of what a measurement depends on, see ``measured_by``."""
+        text = json.dumps(measured_by(self.described()), sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
     def device_fingerprint(self) -> dict[str, Any]:
@@ -141,7 +203,13 @@ class RigConfig(Section):
 
     def broken_rules(self) -> Iterator[str]:
         motion, session = self.motion, self.session
-        slowest = self.bus.timeout_s * (self.bus.read_retries + 1)
+        slowest, shortest = self._slowest_read_s, self.shortest_step_s
+        if motion.heartbeat_s is not None and motion.heartbeat_s > shortest:
+            yield (
+                "motion.heartbeat_s: must not exceed the shortest step, "
+                f"{shortest:.3g} s (max_step_deg at an axis's speed), got "
+                f"{motion.heartbeat_s:g}; leave it out to have it computed"
+            )
         overshoot = motion.approach_overshoot_deg
         if session.k >= session.candidates:
             yield f"session.k: must be under candidates ({session.candidates})"

