@@ -113,4 +113,10 @@ def _check(args: argparse.Namespace) -> int:
             f"{axis.pulses_per_deg:.3f} pulses per degree, "
             f"{axis.min_pulses}..{axis.max_pulses} pulses"
         )
+    late = ", LONGER than the shortest step: shorten bus.timeout_s or slow the axes"
+    print(
+        f"  heartbeat {config.heartbeat_s:.3g} s, shortest step "
+        f"{config.shortest_step_s:.3g} s"
+        f"{late if config.heartbeat_s > config.shortest_step_s else ''}"
+    )
     return EXIT_OK

@@ -22,7 +22,8 @@ from rig.faults import EXIT_FAULT, EXIT_OK, Fault, Refused
 from rig.guard.signals import Signals
 from rig.guard.stop import UnitStop, stop_all
 
-HOLDER_S = 6.0  # for a session to stop its drives, see them stand, and end
+HOLDER_S = 5.0  # for a session to see its drives stand, and to end
+HOLDER_WAITS = 6  # and so many times the bus's timeout, for units that do not answer
 NOTHING = "NOTHING WAS STOPPED BY THIS COMMAND"
 LAST_RESORT = "Use the emergency stop"
 
@@ -49,7 +50,7 @@ def stop_device(path: pathlib.Path) -> int:
                 f"{lost}"
             )
         lock = BusLock(found.bus)
-        reported = _ask_holder(lock)
+        reported = _ask_holder(lock, found.bus.timeout_s)
         try:
             lock.acquire("stop")
         except (OSError, Refused) as error:  # a stop waits for nobody
@@ -64,7 +65,7 @@ def _say(text: str) -> None:
         print(text, flush=True)
 
 
-def _ask_holder(lock: BusLock) -> str:
+def _ask_holder(lock: BusLock, timeout_s: float) -> str:
     """Tell the holder to stop, and wait for it; what it reported."""
     asked = time.time()
     try:
@@ -75,11 +76,11 @@ def _ask_holder(lock: BusLock) -> str:
     if holder is None:
         return ""
     print(f"{lock.where} is {held_by(holder)}: told to stop now")
-    ended = lock.freed(HOLDER_S)
+    ended = lock.freed(HOLDER_S + HOLDER_WAITS * timeout_s)
     reported = _reported(holder, asked)
     _say(reported or "it has reported no stop")
     if not ended:
-        _say(f"it still holds the bus after {HOLDER_S:g} s")
+        _say("it still holds the bus")
     return reported
 
 

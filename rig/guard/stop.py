@@ -16,6 +16,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rig.config.registers import encode
+from rig.device.bus import Bus
 from rig.device.drives import Drive
 from rig.faults import EXIT_FAULT, StopRequested
 
@@ -59,7 +60,7 @@ def stop_all(drives: list[Drive]) -> list[UnitStop]:
         return results
     bus, pairs = drives[0].bus, list(zip(drives, results, strict=True))
     with bus.urgent():
-        with bus.urgent(QUICK_S + FRAME_BITS / bus.settings.baudrate):
+        with bus.urgent(_quick_s(bus)):
             _broadcast(drives)
             _round(pairs)
         for _ in range(ROUNDS - 1):
@@ -69,6 +70,10 @@ def stop_all(drives: list[Drive]) -> list[UnitStop]:
 
 
 Pairs = list[tuple[Drive, UnitStop]]
+
+
+def _quick_s(bus: Bus) -> float:
+    return QUICK_S + FRAME_BITS / bus.settings.baudrate
 
 
 def _responsive_first(pairs: Pairs) -> Pairs:
@@ -112,8 +117,11 @@ def _verify(pairs: Pairs) -> None:
     before: dict[str, int] = {}
     while moving := [pair for pair in pairs if not pair[1].standing]:
         for drive, result in _responsive_first(moving):
+            bus = drive.bus
+            wait_s = _quick_s(bus) if drive.axis.unit in bus.silent else None
             try:
-                status = drive.status(retries=0)
+                with bus.urgent(wait_s):
+                    status = drive.status(retries=0)
             except Exception as error:
                 result.detail = str(error)
                 continue
