@@ -263,8 +263,7 @@ def test_sigterm_stops_a_move_under_way():
 
 
 def test_a_lost_heartbeat_stops_the_drives():
-    text = fast_text({"[motion]": "[motion]\nheartbeat_s = 0.3"})
-    with bench(parse_config(text), speedup=0.02) as motion:
+    with bench(fast_config(HASTY), speedup=0.02) as motion:
         for drive, pulses in zip(
             motion.device.drives, motion.config.to_pulses([15, 15, 15]), strict=True
         ):
