@@ -180,6 +180,16 @@ class Drive:
                 found[name] = f"exception {error.code}"
         return found
 
+    def pulses_per_rev(self) -> int | None:
+        """Pulses for one motor turn by the drive's own word; None where it has none."""
+        read = self.axis.map.pulses_per_rev
+        return None if read is None else self._read(read)
+
+    def homed(self, word: int) -> bool:
+        """Whether a status word says that the drive is homed."""
+        bits = self.axis.map.homed
+        return bits is not None and bits.holds(word)
+
     def _read(self, read: Read, retries: int | None = None) -> int:
         unit, order = self.axis.unit, self.axis.map.word_order
         words = self.bus.read_words(unit, read.address, read.count, retries)

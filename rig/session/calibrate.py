@@ -9,10 +9,12 @@ import numpy as np
 
 from rig.attitude import Array
 from rig.config import AXIS_NAMES
+from rig.device.record import SIGN_CHECKED
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault
 from rig.guard.limits import check_plan
 from rig.outputs.console import plan_lines, summary_lines
 from rig.outputs.journal import Record
+from rig.session.checks import check_matrix
 from rig.session.identification import (
     errors,
     fit,
@@ -41,6 +43,7 @@ def calibrate(run: Run) -> int:
     chosen = _visit_chosen(run, candidates, choice)
     run.emit("phase", phase="saving")
     first = fit(chosen)
+    _check_gains(run, first.matrix)
     first.save(run.folder / "calibration.partial.json")
     held = _held_out(run, first)
     run.planned = session.k + 2 * len(held) + 1
@@ -117,6 +120,15 @@ def _visit_chosen(run: Run, candidates: Array, choice: Choice) -> list[Record]:
         )
 
 
+def _check_gains(run: Run, matrix: Any) -> None:
+    """Refuse a fit whose axes are reversed or exchanged: the sign check is void."""
+    try:
+        run.say(*(f"WARNING: {text}" for text in check_matrix(matrix)))
+    except MotionFault as fault:
+        run.record.void(SIGN_CHECKED, str(fault))
+        raise
+
+
 def _held_out(run: Run, calibration: Any) -> list[Any]:
     """Pairs of pulses, raw and compensated; drawn once for one set of chosen postures.
 
@@ -187,6 +199,8 @@ def _identify(
         "postures": [record["name"] for record in chosen],
     }
     notes = shared | {
+        "device": config.device_fingerprint(),
+        "zero_attitude": zero["attitude"],
         "mechanism_order": config.mechanism.order,
         "noise_from": limits["basis"],
         "run": run.folder.name,

@@ -191,17 +191,20 @@ class Observer:
                 "the command, more than motion.max_disagreement_deg. Check zero, axis "
                 "order and signs"
             )
-        asked = np.abs(commanded - self._seen[0])
-        seen = np.abs(measured - self._seen[1])
+        way = commanded - self._seen[0]
+        asked = np.abs(way)
+        seen = np.sign(way) * (measured - self._seen[1])
         leading = max(FOLLOW_MIN_DEG, FOLLOW_LEADING * float(asked.max()))
         for index, name in enumerate(AXIS_NAMES):
             if asked[index] < leading:
                 self._unproven[index].append(label)
             elif seen[index] < FOLLOW_SHARE * asked[index]:
+                hint = "a slipped coupling, a frozen stream, or axes mixed up"
+                if seen[index] < -FOLLOW_SHARE * asked[index]:
+                    hint = f"axes.{name}.direction, its wiring, and imu.signs"
                 raise NotFollowing(
                     f"the drive of {name} turned {asked[index]:.1f} deg, the IMU "
-                    f"saw {seen[index]:.2f}. Look for a slipped coupling, a frozen "
-                    "stream, or axes mixed up",
+                    f"saw {seen[index]:.2f}. Look for {hint}",
                     self._unproven[index],
                 )
             else:

@@ -41,7 +41,7 @@ def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
             code, event, reason = 130, "stopped", "SIGINT"
         except Refused as error:
             reason = str(error)
-            if not run.journal.events("command"):
+            if not run.signals.armed or not run.journal.events("command"):
                 code, event = EXIT_BAD_INPUT, "refused"
         except Fault as error:
             reason = str(error)

@@ -66,9 +66,16 @@ def fast_config(changes: dict[str, str] | None = None) -> RigConfig:
     return parse_config(fast_text(changes))
 
 
-def commissioned(config: RigConfig, folder: pathlib.Path) -> DeviceRecord:
-    """The record in a folder, with every state that a session needs."""
+def commissioned(
+    config: RigConfig, folder: pathlib.Path, sim: Simulator | None = None
+) -> DeviceRecord:
+    """The record in a folder, with every state that a session needs.
+
+    What was lost is reached again, as `home` and `axes` would.
+    """
     record = DeviceRecord.load(folder / "device.json")
+    for drive in sim.drives if sim and record.state(HOMED) is None else ():
+        drive.alarm = 0
     for name in (IDENTIFIED, HOMED, SIGN_CHECKED):
         if record.state(name) is None:
             record.reach(name, config)
@@ -103,6 +110,7 @@ def session(
         folder,
         "calibrate",
         (said if said is not None else []).append,
+        record=commissioned(config, folder, sim),
         start={"simulated": {"noise": 0.0}, "inputs": {}, "maps_from": "."},
         reset_alarms=True,
     )

@@ -22,6 +22,7 @@ from harness import (
     HASTY,
     SESSION,
     changed,
+    commissioned,
     fast_config,
     fast_text,
     no_figures,
@@ -145,8 +146,12 @@ def test_a_finished_run_resumes_to_the_same_without_moving(finished, tmp_path):
 
 def test_resume_refuses_a_changed_configuration(finished):
     changed = parse_config(fast_text({"std_deg = 0.1": "std_deg = 0.2"}))
-    with pytest.raises(Refused, match="configuration changed"):
-        Run(changed, finished[0], "calibrate", [].append)
+    named = r"configuration changed.*settle\.std_deg: 0\.1 then, 0\.2 now"
+    with pytest.raises(Refused, match=named):
+        Run(
+            changed, finished[0], "calibrate", [].append,
+            record=commissioned(changed, finished[0]),
+        )  # fmt: skip
 
 
 def test_resume_checks_the_reference_posture_first(tmp_path):
@@ -230,7 +235,8 @@ def test_a_terminal_that_goes_away_stops_the_run_and_not_the_stop(tmp_path):
             if "1/7" in text or "stop" in text or "acknowledged" in text:
                 raise BrokenPipeError("Broken pipe")
 
-        run = Run(served, folder, "calibrate", broken)
+        record = commissioned(served, folder)
+        run = Run(served, folder, "calibrate", broken, record=record)
         run.on_imu_port = sim.start_phone
         assert run_safely(run, calibrate) == 3
         assert all(drive.stops for drive in sim.drives)
@@ -269,7 +275,8 @@ def test_collect_records_a_dataset_and_resumes(tmp_path):
         served, pressed = sim.start(), []
 
         def once():
-            run = Run(served, folder, "collect", said.append)
+            record = commissioned(served, folder)
+            run = Run(served, folder, "collect", said.append, record=record)
             run.on_imu_port = sim.start_phone
 
             def press(phase):
@@ -454,6 +461,7 @@ def test_verify_says_when_it_is_time_to_recalibrate(finished, tmp_path, capsys):
         np.vstack([np.zeros(3), 10 * np.eye(3)]),
         np.vstack([np.zeros(3), 10 * np.eye(3)]) @ TRUTH[:, :3].T + TRUTH[:, 3] + 1.0,
         noise_std=0.01,
+        notes={"device": fast_config().device_fingerprint()},
     )
     stale.save(tmp_path / "calibration.json")
     path = tmp_path / "rig.toml"
@@ -508,6 +516,7 @@ def test_nothing_moves_without_confirmation(tmp_path, capsys):
         served = sim.start()
         text = fast_text({"port = 5020": f"port = {served.bus.port}"})
         (tmp_path / "rig.toml").write_text(text)
+        commissioned(config, tmp_path)
         code = main(["calibrate", "--config", str(tmp_path / "rig.toml"),
                      "--out", str(tmp_path / "runs")])  # fmt: skip
         assert code == 2
@@ -590,6 +599,7 @@ def test_simulate_serves_a_session_in_another_process(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_text(fast_text({"port = 5020": f"port = {bus}",
                                "port = 2055": f"port = {phone}"}))  # fmt: skip
+    commissioned(fast_config(), tmp_path)
     served = subprocess.Popen(
         [sys.executable, "-m", "rig", "simulate", "--config", str(path),
          "--rate", "250"], stdout=subprocess.PIPE, text=True,
@@ -698,7 +708,8 @@ def test_a_plan_that_leaves_the_limits_is_refused_before_arming(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     said = []
-    run = Run(config, folder, "calibrate", said.append)
+    record = commissioned(config, folder)
+    run = Run(config, folder, "calibrate", said.append, record=record)
     wild = draw_candidates(config)
     wild[:, 0] = 99999
     choice = choose(config, config.to_deg(draw_candidates(config)))
