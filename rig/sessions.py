@@ -66,7 +66,7 @@ def run_session(args: argparse.Namespace) -> int:
     from rig.session.runner import run_safely
 
     resumed = args.command == "resume"
-    config, start = _recorded(args) if resumed else _new(args)
+    config, start = recorded(args) if resumed else _new(args)
     mode = start["mode"]
     procedure, kept_zero = _procedure(mode, start["inputs"], config)
     # With --zero the operator put the device into its zero posture.
@@ -92,7 +92,7 @@ def run_session(args: argparse.Namespace) -> int:
         if simulator is not None:
             record = DeviceRecord(folder / "device.json")
             if not dry_run:
-                commission(config, record, simulator)
+                _commission(config, record, simulator)
         session = Run(
             config,
             folder,
@@ -131,8 +131,8 @@ def _new(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
     }
 
 
-def _recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
-    """The same of a run that is resumed, from its folder."""
+def recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
+    """The same of a run that is resumed or identified anew, from its folder."""
     from rig.outputs.journal import read_journal
     from rig.session.folder import JOURNAL
 
@@ -140,7 +140,10 @@ def _recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
     if not records or records[0]["event"] != "start":
         raise Refused(f"{args.run} holds no run")
     start = records[0]
-    if args.config is not None:
+    if start["mode"] == "refit":
+        source = start["inputs"]["run"]
+        raise Refused(f"{args.run} is a refit of {source}; give that run instead")
+    if getattr(args, "config", None) is not None:
         return load_config(args.config), start
     text = (args.run / "rig.toml").read_text(encoding="utf-8")
     return parse_config(text, pathlib.Path(start["maps_from"]), str(args.run)), start
@@ -169,18 +172,24 @@ def _procedure(
     return lambda run: checking.goto(run, calibration, desired), saved.zero
 
 
-def commission(config: RigConfig, record: DeviceRecord, simulator: Simulator) -> None:
-    """Reach every state of a simulated device as those of a real one are reached."""
-    from rig.device.bus import Bus
-    from rig.device.drives import Drive
-    from rig.device.record import HOMED, IDENTIFIED, SIGN_CHECKED
+def _commission(config: RigConfig, record: DeviceRecord, simulator: Simulator) -> None:
+    """Take a simulated device through every state as a real one is taken.
 
-    with Bus(config.bus, config.silence_s) as bus:
-        drives = [Drive(bus, axis) for axis in config.axes]
-        record.reach(IDENTIFIED, config)
-        positions = [drive.status().position for drive in drives]
-        record.reach(HOMED, config, how="here", pulses=positions)
-    record.reach(SIGN_CHECKED, config)
+    Raises:
+        MotionFault: its axes are not as configured.
+    """
+    from rig.commission.operator import Operator
+    from rig.commission.steps import Place, begin_simulated
+    from rig.device.record import SIGN_CHECKED
+
+    folder = record.path.parent / "axes"
+    folder.mkdir(exist_ok=True)
+    operator = Operator(yes=True, say=functools.partial(print, flush=True))
+    place = Place(
+        config, record, operator, folder=folder, full_speed=True, locked=True,
+        on_imu_port=simulator.start_phone,
+    )  # fmt: skip
+    begin_simulated(place, SIGN_CHECKED)
 
 
 def _confirm(args: argparse.Namespace, session: Run) -> None:

@@ -36,6 +36,13 @@ def check_drives(
                 f"per turn, axes.{axis.name}.pulses_per_rev says {axis.pulses_per_rev}."
                 " Correct the one that is wrong; nothing was moved"
             )
+    check_record(config, drives, record)
+
+
+def check_record(
+    config: RigConfig, drives: Sequence[Drive], record: DeviceRecord
+) -> None:
+    """The drives are those of the record, and where they were; else Refused."""
     for state, faults in (
         (IDENTIFIED, [_exchanged(drive, record) for drive in drives]),
         (HOMED, [_displaced(config, drive, record) for drive in drives]),

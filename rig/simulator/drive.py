@@ -93,6 +93,7 @@ class SimDrive:
         m = self.map
         tables = (
             m.move, m.stop, m.enable, m.alarm_reset, m.comm_timeout, m.limits, m.home,
+            m.set_zero,
         )  # fmt: skip
         reads = (m.status, m.position, m.alarm, m.target, m.pulses_per_rev)
         places: list[Read | Write] = [*m.identity.values()]
@@ -241,6 +242,9 @@ class SimDrive:
             self.advance()
         elif self._begins(m.home, address, words):
             self._home()
+        elif self._begins(m.set_zero, address, words):
+            self.offset -= round(self.position)
+            self.position, self.target, self.homed = 0.0, 0, True
         elif m.comm_timeout and address == m.comm_timeout.write[0].address:
             counts = self._value(m.comm_timeout, "timeout")
             self._comm_timeout = counts / m.comm_timeout.per_s
