@@ -165,7 +165,7 @@ def test_a_changed_verify_limit_does_not_keep_a_run_from_resuming(finished):
     Run(judged, finished[0], "calibrate", [].append, record=record).close()
     other = parse_config(fast_text({"samples = 5": "samples = 6"}, session=table))
     with pytest.raises(Refused, match=r"settle.samples: 5 then, 6 now"):
-        Run(other, finished[0], "calibrate", [].append)
+        Run(other, finished[0], "calibrate", [].append, record=record)
 
 
 def test_a_resume_that_is_refused_before_it_moves_is_bad_input(tmp_path):
