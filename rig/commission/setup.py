@@ -143,11 +143,11 @@ def go(place: steps.Place, given: Given) -> int:
 
 def pin(place: steps.Place, sender: str) -> None:
     """Only this phone is listened to from now on."""
-    if not sender or sender in place.config.imu.allow:
+    if not sender or sender == place.record.sender:
         return
-    assert place.path is not None
     place.operator.confirm(f"imu: listen to {sender} only, and to no other sender")
-    place.take(edit(place.path, {"imu.allow": [sender]}))
+    place.record.sender = sender
+    place.record.save()
 
 
 def _offer_jog(place: steps.Place) -> None:
