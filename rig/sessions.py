@@ -72,10 +72,6 @@ def run_session(args: argparse.Namespace) -> int:
     # With --zero the operator put the device into its zero posture.
     zero_at = kept_zero.pulses if kept_zero and not args.zero else None
     dry_run = getattr(args, "dry_run", False)
-    record = DeviceRecord.load(config.device_path)
-    if start["simulated"] is None and not dry_run:
-        if text := record.missing(config):
-            raise Refused(text)
     with contextlib.ExitStack() as stack:
         simulator, text = None, config.text
         if start["simulated"] is not None:
@@ -84,6 +80,9 @@ def run_session(args: argparse.Namespace) -> int:
         lock = BusLock(config.bus)
         if not dry_run:
             stack.enter_context(lock.acquire(args.command))
+        record = DeviceRecord.load(config.device_path)
+        if simulator is None and not dry_run and (lack := record.missing(config)):
+            raise Refused(lack)
         if resumed:
             folder = args.run
         else:
@@ -93,7 +92,7 @@ def run_session(args: argparse.Namespace) -> int:
         if simulator is not None:
             record = DeviceRecord(folder / "device.json")
             if not dry_run:
-                commission(config, record, simulator)
+                _commission(config, record, simulator)
         session = Run(
             config,
             folder,
@@ -170,18 +169,24 @@ def _procedure(
     return lambda run: checking.goto(run, calibration, desired), saved.zero
 
 
-def commission(config: RigConfig, record: DeviceRecord, simulator: Simulator) -> None:
-    """Reach every state of a simulated device as those of a real one are reached."""
-    from rig.device.bus import Bus
-    from rig.device.drives import Drive
-    from rig.device.record import HOMED, IDENTIFIED, SIGN_CHECKED
+def _commission(config: RigConfig, record: DeviceRecord, simulator: Simulator) -> None:
+    """Take a simulated device through every state as a real one is taken.
 
-    with Bus(config.bus, config.silence_s) as bus:
-        drives = [Drive(bus, axis) for axis in config.axes]
-        record.reach(IDENTIFIED, config)
-        positions = [drive.status().position for drive in drives]
-        record.reach(HOMED, config, how="here", pulses=positions)
-    record.reach(SIGN_CHECKED, config)
+    Raises:
+        MotionFault: its axes are not as configured.
+    """
+    from rig.commission.operator import Operator
+    from rig.commission.steps import Place, begin_simulated
+    from rig.device.record import SIGN_CHECKED
+
+    folder = record.path.parent / "axes"
+    folder.mkdir(exist_ok=True)
+    operator = Operator(yes=True, say=functools.partial(print, flush=True))
+    place = Place(
+        config, record, operator, folder=folder, full_speed=True, locked=True,
+        on_imu_port=simulator.start_phone,
+    )  # fmt: skip
+    begin_simulated(place, SIGN_CHECKED)
 
 
 def _confirm(args: argparse.Namespace, session: Run) -> None:

@@ -44,9 +44,7 @@ def check_axes(run: Bench, names_known: bool) -> tuple[Findings, list[Change]]:
         "phone_turned_deg": round(found.turned_deg, 2),
         "run": run.folder.name,
     }
-    run.emit(
-        "axes", sync=True, **evidence, changes=[str(change) for change in changes]
-    )
+    run.emit("axes", sync=True, **evidence, changes=[str(change) for change in changes])
     run.say(*lines(run.config, found))
     if not changes:
         run.record.reach(SIGN_CHECKED, run.plain, **evidence)
@@ -110,7 +108,9 @@ def measure(run: Bench) -> dict[str, Stand]:
     for a, b in itertools.combinations(range(3), 2):
         for sign in "-+":
             way = pair[a] if sign == "+" else -pair[a]
-            visit(f"{AXIS_NAMES[a]}{sign}{AXIS_NAMES[b]}+", {a: way, b: pair[b]}, samples)
+            visit(
+                f"{AXIS_NAMES[a]}{sign}{AXIS_NAMES[b]}+", {a: way, b: pair[b]}, samples
+            )
     run.small.move_to(start, "back")
     return stands
 

@@ -125,4 +125,3 @@ def _slow(axis: Axis) -> Axis:
         except ValueError:  # slower than the drive's register can say
             speed *= 2.0
     return axis
-

@@ -64,7 +64,9 @@ class Findings:
     off_deg: Array  # (3,) each axis from where the placement that was found puts it
     mounting: Array  # (3, 3) phone to end-effector, nearest to the three axes
     turned_deg: float  # that from the configured one
-    mirrored: bool  # the axes are left-handed where the configured ones are right-handed
+    mirrored: (
+        bool  # the axes are left-handed where the configured ones are right-handed
+    )
     order: str | None  # axes of the mechanism from the base outwards; None: not clear
     skew_deg: float  # largest departure of two axes from a right angle
 
@@ -211,8 +213,7 @@ def _chain(
         raise MotionFault(
             "the phone's readings do not combine as rotations of three joints do: "
             "imu.order, imu.columns or imu.signs is wrong, or the phone is loose. "
-            "Nothing was corrected"
-            + (others and f". They would combine with {others}")
+            "Nothing was corrected" + (others and f". They would combine with {others}")
         )
     letters = [config.letters[joints[drive]] for drive in np.argsort(inner)[::-1]]
     return "".join(letters)

@@ -88,7 +88,10 @@ def proposals(
                 )
             )  # fmt: skip
     for table in tables:
-        at, scales = f"axes.{table['name']}", ("pulses_per_rev", "reduction", "direction")
+        at, scales = (
+            f"axes.{table['name']}",
+            ("pulses_per_rev", "reduction", "direction"),
+        )
         if any(change.key == f"{at}.{name}" for change in changes for name in scales):
             changes += [
                 Change(f"{at}.{name}", table[name], None, "pulses have a new scale")

@@ -101,6 +101,8 @@ class DeviceRecord:
             "fingerprint": config.device_fingerprint(),
         }
         self._voided.pop(name, None)
+        if name == HOMED:
+            self._left = {}  # counts of before mean nothing now
         self.save()
 
     def void(self, name: str, reason: str) -> None:

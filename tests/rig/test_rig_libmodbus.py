@@ -17,7 +17,7 @@ import tty
 import numpy as np
 import pytest
 from fault_matrix import _free_port
-from harness import fast_text
+from harness import commissioned, fast_text
 from scipy.spatial.transform import Rotation
 
 from rig.__main__ import main
@@ -121,6 +121,7 @@ def test_a_whole_calibration_over_tcp(program, tmp_path):
     config = parse_config(text)
     path = tmp_path / "rig.toml"
     path.write_text(text)
+    commissioned(config, tmp_path)
     closing = threading.Event()
     with Slave(program, "tcp", str(bus)) as slave:
         sender = threading.Thread(target=phone, args=(slave, config, imu, closing))
