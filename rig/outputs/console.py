@@ -23,6 +23,13 @@ def event_lines(record: dict[str, Any]) -> list[str]:
             return [f"zero taken at pulses {record['pulses']}"]
         case "void":
             return [f"  withdrawn, to be measured again: {', '.join(record['names'])}"]
+        case "lost_reply":
+            found = {
+                "obeyed": "the drive obeys",
+                "not taken": "the drive did not take it, so it is sent again",
+                "unknown": "whether the drive took it is unknown, so all stop",
+            }[record["outcome"]]
+            return [f"  the reply to a move of {record['axis']} was lost: {found}"]
         case "unreachable":
             return [f"  {record['name']} is out of reach: {record['reason']}"]
         case "stop":

@@ -140,10 +140,9 @@ class Run(RunFolder):
         target = self.zero_at or self.zero_pulses
         if target is None and self.config.session.zero == "drive":
             target = (0, 0, 0)
-        if target is not None:
-            self.motion.move_to(target, "zero")
-        else:
-            target = device.positions()
+        here, target = target is None, target or device.positions()
+        if not here or self.config.motion.approach_overshoot_deg:
+            self.motion.move_to(target, "zero")  # from the side of all references
         check_plan(self.config, [target])  # it is where a resumed run looks again
         # Every posture is measured against this one, so its noise must be the smaller.
         samples = ZERO_FACTOR * self.config.settle.samples

@@ -200,7 +200,7 @@ class SimDrive:
 
     def _counter(self) -> int:
         """The position as read: at rest it may flicker."""
-        most = 0 if self.moving else self.habits.jitter_counts
+        most = 0 if self.velocity else self.habits.jitter_counts
         return round(self.position) + self._random.randint(-most, most)
 
     def _status(self) -> int:

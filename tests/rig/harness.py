@@ -85,8 +85,9 @@ def commissioned(
 def simulator(config: RigConfig, **options) -> Simulator:
     """Noise-free, so that an interrupted run must give the very same calibration."""
     noise = options.pop("noise_deg", 0.0)
+    truth = options.pop("truth", Truth(noise_deg=noise))
     options.setdefault("rate_hz", RATE_HZ)
-    return Simulator(config, Truth(noise_deg=noise), **options)
+    return Simulator(config, truth, **options)
 
 
 def session(
