@@ -15,7 +15,6 @@ from rig.device.lock import BusLock
 from rig.faults import EXIT_FAULT, EXIT_OK
 from rig.sessions import load, make_simulator, run_session
 
-
 COMMISSIONING = ("ports", "scan", "imu", "jog", "home", "axes", "zero", "setup")
 
 

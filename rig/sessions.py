@@ -140,6 +140,8 @@ def _recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
     if not records or records[0]["event"] != "start":
         raise Refused(f"{args.run} holds no run")
     start = records[0]
+    if start["mode"] not in ("calibrate", "collect", "verify", "goto"):
+        raise Refused(f"{args.run} is a step of commissioning: run it again instead")
     if args.config is not None:
         return load_config(args.config), start
     text = (args.run / "rig.toml").read_text(encoding="utf-8")

@@ -48,8 +48,8 @@ def home(run: Bench, here: bool, confirm: Callable[[str], None]) -> None:
     if not here and not can_home(run.config):
         without = {a.map.name for a in run.config.axes if a.map.home is None}
         raise Refused(
-            f"the map {', '.join(sorted(without))} knows no homing. Put the device into "
-            "its home posture and use --here"
+            f"the map {', '.join(sorted(without))} knows no homing. Put the device "
+            "into its home posture and use --here"
         )
     confirm(
         "home: nothing moves; where the device stands now becomes the origin of its "
@@ -107,8 +107,8 @@ def _go_home(run: Bench, drive: Drive) -> None:
             break
         if time.monotonic() > end:
             raise MotionFault(
-                f"{axis.name} is not home after {HOME_S:g} s. Check its home switch and "
-                "the homing that is set in the drive"
+                f"{axis.name} is not home after {HOME_S:g} s. Check its home switch "
+                "and the homing that is set in the drive"
             )
         time.sleep(POLL_S)
     run.device_guard()

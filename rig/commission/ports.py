@@ -11,7 +11,7 @@ MODBUS_PORT = 502
 
 def serial_lines() -> list[str]:
     """One line for each serial port: device, and what its adapter calls itself."""
-    from serial.tools import list_ports
+    from serial.tools import list_ports  # type: ignore[import-untyped]  # no stubs
 
     lines = []
     for port in sorted(list_ports.comports()):

@@ -35,10 +35,10 @@ class Found:
 
 
 def parse_bus(text: str) -> BusSettings:
-    """Settings of ``tcp:HOST[:PORT]``, ``rtu_tcp:HOST[:PORT]``, ``rtu:DEVICE,BAUD,...``.
+    """Settings of ``tcp:HOST[:PORT]``, ``rtu_tcp:HOST[:PORT]`` or ``rtu:DEVICE,...``.
 
-    After the baud rate parity and stop bits may follow: ``rtu:/dev/ttyUSB0,115200,N,1``,
-    or data bits, parity and stop bits as ``8,N,1`` or ``N,8,1``.
+    After the device follow baud rate, parity, data bits and stop bits, as far as they
+    are given: ``rtu:/dev/ttyUSB0,115200,N,8,1``; ``115200,8,N,1`` is the same.
 
     Raises:
         ConfigError: not such a text, or settings that cannot be.
