@@ -68,8 +68,8 @@ def proposals(
         changes.append(Change("imu.mounting_deg", before, angles.tolist(), reason))
     if found.order not in (None, config.mechanism.order):
         reason = "combined moves show which joint carries which"
-        before = config.mechanism.order
-        changes.append(Change("mechanism.order", before, found.order, reason))
+        order = config.mechanism.order
+        changes.append(Change("mechanism.order", order, found.order, reason))
     return changes
 
 
@@ -131,8 +131,8 @@ def lines(config: RigConfig, found: Findings) -> list[str]:
         )
     angles = matrix_to_euler(found.mounting, "ZYX")
     text.append(
-        f"  phone: turned by [{' '.join(f'{angle:.1f}' for angle in angles)}] deg about "
-        f"Z, Y, X, {found.turned_deg:.1f} from imu.mounting_deg"
+        f"  phone: turned by [{' '.join(f'{angle:.1f}' for angle in angles)}] deg "
+        f"about Z, Y, X, {found.turned_deg:.1f} from imu.mounting_deg"
     )
     order = found.order or "not clear from these moves"
     text.append(f"  joints from the base outwards: {order}")
@@ -143,7 +143,7 @@ def lines(config: RigConfig, found: Findings) -> list[str]:
         )
     if found.skew_deg > SKEW_DEG:
         text.append(
-            f"  WARNING: the axes read {found.skew_deg:.0f} deg away from right angles. "
-            "Check imu.order, imu.columns and imu.signs"
+            f"  WARNING: the axes read {found.skew_deg:.0f} deg away from right "
+            "angles. Check imu.order, imu.columns and imu.signs"
         )
     return text

@@ -167,9 +167,9 @@ def axes(place: Place, names_known: bool = False) -> int:
     """Check each axis, correct rig.toml after a yes, and check again: SIGN_CHECKED."""
     place.require(HOMED)
     place.operator.confirm(
-        "axes: each axis in turn will move 0.5 deg, then 3 deg either way; then two "
-        "at a time. Watch that the joint that moves is the one that is named, and keep "
-        "out of the device's reach"
+        "axes: the device stands in its zero posture. Each axis in turn will move 0.5 "
+        "deg, then 3 deg either way; then two at a time. Watch that the joint that "
+        "moves is the one that is named, and keep out of the device's reach"
     )
     for again in (False, True):
         changes: list[Change] = []
