@@ -157,6 +157,35 @@ SETUP: Options = {
 }
 
 
+ORDER = {"choices": ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")}
+RECORDED: Options = {"run": _path("the run's folder")}
+REFIT: Options = RECORDED | {
+    "--order": {**ORDER, "help": "mechanism.order: axes of the joints"},
+    "--imu-order": {**ORDER, "help": "imu.order: of the phone's angles"},
+    "--signs": {
+        "type": int,
+        "choices": (1, -1),
+        "nargs": 3,
+        "help": "imu.signs: of the phone's angles, in the sequence of their order",
+    },
+    "--mounting": {
+        "type": _within(-360, 360),
+        "nargs": 3,
+        "metavar": ("Z", "Y", "X"),
+        "help": "imu.mounting_deg: turn of the phone on the end-effector",
+    },
+}
+EXPORT: Options = RECORDED | {
+    "--to": {
+        "choices": ("c", "st", "ros", "json", "csv"),
+        "required": True,
+        "help": "C header, IEC 61131-3 Structured Text, ROS 2 parameters, JSON, CSV",
+    },
+    "--out": _path("file to write (default: print it)", metavar="FILE"),
+}
+RUNS: Options = {"folder": _path("folder of runs, searched with its subfolders")}
+
+
 def make_parser() -> argparse.ArgumentParser:
     """The parser of every command."""
     parser = argparse.ArgumentParser(
@@ -199,6 +228,12 @@ def make_parser() -> argparse.ArgumentParser:
     add("stop", "quick-stop every drive now, and verify", CONFIG, False)
     add("check", "check a configuration and list every fault", FILE | CONFIG, False)
     add("example", "print a commented example configuration", NAME, False)
+    add("refit", "identify a recorded calibration anew", REFIT, False)
+    add("report", "write report.html of any run, also unfinished", RECORDED, False)
+    text = "print the inverse map of a calibration for a controller"
+    add("export", text, EXPORT, False)
+    text = "compare the calibrations of a device over time"
+    add("trend", text, RUNS, False)
     text = "serve simulated drives and a phone on loopback"
     add("simulate", text, CONFIG | PORT)
     return parser

@@ -32,12 +32,20 @@ def run(args: argparse.Namespace) -> int:
         "simulate": _simulate,
         "example": _example,
         "check": _check,
+        **dict.fromkeys(("refit", "report", "export", "trend"), _of_recorded),
     }
     if args.command in COMMISSIONING:
         from rig.commissioning import run as run_step
 
         return run_step(args)
     return commands.get(args.command, run_session)(args)
+
+
+def _of_recorded(args: argparse.Namespace) -> int:
+    from rig import results
+
+    command: Callable[[argparse.Namespace], int] = getattr(results, args.command)
+    return command(args)
 
 
 def _identify(args: argparse.Namespace) -> int:

@@ -84,8 +84,7 @@ def _told(found: list[Found]) -> int:
 def _imu(args: argparse.Namespace) -> int:
     with _place(args) as place:
         stream = steps.look_at_phone(place, args.seconds)
-        if place.path is not None:
-            setup.pin(place, stream.sender)
+        setup.pin(place, stream.sender)
     return EXIT_OK
 
 

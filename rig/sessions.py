@@ -66,7 +66,7 @@ def run_session(args: argparse.Namespace) -> int:
     from rig.session.runner import run_safely
 
     resumed = args.command == "resume"
-    config, start = _recorded(args) if resumed else _new(args)
+    config, start = recorded(args) if resumed else _new(args)
     mode = start["mode"]
     procedure, kept_zero = _procedure(mode, start["inputs"], config)
     # With --zero the operator put the device into its zero posture.
@@ -131,8 +131,8 @@ def _new(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
     }
 
 
-def _recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
-    """The same of a run that is resumed, from its folder."""
+def recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
+    """The same of a run that is resumed or identified anew, from its folder."""
     from rig.outputs.journal import read_journal
     from rig.session.folder import JOURNAL
 
@@ -140,9 +140,12 @@ def _recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
     if not records or records[0]["event"] != "start":
         raise Refused(f"{args.run} holds no run")
     start = records[0]
+    if start["mode"] == "refit":
+        source = start["inputs"]["run"]
+        raise Refused(f"{args.run} is a refit of {source}; give that run instead")
     if start["mode"] not in ("calibrate", "collect", "verify", "goto"):
         raise Refused(f"{args.run} is a step of commissioning: run it again instead")
-    if args.config is not None:
+    if getattr(args, "config", None) is not None:
         return load_config(args.config), start
     text = (args.run / "rig.toml").read_text(encoding="utf-8")
     return parse_config(text, pathlib.Path(start["maps_from"]), str(args.run)), start

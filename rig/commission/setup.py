@@ -153,11 +153,10 @@ def go(place: steps.Place, given: Given) -> int:
 
 def pin(place: steps.Place, sender: str) -> None:
     """Only this phone is listened to from now on."""
-    if not sender or sender == place.record.sender:
+    if place.path is None or not sender or sender in place.config.imu.allow:
         return
     place.operator.confirm(f"imu: listen to {sender} only, and to no other sender")
-    place.record.sender = sender
-    place.record.save()
+    place.take(edit(place.path, {"imu.allow": [sender]}))
 
 
 def _offer_jog(place: steps.Place) -> None:

@@ -28,7 +28,10 @@ PHONE = (
 )  # fmt: skip
 # Left out of ``fingerprint``: addresses, and what version 1 did not know. A key added
 # here leaves the fingerprints of older files as they are.
-UNCOUNTED = {"imu": ("host", "port", "transport", "stale_s", "heading")}
+UNCOUNTED = {
+    "imu": ("host", "port", "transport", "allow", "stale_s", "heading"),
+    "session": ("drift_limit_deg",),
+}
 # May also change before a run is resumed: they judge what was measured, or stop it.
 LIMITS = {
     "motion": (

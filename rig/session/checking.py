@@ -12,9 +12,9 @@ from rig.attitude import Array
 from rig.config import RigConfig
 from rig.config.config import differences
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
+from rig.identification.fit import pairs
 from rig.outputs.console import error_text, numbers
 from rig.session.calibrate import visit_pairs
-from rig.session.identification import pairs
 from rig.session.planning import draw, draw_held_out
 from rig.session.reference import KeptZero
 from rig.session.run import Run

@@ -16,7 +16,7 @@ from rig.attitude import Array, angle_between_deg
 from rig.config import AXIS_NAMES, RigConfig
 from rig.config.axis import Pulses
 from rig.faults import MotionFault
-from rig.session.measuring import frame_at
+from rig.readings import frame_at
 
 UNSEEN_DEG = 15.0  # an axis this near to the vertical hardly changes the tilt
 TOLD_SHARE = 0.2  # of the largest: an axis that moved less is left out of the words

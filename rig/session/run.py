@@ -31,10 +31,11 @@ from rig.guard.limits import check_plan
 from rig.guard.signals import Signals
 from rig.outputs.console import event_lines, numbers
 from rig.outputs.journal import Record
+from rig.readings import frame_at
 from rig.session.checks import check_drives, leave
 from rig.session.device import Device
 from rig.session.folder import RunFolder
-from rig.session.measuring import Observer, frame_at
+from rig.session.measuring import Observer
 from rig.session.motion import Motion
 from rig.session.reference import KeptZero, axes_text, check_zero
 
@@ -119,7 +120,8 @@ class Run(RunFolder):
         """Open bus and phone and arm; MotionFault, BusError, ImuError: not fit."""
         config = self.config
         self.confirm(self)
-        imu, bus = Imu(config.imu), Bus(config.bus, config.silence_s, self.emit)
+        imu = Imu(config.imu, report=self.emit)
+        bus = Bus(config.bus, config.silence_s, self.emit)
         self.device = Device(config, bus, imu, self.signals, self.emit)
         imu.open()
         self.say(f"IMU: waiting for the phone on port {imu.port} ({config.imu.format})")

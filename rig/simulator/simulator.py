@@ -71,7 +71,7 @@ class Simulator:
         phone_port = 0
         if self.config.imu.transport == "connect":
             phone_port = self.start_phone(0)
-        imu = {"host": "127.0.0.1", "port": phone_port}
+        imu = {"host": "127.0.0.1", "port": phone_port, "allow": ("127.0.0.1",)}
         return self.config.model_copy(
             update={
                 "bus": self.config.bus.model_copy(update=bus),

@@ -36,10 +36,11 @@ from rig.__main__ import main
 from rig.arguments import make_parser
 from rig.config import example_text, parse_config
 from rig.faults import Refused
+from rig.identification.fit import uncertainty
+from rig.identification.orders import order_residuals
 from rig.outputs.journal import read_journal
 from rig.session.calibrate import calibrate
 from rig.session.checking import collect
-from rig.session.identification import order_residuals, uncertainty
 from rig.session.planning import choose, draw_candidates, travel_order
 from rig.session.run import Run
 from rig.session.runner import run_safely
@@ -70,7 +71,8 @@ def test_the_truth_lies_in_the_stated_intervals(finished):
     wide = np.sqrt(np.diag(saved.covariance))
     each = np.array(summary["ci95_each"])
     flat = np.concatenate([each[:, :3].ravel(), each[:, 3]])
-    np.testing.assert_allclose(flat / wide, 2.06, rtol=0.15)  # t, 24 degrees
+    ratio = flat / wide  # of t with 8 degrees of freedom, 2.31, and less than that
+    assert 1.7 < ratio.min() < ratio.max() < 2.5
     assert summary["after"]["rms"] < 0.1 < 1.0 < summary["before"]["rms"]
 
 
@@ -87,8 +89,9 @@ def test_stated_intervals_hold_the_truth_as_often_as_they_say(rng):
         ]
         fitted = jaxcal.identify(u[:4], y[:4])
         stated = uncertainty(
-            fitted, records[:4], records[4:], {"std_deg": [0.04] * 3, "samples": 100}
-        )
+            fitted, records[:4], records[4:], {"std_deg": [0.04] * 3, "samples": 100},
+            np.zeros(3),
+        )  # fmt: skip
         found = np.column_stack([fitted.matrix, fitted.bias])
         off = np.abs(found - TRUTH)
         covered.append(off <= np.array(stated["ci95_each"]))
@@ -123,7 +126,7 @@ def test_the_choice_is_shown_before_anything_moves(finished):
 
 
 def test_progress_tells_the_time_left(finished):
-    assert any(re.search(r"\[ *3/13\].*about \d+ s left", line) for line in finished[1])
+    assert any(re.search(r"\[ *3/14\].*about \d+ s left", line) for line in finished[1])
 
 
 def test_held_out_postures_are_not_the_chosen_ones(finished):
@@ -232,7 +235,7 @@ def test_a_terminal_that_goes_away_stops_the_run_and_not_the_stop(tmp_path):
         served = sim.start()
 
         def broken(text):
-            if "1/7" in text or "stop" in text or "acknowledged" in text:
+            if "1/8" in text or "stop" in text or "acknowledged" in text:
                 raise BrokenPipeError("Broken pipe")
 
         record = commissioned(served, folder)
@@ -687,8 +690,8 @@ def test_without_matplotlib_the_report_says_that_figures_are_missing(
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     summary = json.loads((finished[0] / "summary.json").read_text())
     records = read_journal(finished[0] / "journal.jsonl")
-    postures = {r["name"]: r for r in records if r["event"] == "posture"}
-    page = write_report(tmp_path, summary, records[0], postures).read_text()
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    page = write_report(tmp_path, records).read_text()
     assert page.count("matplotlib is not installed") == 3 and "data:image" not in page
 
 
