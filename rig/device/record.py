@@ -39,7 +39,6 @@ class DeviceRecord:
         self._states: dict[str, Any] = {}
         self._voided: dict[str, Any] = {}
         self._left: dict[str, Any] = {}
-        self.sender: str | None = None  # address of the phone found at setup
 
     @classmethod
     def load(cls, path: pathlib.Path) -> DeviceRecord:
@@ -56,7 +55,6 @@ class DeviceRecord:
             record._states = dict(data["states"])
             record._voided = dict(data["voided"])
             record._left = dict(data["left"])
-            record.sender = data.get("sender")
         except FileNotFoundError:
             pass
         except (OSError, ValueError, KeyError, TypeError) as error:
@@ -73,7 +71,6 @@ class DeviceRecord:
             "states": {n: self._states[n] for n in STATES if n in self._states},
             "voided": self._voided,
             "left": self._left,
-            "sender": self.sender,
         }
         write_text(self.path, json.dumps(data, indent=1) + "\n")
 

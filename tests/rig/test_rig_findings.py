@@ -75,9 +75,7 @@ class Chain:
                 stand(f"{name}:{part}", {j: way})
         for a, b in itertools.combinations(range(3), 2):
             for sign, way in (("-", -reach_deg), ("+", reach_deg)):
-                stand(
-                    f"{AXIS_NAMES[a]}{sign}{AXIS_NAMES[b]}+", {a: way, b: reach_deg}
-                )
+                stand(f"{AXIS_NAMES[a]}{sign}{AXIS_NAMES[b]}+", {a: way, b: reach_deg})
         return stands
 
 
