@@ -114,7 +114,10 @@ def test_play_is_the_difference_of_the_two_ways_to_one_place():
     chain.play = np.array([0.5, 0.1, 0.0])
     found = find(CONFIG, chain.stands())
     np.testing.assert_allclose(found.backlash_deg, chain.play, atol=0.01)
-    own = [abs(r * a.pulses_per_deg) for r, a in zip(found.deg_per_pulse, CONFIG.axes)]
+    own = [
+        abs(r * a.pulses_per_deg)
+        for r, a in zip(found.deg_per_pulse, CONFIG.axes, strict=True)
+    ]
     np.testing.assert_allclose(own, 1.0, atol=0.01)  # play does not enter the gain
 
 
@@ -136,7 +139,7 @@ def test_with_names_known_a_mirrored_axis_is_refused_not_put_on_the_phone():
 
 def test_a_phone_placed_quite_otherwise_is_refused_not_explained_by_exchanged_axes():
     chain = Chain(turned=euler_to_matrix((45, 35, 40), "ZYX"))
-    with pytest.raises(MotionFault, match="imu.mounting_deg"):
+    with pytest.raises(MotionFault, match=r"imu\.mounting_deg"):
         find(CONFIG, chain.stands())
 
 
