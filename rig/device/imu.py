@@ -175,7 +175,8 @@ class Imu:
         return bool(readings)
 
     def _take_body(self, body: bytes, address: str) -> bool:
-        if not self._senders.admits(address):
+        # A phone that keeps its connection must learn that nobody listens any more.
+        if self._closing.is_set() or not self._senders.admits(address):
             return False
         with self._lock:
             self.connections = 1

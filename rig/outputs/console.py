@@ -34,6 +34,11 @@ def event_lines(record: dict[str, Any]) -> list[str]:
             return [f"WARNING: {record['reason']}"]
         case "unreachable":
             return [f"  {record['name']} is out of reach: {record['reason']}"]
+        case "comm_restored" if record["error"]:
+            return [
+                f"{record['axis']}: its communication timeout was not put back to "
+                f"{record['counts']} ({record['error']}); `resume` does it"
+            ]
         case "stop":
             units = [f"  {UnitStop(**unit)}" for unit in record["units"]]
             return [f"stop: {record['reason'] or 'end of run'}", *units]

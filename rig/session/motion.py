@@ -109,8 +109,8 @@ class Motion:
         longest = 0.0
         for axis, start, end in zip(self.config.axes, starts, target, strict=True):
             way = abs(axis.to_deg(end - start.position))
-            ramp = axis.speed_deg_s / axis.accel_deg_s2
-            longest = max(longest, way / axis.speed_deg_s + ramp)
+            speed, accel = axis.drive_motion
+            longest = max(longest, way / speed + speed / accel)
         return motion.deadline_factor * longest + motion.deadline_slack_s
 
     def _watch(

@@ -29,6 +29,7 @@ from rig.faults import (
 )
 from rig.guard.limits import check_plan
 from rig.guard.signals import Signals
+from rig.guard.watchdog import timeouts_left
 from rig.outputs.console import event_lines, numbers
 from rig.outputs.journal import Record
 from rig.readings import frame_at
@@ -122,7 +123,8 @@ class Run(RunFolder):
         self.confirm(self)
         imu = Imu(config.imu, report=self.emit)
         bus = Bus(config.bus, config.silence_s, self.emit)
-        self.device = Device(config, bus, imu, self.signals, self.emit)
+        left = timeouts_left(self.journal.records)
+        self.device = Device(config, bus, imu, self.signals, self.emit, left)
         imu.open()
         self.say(f"IMU: waiting for the phone on port {imu.port} ({config.imu.format})")
         self.on_imu_port(imu.port)

@@ -11,10 +11,13 @@ import threading
 import time
 
 import pytest
-from harness import HASTY, changed, fast_config, simulator
+from harness import HASTY, changed, fast_config, fast_text, simulator
+from hypothesis import given
+from hypothesis import strategies as st
 from recorder import Recorder, axis_with, rtu_over_tcp
 
-from rig.config.maps import load_map
+from rig.config import ConfigError, parse_config
+from rig.config.maps import available_maps, load_map
 from rig.config.settings import BusSettings
 from rig.device.bus import Bus, BusError, Rejected
 from rig.device.drives import Drive
@@ -45,6 +48,63 @@ def test_speed_and_ramp_arrive_in_the_makers_units():
     assert axis.motion_counts() == {"speed": 240, "accel": 60, "decel": 60}
     axis = changed(axis, map=load_map("oriental_az"))
     assert axis.motion_counts()["speed"] == 10000
+
+
+def test_a_speed_is_never_rounded_up_to_the_registers_unit():
+    """1 rpm of a motor without a gear is 6 deg/s: 1 deg/s became 6 deg/s."""
+    axis = axis_with("leadshine_pr", reduction=1.0, speed_deg_s=11.9, accel_deg_s2=600)
+    assert axis.motion_counts()["speed"] == 1
+    assert axis.drive_motion[0] == pytest.approx(6.0)
+    slow = changed(axis, speed_deg_s=1.0)
+    with pytest.raises(ValueError, match=r"speed_deg_s: must be at least 6 deg/s"):
+        slow.motion_counts()
+    assert changed(axis, speed_deg_s=6.0).motion_counts()["speed"] == 1
+    text = fast_text({"speed_deg_s = 400": "speed_deg_s = 0.5"})
+    with pytest.raises(ConfigError, match=r"pitch.speed_deg_s: must be at least 0\.6"):
+        parse_config(text)
+
+
+def test_a_ramp_register_holds_a_time_that_is_rounded_up():
+    axis = axis_with("leadshine_pr", reduction=1.0, speed_deg_s=60, accel_deg_s2=3e5)
+    assert axis.motion_counts()["accel"] == 20  # ms per 1000 rpm, of 20 exactly
+    assert changed(axis, accel_deg_s2=2.95e5).motion_counts()["accel"] == 21
+    with pytest.raises(ValueError, match=r"accel_deg_s2: .*does not fit u16"):
+        changed(axis, accel_deg_s2=1.0).motion_counts()
+    coarse = axis_with("applied_motion", reduction=1.0, accel_deg_s2=59.0)
+    with pytest.raises(ValueError, match="accel_deg_s2: must be at least 60 deg/s"):
+        coarse.motion_counts()
+
+
+@given(
+    name=st.sampled_from(available_maps()),
+    speed=st.floats(1e-3, 5000),
+    accel=st.floats(1e-3, 1e5),
+    reduction=st.floats(0.01, 500),
+    per_rev=st.integers(200, 100_000),
+)
+def test_no_drive_is_told_to_be_quicker_than_configured(
+    name, speed, accel, reduction, per_rev
+):
+    axis = axis_with(
+        name, speed_deg_s=speed, accel_deg_s2=accel, reduction=reduction,
+        pulses_per_rev=per_rev,
+    )  # fmt: skip
+    try:
+        counts = axis.motion_counts()
+    except ValueError as error:
+        assert str(error).startswith(("speed_deg_s: ", "accel_deg_s2: "))
+        return
+    units = axis.map.units  # what the makers' units come to, worked out again
+    in_unit = reduction / 360 * (per_rev if units.speed == "pulse_per_s" else 1)
+    told = counts["speed"] / units.speed_per_unit / in_unit
+    least = 1 / units.speed_per_unit / in_unit
+    assert speed - least < told <= speed * (1 + 1e-8)
+    turns = counts["accel"] / units.accel_per_unit
+    if units.accel == "s_per_rev_per_s":
+        turns = 1 / turns
+    in_unit = reduction / 360 * (per_rev if units.accel == "pulse_per_s2" else 1)
+    assert turns / in_unit <= accel * (1 + 1e-8)
+    assert axis.drive_motion == pytest.approx((told, turns / in_unit))
 
 
 @pytest.mark.parametrize("transport", ["tcp", "rtu_tcp", "rtu"])
