@@ -42,12 +42,12 @@ class Imu:
         self._parser = Parser(settings)
         self._ring: deque[Reading] = deque(maxlen=RING)
         self._lock = threading.Lock()
+        self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._lines: LineReceiver | None = None
         self._web: http.server.HTTPServer | None = None
         self._arrived = 0.0
         self._fault = ""
-        self._closed = False
 
     def open(self) -> Imu:
         """Listen, or begin to connect; ImuError where the port cannot be opened."""
@@ -75,7 +75,7 @@ class Imu:
 
     def close(self) -> None:
         """Close every socket and end the thread."""
-        self._closed = True
+        self._closing.set()
         if self._lines is not None:
             self._lines.stop()
         if self._web is not None:
@@ -178,7 +178,7 @@ class Imu:
 
     def _take_body(self, body: bytes, address: str) -> bool:
         # A phone that keeps its connection must learn that nobody listens any more.
-        if self._closed or not self._senders.admits(address):
+        if self._closing.is_set() or not self._senders.admits(address):
             return False
         with self._lock:
             self.connections = 1
