@@ -15,6 +15,8 @@ from rig.device.lock import BusLock
 from rig.faults import EXIT_FAULT, EXIT_OK
 from rig.sessions import load, make_simulator, run_session
 
+COMMISSIONING = ("ports", "scan", "imu", "jog", "home", "axes", "zero", "setup")
+
 
 def run(args: argparse.Namespace) -> int:
     """Run the command that was asked for; returns the exit code."""
@@ -30,8 +32,20 @@ def run(args: argparse.Namespace) -> int:
         "simulate": _simulate,
         "example": _example,
         "check": _check,
+        **dict.fromkeys(("refit", "report", "export", "trend"), _of_recorded),
     }
+    if args.command in COMMISSIONING:
+        from rig.commissioning import run as run_step
+
+        return run_step(args)
     return commands.get(args.command, run_session)(args)
+
+
+def _of_recorded(args: argparse.Namespace) -> int:
+    from rig import results
+
+    command: Callable[[argparse.Namespace], int] = getattr(results, args.command)
+    return command(args)
 
 
 def _identify(args: argparse.Namespace) -> int:

@@ -28,10 +28,17 @@ POLLS, HICCUP_S = 4, 0.25  # of the motion loop's heartbeat
 PHONE = (
     "format", "columns", "quaternion_columns", "unit", "order", "signs", "mounting_deg"
 )  # fmt: skip
+# Left out of ``fingerprint``: addresses, and what version 1 did not know. A key added
+# here leaves the fingerprints of older files as they are.
+UNCOUNTED = {
+    "imu": ("host", "port", "transport", "allow", "stale_s", "heading"),
+    "session": ("drift_limit_deg",),
+}
 # Where bus and phone are reached, and when a session gives up or says that it is good,
 # may change between a run and its resumption.
 UNMEASURED = {
-    "imu": ("host", "port", "transport", "stale_s"),
+    "axes": ("comm_timeout_s",),
+    "imu": ("host", "port", "transport", "allow", "stale_s", "heading"),
     "motion": (
         "poll_s", "deadline_factor", "deadline_slack_s", "stall_s", "following_deg",
         "envelope_margin_deg", "max_disagreement_deg", "heartbeat_s", "mirror_limits",
@@ -41,20 +48,41 @@ UNMEASURED = {
 }  # fmt: skip
 
 
-def measured_by(described: dict[str, Any]) -> dict[str, Any]:
-    """``section.key`` to value, of all in ``RigConfig.described`` but the above.
+def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    """``key: VALUE then, VALUE now`` of two flat tables, where they differ."""
+    return [
+        f"{key}: {then.get(key, 'not known')} then, {now.get(key, 'not known')} now"
+        for key in dict.fromkeys([*then, *now])
+        if then.get(key) != now.get(key)
+    ]
 
-    How the device moves and is measured must not change between a run and its
-    resumption: that is what is left.
-    """
-    tables = json.loads(json.dumps(described, default=str))
-    axes = {f"axes.{axis['name']}": axis for axis in tables.pop("axes")}
-    found = {"mechanism_order": tables.pop("mechanism_order")}
-    del tables["bus"]
-    for name, table in (tables | axes).items():
-        spared = ("comm_timeout_s",) if name in axes else UNMEASURED.get(name, ())
-        found |= {f"{name}.{key}": table[key] for key in table if key not in spared}
+
+def _without(data: dict[str, Any], left_out: dict[str, Any]) -> dict[str, Any]:
+    """A described configuration without its bus and some keys of its tables."""
+    found = {}
+    for name, table in data.items():
+        gone = left_out.get(name, ())
+        if isinstance(table, dict):
+            table = {key: table[key] for key in table if key not in gone}
+        elif name == "axes":
+            table = [{k: axis[k] for k in axis if k not in gone} for axis in table]
+        if name != "bus":
+            found[name] = table
     return found
+
+
+def _flat(data: Any, at: str = "") -> dict[str, Any]:
+    """Dotted key to value; axes are called by their names."""
+    if isinstance(data, dict):
+        pairs = [(str(name), value) for name, value in data.items()]
+    elif data and isinstance(data, list) and isinstance(data[0], dict):
+        pairs = [(value["name"], value) for value in data]
+    else:
+        return {at: data}
+    flat: dict[str, Any] = {}
+    for name, value in pairs:
+        flat |= _flat(value, f"{at}.{name}" if at else name)
+    return flat
 
 
 def _family(register_map: RegisterMap) -> str:
@@ -182,9 +210,22 @@ class RigConfig(Section):
         return {**data, "axes": axes, "mechanism_order": self.mechanism.order}
 
     def fingerprint(self) -> str:
-        """SHA-256 of what a measurement depends on, see ``measured_by``."""
-        text = json.dumps(measured_by(self.described()), sort_keys=True)
+        """SHA-256 of what a measurement depends on, as version 1 took it."""
+        data = _without(self.described(), UNCOUNTED)
+        data["motion"]["heartbeat_s"] = self.motion.heartbeat_s or 3.0  # default then
+        text = json.dumps(data, sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()
+
+    def changed_since(self, described: dict[str, Any]) -> list[str]:
+        """Keys that would make a resumed run move or measure differently, in words.
+
+        Args:
+            described: ``described()`` when the run began, from its journal.
+        """
+        now = json.loads(json.dumps(self.described(), default=str))
+        then, now = (_flat(_without(each, UNMEASURED)) for each in (described, now))
+        # Keys that came after the run began had their defaults in it.
+        return differences(then, {key: now.get(key) for key in then})
 
     def device_fingerprint(self) -> dict[str, Any]:
         """Key of rig.toml to value, of all that says which place a pulse count means.

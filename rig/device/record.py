@@ -1,8 +1,8 @@
 """device.json: what was proved of a device, what has voided it, where it was left.
 
 A device is trusted in steps: IDENTIFIED (these drives answer at these units), HOMED
-(the pulses mean a place), SIGN_CHECKED (each axis turns the joint it is named after, the
-way and about as far as it is told), ZEROED (the attitude of the zero posture is known).
+(the pulses mean a place), SIGN_CHECKED (each axis turns the joint it is named after,
+the way and about as far as it is told), ZEROED (the zero posture's attitude is known).
 ARMED lives in a running process only. No step stands without those before it. A
 session needs all but the last, which it reaches itself before it measures.
 """
@@ -17,6 +17,7 @@ from typing import Any
 
 from jaxcal.files import write_text
 from rig.config import AXIS_NAMES, RigConfig
+from rig.config.config import differences
 from rig.faults import Refused
 
 IDENTIFIED, HOMED = "IDENTIFIED", "HOMED"
@@ -28,15 +29,6 @@ COMMANDS = {
     SIGN_CHECKED: "axes",
     ZEROED: "calibrate",
 }  # that reach a state
-
-
-def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
-    """``key: VALUE then, VALUE now`` of two device fingerprints, where they differ."""
-    return [
-        f"{key}: {then.get(key, 'not known')} then, {now.get(key, 'not known')} now"
-        for key in dict.fromkeys([*then, *now])
-        if then.get(key) != now.get(key)
-    ]
 
 
 class DeviceRecord:
@@ -106,6 +98,8 @@ class DeviceRecord:
             "fingerprint": config.device_fingerprint(),
         }
         self._voided.pop(name, None)
+        if name == HOMED:
+            self._left = {}  # counts of before mean nothing now
         self.save()
 
     def void(self, name: str, reason: str) -> None:
@@ -144,16 +138,29 @@ class DeviceRecord:
 
     # Where the drives stand between sessions
 
-    def left_at(self, positions: Sequence[int | None] = (None, None, None)) -> None:
-        """Where the drives are left, in pulses; None: not known, as while armed."""
+    def left_at(
+        self,
+        positions: Sequence[int | None] = (None, None, None),
+        homed: Sequence[str] = (),
+    ) -> None:
+        """Where the drives are left.
+
+        Args:
+            positions: pulses; None where it is not known, as while armed.
+            homed: names of the axes whose drives say that they are homed.
+        """
         pulses = dict(zip(AXIS_NAMES, positions, strict=True))
-        self._left = {"time": _now(), "pulses": pulses}
+        self._left = {"time": _now(), "pulses": pulses, "homed": list(homed)}
         self.save()
 
     def left(self) -> dict[str, int]:
         """Pulses at which the last session left the axes of which that is known."""
         pulses = self._left.get("pulses", {})
         return {name: count for name, count in pulses.items() if count is not None}
+
+    def left_homed(self) -> list[str]:
+        """Names of the axes whose drives said then that they are homed."""
+        return self._left.get("homed", [])
 
 
 def _now() -> str:

@@ -55,6 +55,18 @@ def read_journal(path: pathlib.Path) -> list[Record]:
         raise JournalError(f"{path}: {error.strerror or error}") from None
 
 
+def measured_postures(records: list[Record]) -> dict[str, Record]:
+    """Every posture measured and not withdrawn since, by name, in order."""
+    found: dict[str, Record] = {}
+    for record in records:
+        if record["event"] == "posture":
+            found[record["name"]] = record
+        elif record["event"] == "void":
+            for name in record["names"]:
+                found.pop(name, None)
+    return found
+
+
 class Journal:
     """The one writer of a journal; a second one on the same run is refused."""
 

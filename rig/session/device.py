@@ -73,8 +73,7 @@ class Device:
     def _check_fit(self, drive: Drive, reset_alarms: bool) -> None:
         axis, status = drive.axis, drive.status()
         if status.fault and reset_alarms and axis.map.alarm_reset:
-            drive.write(axis.map.alarm_reset)
-            status = drive.status()
+            status = drive.bring(axis.map.alarm_reset, lambda s: not s.fault)
         if status.fault:
             raise MotionFault(
                 f"{axis.name} is in alarm: {drive.alarm() or 'no code given'}. Find "
@@ -86,8 +85,7 @@ class Device:
                 "`stop`"
             )
         if not status.enabled:
-            drive.write(axis.map.enable)
-            if not drive.status().enabled:
+            if not drive.bring(axis.map.enable, lambda s: s.enabled).enabled:
                 raise MotionFault(
                     f"{axis.name} does not enable its power stage. Check its "
                     "supply and its enable and STO inputs"

@@ -61,6 +61,6 @@ def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
         if event != "end":
             run.say(f"{event}: {reason}")
             if event != "refused":
-                run.say(f"to go on: python -m rig resume {run.folder}")
+                run.say(f"to go on: {run.to_go_on}")
         run.close()
     return code

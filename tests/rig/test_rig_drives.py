@@ -1,4 +1,4 @@
-"""Drives: the makers' published frames, three transports, retries, and other stacks."""
+"""Drives: three transports, retries, and other stacks."""
 
 import asyncio
 import contextlib
@@ -14,6 +14,7 @@ import pytest
 from harness import HASTY, changed, fast_config, fast_text, simulator
 from hypothesis import given
 from hypothesis import strategies as st
+from recorder import Recorder, axis_with, rtu_over_tcp
 
 from rig.config import ConfigError, parse_config
 from rig.config.maps import available_maps, load_map
@@ -23,44 +24,6 @@ from rig.device.drives import Drive
 from rig.guard.stop import stop_all
 from rig.simulator import parse_fault
 from rig.simulator.server import crc16
-
-
-class Recorder:
-    """A TCP peer that keeps what it is sent and answers from a script."""
-
-    def __init__(self, answer):
-        self.received = b""
-        self._answer = answer
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self.port = self._listener.getsockname()[1]
-        self._connections = []
-        threading.Thread(target=self._run, daemon=True).start()
-
-    def _run(self):
-        while True:
-            try:
-                connection, _ = self._listener.accept()
-            except OSError:
-                return
-            self._connections.append(connection)
-            threading.Thread(
-                target=self._serve, args=(connection,), daemon=True
-            ).start()
-
-    def _serve(self, connection):
-        try:
-            while data := connection.recv(4096):
-                self.received += data
-                reply = self._answer(data)
-                if reply:
-                    connection.sendall(reply)
-        except OSError:
-            return
-
-    def close(self):
-        self._listener.close()
-        for connection in self._connections:
-            connection.close()
 
 
 @pytest.fixture
@@ -74,73 +37,6 @@ def recorder():
     yield make
     for peer in made:
         peer.close()
-
-
-def rtu_over_tcp(port, retries=2):
-    return BusSettings(
-        transport="rtu_tcp", host="127.0.0.1", port=port, timeout_s=0.1,
-        read_retries=retries,
-    )  # fmt: skip
-
-
-def echo_write(frame):
-    """The RTU reply to a write of many registers."""
-    head = frame[:6]
-    return head + crc16(head)
-
-
-def axis_with(name, **changes):
-    axis = fast_config().axes[0]
-    return changed(axis, map=load_map(name), unit=7, **changes)
-
-
-def test_crc_is_the_standards():
-    assert crc16(bytes.fromhex("010300000001")) == bytes.fromhex("840a")
-
-
-def test_leadshine_move_is_the_frame_printed_in_the_makers_manual(recorder):
-    """CS2RS manual, page 43: absolute move to 10000, both ramps 10000 ms."""
-    manual = bytes.fromhex("07106200000810000100002710000027102710000000108D50")
-    assert crc16(manual[:-2]) == manual[-2:]
-    peer = recorder(echo_write)
-    with Bus(rtu_over_tcp(peer.port)) as bus:
-        words = list(struct.unpack(">8H", manual[7:23]))
-        bus.write(7, 0x6200, 16, words)
-        assert peer.received == manual
-        peer.received = b""
-        drive = Drive(bus, axis_with("leadshine_pr", max_pulses=20000))
-        drive.move(10000)
-    frame = peer.received
-    assert frame[:7] == manual[:7] and len(frame) == len(manual)
-    assert frame[7:13] == manual[7:13]  # absolute, 10000, high word first
-    assert frame[-4:-2] == bytes.fromhex("0010")  # run PR path 0 at once
-    assert crc16(frame[:-2]) == frame[-2:]
-    assert peer.received.count(frame) == 1
-
-
-def test_oriental_move_is_one_frame_of_sixteen_registers(recorder):
-    peer = recorder(echo_write)
-    with Bus(rtu_over_tcp(peer.port)) as bus:
-        Drive(bus, axis_with("oriental_az")).move(-1000)
-    frame = peer.received
-    assert frame[:7] == bytes([7, 16, 0x00, 0x58, 0, 16, 32])
-    words = struct.unpack(">16H", frame[7:39])
-    assert words[:4] == (0, 0, 0, 1)  # data 0, type 1: absolute
-    assert words[4:6] == (0xFFFF, 0xFC18)  # -1000, high word first
-    assert words[12:] == (0, 1000, 0, 1)  # full current; start
-
-
-def test_applied_motion_sends_its_parameters_then_the_opcode(recorder):
-    def answer(frame):
-        return echo_write(frame) if frame[1] == 16 else frame
-
-    peer = recorder(answer)
-    with Bus(rtu_over_tcp(peer.port)) as bus:
-        Drive(bus, axis_with("applied_motion")).move(4321)
-    first, second = peer.received[:-8], peer.received[-8:]
-    assert first[:7] == bytes([7, 16, 0, 27, 0, 5, 10])
-    assert first[13:17] == struct.pack(">i", 4321)
-    assert second[:6] == bytes([7, 6, 0, 124, 0, 0x67])
 
 
 def test_speed_and_ramp_arrive_in_the_makers_units():

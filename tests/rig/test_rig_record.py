@@ -6,6 +6,7 @@ import pytest
 from harness import fast_config
 
 from rig.config import parse_config
+from rig.config.config import differences
 from rig.device.record import (
     HOMED,
     IDENTIFIED,
@@ -13,7 +14,6 @@ from rig.device.record import (
     STATES,
     ZEROED,
     DeviceRecord,
-    differences,
 )
 from rig.faults import Refused
 
