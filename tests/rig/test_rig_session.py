@@ -157,14 +157,15 @@ def test_resume_refuses_a_changed_configuration(finished):
         )  # fmt: skip
 
 
-def test_a_changed_verify_limit_does_not_keep_a_run_from_resuming(finished):
+def test_a_changed_verify_limit_does_not_keep_a_run_from_resuming(finished, tmp_path):
     limits = "verify_limit_deg = 9.0\nreference_tolerance_deg = 3.0\n"
     table = '\n[session]\nmethod = "exact"\n' + limits
     judged = parse_config(fast_text({"stall_s = 0.3": "stall_s = 0.4"}, session=table))
-    Run(judged, finished[0], "calibrate", [].append).close()
+    record = commissioned(judged, tmp_path)
+    Run(judged, finished[0], "calibrate", [].append, record=record).close()
     other = parse_config(fast_text({"samples = 5": "samples = 6"}, session=table))
     with pytest.raises(Refused, match=r"settle.samples: 5 then, 6 now"):
-        Run(other, finished[0], "calibrate", [].append)
+        Run(other, finished[0], "calibrate", [].append, record=record)
 
 
 def test_a_resume_that_is_refused_before_it_moves_is_bad_input(tmp_path):
@@ -181,7 +182,8 @@ def test_a_resume_that_is_refused_before_it_moves_is_bad_input(tmp_path):
     with simulator(config) as sim:
         served = sim.start()
         assert session(served, tmp_path, sim, listeners=[pause]) == 4
-        run = Run(served, tmp_path, "calibrate", said.append)
+        record = commissioned(served, tmp_path)
+        run = Run(served, tmp_path, "calibrate", said.append, record=record)
         run.confirm = refuse
         moves = [list(ran) for ran in sim.executions()]
         assert run_safely(run, calibrate) == 2
