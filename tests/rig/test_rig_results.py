@@ -199,11 +199,11 @@ def test_refit_says_why_it_refuses(run, capsys, tmp_path):
 
 
 def test_a_heading_that_drifts_is_taken_out_of_a_session(tmp_path):
-    truth = Truth(noise_deg=0.0, drift_deg_per_min=8.0)
+    truth = Truth(noise_deg=0.0, drift_deg_per_min=3.0)
     assert run_in(tmp_path / "run", fast_text(session=SESSION), truth) == 0
     summary = json.loads((tmp_path / "run/summary.json").read_text())
     assert summary["drift"]["corrected"] and len(summary["drift"]["minutes"]) == 3
-    assert max(map(abs, summary["drift"]["rate_deg_per_min"])) == pytest.approx(8, 0.1)
+    assert max(map(abs, summary["drift"]["rate_deg_per_min"])) == pytest.approx(3, 0.1)
     rows = [*csv.DictReader((tmp_path / "run/pairs.csv").open())]
     chosen = [row for row in rows if row["role"] == "select"]
     u, y = ([[float(row[f"{what}_deg_{axis}"]) for axis in AXIS_NAMES]
@@ -269,6 +269,7 @@ def test_a_report_says_what_there_is_of_an_unfinished_run(run, capsys, kept):
 def test_reports_of_collect_verify_and_goto(run, tmp_path, capsys):
     (tmp_path / "rig.toml").write_text((run / "rig.toml").read_text())
     given = ["--config", str(tmp_path / "rig.toml"), "--simulate", "--rate", "250"]
+    given += ["--noise", "0"]
     out = ["--out", str(tmp_path / "more")]
     assert main(["collect", *given, *out, "--count", "3"]) == 0
     assert main(["verify", str(run), *given, *out, "--count", "1"]) in (0, 1)
