@@ -10,9 +10,9 @@ from typing import Any
 
 from rig.commission import steps
 from rig.commission.home import can_home
+from rig.commission.operator import Operator
 from rig.commission.ports import serial_lines
 from rig.commission.scan import Found, parse_bus, scan
-from rig.commission.operator import Operator
 from rig.commission.toml import create, edit, new_text, set_values
 from rig.config import AXIS_NAMES, RigConfig
 from rig.config.axis import DEFAULT_ROTATES

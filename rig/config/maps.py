@@ -28,6 +28,7 @@ from rig.config.schema import Section, key, parse, read_text
 LATER_KEYS = (
     "pulses_per_rev", "target", "home", "homed", "absolute_encoder", "ready_s",
     "set_zero", "recognise",
+    "broadcast_stop",
 )  # fmt: skip
 MAP_FOLDER = pathlib.Path(__file__).parent.parent / "maps"
 
@@ -58,6 +59,7 @@ class RegisterMap(Section):
         "`trigger` is the last word"
     )
     stop: Writes = key("`write`: frames of the quick stop; torque must stay on")
+    broadcast_stop: bool = key("every unit of a serial line obeys its stop to 0", False)
     enable: Writes | None = key("`write`: switch the power stage on", None)
     alarm_reset: Writes | None = key("`write`: reset an alarm", None)
     comm_timeout: CommTimeout | None = key(

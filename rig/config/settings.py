@@ -150,7 +150,10 @@ class MotionSettings(Section):
     max_disagreement_deg: float = key(
         "between IMU and command at a posture", 45.0, 0.1, 180
     )
-    heartbeat_s: float = key("a motion loop silent for so long: stop", 3.0, 0.2, 60)
+    heartbeat_s: float | None = key(
+        "a motion loop silent for so long: stop; at most the shortest step",
+        "of [bus] and poll_s", 0.1, 60, by=lambda made: None,
+    )  # fmt: skip
     mirror_limits: bool = key("write the soft limits to the drives too", False)
 
 

@@ -47,6 +47,7 @@ class Imu:
         self._web: http.server.HTTPServer | None = None
         self._arrived = 0.0
         self._fault = ""
+        self._closed = False
 
     def open(self) -> Imu:
         """Listen, or begin to connect; ImuError where the port cannot be opened."""
@@ -74,6 +75,7 @@ class Imu:
 
     def close(self) -> None:
         """Close every socket and end the thread."""
+        self._closed = True
         if self._lines is not None:
             self._lines.stop()
         if self._web is not None:
@@ -175,7 +177,8 @@ class Imu:
         return bool(readings)
 
     def _take_body(self, body: bytes, address: str) -> bool:
-        if not self._senders.admits(address):
+        # A phone that keeps its connection must learn that nobody listens any more.
+        if self._closed or not self._senders.admits(address):
             return False
         with self._lock:
             self.connections = 1

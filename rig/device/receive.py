@@ -212,6 +212,7 @@ def make_web(
                 return
             known = take(self.rfile.read(int(length)), self.client_address[0])
             self.send_response(200 if known else 403)
+            self.close_connection = not known
             self.send_header("Content-Length", "0")
             self.end_headers()
 

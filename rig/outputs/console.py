@@ -23,10 +23,22 @@ def event_lines(record: dict[str, Any]) -> list[str]:
             return [f"zero taken at pulses {record['pulses']}"]
         case "void":
             return [f"  withdrawn, to be measured again: {', '.join(record['names'])}"]
+        case "lost_reply":
+            found = {
+                "obeyed": "the drive obeys",
+                "not taken": "the drive did not take it, so it is sent again",
+                "unknown": "whether the drive took it is unknown, so all stop",
+            }[record["outcome"]]
+            return [f"  the reply to a move of {record['axis']} was lost: {found}"]
         case "sender_refused":
             return [f"WARNING: {record['reason']}"]
         case "unreachable":
             return [f"  {record['name']} is out of reach: {record['reason']}"]
+        case "comm_restored" if record["error"]:
+            return [
+                f"{record['axis']}: its communication timeout was not put back to "
+                f"{record['counts']} ({record['error']}); `resume` does it"
+            ]
         case "stop":
             units = [f"  {UnitStop(**unit)}" for unit in record["units"]]
             return [f"stop: {record['reason'] or 'end of run'}", *units]

@@ -106,9 +106,11 @@ class Journal:
                     written += os.write(self._fd, data[written:])
                 if sync:
                     os.fsync(self._fd)
-            except OSError as error:
+            except BaseException as error:  # a signal's too, while nothing is armed
                 with contextlib.suppress(OSError):  # or the next writer cuts it off
                     os.ftruncate(self._fd, self._size)
+                if not isinstance(error, OSError):
+                    raise
                 raise JournalError(
                     f"cannot write {self.path}: {error.strerror or error}"
                 ) from None

@@ -18,7 +18,11 @@ from rig.faults import Refused
 from rig.outputs.journal import Journal, JournalError, Record, measured_postures
 
 JOURNAL = "journal.jsonl"
-SPARED = ("write", "stop")  # a full disk must not keep a stop from the bus
+SPARED = (
+    "write",
+    "stop",
+    "comm_restored",
+)  # a full disk must not keep a stop from the bus
 
 
 def new_run_folder(output: pathlib.Path, mode: str) -> pathlib.Path:

@@ -29,6 +29,7 @@ from rig.faults import (
 )
 from rig.guard.limits import check_plan
 from rig.guard.signals import Signals
+from rig.guard.watchdog import timeouts_left
 from rig.outputs.console import event_lines, numbers
 from rig.outputs.journal import Record
 from rig.readings import frame_at
@@ -122,7 +123,8 @@ class Run(RunFolder):
         self.confirm(self)
         imu = Imu(config.imu, report=self.emit)
         bus = Bus(config.bus, config.silence_s, self.emit)
-        self.device = Device(config, bus, imu, self.signals, self.emit)
+        left = timeouts_left(self.journal.records)
+        self.device = Device(config, bus, imu, self.signals, self.emit, left)
         imu.open()
         self.say(f"IMU: waiting for the phone on port {imu.port} ({config.imu.format})")
         self.on_imu_port(imu.port)
@@ -142,10 +144,9 @@ class Run(RunFolder):
         target = self.zero_at or self.zero_pulses
         if target is None and self.config.session.zero == "drive":
             target = (0, 0, 0)
-        if target is not None:
-            self.motion.move_to(target, "zero")
-        else:
-            target = device.positions()
+        here, target = target is None, target or device.positions()
+        if not here or self.config.motion.approach_overshoot_deg:
+            self.motion.move_to(target, "zero")  # from the side of all references
         check_plan(self.config, [target])  # it is where a resumed run looks again
         # Every posture is measured against this one, so its noise must be the smaller.
         samples = ZERO_FACTOR * self.config.settle.samples

@@ -157,8 +157,7 @@ class SimDrive:
             self.position, self.velocity = float(self.target), 0.0
             self.moving, self.done = False, True
             if self._homing:
-                self.target, self.offset = 0, 0
-                self.position, self.homed, self._homing = 0.0, True, False
+                self.find_origin()
             return
         self.position += step
 
@@ -168,6 +167,12 @@ class SimDrive:
         self.alarm = code
         self.done = False
         self._stopping = self.moving
+
+    def find_origin(self) -> None:
+        """Count from the motor's origin again, as homing ends."""
+        self.position -= self.offset
+        self.target, self.offset = round(self.position), 0
+        self.homed, self._homing = True, False
 
     def power_cycle(self, offset: int = 0) -> None:
         """Off and on again: its counter comes back ``offset`` pulses away."""
@@ -200,7 +205,7 @@ class SimDrive:
 
     def _counter(self) -> int:
         """The position as read: at rest it may flicker."""
-        most = 0 if self.moving else self.habits.jitter_counts
+        most = 0 if self.velocity else self.habits.jitter_counts
         return round(self.position) + self._random.randint(-most, most)
 
     def _status(self) -> int:

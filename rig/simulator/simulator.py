@@ -116,6 +116,10 @@ class Simulator:
         """Undo every fault, as a technician would before the run is resumed."""
         self.faults.clear()
         self.plant.tighten()
+        with self.server.lock:
+            for drive in self.drives:
+                if drive.offset:
+                    drive.find_origin()
 
     def executions(self) -> list[list[int]]:
         """Targets in pulses each drive really ran, pitch, yaw, roll."""
