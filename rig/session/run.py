@@ -23,6 +23,7 @@ from rig.guard.limits import check_plan
 from rig.guard.signals import Signals
 from rig.outputs.console import event_lines, numbers
 from rig.outputs.journal import Record
+from rig.outputs.telemetry import Telemetry
 from rig.session.device import Device
 from rig.session.folder import RunFolder
 from rig.session.measuring import Observer, frame_at
@@ -51,6 +52,7 @@ class Run(RunFolder):
         self.confirm: Callable[[Run], None] = lambda run: None  # before ports open
         self.on_imu_port: Callable[[int], object] = lambda port: None
         self.device: Device | None = None
+        self.telemetry: Telemetry | None = None
         self.frame: Frame | None = None
         self.zero_pulses: Pulses | None = None
         self.zero_at = zero_at
@@ -89,11 +91,15 @@ class Run(RunFolder):
         config = self.config
         self.confirm(self)
         imu, bus = Imu(config.imu), Bus(config.bus, config.silence_s, self.emit)
-        self.device = Device(config, bus, imu, self.signals, self.emit)
+        self.device = device = Device(config, bus, imu, self.signals, self.emit)
         imu.open()
         self.say(f"IMU: waiting for the phone on port {imu.port} ({config.imu.format})")
         self.on_imu_port(imu.port)
         bus.open()
+        self.telemetry = Telemetry(
+            self.folder, config, imu, device.drives, lambda: device.frame
+        )
+        self.telemetry.start()
         imu.wait_for_stream(STREAM_WAIT_S)
         self.signals.armed = True
         self.device.arm(self._reset_alarms)
@@ -158,6 +164,7 @@ class Run(RunFolder):
         self.signals.check_pause()
         pitch, yaw, roll = (int(count) for count in pulses)
         begun = time.monotonic()
+        self.emit("visit", name=name, pulses=[pitch, yaw, roll])
         try:
             self.motion.move_to((pitch, yaw, roll), name)
             measured = self.observer.measure((pitch, yaw, roll), name)
@@ -198,6 +205,8 @@ class Run(RunFolder):
 
     def disarm(self) -> None:
         """Nothing more will move: close the device, free the signals."""
+        if self.telemetry is not None:
+            self.telemetry.close()
         if self.device is not None:
             self.device.close()
         self.device = None
