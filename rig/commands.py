@@ -11,7 +11,7 @@ from rig.config import ConfigError, example_text, load_config
 from rig.config.files import example_names
 from rig.device.bus import Bus, BusError
 from rig.device.drives import Drive
-from rig.faults import EXIT_FAULT, EXIT_OK
+from rig.faults import EXIT_FAULT, EXIT_OK, Refused
 from rig.sessions import load, make_simulator, run_session
 
 
@@ -29,6 +29,7 @@ def run(args: argparse.Namespace) -> int:
         "simulate": _simulate,
         "example": _example,
         "check": _check,
+        "watch": _watch,
     }
     return commands.get(args.command, run_session)(args)
 
@@ -100,6 +101,20 @@ def _simulate(args: argparse.Namespace) -> int:
                 time.sleep(3600)
         except KeyboardInterrupt:
             return EXIT_OK
+
+
+def _watch(args: argparse.Namespace) -> int:
+    from jaxcal.extras import needs
+    from rig.live import launch
+
+    if not (args.run / "journal.jsonl").is_file():
+        raise Refused(f"{args.run} holds no run")
+    with needs("live", "the live page"):
+        from rig.live.server import serve
+    sock, token, url = launch.listen(args.live_host)
+    print(f"live page: {url}\nCtrl-C ends", flush=True)
+    serve(args.run, sock, token)
+    return EXIT_OK
 
 
 def _example(args: argparse.Namespace) -> int:
