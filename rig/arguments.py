@@ -41,6 +41,13 @@ def _within(low: float, high: float) -> Callable[[str], float]:
     return number
 
 
+def _axes(text: str) -> list[str]:
+    names = text.split(",")
+    if unknown := [name for name in names if name not in ("pitch", "yaw", "roll")]:
+        raise argparse.ArgumentTypeError(f"no axis {unknown[0]!r}: pitch, yaw, roll")
+    return names
+
+
 def _number(low: float, high: float, default: float, text: str) -> dict[str, Any]:
     text = f"{text} (default {default:g})"
     return {"type": _within(low, high), "default": default, "help": text}
@@ -83,6 +90,11 @@ SIMULATOR: Options = {
     "--drift": _number(-90.0, 90.0, 0.0, "degrees per minute"),
     "--speedup": _number(0.01, 100.0, 1.0, "factor on the speed of the axes"),
     "--rate": _number(0.1, 1000.0, 100.0, "of the phone, Hz"),
+    "--reversed": {"type": _axes, "metavar": "AXES", "help": "turn the other way"},
+    "--swapped": {"type": _axes, "metavar": "A,B", "help": "two drives change cables"},
+    "--gearing": {"type": int, "metavar": "PULSES", "help": "per turn, in the drives"},
+    "--lost-origin": _number(-90.0, 90.0, 0.0, "degrees the counts are off"),
+    "--realistic": _flag("slow replies and enabling, jitter, idle watchdog"),
 }
 SESSION: Options = CONFIG | FOLDER | MOTION | LIVE
 FOLDER_OF: Options = {"run": _path("the run's folder")}

@@ -11,6 +11,7 @@ from rig.config import ConfigError, example_text, load_config
 from rig.config.files import example_names
 from rig.device.bus import Bus, BusError
 from rig.device.drives import Drive
+from rig.device.lock import BusLock
 from rig.faults import EXIT_FAULT, EXIT_OK, Refused
 from rig.sessions import load, make_simulator, run_session
 
@@ -40,6 +41,8 @@ def _identify(args: argparse.Namespace) -> int:
         if args.simulate:
             simulator = make_simulator(config, vars(args), args.fault)
             config = stack.enter_context(simulator).start()
+        # Its reads would delay those of a session that moves.
+        stack.enter_context(BusLock(config.bus).acquire("identify"))
         bus = stack.enter_context(Bus(config.bus, config.silence_s))
         for axis in config.axes:
             try:

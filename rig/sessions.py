@@ -24,7 +24,10 @@ if TYPE_CHECKING:
     from rig.session.run import Run
     from rig.simulator import Simulator
 
-SIMULATION = ("transport", "noise", "backlash", "drift", "speedup", "rate")
+SIMULATION = (
+    "transport", "noise", "backlash", "drift", "speedup", "rate", "reversed", "swapped",
+    "gearing", "lost_origin", "realistic",
+)  # fmt: skip
 
 
 def load(args: argparse.Namespace) -> RigConfig:
@@ -40,14 +43,9 @@ def make_simulator(
     config: RigConfig, options: dict[str, Any], faults: list[str]
 ) -> Simulator:
     """A simulated rig as the options of the command line describe it."""
-    from rig.simulator import Simulator, Truth, parse_fault
+    from rig.simulator import Simulator, parse_fault, truth_of
 
-    truth = Truth(
-        noise_deg=options["noise"],
-        backlash_deg=options["backlash"],
-        drift_deg_per_min=options["drift"],
-        seed=config.session.seed,
-    )
+    truth = truth_of(options, config.session.seed)
     return Simulator(
         config,
         truth,
@@ -60,6 +58,7 @@ def make_simulator(
 
 def run_session(args: argparse.Namespace) -> int:
     """Run a session, new or resumed; returns the exit code."""
+    from rig.device.lock import BusLock
     from rig.session.folder import new_run_folder
     from rig.session.run import Run
     from rig.session.runner import run_safely
@@ -70,16 +69,21 @@ def run_session(args: argparse.Namespace) -> int:
     procedure, zero_at = _procedure(mode, start["inputs"])
     if args.zero:
         zero_at = None  # the operator put the device into its zero posture
-    if resumed:
-        folder = args.run
-    else:
-        folder = new_run_folder(args.out or pathlib.Path(config.output), mode)
-        (folder / "rig.toml").write_text(config.text, encoding="utf-8")
+    dry_run = getattr(args, "dry_run", False)
     with contextlib.ExitStack() as stack:
-        simulator = None
+        simulator, text = None, config.text
         if start["simulated"] is not None:
             simulator = make_simulator(config, start["simulated"], args.fault)
             config = stack.enter_context(simulator).start()
+        lock = BusLock(config.bus)
+        if not dry_run:
+            stack.enter_context(lock.acquire(args.command))
+        if resumed:
+            folder = args.run
+        else:
+            folder = new_run_folder(args.out or pathlib.Path(config.output), mode)
+            (folder / "rig.toml").write_text(text, encoding="utf-8")
+        lock.tell(run=str(folder.resolve()))
         session = Run(
             config,
             folder,
@@ -88,7 +92,7 @@ def run_session(args: argparse.Namespace) -> int:
             start={key: start[key] for key in ("simulated", "inputs", "maps_from")},
             reset_alarms=args.reset_alarms,
             zero_at=zero_at,
-            dry_run=getattr(args, "dry_run", False),
+            dry_run=dry_run,
         )
         if simulator is None:
             session.confirm = functools.partial(_confirm, args)

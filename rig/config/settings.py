@@ -96,6 +96,10 @@ class ImuSettings(Section):
     mounting_deg: tuple[Angle, Angle, Angle] = key(
         "turn of the phone on the end-effector about Z, then Y, then X", (0.0, 0.0, 0.0)
     )
+    heading: Literal["relative", "absolute"] = key(
+        "absolute: the phone comes back to the same heading whenever it is started",
+        "relative",
+    )
     stale_s: float = key("older than this while moving: stop", 0.4, 0.02, 10)
     max_jump_deg: float = key("between two readings", 20.0, 0.1, 180)
 
@@ -171,7 +175,9 @@ class SessionSettings(Section):
     roll_range_deg: Range | None = key("likewise", None)
     verify_postures: int = key("held out; each before and after", 4, 0, 1000)
     verify_limit_deg: float = key("largest good error once compensated", 0.5, 1e-3, 45)
-    reference_tolerance_deg: float = key("zero posture on `resume`", 0.5, 1e-3, 45)
+    reference_tolerance_deg: float = key(
+        "the zero posture may be found so far from where it was", 0.5, 1e-3, 45
+    )
     max_unreachable: int = key("postures out of reach until a fault", 3, 0, 1000)
     zero: Literal["here", "drive"] = key(
         "here: the device stands in its zero posture; drive: go to pulse 0", "here"

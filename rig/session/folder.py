@@ -65,18 +65,18 @@ class RunFolder:
             "arguments": sys.argv[1:],
             "started": now.isoformat(timespec="seconds"),
         }
-        fingerprint = self.config.fingerprint()
         if known := self.journal.events("start"):
-            if known[0]["fingerprint"] != fingerprint:
+            if changed := self.config.changed_since(known[0]["config"]):
                 raise Refused(
-                    f"{self.folder}: the configuration changed since this run began "
-                    "(only the addresses of bus and phone may). Start a new run"
+                    f"{self.folder}: the configuration changed since this run began: "
+                    f"{'; '.join(changed)}. Addresses and limits may change, nothing "
+                    "else. Start a new run"
                 )
             if known[0]["mode"] != mode:
                 raise Refused(f"{self.folder} is a {known[0]['mode']} run")
             self.emit("resume", sync=True, **provenance)
             return
-        config = self.config.described()
+        config, fingerprint = self.config.described(), self.config.fingerprint()
         start = {"config": config, **provenance, **start}
         self.emit(
             "start", sync=True, schema=1, mode=mode, fingerprint=fingerprint, **start

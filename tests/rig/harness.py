@@ -17,6 +17,7 @@ from unittest import mock
 
 from rig.config import RigConfig, parse_config
 from rig.config.files import EXAMPLES
+from rig.device.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
 from rig.guard import stop
 from rig.outputs import report
 from rig.session.calibrate import calibrate
@@ -63,6 +64,15 @@ def changed(settings, **changes):
 
 def fast_config(changes: dict[str, str] | None = None) -> RigConfig:
     return parse_config(fast_text(changes))
+
+
+def commissioned(config: RigConfig, folder: pathlib.Path) -> DeviceRecord:
+    """The record in a folder, with every state that a session needs."""
+    record = DeviceRecord.load(folder / "device.json")
+    for name in (IDENTIFIED, HOMED, SIGN_CHECKED):
+        if record.state(name) is None:
+            record.reach(name, config)
+    return record
 
 
 def simulator(config: RigConfig, **options) -> Simulator:

@@ -1,5 +1,6 @@
 """Configuration and maps: every fault at once, and all that ships is valid."""
 
+import json
 import pathlib
 
 import pydantic
@@ -20,6 +21,35 @@ GENERIC = (MAP_FOLDER / "generic.toml").read_text()
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda p: p.stem)
 def test_every_example_is_valid(path):
     assert load_config(path).fingerprint()
+
+
+@pytest.mark.parametrize(
+    ("name", "digest"),
+    [
+        ("applied_motion", "0c4feedd22a0ace4"),
+        ("generic", "f9e9b5c368d0ce6a"),
+        ("leadshine_pr", "b44aa4d170aa15ab"),
+        ("oriental_az", "c7934a5f0deea16c"),
+        ("simulate", "4821a105dec416dd"),
+    ],
+)
+def test_fingerprints_of_version_1_stay_what_they_were(name, digest):
+    """A new key belongs in config.UNCOUNTED or maps.LATER_KEYS."""
+    text = (EXAMPLES / f"{name}.toml").read_text()
+    assert parse_config(text).fingerprint().startswith(digest)
+
+
+def test_what_changed_since_a_run_began_is_named_but_for_addresses_and_limits():
+    began = json.loads(json.dumps(parse_config(EXAMPLE_TEXT).described()))
+    limits = "\n[session]\nverify_limit_deg = 0.3\nreference_tolerance_deg = 1.0\n"
+    same = EXAMPLE_TEXT.replace("port = 5020", "port = 1") + limits
+    assert parse_config(same).changed_since(began) == []
+    other = EXAMPLE_TEXT.replace("samples = 25", "samples = 30")
+    other = other.replace("direction = -1", "direction = 1")
+    assert parse_config(other).changed_since(began) == [
+        "settle.samples: 25 then, 30 now",
+        "axes.yaw.scale.direction: -1 then, 1 now",
+    ]
 
 
 @pytest.mark.parametrize("name", available_maps())
