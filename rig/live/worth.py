@@ -14,16 +14,16 @@ from numpy.typing import ArrayLike
 
 from rig.attitude import Array
 
-UNIT_INPUTS = 3
+NUM_INPUTS = 3
 FLAT_DEG = 1e-6  # nearer to the flat than this is in it
 FLATS = ("", "from the first", "off the line of two", "off the plane of three")
 
 
 def reasons(postures: ArrayLike) -> list[str]:
     """Why each of (N, 3) postures, visited in this order: its gain in log det."""
-    points = np.asarray(postures, dtype=np.float64).reshape(-1, UNIT_INPUTS)
+    points = np.asarray(postures, dtype=np.float64).reshape(-1, NUM_INPUTS)
     texts: list[str] = []
-    basis = np.empty((0, UNIT_INPUTS))  # orthonormal rows that span the flat
+    basis = np.empty((0, NUM_INPUTS))  # orthonormal rows that span the flat
     for count, point in enumerate(points):
         if count == 0:
             texts.append("the first: nothing to compare with")
@@ -35,7 +35,7 @@ def reasons(postures: ArrayLike) -> list[str]:
             basis = np.vstack([basis, off / distance])
             gain, flat = 6.0 * np.log(distance), len(basis)
             text = f"{distance:.1f}° {FLATS[flat]}: {gain:+.1f} log det"
-            if flat == UNIT_INPUTS:
+            if flat == NUM_INPUTS:
                 text += "; with it all twelve are known"
             texts.append(text)
             continue
@@ -53,13 +53,13 @@ def ellipsoid(postures: ArrayLike, noise_deg: float) -> tuple[Array, Array]:
         (3,) in degrees per degree, ``inf`` along directions no posture has measured,
         and (3, 3) the directions, one a column, right-handed.
     """
-    points = np.asarray(postures, dtype=np.float64).reshape(-1, UNIT_INPUTS)
+    points = np.asarray(postures, dtype=np.float64).reshape(-1, NUM_INPUTS)
     if len(points) < 2:
-        return np.full(UNIT_INPUTS, np.inf), np.eye(UNIT_INPUTS)
+        return np.full(NUM_INPUTS, np.inf), np.eye(NUM_INPUTS)
     off = points - points.mean(axis=0)
     spread, directions = np.linalg.eigh(off.T @ off)
-    with np.errstate(divide="ignore"):
-        std = noise_deg / np.sqrt(np.where(spread > FLAT_DEG, spread, 0.0))
+    std = np.full(NUM_INPUTS, np.inf)
+    std[spread > FLAT_DEG] = noise_deg / np.sqrt(spread[spread > FLAT_DEG])
     directions[:, 0] *= np.sign(np.linalg.det(directions))
     return std, directions
 
@@ -72,9 +72,9 @@ def prediction_std(
     Over (M, 3) candidates, and the same on each axis; ``inf`` until four postures that
     lie in no plane are measured.
     """
-    points = np.asarray(postures, dtype=np.float64).reshape(-1, UNIT_INPUTS)
+    points = np.asarray(postures, dtype=np.float64).reshape(-1, NUM_INPUTS)
     rows = np.column_stack([points, np.ones(len(points))])
-    if np.linalg.matrix_rank(rows) <= UNIT_INPUTS:
+    if np.linalg.matrix_rank(rows) <= NUM_INPUTS:
         return np.inf, np.inf
     wanted = np.asarray(candidates, dtype=np.float64)
     wanted = np.column_stack([wanted, np.ones(len(wanted))])
