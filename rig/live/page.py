@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import time
 from typing import Any
@@ -19,8 +20,10 @@ HEAD = """
 <link rel="stylesheet" href="/page.css">
 <script src="/page.js" defer></script>
 """
-ACTIONS = """
-<div id="actions" hidden>
+# Stands before anything is connected: STOP works from the first moment.
+BODY = """
+<header id="head">{head}</header>
+<div id="actions" {hidden}>
   <p id="answer" role="status" aria-live="assertive"></p>
   <button id="pause" type="button">PAUSE<small>after this posture</small></button>
   <button id="stop" type="button">STOP<small>all drives, now</small></button>
@@ -116,16 +119,8 @@ class LivePage:
         """Draw everything that follows from the journal."""
         watcher, state = self.watcher, self.watcher.state
         self._version = watcher.version
-        tone, line = words.headline(state, watcher.running)
-        share, said = words.progress(state)
-        bar = f"<i style='width:{100 * min(1.0, share):.1f}%'></i>"
-        simulated = "<em>simulated</em>" if state.start.get("simulated") else ""
-        head = (
-            f"<h1>{words.text(state.mode)} {simulated}"
-            f"<small>{words.text(watcher.folder.name)}</small></h1>"
-            f"<p class='now {tone}'>{words.text(line)}</p>"
-            f"<div class='bar'>{bar}</div><p class='note'>{words.text(said)}</p>"
-        )
+        tone = words.headline(state, watcher.running)[0]
+        head = words.head(state, watcher.running, watcher.folder.name)
         ui.run_javascript(f"live.head({json.dumps(head)}, {json.dumps(watcher.here)})")
         self._show(self._trouble, words.trouble(
             state, watcher.running, str(watcher.folder)
@@ -158,9 +153,13 @@ def make_page(watcher: Watcher) -> Any:
 
     async def page() -> None:
         ui.add_head_html(HEAD)
-        ui.add_body_html(f'<header id="head"></header>{ACTIONS}')
+        state, hidden = watcher.state, "" if watcher.here else "hidden"
+        head = words.head(state, watcher.running, watcher.folder.name)
+        ui.add_body_html(BODY.format(head=head, hidden=hidden))
         await ui.context.client.connected()
-        dark = await ui.run_javascript(DARK_QUERY, timeout=5.0)
+        dark = await ui.run_javascript(DARK_QUERY, timeout=20.0)
+        while not watcher.state.start:  # the device's axes are drawn from it
+            await asyncio.sleep(TICK_S)
         live = LivePage(watcher, DARK if dark else LIGHT)
         ui.timer(TICK_S, live.tick)
 

@@ -152,6 +152,19 @@ def progress(state: RunState) -> tuple[float, str]:
     return (done / planned if planned else 0.0), words
 
 
+def head(state: RunState, running: bool, folder: str) -> str:
+    """The head of the page: which run, what happens now, how far it is."""
+    tone, line = headline(state, running)
+    share, said = progress(state)
+    simulated = "<em>simulated</em>" if state.start.get("simulated") else ""
+    return (
+        f"<h1>{text(state.mode)} {simulated}<small>{text(folder)}</small></h1>"
+        f"<p class='now {tone}'>{text(line)}</p>"
+        f"<div class='bar'><i style='width:{100 * min(1.0, share):.1f}%'></i></div>"
+        f"<p class='note'>{text(said)}</p>"
+    )
+
+
 def queue(state: RunState) -> str:
     """The postures: state, commanded, measured and why."""
     postures = list(state.postures.values())

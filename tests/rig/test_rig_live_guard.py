@@ -291,7 +291,7 @@ def _handshake(port, origin, cookie):
     ]  # fmt: skip
     with socket.create_connection(("127.0.0.1", port), timeout=30) as sock:
         sock.sendall(("\r\n".join(lines) + "\r\n\r\n").encode())
-        return sock.recv(200).decode().split("\r\n")[0]
+        return sock.recv(200).split(b"\r\n")[0].decode()
 
 
 def test_the_served_page_refuses_a_websocket_of_another_site(served):
