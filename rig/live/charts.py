@@ -154,7 +154,7 @@ def settling(
 def noise(state: RunState, palette: Palette) -> dict[str, Any]:
     """Scatter of the readings of every posture."""
     options = _frame(palette, "posture", "degrees")
-    done = [posture for posture in state.done if posture.std]
+    done = [posture for posture in state.done if posture.std][-POINTS:]
     options["xAxis"] |= {"min": 0.5, "max": max(5, len(done)) + 0.5, "minInterval": 1}
     options["yAxis"]["min"] = 0
     for axis, (name, color) in enumerate(zip(AXIS_NAMES, AXIS_COLORS, strict=True)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from nicegui import ui
 
 from rig.config import AXIS_NAMES
 from rig.live.charts import AXIS_COLORS, Palette
-from rig.live.state import Degrees, RunState
+from rig.live.state import Degrees, Posture, RunState
 from rig.live.worth import ellipsoid
 
 RADII = (1.5, 1.2)  # of the two rings of the gimbal
@@ -23,7 +24,9 @@ FOOT = (  # outline of the sole, toes along +y
     (0.31, -0.45), (0.26, -0.72), (0.12, -0.82), (-0.12, -0.82),
 )  # fmt: skip
 GHOST = "#e0568f"
-STATE_COLORS = {"done": "#1fae85", "waiting": "#8c98a6", "unreachable": "#d1453b"}
+STATE_COLORS = {"done": "#1fae85", "waiting": "#8c98a6"}
+ACTIVE_COLOR = "#3b9de0"
+MARKED = 200  # postures of a kind; more would make the page slow
 UNKNOWN = 1.0  # drawn radius along directions that no posture has measured
 LEAST = 0.12  # drawn radius of a slope known to KNOWN
 KNOWN = 1e-4  # degrees per degree
@@ -192,22 +195,24 @@ class CommandScene:
                 shade = self._palette.metal.lstrip("#")
                 rgb = [int(shade[i : i + 2], 16) / 255 for i in (0, 2, 4)]
                 self._cloud = ui.scene.point_cloud(points, [rgb] * len(points), 0.07)
-            for posture in state.by_role("select", "collect", "goto"):
-                look = posture.state
-                if posture.commanded is None or self._marks.get(
-                    posture.name, ("", None)
-                )[0] == look:  # fmt: skip
-                    continue
-                if posture.name in self._marks:
-                    self._marks[posture.name][1].delete()
-                color = STATE_COLORS.get(look, "#3b9de0")
-                mark = ui.scene.sphere(0.065 if look == "done" else 0.05)
-                mark.material(color).move(*place(posture.commanded).tolist())
-                self._marks[posture.name] = (look, mark)
-            standing = {p.name for p in state.by_role("select", "collect", "goto")}
-            for name in self._marks.keys() - standing:
-                self._marks.pop(name)[1].delete()
+            marked = state.by_role("select", "goto")[:MARKED]
+            marked += [p for p in state.done if p.role == "collect"][-MARKED:]
+            self._mark(marked, place)
         self._ellipsoid(state)
+
+    def _mark(self, postures: list[Posture], place: Callable[[Any], Any]) -> None:
+        """A sphere for each posture, made anew where its state has changed."""
+        looks = {p.name: p.state for p in postures if p.commanded is not None}
+        for name, (look, mark) in [*self._marks.items()]:
+            if looks.get(name) != look:
+                mark.delete()
+                del self._marks[name]
+        for posture in postures:
+            if posture.name in looks and posture.name not in self._marks:
+                mark = ui.scene.sphere(0.065 if posture.state == "done" else 0.05)
+                mark.material(STATE_COLORS.get(posture.state, ACTIVE_COLOR))
+                mark.move(*place(posture.commanded).tolist())
+                self._marks[posture.name] = (posture.state, mark)
 
     def _ellipsoid(self, state: RunState) -> None:
         chosen = [p for p in state.by_role("select") if p.state == "done"]

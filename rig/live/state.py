@@ -182,13 +182,17 @@ class RunState:
         if posture.role == "reference":
             self.drift.append((now, record["measured_deg"]))
         self.current = None
-        self.queue = [name for name in self.queue if name != record["name"]]
+        self._leave_queue(record["name"])
+
+    def _leave_queue(self, name: str) -> None:
+        if name in self.queue:
+            self.queue.remove(name)
 
     def _drop(self, name: str, state: Visit, note: str) -> None:
         posture = self._posture(name)
         posture.state, posture.note, posture.time = state, note, self.time
         posture.measured = posture.std = None
-        self.queue = [other for other in self.queue if other != name]
+        self._leave_queue(name)
         if self.current == name:
             self.current = None
 

@@ -24,7 +24,11 @@ def reasons(postures: ArrayLike) -> list[str]:
     points = np.asarray(postures, dtype=np.float64).reshape(-1, NUM_INPUTS)
     texts: list[str] = []
     basis = np.empty((0, NUM_INPUTS))  # orthonormal rows that span the flat
-    for count, point in enumerate(points):
+    gram = np.zeros((NUM_INPUTS + 1, NUM_INPUTS + 1))  # Z'Z of those before
+    for count, (point, row) in enumerate(
+        zip(points, np.column_stack([points, np.ones(len(points))]), strict=True)
+    ):
+        before, gram = gram, gram + np.outer(row, row)
         if count == 0:
             texts.append("the first: nothing to compare with")
             continue
@@ -39,9 +43,7 @@ def reasons(postures: ArrayLike) -> list[str]:
                 text += "; with it all twelve are known"
             texts.append(text)
             continue
-        rows = np.column_stack([points[:count], np.ones(count)])
-        row = np.append(point, 1.0)
-        variance = float(row @ np.linalg.pinv(rows.T @ rows) @ row)
+        variance = float(row @ np.linalg.pinv(before, hermitian=True) @ row)
         texts.append(f"{3.0 * np.log1p(variance):+.2f} log det given those before")
     return texts
 

@@ -41,7 +41,7 @@ BRISK = PATIENT | {
     "speed_deg_s = 400": "speed_deg_s = 40",
     "samples = 5": "samples = 50",
 }
-SLOW = PATIENT | {"speed_deg_s = 400": "speed_deg_s = 4"}  # minutes, to step in
+SLOW = PATIENT | {"speed_deg_s = 400": "speed_deg_s = 2"}  # minutes, to step in
 # Angles in degrees of the chains in the scene of the device: device, then ghost.
 CHAINS = """
 const found = [];
@@ -118,6 +118,18 @@ def until(true, seconds=PATIENT_S):
     return found
 
 
+def open_browser(width=1100, height=800):
+    """Headless Chromium, which draws the scenes in software."""
+    options = webdriver.ChromeOptions()
+    options.binary_location = BROWSER
+    size = f"--window-size={width},{height}"
+    software = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+    for flag in ("--headless=new", "--no-sandbox", size, *software):
+        options.add_argument(flag)
+    service = webdriver.ChromeService(DRIVER)
+    return webdriver.Chrome(options=options, service=service)
+
+
 @pytest.fixture
 def rig(tmp_path):
     with contextlib.closing(Rig(tmp_path)) as made:
@@ -131,14 +143,7 @@ def browse():
 
     def browser(rig, query="", width=1100, height=800, pace=SLOW):
         """Opened first: a browser takes longer to start than a short session runs."""
-        options = webdriver.ChromeOptions()
-        options.binary_location = BROWSER
-        size = f"--window-size={width},{height}"
-        software = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
-        for flag in ("--headless=new", "--no-sandbox", size, *software):
-            options.add_argument(flag)
-        service = webdriver.ChromeService(DRIVER)
-        driver = webdriver.Chrome(options=options, service=service)
+        driver = open_browser(width, height)
         opened.append(driver)
         if width < 500:
             metrics = {"width": width, "height": height, "deviceScaleFactor": 2}
@@ -245,7 +250,9 @@ def test_a_page_that_is_killed_costs_the_session_nothing(rig, browse):
 
 
 def test_two_browsers_see_the_same_and_either_stops(rig, browse):
-    first, second = (browse(rig), browse(rig.url, 700, 600))
+    first = browse(rig, pace=None)
+    second = browse(rig, width=700, height=600, pace=None)
+    rig.start(SLOW)
     for driver in (first, second):
         until(lambda driver=driver: shown(driver, "#stop"))
         until(lambda driver=driver: words(driver, ".queue li"))
