@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import time
 from typing import Any
@@ -15,6 +16,7 @@ from rig.live.scene import CommandScene, DeviceScene
 from rig.live.watcher import Watcher
 
 TICK_S = 0.1
+ANSWER_S = 10.0  # for a browser to show what it was sent
 PLOT_TICKS = 5  # ticks between two drawings of the plots over time
 HEAD = """
 <link rel="stylesheet" href="/page.css">
@@ -88,14 +90,20 @@ class LivePage:
                 self._log = ui.html()
         self.update()
 
-    def tick(self) -> None:
-        """Ten times a second: turn the device; draw anew what has changed."""
+    async def tick(self) -> None:
+        """Ten times a second: turn the device; draw anew what has changed.
+
+        A browser that is slower than that is waited for, so that it shows the present
+        less often and not an ever older past.
+        """
         self._ticks += 1
         self._follow()
         if self.watcher.version != self._version:
             self.update()
         elif self.watcher.running and self._ticks % PLOT_TICKS == 0:
             self._plot()
+        with contextlib.suppress(TimeoutError):
+            await ui.run_javascript("0", timeout=ANSWER_S)
 
     def _follow(self) -> None:
         watcher, state = self.watcher, self.watcher.state
