@@ -15,6 +15,8 @@ from rig.device.lock import BusLock
 from rig.faults import EXIT_FAULT, EXIT_OK, Refused
 from rig.sessions import load, make_simulator, run_session
 
+COMMISSIONING = ("ports", "scan", "imu", "jog", "home", "axes", "zero", "setup")
+
 
 def run(args: argparse.Namespace) -> int:
     """Run the command that was asked for; returns the exit code."""
@@ -31,8 +33,20 @@ def run(args: argparse.Namespace) -> int:
         "example": _example,
         "check": _check,
         "watch": _watch,
+        **dict.fromkeys(("refit", "report", "export", "trend"), _of_recorded),
     }
+    if args.command in COMMISSIONING:
+        from rig.commissioning import run as run_step
+
+        return run_step(args)
     return commands.get(args.command, run_session)(args)
+
+
+def _of_recorded(args: argparse.Namespace) -> int:
+    from rig import results
+
+    command: Callable[[argparse.Namespace], int] = getattr(results, args.command)
+    return command(args)
 
 
 def _identify(args: argparse.Namespace) -> int:
@@ -67,23 +81,11 @@ def _described(drive: Drive) -> list[str]:
 
 
 def _stop(args: argparse.Namespace) -> int:
-    from rig.guard.stop import stop_all
+    from rig.stopping import stop_device
 
-    config = load(args)
-    bus = Bus(config.bus, config.silence_s)
-    try:
-        bus.open()
-    except BusError as error:
-        raise BusError(
-            f"NOTHING WAS STOPPED: {error}. If a session holds the port, press Ctrl-C "
-            "twice there; otherwise use the emergency stop"
-        ) from None
-    with bus:
-        results = stop_all([Drive(bus, axis) for axis in config.axes])
-    for result in results:
-        print(result)
-    stopped = all(r.acknowledged and r.standing for r in results)
-    return EXIT_OK if stopped else EXIT_FAULT
+    if args.config is None:
+        raise ConfigError("configuration", ["--config FILE is required"])
+    return stop_device(args.config)
 
 
 def _simulate(args: argparse.Namespace) -> int:
@@ -140,4 +142,10 @@ def _check(args: argparse.Namespace) -> int:
             f"{axis.pulses_per_deg:.3f} pulses per degree, "
             f"{axis.min_pulses}..{axis.max_pulses} pulses"
         )
+    late = ", LONGER than the shortest step: shorten bus.timeout_s or slow the axes"
+    print(
+        f"  heartbeat {config.heartbeat_s:.3g} s, shortest step "
+        f"{config.shortest_step_s:.3g} s"
+        f"{late if config.heartbeat_s > config.shortest_step_s else ''}"
+    )
     return EXIT_OK

@@ -14,9 +14,9 @@ from jaxcal.calibration.affine_inverse import limits_of
 from jaxcal.calibration.base import Calibration
 from jaxcal.calibration.checked import derivative, predict
 from jaxcal.calibration.discrepancy import WithDiscrepancy
-from jaxcal.calibration.reach import reach
+from jaxcal.calibration.reach import Carry, reach
 from jaxcal.checks import in_words
-from jaxcal.models import Affine, Model, from_dict, identifiability
+from jaxcal.models import Affine, Model, SerialChain, from_dict, identifiability
 from jaxcal.models.identifiability import Identifiability
 
 __all__ = ["ModelCalibration"]
@@ -212,7 +212,9 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
 
         Args:
             desired: (..., m) in the measured unit; m at most n. Where m is less than n
-                the command is the one that Newton's method finds near the start.
+                the command is the one that Newton's method finds near the start. Of an
+                arm's pose, position and turn from the nominal orientation at ``start``,
+                which then must be given, as ``model.rotation_vectors(start, R)``.
             limits: (n, 2) least and greatest command of each input, if any.
             start: (n,) or (..., n) where the search begins; the measured command whose
                 output is nearest when not given.
@@ -248,8 +250,27 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
             bounds=None if limits is None else limits_of(limits, self.input_names),
             clip=clip,
             max_condition=max_condition,
+            carry=self._carry(wanted.reshape(-1, m), begin),
         )
         return commands.reshape(*wanted.shape[:-1], n)
+
+    def _carry(self, wanted: Array, start: Array | None) -> Carry | None:
+        """Of an arm's pose, whose orientations are relative to the commands."""
+        arm = self.model
+        if not (isinstance(arm, SerialChain) and arm.output == "pose"):
+            return None
+        if start is None:
+            raise ValueError(
+                "start must be given for an arm's pose: the joints at whose nominal "
+                "orientation desired is a turn, as rotation_vectors(start, R) makes it"
+            )
+        rotations = arm.rotations(start, wanted[:, 3:])
+
+        def carry(commands: Array, rows: NDArray[np.intp]) -> Array:
+            turns = arm.rotation_vectors(commands, rotations[rows])
+            return np.hstack([wanted[rows, :3], turns])
+
+        return carry
 
     @property
     def _whole(self) -> Model:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +18,8 @@ Array = NDArray[np.float64]
 
 _STARTS, _STEPS, _REACHED = 6, 60, 1e-9  # of the outputs' spread over the measurements
 
+Carry = Callable[[Array, NDArray[np.intp]], Array]
+
 
 def reach(
     model: Model,
@@ -28,6 +32,7 @@ def reach(
     bounds: Array | None,
     clip: bool,
     max_condition: float,
+    carry: Carry | None = None,
 ) -> Array:
     """Commands (P, n) that reach outputs ``wanted`` (P, q), by Newton's method.
 
@@ -39,8 +44,10 @@ def reach(
         begin: (P, n) where the first search begins; the nearest when None.
         bounds: (n, 2) limits of the commands, or None.
         clip, max_condition: as for :meth:`ModelCalibration.command_for`.
+        carry: what the model would answer at commands (R, n) if points ``rows`` (R,)
+            were reached there; ``wanted[rows]`` where outputs are absolute.
     """
-    search = _Search(model, parameters, known, wanted, names)
+    search = _Search(model, parameters, known, wanted, names, carry)
     if begin is None:
         begin = search.nearest[:, 0]
     commands, reached = search.newton(begin)
@@ -78,18 +85,28 @@ class _Search:
         known: Array,
         wanted: Array,
         names: tuple[str, ...],
+        carry: Carry | None,
     ) -> None:
         self.model, self.theta, self.wanted, self.names = model, theta, wanted, names
+        self.carry: Carry = carry or (lambda commands, rows: wanted[rows])
         outputs = predict(self.model, known, self.theta)
         self.spread = np.where(np.ptp(known, axis=0) > 0.0, known.std(axis=0), 1.0)
-        moved = np.ptp(outputs, axis=0) > 0.0
-        self.size = np.where(moved, outputs.std(axis=0), 1.0)
-        gap = (wanted[:, None] - outputs) / self.size
-        order = np.argsort((gap**2).sum(axis=-1), axis=1)[:, :_STARTS]
-        self.nearest = known[order]  # (P, starts, n)
+        points, count = np.arange(len(wanted)), len(known)
+        there = self.carry(np.tile(known, (len(wanted), 1)), np.repeat(points, count))
+        there = there.reshape(len(wanted), count, -1) - outputs
+        # Relative outputs spread as what is wanted, seen from where it was measured.
+        seen = outputs if carry is None else np.concatenate(there)
+        self.size = np.where(np.ptp(seen, axis=0) > 0.0, seen.std(axis=0), 1.0)
+        order = np.argsort(((there / self.size) ** 2).sum(axis=-1), axis=1)
+        self.nearest = known[order[:, :_STARTS]]  # (P, starts, n)
 
     def outputs(self, commands: Array) -> Array:
         return predict(self.model, commands, self.theta, finite=False)
+
+    def gap(self, commands: Array, rows: NDArray[np.intp]) -> Array:
+        """(R, q) of points ``rows`` from the outputs at ``commands``, in sizes."""
+        gap = self.carry(commands, rows) - self.outputs(commands)
+        return np.asarray(gap / self.size)
 
     def slopes(self, commands: Array) -> Array:
         """(P, q, n) in units of the spreads."""
@@ -98,8 +115,8 @@ class _Search:
 
     def newton(self, begin: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Damped steps of least length for all points together, and which arrived."""
-        commands = begin.copy()
-        gap = (self.wanted - self.outputs(commands)) / self.size
+        commands, rows = begin.copy(), np.arange(len(begin))
+        gap = self.gap(commands, rows)
         damping = np.full(len(commands), 1e-6)
         eye = np.eye(self.wanted.shape[1])
         for _ in range(_STEPS):
@@ -112,7 +129,7 @@ class _Search:
             step = np.linalg.solve(gram, gap[..., None])
             step = (np.matrix_transpose(slopes) @ step)[..., 0] * self.spread
             trial = commands + step
-            after = (self.wanted - self.outputs(trial)) / self.size
+            after = self.gap(trial, rows)
             better = (after**2).sum(axis=1) < (gap**2).sum(axis=1)
             commands = np.where(better[:, None], trial, commands)
             gap = np.where(better[:, None], after, gap)
@@ -134,7 +151,7 @@ class _Search:
         wanted, names = self.wanted[i], self.names
 
         def off(command: Array) -> Array:
-            return (self.outputs(command[None])[0] - wanted) / self.size
+            return -self.gap(command[None], np.array([i]))[0]
 
         best = None
         for begin in (free, *self.nearest[i]):

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import argparse
 
-from jaxcal.commands.select import add_candidates, show, whole_numbers
+from jaxcal.commands.select import (
+    about,
+    add_about,
+    add_candidates,
+    show,
+    whole_numbers,
+)
 from jaxcal.commands.tables import add_output, read_table
 from jaxcal.selection import score
 
@@ -14,6 +20,7 @@ __all__ = ["add_arguments", "run"]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Flags of the command."""
     add_candidates(parser)
+    add_about(parser)
     chosen = parser.add_mutually_exclusive_group(required=True)
     indices = "rows, counted from 0"
     chosen.add_argument("--indices", type=whole_numbers, metavar="I,J", help=indices)
@@ -47,5 +54,6 @@ def run(arguments: argparse.Namespace) -> None:
         max_replicates=arguments.max_replicates,
         reference=arguments.reference,
         time_limit=arguments.time_limit,
+        **about(arguments),
     )
     show(selection, table, arguments)

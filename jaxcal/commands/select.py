@@ -17,6 +17,8 @@ from jaxcal.models import Noise
 from jaxcal.selection import Selection, select
 
 __all__ = [
+    "about",
+    "add_about",
     "add_arguments",
     "add_candidates",
     "numbers",
@@ -44,6 +46,29 @@ def add_candidates(parser: argparse.ArgumentParser) -> None:
     add("--replicates", type=int, help=often, **cap)
 
 
+def add_about(parser: argparse.ArgumentParser) -> None:
+    """What is measured, and how good a choice is."""
+    add_model(parser)
+    add = parser.add_argument
+    criterion = "D for y = A u + b, I for another model"
+    add("--criterion", choices=CRITERIA, help=criterion)
+    names = "of Ds and As: the parameters of interest"
+    add("--parameters", type=lambda x: x.split(","), metavar="A,B", help=names)
+    noise = "standard deviation of a measurement; one number or one per output"
+    add("--noise", type=numbers, metavar="S", help=noise)
+
+
+def about(arguments: argparse.Namespace) -> dict[str, Any]:
+    """The keywords of ``add_about``'s flags."""
+    noise = arguments.noise
+    return {
+        "model": read_model(arguments.model),
+        "criterion": arguments.criterion,
+        "parameters": arguments.parameters,
+        "noise": noise and Noise(noise[0] if len(noise) == 1 else noise),
+    }
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Flags of the command."""
     add_candidates(parser)
@@ -51,13 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("-k", "--k", type=int, metavar="K", help="rows to choose")
     methods = "auto (the cheapest proof), exact, exchange, greedy, random or policy"
     add("--method", default="auto", help=methods)
-    add_model(parser)
-    criterion = "D for y = A u + b, I for another model"
-    add("--criterion", choices=CRITERIA, help=criterion)
-    names = "of Ds and As: the parameters of interest"
-    add("--parameters", type=lambda x: x.split(","), metavar="A,B", help=names)
-    noise = "standard deviation of a measurement; one number or one per output"
-    add("--noise", type=numbers, metavar="S", help=noise)
+    add_about(parser)
     required = "rows, counted from 0, that must be chosen"
     add("--required", type=whole_numbers, metavar="I,J", help=required)
     add("--seed", type=int, help="of methods that draw at random; 0")
@@ -76,20 +95,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Choose and print."""
     table = read_table(arguments.file)
-    noise = arguments.noise
     options = {n: getattr(arguments, n) for n in (*_OPTIONS, "least_efficiency")}
     selection = select(
         table.frame(table.inputs(arguments.columns)),
         arguments.k,
         arguments.method,
-        model=read_model(arguments.model),
-        criterion=arguments.criterion,
-        parameters=arguments.parameters,
-        noise=noise and Noise(noise[0] if len(noise) == 1 else noise),
         available=table.available(),
         required=arguments.required,
         max_replicates=arguments.max_replicates,
         num_outputs=arguments.num_outputs,
+        **about(arguments),
         **{name: value for name, value in options.items() if value is not None},
     )
     show(selection, table, arguments)

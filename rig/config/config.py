@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import pathlib
 import tomllib
 from collections.abc import Iterator
@@ -23,18 +24,26 @@ from rig.config.settings import (
     SettleSettings,
 )
 
+POLLS, HICCUP_S = 4, 0.25  # of the motion loop's heartbeat
 PHONE = (
     "format", "columns", "quaternion_columns", "unit", "order", "signs", "mounting_deg"
 )  # fmt: skip
 # Left out of ``fingerprint``: addresses, and what version 1 did not know. A key added
 # here leaves the fingerprints of older files as they are.
-UNCOUNTED = {"imu": ("host", "port", "transport", "stale_s", "heading")}
-# May also change before a run is resumed: they judge what was measured, or stop it.
-LIMITS = {
+UNCOUNTED = {
+    "imu": ("host", "port", "transport", "allow", "stale_s", "heading"),
+    "session": ("drift_limit_deg",),
+}
+# Where bus and phone are reached, and when a session gives up or says that it is good,
+# may change between a run and its resumption.
+UNMEASURED = {
+    "axes": ("comm_timeout_s",),
+    "imu": ("host", "port", "transport", "allow", "stale_s", "heading"),
     "motion": (
-        "deadline_factor", "deadline_slack_s", "stall_s", "following_deg",
-        "envelope_margin_deg", "max_disagreement_deg", "heartbeat_s",
+        "poll_s", "deadline_factor", "deadline_slack_s", "stall_s", "following_deg",
+        "envelope_margin_deg", "max_disagreement_deg", "heartbeat_s", "mirror_limits",
     ),
+    "settle": ("timeout_s",),
     "session": ("verify_limit_deg", "reference_tolerance_deg", "max_unreachable"),
 }  # fmt: skip
 
@@ -50,13 +59,16 @@ def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
 
 def _without(data: dict[str, Any], left_out: dict[str, Any]) -> dict[str, Any]:
     """A described configuration without its bus and some keys of its tables."""
-    return {
-        table: {k: v for k, v in keys.items() if k not in left_out.get(table, ())}
-        if isinstance(keys, dict)
-        else keys
-        for table, keys in data.items()
-        if table != "bus"
-    }
+    found = {}
+    for name, table in data.items():
+        gone = left_out.get(name, ())
+        if isinstance(table, dict):
+            table = {key: table[key] for key in table if key not in gone}
+        elif name == "axes":
+            table = [{k: axis[k] for k in axis if k not in gone} for axis in table]
+        if name != "bus":
+            found[name] = table
+    return found
 
 
 def _flat(data: Any, at: str = "") -> dict[str, Any]:
@@ -123,6 +135,47 @@ class RigConfig(Section):
         """Silence between frames that the slowest of the drives wants."""
         return max(axis.map.inter_frame_s for axis in self.axes)
 
+    @property
+    def shortest_step_s(self) -> float:
+        """Time of a step of ``motion.max_step_deg`` on the quickest axis."""
+        motions = [axis.drive_motion for axis in self.axes]
+        step = self.motion.max_step_deg
+        return min(
+            step / speed + speed / accel
+            if step * accel > speed * speed
+            else 2.0 * math.sqrt(step / accel)  # it never reaches its speed
+            for speed, accel in motions
+        )
+
+    @property
+    def heartbeat_s(self) -> float:
+        """How long the motion loop may be silent while something moves.
+
+        Between two signs of life lies at most one exchange, which may have to connect
+        first, and the pause between polls; POLLS of these are allowed for, and a
+        computer that pauses for HICCUP_S.
+        """
+        longest = max(POLLS * self.motion.poll_s, HICCUP_S) + 2.0 * self.bus.timeout_s
+        return self.motion.heartbeat_s or longest
+
+    @property
+    def comm_timeouts_s(self) -> dict[str, float]:
+        """Axis to seconds, of the drives that watch their line.
+
+        Unless configured, a drive waits longer than the heartbeat, by one read with
+        all its tries.
+        """
+        default = self.heartbeat_s + self._slowest_read_s
+        return {
+            axis.name: axis.comm_timeout_s or default
+            for axis in self.axes
+            if axis.map.comm_timeout
+        }
+
+    @property
+    def _slowest_read_s(self) -> float:
+        return self.bus.timeout_s * (self.bus.read_retries + 1)
+
     def to_pulses(self, angles_deg: Any) -> Pulses:
         """Whole pulses of (3,) degrees."""
         a, b, c = (
@@ -159,6 +212,7 @@ class RigConfig(Section):
     def fingerprint(self) -> str:
         """SHA-256 of what a measurement depends on, as version 1 took it."""
         data = _without(self.described(), UNCOUNTED)
+        data["motion"]["heartbeat_s"] = self.motion.heartbeat_s or 3.0  # default then
         text = json.dumps(data, sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -169,12 +223,9 @@ class RigConfig(Section):
             described: ``described()`` when the run began, from its journal.
         """
         now = json.loads(json.dumps(self.described(), default=str))
-        left_out = {
-            table: (*UNCOUNTED.get(table, ()), *LIMITS.get(table, ()))
-            for table in UNCOUNTED | LIMITS
-        }
-        then, now = (_flat(_without(each, left_out)) for each in (described, now))
-        return differences(then, now)
+        then, now = (_flat(_without(each, UNMEASURED)) for each in (described, now))
+        # Keys that came after the run began had their defaults in it.
+        return differences(then, {key: now.get(key) for key in then})
 
     def device_fingerprint(self) -> dict[str, Any]:
         """Key of rig.toml to value, of all that says which place a pulse count means.
@@ -193,7 +244,13 @@ class RigConfig(Section):
 
     def broken_rules(self) -> Iterator[str]:
         motion, session = self.motion, self.session
-        slowest = self.bus.timeout_s * (self.bus.read_retries + 1)
+        slowest, shortest = self._slowest_read_s, self.shortest_step_s
+        if motion.heartbeat_s is not None and motion.heartbeat_s > shortest:
+            yield (
+                "motion.heartbeat_s: must not exceed the shortest step, "
+                f"{shortest:.3g} s (max_step_deg at an axis's speed), got "
+                f"{motion.heartbeat_s:g}; leave it out to have it computed"
+            )
         overshoot = motion.approach_overshoot_deg
         if session.k >= session.candidates:
             yield f"session.k: must be under candidates ({session.candidates})"

@@ -27,6 +27,8 @@ from rig.config.schema import Section, key, parse, read_text
 
 LATER_KEYS = (
     "pulses_per_rev", "target", "home", "homed", "absolute_encoder", "ready_s",
+    "set_zero", "recognise",
+    "broadcast_stop",
 )  # fmt: skip
 MAP_FOLDER = pathlib.Path(__file__).parent.parent / "maps"
 
@@ -57,6 +59,7 @@ class RegisterMap(Section):
         "`trigger` is the last word"
     )
     stop: Writes = key("`write`: frames of the quick stop; torque must stay on")
+    broadcast_stop: bool = key("every unit of a serial line obeys its stop to 0", False)
     enable: Writes | None = key("`write`: switch the power stage on", None)
     alarm_reset: Writes | None = key("`write`: reset an alarm", None)
     comm_timeout: CommTimeout | None = key(
@@ -64,7 +67,11 @@ class RegisterMap(Section):
         None,
     )
     limits: Writes | None = key("`write` with `min` and `max` in pulses", None)
+    set_zero: Writes | None = key("`write`: the present position becomes 0", None)
     identity: dict[str, Read] = key("registers that `identify` prints", {})
+    recognise: dict[str, tuple[int, int]] = key(
+        "of identity registers: [lowest, highest] that a drive of this family holds", {}
+    )
     pulses_per_rev: Read | None = key(
         "register of the drive's own pulses for one motor turn", None
     )
@@ -97,6 +104,8 @@ class RegisterMap(Section):
     def broken_rules(self) -> Iterator[str]:
         if self.stop.place_of("position"):
             yield "stop.write: must not write a position"
+        for name in sorted(self.recognise.keys() - self.identity.keys()):
+            yield f"recognise.{name}: is no register of identity"
 
 
 def available_maps() -> list[str]:

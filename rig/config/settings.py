@@ -1,5 +1,6 @@
 """The tables of rig.toml but for its axes: one class a table, one field a key."""
 
+import ipaddress
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any, Literal
 
@@ -96,6 +97,9 @@ class ImuSettings(Section):
     mounting_deg: tuple[Angle, Angle, Angle] = key(
         "turn of the phone on the end-effector about Z, then Y, then X", (0.0, 0.0, 0.0)
     )
+    allow: tuple[str, ...] = key(
+        "addresses that may send; none: the first phone that does", ()
+    )
     heading: Literal["relative", "absolute"] = key(
         "absolute: the phone comes back to the same heading whenever it is started",
         "relative",
@@ -104,6 +108,11 @@ class ImuSettings(Section):
     max_jump_deg: float = key("between two readings", 20.0, 0.1, 180)
 
     def broken_rules(self) -> Iterator[str]:
+        for address in self.allow:
+            try:
+                ipaddress.ip_address(address)
+            except ValueError:
+                yield f"allow: must hold IP addresses, got {address!r}"
         if self.format == "sensorlogger" and self.transport != "listen":
             yield "transport: must be listen: Sensor Logger pushes its messages"
         named = (*self.columns, *(self.quaternion_columns or ()), self.stamp_column)
@@ -141,7 +150,10 @@ class MotionSettings(Section):
     max_disagreement_deg: float = key(
         "between IMU and command at a posture", 45.0, 0.1, 180
     )
-    heartbeat_s: float = key("a motion loop silent for so long: stop", 3.0, 0.2, 60)
+    heartbeat_s: float | None = key(
+        "a motion loop silent for so long: stop; at most the shortest step",
+        "of [bus] and poll_s", 0.1, 60, by=lambda made: None,
+    )  # fmt: skip
     mirror_limits: bool = key("write the soft limits to the drives too", False)
 
 
@@ -175,6 +187,9 @@ class SessionSettings(Section):
     roll_range_deg: Range | None = key("likewise", None)
     verify_postures: int = key("held out; each before and after", 4, 0, 1000)
     verify_limit_deg: float = key("largest good error once compensated", 0.5, 1e-3, 45)
+    drift_limit_deg: float = key(
+        "of the zero in a session, of what is not linear", 0.2, 1e-3, 45
+    )
     reference_tolerance_deg: float = key(
         "the zero posture may be found so far from where it was", 0.5, 1e-3, 45
     )

@@ -98,6 +98,8 @@ class DeviceRecord:
             "fingerprint": config.device_fingerprint(),
         }
         self._voided.pop(name, None)
+        if name == HOMED:
+            self._left = {}  # counts of before mean nothing now
         self.save()
 
     def void(self, name: str, reason: str) -> None:
@@ -136,16 +138,29 @@ class DeviceRecord:
 
     # Where the drives stand between sessions
 
-    def left_at(self, positions: Sequence[int | None] = (None, None, None)) -> None:
-        """Where the drives are left, in pulses; None: not known, as while armed."""
+    def left_at(
+        self,
+        positions: Sequence[int | None] = (None, None, None),
+        homed: Sequence[str] = (),
+    ) -> None:
+        """Where the drives are left.
+
+        Args:
+            positions: pulses; None where it is not known, as while armed.
+            homed: names of the axes whose drives say that they are homed.
+        """
         pulses = dict(zip(AXIS_NAMES, positions, strict=True))
-        self._left = {"time": _now(), "pulses": pulses}
+        self._left = {"time": _now(), "pulses": pulses, "homed": list(homed)}
         self.save()
 
     def left(self) -> dict[str, int]:
         """Pulses at which the last session left the axes of which that is known."""
         pulses = self._left.get("pulses", {})
         return {name: count for name, count in pulses.items() if count is not None}
+
+    def left_homed(self) -> list[str]:
+        """Names of the axes whose drives said then that they are homed."""
+        return self._left.get("homed", [])
 
 
 def _now() -> str:

@@ -67,6 +67,18 @@ def is_written(path: pathlib.Path) -> bool:
     return False
 
 
+def measured_postures(records: list[Record]) -> dict[str, Record]:
+    """Every posture measured and not withdrawn since, by name, in order."""
+    found: dict[str, Record] = {}
+    for record in records:
+        if record["event"] == "posture":
+            found[record["name"]] = record
+        elif record["event"] == "void":
+            for name in record["names"]:
+                found.pop(name, None)
+    return found
+
+
 class Journal:
     """The one writer of a journal; a second one on the same run is refused."""
 
@@ -115,9 +127,11 @@ class Journal:
                     written += os.write(self._fd, data[written:])
                 if sync:
                     os.fsync(self._fd)
-            except OSError as error:
+            except BaseException as error:  # a signal's too, while nothing is armed
                 with contextlib.suppress(OSError):  # or the next writer cuts it off
                     os.ftruncate(self._fd, self._size)
+                if not isinstance(error, OSError):
+                    raise
                 raise JournalError(
                     f"cannot write {self.path}: {error.strerror or error}"
                 ) from None

@@ -16,10 +16,14 @@ from typing import Any
 from jaxcal.files import write_text
 from rig.config import AXIS_NAMES, RigConfig
 from rig.faults import Refused
-from rig.outputs.journal import Journal, JournalError, Record
+from rig.outputs.journal import Journal, JournalError, Record, measured_postures
 
 JOURNAL = "journal.jsonl"
-SPARED = ("write", "stop")  # a full disk must not keep a stop from the bus
+SPARED = (
+    "write",
+    "stop",
+    "comm_restored",
+)  # a full disk must not keep a stop from the bus
 
 
 def new_run_folder(output: pathlib.Path, mode: str) -> pathlib.Path:
@@ -77,7 +81,8 @@ class RunFolder:
             self.emit("resume", sync=True, **provenance)
             return
         config, fingerprint = self.config.described(), self.config.fingerprint()
-        start = {"config": config, **provenance, **start}
+        device = self.config.device_fingerprint()
+        start = {"config": config, "device": device, **provenance, **start}
         self.emit(
             "start", sync=True, schema=1, mode=mode, fingerprint=fingerprint, **start
         )
@@ -105,14 +110,7 @@ class RunFolder:
 
     def postures(self) -> dict[str, Record]:
         """Every posture measured and not withdrawn since, by name, in order."""
-        found: dict[str, Record] = {}
-        for record in self.journal.records:
-            if record["event"] == "posture":
-                found[record["name"]] = record
-            elif record["event"] == "void":
-                for name in record["names"]:
-                    found.pop(name, None)
-        return found
+        return measured_postures(self.journal.records)
 
     def save_pairs(self) -> None:
         """Write pairs.csv: role, commands, measurements, scatter of every posture."""

@@ -7,16 +7,45 @@ seen whatever the phone calls north. Where it has a heading to be trusted
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rig.attitude import Array, angle_between_deg
 from rig.config import AXIS_NAMES, RigConfig
+from rig.config.axis import Pulses
 from rig.faults import MotionFault
-from rig.session.measuring import frame_at
+from rig.readings import frame_at
 
 UNSEEN_DEG = 15.0  # an axis this near to the vertical hardly changes the tilt
 TOLD_SHARE = 0.2  # of the largest: an axis that moved less is left out of the words
+
+
+class KeptZero(NamedTuple):
+    """The zero posture as a calibration keeps it; None where it does not."""
+
+    whose: str  # of messages
+    pulses: Pulses | None = None
+    attitude: Array | None = None  # (3, 3) phone to its world
+
+    def check(self, config: RigConfig, pulses: Pulses, attitude: Array) -> str:
+        """The zero posture taken now is this one; returns what was compared, in words.
+
+        Raises:
+            MotionFault: it is not, by more than ``session.reference_tolerance_deg``.
+        """
+        if self.pulses is not None:
+            off = config.to_deg(np.subtract(pulses, self.pulses))
+            if np.abs(off).max() > config.session.reference_tolerance_deg:
+                raise MotionFault(
+                    f"in its zero posture the device counts other pulses than for "
+                    f"{self.whose}: {axes_text(off)}. The drives have lost their "
+                    "origin, or this is not the zero posture"
+                )
+        if self.attitude is None:
+            return f"{self.whose} keeps no attitude of its zero posture: not compared"
+        return check_zero(config, self.attitude, attitude, self.whose)
 
 
 def moved(config: RigConfig, then: Array, now: Array) -> tuple[float, Array]:
@@ -51,7 +80,7 @@ def check_zero(config: RigConfig, then: Array, now: Array, whose: str) -> str:
         config: names tolerance, mounting and axes.
         then: (3, 3) attitude of the phone, as kept.
         now: (3, 3) the same posture, measured.
-        whose: "this calibration" or the like, for the words.
+        whose: for the words.
 
     Raises:
         MotionFault: they differ by more than ``session.reference_tolerance_deg``.
@@ -63,7 +92,7 @@ def check_zero(config: RigConfig, then: Array, now: Array, whose: str) -> str:
     if angle <= limit:
         return f"zero posture stands {angle:.3f} deg from that of {whose}{but}"
     raise MotionFault(
-        f"the zero posture is not where it was in {whose}: {axes_text(joints)} (limit "
+        f"the zero posture is not that of {whose}: {axes_text(joints)} (limit "
         f"session.reference_tolerance_deg = {limit:g}){but}. Drives that were without "
         "power have lost their origin: home them. Where the phone or the base was "
         "moved, calibrate again"

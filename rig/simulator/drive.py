@@ -93,6 +93,7 @@ class SimDrive:
         m = self.map
         tables = (
             m.move, m.stop, m.enable, m.alarm_reset, m.comm_timeout, m.limits, m.home,
+            m.set_zero,
         )  # fmt: skip
         reads = (m.status, m.position, m.alarm, m.target, m.pulses_per_rev)
         places: list[Read | Write] = [*m.identity.values()]
@@ -156,8 +157,7 @@ class SimDrive:
             self.position, self.velocity = float(self.target), 0.0
             self.moving, self.done = False, True
             if self._homing:
-                self.target, self.offset = 0, 0
-                self.position, self.homed, self._homing = 0.0, True, False
+                self.find_origin()
             return
         self.position += step
 
@@ -167,6 +167,12 @@ class SimDrive:
         self.alarm = code
         self.done = False
         self._stopping = self.moving
+
+    def find_origin(self) -> None:
+        """Count from the motor's origin again, as homing ends."""
+        self.position -= self.offset
+        self.target, self.offset = round(self.position), 0
+        self.homed, self._homing = True, False
 
     def power_cycle(self, offset: int = 0) -> None:
         """Off and on again: its counter comes back ``offset`` pulses away."""
@@ -199,7 +205,7 @@ class SimDrive:
 
     def _counter(self) -> int:
         """The position as read: at rest it may flicker."""
-        most = 0 if self.moving else self.habits.jitter_counts
+        most = 0 if self.velocity else self.habits.jitter_counts
         return round(self.position) + self._random.randint(-most, most)
 
     def _status(self) -> int:
@@ -236,6 +242,9 @@ class SimDrive:
             self.advance()
         elif self._begins(m.home, address, words):
             self._home()
+        elif self._begins(m.set_zero, address, words):
+            self.offset -= round(self.position)
+            self.position, self.target, self.homed = 0.0, 0, True
         elif m.comm_timeout and address == m.comm_timeout.write[0].address:
             counts = self._value(m.comm_timeout, "timeout")
             self._comm_timeout = counts / m.comm_timeout.per_s

@@ -151,9 +151,19 @@ class ModbusServer:
         fault = self.faults.take("spoilt_frames", axis)
         return fault is not None and self._random.random() < fault.share
 
+    def _broadcast(self, pdu: bytes) -> None:
+        """A write to unit 0: every drive of a family that takes it obeys, none says."""
+        with self.lock:
+            for unit, drive in self.drives.items():
+                dead = self.faults.take("dead_drive", self._axis[unit])
+                if drive.map.broadcast_stop and not dead and pdu[0] in (6, 16):
+                    _execute(drive, pdu)
+
     def _answer(self, unit: int, pdu: bytes) -> list[tuple[bytes, bytes, bool]]:
         """Noise to send first, the reply's PDU, if that is spoilt; empty: silence."""
         axis, faults = self._axis.get(unit), self.faults
+        if unit == 0:
+            self._broadcast(pdu)
         if axis is None:
             return []
         if faults.take("dead_drive", axis) or faults.take("lost_request", axis):

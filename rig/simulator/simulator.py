@@ -71,7 +71,7 @@ class Simulator:
         phone_port = 0
         if self.config.imu.transport == "connect":
             phone_port = self.start_phone(0)
-        imu = {"host": "127.0.0.1", "port": phone_port}
+        imu = {"host": "127.0.0.1", "port": phone_port, "allow": ("127.0.0.1",)}
         return self.config.model_copy(
             update={
                 "bus": self.config.bus.model_copy(update=bus),
@@ -116,6 +116,10 @@ class Simulator:
         """Undo every fault, as a technician would before the run is resumed."""
         self.faults.clear()
         self.plant.tighten()
+        with self.server.lock:
+            for drive in self.drives:
+                if drive.offset:
+                    drive.find_origin()
 
     def executions(self) -> list[list[int]]:
         """Targets in pulses each drive really ran, pitch, yaw, roll."""

@@ -11,7 +11,15 @@ import pytest
 from scipy import optimize
 
 from jaxcal.calibration import Calibration, ModelCalibration, identify
-from jaxcal.models import Affine, FromJax, Linear, Noise, Polynomial, Prior
+from jaxcal.models import (
+    Affine,
+    FromJax,
+    Linear,
+    Noise,
+    Polynomial,
+    Prior,
+    SerialChain,
+)
 
 
 class Wave:
@@ -398,6 +406,31 @@ def test_command_for_inverts_predict() -> None:
     assert (np.abs(inside) <= 1.5).all()
     near = found.command_for(wanted[0, 0], start=commands[0])
     np.testing.assert_allclose(near, commands[0], atol=1e-8)
+
+
+def test_command_for_reaches_a_pose() -> None:
+    """Absolute poses, asked for as turns from nominal at a rough start."""
+    table = [(0, 90, 89, 0), (-425, 0, 0, 0), (-392, 0, 0, 0),
+             (0, 90, 109, 0), (0, -90, 95, 0), (0, 0, 82, 0)]  # fmt: skip
+    arm = SerialChain.from_dh(table, output="pose")
+    rng = np.random.default_rng(0)
+    joints = rng.uniform(-120, 120, (30, 6))
+    truth = arm.nominal + 0.2 * rng.normal(size=arm.num_parameters)
+    measured = arm.predict(joints, truth)
+    found = identify(joints, measured, model=arm, noise_std=0.01)
+    goals = joints[:5] + 1.0
+    poses = found.predict(goals)
+    frames = arm.rotations(goals, poses[:, 3:])
+    for away in (2.0, 40.0):
+        start = goals + away * rng.normal(size=goals.shape)
+        desired = np.hstack([poses[:, :3], arm.rotation_vectors(start, frames)])
+        back = found.command_for(desired, start=start)
+        reached = found.predict(back)
+        np.testing.assert_allclose(reached[:, :3], poses[:, :3], atol=1e-6)
+        again = arm.rotations(back, reached[:, 3:])
+        np.testing.assert_allclose(again, frames, atol=1e-9)
+    with pytest.raises(ValueError, match="start must be given for an arm's pose"):
+        found.command_for(desired)
 
 
 def test_what_is_out_of_reach_or_beyond_the_limits_is_named() -> None:

@@ -204,6 +204,17 @@ def test_a_model_goes_through_every_command(tmp_path, arm, capsys):
     )
     assert sorted(chosen["indices"]) == sorted(wanted.indices.tolist())
 
+    rows_chosen = ",".join(str(i) for i in chosen["indices"])
+    judge = ["score", *flags, "--indices", rows_chosen, "--json"]
+    assert main([*judge, "--criterion", "D"]) == 0
+    assert json.loads(capsys.readouterr().out)["value"] == wanted.value
+    assert main(judge) == 0  # by the variance of predictions, as select would
+    judged = jaxcal.score(
+        commands, chosen["indices"], model=model, noise=jaxcal.Noise(0.01)
+    )
+    found = json.loads(capsys.readouterr().out)
+    assert (found["criterion"], found["value"]) == ("I", judged.value)
+
     assert main(["plan", *flags, "--accuracy", "0.02", "--csv"]) == 0
     assert float(parsed(capsys.readouterr().out)[-1]["standard_error"]) <= 0.02
 

@@ -86,10 +86,25 @@ class Arm:
                 f"rotations must have shape ({len(commands)}, 3, 3), "
                 f"got {rotations.shape}"
             )
-        steps = self._steps(commands, self.nominal)
-        nominal = forward(len(commands), steps)[0][:3]
-        turn = rotations @ np.moveaxis(nominal, -1, 0)
+        nominal = self._nominal_rotations(commands)
+        turn = rotations @ np.matrix_transpose(nominal)
         return np.asarray(Rotation.from_matrix(turn).as_rotvec(degrees=True))
+
+    def rotations(self, commands: ArrayLike, vectors: ArrayLike) -> Array:
+        """Rotation matrices (N, 3, 3) of turns from nominal (N, 3) in degrees.
+
+        The inverse of :meth:`rotation_vectors`.
+        """
+        from scipy.spatial.transform import Rotation
+
+        commands = as_commands(commands, self.num_inputs)
+        turn = Rotation.from_rotvec(numbers("vectors", vectors), degrees=True)
+        return np.asarray(turn.as_matrix() @ self._nominal_rotations(commands))
+
+    def _nominal_rotations(self, commands: Array) -> Array:
+        """(N, 3, 3) from the tool to the measuring frame."""
+        steps = self._steps(commands, self.nominal)
+        return forward(len(commands), steps)[0][:3].transpose(2, 1, 0)
 
     @property
     def _steps_of_joints(self) -> NDArray[np.int64]:

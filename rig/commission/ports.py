@@ -1,0 +1,57 @@
+"""What this computer can reach: serial ports, TCP addresses, its own addresses."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+
+TCP_TIMEOUT_S = 1.0
+MODBUS_PORT = 502
+
+
+def serial_lines() -> list[str]:
+    """One line for each serial port: device, and what its adapter calls itself."""
+    from serial.tools import list_ports
+
+    lines = []
+    for port in sorted(list_ports.comports()):
+        usb = f", USB {port.vid:04x}:{port.pid:04x}" if port.vid is not None else ""
+        maker = f", {port.manufacturer}" if port.manufacturer else ""
+        lines.append(f"{port.device}: {port.description}{maker}{usb}")
+    return lines
+
+
+def tcp_line(host: str, port: int) -> tuple[bool, str]:
+    """Whether something accepts connections at an address, and that in words."""
+    where = f"{host}:{port}"
+    try:
+        with socket.create_connection((host, port), timeout=TCP_TIMEOUT_S):
+            return True, f"{where}: accepts connections"
+    except TimeoutError:
+        return False, (
+            f"{where}: no answer in {TCP_TIMEOUT_S:g} s. Check power, cable and address"
+        )
+    except OSError as error:
+        return False, f"{where}: {error.strerror or error}"
+
+
+def own_addresses() -> list[str]:
+    """Addresses under which the phone can reach this computer, loopback left out."""
+    found = dict.fromkeys(_routed())
+    try:
+        for *_, address in socket.getaddrinfo(socket.gethostname(), None):
+            found[str(address[0])] = None
+    except OSError:
+        pass
+    return [a for a in found if not a.startswith(("127.", "::1", "fe80", "0."))]
+
+
+def _routed() -> Iterator[str]:
+    """The address packets to other networks leave from; connecting UDP sends none."""
+    for family, far in ((socket.AF_INET, "192.0.2.1"), (socket.AF_INET6, "2001:db8::")):
+        try:
+            with socket.socket(family, socket.SOCK_DGRAM) as probe:
+                probe.connect((far, 9))
+                yield str(probe.getsockname()[0])
+        except OSError:
+            continue

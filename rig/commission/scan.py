@@ -1,0 +1,144 @@
+"""Which units answer on a bus, and of which drive family each is. Reads only."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+from rig.config.maps import RegisterMap, available_maps, load_map
+from rig.config.registers import Read, decode
+from rig.config.schema import ConfigError, parse
+from rig.config.settings import BusSettings
+from rig.device.bus import Bus, BusError, Rejected
+
+SCAN_TIMEOUT_S = 0.15  # for each absent unit; a drive answers within 25 ms at 9600 baud
+PARITIES = ("N", "E", "O")
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """A unit that answered."""
+
+    unit: int
+    families: tuple[str, ...]  # maps all of whose registers answer as they should
+    identity: dict[str, int]  # registers of the first of them
+    pulses_per_rev: int | None = None  # by its own word
+
+    def __str__(self) -> str:
+        if not self.families:
+            return f"unit {self.unit}: answers, of no known family"
+        words = ", ".join(f"{name} = {value}" for name, value in self.identity.items())
+        others = ", ".join(self.families[1:])
+        more = f" (or {others})" if others else ""
+        return f"unit {self.unit}: {self.families[0]}{more}" + (words and f", {words}")
+
+
+def parse_bus(text: str) -> BusSettings:
+    """Settings of ``tcp:HOST[:PORT]``, ``rtu_tcp:HOST[:PORT]``, ``rtu:DEVICE,BAUD,...``.
+
+    After the baud rate parity and stop bits may follow: ``rtu:/dev/ttyUSB0,115200,N,1``,
+    or data bits, parity and stop bits as ``8,N,1`` or ``N,8,1``.
+
+    Raises:
+        ConfigError: not such a text, or settings that cannot be.
+    """
+    transport, _, rest = text.partition(":")
+    lines = [f'transport = "{transport}"']
+    try:
+        if transport == "rtu":
+            device, *line = rest.split(",")
+            lines.append(f'device = "{device}"')
+            parity = [word for word in line[1:] if word in PARITIES]
+            bits = [int(word) for word in line[1:] if word not in PARITIES]
+            data = [bit for bit in bits if bit > 2]
+            stop = [bit for bit in bits if bit <= 2]
+            if max(len(parity), len(data), len(stop)) > 1:
+                raise ValueError
+            lines += [f"baudrate = {int(line[0])}"] if line else []
+            lines += [f'parity = "{word}"' for word in parity]
+            lines += [f"bytesize = {bit}" for bit in data]
+            lines += [f"stopbits = {bit}" for bit in stop]
+        elif transport in ("tcp", "rtu_tcp"):
+            host, _, port = rest.rpartition(":") if ":" in rest else (rest, "", "")
+            lines.append(f'host = "{host}"')
+            lines += [f"port = {int(port)}"] if port else []
+        else:
+            raise ValueError
+    except ValueError:
+        raise ConfigError(
+            "--bus",
+            [
+                "must be tcp:HOST[:PORT], rtu_tcp:HOST[:PORT] or "
+                f"rtu:DEVICE[,BAUD[,PARITY[,BITS[,STOPBITS]]]], got {text!r}"
+            ],
+        ) from None
+    return parse(BusSettings, "\n".join(lines), "--bus")
+
+
+def scan(
+    settings: BusSettings,
+    units: int,
+    say: Callable[[str], None],
+    maps: tuple[RegisterMap, ...] = (),
+) -> list[Found]:
+    """Ask units 1 to ``units`` for their identity; ``maps`` beside those that ship."""
+    known = [*maps, *(load_map(name) for name in available_maps())]
+    known = list({each.name: each for each in known}.values())
+    short = settings.model_copy(
+        update={"timeout_s": min(settings.timeout_s, SCAN_TIMEOUT_S), "read_retries": 1}
+    )
+    found: list[Found] = []
+    with Bus(short, max(each.inter_frame_s for each in known)) as bus:
+        begun = time.monotonic()
+        for unit in range(1, units + 1):
+            if answer := _ask(bus, unit, known):
+                found.append(answer)
+                say(str(answer))
+            if unit % 10 == 0 or unit == units:
+                spent = time.monotonic() - begun
+                left = spent / unit * (units - unit)
+                say(f"  {unit} of {units} units asked, about {left:.0f} s left")
+    return found
+
+
+def _ask(bus: Bus, unit: int, known: list[RegisterMap]) -> Found | None:
+    """A unit is there when it answers anything, if only by refusing a register."""
+    there, fitting = False, []
+    for each in known:
+        try:
+            identity = _identity(bus, unit, each)
+        except Rejected:
+            there = True
+            continue
+        except BusError:
+            if not there:
+                return None  # silent twice
+            continue
+        there = True
+        if identity is not None:
+            fitting.append((each.name, identity))
+    if not there:
+        return None
+    # The family with the most registers that agree comes first.
+    fitting.sort(key=lambda pair: -len(pair[1]))
+    names = tuple(name for name, _ in fitting)
+    return Found(unit, names, fitting[0][1] if fitting else {})
+
+
+def _identity(bus: Bus, unit: int, each: RegisterMap) -> dict[str, int] | None:
+    """Values of the identity registers; None where one is not of this family."""
+    values = {}
+    for name, read in each.identity.items():
+        values[name] = _read(bus, unit, read, each.word_order)
+        low, high = each.recognise.get(name, (values[name], values[name]))
+        if not low <= values[name] <= high:
+            return None
+    for read in (each.status, each.position, *([each.alarm] if each.alarm else [])):
+        _read(bus, unit, read, each.word_order)
+    return values
+
+
+def _read(bus: Bus, unit: int, read: Read, word_order: str) -> int:
+    words = bus.read_words(unit, read.address, read.count)
+    return decode(words, read.type, word_order)
