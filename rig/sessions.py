@@ -110,6 +110,10 @@ def run_session(args: argparse.Namespace) -> int:
         else:
             session.on_imu_port = simulator.start_phone
             session.listeners.append(simulator.hear)
+        if args.live:
+            from rig.live import launch
+
+            session.say(launch.start(folder, args.live_host))
         return run_safely(session, procedure)
 
 
@@ -143,6 +147,8 @@ def recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
     if start["mode"] == "refit":
         source = start["inputs"]["run"]
         raise Refused(f"{args.run} is a refit of {source}; give that run instead")
+    if start["mode"] not in ("calibrate", "collect", "verify", "goto"):
+        raise Refused(f"{args.run} is a step of commissioning: run it again instead")
     if getattr(args, "config", None) is not None:
         return load_config(args.config), start
     text = (args.run / "rig.toml").read_text(encoding="utf-8")
