@@ -40,6 +40,7 @@ class Drive:
     def __init__(self, bus: Bus, axis: Axis) -> None:
         self.bus = bus
         self.axis = axis
+        self.last: Status | None = None  # as last read
 
     def status(self, retries: int | None = None) -> Status:
         """Read status and position.
@@ -61,7 +62,9 @@ class Drive:
         status = self.axis.map.status
         word = self._read(status, retries)
         position = self._read(self.axis.map.position, retries)
-        return Status(word, position, time.monotonic(), **status.flags(word))
+        flags = status.flags(word)
+        self.last = Status(word, position, time.monotonic(), **flags)
+        return self.last
 
     def sound(self) -> Status:
         """Status; MotionFault where the fault bit is set."""
@@ -183,7 +186,10 @@ class Drive:
     def pulses_per_rev(self) -> int | None:
         """Pulses for one motor turn by the drive's own word; None where it has none."""
         read = self.axis.map.pulses_per_rev
-        return None if read is None else self._read(read)
+        try:
+            return self._read(read) or None if read else None
+        except Rejected:  # a model of the family without this register
+            return None
 
     def homed(self, word: int) -> bool:
         """Whether a status word says that the drive is homed."""
