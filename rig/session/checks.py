@@ -96,10 +96,12 @@ def leave(drives: Sequence[Drive], record: DeviceRecord) -> None:
     homed: list[str] = []
     for drive in drives:
         try:
-            status = drive.status(retries=0)
+            with drive.bus.urgent():  # also after a stop
+                status = drive.status(retries=0)
+                alarm = drive.alarm() if status.fault else ""
             if status.fault and not drive.axis.map.absolute_encoder:
-                alarm = drive.alarm() or "no code given"
-                record.void(HOMED, f"{drive.axis.name} went into alarm: {alarm}")
+                told = alarm or "no code given"
+                record.void(HOMED, f"{drive.axis.name} went into alarm: {told}")
         except BusError:
             positions.append(None)
             continue
