@@ -205,6 +205,9 @@ def run_cell(
         assert done, f"the session never entered {phase}"
         reason = next((s for s in reversed(said) if s.startswith("fault:")), "")
         check_invariants(folder, sim, alive=True, deaf=spec.kind in DEAF)
+        if spec.kind == "imu_second_sender":
+            events = {r["event"] for r in read_journal(folder / "journal.jsonl")}
+            assert "sender_refused" in events, "another sender was not refused"
         sim.repair()
         resumes = 0
         while code != 0 and resumes < MAX_RESUMES:
