@@ -84,8 +84,7 @@ def _told(found: list[Found]) -> int:
 def _imu(args: argparse.Namespace) -> int:
     with _place(args) as place:
         stream = steps.look_at_phone(place, args.seconds)
-        if place.path is not None:
-            setup.pin(place, stream.sender)
+        setup.pin(place, stream.sender)
     return EXIT_OK
 
 
@@ -116,7 +115,7 @@ def _setup(args: argparse.Namespace) -> int:
         bus=args.bus or "",
         imu=args.imu or "",
         units=args.units,
-        values=dict(map(_setting, args.set)),
+        values=dict(map(setting, args.set)),
         home=args.home,
         names_known=args.names_known,
     )
@@ -135,7 +134,7 @@ def _setup(args: argparse.Namespace) -> int:
     return setup.go(place, given)
 
 
-def _setting(text: str) -> tuple[str, Any]:
+def setting(text: str) -> tuple[str, Any]:
     """A key of rig.toml and its value; what is no TOML is a text."""
     key, equals, value = text.partition("=")
     if not equals:

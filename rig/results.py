@@ -10,7 +10,7 @@ from typing import Any
 
 from jaxcal.files import write_text
 from rig.config import parse_config
-from rig.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
+from rig.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault, Refused
 from rig.sessions import recorded
 
 Record = dict[str, Any]
@@ -23,6 +23,7 @@ def refit(args: argparse.Namespace) -> int:
     from rig.identification.refit import require_angles, reread
     from rig.outputs.console import recalibrate, summary_lines
     from rig.outputs.report import write_report
+    from rig.session.checks import check_matrix
     from rig.session.folder import RunFolder, new_run_folder
 
     held = _records(args.run)
@@ -48,6 +49,10 @@ def refit(args: argparse.Namespace) -> int:
     changed = {key: [old[key], value] for key, value in new.items()}
     records, evidence = reread(held, then, now)
     calibration, summary = conclude(now, evidence, {"refit_of": args.run.name})
+    try:
+        warnings = check_matrix(calibration.matrix)
+    except MotionFault as fault:
+        raise Refused(f"nothing was written: read like this, {fault}") from None
     if changed:
         summary.pop("after", None)  # compensated by another calibration than this
     summary |= {
@@ -78,6 +83,7 @@ def refit(args: argparse.Namespace) -> int:
     print("  no key was changed" if not changed else "  Set these in your rig.toml too")
     limit = now.session.verify_limit_deg
     print(*summary_lines(summary, limit), sep="\n")
+    print(*(f"WARNING: {text}\n" for text in warnings), sep="", end="")
     print(f"saved: {folder}/calibration.json, pairs.csv, summary.json, report.html")
     return EXIT_RECALIBRATE if recalibrate(summary, limit) else EXIT_OK
 

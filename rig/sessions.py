@@ -147,6 +147,8 @@ def recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
     if start["mode"] == "refit":
         source = start["inputs"]["run"]
         raise Refused(f"{args.run} is a refit of {source}; give that run instead")
+    if start["mode"] not in ("calibrate", "collect", "verify", "goto"):
+        raise Refused(f"{args.run} is a step of commissioning: run it again instead")
     if getattr(args, "config", None) is not None:
         return load_config(args.config), start
     text = (args.run / "rig.toml").read_text(encoding="utf-8")

@@ -133,6 +133,7 @@ def _check_room(run: Bench, start: Pulses) -> None:
     for j, name in enumerate(AXIS_NAMES):
         if (room := _room(run, start, j)) < REACH_DEG:
             raise Refused(
-                f"{name} stands {room + ROOM_DEG:.1f} deg from a limit; the check moves "
-                f"it {REACH_DEG:g} deg either way. Move it inwards: jaxcal-rig jog {name}"
+                f"{name} stands {room + ROOM_DEG:.1f} deg from a limit; the check "
+                f"moves it {REACH_DEG:g} deg either way. Move it inwards: jaxcal-rig "
+                f"jog {name}"
             )

@@ -59,6 +59,8 @@ class SmallMotion(Motion):
 class Bench(Run):
     """A run that commissions. It has a folder and a journal; it is not resumed."""
 
+    small: SmallMotion  # once armed
+
     def __init__(
         self,
         config: RigConfig,

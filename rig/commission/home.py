@@ -15,7 +15,7 @@ from rig.faults import MotionFault, Refused
 from rig.session.run import ZERO_FACTOR
 
 HOME_S = 120.0  # for one axis on its own way home
-SET_S = 2.0  # until a drive counts from its new zero
+SET_S, SET_TRIES = 1.0, 3  # until a drive counts from its new zero
 ANSWER_S = 0.5  # until a drive that was sent home moves
 POLL_S = 0.05
 
@@ -48,8 +48,8 @@ def home(run: Bench, here: bool, confirm: Callable[[str], None]) -> None:
     if not here and not can_home(run.config):
         without = {a.map.name for a in run.config.axes if a.map.home is None}
         raise Refused(
-            f"the map {', '.join(sorted(without))} knows no homing. Put the device into "
-            "its home posture and use --here"
+            f"the map {', '.join(sorted(without))} knows no homing. Put the device "
+            "into its home posture and use --here"
         )
     confirm(
         "home: nothing moves; where the device stands now becomes the origin of its "
@@ -78,17 +78,25 @@ def _set_zero(run: Bench, drive: Drive) -> None:
             f"it; home is at its count of {drive.status().position}"
         )
         return
-    drive.write(drive.axis.map.set_zero)
     tolerance = drive.axis.pulses_within(run.config.motion.position_tolerance_deg)
-    end = time.monotonic() + SET_S
-    while abs(count := drive.sound().position) > tolerance:
-        run.device_guard()
-        if time.monotonic() > end:
-            raise MotionFault(
-                f"{drive.axis.name} still counts {count} pulses {SET_S:g} s after its "
-                "position was set to 0. Set it with the maker's tool"
-            )
-        time.sleep(POLL_S)
+    lost = ""
+    for _ in range(SET_TRIES):  # the same once more where a frame was lost
+        try:
+            drive.write(drive.axis.map.set_zero)
+        except BusError as error:
+            lost = f" ({error})"
+        end = time.monotonic() + SET_S
+        while abs(count := drive.sound().position) > tolerance:
+            run.device_guard()
+            if time.monotonic() > end:
+                break
+            time.sleep(POLL_S)
+        else:
+            return
+    raise MotionFault(
+        f"{drive.axis.name} still counts {count} pulses after its position was set to "
+        f"0{lost}. Set it with the maker's tool"
+    )
 
 
 def _go_home(run: Bench, drive: Drive) -> None:
@@ -107,8 +115,8 @@ def _go_home(run: Bench, drive: Drive) -> None:
             break
         if time.monotonic() > end:
             raise MotionFault(
-                f"{axis.name} is not home after {HOME_S:g} s. Check its home switch and "
-                "the homing that is set in the drive"
+                f"{axis.name} is not home after {HOME_S:g} s. Check its home switch "
+                "and the homing that is set in the drive"
             )
         time.sleep(POLL_S)
     run.device_guard()

@@ -31,9 +31,9 @@ class Stream:
     def __str__(self) -> str:
         dropped = ", ".join(f"{n} {reason}" for reason, n in self.dropped.items())
         return (
-            f"{self.rate_hz:.0f} readings per s, longest gap {self.longest_gap_s:.2f} s, "
-            f"scatter {self.scatter_deg:.3f} deg, tilt {self.tilt_deg:.1f} deg, "
-            f"dropped: {dropped or 'none'}"
+            f"{self.rate_hz:.0f} readings per s, longest gap "
+            f"{self.longest_gap_s:.2f} s, scatter {self.scatter_deg:.3f} deg, tilt "
+            f"{self.tilt_deg:.1f} deg, dropped: {dropped or 'none'}"
         )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from rig.attitude import matrix_to_euler
 from rig.commission.findings import MOUNTING_DEG, Findings
 from rig.config import AXIS_NAMES, RigConfig
+from rig.config.axis import Axis, Scale
 
 # Measured against commanded: what A may take up, and what only a wrong gearing does.
 SOUND_RATIO = (0.4, 1.5)
@@ -45,74 +46,63 @@ def proposals(
         found: what they showed.
         told: pulses for one turn by each drive's own word, None where it has none.
     """
+    tables = {table["name"]: table for table in tomllib.loads(config.text)["axes"]}
     changes: list[Change] = []
-    tables = tomllib.loads(config.text)["axes"]
-    written = {table["name"]: table["map"] for table in tables}  # a name or a path
     for drive, joint in enumerate(found.joints):
         source, axis = config.axes[drive], config.axes[joint]
-        at = f"axes.{axis.name}"
-        values = {name: getattr(source, name) for name in OF_DRIVE}
-        values["map"] = written[source.name]
-        old = {name: getattr(axis, name) for name in OF_DRIVE} | {
-            "map": written[axis.name]
-        }
-        reasons = dict.fromkeys(OF_DRIVE, f"unit {source.unit} turns {axis.name}")
-        if told[drive] not in (None, values["pulses_per_rev"]):
-            values["pulses_per_rev"] = told[drive]
-            reasons["pulses_per_rev"] = (
-                f"unit {source.unit} says so itself, register "
-                f"0x{source.map.pulses_per_rev.address:04X}"
-            )
-        changes += [
-            Change(f"{at}.{name}", old[name], values[name], reasons[name])
-            for name in OF_DRIVE
-            if values[name] != old[name]
-        ]
+        own = _of_drive(source, axis, tables, told[drive])
         per_pulse = float(found.deg_per_pulse[drive])
-        direction = 1 if per_pulse > 0 else -1
-        if direction != axis.direction:
-            changes.append(
-                Change(
-                    f"{at}.direction", axis.direction, direction,
-                    f"positive pulses turn it the {_way(direction)} way",
-                )
-            )  # fmt: skip
-        ratio = abs(per_pulse) * values["pulses_per_rev"] * axis.reduction / 360.0
-        if not SOUND_RATIO[0] <= ratio <= SOUND_RATIO[1]:
-            changes.append(
-                Change(
-                    f"{at}.reduction", axis.reduction,
-                    float(f"{axis.reduction / ratio:.{DIGITS}g}"),
-                    f"it turns {ratio:.3g} of what is commanded; sound is "
-                    f"{SOUND_RATIO[0]:g} to {SOUND_RATIO[1]:g}",
-                )
-            )  # fmt: skip
-    for table in tables:
-        at, scales = (
-            f"axes.{table['name']}",
-            ("pulses_per_rev", "reduction", "direction"),
-        )
-        if any(change.key == f"{at}.{name}" for change in changes for name in scales):
-            changes += [
-                Change(f"{at}.{name}", table[name], None, "pulses have a new scale")
-                for name in ("min_pulses", "max_pulses")
-                if name in table
+        pulses = told[drive] or source.pulses_per_rev
+        own += _of_joint(axis, per_pulse, pulses)
+        if any(change.key.endswith(tuple(Scale.model_fields)) for change in own):
+            own += [
+                Change(f"axes.{axis.name}.{name}", value, None, "pulses mean otherwise")
+                for name, value in tables[axis.name].items()
+                if name in ("min_pulses", "max_pulses")
             ]
+        changes += own
     if found.turned_deg > MOUNTING_DEG:
         angles = matrix_to_euler(found.mounting, "ZYX").round(2) + 0.0
-        changes.append(
-            Change(
-                "imu.mounting_deg", list(config.imu.mounting_deg), angles.tolist(),
-                f"the three axes put the phone {found.turned_deg:.1f} deg from there",
-            )
-        )  # fmt: skip
+        before, reason = list(config.imu.mounting_deg), "the three axes put the phone"
+        reason += f" {found.turned_deg:.1f} deg from there"
+        changes.append(Change("imu.mounting_deg", before, angles.tolist(), reason))
     if found.order not in (None, config.mechanism.order):
-        changes.append(
-            Change(
-                "mechanism.order", config.mechanism.order, found.order,
-                "combined moves show which joint carries which",
-            )
-        )  # fmt: skip
+        reason = "combined moves show which joint carries which"
+        order = config.mechanism.order
+        changes.append(Change("mechanism.order", order, found.order, reason))
+    return changes
+
+
+def _of_drive(
+    source: Axis, axis: Axis, tables: dict[str, Any], told: int | None
+) -> list[Change]:
+    """Keys of the drive that turns ``axis``, which is configured as ``source``."""
+    changes = []
+    for name in OF_DRIVE:
+        # A map stands in the file as its name or its path.
+        old, new = tables[axis.name].get(name), tables[source.name].get(name)
+        reason = f"unit {source.unit} turns {axis.name}"
+        if name == "pulses_per_rev" and told not in (None, new):
+            new, reason = told, f"unit {source.unit} says so itself"
+        if old != new:
+            changes.append(Change(f"axes.{axis.name}.{name}", old, new, reason))
+    return changes
+
+
+def _of_joint(axis: Axis, deg_per_pulse: float, pulses_per_rev: int) -> list[Change]:
+    """Direction and reduction of a joint whose drive is known."""
+    changes, at = [], f"axes.{axis.name}"
+    direction = 1 if deg_per_pulse > 0 else -1
+    if direction != axis.direction:
+        reason = f"positive pulses turn it the {_way(direction)} way"
+        changes.append(Change(f"{at}.direction", axis.direction, direction, reason))
+    ratio = abs(deg_per_pulse) * pulses_per_rev * axis.reduction / 360.0
+    low, high = SOUND_RATIO
+    if not low <= ratio <= high:
+        reduction = float(f"{axis.reduction / ratio:.{DIGITS}g}")
+        reason = f"it turns {ratio:.3g} of what is commanded; sound is {low:g} to "
+        reason += f"{high:g}"
+        changes.append(Change(f"{at}.reduction", axis.reduction, reduction, reason))
     return changes
 
 
@@ -141,8 +131,8 @@ def lines(config: RigConfig, found: Findings) -> list[str]:
         )
     angles = matrix_to_euler(found.mounting, "ZYX")
     text.append(
-        f"  phone: turned by [{' '.join(f'{angle:.1f}' for angle in angles)}] deg about "
-        f"Z, Y, X, {found.turned_deg:.1f} from imu.mounting_deg"
+        f"  phone: turned by [{' '.join(f'{angle:.1f}' for angle in angles)}] deg "
+        f"about Z, Y, X, {found.turned_deg:.1f} from imu.mounting_deg"
     )
     order = found.order or "not clear from these moves"
     text.append(f"  joints from the base outwards: {order}")
@@ -153,7 +143,7 @@ def lines(config: RigConfig, found: Findings) -> list[str]:
         )
     if found.skew_deg > SKEW_DEG:
         text.append(
-            f"  WARNING: the axes read {found.skew_deg:.0f} deg away from right angles. "
-            "Check imu.order, imu.columns and imu.signs"
+            f"  WARNING: the axes read {found.skew_deg:.0f} deg away from right "
+            "angles. Check imu.order, imu.columns and imu.signs"
         )
     return text

@@ -35,10 +35,10 @@ class Found:
 
 
 def parse_bus(text: str) -> BusSettings:
-    """Settings of ``tcp:HOST[:PORT]``, ``rtu_tcp:HOST[:PORT]``, ``rtu:DEVICE,BAUD,...``.
+    """Settings of ``tcp:HOST[:PORT]``, ``rtu_tcp:HOST[:PORT]`` or ``rtu:DEVICE,...``.
 
-    After the baud rate parity and stop bits may follow: ``rtu:/dev/ttyUSB0,115200,N,1``,
-    or data bits, parity and stop bits as ``8,N,1`` or ``N,8,1``.
+    After the device follow baud rate, parity, data bits and stop bits, as far as they
+    are given: ``rtu:/dev/ttyUSB0,115200,N,8,1``; ``115200,8,N,1`` is the same.
 
     Raises:
         ConfigError: not such a text, or settings that cannot be.
@@ -104,7 +104,8 @@ def scan(
 
 def _ask(bus: Bus, unit: int, known: list[RegisterMap]) -> Found | None:
     """A unit is there when it answers anything, if only by refusing a register."""
-    there, fitting = False, []
+    there = False
+    fitting: list[tuple[RegisterMap, dict[str, int]]] = []
     for each in known:
         try:
             identity = _identity(bus, unit, each)
@@ -117,13 +118,17 @@ def _ask(bus: Bus, unit: int, known: list[RegisterMap]) -> Found | None:
             continue
         there = True
         if identity is not None:
-            fitting.append((each.name, identity))
+            fitting.append((each, identity))
     if not there:
         return None
+    if not fitting:
+        return Found(unit, (), {})
     # The family with the most registers that agree comes first.
     fitting.sort(key=lambda pair: -len(pair[1]))
-    names = tuple(name for name, _ in fitting)
-    return Found(unit, names, fitting[0][1] if fitting else {})
+    (first, identity), *_ = fitting
+    told = first.pulses_per_rev
+    pulses = None if told is None else _read(bus, unit, told, first.word_order)
+    return Found(unit, tuple(each.name for each, _ in fitting), identity, pulses)
 
 
 def _identity(bus: Bus, unit: int, each: RegisterMap) -> dict[str, int] | None:

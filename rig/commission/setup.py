@@ -8,13 +8,14 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any
 
+from jaxcal.files import write_text
 from rig.commission import steps
 from rig.commission.home import can_home
 from rig.commission.operator import Operator
 from rig.commission.ports import serial_lines
 from rig.commission.scan import Found, parse_bus, scan
-from rig.commission.toml import create, edit, new_text, set_values
-from rig.config import AXIS_NAMES, RigConfig
+from rig.commission.toml import edit, new_text, set_values
+from rig.config import AXIS_NAMES, RigConfig, parse_config
 from rig.config.axis import DEFAULT_ROTATES
 from rig.config.settings import BusSettings
 from rig.device.lock import BusLock
@@ -60,16 +61,17 @@ def write_config(path: pathlib.Path, given: Given, operator: Operator) -> RigCon
         f"app of the phone ({', '.join(FORMATS)})", FORMATS, FORMATS[0]
     )
     port = port or operator.ask("TCP port that the phone sends to", "2055")
-    text = new_text(bus, axes, form, int(port))
     values = dict(given.values)
     for name in AXIS_NAMES:
         key = f"axes.{name}.reduction"
         if key not in values:
             question = f"{name}: motor turns for one turn of the joint (gearbox)"
             values[key] = operator.number(question, 1.0)
-    text = set_values(text, values)
+    text = set_values(new_text(bus, axes, form, int(port)), values)
+    config = parse_config(text, path.parent, str(path))
     operator.confirm(f"write {path}")
-    return create(path, text)
+    write_text(path, text)
+    return config
 
 
 def _ask_bus(given: Given, operator: Operator, lines: list[str]) -> BusSettings:
@@ -82,7 +84,7 @@ def _ask_bus(given: Given, operator: Operator, lines: list[str]) -> BusSettings:
 
 def _ask_axes(
     found: list[Found], given: Given, operator: Operator
-) -> list[tuple[str, str, int, str, int]]:
+) -> list[dict[str, Any]]:
     usable = {each.unit: each for each in found if each.families}
     if len(usable) < 3:
         unknown = [each.unit for each in found if not each.families]
@@ -105,7 +107,15 @@ def _ask_axes(
         pulses = each.pulses_per_rev or int(
             operator.number(f"{name}: pulses for one motor turn", 10000)
         )
-        axes.append((name, DEFAULT_ROTATES[name], unit, family, pulses))
+        axes.append(
+            {
+                "name": name,
+                "letter": DEFAULT_ROTATES[name],
+                "unit": unit,
+                "family": family,
+                "pulses": pulses,
+            }
+        )
     return axes
 
 
@@ -143,9 +153,8 @@ def go(place: steps.Place, given: Given) -> int:
 
 def pin(place: steps.Place, sender: str) -> None:
     """Only this phone is listened to from now on."""
-    if not sender or sender in place.config.imu.allow:
+    if place.path is None or not sender or sender in place.config.imu.allow:
         return
-    assert place.path is not None
     place.operator.confirm(f"imu: listen to {sender} only, and to no other sender")
     place.take(edit(place.path, {"imu.allow": [sender]}))
 

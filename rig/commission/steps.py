@@ -109,23 +109,22 @@ def identify(place: Place) -> None:
     with place.bus("scan") as drives:
         found = identity(drives)
     place.record.reach(IDENTIFIED, place.config, identity=found)
-    units = {axis.name: axis.unit for axis in place.config.axes}
-    each = ", ".join(f"{name} is unit {units[name]}" for name in AXIS_NAMES)
-    place.say(f"IDENTIFIED: {each}")
+    each = [f"{axis.name} is unit {axis.unit}" for axis in place.config.axes]
+    place.say(f"IDENTIFIED: {', '.join(each)}")
 
 
-def look_at_phone(place: Place, seconds: float = WATCH_S) -> Stream:
+def look_at_phone(place: Place, seconds: float | None = None) -> Stream:
     """Wait for the phone, tell what it sends, and say what of it is too little."""
     settings = place.config.imu
     with Imu(settings) as imu:
         place.say(f"imu: {addresses_text(settings, imu.port)}; then start its stream")
         place.on_imu_port(imu.port)
-        stream = watch(imu, seconds, STREAM_WAIT_S, place.say)
+        stream = watch(imu, seconds or WATCH_S, STREAM_WAIT_S, place.say)
     if stream.rate_hz < SLOW_HZ or stream.longest_gap_s > LONG_GAP_S:
         place.say(
             f"  note: sessions want {SLOW_HZ:g} readings per s without gaps over "
-            f"{LONG_GAP_S:g} s. Raise the app's rate, keep the phone awake and near the "
-            "Wi-Fi; or raise imu.stale_s and settle.window_s"
+            f"{LONG_GAP_S:g} s. Raise the app's rate, keep the phone awake and near "
+            "the Wi-Fi; or raise imu.stale_s and settle.window_s"
         )
     return stream
 
@@ -168,9 +167,9 @@ def axes(place: Place, names_known: bool = False) -> int:
     """Check each axis, correct rig.toml after a yes, and check again: SIGN_CHECKED."""
     place.require(HOMED)
     place.operator.confirm(
-        "axes: each axis in turn will move 0.5 deg, then 3 deg either way; then two at "
-        "a time. Watch that the joint that moves is the one that is named, and keep out "
-        "of the device's reach"
+        "axes: the device stands in its zero posture. Each axis in turn will move 0.5 "
+        "deg, then 3 deg either way; then two at a time. Watch that the joint that "
+        "moves is the one that is named, and keep out of the device's reach"
     )
     for again in (False, True):
         changes: list[Change] = []

@@ -186,7 +186,10 @@ class Drive:
     def pulses_per_rev(self) -> int | None:
         """Pulses for one motor turn by the drive's own word; None where it has none."""
         read = self.axis.map.pulses_per_rev
-        return None if read is None else self._read(read)
+        try:
+            return self._read(read) or None if read else None
+        except Rejected:  # a model of the family without this register
+            return None
 
     def homed(self, word: int) -> bool:
         """Whether a status word says that the drive is homed."""

@@ -42,6 +42,7 @@ class Imu:
         self._parser = Parser(settings)
         self._ring: deque[Reading] = deque(maxlen=RING)
         self._lock = threading.Lock()
+        self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._lines: LineReceiver | None = None
         self._web: http.server.HTTPServer | None = None
@@ -74,6 +75,7 @@ class Imu:
 
     def close(self) -> None:
         """Close every socket and end the thread."""
+        self._closing.set()
         if self._lines is not None:
             self._lines.stop()
         if self._web is not None:

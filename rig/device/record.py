@@ -27,7 +27,7 @@ COMMANDS = {
     IDENTIFIED: "scan",
     HOMED: "home",
     SIGN_CHECKED: "axes",
-    ZEROED: "calibrate",
+    ZEROED: "zero",
 }  # that reach a state
 
 

@@ -96,13 +96,14 @@ def leave(drives: Sequence[Drive], record: DeviceRecord) -> None:
     homed: list[str] = []
     for drive in drives:
         try:
-            status = drive.status(retries=0)
-            if status.fault and not drive.axis.map.absolute_encoder:
-                alarm = drive.alarm() or "no code given"
-                record.void(HOMED, f"{drive.axis.name} went into alarm: {alarm}")
+            with drive.bus.urgent():  # also after a stop, when nothing else is sent
+                status = drive.status(retries=0)
+                alarm = drive.alarm() or "no code given" if status.fault else ""
         except BusError:
             positions.append(None)
             continue
+        if alarm and not drive.axis.map.absolute_encoder:
+            record.void(HOMED, f"{drive.axis.name} went into alarm: {alarm}")
         positions.append(None if status.moving else status.position)
         if drive.homed(status.word):
             homed.append(drive.axis.name)

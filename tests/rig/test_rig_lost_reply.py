@@ -17,10 +17,13 @@ from rig.faults import MotionFault, StopRequested
 from rig.outputs.journal import read_journal
 from rig.simulator import Simulator, Truth, parse_fault
 
+# Time enough for a busy computer: a reply that is late is one lost reply more.
+TIMEOUT = {"timeout_s = 0.5": "timeout_s = 0.25"}
+
 
 def hasty(register_map="leadshine_pr"):
     changes = {'map = "leadshine_pr"': f'map = "{register_map}"'}
-    return parse_config(fast_text(HASTY | changes))
+    return parse_config(fast_text(TIMEOUT | changes))
 
 
 def spoiling(motion, act):
@@ -173,7 +176,7 @@ def test_only_what_may_be_written_twice_is_retried():
 
 def rtu_session(seed, folder, said):
     pytest.importorskip("serial", reason="serial ports need pyserial")
-    config = fast_config(HASTY)
+    config = fast_config({"timeout_s = 0.5": "timeout_s = 0.15"})
     fault = parse_fault("spoilt_frames,share=0.03")
     with Simulator(
         config, Truth(noise_deg=0.0, seed=seed), [fault], transport="rtu", rate_hz=250.0

@@ -23,7 +23,8 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from rig.__main__ import main
 from rig.attitude import euler_to_matrix
-from rig.config import parse_config
+from rig.config import example_text, parse_config
+from rig.device.imu import Imu
 from rig.device.record import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED, DeviceRecord
 from rig.faults import MotionFault, Refused
 from rig.outputs.journal import read_journal
@@ -33,6 +34,8 @@ from rig.session.reference import KeptZero, check_zero, moved, unseen
 from rig.session.run import Run
 from rig.session.runner import run_safely
 from rig.simulator import Simulator, Truth
+from rig.simulator.faults import FaultInjector
+from rig.simulator.phone import Phone
 
 LOST = 1.4  # degrees, as was seen
 
@@ -342,6 +345,20 @@ def test_the_drives_own_gearing_counts(tmp_path):
     assert "axes.roll.pulses_per_rev says 10000" in said[-1]
 
 
+def test_a_drive_without_a_word_on_its_gearing_is_not_asked_for_it(tmp_path):
+    config = fast_config()
+    bare = tuple(
+        changed(axis, map=changed(axis.map, pulses_per_rev=None))
+        for axis in config.axes
+    )
+    with device(changed(config, axes=bare)) as sim:
+        served = changed(sim.start(), axes=config.axes)
+        record = commissioned(served, tmp_path)
+        run = Run(served, tmp_path, "collect", [].append, record=record)
+        run.on_imu_port = sim.start_phone
+        assert run_safely(run, lambda r: collect(r, 1)) == 0
+
+
 # States
 
 
@@ -412,3 +429,19 @@ def test_a_session_reaches_zeroed(calibrated):
     np.testing.assert_allclose(record.state(ZEROED)["attitude"], zero["attitude"])
     notes = jaxcal.Calibration.load(calibrated / "calibration.json").provenance["notes"]
     np.testing.assert_allclose(notes["zero_attitude"], zero["attitude"])
+
+
+def test_a_pushing_phone_comes_to_the_next_session_of_the_process(tmp_path):
+    """The axis check and the session after it each open the phone's port."""
+    text = example_text("oriental_az")
+    settings = parse_config(text).imu
+    assert settings.format == "sensorlogger"
+    settings = changed(settings, host="127.0.0.1", port=0)
+    phone = Phone(settings, lambda: np.eye(3), FaultInjector([]), RATE_HZ, 0)
+    try:
+        for _ in range(2):
+            with Imu(settings) as imu:
+                phone.start(imu.port)
+                imu.wait_for_stream(20.0)
+    finally:
+        phone.close()
