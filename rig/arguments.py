@@ -63,6 +63,15 @@ MOTION: Options = {
     "--reset-alarms": _flag("before arming"),
     "--zero": _flag("confirm that the device stands in its zero posture"),
 }
+LIVE_HOST: Options = {
+    "--live-host": {
+        "default": "127.0.0.1",
+        "metavar": "ADDRESS",
+        "help": "of this computer, to show the page on; another than loopback needs "
+        "the token that is printed",
+    },
+}
+LIVE: Options = {"--live": _flag("show it as a page in the browser")} | LIVE_HOST
 SIMULATOR: Options = {
     "--simulate": _flag("run against a simulated rig"),
     "--transport": {
@@ -87,11 +96,9 @@ SIMULATOR: Options = {
     "--lost-origin": _number(-90.0, 90.0, 0.0, "degrees the counts are off"),
     "--realistic": _flag("slow replies and enabling, jitter, idle watchdog"),
 }
-SESSION: Options = CONFIG | FOLDER | MOTION
-RUN: Options = {
-    "run": _path("the run's folder"),
-    "--config": _path("for a changed port"),
-}
+SESSION: Options = CONFIG | FOLDER | MOTION | LIVE
+FOLDER_OF: Options = {"run": _path("the run's folder")}
+RUN: Options = FOLDER_OF | {"--config": _path("for a changed port")}
 FILE: Options = {"file": _path("rig.toml", nargs="?")}
 NAME: Options = {"name": {"nargs": "?", "help": "without it the names are listed"}}
 PORT: Options = {"--bus-port": {"type": int, "help": "0: any free one"}}
@@ -117,7 +124,13 @@ BUS: Options = {
         "help": "rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT; without it "
         "that of rig.toml",
     },
-    "--units": {"type": int, "default": 16, "help": "ids 1 to this (default 16)"},
+    "--units": {
+        "type": int,
+        "choices": range(1, 248),
+        "metavar": "N",
+        "default": 16,
+        "help": "ids 1 to N (default 16)",
+    },
 }
 TCP: Options = {
     "--tcp": {
@@ -222,7 +235,9 @@ def make_parser() -> argparse.ArgumentParser:
     text = "move the end-effector to a posture, calibrated"
     add("goto", text, SAVED | TO | SESSION)
     text = "go on with a run that was paused, stopped or killed"
-    add("resume", text, RUN | MOTION)
+    add("resume", text, RUN | MOTION | LIVE)
+    text = "show a run, also a running one, as a page in the browser"
+    add("watch", text, FOLDER_OF | LIVE_HOST, False)
     text = "read identity and status of every drive; write nothing"
     add("identify", text, CONFIG)
     add("stop", "quick-stop every drive now, and verify", CONFIG, False)

@@ -12,7 +12,7 @@ from rig.config.files import example_names
 from rig.device.bus import Bus, BusError
 from rig.device.drives import Drive
 from rig.device.lock import BusLock
-from rig.faults import EXIT_FAULT, EXIT_OK
+from rig.faults import EXIT_FAULT, EXIT_OK, Refused
 from rig.sessions import load, make_simulator, run_session
 
 COMMISSIONING = ("ports", "scan", "imu", "jog", "home", "axes", "zero", "setup")
@@ -32,6 +32,7 @@ def run(args: argparse.Namespace) -> int:
         "simulate": _simulate,
         "example": _example,
         "check": _check,
+        "watch": _watch,
         **dict.fromkeys(("refit", "report", "export", "trend"), _of_recorded),
     }
     if args.command in COMMISSIONING:
@@ -105,6 +106,20 @@ def _simulate(args: argparse.Namespace) -> int:
                 time.sleep(3600)
         except KeyboardInterrupt:
             return EXIT_OK
+
+
+def _watch(args: argparse.Namespace) -> int:
+    from jaxcal.extras import needs
+    from rig.live import launch
+
+    if not (args.run / "journal.jsonl").is_file():
+        raise Refused(f"{args.run} holds no run")
+    with needs("live", "the live page"):
+        from rig.live.server import serve
+    sock, token, url = launch.listen(args.live_host)
+    print(f"live page: {url}\nCtrl-C ends", flush=True)
+    serve(args.run, sock, token)
+    return EXIT_OK
 
 
 def _example(args: argparse.Namespace) -> int:

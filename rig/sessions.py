@@ -110,6 +110,10 @@ def run_session(args: argparse.Namespace) -> int:
         else:
             session.on_imu_port = simulator.start_phone
             session.listeners.append(simulator.hear)
+        if args.live:
+            from rig.live import launch
+
+            session.say(launch.start(folder, args.live_host))
         return run_safely(session, procedure)
 
 

@@ -40,6 +40,7 @@ class Drive:
     def __init__(self, bus: Bus, axis: Axis) -> None:
         self.bus = bus
         self.axis = axis
+        self.last: Status | None = None  # as last read
 
     def status(self, retries: int | None = None) -> Status:
         """Read status and position.
@@ -50,10 +51,8 @@ class Drive:
         """
         try:
             return self._status(retries)
-        except Rejected:
-            raise
-        except BusError:
-            if retries is not None:
+        except BusError as error:
+            if retries is not None or refusal(error):
                 raise
             return self._status(None)
 
@@ -61,7 +60,9 @@ class Drive:
         status = self.axis.map.status
         word = self._read(status, retries)
         position = self._read(self.axis.map.position, retries)
-        return Status(word, position, time.monotonic(), **status.flags(word))
+        flags = status.flags(word)
+        self.last = Status(word, position, time.monotonic(), **flags)
+        return self.last
 
     def sound(self) -> Status:
         """Status; MotionFault where the fault bit is set."""

@@ -11,7 +11,7 @@ from scipy.optimize import brentq
 
 from rig.attitude import Array
 from rig.config import AXIS_NAMES, RigConfig
-from rig.identification.noise import mean_variance
+from rig.identification.noise import effective_samples, mean_variance
 from rig.outputs.journal import Record
 
 
@@ -118,7 +118,10 @@ def uncertainty(
         one, all_twelve = (_half_widths(level, shared, dof) for level in levels)
     else:
         variance = np.mean([mean_variance(r, phi) for r in chosen], axis=0)
-        one, all_twelve = (special.ndtri(0.5 + 0.5 * level) for level in levels)
+        counts = [effective_samples(phi, r["samples"]) - 1.0 for r in chosen]
+        free = np.maximum(1.0, np.sum(counts, axis=0))[:, None]
+        one, all_twelve = (special.stdtrit(free, 0.5 + 0.5 * p) for p in levels)
+        dof = int(free.min())
         basis = ["scatter of single readings only"]
     of_zero = mean_variance(zero, phi)
     spread = np.outer(variance, np.diag(inverse))

@@ -89,7 +89,9 @@ def _visit_chosen(run: Run, candidates: Array, choice: Choice) -> list[Record]:
     plans = iter(run.journal.events("replan"))
     while True:
         left = np.array([i for i in choice.indices if i not in records], dtype=int)
-        for index in left[travel_order(config, degrees[left], here)].tolist():
+        queue = left[travel_order(config, degrees[left], here)].tolist()
+        run.emit("queue", names=[f"select:{index}" for index in queue])
+        for index in queue:
             record = run.visit(
                 f"select:{index}", candidates[index], role="select", index=index
             )
@@ -168,7 +170,9 @@ def visit_pairs(run: Run, held: list[Any]) -> tuple[list[Record], dict[str, Any]
     points = config.to_deg([pulses for *_, pulses in visits] or np.empty((0, 3)))
     start = config.to_deg(run.zero_pulses or (0, 0, 0))
     found: dict[str, Record] = {}
-    for number in travel_order(config, points, start):
+    queue = travel_order(config, points, start)
+    run.emit("queue", names=[visits[number][0] for number in queue])
+    for number in queue:
         name, role, pulses = visits[number]
         if record := run.visit(name, pulses, role=role):
             found[name] = record

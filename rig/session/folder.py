@@ -6,6 +6,7 @@ import csv
 import datetime
 import io
 import json
+import os
 import pathlib
 import platform
 import sys
@@ -64,6 +65,7 @@ class RunFolder:
             "jaxcal": jaxcal.__version__,
             "python": platform.python_version(),
             "host": platform.node(),
+            "pid": os.getpid(),
             "arguments": sys.argv[1:],
             "started": now.isoformat(timespec="seconds"),
         }

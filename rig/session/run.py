@@ -32,6 +32,7 @@ from rig.guard.signals import Signals
 from rig.guard.watchdog import timeouts_left
 from rig.outputs.console import event_lines, numbers
 from rig.outputs.journal import Record
+from rig.outputs.telemetry import Telemetry
 from rig.readings import frame_at
 from rig.session.checks import check_drives, leave
 from rig.session.device import Device
@@ -65,6 +66,7 @@ class Run(RunFolder):
         self.confirm: Callable[[Run], None] = lambda run: None  # before ports open
         self.on_imu_port: Callable[[int], object] = lambda port: None
         self.device: Device | None = None
+        self.telemetry: Telemetry | None = None
         self.frame: Frame | None = None
         self.zero_pulses: Pulses | None = None
         self.record = record
@@ -124,12 +126,16 @@ class Run(RunFolder):
         imu = Imu(config.imu, report=self.emit)
         bus = Bus(config.bus, config.silence_s, self.emit)
         left = timeouts_left(self.journal.records)
-        self.device = Device(config, bus, imu, self.signals, self.emit, left)
+        self.device = device = Device(config, bus, imu, self.signals, self.emit, left)
         imu.open()
         self.say(f"IMU: waiting for the phone on port {imu.port} ({config.imu.format})")
         self.on_imu_port(imu.port)
         bus.open()
         self.check_device(self.device)
+        self.telemetry = Telemetry(
+            self.folder, config, imu, device.drives, lambda: device.frame
+        )
+        self.telemetry.start()
         imu.wait_for_stream(STREAM_WAIT_S)
         self.signals.armed = True
         self.device.arm(self._reset_alarms)
@@ -205,6 +211,7 @@ class Run(RunFolder):
         self.signals.check_pause()
         pitch, yaw, roll = (int(count) for count in pulses)
         begun = time.monotonic()
+        self.emit("visit", name=name, pulses=[pitch, yaw, roll])
         try:
             self.motion.move_to((pitch, yaw, roll), name)
             measured = self.observer.measure((pitch, yaw, roll), name)
@@ -250,10 +257,13 @@ class Run(RunFolder):
 
     def disarm(self) -> None:
         """Nothing more will move: close the device, free the signals."""
+        if self.telemetry is not None:
+            self.telemetry.close()
         if self.device is not None:
             if self.signals.armed:
                 try:
-                    leave(self.device.drives, self.record)
+                    with self.device.bus.urgent():  # also after a stop that latched
+                        leave(self.device.drives, self.record)
                 except OSError as error:
                     self.say(f"{self.record.path} cannot be written: {error}")
             self.device.close()
