@@ -24,6 +24,7 @@ Visit = Literal[
 ENDS = ("end", "fault", "stopped", "paused", "refused")
 KEPT_PHASES = 400  # newest changes of phase: more than the plots show
 LOGGED = 200  # newest lines of what happened
+REFERENCES = {"reference:middle", "reference:end"}  # visits of a calibration
 ACTIVE = ("moving", "settling", "measuring")
 
 
@@ -89,6 +90,7 @@ class RunState:
     drift: list[tuple[float, Degrees]] = dataclasses.field(default_factory=list)
     stop: Record | None = None
     ended: Record | None = None
+    warnings: list[str] = dataclasses.field(default_factory=list)
     log: list[tuple[float, str]] = dataclasses.field(default_factory=list)
     time: float = 0.0  # of the newest record
     damaged: bool = False  # a record is missing in between
@@ -143,6 +145,8 @@ class RunState:
                     self._drop(name, "withdrawn", "recorded while an axis slipped")
             case "stop":
                 self.stop = record
+            case "sender_refused" | "comm_restored":
+                self.warnings += [line.strip() for line in event_lines(record)]
             case _ if event in ENDS:
                 self.ended, self.current, self.phase = record, None, event
         if line := self._line(record):
@@ -154,7 +158,7 @@ class RunState:
         self.sessions += 1
         self.pid, self.host = record.get("pid"), record.get("host", "")
         self.ended = self.stop = self.current = None
-        self.phase = "opening"
+        self.phase, self.warnings = "opening", []
 
     def _enter(self, phase: str, now: float) -> None:
         self.phase = phase
@@ -236,9 +240,7 @@ class RunState:
                 return "the remaining postures were chosen again"
             case event if event in ENDS and record.get("reason"):
                 return f"{event}: {record['reason']}"
-            case "zero" | "void" | "unreachable" | "stop":
-                return "; ".join(line.strip() for line in event_lines(record))
-        return ""
+        return "; ".join(line.strip() for line in event_lines(record))
 
     # What follows from it
 
@@ -285,7 +287,7 @@ class RunState:
         pairs = 0 if self.by_role("before") else self.setting(
             "session", "verify_postures", 0
         )  # fmt: skip
-        return known + 2 * pairs + (not self.by_role("reference"))
+        return known + 2 * pairs + len(REFERENCES - self.postures.keys())
 
     @property
     def noise_deg(self) -> float:

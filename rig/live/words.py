@@ -13,7 +13,7 @@ from rig.faults import EXIT_RECALIBRATE
 from rig.guard.stop import UnitStop
 from rig.live.state import ACTIVE, Degrees, Posture, Record, RunState
 from rig.live.worth import ellipsoid, prediction_std
-from rig.outputs.console import error_text, noise_text
+from rig.outputs.console import drift_text, error_text, noise_text
 
 SHOWN = 40  # rows of a long queue
 STALE_S = 1.0
@@ -35,6 +35,11 @@ RESUME = "To go on: jaxcal-rig resume {}"
 def text(value: Any) -> str:
     """Escaped for HTML."""
     return html.escape(str(value))
+
+
+def sentence(words: str) -> str:
+    """With a capital, and nothing else changed."""
+    return words[:1].upper() + words[1:]
 
 
 def angle(value: float | None, digits: int = 3) -> str:
@@ -63,7 +68,7 @@ def headline(state: RunState, running: bool) -> tuple[str, str]:
     code = ended.get("code", 0)
     match ended["event"]:
         case "end" if code == EXIT_RECALIBRATE:
-            return "warn", "Done: recalibrate, an error is over its limit"
+            return "warn", "Done: recalibrate"
         case "end":
             return "good", "Done"
         case "paused":
@@ -95,6 +100,7 @@ def trouble(state: RunState, running: bool, folder: str) -> str:
             lines.append(RESUME.format(folder))
     elif ended is None and stop is not None and stop["reason"]:
         lines.append(f"Stopped: {stop['reason']}")
+    lines += state.warnings
     for posture in state.postures.values():
         if posture.state == "unreachable":
             lines.append(f"{posture.title} is out of reach: {posture.note}")
@@ -237,10 +243,12 @@ def verdict(state: RunState, summary: dict[str, Any], report: bool) -> str:
     lines: list[str] = []
     limit = state.setting("session", "verify_limit_deg")
     if "before" in summary:
-        lines.append(f"{error_text(summary).capitalize()}, limit {limit:g}")
+        lines.append(f"{sentence(error_text(summary))}, limit {limit:g}")
     if "noise_std_deg" in summary:
-        lines.append(noise_text(summary).capitalize())
-    if summary.get("drift_deg") is not None:
+        lines.append(sentence(noise_text(summary)))
+    if summary.get("drift"):
+        lines.append(sentence(drift_text(summary["drift"])))
+    elif summary.get("drift_deg") is not None:  # of version 1
         lines.append(f"Zero posture at the end: {summary['drift_deg']:.4f} deg off")
     if warning := summary.get("orders", {}).get("warning"):
         lines.append(f"Warning: {warning}")

@@ -156,6 +156,11 @@ def test_out_of_reach_and_withdrawn_postures_say_why():
     assert state_of(numbered(again)).postures["select:4"].state == "waiting"
 
 
+def test_what_a_session_warned_of_is_in_sight():
+    records = [*begun(), {"event": "sender_refused", "reason": "a second phone"}]
+    assert "a second phone" in words.trouble(state_of(numbered(records)), True, "run")
+
+
 def test_another_choice_forgets_what_was_only_waiting():
     choice = {"indices": [4, 5], "method": "exact", "log_det": 1.0}
     records = [*begun(), posture("select:3"), {"event": "replan", "choice": choice}]
