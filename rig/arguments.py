@@ -218,7 +218,7 @@ def make_parser() -> argparse.ArgumentParser:
             group.add_argument(option, **given)
 
     text = "from cables to a device that may be calibrated; writes rig.toml"
-    add("setup", text, STEP | BUS | SETUP | NAMES_KNOWN, False)
+    add("setup", text, STEP | BUS | SETUP | NAMES_KNOWN)
     add("ports", "list serial ports, and what answers on TCP", TCP, False)
     add("scan", "which units answer, and of which family; reads only", CONFIG | BUS)
     add("imu", "what to type into the phone, and what it sends", STEP | SECONDS)
