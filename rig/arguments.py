@@ -123,7 +123,13 @@ BUS: Options = {
         "help": "rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT; without it "
         "that of rig.toml",
     },
-    "--units": {"type": int, "default": 16, "help": "ids 1 to this (default 16)"},
+    "--units": {
+        "type": int,
+        "choices": range(1, 248),
+        "metavar": "N",
+        "default": 16,
+        "help": "ids 1 to N (default 16)",
+    },
 }
 TCP: Options = {
     "--tcp": {

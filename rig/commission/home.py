@@ -158,7 +158,7 @@ def identity(drives: list[Drive]) -> dict[str, dict[str, int | str]]:
             ) from None
         for name, (low, high) in axis.map.recognise.items():
             value = values[name]
-            if not isinstance(value, int) or not low <= value <= high:
+            if isinstance(value, int) and not low <= value <= high:
                 raise Refused(
                     f"{axis.name} (unit {axis.unit}) is no {axis.map.name}: {name} is "
                     f"{value}, not in [{low}, {high}]. Run `jaxcal-rig scan`"

@@ -67,6 +67,7 @@ def by_keyboard(run: Bench, axis: int) -> None:
     with Keyboard() as keyboard:
         while True:
             device.guard()
+            device.statuses()  # alarms, and the line is kept alive
             run.signals.check_pause()
             for key in keyboard.keys(0.1)[-1:]:
                 if key == "q":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Callable
@@ -12,7 +13,9 @@ from rig.config.schema import ConfigError, parse
 from rig.config.settings import BusSettings
 from rig.device.bus import Bus, BusError, Rejected
 
-SCAN_TIMEOUT_S = 0.15  # for each absent unit; a drive answers within 25 ms at 9600 baud
+# For each absent unit, twice; a drive answers within 25 ms at 9600 baud.
+SCAN_TIMEOUT_S = 0.25
+ABSENT = (4, 10, 11)  # what servers and gateways answer for a unit that is not there
 PARITIES = ("N", "E", "O")
 
 
@@ -21,7 +24,7 @@ class Found:
     """A unit that answered."""
 
     unit: int
-    families: tuple[str, ...]  # maps all of whose registers answer as they should
+    families: tuple[str, ...]  # maps that its registers fit, the best first
     identity: dict[str, int]  # registers of the first of them
     pulses_per_rev: int | None = None  # by its own word
 
@@ -103,45 +106,56 @@ def scan(
 
 
 def _ask(bus: Bus, unit: int, known: list[RegisterMap]) -> Found | None:
-    """A unit is there when it answers anything, if only by refusing a register."""
+    """What a unit is; None where it is silent, or a gateway says that it is."""
     there = False
-    fitting: list[tuple[RegisterMap, dict[str, int]]] = []
+    fitting: list[tuple[tuple[int, int], RegisterMap, dict[str, int]]] = []
     for each in known:
         try:
-            identity = _identity(bus, unit, each)
-        except Rejected:
-            there = True
+            _read(bus, unit, each.status, each.word_order)
+            _read(bus, unit, each.position, each.word_order)
+        except Rejected as refusal:
+            there |= refusal.code not in ABSENT
             continue
         except BusError:
             if not there:
-                return None  # silent twice
+                return None
             continue
         there = True
-        if identity is not None:
-            fitting.append((each, identity))
-    if not there:
-        return None
+        identity = _identity(bus, unit, each)
+        told = {name for name in each.recognise if name in identity}
+        if all(_within(each, name, identity[name]) for name in told):
+            # Registers that are not there read as 0 in some drives.
+            proved = sum(identity[name] != 0 for name in told)
+            fitting.append(((proved, len(identity)), each, identity))
     if not fitting:
-        return Found(unit, (), {})
-    # The family with the most registers that agree comes first.
-    fitting.sort(key=lambda pair: -len(pair[1]))
-    (first, identity), *_ = fitting
-    told = first.pulses_per_rev
-    pulses = None if told is None else _read(bus, unit, told, first.word_order)
-    return Found(unit, tuple(each.name for each, _ in fitting), identity, pulses)
+        return Found(unit, (), {}) if there else None
+    fitting.sort(key=lambda one: one[0], reverse=True)
+    _, first, identity = fitting[0]
+    names = tuple(each.name for _, each, _ in fitting)
+    return Found(unit, names, identity, _told(bus, unit, first))
 
 
-def _identity(bus: Bus, unit: int, each: RegisterMap) -> dict[str, int] | None:
-    """Values of the identity registers; None where one is not of this family."""
+def _within(each: RegisterMap, name: str, value: int) -> bool:
+    low, high = each.recognise[name]
+    return low <= value <= high
+
+
+def _identity(bus: Bus, unit: int, each: RegisterMap) -> dict[str, int]:
+    """Values of the identity registers; those that a model lacks are left out."""
     values = {}
     for name, read in each.identity.items():
-        values[name] = _read(bus, unit, read, each.word_order)
-        low, high = each.recognise.get(name, (values[name], values[name]))
-        if not low <= values[name] <= high:
-            return None
-    for read in (each.status, each.position, *([each.alarm] if each.alarm else [])):
-        _read(bus, unit, read, each.word_order)
+        with contextlib.suppress(Rejected):
+            values[name] = _read(bus, unit, read, each.word_order)
     return values
+
+
+def _told(bus: Bus, unit: int, each: RegisterMap) -> int | None:
+    """Pulses for one turn by the drive's own word."""
+    if each.pulses_per_rev is None:
+        return None
+    with contextlib.suppress(Rejected):
+        return _read(bus, unit, each.pulses_per_rev, each.word_order) or None
+    return None
 
 
 def _read(bus: Bus, unit: int, read: Read, word_order: str) -> int:

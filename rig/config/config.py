@@ -24,7 +24,7 @@ from rig.config.settings import (
     SettleSettings,
 )
 
-POLLS, HICCUP_S = 4, 0.25  # of the motion loop's heartbeat
+POLLS, HICCUP_S = 4, 0.5  # of the motion loop's heartbeat
 PHONE = (
     "format", "columns", "quaternion_columns", "unit", "order", "signs", "mounting_deg"
 )  # fmt: skip

@@ -32,7 +32,9 @@ class BusSettings(Section):
     stopbits: int = key("of an rtu bus", 1, 1, 2)
     bytesize: int = key("of an rtu bus", 8, 7, 8)
     timeout_s: float = key("for one reply", 0.3, 0.01, 5)
-    read_retries: int = key("of reads only; a motion write is sent once", 2, 0, 10)
+    read_retries: int = key(
+        "of reads, and of a move that the drive has not taken", 2, 0, 10
+    )
 
     @property
     def where(self) -> str:

@@ -51,10 +51,8 @@ class Drive:
         """
         try:
             return self._status(retries)
-        except Rejected:
-            raise
-        except BusError:
-            if retries is not None:
+        except BusError as error:
+            if retries is not None or refusal(error):
                 raise
             return self._status(None)
 

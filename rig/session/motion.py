@@ -11,9 +11,8 @@ from rig.device.bus import BusError, Rejected
 from rig.device.drives import Drive, Status, refusal
 from rig.faults import LimitError, MotionFault, Unreachable
 from rig.guard.limits import approach, check_plan, outside
+from rig.guard.stop import STILL_COUNTS
 from rig.session.device import Device
-
-STILL_COUNTS = 2  # between two readings of a position that flickers by one count
 
 
 class Motion:

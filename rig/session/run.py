@@ -262,7 +262,8 @@ class Run(RunFolder):
         if self.device is not None:
             if self.signals.armed:
                 try:
-                    leave(self.device.drives, self.record)
+                    with self.device.bus.urgent():  # also after a stop that latched
+                        leave(self.device.drives, self.record)
                 except OSError as error:
                     self.say(f"{self.record.path} cannot be written: {error}")
             self.device.close()

@@ -47,9 +47,9 @@ class Recorder:
             connection.close()
 
 
-def rtu_over_tcp(port, retries=2):
+def rtu_over_tcp(port, retries=2, timeout_s=0.1):
     return BusSettings(
-        transport="rtu_tcp", host="127.0.0.1", port=port, timeout_s=0.1,
+        transport="rtu_tcp", host="127.0.0.1", port=port, timeout_s=timeout_s,
         read_retries=retries,
     )  # fmt: skip
 

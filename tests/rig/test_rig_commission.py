@@ -35,6 +35,7 @@ from rig.device.record import (
 )
 from rig.faults import Refused
 from rig.simulator import Simulator, Truth
+from rig.simulator.drive import DriveException
 
 RIG = pathlib.Path(__file__).parents[2]
 QUICK = (  # of the new rig.toml: short windows, quick axes
@@ -427,6 +428,47 @@ def test_scan_tells_families_apart_and_writes_nothing(at, capsys):
                 place = drive.map.position
                 held = drive.map.move.write[0].address
                 assert drive._registers[held] == before[held], place
+
+
+class Registers:
+    """A drive by its bare registers, served by our server in place of a SimDrive."""
+
+    def __init__(self, values, others=None):
+        self.values, self.others = values, others
+
+    def read(self, address, count):
+        found = [self.values.get(address + i, self.others) for i in range(count)]
+        if None in found:
+            raise DriveException(2)
+        return found
+
+
+@pytest.mark.parametrize(
+    ("others", "lacking"),
+    [(None, ()), (0, ()), (None, (0x0191, 0x01BF))],
+    ids=["refuses what it has not", "reads 0 there", "a model without two of them"],
+)
+def test_scan_knows_a_drive_that_is_not_the_simulators(at, others, lacking, capsys):
+    has = {0x1003: 0x32, 0x602C: 0, 0x602D: 0, 0x2203: 0, 0x0001: 4000}
+    has |= {0x0191: 20, 0x01BF: 2}
+    drive = Registers({k: v for k, v in has.items() if k not in lacking}, others)
+    with device() as (sim, bus, _):
+        sim.server.drives[2] = drive
+        assert main(["scan", "--bus", bus, "--units", "2"]) == 0
+    said = capsys.readouterr().out
+    assert "unit 2: leadshine_pr" in said and "pulses_per_rev = 4000" in said
+
+
+def test_a_gateway_that_answers_for_absent_units_is_no_drive(at, capsys):
+    class Absent(Registers):
+        def read(self, address, count):
+            raise DriveException(11)
+
+    with device() as (sim, bus, _):
+        sim.server.drives[2] = Absent({})
+        assert main(["scan", "--bus", bus, "--units", "3"]) == 0
+    said = capsys.readouterr().out
+    assert "unit 1: lead" in said and "unit 2" not in said and "unit 3: lead" in said
 
 
 def test_an_empty_bus_is_said_with_what_to_check(at, capsys):

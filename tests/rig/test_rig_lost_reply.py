@@ -1,6 +1,8 @@
 """A lost reply to a move: the drive is read, and nothing is ever done twice."""
 
 import json
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -155,6 +157,25 @@ def test_no_move_is_sent_again_once_a_stop_was_asked_for(stop):
             motion.move_to(motion.config.to_pulses([3, 3, 3]), "x")
         assert outcomes(told) == ["not taken"]
         assert motion.sim.executions()[1] == []
+
+
+def test_a_move_that_waited_for_the_line_while_it_was_stopped_is_not_sent():
+    with bench(hasty()) as motion:
+        device, held = motion.device, threading.Event()
+
+        def stop():
+            with device.bus.urgent():  # as the stop path holds it
+                held.set()
+                time.sleep(0.1)
+                device.stopper.reason = "stopped by another thread"
+
+        thread = threading.Thread(target=stop)
+        thread.start()
+        held.wait()
+        with pytest.raises(StopRequested):
+            device.drives[0].move(100)
+        thread.join()
+        assert motion.sim.executions()[0] == []
 
 
 def test_only_what_may_be_written_twice_is_retried():

@@ -52,7 +52,7 @@ def spoken():
     def say(map_name, unit, act, answer=None, **changes):
         peer = Recorder(answer or echo)
         made.append(peer)
-        with Bus(rtu_over_tcp(peer.port, retries=0)) as bus:
+        with Bus(rtu_over_tcp(peer.port, retries=0, timeout_s=1.0)) as bus:
             result = act(Drive(bus, axis_with(map_name, unit=unit, **changes)))
         return peer.received, result
 

@@ -158,7 +158,7 @@ def test_resume_refuses_a_changed_configuration(finished):
         )  # fmt: skip
 
 
-def test_a_changed_verify_limit_does_not_keep_a_run_from_resuming(finished):
+def test_a_changed_verify_limit_does_not_keep_a_run_from_resuming(finished, tmp_path):
     limits = "verify_limit_deg = 9.0\nreference_tolerance_deg = 3.0\n"
     table = '\n[session]\nmethod = "exact"\n' + limits
     judged = parse_config(fast_text({"stall_s = 0.3": "stall_s = 0.4"}, session=table))

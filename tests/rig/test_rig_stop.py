@@ -9,11 +9,12 @@ import threading
 import time
 
 import pytest
-from harness import HASTY, fast_config, fast_text, simulator
+from harness import HASTY, commissioned, fast_config, fast_text, simulator
 from test_rig_motion import bench
 
 from rig import stopping
 from rig.__main__ import main
+from rig.config import load_config
 from rig.config.salvage import read_for_stop
 from rig.device import lock
 from rig.device.bus import Bus, BusError
@@ -34,6 +35,7 @@ def rig(tmp_path):
     with simulator(config, speedup=0.02) as sim:
         sim.path = tmp_path / "rig.toml"
         sim.path.write_text(text_for(sim.start().bus.port))
+        commissioned(load_config(sim.path), tmp_path)
         yield sim
 
 
