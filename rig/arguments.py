@@ -65,10 +65,9 @@ MOTION: Options = {
 }
 LIVE_HOST: Options = {
     "--live-host": {
-        "default": "127.0.0.1",
         "metavar": "ADDRESS",
-        "help": "of this computer, to show the page on; another than loopback needs "
-        "the token that is printed",
+        "help": "show the page on this address of this computer (default loopback); "
+        "another than loopback needs the token that is printed",
     },
 }
 LIVE: Options = {"--live": _flag("show it as a page in the browser")} | LIVE_HOST
