@@ -65,10 +65,9 @@ MOTION: Options = {
 }
 LIVE_HOST: Options = {
     "--live-host": {
-        "default": "127.0.0.1",
         "metavar": "ADDRESS",
-        "help": "of this computer, to show the page on; another than loopback needs "
-        "the token that is printed",
+        "help": "show the page on this address of this computer (default loopback); "
+        "another than loopback needs the token that is printed",
     },
 }
 LIVE: Options = {"--live": _flag("show it as a page in the browser")} | LIVE_HOST
@@ -218,7 +217,7 @@ def make_parser() -> argparse.ArgumentParser:
             group.add_argument(option, **given)
 
     text = "from cables to a device that may be calibrated; writes rig.toml"
-    add("setup", text, STEP | BUS | SETUP | NAMES_KNOWN, False)
+    add("setup", text, STEP | BUS | SETUP | NAMES_KNOWN)
     add("ports", "list serial ports, and what answers on TCP", TCP, False)
     add("scan", "which units answer, and of which family; reads only", CONFIG | BUS)
     add("imu", "what to type into the phone, and what it sends", STEP | SECONDS)

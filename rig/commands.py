@@ -118,7 +118,8 @@ def _watch(args: argparse.Namespace) -> int:
         from rig.live.server import serve
     sock, token, url = launch.listen(args.live_host)
     print(f"live page: {url}\nCtrl-C ends", flush=True)
-    serve(args.run, sock, token)
+    with contextlib.suppress(KeyboardInterrupt):
+        serve(args.run, sock, token)
     return EXIT_OK
 
 

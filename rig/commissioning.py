@@ -4,20 +4,32 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import pathlib
+import socket
 import tomllib
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rig.commission import setup, steps
 from rig.commission.operator import Operator
 from rig.commission.ports import MODBUS_PORT, serial_lines, tcp_line
 from rig.commission.scan import Found, parse_bus, scan
-from rig.config import AXIS_NAMES, RigConfig, load_config
+from rig.config import (
+    AXIS_NAMES,
+    RigConfig,
+    example_text,
+    load_config,
+    parse_config,
+)
 from rig.device.lock import BusLock
 from rig.device.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
 from rig.faults import EXIT_FAULT, EXIT_OK, Refused
+from rig.session.folder import new_run_folder
 from rig.sessions import load, make_simulator
+
+if TYPE_CHECKING:
+    from rig.simulator import Simulator
 
 FILE = pathlib.Path("rig.toml")
 
@@ -119,19 +131,48 @@ def _setup(args: argparse.Namespace) -> int:
         home=args.home,
         names_known=args.names_known,
     )
-    operator.confirm(setup.SAFETY)
-    if path.exists() and given.values:
-        raise Refused(f"{path} exists: edit it, or leave out --set")
-    if path.exists():
-        config = load_config(path)
-        operator.say(f"{path} exists and is used; delete it to begin anew")
-    else:
-        config = setup.write_config(path, given, operator)
-    place = steps.Place(
-        config, DeviceRecord.load(config.device_path), operator, path,
-        reset_alarms=args.reset_alarms,
+    with contextlib.ExitStack() as stack:
+        if args.simulate:
+            simulator = stack.enter_context(_simulator(args))
+            given = _given(simulator, given)
+            path = args.config or _own_folder(simulator.config) / "rig.toml"
+        operator.confirm(setup.SAFETY)
+        if path.exists() and args.set:
+            raise Refused(f"{path} exists: edit it, or leave out --set")
+        if path.exists():
+            config = load_config(path)
+            operator.say(f"{path} exists and is used; delete it to begin anew")
+        else:
+            config = setup.write_config(path, given, operator)
+        place = steps.Place(
+            config, DeviceRecord.load(config.device_path), operator, path,
+            reset_alarms=args.reset_alarms, full_speed=args.simulate,
+        )  # fmt: skip
+        return setup.go(place, given)
+
+
+def _simulator(args: argparse.Namespace) -> Simulator:
+    config = parse_config(example_text("simulate"))
+    return make_simulator(config, vars(args), args.fault)
+
+
+def _given(simulator: Simulator, given: setup.Given) -> setup.Given:
+    """What an operator would answer of a simulated device, and its phone started."""
+    bus = simulator.start().bus
+    where = f"{bus.transport}:{bus.host}:{bus.port}"
+    if bus.transport == "rtu":
+        where = f"rtu:{bus.device},{bus.baudrate},N,8,1"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    simulator.start_phone(port)
+    values: dict[str, Any] = {"imu.host": "127.0.0.1"}
+    for axis in simulator.config.axes:
+        for name in ("reduction", "speed_deg_s", "accel_deg_s2"):
+            values[f"axes.{axis.name}.{name}"] = getattr(axis, name)
+    return dataclasses.replace(
+        given, bus=where, imu=f"{simulator.config.imu.format}:{port}",
+        values=values | given.values,
     )  # fmt: skip
-    return setup.go(place, given)
 
 
 def setting(text: str) -> tuple[str, Any]:
@@ -174,6 +215,4 @@ def _place(args: argparse.Namespace, state: str = "") -> Iterator[steps.Place]:
 
 
 def _own_folder(config: RigConfig) -> pathlib.Path:
-    from rig.session.folder import new_run_folder
-
     return new_run_folder(pathlib.Path(config.output), "simulated")

@@ -110,7 +110,7 @@ def run_session(args: argparse.Namespace) -> int:
         else:
             session.on_imu_port = simulator.start_phone
             session.listeners.append(simulator.hear)
-        if args.live:
+        if args.live or args.live_host:
             from rig.live import launch
 
             session.say(launch.start(folder, args.live_host))

@@ -13,8 +13,8 @@ from rig.config.schema import ConfigError, parse
 from rig.config.settings import BusSettings
 from rig.device.bus import Bus, BusError, Rejected
 
-# For each absent unit, twice; a drive answers within 25 ms at 9600 baud.
-SCAN_TIMEOUT_S = 0.25
+# For each absent unit, three times; a drive answers within 25 ms at 9600 baud.
+SCAN_TIMEOUT_S, RETRIES = 0.2, 2
 ABSENT = (4, 10, 11)  # what servers and gateways answer for a unit that is not there
 PARITIES = ("N", "E", "O")
 
@@ -89,7 +89,10 @@ def scan(
     known = [*maps, *(load_map(name) for name in available_maps())]
     known = list({each.name: each for each in known}.values())
     short = settings.model_copy(
-        update={"timeout_s": min(settings.timeout_s, SCAN_TIMEOUT_S), "read_retries": 1}
+        update={
+            "timeout_s": min(settings.timeout_s, SCAN_TIMEOUT_S),
+            "read_retries": RETRIES,
+        }
     )
     found: list[Found] = []
     with Bus(short, max(each.inter_frame_s for each in known)) as bus:
@@ -144,7 +147,7 @@ def _identity(bus: Bus, unit: int, each: RegisterMap) -> dict[str, int]:
     """Values of the identity registers; those that a model lacks are left out."""
     values = {}
     for name, read in each.identity.items():
-        with contextlib.suppress(Rejected):
+        with contextlib.suppress(BusError):
             values[name] = _read(bus, unit, read, each.word_order)
     return values
 
@@ -153,7 +156,7 @@ def _told(bus: Bus, unit: int, each: RegisterMap) -> int | None:
     """Pulses for one turn by the drive's own word."""
     if each.pulses_per_rev is None:
         return None
-    with contextlib.suppress(Rejected):
+    with contextlib.suppress(BusError):
         return _read(bus, unit, each.pulses_per_rev, each.word_order) or None
     return None
 

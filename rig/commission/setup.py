@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import os
 import pathlib
-from collections.abc import Mapping
 from typing import Any
 
 from jaxcal.files import write_text
@@ -37,7 +36,7 @@ class Given:
     bus: str = ""
     imu: str = ""  # FORMAT or FORMAT:PORT
     units: int = UNITS
-    values: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # of rig.toml
+    values: dict[str, Any] = dataclasses.field(default_factory=dict)  # of rig.toml
     home: str = "here"
     names_known: bool = False
 

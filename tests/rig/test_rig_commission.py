@@ -87,7 +87,9 @@ def set_up(bus: str, port: int, *more: str, values=QUICK) -> int:
 # From cables to a calibration
 
 
-@pytest.mark.parametrize("transport", ["tcp", "rtu"])
+@pytest.mark.parametrize(
+    "transport", ["tcp", pytest.param("rtu", marks=pytest.mark.slow)]
+)
 def test_setup_finds_exchanged_reversed_and_wrongly_geared_axes(at, transport, capsys):
     truth = Truth(
         noise_deg=0.005, swapped=(1, 0, 2), reversed=(True, False, True),
@@ -187,6 +189,17 @@ def test_setup_asks_with_defaults_and_moves_nothing_without_a_yes(at):
         assert sim.executions() == [[], [], []]
     assert record.state(HOMED) and not record.state(SIGN_CHECKED)
     assert all(re.search(r"\[.+\]: $", question) for question in asked)
+
+
+def test_setup_of_a_simulated_device_in_one_command(at):
+    wrong = ["--reversed", "yaw", "--noise", "0.005"]
+    quick = [word for value in QUICK for word in ("--set", value)]
+    common = ["--simulate", "--yes", "--units", "3"]
+    assert main(["setup", *common, *wrong, *quick]) == 0
+    (path,) = at.glob("runs/simulated-*/rig.toml")
+    yaw = load_config(path).axes[1]
+    assert yaw.direction == 1  # the simulator's own has -1
+    assert DeviceRecord.load(path.with_name("device.json")).state(ZEROED)
 
 
 def test_without_a_terminal_nothing_is_confirmed(at, monkeypatch, capsys):

@@ -14,6 +14,7 @@ import urllib.request
 
 import pytest
 
+from rig.__main__ import main
 from rig.faults import Refused
 from rig.live import launch
 from rig.live.guard import Guard
@@ -139,22 +140,34 @@ def test_the_token_of_an_address_opens_nothing_but_the_page():
 
 
 def test_only_another_address_than_loopback_needs_a_token():
-    for host in ("127.0.0.1", "127.0.0.5"):
+    for host in (None, "127.0.0.1", "127.0.0.5", "localhost"):
         sock, token, url = launch.listen(host)
         sock.close()
         assert token is None and "token" not in url
-    assert not launch.is_loopback("192.0.2.7")
-    assert not launch.is_loopback("rig-pc")
-    with pytest.raises(ValueError, match="one address of this computer"):
-        launch.listen("0.0.0.0")
+        assert url.startswith("http://127.0.0.")
+    for host in ("0.0.0.0", "0", ""):
+        with pytest.raises(ValueError, match="one address of this computer"):
+            launch.listen(host)
 
 
-def test_an_address_of_this_computer_gets_a_fresh_long_token(monkeypatch):
-    monkeypatch.setattr(launch, "is_loopback", lambda host: False)
+def test_another_address_of_this_computer_gets_a_fresh_long_token(monkeypatch):
+    """No such address may be here, so one is made of a loopback socket."""
+    create = socket.create_server
+
+    class Elsewhere(socket.socket):
+        def getsockname(self):
+            return "192.0.2.7", 8642
+
+    def elsewhere(address, family):
+        with create(("127.0.0.1", 0)) as sock:
+            return Elsewhere(fileno=sock.detach())
+
+    monkeypatch.setattr(launch.socket, "create_server", elsewhere)
     found = []
     for _ in range(2):
-        sock, token, url = launch.listen("127.0.0.1")
+        sock, token, url = launch.listen("192.0.2.7")
         sock.close()
+        assert url.startswith("http://192.0.2.7:8642/")
         assert url.endswith(f"/?token={token}")
         found.append(token)
     assert found[0] != found[1] and min(map(len, found)) >= 43
@@ -308,6 +321,34 @@ def test_the_token_is_not_on_the_command_line(served):
         ["ps", "-o", "args=", "-p", str(page.pid)], capture_output=True, text=True
     ).stdout
     assert "rig.live" in shown and token not in shown
+
+
+def test_watch_shows_a_run_until_it_is_interrupted(tmp_path):
+    pytest.importorskip("nicegui")
+    _journal(tmp_path, os.getpid()).close()
+    command = [sys.executable, "-m", "rig", "watch", str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as watch:
+        port = int(watch.stdout.readline().rstrip("/\n").rpartition(":")[2])
+        status, _, html = fetch(port, "/")
+        assert status == 200 and "Ended without a last record" in html
+        watch.send_signal(signal.SIGINT)
+        assert watch.wait(30) == 0
+
+
+def test_watch_of_what_is_no_run_is_refused(tmp_path, capsys):
+    assert main(["watch", str(tmp_path)]) == 2
+    assert "holds no run" in capsys.readouterr().err
+
+
+def test_a_page_that_nobody_looks_at_ends_by_itself(tmp_path):
+    pytest.importorskip("nicegui")
+    _journal(tmp_path, os.getpid()).close()
+    code = (
+        "import pathlib, socket; from rig.live.server import serve;"
+        "sock = socket.create_server(('127.0.0.1', 0));"
+        f"serve(pathlib.Path({str(tmp_path)!r}), sock, None, linger_s=0.2)"
+    )
+    subprocess.run([sys.executable, "-c", code], timeout=60, check=False)
 
 
 def test_without_the_extra_a_session_says_so_in_one_line(tmp_path, monkeypatch):
