@@ -148,7 +148,8 @@ class RunState:
             case "sender_refused" | "comm_restored":
                 self.warnings += [line.strip() for line in event_lines(record)]
             case _ if event in ENDS:
-                self.ended, self.current, self.phase = record, None, event
+                self._interrupt()
+                self.ended, self.phase = record, event
         if line := self._line(record):
             self.log = [*self.log, (now, line)][-LOGGED:]
 
@@ -157,8 +158,15 @@ class RunState:
             self.start = record
         self.sessions += 1
         self.pid, self.host = record.get("pid"), record.get("host", "")
-        self.ended = self.stop = self.current = None
+        self._interrupt()
+        self.ended = self.stop = None
         self.phase, self.warnings = "opening", []
+
+    def _interrupt(self) -> None:
+        """The posture under way is not measured: it waits again."""
+        if self.current is not None and self.postures[self.current].state in ACTIVE:
+            self.postures[self.current].state = "waiting"
+        self.current = None
 
     def _enter(self, phase: str, now: float) -> None:
         self.phase = phase

@@ -192,6 +192,15 @@ def test_the_headline_says_how_it_stands(last, running, tone, part):
         assert "jaxcal-rig resume runs/one" in told
 
 
+@pytest.mark.parametrize("event", ["fault", "stopped", "resume"])
+def test_the_posture_that_was_interrupted_waits_again(event):
+    records = [*begun(), {"event": "phase", "phase": "measuring"}]
+    state = state_of(numbered([*records, {"event": event, "reason": "why"}]))
+    assert state.postures["select:3"].state == "waiting"
+    assert state.queue == ["select:3", "select:4", "select:1"]
+    assert state.current is None
+
+
 def test_a_resumed_run_is_alive_again_under_its_new_process():
     ended = {"event": "paused", "code": 4, "reason": "paused by Ctrl-C"}
     resumed = {"event": "resume", "pid": 8, "host": "here"}
