@@ -10,9 +10,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rig.config.registers import decode, registers_of
-from rig.device.bus import BusError
+from rig.device.bus import BusError, Rejected
 from rig.device.drives import Drive
-from rig.faults import StopRequested
+from rig.faults import MotionFault, StopRequested
 from rig.guard.stop import Stopper
 
 
@@ -81,14 +81,22 @@ class LineWatch:
         """Set the timeouts.
 
         Raises:
-            BusError: a register cannot be written, or not be read and so not restored.
+            MotionFault: a register cannot be read, so it could not be put back.
+            BusError: no valid reply.
         """
         for drive in self._watched:
             axis, watch = drive.axis, drive.axis.map.comm_timeout
             assert watch is not None
             address, kind = watch.place_of("timeout") or (watch.write[0].address, "u16")
             order = axis.map.word_order
-            words = drive.bus.read_words(axis.unit, address, registers_of(kind))
+            try:
+                words = drive.bus.read_words(axis.unit, address, registers_of(kind))
+            except Rejected as error:
+                raise MotionFault(
+                    f"{axis.name}: its communication timeout cannot be read, so it "
+                    f"could not be put back: {error}. Correct [comm_timeout] of the "
+                    f"map {axis.map.name}, or leave it out"
+                ) from None
             before = decode(words, kind, order)
             counts = max(1, math.ceil(self._timeouts_s[axis.name] * watch.per_s - 1e-9))
             left = self._left.get(axis.name)
