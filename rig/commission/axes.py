@@ -7,8 +7,10 @@ import itertools
 import numpy as np
 
 from rig.commission.bench import Bench
-from rig.commission.findings import CLEAR, Findings, Stand, find, turn
+from rig.commission.chain import CLEAR
+from rig.commission.findings import Findings, find
 from rig.commission.proposals import Change, lines, proposals
+from rig.commission.stands import Stand, turn
 from rig.config import AXIS_NAMES
 from rig.config.axis import Pulses
 from rig.device.record import SIGN_CHECKED

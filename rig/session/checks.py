@@ -49,8 +49,8 @@ def check_record(
     ):
         if reason := "; ".join(filter(None, faults)):
             record.void(state, reason)
-        if text := record.missing(config, state):
-            raise Refused(text)
+        if record.missing(config, state):
+            raise Refused(record.missing(config))
 
 
 def _exchanged(drive: Drive, record: DeviceRecord) -> str:

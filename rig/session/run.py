@@ -247,8 +247,12 @@ class Run(RunFolder):
 
     @property
     def to_go_on(self) -> str:
-        """The command that goes on after a pause or a fault."""
-        return f"python -m rig resume {self.folder}"
+        """What goes on after a pause or a fault."""
+        resume = f"python -m rig resume {self.folder}"
+        if self.journal.records[0].get("simulated") is None:  # or it begins anew
+            if lack := self.record.missing(self.config):
+                return f"{lack}. Then {resume}"
+        return resume
 
     def stop(self, reason: str, latch: bool = True) -> None:
         """Stop every unit; before the device is about to be armed there is no need."""

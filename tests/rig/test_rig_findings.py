@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rig.attitude import ORDERS, angle_between_deg, euler_to_matrix
-from rig.commission.findings import Stand, find
+from rig.commission.findings import find
 from rig.commission.proposals import proposals
+from rig.commission.stands import Stand
 from rig.config import AXIS_NAMES
 from rig.faults import MotionFault
 

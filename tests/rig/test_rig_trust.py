@@ -404,6 +404,17 @@ def test_another_drive_is_another_device(tmp_path):
     assert DeviceRecord.load(record.path).state(IDENTIFIED) is None
 
 
+def test_after_a_lost_place_the_way_on_begins_with_home(tmp_path):
+    config = fast_config()
+    record = commissioned(config, tmp_path)
+    run = Run(config, tmp_path, "collect", [].append, record=record)
+    assert run.to_go_on == f"python -m rig resume {tmp_path}"
+    record.void(HOMED, "yaw went into alarm")
+    assert "`jaxcal-rig home`, then `jaxcal-rig axes`" in run.to_go_on
+    assert run.to_go_on.endswith(f"Then python -m rig resume {tmp_path}")
+    run.close()
+
+
 def test_while_armed_the_place_of_the_drives_is_not_known(tmp_path):
     """A killed session must not leave positions of before."""
     config, seen = fast_config(), []
