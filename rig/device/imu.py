@@ -143,6 +143,8 @@ class Imu:
                     counts = self._parser.counts
                     dropped = {k: v for k, v in counts.items() if k != "accepted"}
                     detail = f"; records dropped: {dropped}" if dropped else ""
+                    if refused := ", ".join(self._senders.refused):
+                        detail += f"; refused by imu.allow: {refused}"
                     raise ImuError(
                         f"no usable reading from the phone in {timeout_s:g} s on "
                         f"{self.settings.host}:{self.port} ({self.connections} "

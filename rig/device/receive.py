@@ -22,15 +22,15 @@ LOOK_S = 0.05  # between two looks at who is silent and who waits
 
 
 class Senders:
-    """Who may be heard. ``refused`` is told once of each address that may not."""
+    """Who may be heard; ``refused`` is called once for each address that may not."""
 
     def __init__(
         self, allowed: tuple[str, ...], refused: Callable[[str, str], None]
     ) -> None:
         self.phone = ""  # address that is heard, once a reading of it was used
         self._allowed = allowed
-        self._told: set[str] = set()
-        self._refused = refused
+        self.refused: list[str] = []  # addresses
+        self._tell = refused
 
     def admits(self, address: str) -> bool:
         """It may be heard; otherwise it is refused."""
@@ -45,11 +45,9 @@ class Senders:
 
     def refuse(self, address: str, why: str) -> None:
         """Tell of a sender that is not heard, once."""
-        if address not in self._told:
-            self._told.add(address)
-            self._refused(
-                address, f"refused a sender on the IMU port, {address}: {why}"
-            )
+        if address not in self.refused:
+            self.refused.append(address)
+            self._tell(address, f"refused a sender on the IMU port, {address}: {why}")
 
 
 class Connection:

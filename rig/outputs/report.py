@@ -71,12 +71,14 @@ def write_report(folder: pathlib.Path, records: list[Record]) -> pathlib.Path:
 
 def _ending(records: list[Record]) -> Text:
     """How the run ended, or that it did not."""
-    last = next((r for r in reversed(records) if r["event"] in (*ENDS, "resume")), None)
-    if last is None or last["event"] == "resume":
-        if any(record["event"] == "phase" for record in records[-3:]):
-            text = "The report was written by the run itself, before its last record."
-            if records[-1].get("phase") == "finishing":
-                return Text(text, "note")
+    last = next(
+        r
+        for r in reversed(records)
+        if r["event"] in (*ENDS, "start", "resume") or r.get("phase") == "finishing"
+    )
+    if last["event"] == "phase":  # a calibration writes its report before its end
+        return Text("All was measured, and every drive was stopped.")
+    if last["event"] in ("start", "resume"):
         return Text("This run has no end: it still runs, or it was killed.", "warning")
     if last["event"] == "end":
         return Text(f"Ended with exit code {last['code']}.")
@@ -158,14 +160,17 @@ def _measured(start: Record, records: list[Record]) -> dict[str, list[Any]]:
         for r in postures[:MOST_ROWS]
     ]  # fmt: skip
     head = ["posture", "commanded [deg]", "measured [deg]", "scatter [deg]"]
-    table = Table(head, shown, f"{len(postures)} measured; in order, of them the first")
+    more = f", the first {MOST_ROWS} of them" if len(postures) > MOST_ROWS else ""
+    table = Table(head, shown, f"{len(postures)} measured{more}")
     alt = "commanded postures, three planes"
     parts = [_drawn(figures.postures, postures, (10, 3.2), alt), table]
-    zero = [record for record in records if record["event"] == "zero"][-1]
-    frame = recorded_frame(start["config"], zero)
-    off = [angles(r, frame) - np.array(r["measured_deg"]) for r in postures]
-    alt = "readings of every posture about their mean"
-    return {"Postures": parts, "Readings": [_drawn(figures.readings, off, (9, 4), alt)]}
+    blocks = {"Postures": parts}
+    if zeros := [record for record in records if record["event"] == "zero"]:
+        frame = recorded_frame(start["config"], zeros[-1])
+        off = [angles(r, frame) - np.array(r["measured_deg"]) for r in postures]
+        alt = "readings of every posture about their mean"
+        blocks["Readings"] = [_drawn(figures.readings, off, (9, 4), alt)]
+    return blocks
 
 
 def _told(records: list[Record]) -> dict[str, list[Any]]:

@@ -250,7 +250,7 @@ def test_a_journal_keeps_every_reading_in_little_room(finished):
 
 
 @pytest.mark.parametrize("kept", [1, 4, 12, 30, 10_000])
-def test_a_report_says_what_there_is_of_an_unfinished_run(run, capsys, kept):
+def test_a_report_says_what_there_is_of_an_unfinished_run(run, finished, kept):
     lines = (run / "journal.jsonl").read_text().splitlines(keepends=True)
     (run / "journal.jsonl").write_text("".join(lines[:kept]))
     if kept < len(lines):
@@ -262,6 +262,8 @@ def test_a_report_says_what_there_is_of_an_unfinished_run(run, capsys, kept):
         assert "y = A u + b" not in page
     else:
         assert "Ended with exit code 1" in page and "RECALIBRATE" in page
+    own = (finished / "report.html").read_text()  # written before the last record
+    assert "All was measured" in own and "was killed" not in own
     measured = sum('"event":"posture"' in line for line in lines[:kept])
     assert (f"{measured} measured" in page) == (measured > 0)
 
