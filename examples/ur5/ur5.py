@@ -1,7 +1,7 @@
 """Calibrate a real UR5 from a few of the 1,000 poses that a laser tracker measured.
 
     python examples/ur5/ur5.py            # table, errors.csv and errors.png, minutes
-    python examples/ur5/ur5.py --quick    # two sub-pools instead of twenty
+    python examples/ur5/ur5.py --quick    # two sub-pools instead of sixty
 
 For K = 6 to 40 poses of sub-pools of 300, chosen by several rules, 39 parameters are
 fitted from the chosen poses alone, and the position error is judged on the poses that
@@ -37,7 +37,7 @@ DH = [
 NOISE = jaxcal.Noise(std=0.1)  # mm: the robot's repeatability
 RULES = ("random", "maximin", "D", "A", "I greedy", "I")
 COUNTS = (6, 8, 12, 20, 40)
-POOLS, POOL = 20, 300
+POOLS, POOL = 60, 300
 
 
 def arm() -> SerialChain:
@@ -209,7 +209,7 @@ def save(found: dict[tuple[str, int], Array], folder: pathlib.Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="two sub-pools of twenty")
+    parser.add_argument("--quick", action="store_true", help="two sub-pools of sixty")
     parser.add_argument(
         "--out", type=pathlib.Path, default=HERE, help="folder to write"
     )
@@ -219,6 +219,11 @@ def main() -> None:
     save(found, options.out)
     print("rest mean / rest max / test mean, mm")
     print(table(found))
+    for k in (8, 20):
+        error = found["I", k].std(axis=0) / np.sqrt(pools)
+        print(f"I, K = {k}: standard errors", "/".join(f"{x:.4f}" for x in error))
+        first = found["I", k][:20].mean(axis=0)
+        print("  first 20 sub-pools", "/".join(f"{x:.3f}" for x in first))
     best, random = found["I", 8], found["random", 8]
     share = np.mean(random[:, 0] < best[:, 0].mean())
     print(f"random draws better than I at K = 8: {100 * share:.1f} %")
