@@ -1,0 +1,134 @@
+"""Sessions played to their end, thousands at once, and the comparison of deciders."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxcal.adaptive.session import Decider, Task
+
+__all__ = ["Comparison", "Episodes", "compare", "play"]
+
+
+@struct.dataclass
+class Episodes:
+    """B sessions of at most T measurements; what follows a session's end is void."""
+
+    truth: Any  # leaves (B, ...)
+    begun: Any  # Session, leaves (B, ...): the budget
+    designs: Any  # leaves (B, T, ...)
+    outcomes: Any  # leaves (B, T, ...)
+    gains: jax.Array  # (B, T) nats expected of each measurement when it was chosen
+    alive: jax.Array  # (B, T) bool
+    told: jax.Array  # (B,) nats: entropy of the prior less the posterior's
+    log_ratio: jax.Array  # (B,) log posterior less log prior, at the truth
+
+    @property
+    def gain(self) -> jax.Array:
+        """(B,) nats: the sum of expected gains. Its mean is that of ``told``."""
+        return (self.gains * self.alive).sum(axis=-1)
+
+
+@jax.jit
+def play(task: Task, decider: Decider, keys: jax.Array) -> Episodes:
+    """Play a session a key (B,).
+
+    The truth, the budget and the luck of every measurement depend on the key alone, so
+    deciders that are given the same keys can be compared in pairs.
+    """
+    return jax.vmap(lambda key: _episode(task, decider, key))(keys)
+
+
+def _episode(task: Task, decider: Decider, key: jax.Array) -> Episodes:
+    key_truth, key_begin, key_steps = jax.random.split(key, 3)
+    truth = task.draw(key_truth)
+    prior, begun = task.begin(key_begin)
+
+    def step(carry: Any, key: jax.Array) -> tuple[Any, Any]:
+        belief, session = carry
+        key_options, key_choice, key_gain, key_outcome, key_update = jax.random.split(
+            key, 5
+        )
+        options = task.options(belief, session, key_options)
+        index = decider(task, belief, session, options, key_choice)
+        design = jax.tree.map(lambda leaf: leaf[index], options.designs)
+        gain = belief.gains(task, options, key_gain)[index]
+        outcome = task.measure(truth, design, key_outcome)
+        after = (
+            belief.update(task, design, outcome, key_update),
+            task.spend(session, design, outcome),
+        )
+        alive = ~session.over
+        carry = jax.tree.map(lambda old, new: jnp.where(alive, new, old), carry, after)
+        return carry, (design, outcome, gain, alive)
+
+    (belief, _), seen = jax.lax.scan(
+        step, (prior, begun), jax.random.split(key_steps, task.most)
+    )
+    designs, outcomes, gains, alive = seen
+    return Episodes(
+        truth=truth,
+        begun=begun,
+        designs=designs,
+        outcomes=outcomes,
+        gains=gains,
+        alive=alive,
+        told=prior.entropy() - belief.entropy(),
+        log_ratio=belief.log_density(truth) - prior.log_density(truth),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """Deciders on the same sessions: information in nats, with standard errors."""
+
+    names: tuple[str, ...]
+    gain: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) sum of expected gains
+    told: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) drop of entropy
+    log_ratio: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) at the truth
+
+    def mean(self, name: str) -> tuple[float, float]:
+        """Nats by the sum of expected gains, and the standard error."""
+        return _mean(self.gain[self.names.index(name)])
+
+    def paired(self, name: str, base: str) -> tuple[float, float]:
+        """Nats that one decider has more than another on the same sessions."""
+        a, b = (self.gain[self.names.index(n)] for n in (name, base))
+        return _mean(a - b)
+
+
+def compare(
+    task: Task,
+    deciders: Mapping[str, Decider],
+    episodes: int = 4096,
+    seed: int = 0,
+    batch: int = 1024,
+) -> Comparison:
+    """Play every decider on the same ``episodes`` sessions."""
+    keys = jax.random.split(jax.random.key(seed), episodes)
+    found = []
+    for decider in deciders.values():
+        parts = [
+            play(task, decider, keys[at : at + batch])
+            for at in range(0, episodes, batch)
+        ]
+        found.append(
+            [
+                np.concatenate([np.asarray(x, np.float64) for x in values])
+                for values in zip(
+                    *((p.gain, p.told, p.log_ratio) for p in parts), strict=True
+                )
+            ]
+        )
+    gain, told, ratio = (np.stack(values) for values in zip(*found, strict=True))
+    return Comparison(tuple(deciders), gain, told, ratio)
+
+
+def _mean(values: Any) -> tuple[float, float]:
+    return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
