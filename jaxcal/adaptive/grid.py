@@ -76,6 +76,8 @@ class GridTask:
     seconds: jax.Array  # (2,) budget of a session, uniform between the two
     num_uses: jax.Array  # (E,) int32 budgets, each as likely
     place: jax.Array  # () int32 at the start
+    groups: jax.Array  # (A,) int32 of alike designs, such as those of one joint
+    num_groups: int = struct.field(pytree_node=False)
     most: int = struct.field(pytree_node=False)
     theta_names: tuple[str, ...] = struct.field(pytree_node=False)
     design_names: tuple[str, ...] = struct.field(pytree_node=False)
@@ -90,6 +92,7 @@ class GridTask:
         travel: ArrayLike = 0.0,
         place_after: ArrayLike | None = None,
         place: int | None = None,
+        groups: ArrayLike | None = None,
         extra: ArrayLike = 0.0,
         uses: ArrayLike = 0,
         seconds: float | tuple[float, float] = np.inf,
@@ -111,6 +114,8 @@ class GridTask:
                 without more, the last, A, is where a session starts.
             place_after: (A, Y) place after an outcome; the design itself by default.
             place: at the start; the last place by default.
+            groups: (A,) numbers from 0 of alike designs, such as the joint they are
+                of; what is shortlisted holds the best of each. One by default.
             extra: (A, Y), or what broadcasts to it, seconds that an outcome costs.
             uses: (A, Y), or what broadcasts to it, of a countable resource.
             seconds: budget of a session, or (least, most) to draw it from.
@@ -184,6 +189,11 @@ class GridTask:
             raise ValueError(
                 f"num_uses must be whole numbers of at least 1, got {in_words(ends)}"
             )
+        alike = np.zeros(count, int) if groups is None else np.asarray(groups)
+        if alike.shape != (count,) or alike.min() < 0 or (alike % 1 != 0).any():
+            raise ValueError(
+                f"groups must hold {count} whole numbers from 0, got {in_words(alike)}"
+            )
         log = np.log(np.where(table > 0.0, table, 1.0))
         single, whole = jnp.float32, jnp.int32
         return GridTask(
@@ -199,6 +209,8 @@ class GridTask:
             seconds=jnp.asarray(budget, single),
             num_uses=jnp.asarray(ends, whole),
             place=jnp.asarray(first, whole),
+            groups=jnp.asarray(alike, whole),
+            num_groups=int(alike.max()) + 1,
             most=whole_number("most", most, 1),
             theta_names=_names("theta_names", theta_names, "theta", grid.shape[1]),
             design_names=_names("design_names", design_names, "u", at.shape[1]),

@@ -73,6 +73,7 @@ def knee(
         np.column_stack([joint, u]),
         np.stack([1.0 - trip, trip], axis=1),
         prior=prior,
+        groups=joint,
         travel=test_s + travel_s * way + np.where(same, 0.0, change_s),
         extra=[0.0, reset_s],
         uses=[0, 1],
