@@ -22,7 +22,7 @@ class Network(nn.Module):
     """Logits (..., C) and a value (...) of shortlists.
 
     Each option is embedded, the embeddings are pooled by their maximum, and each is
-    scored beside the pool. The last layer begins at zero: the policy begins as its rule.
+    scored beside the pool. The last layer begins at zero: a policy begins as its rule.
     """
 
     width: int = 48

@@ -12,7 +12,7 @@ from jaxcal.adaptive.policy.features import Seen, see
 from jaxcal.adaptive.policy.network import Network
 from jaxcal.adaptive.rules import Scored
 from jaxcal.adaptive.session import Task
-from jaxcal.learning.training import rollout, update
+from jaxcal.learning.training import update
 from jaxcal.learning.training.config import PPOConfig
 from jaxcal.learning.training.optimiser import Metrics
 from jaxcal.learning.training.update import Update
@@ -61,10 +61,11 @@ def updater(config: PPOConfig, per_group: int, width: int) -> Update:
         cut: Any = jax.tree.map(lambda leaf: leaf[:, :-1], (seen, action, log_prob))
         scale = advantage.std() + 1e-6
         normal = (advantage - advantage.mean()) / scale
-        return Steps(*cut, normal, advantage + value[:, :-1]), metrics
+        target = advantage + value[:, :-1]
+        return Steps(*cut, normal, target), metrics
 
     def loss(params: Any, batch: Steps, done: jax.Array) -> tuple[jax.Array, Metrics]:
-        logits, value = network.apply(params, batch.seen)
+        logits, value = _apply(network, params, batch.seen)
         log_probs = jax.nn.log_softmax(logits)
         taken = jnp.take_along_axis(log_probs, batch.action[..., None], -1)[..., 0]
         log_ratio = taken - batch.log_prob
@@ -83,6 +84,11 @@ def updater(config: PPOConfig, per_group: int, width: int) -> Update:
         return whole, {"policy_loss": policy, "value_loss": error, "kl": kl}
 
     return update.jitted(config, None, draw=draw, gather=gather, loss=loss)
+
+
+def _apply(network: Network, params: Any, seen: Seen) -> tuple[jax.Array, jax.Array]:
+    result: Any = network.apply(params, seen)
+    return result
 
 
 def _advantages(
@@ -115,7 +121,7 @@ def _stream(
         keys = jax.random.split(key, 6)
         options = task.options(belief, session, keys[0])
         seen = see(task, belief, session, options, keys[1], base, per_group)
-        logits, value = network.apply(params, seen)
+        logits, value = _apply(network, params, seen)
         action = jax.random.categorical(keys[2], logits).astype(jnp.int32)
         log_probs = jax.nn.log_softmax(logits)
         design = jax.tree.map(lambda leaf: leaf[seen.index[action]], options.designs)
