@@ -58,11 +58,13 @@ def updater(config: PPOConfig, per_group: int, width: int) -> Update:
             "choices": 1.0 / jnp.maximum(ended.mean(), 1e-6),
             "entropy": entropy.mean(),
         }
-        cut: Any = jax.tree.map(lambda leaf: leaf[:, :-1], (seen, action, log_prob))
+        seen, action, log_prob = jax.tree.map(
+            lambda leaf: leaf[:, :-1], (seen, action, log_prob)
+        )
         scale = advantage.std() + 1e-6
         normal = (advantage - advantage.mean()) / scale
         target = advantage + value[:, :-1]
-        return Steps(*cut, normal, target), metrics
+        return Steps(seen, action, log_prob, normal, target), metrics
 
     def loss(params: Any, batch: Steps, done: jax.Array) -> tuple[jax.Array, Metrics]:
         logits, value = _apply(network, params, batch.seen)
