@@ -49,6 +49,20 @@ class GridBelief:
         weights = self.weights * task.likelihood[design, outcome]
         return GridBelief(weights / (weights.sum() + _SMALL))
 
+    def draw(self, key: jax.Array) -> jax.Array:
+        """() int32 a value of the unknown, drawn."""
+        below = jnp.cumsum(self.weights)
+        at = jax.random.uniform(key) * below[-1]
+        index = jnp.searchsorted(below, at, side="right")
+        return jnp.minimum(index, len(below) - 1).astype(jnp.int32)
+
+    def outcomes(
+        self, task: GridTask, design: jax.Array, key: jax.Array | None = None
+    ) -> tuple[jax.Array, jax.Array]:
+        """(Y,) all outcomes of a design and (Y,) their probabilities."""
+        p = task.likelihood[design] @ self.weights
+        return jnp.arange(len(p)), p
+
     def entropy(self) -> jax.Array:
         return -(self.weights * jnp.log(self.weights + _SMALL)).sum()
 

@@ -42,16 +42,16 @@ def play(task: Task, decider: Decider, keys: jax.Array) -> Episodes:
     The truth, the budget and the luck of every measurement depend on the key alone, so
     deciders that are given the same keys can be compared in pairs.
     """
-    return jax.vmap(lambda key: _episode(task, decider, key))(keys)
+    key_truth, key_begin, key_steps = jax.vmap(
+        lambda key: jax.random.split(key, 3), out_axes=1
+    )(keys)
+    truth = jax.vmap(task.draw)(key_truth)
+    prior, begun = jax.vmap(task.begin)(key_begin)
+    steps = jax.vmap(lambda key: jax.random.split(key, task.most), out_axes=1)(
+        key_steps
+    )
 
-
-def _episode(task: Task, decider: Decider, key: jax.Array) -> Episodes:
-    key_truth, key_begin, key_steps = jax.random.split(key, 3)
-    truth = task.draw(key_truth)
-    prior, begun = task.begin(key_begin)
-
-    def step(carry: Any, key: jax.Array) -> tuple[Any, Any]:
-        belief, session = carry
+    def choose(truth: Any, belief: Any, session: Any, key: jax.Array) -> Any:
         key_options, key_choice, key_gain, key_outcome, key_update = jax.random.split(
             key, 5
         )
@@ -65,13 +65,29 @@ def _episode(task: Task, decider: Decider, key: jax.Array) -> Episodes:
             task.spend(session, design, outcome),
         )
         alive = ~session.over
-        carry = jax.tree.map(lambda old, new: jnp.where(alive, new, old), carry, after)
-        return carry, (design, outcome, gain, alive)
+        after = jax.tree.map(
+            lambda old, new: jnp.where(alive, new, old), (belief, session), after
+        )
+        return after, (design, outcome, gain, alive)
 
-    (belief, _), seen = jax.lax.scan(
-        step, (prior, begun), jax.random.split(key_steps, task.most)
+    def step(carry: Any, keys: jax.Array) -> tuple[Any, Any]:
+        def nothing(carry: Any) -> tuple[Any, Any]:
+            return carry, jax.tree.map(
+                lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), blank
+            )
+
+        def going(carry: Any) -> tuple[Any, Any]:
+            result: tuple[Any, Any] = jax.vmap(choose)(truth, *carry, keys)
+            return result
+
+        blank = jax.eval_shape(going, carry)[1]
+        # Nothing is computed once every session is over.
+        return jax.lax.cond(carry[1].over.all(), nothing, going, carry)
+
+    (belief, _), seen = jax.lax.scan(step, (prior, begun), steps)
+    designs, outcomes, gains, alive = jax.tree.map(
+        lambda leaf: jnp.moveaxis(leaf, 0, 1), seen
     )
-    designs, outcomes, gains, alive = seen
     return Episodes(
         truth=truth,
         begun=begun,
@@ -79,8 +95,10 @@ def _episode(task: Task, decider: Decider, key: jax.Array) -> Episodes:
         outcomes=outcomes,
         gains=gains,
         alive=alive,
-        told=prior.entropy() - belief.entropy(),
-        log_ratio=belief.log_density(truth) - prior.log_density(truth),
+        told=jax.vmap(lambda a, b: a.entropy() - b.entropy())(prior, belief),
+        log_ratio=jax.vmap(lambda a, b, t: b.log_density(t) - a.log_density(t))(
+            prior, belief, truth
+        ),
     )
 
 

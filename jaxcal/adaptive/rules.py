@@ -2,20 +2,61 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from jaxcal.adaptive.session import Options, Session
 
-__all__ = ["Gain", "GainRate", "Priced", "Random", "StateRule", "best"]
+__all__ = [
+    "Gain",
+    "GainRate",
+    "Priced",
+    "Random",
+    "StateRule",
+    "best",
+    "log_score",
+    "shortlist",
+]
 
 
 def best(score: jax.Array, options: Options) -> jax.Array:
     """() int32 the allowed option of the largest score (A,)."""
     return jnp.argmax(jnp.where(options.allowed, score, -jnp.inf)).astype(jnp.int32)
+
+
+def log_score(gains: jax.Array, prices: jax.Array) -> jax.Array:
+    """log (gain / price), finite also where one is zero."""
+    return jnp.log(gains + 1e-9) - jnp.log(prices + 1e-9)
+
+
+def shortlist(
+    task: Any, score: jax.Array, options: Options, per_group: int
+) -> tuple[jax.Array, jax.Array]:
+    """The options of the largest scores, some of each of the task's groups.
+
+    Args:
+        task: ``num_groups`` and ``groups`` (A,) of its options; one group without them.
+        score: (A,).
+        options: what is not allowed is not listed.
+        per_group: at most so many of each group.
+
+    Returns:
+        (C,) int32 indices and (C,) bool where one is listed: a group of fewer options
+        leaves places void.
+    """
+    score = jnp.where(options.allowed, score, -jnp.inf)
+    number = getattr(task, "num_groups", 1)
+    groups = task.groups if number > 1 else jnp.zeros(len(score), jnp.int32)
+    values, index = jax.vmap(
+        lambda group: jax.lax.top_k(
+            jnp.where(groups == group, score, -jnp.inf), min(per_group, len(score))
+        )
+    )(jnp.arange(number))
+    return index.ravel().astype(jnp.int32), jnp.isfinite(values.ravel())
 
 
 @struct.dataclass
@@ -54,14 +95,22 @@ class GainRate:
 class Scored:
     """A rule by a price: the largest log (gain / price)."""
 
-    def log_score(
+    num_free: ClassVar[int]  # constants that can be tuned; the price's unit is free
+
+    def moved(self, by: Any) -> Any:
+        """The rule with other constants, ``by`` (num_free,) away: what a tuner tries.
+
+        Prices are multiplied by ``exp(by)``, exponents are added to.
+        """
+        raise NotImplementedError
+
+    def judged(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
-    ) -> jax.Array:
-        """(A,) log of gain over price, finite."""
-        seconds, uses = task.expected(belief, session, options)
+    ) -> tuple[jax.Array, jax.Array]:
+        """(A,) gains in nats and (A,) prices."""
         gains = belief.gains(task, options, key)
-        price = self.price(session, seconds, uses)
-        return jnp.log(gains + 1e-9) - jnp.log(price + 1e-9)
+        seconds, uses = task.expected(belief, session, options)
+        return gains, self.price(session, seconds, uses)
 
     def price(self, session: Session, seconds: jax.Array, uses: jax.Array) -> jax.Array:
         """(A,) what the measurements are taken to cost."""
@@ -70,7 +119,8 @@ class Scored:
     def __call__(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
     ) -> jax.Array:
-        return best(self.log_score(task, belief, session, options, key), options)
+        judged = self.judged(task, belief, session, options, key)
+        return best(log_score(*judged), options)
 
 
 @struct.dataclass
@@ -80,6 +130,10 @@ class Priced(Scored):
     c0: Any = 1.0
     c1: Any = 1.0
     c2: Any = 1.0
+    num_free: ClassVar[int] = 2
+
+    def moved(self, by: Any) -> Priced:
+        return Priced(self.c0 * np.exp(by[0]), self.c1, self.c2 * np.exp(by[1]))
 
     def price(self, session: Session, seconds: jax.Array, uses: jax.Array) -> jax.Array:
         return self.c0 + self.c1 * seconds + self.c2 * uses
@@ -99,6 +153,18 @@ class StateRule(Scored):
     d1: Any = 0.0
     d2: Any = 0.0
     scale: Any = 20.0  # seconds
+    num_free: ClassVar[int] = 5
+
+    def moved(self, by: Any) -> StateRule:
+        return StateRule(
+            c0=self.c0 * np.exp(by[0]),
+            c1=self.c1,
+            c2=self.c2 * np.exp(by[1]),
+            d0=self.d0 + by[2],
+            d1=self.d1 + by[3],
+            d2=self.d2 + by[4],
+            scale=self.scale,
+        )
 
     def price(self, session: Session, seconds: jax.Array, uses: jax.Array) -> jax.Array:
         more = session.uses - 1.0

@@ -50,6 +50,15 @@ class Belief(Protocol):
     def update(self, task: Any, design: Any, outcome: Any, key: jax.Array) -> Any:
         """The belief after a measurement."""
 
+    def draw(self, key: jax.Array) -> Any:
+        """A value of the unknown, drawn."""
+
+    def outcomes(self, task: Any, design: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+        """Outcomes of a design, leaves (Y, ...), and (Y,) their probabilities.
+
+        All there are where they are few; otherwise some, drawn, each 1 / Y.
+        """
+
     def entropy(self) -> jax.Array:
         """() nats; NaN where it is not defined."""
 

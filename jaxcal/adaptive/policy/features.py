@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcal.adaptive.rules import Scored
+from jaxcal.adaptive.rules import Scored, log_score, shortlist
 from jaxcal.adaptive.session import Options, Session
 
 __all__ = ["NUM_FEATURES", "Seen", "see"]
@@ -40,20 +40,10 @@ def see(
     """The best ``per_group`` options of each group by the base rule, and features."""
     gains = belief.gains(task, options, key)
     seconds, uses = task.expected(belief, session, options)
-    price = base.price(session, seconds, uses)
-    score = jnp.log(gains + 1e-9) - jnp.log(price + 1e-9)
-    score = jnp.where(options.allowed, score, -jnp.inf)
-    found = []
-    for group in range(task.num_groups):
-        mine = jnp.where(task.groups == group, score, -jnp.inf)
-        found.append(jax.lax.top_k(mine, min(per_group, len(mine)))[1])
-    index = jnp.concatenate(found).astype(jnp.int32)
+    score = log_score(gains, base.price(session, seconds, uses))
+    index, valid = shortlist(task, score, options, per_group)
     mine = task.groups[index]
-    valid = jnp.isfinite(score[index])
-    # A group with fewer options fills its places with those of others: void.
-    place = jnp.repeat(jnp.arange(task.num_groups), len(index) // task.num_groups)
-    valid = valid & (mine == place)
-    log_score = score[index] - score.max()
+    below = score[index] - jnp.where(options.allowed, score, -jnp.inf).max()
 
     left = jnp.where(jnp.isfinite(session.seconds), session.seconds, 2 * _SCALE)
     g, s, u = gains[index], seconds[index], uses[index]
@@ -73,7 +63,7 @@ def see(
         [
             0.2 * jnp.log(g + 1e-6), g, u, s / 5.0,
             jnp.minimum(s / jnp.maximum(left, 1e-3), 3.0),
-            g / jnp.maximum(s, 1e-6), jnp.maximum(log_score, -10.0),
+            g / jnp.maximum(s, 1e-6), jnp.maximum(below, -10.0),
             (nearest[mine] <= nearest.min() + 1e-6).astype(g.dtype),
             where, u * first, u * second, u * u,
             (left - s) / _SCALE, own, others, u * left / _SCALE,
@@ -89,7 +79,7 @@ def see(
     return Seen(
         index=index,
         features=jnp.where(valid[:, None], features, 0.0),
-        log_score=jnp.where(valid, log_score, -1e9),
+        log_score=jnp.where(valid, below, -1e9),
         gain=g,
         valid=valid,
     )

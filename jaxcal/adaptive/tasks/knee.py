@@ -12,6 +12,7 @@ from scipy import special
 
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.rules import Priced, StateRule
+from jaxcal.adaptive.tasks.registry import Entry
 
 __all__ = ["PRICED", "STATE_RULE", "knee"]
 
@@ -87,3 +88,10 @@ def knee(
 
 def _most(seconds: float | tuple[float, float], test_s: float) -> int:
     return int(np.ceil(np.max(seconds) / test_s))
+
+
+ENTRY = Entry(
+    knee,
+    about="two thresholds, found by tests that may trip",
+    rules={"priced": PRICED, "state": STATE_RULE},
+)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import pathlib
+from collections.abc import Sequence
 
 from jaxcal.files import write_text
 
@@ -30,14 +31,16 @@ COLUMNS = (
 class MetricsTable:
     """Rows are flushed as they come; after a resume they go on where the state does."""
 
-    def __init__(self, root: pathlib.Path, done: int) -> None:
+    def __init__(
+        self, root: pathlib.Path, done: int, columns: Sequence[str] = COLUMNS
+    ) -> None:
         from tensorboardX import SummaryWriter  # 0.2 s; loads PyTorch where installed
 
         path = root / "metrics.csv"
-        lines = [",".join(COLUMNS), *_rows_until(path, done)]
+        lines = [",".join(columns), *_rows_until(path, done)]
         write_text(path, "\n".join(lines) + "\n")
         self._file = path.open("a", newline="")
-        self._writer = csv.DictWriter(self._file, COLUMNS, extrasaction="ignore")
+        self._writer = csv.DictWriter(self._file, columns, extrasaction="ignore")
         self._events = SummaryWriter(str(root), flush_secs=30)
 
     def add(self, row: dict[str, float]) -> None:
