@@ -46,7 +46,8 @@ class TwoStep:
                 gains, prices = self.base.judged(task, then, left, follow, key_next)
                 chosen = best(log_score(gains, prices), follow)
                 going = ~(left.over | (left.made >= task.most))
-                return going * gains[chosen], going * prices[chosen]
+                # The price counts also where the session ends: an end is not cheap.
+                return going * gains[chosen], prices[chosen]
 
             gain, price = jax.vmap(after)(outcomes)
             return p @ gain, p @ price

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -77,7 +77,8 @@ def play(task: Task, decider: Decider, keys: jax.Array) -> Episodes:
             )
 
         def going(carry: Any) -> tuple[Any, Any]:
-            result: tuple[Any, Any] = jax.vmap(choose)(truth, *carry, keys)
+            belief, session = carry
+            result: tuple[Any, Any] = jax.vmap(choose)(truth, belief, session, keys)
             return result
 
         blank = jax.eval_shape(going, carry)[1]
@@ -110,6 +111,7 @@ class Comparison:
     gain: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) sum of expected gains
     told: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) drop of entropy
     log_ratio: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) at the truth
+    choices: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) measurements made
 
     def mean(self, name: str) -> tuple[float, float]:
         """Nats by the sum of expected gains, and the standard error."""
@@ -127,25 +129,30 @@ def compare(
     episodes: int = 4096,
     seed: int = 0,
     batch: int = 1024,
+    progress: Callable[[int], None] = lambda done: None,
 ) -> Comparison:
-    """Play every decider on the same ``episodes`` sessions."""
+    """Play every decider on the same ``episodes`` sessions.
+
+    Args:
+        task, deciders: what is played.
+        episodes: at least two.
+        seed: of the sessions.
+        batch: sessions played at once; the result does not depend on it.
+        progress: told how many sessions of a decider are played, from 0.
+    """
     keys = jax.random.split(jax.random.key(seed), episodes)
     found = []
     for decider in deciders.values():
-        parts = [
-            play(task, decider, keys[at : at + batch])
-            for at in range(0, episodes, batch)
-        ]
-        found.append(
-            [
-                np.concatenate([np.asarray(x, np.float64) for x in values])
-                for values in zip(
-                    *((p.gain, p.told, p.log_ratio) for p in parts), strict=True
-                )
-            ]
-        )
-    gain, told, ratio = (np.stack(values) for values in zip(*found, strict=True))
-    return Comparison(tuple(deciders), gain, told, ratio)
+        parts = []
+        for at in range(0, episodes, batch):
+            progress(at)
+            played = play(task, decider, keys[at : at + batch])
+            made = played.alive.sum(axis=1)
+            part = played.gain, played.told, played.log_ratio, made
+            parts.append([np.asarray(values, np.float64) for values in part])
+        found.append([np.concatenate(values) for values in zip(*parts, strict=True)])
+    whole = (np.stack(values) for values in zip(*found, strict=True))
+    return Comparison(tuple(deciders), *whole)
 
 
 def _mean(values: Any) -> tuple[float, float]:

@@ -23,9 +23,9 @@ from jaxcal.learning.runtime import processes
 if TYPE_CHECKING:
     from jaxcal.learning.environments.task import GivenCandidates
     from jaxcal.learning.training.config import TrainConfig
-    from jaxcal.learning.training.run import Report
+    from jaxcal.learning.training.loop import Report
 
-__all__ = ["main"]
+__all__ = ["clock", "main", "names_task", "stop_on_signals"]
 
 
 def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
@@ -36,6 +36,10 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
         another process of the job was lost.
     """
     given = list(sys.argv[1:] if argv is None else argv)
+    if names_task(given):
+        from jaxcal.commands import train_task
+
+        return train_task.main(given, prog)
 
     def alone() -> int:  # this process may be one of several
         try:
@@ -49,6 +53,11 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
     return processes.run_job(prog, given, alone, advice)
 
 
+def names_task(argv: Sequence[str]) -> bool:
+    """Whether a command line names a task of sequential measurement."""
+    return any(word == "--task" or word.startswith("--task=") for word in argv)
+
+
 def _run(arguments: argparse.Namespace) -> int:
     """Train, say how it went; of several processes the first speaks for all."""
     from jaxcal.learning.runtime import cache, devices
@@ -58,7 +67,7 @@ def _run(arguments: argparse.Namespace) -> int:
     cache.keep_compiled_programs()
     out = pathlib.Path(arguments.out or f"runs/{arguments.preset}")
     config = devices.on_first(lambda: _configuration(arguments, out))
-    stop = _stop_on_signals()
+    stop = stop_on_signals()
     if arguments.trainer == "brax":
         from jaxcal.learning.training import brax_ppo
 
@@ -261,7 +270,7 @@ def _introduce(config: TrainConfig, out: pathlib.Path, devices: str) -> None:
     print(f"configuration: {config.as_meta()}")
 
 
-def _stop_on_signals() -> Callable[[], bool]:
+def stop_on_signals() -> Callable[[], bool]:
     """Whether Ctrl-C or SIGTERM asked to save and stop; a second Ctrl-C is at once."""
     asked: list[int] = []
 
@@ -283,13 +292,13 @@ def _show(report: Report) -> None:
     print(
         f"{report.update:9,d} {report.episodes:10,d} "
         f"{report.episodes_per_second:6,.0f} "
-        f"{_clock(report.seconds):>9} {_clock(report.eta):>9} "
+        f"{clock(report.seconds):>9} {clock(report.eta):>9} "
         + (f"{reward:8.4f} " if reward is not None else " imitate ")
         + (f"{ratio:16.4f} {hits:12.3f}" if ratio is not None else ""),
         flush=True,
     )
 
 
-def _clock(seconds: float) -> str:
+def clock(seconds: float) -> str:
     """h:mm:ss."""
     return str(datetime.timedelta(seconds=round(seconds)))
