@@ -11,7 +11,9 @@ from jaxcal.adaptive.rules import Scored
 from jaxcal.learning.settings import require, setting
 from jaxcal.learning.training.config import PPOConfig
 
-__all__ = ["PPO", "PolicyConfig"]
+__all__ = ["LENGTH", "PPO", "PolicyConfig"]
+
+LENGTH = 32  # choices that one stream of sessions makes in an update
 
 _RULES: tuple[type[Scored], ...] = (rules.Priced, rules.StateRule)
 
@@ -45,6 +47,12 @@ class PolicyConfig:
 
     def __post_init__(self) -> None:
         require(self, "at least 1", lambda v: v >= 1, "per_group", "width")
+        whole = LENGTH * self.ppo.num_minibatches
+        if self.ppo.episodes_per_update % whole:
+            raise ValueError(
+                f"episodes_per_update must be a multiple of {LENGTH} x num_minibatches "
+                f"= {whole}, got {self.ppo.episodes_per_update}"
+            )
         if not isinstance(self.base, _RULES):
             known = ", ".join(rule.__name__ for rule in _RULES)
             raise ValueError(

@@ -13,7 +13,7 @@ from jaxcal.adaptive.session import Options, Session
 
 __all__ = ["NUM_FEATURES", "Seen", "see"]
 
-NUM_FEATURES = 27
+NUM_FEATURES = 29
 _SCALE = 20.0  # seconds
 
 
@@ -49,7 +49,9 @@ def see(
     g, s, u = gains[index], seconds[index], uses[index]
     members = task.groups[None] == jnp.arange(task.num_groups)[:, None]
     tops = jnp.where(members & options.allowed, gains, 0.0).max(axis=1)  # (G,)
-    own = tops[mine]
+    # Summed over a group's options, the gains measure how much of it is unknown.
+    sums = jnp.where(members & options.allowed, gains, 0.0).sum(axis=1)
+    own, whole = tops[mine], sums[mine]
     others = jnp.where(
         jnp.arange(task.num_groups) == mine[:, None], 0.0, tops[None]
     ).max(axis=1)
@@ -68,6 +70,7 @@ def see(
             where, u * first, u * second, u * u,
             (left - s) / _SCALE, own, others, u * left / _SCALE,
             g / (u + 0.05), jnp.sqrt(g),
+            jnp.log1p(whole), jnp.log1p(jnp.maximum(sums.sum() - whole, 0.0)),
             # the same of all options
             ones * left / _SCALE, ones * jnp.minimum(left / 5.0, 1.0),
             ones * first, ones * second, ones * jnp.minimum(session.uses, 4) / 4.0,

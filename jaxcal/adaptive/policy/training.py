@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxcal.adaptive.policy.config import LENGTH
 from jaxcal.adaptive.policy.features import Seen, see
 from jaxcal.adaptive.policy.network import Network
 from jaxcal.adaptive.rules import Scored
@@ -18,9 +19,6 @@ from jaxcal.learning.training.optimiser import Metrics
 from jaxcal.learning.training.update import Update
 
 __all__ = ["updater"]
-
-
-_LENGTH = 32  # choices that one stream of sessions makes in an update
 
 
 @struct.dataclass
@@ -37,10 +35,10 @@ class Steps:
 def updater(config: PPOConfig, per_group: int, width: int) -> Update:
     """An update: (state, given up; task; base rule) -> the next state and metrics.
 
-    ``config.episodes_per_update`` are choices: streams of ``_LENGTH``.
+    ``config.episodes_per_update`` are choices: streams of ``LENGTH``.
     """
     network = Network(width)
-    streams = config.episodes_per_update // _LENGTH
+    streams = config.episodes_per_update // LENGTH
 
     def draw(key: jax.Array, task: Task, base: Scored) -> Any:
         return jax.random.split(key, streams), task, base
@@ -142,5 +140,5 @@ def _stream(
         )  # fmt: skip
 
     key_begin, key_steps = jax.random.split(key)
-    keys = jax.random.split(key_steps, _LENGTH + 1)
+    keys = jax.random.split(key_steps, LENGTH + 1)
     return jax.lax.scan(step, begin(key_begin), keys)[1]
