@@ -18,7 +18,7 @@ LENGTH = 32  # choices that one stream of sessions makes in an update
 _RULES: tuple[type[Scored], ...] = (rules.Priced, rules.StateRule)
 
 PPO = PPOConfig(
-    num_episodes=400 * 4096,
+    num_episodes=600 * 4096,
     episodes_per_update=4096,
     episodes_per_set=1,
     num_epochs=4,
@@ -26,8 +26,9 @@ PPO = PPOConfig(
     learning_rate=2e-3,
     final_learning_rate=6e-5,
     entropy_start=0.003,
-    entropy_end=0.003,
-    gae_lambda=0.97,
+    entropy_end=0.0,
+    gae_lambda=0.92,
+    average_decay=0.998,
 )
 """Its episodes are choices: sessions differ in length."""
 

@@ -48,18 +48,18 @@ def see(
     left = jnp.where(jnp.isfinite(session.seconds), session.seconds, 2 * _SCALE)
     g, s, u = gains[index], seconds[index], uses[index]
     members = task.groups[None] == jnp.arange(task.num_groups)[:, None]
-    tops = jnp.where(members & options.allowed, gains, 0.0).max(axis=1)  # (G,)
+    within = jnp.where(members & options.allowed[None], gains[None], 0.0)  # (G, A)
     # Summed over a group's options, the gains measure how much of it is unknown.
-    sums = jnp.where(members & options.allowed, gains, 0.0).sum(axis=1)
+    tops, sums = within.max(axis=1), within.sum(axis=1)
     own, whole = tops[mine], sums[mine]
     others = jnp.where(
-        jnp.arange(task.num_groups) == mine[:, None], 0.0, tops[None]
+        jnp.arange(task.num_groups)[None] == mine[:, None], 0.0, tops[None]
     ).max(axis=1)
-    nearest = jnp.where(members, options.seconds, jnp.inf).min(axis=1)
+    nearest = jnp.where(members, options.seconds[None], jnp.inf).min(axis=1)
     rate = gains / jnp.maximum(seconds, 1e-6)
     first, second = session.uses <= 1, session.uses <= 2
     ones = jnp.ones_like(g)
-    low, high = task.designs.min(axis=0), task.designs.max(axis=0)
+    low, high = (f(task.designs, axis=0, keepdims=True) for f in (jnp.min, jnp.max))
     where = ((task.designs - low) / jnp.maximum(high - low, 1e-9))[index, -1]
     features = jnp.stack(
         [
