@@ -35,6 +35,7 @@ METHODS = {
     "policy": "the network that corrects the state rule",
 }
 _GENERATIONS = 20  # of tuning
+_STATIC = 16  # entries of a static sequence; few sessions last longer
 _TIMED = 128  # sessions on which a choice is timed
 _BATCH = {"rollouts": 64, "two_step": 256}  # sessions at once, for the memory
 
@@ -98,6 +99,8 @@ def evaluate(
         if method == "static":
             decider: Any = static.optimise(
                 task,
+                length=min(task.most, _STATIC),
+                sweeps=1,
                 seed=seed + 1,
                 report=lambda done, of, nats: progress("optimising static", done, of),
             )

@@ -149,7 +149,7 @@ def test_deciders_that_look_ahead_run_on_another_task():
 def test_a_static_sequence_is_as_good_as_the_best_of_all():
     task = knee(4, sigma=0.05, seconds=4.0, trips=1)
     keys = jax.random.split(jax.random.key(5), 256)
-    found = static.optimise(task, length=3, episodes=256, starts=4, seed=5)
+    found = static.optimise(task, length=3, episodes=256, starts=8, seed=5)
 
     def nats(sequence):
         return float(play(task, static.Static(np.array(sequence)), keys).gain.mean())

@@ -83,7 +83,10 @@ class PolicyConfig:
         return PolicyConfig(
             task=meta["task"],
             base=base,
-            options=tuple(meta["options"]),
+            options=tuple(
+                {k: tuple(v) if isinstance(v, list) else v for k, v in options.items()}
+                for options in meta["options"]
+            ),
             ppo=PPOConfig(**meta["ppo"]),
             **meta["network"],
         )
