@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NoReturn
 
 from jaxcal.arguments import refused
-from jaxcal.commands.train import names_task
+from jaxcal.commands.runs import names_task
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.learning.runtime import processes
 

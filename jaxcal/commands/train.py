@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import datetime
 import hashlib
 import pathlib
-import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxcal.arguments import refused
+from jaxcal.commands.runs import clock, names_task, stop_on_signals
 from jaxcal.commands.tables import read_table
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
     from jaxcal.learning.training.config import TrainConfig
     from jaxcal.learning.training.loop import Report
 
-__all__ = ["clock", "main", "names_task", "stop_on_signals"]
+__all__ = ["main"]
 
 
 def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
@@ -51,11 +50,6 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
 
     advice = "what is saved stays: start every process again with --resume"
     return processes.run_job(prog, given, alone, advice)
-
-
-def names_task(argv: Sequence[str]) -> bool:
-    """Whether a command line names a task of sequential measurement."""
-    return any(word == "--task" or word.startswith("--task=") for word in argv)
 
 
 def _run(arguments: argparse.Namespace) -> int:
@@ -270,20 +264,6 @@ def _introduce(config: TrainConfig, out: pathlib.Path, devices: str) -> None:
     print(f"configuration: {config.as_meta()}")
 
 
-def stop_on_signals() -> Callable[[], bool]:
-    """Whether Ctrl-C or SIGTERM asked to save and stop; a second Ctrl-C is at once."""
-    asked: list[int] = []
-
-    def ask(number: int, frame: Any) -> None:
-        asked.append(number)
-        print("\nstopping after this update and saving ...", flush=True)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, ask)
-    return lambda: bool(asked)
-
-
 def _show(report: Report) -> None:
     """One line of progress."""
     metrics = report.metrics
@@ -297,8 +277,3 @@ def _show(report: Report) -> None:
         + (f"{ratio:16.4f} {hits:12.3f}" if ratio is not None else ""),
         flush=True,
     )
-
-
-def clock(seconds: float) -> str:
-    """h:mm:ss."""
-    return str(datetime.timedelta(seconds=round(seconds)))

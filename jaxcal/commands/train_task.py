@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from jaxcal.arguments import Parser, at_least, refused
+from jaxcal.commands.runs import clock, stop_on_signals
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder
 
@@ -104,7 +105,6 @@ def _parser(prog: str) -> Parser:
 
 def _run(arguments: argparse.Namespace) -> int:
     from jaxcal.adaptive.policy import run
-    from jaxcal.commands.train import clock, stop_on_signals
     from jaxcal.learning.runtime import cache
     from jaxcal.learning.training import checkpoint
 
