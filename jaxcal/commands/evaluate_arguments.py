@@ -53,6 +53,8 @@ examples:
       figures and report/index.html; dataset3 holds outputs, so parameters too
   {program} --methods random,greedy,exact --k 8 --episodes 100
       eight of fifty postures; loads no JAX
+  {program} --task knee
+      deciders of sequential measurement; {program} --task knee --help
   {program} --stream runs/ten_million --episodes 10000000
       any number of episodes in constant memory; the same command resumes where it
       stopped; under srun, or with --coordinator, many processes share the work

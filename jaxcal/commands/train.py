@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import datetime
 import hashlib
 import pathlib
-import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from jaxcal.arguments import refused
+from jaxcal.commands.runs import clock, names_task, stop_on_signals
 from jaxcal.commands.tables import read_table
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder
@@ -23,7 +22,7 @@ from jaxcal.learning.runtime import processes
 if TYPE_CHECKING:
     from jaxcal.learning.environments.task import GivenCandidates
     from jaxcal.learning.training.config import TrainConfig
-    from jaxcal.learning.training.run import Report
+    from jaxcal.learning.training.loop import Report
 
 __all__ = ["main"]
 
@@ -36,6 +35,10 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
         another process of the job was lost.
     """
     given = list(sys.argv[1:] if argv is None else argv)
+    if names_task(given):
+        from jaxcal.commands import train_task
+
+        return train_task.main(given, prog)
 
     def alone() -> int:  # this process may be one of several
         try:
@@ -58,7 +61,7 @@ def _run(arguments: argparse.Namespace) -> int:
     cache.keep_compiled_programs()
     out = pathlib.Path(arguments.out or f"runs/{arguments.preset}")
     config = devices.on_first(lambda: _configuration(arguments, out))
-    stop = _stop_on_signals()
+    stop = stop_on_signals()
     if arguments.trainer == "brax":
         from jaxcal.learning.training import brax_ppo
 
@@ -261,20 +264,6 @@ def _introduce(config: TrainConfig, out: pathlib.Path, devices: str) -> None:
     print(f"configuration: {config.as_meta()}")
 
 
-def _stop_on_signals() -> Callable[[], bool]:
-    """Whether Ctrl-C or SIGTERM asked to save and stop; a second Ctrl-C is at once."""
-    asked: list[int] = []
-
-    def ask(number: int, frame: Any) -> None:
-        asked.append(number)
-        print("\nstopping after this update and saving ...", flush=True)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, ask)
-    return lambda: bool(asked)
-
-
 def _show(report: Report) -> None:
     """One line of progress."""
     metrics = report.metrics
@@ -283,13 +272,8 @@ def _show(report: Report) -> None:
     print(
         f"{report.update:9,d} {report.episodes:10,d} "
         f"{report.episodes_per_second:6,.0f} "
-        f"{_clock(report.seconds):>9} {_clock(report.eta):>9} "
+        f"{clock(report.seconds):>9} {clock(report.eta):>9} "
         + (f"{reward:8.4f} " if reward is not None else " imitate ")
         + (f"{ratio:16.4f} {hits:12.3f}" if ratio is not None else ""),
         flush=True,
     )
-
-
-def _clock(seconds: float) -> str:
-    """h:mm:ss."""
-    return str(datetime.timedelta(seconds=round(seconds)))

@@ -27,6 +27,8 @@ what to try first:
   most where more than n + 1 postures are chosen. Other numbers rarely need a change.
 
 more examples:
+  {program} --task knee            another kind: the next measurement from the last;
+                                   {program} --task knee --help
   {program} --resume --out runs/compact      go on where a run stopped
   {program} --preset general --export checkpoints/default   what ships
   {program} --trainer brax --episodes 50000  the same task, brax's own PPO

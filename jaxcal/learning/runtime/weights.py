@@ -31,6 +31,7 @@ __all__ = [
     "newest_step",
     "read",
     "resolve",
+    "shipped",
     "write",
 ]
 
@@ -45,11 +46,16 @@ class CheckpointError(ValueError):
     """A checkpoint that is missing, damaged, or made by another version."""
 
 
-def default_folder() -> pathlib.Path:
-    """The checkpoint that ships: in the installed package, or in the repository."""
+def shipped(name: str) -> pathlib.Path:
+    """A checkpoint that ships: in the installed package, or in the repository."""
     package = pathlib.Path(__file__).resolve().parents[2]
-    inside = package / "checkpoints" / "default"
-    return inside if inside.is_dir() else package.parent / "checkpoints" / "default"
+    inside = package / "checkpoints" / name
+    return inside if inside.is_dir() else package.parent / "checkpoints" / name
+
+
+def default_folder() -> pathlib.Path:
+    """The checkpoint of postures that ships."""
+    return shipped("default")
 
 
 def resolve(folder: str | pathlib.Path | None) -> pathlib.Path:

@@ -27,6 +27,7 @@ import pathlib
 import platform
 import sys
 import tempfile
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -49,8 +50,10 @@ __all__ = [
     "Policy",
     "export",
     "fingerprint",
+    "latest",
     "load",
     "package_versions",
+    "read_policy",
     "restore",
     "save",
 ]
@@ -80,8 +83,10 @@ class Policy:
 
 
 def _plain(params: Any, meta: dict[str, Any]) -> Weights:
-    network = NetworkConfig(**meta["network"])  # with every field, also those not saved
-    return Weights(dataclasses.asdict(network), weights.flat(params), meta)
+    network = meta["network"]
+    if meta.get("schema", SCHEMA) == SCHEMA:  # with every field, also those not saved
+        network = dataclasses.asdict(NetworkConfig(**network))
+    return Weights(network, weights.flat(params), meta)
 
 
 def package_versions() -> dict[str, str]:
@@ -117,7 +122,8 @@ def save(
         folder: made where missing.
         step: number of the step; a step that exists is left as it is.
         params: the policy's weights.
-        meta: JSON values; ``network`` is the fields of a ``NetworkConfig``.
+        meta: JSON values; ``network`` is the fields of a ``NetworkConfig``, or, of
+            another ``schema``, what that one says.
         state: what ``restore`` gives back, or None for a policy only.
         keep: older steps beyond these are deleted.
     """
@@ -194,15 +200,29 @@ def _unreadable(path: pathlib.Path, what: str, error: Exception) -> CheckpointEr
     return CheckpointError(f"checkpoint {path} cannot be {what} ({line})")
 
 
-def _latest(folder: str | pathlib.Path | None) -> tuple[pathlib.Path, dict[str, Any]]:
-    """The newest complete step of a folder and its meta, checked."""
+def latest(
+    folder: str | pathlib.Path | None, schema: str = SCHEMA
+) -> tuple[pathlib.Path, dict[str, Any]]:
+    """The newest complete step of a folder and its meta, checked.
+
+    Args:
+        folder: a checkpoint folder or a training run's; the one that ships when None.
+        schema: what it must hold.
+
+    Raises:
+        CheckpointError: there is none, it is damaged, or holds something else.
+    """
     path = newest_step(resolve(folder))
     try:
         meta = json.loads((path / "meta" / "metadata").read_text())
     except (OSError, ValueError) as error:
         raise _unreadable(path, "read: its meta is damaged", error) from error
-    if not isinstance(meta, dict) or meta.get("schema") != SCHEMA:
-        raise CheckpointError(f"checkpoint {path} is not a jaxcal policy")
+    if not isinstance(meta, dict) or meta.get("schema") != schema:
+        held = meta.get("schema") if isinstance(meta, dict) else None
+        raise CheckpointError(
+            f"checkpoint {path} is not a jaxcal policy of this kind: its schema must "
+            f"be {schema}, got {held}"
+        )
     if meta.get("version") != VERSION:
         raise CheckpointError(
             f"checkpoint {path} has version {meta.get('version')!r}; this jaxcal reads "
@@ -220,7 +240,7 @@ def load(folder: str | pathlib.Path | None = None) -> Policy:
     Raises:
         CheckpointError: there is none, it is damaged, or another version made it.
     """
-    path, meta = _latest(folder)
+    path, meta = latest(folder)
     try:
         network = build(NetworkConfig(**meta["network"]))
         env = meta["tasks"][0]["environment"]
@@ -230,6 +250,16 @@ def load(folder: str | pathlib.Path | None = None) -> Policy:
             f"checkpoint {path} names no network or task this jaxcal knows: {error}"
         ) from error
     like = jax.eval_shape(lambda: networks.initial(network, jax.random.key(0), m, n, k))
+    params = read_policy(path, like)
+    return Policy(network, params, meta, path.parent, int(path.name))
+
+
+def read_policy(path: pathlib.Path, like: Any) -> Any:
+    """The weights in a step's folder, of the shapes of ``like``.
+
+    Raises:
+        CheckpointError: they are damaged, of other shapes or not finite.
+    """
     what = "read: its weights are damaged or do not fit its network"
     params = _read(path / "policy", like, what)
     for name, array in weights.flat(params).items():
@@ -237,7 +267,7 @@ def load(folder: str | pathlib.Path | None = None) -> Policy:
             raise CheckpointError(
                 f"checkpoint {path} holds weights that are not finite, in {name}"
             )
-    return Policy(network, params, meta, path.parent, int(path.name))
+    return params
 
 
 def fingerprint(folder: str | pathlib.Path | None = None) -> str:
@@ -249,18 +279,23 @@ def fingerprint(folder: str | pathlib.Path | None = None) -> str:
     return load(folder).weights.fingerprint
 
 
-def export(run: str | pathlib.Path, folder: str | pathlib.Path) -> None:
+def export(
+    run: str | pathlib.Path,
+    folder: str | pathlib.Path,
+    load: Callable[[str | pathlib.Path], Any] = load,
+) -> None:
     """Write a run's policy alone, without its training state, to another folder.
 
     Args:
         run: a training run's folder.
         folder: becomes a checkpoint folder with one step; one that is there is replaced
             after the new one is complete.
+        load: reads the run's policy, with ``params``, ``meta`` and ``step``.
     """
     policy = load(run)
     target = pathlib.Path(folder)
     target.parent.mkdir(parents=True, exist_ok=True)
-    own = {"schema", "version", "created", "versions"}
+    own = {"version", "created", "versions"}
     meta = {name: value for name, value in policy.meta.items() if name not in own}
     meta["trained_with"] = policy.meta["versions"]
     with tempfile.TemporaryDirectory(dir=target.parent, prefix=".export-") as fresh:
@@ -275,17 +310,20 @@ def export(run: str | pathlib.Path, folder: str | pathlib.Path) -> None:
         new.rename(target)
 
 
-def restore(folder: str | pathlib.Path, fresh: Any) -> tuple[Any, dict[str, Any]]:
+def restore(
+    folder: str | pathlib.Path, fresh: Any, schema: str = SCHEMA
+) -> tuple[Any, dict[str, Any]]:
     """The training state of the newest step, and its meta.
 
     Args:
         folder: as for ``load``.
         fresh: a state of the same structure, for shapes and types.
+        schema: of the run.
 
     Raises:
         CheckpointError: none, damaged, or one without a training state.
     """
-    path, meta = _latest(folder)
+    path, meta = latest(folder, schema)
     if not (path / "state").exists():
         raise CheckpointError(
             f"checkpoint {path} holds a policy but no training state to resume from"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import pathlib
+from collections.abc import Sequence
 
 from jaxcal.files import write_text
 
@@ -30,14 +31,16 @@ COLUMNS = (
 class MetricsTable:
     """Rows are flushed as they come; after a resume they go on where the state does."""
 
-    def __init__(self, root: pathlib.Path, done: int) -> None:
+    def __init__(
+        self, root: pathlib.Path, done: int, columns: Sequence[str] = COLUMNS
+    ) -> None:
         from tensorboardX import SummaryWriter  # 0.2 s; loads PyTorch where installed
 
         path = root / "metrics.csv"
-        lines = [",".join(COLUMNS), *_rows_until(path, done)]
+        lines = [",".join(columns), *_rows_until(path, done, len(columns))]
         write_text(path, "\n".join(lines) + "\n")
         self._file = path.open("a", newline="")
-        self._writer = csv.DictWriter(self._file, COLUMNS, extrasaction="ignore")
+        self._writer = csv.DictWriter(self._file, columns, extrasaction="ignore")
         self._events = SummaryWriter(str(root), flush_secs=30)
 
     def add(self, row: dict[str, float]) -> None:
@@ -56,10 +59,10 @@ class MetricsTable:
         self._events.close()
 
 
-def _rows_until(path: pathlib.Path, done: int) -> list[str]:
+def _rows_until(path: pathlib.Path, done: int, width: int) -> list[str]:
     """Whole rows of a metrics file up to an update; later ones were never saved."""
     lines = path.read_text().splitlines()[1:] if path.exists() else []
-    whole = [line for line in lines if line.count(",") == len(COLUMNS) - 1]
+    whole = [line for line in lines if line.count(",") == width - 1]
     numbers = [line.partition(",")[0] for line in whole]
     return [
         line

@@ -1,0 +1,171 @@
+"""One policy on tasks it was not trained on, and with a belief that is wrong.
+
+    python benchmarks/adaptive_transfer.py [--checkpoint DIR] [--episodes 4096]
+        [--seed 0] [--parts other wrong] [--json FILE]
+
+other   KNEE with another sigma, rho, slip, grid, number of joints or budget: the state
+        rule with KNEE's constants, the state rule tuned on that task, and the policy.
+wrong   the belief assumes KNEE's constants, the machine has others: what is quoted is
+        the rise of the log posterior at the truth, which a wrong belief can make
+        negative.
+
+Differences are in pairs, on the same sessions, with standard errors.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pathlib
+import sys
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxcal.adaptive.grid import GridTask
+from jaxcal.adaptive.play import compare
+from jaxcal.adaptive.policy import run
+from jaxcal.adaptive.tasks.knee import PRICED, STATE_RULE, knee
+from jaxcal.adaptive.tuning import tune
+from jaxcal.files import require_writable_folder, write_text
+from jaxcal.learning.runtime import cache
+from jaxcal.learning.training.checkpoint import package_versions
+
+OTHER: dict[str, dict[str, Any]] = {
+    "as trained": {},
+    "sigma 0.005": {"sigma": 0.005},
+    "sigma 0.06": {"sigma": 0.06},
+    "slip 0.05": {"slip": 0.05},
+    "rho 0": {"rho": 0.0},
+    "rho 0.9": {"rho": 0.9},
+    "16 cells": {"cells": 16},
+    "48 cells": {"cells": 48},
+    "1 joint": {"joints": 1},
+    "3 joints of 12 cells": {"joints": 3, "cells": 12},
+    "4 to 10 s": {"seconds": (4.0, 10.0)},
+    "30 to 60 s": {"seconds": (30.0, 60.0)},
+    "5 trips": {"trips": 5},
+    "slow travel": {"travel_s": 6.0, "change_s": 6.0},
+    "reset 5 s": {"reset_s": 5.0},
+}
+WRONG: dict[str, dict[str, Any]] = {
+    "none": {},
+    "rho is 0": {"rho": 0.0},
+    "rho is 0.9": {"rho": 0.9},
+    "sigma is 0.04": {"sigma": 0.04},
+    "slip is 0.03": {"slip": 0.03},
+}
+
+
+@struct.dataclass
+class Misled:
+    """A machine of one task, played with the belief of another of the same designs."""
+
+    believed: GridTask
+    real: GridTask
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.believed, name)
+
+    def draw(self, key: jax.Array) -> jax.Array:
+        return self.real.draw(key)
+
+    def measure(self, truth: jax.Array, design: jax.Array, key: jax.Array) -> jax.Array:
+        return self.real.measure(truth, design, key)
+
+
+def other(policy: Any, episodes: int, seed: int) -> dict[str, Any]:
+    """Nats on tasks that differ from KNEE."""
+    rows = {}
+    print(f"{'task':24}{'priced':>8}{'state':>8}{'policy':>8}"
+          f"{'less state':>18}{'less state tuned here':>24}")  # fmt: skip
+    for name, options in OTHER.items():
+        task = arrays(knee(**options))
+        tuned = STATE_RULE
+        if options:
+            tuned = tune(
+                task, STATE_RULE, episodes=1024, generations=10, population=16, elite=4,
+                seed=seed + 1,
+            )  # fmt: skip
+        deciders = {"priced": PRICED, "state": STATE_RULE, "tuned": tuned}
+        deciders = arrays(deciders | {"policy": policy})
+        found = compare(task, deciders, episodes, seed, batch=512)
+        rows[name] = {
+            "options": options,
+            "nats": {decider: found.mean(decider) for decider in found.names},
+            "policy_less_state": found.paired("policy", "state"),
+            "policy_less_tuned": found.paired("policy", "tuned"),
+        }
+        line = [f"{found.mean(d)[0]:8.3f}" for d in ("priced", "state", "policy")]
+        line += [
+            shown(found.paired("policy", d), w)
+            for d, w in zip(("state", "tuned"), (18, 24), strict=True)
+        ]
+        print(f"{name:24}" + "".join(line), flush=True)
+    return rows
+
+
+def wrong(policy: Any, episodes: int, seed: int) -> dict[str, Any]:
+    """Log ratio at the truth where the belief's constants are not the machine's."""
+    rows = {}
+    print(
+        f"{'what is wrong':24}{'priced':>8}{'state':>8}{'policy':>8}{'less state':>18}"
+    )
+    for name, options in WRONG.items():
+        task = Misled(arrays(knee()), arrays(knee(**options)))
+        deciders = arrays({"priced": PRICED, "state": STATE_RULE, "policy": policy})
+        found = compare(task, deciders, episodes, seed, batch=512)
+        found = type(found)(
+            found.names, found.log_ratio, found.told, found.log_ratio, found.choices
+        )
+        rows[name] = {
+            "options": options,
+            "nats": {decider: found.mean(decider) for decider in found.names},
+            "policy_less_state": found.paired("policy", "state"),
+        }
+        line = [f"{found.mean(d)[0]:8.3f}" for d in found.names]
+        print(f"{name:24}" + "".join(line) + shown(found.paired("policy", "state"), 18),
+              flush=True)  # fmt: skip
+    return rows
+
+
+def shown(value: tuple[float, float], width: int) -> str:
+    return f"{value[0]:+.3f} ± {value[1]:.3f}".rjust(width)
+
+
+def arrays(tree: Any) -> Any:
+    return jax.tree.map(jnp.asarray, tree)
+
+
+def main(argv: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--checkpoint", help="the one that ships when not given")
+    parser.add_argument("--episodes", type=int, default=4096)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--parts", nargs="+", choices=("other", "wrong"), default=["other", "wrong"]
+    )
+    parser.add_argument("--json", type=pathlib.Path)
+    options = parser.parse_args(argv)
+    if options.json is not None:
+        require_writable_folder(options.json.parent)
+    cache.keep_compiled_programs()
+    trained = run.load(options.checkpoint)
+    document: dict[str, Any] = {
+        "versions": package_versions(), "policy": trained.meta, "seed": options.seed,
+        "episodes": options.episodes,
+    }  # fmt: skip
+    for part in options.parts:
+        play = {"other": other, "wrong": wrong}[part]
+        document[part] = play(trained.decider, options.episodes, options.seed)
+    if options.json is not None:
+        write_text(options.json, json.dumps(document, indent=1) + "\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

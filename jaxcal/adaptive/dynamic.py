@@ -1,0 +1,174 @@
+"""The optimum of a small task by dynamic programming.
+
+Where outcomes are certain once theta is known, a belief is the prior restricted to the
+values that every answer allows: a set. The sets that can be reached are few, and with
+the place, the time left in ticks and the uses left they are the states of a finite
+problem, solved backwards in time. Every other decider is measured against its value.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numba as nb
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.adaptive.grid import GridTask
+from jaxcal.checks import seconds as checked_seconds
+
+__all__ = ["Optimum", "solve"]
+
+Array = NDArray[np.float64]
+
+_MOST_STATES = 2**28
+
+
+@dataclasses.dataclass(frozen=True)
+class Optimum:
+    """The largest expected information that any decider can gain."""
+
+    values: NDArray[np.float32]  # (ticks + 1, uses + 1) nats at the start
+    tick: float  # seconds
+    task: GridTask
+
+    def value(self, seconds: float, uses: int) -> float:
+        """Nats of a session with this budget."""
+        ticks = int(np.ceil(seconds / self.tick - 1e-6))
+        return float(self.values[ticks, uses])
+
+    @property
+    def mean(self) -> float:
+        """Nats of the task's sessions: over its budgets, time uniform."""
+        low, high = np.asarray(self.task.seconds, np.float64)
+        edges = np.arange(len(self.values)) * self.tick  # tick k: (k - 1, k] seconds
+        upper, lower = np.minimum(edges[1:], high), np.maximum(edges[:-1], low)
+        share = np.maximum(upper - lower, 0.0)
+        if high <= low:
+            return float(np.mean([self.value(low, e) for e in self._uses]))
+        return float(
+            np.mean([share @ self.values[1:, e] for e in self._uses]) / share.sum()
+        )
+
+    @property
+    def _uses(self) -> list[int]:
+        return np.asarray(self.task.num_uses).tolist()
+
+
+def solve(task: GridTask, tick: float) -> Optimum:
+    """The optimum of a task whose outcomes are certain once theta is known.
+
+    Args:
+        task: every likelihood 0 or 1, a finite budget of time.
+        tick: seconds of which every cost is a whole multiple.
+
+    Raises:
+        ValueError: an outcome that is not certain, a cost that is not a multiple or is
+            zero, or more states than fit in memory.
+    """
+    checked_seconds("tick", tick)
+    likelihood = np.asarray(task.likelihood, np.float64)
+    if (np.abs(likelihood - np.rint(likelihood)) > 1e-6).any():
+        raise ValueError(
+            "task.likelihood must be 0 or 1 for dynamic programming: a noisy answer "
+            "leaves more beliefs than can be listed"
+        )
+    travel = _ticks("task.travel", np.asarray(task.travel, np.float64), tick)
+    extra = _ticks("task.extra", np.asarray(task.extra, np.float64), tick)
+    if travel.min() < 1:
+        raise ValueError("task.travel must be at least one tick for every measurement")
+    high = float(np.asarray(task.seconds)[1])
+    if not np.isfinite(high):
+        raise ValueError(f"task.seconds must be finite, got {high}")
+    ticks = int(np.ceil(high / tick - 1e-6))
+    after, chance = _beliefs(likelihood > 0.5, np.asarray(task.prior, np.float64))
+    uses = int(np.asarray(task.num_uses).max())
+    size = (ticks + 1) * (uses + 1) * len(travel) * len(after)
+    if size > _MOST_STATES:
+        raise ValueError(
+            f"task must have at most {_MOST_STATES:,} states for dynamic programming, "
+            f"got {size:,}: use fewer cells or a longer tick"
+        )
+    values = _backwards(
+        after, chance, travel, extra,
+        np.asarray(task.place_after, np.int64), np.asarray(task.uses, np.int64),
+        ticks, uses,
+    )  # fmt: skip
+    return Optimum(values[:, :, int(task.place), 0], tick, task)
+
+
+def _ticks(name: str, values: Array, tick: float) -> NDArray[np.int64]:
+    whole = np.rint(values / tick)
+    off = np.abs(values - whole * tick)
+    if (off > 1e-4 * tick).any():
+        worst = values.ravel()[int(off.argmax())]
+        raise ValueError(f"{name} must be multiples of {tick:g} s, got {worst:g}")
+    return whole.astype(np.int64)
+
+
+def _beliefs(
+    answers: NDArray[np.bool_], prior: Array
+) -> tuple[NDArray[np.int64], Array]:
+    """All sets that answers can leave: the next set, and its chance, (B, A, Y)."""
+    number: dict[bytes, int] = {}
+    sets: list[NDArray[np.bool_]] = []
+
+    def of(members: NDArray[np.bool_]) -> int:
+        key = np.packbits(members).tobytes()
+        if key not in number:
+            number[key] = len(sets)
+            sets.append(members)
+        return number[key]
+
+    of(prior > 0.0)
+    after, chance = [], []
+    done = 0
+    while done < len(sets):
+        mine = sets[done]
+        weight = prior * mine
+        p = answers @ weight / weight.sum()
+        follow = np.zeros(p.shape, np.int64)
+        for a, y in np.argwhere(p > 0.0):
+            follow[a, y] = of(mine & answers[a, y])
+        after.append(follow)
+        chance.append(p)
+        done += 1
+    return np.stack(after), np.stack(chance)
+
+
+@nb.njit(cache=True)
+def _backwards(after, chance, travel, extra, place_after, taken, ticks, uses):
+    """(ticks + 1, uses + 1, P, B) nats still to gain."""
+    num_beliefs, num_designs, num_outcomes = after.shape
+    places = len(travel)
+    values = np.zeros((ticks + 1, uses + 1, places, num_beliefs), np.float32)
+    gains = np.zeros((num_beliefs, num_designs))
+    for b in range(num_beliefs):
+        for a in range(num_designs):
+            for y in range(num_outcomes):
+                p = chance[b, a, y]
+                if p > 0.0:
+                    gains[b, a] -= p * np.log(p)
+    for t in range(1, ticks + 1):
+        for e in range(1, uses + 1):
+            for place in range(places):
+                for b in range(num_beliefs):
+                    best = 0.0
+                    for a in range(num_designs):
+                        if gains[b, a] <= 0.0:
+                            continue
+                        total = gains[b, a]
+                        for y in range(num_outcomes):
+                            p = chance[b, a, y]
+                            if p > 0.0:
+                                left = t - travel[place, a] - extra[a, y]
+                                more = e - taken[a, y]
+                                if left > 0 and more > 0:
+                                    follow = after[b, a, y]
+                                    total += (
+                                        p
+                                        * values[left, more, place_after[a, y], follow]
+                                    )
+                        best = max(best, total)
+                    values[t, e, place, b] = best
+    return values

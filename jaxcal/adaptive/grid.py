@@ -1,0 +1,317 @@
+"""Tasks of finitely many unknowns, designs and outcomes, and their exact belief."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.adaptive.session import Options, Session
+from jaxcal.checks import in_words, numbers, whole_number
+
+__all__ = ["GridBelief", "GridTask"]
+
+Array = NDArray[np.float64]
+
+_SMALL = 1e-30  # probability whose logarithm is still finite in float32
+
+
+@struct.dataclass
+class GridBelief:
+    """The exact posterior over S values of the unknown."""
+
+    weights: jax.Array  # (S,) sum to one
+
+    def predictive(self, task: GridTask) -> jax.Array:
+        """(A, Y) probability of every outcome of every design."""
+        return task.likelihood @ self.weights
+
+    def gains(
+        self, task: GridTask, options: Options, key: jax.Array | None = None
+    ) -> jax.Array:
+        """(A,) nats: entropy of the outcome less its entropy if theta were known."""
+        p = self.predictive(task)
+        outcome = -(p * jnp.log(p + _SMALL)).sum(axis=-1)
+        return jnp.maximum(outcome - task.noise_entropy @ self.weights, 0.0)
+
+    def update(
+        self,
+        task: GridTask,
+        design: jax.Array,
+        outcome: jax.Array,
+        key: jax.Array | None = None,
+    ) -> GridBelief:
+        weights = self.weights * task.likelihood[design, outcome]
+        return GridBelief(weights / (weights.sum() + _SMALL))
+
+    def draw(self, key: jax.Array) -> jax.Array:
+        """() int32 a value of the unknown, drawn."""
+        below = jnp.cumsum(self.weights)
+        at = jax.random.uniform(key) * below[-1]
+        index = jnp.searchsorted(below, at, side="right")
+        return jnp.minimum(index, len(below) - 1).astype(jnp.int32)
+
+    def outcomes(
+        self, task: GridTask, design: jax.Array, key: jax.Array | None = None
+    ) -> tuple[jax.Array, jax.Array]:
+        """(Y,) all outcomes of a design and (Y,) their probabilities."""
+        p = task.likelihood[design] @ self.weights
+        return jnp.arange(len(p)), p
+
+    def entropy(self) -> jax.Array:
+        return -(self.weights * jnp.log(self.weights + _SMALL)).sum()
+
+    def log_density(self, truth: jax.Array) -> jax.Array:
+        """() log probability of the truth, an index in [0, S)."""
+        return jnp.log(self.weights[truth] + _SMALL)
+
+
+@struct.dataclass
+class GridTask:
+    """S values of theta, A designs, Y outcomes, P places; made by :func:`make`.
+
+    A design is an index in [0, A), an outcome one in [0, Y), the truth one in [0, S).
+    """
+
+    theta: jax.Array  # (S, d)
+    prior: jax.Array  # (S,) sums to one
+    designs: jax.Array  # (A, e) for the reader and for features
+    likelihood: jax.Array  # (A, Y, S)
+    noise_entropy: jax.Array  # (A, S) of the outcome where theta is known
+    travel: jax.Array  # (P, A) seconds from a place until a design is measured
+    place_after: jax.Array  # (A, Y) int32
+    extra: jax.Array  # (A, Y) seconds that an outcome costs
+    uses: jax.Array  # (A, Y) int32 of what is countable that an outcome takes
+    seconds: jax.Array  # (2,) budget of a session, uniform between the two
+    num_uses: jax.Array  # (E,) int32 budgets, each as likely
+    place: jax.Array  # () int32 at the start
+    groups: jax.Array  # (A,) int32 of alike designs, such as those of one joint
+    num_groups: int = struct.field(pytree_node=False)
+    most: int = struct.field(pytree_node=False)
+    theta_names: tuple[str, ...] = struct.field(pytree_node=False)
+    design_names: tuple[str, ...] = struct.field(pytree_node=False)
+
+    @staticmethod
+    def make(
+        theta: ArrayLike,
+        designs: ArrayLike,
+        likelihood: ArrayLike | Callable[[Array, Array], ArrayLike],
+        *,
+        prior: ArrayLike | None = None,
+        travel: ArrayLike = 0.0,
+        place_after: ArrayLike | None = None,
+        place: int | None = None,
+        groups: ArrayLike | None = None,
+        extra: ArrayLike = 0.0,
+        uses: ArrayLike = 0,
+        seconds: float | tuple[float, float] = np.inf,
+        num_uses: int | Sequence[int] = 1,
+        most: int,
+        theta_names: Sequence[str] = (),
+        design_names: Sequence[str] = (),
+    ) -> GridTask:
+        """Check the tables of a task.
+
+        Args:
+            theta: (S, d) or (S,) values that the unknown may have.
+            designs: (A, e) or (A,) what may be measured.
+            likelihood: (A, Y, S) probability of each outcome, or a function of
+                ``designs`` (A, e) and ``theta`` (S, d) that returns it.
+            prior: (S,) weights; equal when not given.
+            travel: seconds from a place to a measured design: a number, (A,) or
+                (P, A). Places 0 to A - 1 are the designs, others are the task's own;
+                without more, the last, A, is where a session starts.
+            place_after: (A, Y) place after an outcome; the design itself by default.
+            place: at the start; the last place by default.
+            groups: (A,) numbers from 0 of alike designs, such as the joint they are
+                of; what is shortlisted holds the best of each. One by default.
+            extra: (A, Y), or what broadcasts to it, seconds that an outcome costs.
+            uses: (A, Y), or what broadcasts to it, of a countable resource.
+            seconds: budget of a session, or (least, most) to draw it from.
+            num_uses: uses that end a session, or the list it is drawn from.
+            most: measurements after which a session ends in any case.
+
+        Raises:
+            ValueError: naming the table, the rule and the value.
+        """
+        at, grid = _columns("designs", designs), _columns("theta", theta)
+        count, size = len(at), len(grid)
+        given = likelihood(at, grid) if callable(likelihood) else likelihood
+        table = numbers("likelihood", given)
+        if table.ndim != 3 or table.shape[::2] != (count, size):
+            raise ValueError(
+                f"likelihood must have shape ({count}, Y, {size}), got {table.shape}"
+            )
+        if (table < 0.0).any():
+            raise ValueError(f"likelihood must be at least 0, got {table.min():g}")
+        total = table.sum(axis=1)
+        if (bad := np.argwhere(np.abs(total - 1.0) > 1e-6)).size:
+            a, s = bad[0]
+            raise ValueError(
+                "likelihood must sum to 1 over the outcomes, got "
+                f"{total[a, s]:.9g} for design {in_words(at[a])} and theta "
+                f"{in_words(grid[s])}"
+            )
+        table = table / total[:, None]
+        weights = np.full(size, 1.0) if prior is None else numbers("prior", prior)
+        if weights.shape != (size,) or (weights < 0.0).any() or not weights.sum() > 0.0:
+            raise ValueError(
+                f"prior must hold {size} weights, none below 0 and one above, "
+                f"got shape {weights.shape}, least {weights.min():g}"
+            )
+        roads = numbers("travel", travel)
+        if roads.ndim < 2:
+            roads = np.broadcast_to(roads, (count + 1, count))
+        if roads.ndim != 2 or roads.shape[1] != count or len(roads) < count:
+            raise ValueError(
+                f"travel must be a number, ({count},) or (P, {count}) with at least "
+                f"{count} places, got shape {roads.shape}"
+            )
+        shape = (count, table.shape[1])
+        more, used = _table("extra", extra, shape), _table("uses", uses, shape)
+        for name, values in (("travel", roads), ("extra", more), ("uses", used)):
+            if (values < 0.0).any():
+                raise ValueError(f"{name} must be at least 0, got {values.min():g}")
+        itself = np.arange(count)[:, None]
+        after = _table(
+            "place_after", itself if place_after is None else place_after, shape
+        )
+        first = len(roads) - 1 if place is None else place
+        for name, values in (("place_after", after), ("place", np.asarray(first))):
+            if (
+                (values % 1 != 0).any()
+                or values.min() < 0
+                or values.max() >= len(roads)
+            ):
+                raise ValueError(
+                    f"{name} must hold places in [0, {len(roads)}), "
+                    f"got {values.min():g} to {values.max():g}"
+                )
+        budget = numbers("seconds", seconds, finite=False)
+        budget = np.broadcast_to(budget, 2)
+        if not 0.0 < budget[0] <= budget[1]:
+            raise ValueError(
+                f"seconds must be above 0, or (least, most), got {in_words(budget)}"
+            )
+        ends = np.atleast_1d(numbers("num_uses", num_uses))
+        if ends.ndim != 1 or (ends < 1).any() or (ends % 1 != 0).any():
+            raise ValueError(
+                f"num_uses must be whole numbers of at least 1, got {in_words(ends)}"
+            )
+        alike = np.zeros(count, int) if groups is None else np.asarray(groups)
+        if alike.shape != (count,) or alike.min() < 0 or (alike % 1 != 0).any():
+            raise ValueError(
+                f"groups must hold {count} whole numbers from 0, got {in_words(alike)}"
+            )
+        log = np.log(np.where(table > 0.0, table, 1.0))
+        single, whole = jnp.float32, jnp.int32
+        return GridTask(
+            theta=jnp.asarray(grid, single),
+            prior=jnp.asarray(weights / weights.sum(), single),
+            designs=jnp.asarray(at, single),
+            likelihood=jnp.asarray(table, single),
+            noise_entropy=jnp.asarray(-(table * log).sum(axis=1), single),
+            travel=jnp.asarray(roads, single),
+            place_after=jnp.asarray(after, whole),
+            extra=jnp.asarray(more, single),
+            uses=jnp.asarray(used, whole),
+            seconds=jnp.asarray(budget, single),
+            num_uses=jnp.asarray(ends, whole),
+            place=jnp.asarray(first, whole),
+            groups=jnp.asarray(alike, whole),
+            num_groups=int(alike.max()) + 1,
+            most=whole_number("most", most, 1),
+            theta_names=_names("theta_names", theta_names, "theta", grid.shape[1]),
+            design_names=_names("design_names", design_names, "u", at.shape[1]),
+        )
+
+    def draw(self, key: jax.Array) -> jax.Array:
+        """() int32 index of the truth."""
+        return jax.random.categorical(key, jnp.log(self.prior + _SMALL))
+
+    def begin(self, key: jax.Array) -> tuple[GridBelief, Session]:
+        """The prior, and a session with a budget that is drawn."""
+        key_seconds, key_uses = jax.random.split(key)
+        low, high = self.seconds
+        spread = jnp.where(jnp.isfinite(high), high - low, 0.0)
+        seconds = low + spread * jax.random.uniform(key_seconds)
+        uses = jax.random.choice(key_uses, self.num_uses)
+        return GridBelief(self.prior), self.session(seconds, uses)
+
+    def session(self, seconds: Any, uses: Any) -> Session:
+        """A session with this budget."""
+        return Session(
+            place=self.place,
+            seconds=jnp.asarray(seconds, jnp.float32),
+            uses=jnp.asarray(uses, jnp.int32),
+            made=jnp.int32(0),
+        )
+
+    def options(
+        self, belief: GridBelief, session: Session, key: jax.Array | None = None
+    ) -> Options:
+        """All designs, always."""
+        count = len(self.designs)
+        return Options(
+            designs=jnp.arange(count),
+            seconds=self.travel[session.place],
+            allowed=jnp.ones(count, bool),
+        )
+
+    def measure(self, truth: jax.Array, design: jax.Array, key: jax.Array) -> jax.Array:
+        """() int32 outcome, drawn."""
+        below = jnp.cumsum(self.likelihood[design, :, truth])[:-1]
+        return (jax.random.uniform(key) >= below).sum().astype(jnp.int32)
+
+    def spend(self, session: Session, design: jax.Array, outcome: jax.Array) -> Session:
+        took = self.travel[session.place, design] + self.extra[design, outcome]
+        return Session(
+            place=self.place_after[design, outcome],
+            seconds=session.seconds - took,
+            uses=session.uses - self.uses[design, outcome],
+            made=session.made + 1,
+        )
+
+    def expected(
+        self, belief: GridBelief, session: Session, options: Options
+    ) -> tuple[jax.Array, jax.Array]:
+        p = belief.predictive(self)
+        uses = (p * self.uses).sum(axis=-1)
+        return options.seconds + (p * self.extra).sum(axis=-1), uses
+
+    def log_likelihood(
+        self, truth: jax.Array, design: jax.Array, outcome: jax.Array
+    ) -> jax.Array:
+        return jnp.log(self.likelihood[design, outcome, truth] + _SMALL)
+
+
+def _columns(name: str, values: ArrayLike) -> Array:
+    array = numbers(name, values)
+    array = array[:, None] if array.ndim == 1 else array
+    if array.ndim != 2 or not array.size:
+        raise ValueError(f"{name} must have shape (N, d) or (N,), got {array.shape}")
+    return array
+
+
+def _table(name: str, values: ArrayLike, shape: tuple[int, int]) -> Array:
+    array = numbers(name, values)
+    try:
+        return np.broadcast_to(array, shape)
+    except ValueError:
+        raise ValueError(
+            f"{name} must broadcast to {shape}, got shape {array.shape}"
+        ) from None
+
+
+def _names(
+    argument: str, names: Sequence[str], stem: str, count: int
+) -> tuple[str, ...]:
+    names = tuple(names) or tuple(f"{stem}{i + 1}" for i in range(count))
+    if len(names) != count:
+        raise ValueError(f"{argument} must hold {count} names, got {names}")
+    return names

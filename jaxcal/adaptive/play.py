@@ -1,0 +1,159 @@
+"""Sessions played to their end, thousands at once, and the comparison of deciders."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxcal.adaptive.session import Decider, Task
+
+__all__ = ["Comparison", "Episodes", "compare", "play"]
+
+
+@struct.dataclass
+class Episodes:
+    """B sessions of at most T measurements; what follows a session's end is void."""
+
+    truth: Any  # leaves (B, ...)
+    begun: Any  # Session, leaves (B, ...): the budget
+    designs: Any  # leaves (B, T, ...)
+    outcomes: Any  # leaves (B, T, ...)
+    gains: jax.Array  # (B, T) nats expected of each measurement when it was chosen
+    alive: jax.Array  # (B, T) bool
+    told: jax.Array  # (B,) nats: entropy of the prior less the posterior's
+    log_ratio: jax.Array  # (B,) log posterior less log prior, at the truth
+
+    @property
+    def gain(self) -> jax.Array:
+        """(B,) nats: the sum of expected gains. Its mean is that of ``told``."""
+        return (self.gains * self.alive).sum(axis=-1)
+
+
+@jax.jit
+def play(task: Task, decider: Decider, keys: jax.Array) -> Episodes:
+    """Play a session a key (B,).
+
+    The truth, the budget and the luck of every measurement depend on the key alone, so
+    deciders that are given the same keys can be compared in pairs.
+    """
+    key_truth, key_begin, key_steps = jax.vmap(
+        lambda key: jax.random.split(key, 3), out_axes=1
+    )(keys)
+    truth = jax.vmap(task.draw)(key_truth)
+    prior, begun = jax.vmap(task.begin)(key_begin)
+    steps = jax.vmap(lambda key: jax.random.split(key, task.most), out_axes=1)(
+        key_steps
+    )
+
+    def choose(truth: Any, belief: Any, session: Any, key: jax.Array) -> Any:
+        key_options, key_choice, key_gain, key_outcome, key_update = jax.random.split(
+            key, 5
+        )
+        options = task.options(belief, session, key_options)
+        index = decider(task, belief, session, options, key_choice)
+        design = jax.tree.map(lambda leaf: leaf[index], options.designs)
+        gain = belief.gains(task, options, key_gain)[index]
+        outcome = task.measure(truth, design, key_outcome)
+        after = (
+            belief.update(task, design, outcome, key_update),
+            task.spend(session, design, outcome),
+        )
+        alive = ~session.over
+        after = jax.tree.map(
+            lambda old, new: jnp.where(alive, new, old), (belief, session), after
+        )
+        return after, (design, outcome, gain, alive)
+
+    def step(carry: Any, keys: jax.Array) -> tuple[Any, Any]:
+        def nothing(carry: Any) -> tuple[Any, Any]:
+            return carry, jax.tree.map(
+                lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), blank
+            )
+
+        def going(carry: Any) -> tuple[Any, Any]:
+            belief, session = carry
+            result: tuple[Any, Any] = jax.vmap(choose)(truth, belief, session, keys)
+            return result
+
+        blank = jax.eval_shape(going, carry)[1]
+        # Nothing is computed once every session is over.
+        return jax.lax.cond(carry[1].over.all(), nothing, going, carry)
+
+    (belief, _), seen = jax.lax.scan(step, (prior, begun), steps)
+    designs, outcomes, gains, alive = jax.tree.map(
+        lambda leaf: jnp.moveaxis(leaf, 0, 1), seen
+    )
+    return Episodes(
+        truth=truth,
+        begun=begun,
+        designs=designs,
+        outcomes=outcomes,
+        gains=gains,
+        alive=alive,
+        told=jax.vmap(lambda a, b: a.entropy() - b.entropy())(prior, belief),
+        log_ratio=jax.vmap(lambda a, b, t: b.log_density(t) - a.log_density(t))(
+            prior, belief, truth
+        ),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """Deciders on the same sessions: information in nats, with standard errors."""
+
+    names: tuple[str, ...]
+    gain: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) sum of expected gains
+    told: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) drop of entropy
+    log_ratio: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) at the truth
+    choices: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) measurements made
+
+    def mean(self, name: str) -> tuple[float, float]:
+        """Nats by the sum of expected gains, and the standard error."""
+        return _mean(self.gain[self.names.index(name)])
+
+    def paired(self, name: str, base: str) -> tuple[float, float]:
+        """Nats that one decider has more than another on the same sessions."""
+        a, b = (self.gain[self.names.index(n)] for n in (name, base))
+        return _mean(a - b)
+
+
+def compare(
+    task: Task,
+    deciders: Mapping[str, Decider],
+    episodes: int = 4096,
+    seed: int = 0,
+    batch: int = 1024,
+    progress: Callable[[int], None] = lambda done: None,
+) -> Comparison:
+    """Play every decider on the same ``episodes`` sessions.
+
+    Args:
+        task, deciders: what is played.
+        episodes: at least two.
+        seed: of the sessions.
+        batch: sessions played at once; the result does not depend on it.
+        progress: told how many sessions of a decider are played, from 0.
+    """
+    keys = jax.random.split(jax.random.key(seed), episodes)
+    found = []
+    for decider in deciders.values():
+        parts = []
+        for at in range(0, episodes, batch):
+            progress(at)
+            played = play(task, decider, keys[at : at + batch])
+            made = played.alive.sum(axis=1)
+            part = played.gain, played.told, played.log_ratio, made
+            parts.append([np.asarray(values, np.float64) for values in part])
+        found.append([np.concatenate(values) for values in zip(*parts, strict=True)])
+    whole = (np.stack(values) for values in zip(*found, strict=True))
+    return Comparison(tuple(deciders), *whole)
+
+
+def _mean(values: Any) -> tuple[float, float]:
+    return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))

@@ -1,0 +1,92 @@
+"""Every number of a run that trains a policy of sequential measurement."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from jaxcal.adaptive import rules
+from jaxcal.adaptive.rules import Scored
+from jaxcal.learning.settings import require, setting
+from jaxcal.learning.training.config import PPOConfig
+
+__all__ = ["LENGTH", "PPO", "PolicyConfig"]
+
+LENGTH = 32  # choices that one stream of sessions makes in an update
+
+_RULES: tuple[type[Scored], ...] = (rules.Priced, rules.StateRule)
+
+PPO = PPOConfig(
+    num_episodes=600 * 4096,
+    episodes_per_update=4096,
+    episodes_per_set=1,
+    num_epochs=4,
+    num_minibatches=8,
+    learning_rate=2e-3,
+    final_learning_rate=6e-5,
+    entropy_start=0.003,
+    entropy_end=0.0,
+    gae_lambda=0.92,
+    average_decay=0.998,
+)
+"""Its episodes are choices: sessions differ in length."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PolicyConfig:
+    """What is trained, from which rule on, and how."""
+
+    task: str  # as registered
+    base: Scored  # the rule that the network corrects, its constants numbers
+    options: tuple[Mapping[str, Any], ...] = ({},)  # update u trains on u modulo n
+    per_group: int = setting(8, "options of a group that the network sees")
+    width: int = setting(48, "of the network's layers")
+    ppo: PPOConfig = PPO
+    validate_every: float = 30.0  # seconds between validations
+    save_every: float = 60.0  # seconds between checkpoints
+
+    def __post_init__(self) -> None:
+        require(self, "at least 1", lambda v: v >= 1, "per_group", "width")
+        whole = LENGTH * self.ppo.num_minibatches
+        if self.ppo.episodes_per_update % whole:
+            raise ValueError(
+                f"episodes_per_update must be a multiple of {LENGTH} x num_minibatches "
+                f"= {whole}, got {self.ppo.episodes_per_update}"
+            )
+        if not isinstance(self.base, _RULES):
+            known = ", ".join(rule.__name__ for rule in _RULES)
+            raise ValueError(
+                f"base must be one of {known}, got {type(self.base).__name__}"
+            )
+
+    def as_meta(self) -> dict[str, Any]:
+        """Plain JSON values; ``from_meta`` reads them back."""
+        constants = {
+            field.name: float(getattr(self.base, field.name))
+            for field in dataclasses.fields(self.base)  # type: ignore[arg-type]  # flax
+        }
+        return {
+            "task": self.task,
+            "options": [dict(options) for options in self.options],
+            "network": {"width": self.width, "per_group": self.per_group},
+            "base": {"rule": type(self.base).__name__, **constants},
+            "ppo": dataclasses.asdict(self.ppo),
+        }
+
+    @staticmethod
+    def from_meta(meta: Mapping[str, Any]) -> PolicyConfig:
+        """The configuration that a checkpoint was trained with."""
+        constants = dict(meta["base"])
+        kinds = {rule.__name__: rule for rule in _RULES}
+        base = kinds[constants.pop("rule")](**constants)
+        return PolicyConfig(
+            task=meta["task"],
+            base=base,
+            options=tuple(
+                {k: tuple(v) if isinstance(v, list) else v for k, v in options.items()}
+                for options in meta["options"]
+            ),
+            ppo=PPOConfig(**meta["ppo"]),
+            **meta["network"],
+        )

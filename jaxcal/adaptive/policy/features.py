@@ -1,0 +1,88 @@
+"""What a policy sees of a session: a shortlist of options, each by features."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxcal.adaptive.rules import Scored, log_score, shortlist
+from jaxcal.adaptive.session import Options, Session
+
+__all__ = ["NUM_FEATURES", "Seen", "see"]
+
+NUM_FEATURES = 29
+_SCALE = 20.0  # seconds
+
+
+@struct.dataclass
+class Seen:
+    """A shortlist of C options."""
+
+    index: jax.Array  # (C,) int32 into the options
+    features: jax.Array  # (C, NUM_FEATURES)
+    log_score: jax.Array  # (C,) of the base rule, less its maximum
+    gain: jax.Array  # (C,) nats
+    valid: jax.Array  # (C,) bool
+
+
+def see(
+    task: Any,
+    belief: Any,
+    session: Session,
+    options: Options,
+    key: jax.Array,
+    base: Scored,
+    per_group: int,
+) -> Seen:
+    """The best ``per_group`` options of each group by the base rule, and features."""
+    gains = belief.gains(task, options, key)
+    seconds, uses = task.expected(belief, session, options)
+    score = log_score(gains, base.price(session, seconds, uses))
+    index, valid = shortlist(task, score, options, per_group)
+    mine = task.groups[index]
+    below = score[index] - jnp.where(options.allowed, score, -jnp.inf).max()
+
+    left = jnp.where(jnp.isfinite(session.seconds), session.seconds, 2 * _SCALE)
+    g, s, u = gains[index], seconds[index], uses[index]
+    members = task.groups[None] == jnp.arange(task.num_groups)[:, None]
+    within = jnp.where(members & options.allowed[None], gains[None], 0.0)  # (G, A)
+    # Summed over a group's options, the gains measure how much of it is unknown.
+    tops, sums = within.max(axis=1), within.sum(axis=1)
+    own, whole = tops[mine], sums[mine]
+    others = jnp.where(
+        jnp.arange(task.num_groups)[None] == mine[:, None], 0.0, tops[None]
+    ).max(axis=1)
+    nearest = jnp.where(members, options.seconds[None], jnp.inf).min(axis=1)
+    rate = gains / jnp.maximum(seconds, 1e-6)
+    first, second = session.uses <= 1, session.uses <= 2
+    ones = jnp.ones_like(g)
+    low, high = (f(task.designs, axis=0, keepdims=True) for f in (jnp.min, jnp.max))
+    where = ((task.designs - low) / jnp.maximum(high - low, 1e-9))[index, -1]
+    features = jnp.stack(
+        [
+            0.2 * jnp.log(g + 1e-6), g, u, s / 5.0,
+            jnp.minimum(s / jnp.maximum(left, 1e-3), 3.0),
+            g / jnp.maximum(s, 1e-6), jnp.maximum(below, -10.0),
+            (nearest[mine] <= nearest.min() + 1e-6).astype(g.dtype),
+            where, u * first, u * second, u * u,
+            (left - s) / _SCALE, own, others, u * left / _SCALE,
+            g / (u + 0.05), jnp.sqrt(g),
+            jnp.log1p(whole), jnp.log1p(jnp.maximum(sums.sum() - whole, 0.0)),
+            # the same of all options
+            ones * left / _SCALE, ones * jnp.minimum(left / 5.0, 1.0),
+            ones * first, ones * second, ones * jnp.minimum(session.uses, 4) / 4.0,
+            ones * gains.max(), ones * rate.max(),
+            ones * session.made / 10.0, ones * belief.entropy() / 5.0,
+        ],
+        axis=-1,
+    )  # fmt: skip
+    return Seen(
+        index=index,
+        features=jnp.where(valid[:, None], features, 0.0),
+        log_score=jnp.where(valid, below, -1e9),
+        gain=g,
+        valid=valid,
+    )

@@ -1,0 +1,77 @@
+"""The policy: a correction, learned, of a rule's score."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxcal.adaptive.policy.features import NUM_FEATURES, Seen, see
+from jaxcal.adaptive.rules import Scored
+from jaxcal.adaptive.session import Options, Session
+
+__all__ = ["Network", "Policy"]
+
+_BETA, _GAIN = 12.0, 3.0
+
+
+class Network(nn.Module):
+    """Logits (..., C) and a value (...) of shortlists.
+
+    Each option is embedded, the embeddings are pooled by their maximum, and each is
+    scored beside the pool. The last layer begins at zero: a policy begins as its rule.
+    """
+
+    width: int = 48
+
+    @nn.compact
+    def __call__(self, seen: Seen) -> tuple[jax.Array, jax.Array]:
+        hidden = nn.tanh(nn.Dense(self.width)(seen.features))
+        valid = seen.valid[..., None]
+        pool = jnp.where(valid, hidden, -1.0).max(axis=-2)
+        beside = jnp.broadcast_to(pool[..., None, :], hidden.shape)
+        both = jnp.concatenate([hidden, beside], axis=-1)
+        late = nn.tanh(nn.Dense(self.width)(both))
+        change = nn.Dense(1, kernel_init=nn.initializers.zeros)(late)[..., 0]
+        beta = self.param("beta", nn.initializers.constant(_BETA), ())
+        logits = beta * seen.log_score + _GAIN * change
+        mean = (hidden * valid).sum(axis=-2) / jnp.maximum(valid.sum(axis=-2), 1)
+        value = nn.tanh(nn.Dense(self.width)(jnp.concatenate([pool, mean], axis=-1)))
+        value = nn.Dense(1)(value)[..., 0]
+        return jnp.where(seen.valid, logits, -1e9), value
+
+
+@struct.dataclass
+class Policy:
+    """A trained network as a decider."""
+
+    params: Any
+    base: Scored
+    per_group: int = struct.field(pytree_node=False, default=8)
+    width: int = struct.field(pytree_node=False, default=48)
+    sample: bool = struct.field(pytree_node=False, default=False)
+
+    def __call__(
+        self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
+    ) -> jax.Array:
+        seen = see(task, belief, session, options, key, self.base, self.per_group)
+        logits, _ = Network(self.width).apply(self.params, seen)
+        if self.sample:
+            return seen.index[jax.random.categorical(key, logits)]
+        return seen.index[jnp.argmax(logits)]
+
+
+def initial(key: jax.Array, per_group: int, num_groups: int, width: int = 48) -> Any:
+    """Parameters before training."""
+    c = per_group * num_groups
+    blank = Seen(
+        index=jnp.zeros(c, jnp.int32),
+        features=jnp.zeros((c, NUM_FEATURES)),
+        log_score=jnp.zeros(c),
+        gain=jnp.zeros(c),
+        valid=jnp.ones(c, bool),
+    )
+    return Network(width).init(key, blank)

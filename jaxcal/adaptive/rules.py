@@ -1,0 +1,174 @@
+"""Rules that look one measurement ahead: gain, gain a second, gain a price."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxcal.adaptive.session import Options, Session
+
+__all__ = [
+    "Gain",
+    "GainRate",
+    "Priced",
+    "Random",
+    "StateRule",
+    "best",
+    "log_score",
+    "shortlist",
+]
+
+
+def best(score: jax.Array, options: Options) -> jax.Array:
+    """() int32 the allowed option of the largest score (A,)."""
+    return jnp.argmax(jnp.where(options.allowed, score, -jnp.inf)).astype(jnp.int32)
+
+
+def log_score(gains: jax.Array, prices: jax.Array) -> jax.Array:
+    """log (gain / price), finite also where one is zero."""
+    return jnp.log(gains + 1e-9) - jnp.log(prices + 1e-9)
+
+
+def shortlist(
+    task: Any, score: jax.Array, options: Options, per_group: int
+) -> tuple[jax.Array, jax.Array]:
+    """The options of the largest scores, some of each of the task's groups.
+
+    Args:
+        task: ``num_groups`` and ``groups`` (A,) of its options; one group without them.
+        score: (A,).
+        options: what is not allowed is not listed.
+        per_group: at most so many of each group.
+
+    Returns:
+        (C,) int32 indices and (C,) bool where one is listed: a group of fewer options
+        leaves places void.
+    """
+    score = jnp.where(options.allowed, score, -jnp.inf)
+    number = getattr(task, "num_groups", 1)
+    groups = task.groups if number > 1 else jnp.zeros(len(score), jnp.int32)
+    values, index = jax.vmap(
+        lambda group: jax.lax.top_k(
+            jnp.where(groups == group, score, -jnp.inf), min(per_group, len(score))
+        )
+    )(jnp.arange(number))
+    return index.ravel().astype(jnp.int32), jnp.isfinite(values.ravel())
+
+
+@struct.dataclass
+class Random:
+    """Any option that is allowed."""
+
+    def __call__(
+        self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
+    ) -> jax.Array:
+        logits = jnp.where(options.allowed, 0.0, -jnp.inf)
+        return jax.random.categorical(key, logits).astype(jnp.int32)
+
+
+@struct.dataclass
+class Gain:
+    """The largest expected information gain (EIG), whatever it costs."""
+
+    def __call__(
+        self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
+    ) -> jax.Array:
+        return best(belief.gains(task, options, key), options)
+
+
+@struct.dataclass
+class GainRate:
+    """The largest expected gain a second."""
+
+    def __call__(
+        self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
+    ) -> jax.Array:
+        seconds, _ = task.expected(belief, session, options)
+        gains = belief.gains(task, options, key)
+        return best(gains / jnp.maximum(seconds, 1e-9), options)
+
+
+class Scored:
+    """A rule by a price: the largest log (gain / price)."""
+
+    num_free: ClassVar[int]  # constants that can be tuned; the price's unit is free
+
+    def moved(self, by: Any) -> Any:
+        """The rule with other constants, ``by`` (num_free,) away: what a tuner tries.
+
+        Prices are multiplied by ``exp(by)``, exponents are added to.
+        """
+        raise NotImplementedError
+
+    def judged(
+        self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """(A,) gains in nats and (A,) prices."""
+        gains = belief.gains(task, options, key)
+        seconds, uses = task.expected(belief, session, options)
+        return gains, self.price(session, seconds, uses)
+
+    def price(self, session: Session, seconds: jax.Array, uses: jax.Array) -> jax.Array:
+        """(A,) what the measurements are taken to cost."""
+        raise NotImplementedError
+
+    def __call__(
+        self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
+    ) -> jax.Array:
+        judged = self.judged(task, belief, session, options, key)
+        return best(log_score(*judged), options)
+
+
+@struct.dataclass
+class Priced(Scored):
+    """``c0 + c1 seconds + c2 uses``, the same throughout a session."""
+
+    c0: Any = 1.0
+    c1: Any = 1.0
+    c2: Any = 1.0
+    num_free: ClassVar[int] = 2
+
+    def moved(self, by: Any) -> Priced:
+        return Priced(self.c0 * np.exp(by[0]), self.c1, self.c2 * np.exp(by[1]))
+
+    def price(self, session: Session, seconds: jax.Array, uses: jax.Array) -> jax.Array:
+        return self.c0 + self.c1 * seconds + self.c2 * uses
+
+
+@struct.dataclass
+class StateRule(Scored):
+    """A price that follows what is left: e uses and t seconds.
+
+    ``c0 exp(d0 (e - 1)) + c1 seconds + c2 exp(d1 (e - 1) + d2 t / scale) uses``
+    """
+
+    c0: Any = 1.0
+    c1: Any = 1.0
+    c2: Any = 1.0
+    d0: Any = 0.0
+    d1: Any = 0.0
+    d2: Any = 0.0
+    scale: Any = 20.0  # seconds
+    num_free: ClassVar[int] = 5
+
+    def moved(self, by: Any) -> StateRule:
+        return StateRule(
+            c0=self.c0 * np.exp(by[0]),
+            c1=self.c1,
+            c2=self.c2 * np.exp(by[1]),
+            d0=self.d0 + by[2],
+            d1=self.d1 + by[3],
+            d2=self.d2 + by[4],
+            scale=self.scale,
+        )
+
+    def price(self, session: Session, seconds: jax.Array, uses: jax.Array) -> jax.Array:
+        more = session.uses - 1.0
+        left = jnp.where(jnp.isfinite(session.seconds), session.seconds, 0.0)
+        fixed = self.c0 * jnp.exp(self.d0 * more)
+        use = self.c2 * jnp.exp(self.d1 * more + self.d2 * left / self.scale)
+        return fixed + self.c1 * seconds + use * uses

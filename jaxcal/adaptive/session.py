@@ -1,0 +1,103 @@
+"""A session of sequential measurement: what is left, what may come next, the protocols.
+
+A *task* says what is unknown, what may be measured, what a measurement answers and what
+it costs. A *belief* is what is known of the unknown. A *decider* picks the next
+measurement. All three are pytrees, so they are arguments of compiled functions (tables
+closed over by a jitted function have given wrong results on the CPU) and ``jax.vmap``
+plays thousands of sessions at once.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import jax
+from flax import struct
+
+__all__ = ["Belief", "Decider", "Options", "Session", "Task"]
+
+
+@struct.dataclass
+class Session:
+    """Where one session stands, besides its belief."""
+
+    place: Any  # where the machine is, in the task's own terms
+    seconds: jax.Array  # () left; inf where time does not count
+    uses: jax.Array  # () int32 left of what is countable, such as trips
+    made: jax.Array  # () int32 measurements made
+
+    @property
+    def over(self) -> jax.Array:
+        """() bool: time or uses are spent. A measurement begins while any are left."""
+        return (self.seconds <= 0.0) | (self.uses <= 0)
+
+
+@struct.dataclass
+class Options:
+    """The A measurements that may come next."""
+
+    designs: Any  # leaves (A, ...), in the task's own terms; a decider returns an index
+    seconds: jax.Array  # (A,) until each is measured, whatever it answers
+    allowed: jax.Array  # (A,) bool
+
+
+class Belief(Protocol):
+    """What is known of the unknown."""
+
+    def gains(self, task: Any, options: Options, key: jax.Array) -> jax.Array:
+        """(A,) nats that each measurement is expected to tell; at least 0."""
+
+    def update(self, task: Any, design: Any, outcome: Any, key: jax.Array) -> Any:
+        """The belief after a measurement."""
+
+    def draw(self, key: jax.Array) -> Any:
+        """A value of the unknown, drawn."""
+
+    def outcomes(self, task: Any, design: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+        """Outcomes of a design, leaves (Y, ...), and (Y,) their probabilities.
+
+        All there are where they are few; otherwise some, drawn, each 1 / Y.
+        """
+
+    def entropy(self) -> jax.Array:
+        """() nats; NaN where it is not defined."""
+
+
+class Task(Protocol):
+    """What is measured. ``GridTask`` and ``ParticleTask`` are the two kinds."""
+
+    @property
+    def most(self) -> int:
+        """Measurements after which a session ends in any case."""
+
+    def draw(self, key: jax.Array) -> Any:
+        """The truth of one session, from the prior."""
+
+    def begin(self, key: jax.Array) -> tuple[Any, Session]:
+        """The belief and the state at the start of a session."""
+
+    def options(self, belief: Any, session: Session, key: jax.Array) -> Options:
+        """What may be measured next."""
+
+    def measure(self, truth: Any, design: Any, key: jax.Array) -> Any:
+        """An outcome, drawn."""
+
+    def spend(self, session: Session, design: Any, outcome: Any) -> Session:
+        """The session after a measurement."""
+
+    def expected(
+        self, belief: Any, session: Session, options: Options
+    ) -> tuple[jax.Array, jax.Array]:
+        """(A,) seconds and (A,) uses that each measurement is expected to take."""
+
+    def log_likelihood(self, truth: Any, design: Any, outcome: Any) -> jax.Array:
+        """() log probability, or density, of an outcome."""
+
+
+class Decider(Protocol):
+    """Picks the next measurement; a pytree, its numbers are leaves."""
+
+    def __call__(
+        self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
+    ) -> jax.Array:
+        """() int32 index of an allowed option."""

@@ -1,0 +1,103 @@
+"""Tasks by name: those of jaxcal, of installed packages, and of a user's own file.
+
+A task is one file with a function that makes it and ``ENTRY = Entry(function, ...)``.
+It is found by its name in the entry points ``jaxcal.tasks``, or as ``path/to/file.py``.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import importlib.metadata
+import importlib.util
+import inspect
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from jaxcal.learning.settings import installed
+
+__all__ = ["Entry", "load", "names", "options_from"]
+
+_GROUP = "jaxcal.tasks"  # entry points
+_OWN = {"knee": "jaxcal.adaptive.tasks.knee:ENTRY"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """A task that commands know by its name."""
+
+    make: Callable[..., Any]  # options, all with defaults -> the task
+    about: str = ""  # one line for --help
+    rules: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Deciders with constants tuned on the default task, such as ``priced``."""
+    train_on: tuple[Mapping[str, Any], ...] = ({},)
+    """Options of the tasks that a policy is trained on: update u takes u modulo n."""
+
+
+def names() -> list[str]:
+    """Tasks of jaxcal and of installed packages."""
+    return sorted({*_OWN, *installed(_GROUP)})
+
+
+def load(name: str) -> Entry:
+    """A task's entry.
+
+    Args:
+        name: as registered, or a Python file that defines ``ENTRY``.
+
+    Raises:
+        ValueError: no such task, or a file without an entry.
+    """
+    if name.endswith(".py"):
+        entry = _of_file(pathlib.Path(name))
+    elif name in _OWN:
+        entry = importlib.metadata.EntryPoint(name, _OWN[name], _GROUP).load()
+    elif name in installed(_GROUP):
+        entry = installed(_GROUP)[name].load()
+    else:
+        raise ValueError(
+            f"task must be one of {', '.join(names())}, or a Python file that defines "
+            f"ENTRY, got {name!r}"
+        )
+    if not isinstance(entry, Entry):
+        raise ValueError(f"task {name} must be an Entry, got {type(entry).__name__}")
+    return entry
+
+
+def _of_file(path: pathlib.Path) -> Any:
+    if not path.is_file():
+        raise ValueError(f"task file {path} does not exist")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None  # it is a Python file
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    if not hasattr(module, "ENTRY"):
+        raise ValueError(f"task file {path} must define ENTRY = Entry(...)")
+    return module.ENTRY
+
+
+def options_from(entry: Entry, given: Sequence[str]) -> dict[str, Any]:
+    """Options of a task from a command line, such as ``sigma=0.05``.
+
+    Raises:
+        ValueError: not NAME=VALUE, or a name that the task does not have.
+    """
+    known = [
+        name
+        for name, parameter in inspect.signature(entry.make).parameters.items()
+        if parameter.kind is not parameter.VAR_KEYWORD
+    ]
+    options = {}
+    for text in given:
+        name, equals, value = text.partition("=")
+        if not equals or name not in known:
+            raise ValueError(
+                f"--with must be NAME=VALUE with NAME of {', '.join(known)}, "
+                f"got {text!r}"
+            )
+        try:
+            options[name] = ast.literal_eval(value)
+        except (ValueError, SyntaxError):
+            options[name] = value
+    return options

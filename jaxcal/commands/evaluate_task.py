@@ -1,0 +1,130 @@
+"""``evaluate.py --task NAME``: deciders of sequential measurement, compared."""
+
+from __future__ import annotations
+
+import argparse
+import pathlib
+import sys
+from collections.abc import Sequence
+
+from jaxcal.arguments import Parser, at_least, refused, several
+from jaxcal.extras import MissingExtraError, needs
+from jaxcal.files import require_writable_folder, write_text
+
+__all__ = ["main"]
+
+EXIT_INTERRUPTED = 130
+_METHODS = "random,gain,rate,priced,state,two_step,policy"
+
+_EPILOG = """\
+methods:
+{methods}
+
+tasks:
+{tasks}
+  FILE.py    your own: a file that defines ENTRY (docs/adaptive.md)
+
+examples:
+  {program} --task knee
+  {program} --task knee --methods state,rollouts,policy --episodes 512
+  {program} --task knee --with sigma=0.05 cells=16 --retune --json out.json
+"""
+
+
+def main(argv: Sequence[str], prog: str) -> int:
+    """Evaluate, print, write; the exit code."""
+    command = ["python", prog] if prog.endswith(".py") else prog.split()
+    try:
+        with needs("policy", prog):
+            options = _parser(prog, " ".join(command)).parse_args(argv)
+            _run(options, [*command, *argv])
+    except KeyboardInterrupt:
+        print(f"{prog}: interrupted, nothing was written", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except (ValueError, OSError, MissingExtraError) as error:
+        return refused(prog, error)
+    return 0
+
+
+def _parser(prog: str, typed: str) -> Parser:
+    from jaxcal.adaptive.tasks import registry
+    from jaxcal.evaluation.sequential import METHODS
+
+    methods = "\n".join(f"  {name:10} {about}" for name, about in METHODS.items())
+    tasks = "\n".join(
+        f"  {name:10} {registry.load(name).about}" for name in registry.names()
+    )
+    out = Parser(
+        prog=prog,
+        description="Let deciders play the same sessions of a task: what they learn in "
+        "nats, each less the best rule in pairs, and the time of a choice.",
+        epilog=_EPILOG.format(methods=methods, tasks=tasks, program=typed),
+    )
+    add = out.add_argument
+    add("--task", required=True, metavar="NAME", help="see below")
+    add("--with", dest="options", nargs="+", default=[], metavar="OPTION=VALUE",
+        help="options of the task")  # fmt: skip
+    add("--methods", type=several(str, "names"), default=_METHODS.split(","),
+        metavar="LIST", help=f"comma separated; {_METHODS}")  # fmt: skip
+    add("--checkpoint", metavar="DIR", help="of the policy; the shipped one")
+    add(
+        "--episodes", type=at_least(2), default=4096, metavar="N", help="sessions; 4096"
+    )
+    add("--seed", type=at_least(0), default=0, metavar="S", help="of the sessions; 0")
+    add("--rollouts", type=at_least(1), default=16, metavar="N",
+        help="simulations of each candidate of the method rollouts; 16")  # fmt: skip
+    add("--retune", action="store_true",
+        help="tune the rules on this task; else as they ship")  # fmt: skip
+    add("--json", type=pathlib.Path, metavar="FILE", help="write every number")
+    add(
+        "--report", type=pathlib.Path, metavar="DIR", help="write figure and index.html"
+    )
+    add("--quiet", action="store_true", help="no progress")
+    return out
+
+
+def _run(options: argparse.Namespace, command: list[str]) -> None:
+    from jaxcal.adaptive.tasks import registry
+    from jaxcal.evaluation import sequential, sequential_report
+    from jaxcal.learning.runtime import cache
+    from jaxcal.progress import Progress
+
+    if options.json is not None:
+        if options.json.is_dir():
+            raise ValueError(f"--json must be a file, {options.json} is a folder")
+        require_writable_folder(options.json.parent)
+    if options.report is not None:
+        with needs("study", "--report"):
+            import jinja2  # noqa: F401  # looks whether it is there
+            import matplotlib  # noqa: F401  # looks whether it is there
+        require_writable_folder(options.report)
+    if options.checkpoint is not None and "policy" not in options.methods:
+        raise ValueError("--checkpoint is given, but policy is not among --methods")
+    entry = registry.load(options.task)
+    chosen = registry.options_from(entry, options.options)
+    cache.keep_compiled_programs()
+    progress = Progress(quiet=options.quiet)
+    try:
+        result = sequential.evaluate(
+            options.task,
+            entry,
+            chosen,
+            options.methods,
+            checkpoint=options.checkpoint,
+            episodes=options.episodes,
+            seed=options.seed,
+            rollouts=options.rollouts,
+            retune=options.retune,
+            progress=progress,
+        )
+    finally:
+        progress.clear()
+    print(sequential_report.text_table(result))
+    if options.report is not None:
+        sequential_report.write_report(options.report, result, command=command)
+        print(f"saved: {options.report}/index.html and 1 figure")
+    if options.json is not None:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        document = sequential_report.json_document(result, command=command)
+        write_text(options.json, document)
+        print(f"saved: {options.json}")

@@ -1,0 +1,233 @@
+"""Deciders of sequential measurement on equal sessions: nats, pairs, time a choice."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.adaptive import static
+from jaxcal.adaptive.lookahead import Rollouts, TwoStep
+from jaxcal.adaptive.play import Comparison, compare
+from jaxcal.adaptive.policy import run as policies
+from jaxcal.adaptive.rules import Gain, GainRate, Priced, Random, Scored, StateRule
+from jaxcal.adaptive.tasks.registry import Entry
+from jaxcal.adaptive.tuning import tune
+
+__all__ = ["METHODS", "Result", "evaluate"]
+
+METHODS = {
+    "random": "any measurement",
+    "static": "one sequence for all sessions, optimised over the prior",
+    "gain": "the largest expected information gain (EIG)",
+    "rate": "the largest EIG a second",
+    "priced": "EIG per price of time and uses, its constants tuned",
+    "state": "the same with prices that follow what is left, tuned",
+    "two_step": "the state rule over two measurements",
+    "rollouts": "simulation of the state rule to the end, common random numbers",
+    "policy": "the network that corrects the state rule",
+}
+_GENERATIONS = 20  # of tuning
+_STATIC = 16  # entries of a static sequence; few sessions last longer
+_TIMED = 128  # sessions on which a choice is timed
+_BATCH = {"rollouts": 64, "two_step": 256}  # sessions at once, for the memory
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """A table: what each method gains on the same sessions."""
+
+    task: str
+    options: Mapping[str, Any]
+    seed: int
+    reference: str  # whom the others are compared with in pairs
+    found: Comparison
+    seconds: NDArray[np.float64]  # (D,) of one core, a choice
+    rules: Mapping[str, Scored]
+    checkpoint: Mapping[str, Any] | None  # meta of the policy
+
+
+def evaluate(
+    name: str,
+    entry: Entry,
+    options: Mapping[str, Any],
+    methods: Sequence[str],
+    *,
+    checkpoint: str | None = None,
+    episodes: int = 4096,
+    seed: int = 0,
+    rollouts: int = 16,
+    retune: bool = False,
+    progress: Progress = lambda what, done, of: None,
+) -> Result:
+    """Play every method on the same sessions.
+
+    Args:
+        name, entry, options: the task, its entry and options of ``entry.make``.
+        methods: of ``METHODS``.
+        checkpoint: of the policy; the one that ships when None.
+        episodes: sessions.
+        seed: of the sessions.
+        rollouts: simulations of each candidate of the method ``rollouts``.
+        retune: tune the rules on this task instead of taking the constants that ship.
+        progress: told what is done.
+
+    Raises:
+        ValueError: an unknown method, or options that the task refuses.
+        CheckpointError: there is no such policy.
+    """
+    for method in methods:
+        if method not in METHODS:
+            raise ValueError(f"methods must be of {', '.join(METHODS)}, got {method!r}")
+    task = jax.tree.map(jnp.asarray, entry.make(**options))
+    trained = policies.load(checkpoint) if "policy" in methods else None
+    needed = [m for m in ("priced", "state") if m in methods]
+    if {"two_step", "rollouts"} & set(methods) and "state" not in needed:
+        needed.append("state")
+    rules = _rules(entry, task, needed, retune, seed, progress)
+    found, seconds = [], []
+    for method in methods:
+        if method == "static":
+            decider: Any = static.optimise(
+                task,
+                length=min(task.most, _STATIC),
+                sweeps=1,
+                seed=seed + 1,
+                report=lambda done, of, nats: progress("optimising static", done, of),
+            )
+        elif method == "policy":
+            assert trained is not None  # loaded above
+            decider = trained.decider
+        else:
+            decider = _decider(method, rules, rollouts)
+        decider = jax.tree.map(jnp.asarray, decider)
+        played = compare(
+            task,
+            {method: decider},
+            episodes,
+            seed,
+            batch=_BATCH.get(method, 1024),
+            progress=lambda done, method=method: progress(method, done, episodes),  # type: ignore[misc]  # default binds the loop's value
+        )
+        found.append(played)
+        seconds.append(_seconds(task, decider, seed))
+    whole = Comparison(
+        tuple(methods),
+        *(
+            np.concatenate([getattr(one, field) for one in found])
+            for field in ("gain", "told", "log_ratio", "choices")
+        ),
+    )
+    rivals = [m for m in ("state", "priced", "rate", "gain") if m in methods]
+    return Result(
+        task=name,
+        options=options,
+        seed=seed,
+        reference=[*rivals, methods[0]][0],
+        found=whole,
+        seconds=np.array(seconds),
+        rules=rules,
+        checkpoint=None if trained is None else trained.meta,
+    )
+
+
+def _rules(
+    entry: Entry,
+    task: Any,
+    needed: Sequence[str],
+    retune: bool,
+    seed: int,
+    progress: Progress,
+) -> dict[str, Scored]:
+    """Priced rules: as they ship with the task, or tuned on it now."""
+    found = {}
+    for name in needed:
+        rule = entry.rules.get(name)
+        if rule is None or retune:
+            start = {"priced": Priced(), "state": StateRule()}[name]
+            tell = functools.partial(progress, f"tuning {name}")
+            tell(0, _GENERATIONS)
+            # Sessions of another seed than those that judge it.
+            rule = tune(
+                task,
+                start if rule is None else rule,
+                episodes=1024,
+                generations=_GENERATIONS,
+                seed=seed + 1,
+                report=lambda number, *_, tell=tell: tell(number, _GENERATIONS),
+            )
+        found[name] = rule
+    return found
+
+
+def _decider(method: str, rules: Mapping[str, Scored], rollouts: int) -> Any:
+    simple = {"random": Random, "gain": Gain, "rate": GainRate}
+    if method in simple:
+        return simple[method]()
+    if method == "two_step":
+        return TwoStep(rules["state"])
+    if method == "rollouts":
+        return Rollouts(rules["state"], rollouts=rollouts)
+    return rules[method]
+
+
+@jax.jit
+def _middle(task: Any, keys: jax.Array) -> tuple[Any, Any]:
+    """(B,) beliefs and sessions after two measurements of any kind."""
+
+    def one(key: jax.Array) -> tuple[Any, Any]:
+        key_truth, key_begin, *steps = jax.random.split(key, 4)
+        truth = task.draw(key_truth)
+        belief, session = task.begin(key_begin)
+        for step in steps:
+            keys = jax.random.split(step, 4)
+            options = task.options(belief, session, keys[0])
+            index = Random()(task, belief, session, options, keys[1])
+            design = jax.tree.map(lambda leaf, at=index: leaf[at], options.designs)
+            outcome = task.measure(truth, design, keys[2])
+            after = (
+                belief.update(task, design, outcome, keys[3]),
+                task.spend(session, design, outcome),
+            )
+            belief, session = jax.tree.map(
+                lambda old, new, over=after[1].over: jnp.where(over, old, new),
+                (belief, session),
+                after,
+            )
+        return belief, session
+
+    return jax.vmap(one)(keys)
+
+
+@jax.jit
+def _choose(task: Any, decider: Any, belief: Any, session: Any, keys: Any) -> Any:
+    def one(belief: Any, session: Any, key: jax.Array) -> jax.Array:
+        key_options, key_choice = jax.random.split(key)
+        options = task.options(belief, session, key_options)
+        return decider(task, belief, session, options, key_choice)
+
+    return jax.vmap(one)(belief, session, keys)
+
+
+def _seconds(task: Any, decider: Any, seed: int) -> float:
+    """Processor time of one choice, in a batch; that of all threads counts."""
+    keys = jax.random.split(jax.random.key(seed), _TIMED)
+    states = _middle(task, keys)
+    jax.block_until_ready(_choose(task, decider, *states, keys))
+    best = np.inf
+    for _ in range(5):
+        begun, passes = time.process_time(), 0
+        while passes == 0 or time.process_time() - begun < 0.05:
+            jax.block_until_ready(_choose(task, decider, *states, keys))
+            passes += 1
+        best = min(best, (time.process_time() - begun) / passes / _TIMED)
+    return best

@@ -1,0 +1,169 @@
+"""An evaluation of deciders as a table, as JSON, as a figure and as a page."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.evaluation.results import versions
+from jaxcal.evaluation.sequential import METHODS, Result
+from jaxcal.files import atomic_write
+from jaxcal.pages import Block, Code, Figure, Page, Section, Table, Text, render
+
+__all__ = ["figure", "json_document", "text_table", "write_report"]
+
+_ABOUT = (
+    "All methods play the same sessions: the truth, the budget and the luck of every "
+    "measurement are equal. Nats: the sum of the expected information gains of the "
+    "measurements made, with its standard error (95 % intervals in the figure). Time: "
+    "of one core, a choice, averaged over a batch."
+)
+
+
+def text_table(result: Result) -> str:
+    """The table in the terminal."""
+    rows = _rows(result)
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    rows.insert(1, tuple("-" * width for width in widths))
+    lines = []
+    for name, *cells in rows:
+        pairs = zip(cells, widths[1:], strict=True)
+        lines.append(
+            "  ".join([name.ljust(widths[0]), *(c.rjust(w) for c, w in pairs)])
+        )
+    return "\n  ".join([_heading(result), *lines])
+
+
+def _rows(result: Result) -> list[tuple[str, ...]]:
+    """The table's head and rows."""
+    rival = result.reference
+    head = ("method", "nats", "less " + rival + ", paired", "choices", "time each")
+    rows: list[tuple[str, ...]] = [head]
+    for row, name in enumerate(result.found.names):
+        mean, error = result.found.mean(name)
+        over, spread = result.found.paired(name, rival)
+        rows.append(
+            (
+                name,
+                f"{mean:.3f} ± {error:.3f}",
+                "" if name == rival else f"{over:+.3f} ± {spread:.3f}",
+                f"{result.found.choices[row].mean():.1f}",
+                f"{1e3 * result.seconds[row]:.3g} ms",
+            )
+        )
+    return rows
+
+
+def _heading(result: Result) -> str:
+    shown = ", ".join(f"{name} = {value}" for name, value in result.options.items())
+    return (
+        f"{result.task}{f' ({shown})' if shown else ''}, seed {result.seed}: "
+        f"{result.found.gain.shape[1]:,} sessions, information gained in nats"
+    )
+
+
+def json_document(result: Result, *, command: Sequence[str]) -> str:
+    """The numbers; the envelope is that of an evaluation of postures."""
+    found = result.found
+    methods = {}
+    for row, name in enumerate(found.names):
+        told, ratio = found.told[row], found.log_ratio[row]
+        methods[name] = {
+            "label": METHODS[name],
+            "nats": _moments(found.gain[row]),
+            "entropy_drop": _moments(told),
+            "log_ratio_at_truth": _moments(ratio),
+            "choices": float(found.choices[row].mean()),
+            "seconds_per_choice": float(result.seconds[row]),
+            "paired": {
+                other: _moments(found.gain[row] - found.gain[number])
+                for number, other in enumerate(found.names)
+                if other != name
+            },
+        }
+        if name in result.rules:
+            rule: Any = result.rules[name]
+            methods[name]["constants"] = {
+                field.name: float(getattr(rule, field.name))
+                for field in dataclasses.fields(rule)
+            }
+    entry = {
+        "task": result.task,
+        "options": dict(result.options),
+        "episodes": found.gain.shape[1],
+        "seed": result.seed,
+        "checkpoint": result.checkpoint,
+        "methods": methods,
+    }
+    document = {
+        "format": "jaxcal-evaluation",
+        "version": 1,
+        "command": list(command),
+        "versions": versions(),
+        "results": [entry],
+    }
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+
+
+def write_report(
+    folder: pathlib.Path, result: Result, *, command: Sequence[str]
+) -> None:
+    """Write the figure as SVG and PNG, and ``index.html`` with it and the table."""
+    from jaxcal.plots.style import as_files
+
+    files: dict[str, bytes] = {}
+    files["sequential.svg"], files["sequential.png"] = as_files(
+        figure(result), "svg", "png"
+    )
+    head, *rows = _rows(result)
+    blocks: list[Block] = [
+        Table(head, rows),
+        Figure(files["sequential.svg"], "information and time of a choice"),
+    ]
+    made_with = ", ".join(f"{name} {v}" for name, v in versions().items())
+    page = Page(
+        "Deciders of sequential measurement on equal sessions",
+        [Section(_heading(result), blocks)],
+        intro=[Text(Code(" ".join(command)), "note"), Text(made_with, "note")],
+        footer=[Text(_ABOUT, "note")],
+    )
+    files["index.html"] = render(page).encode()
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, data in files.items():
+        with atomic_write(folder / name) as file:
+            file.write(data)
+
+
+def figure(result: Result) -> Any:
+    """Nats with 95 % intervals; the paired difference from the reference."""
+    from jaxcal.plots.style import COLOURS, panels
+
+    found = result.found
+    names = found.names
+    y = np.arange(len(names))[::-1]
+    drawn, (left, right) = panels((9.0, 0.6 + 0.35 * len(names)), shape=(1, 2))
+    pairs = [found.paired(name, result.reference) for name in names]
+    for axes, values in ((left, [found.mean(name) for name in names]), (right, pairs)):
+        mean, error = np.array(values).T
+        axes.errorbar(mean, y, xerr=1.96 * error, fmt="o", color=COLOURS[0], capsize=3)
+        axes.set_yticks(y, names)
+    left.set_xlabel("information gained in a session (nats)")
+    right.set_xlabel(f"less that of {result.reference}, in pairs (nats)")
+    right.axvline(0.0, color=COLOURS[1], linestyle="--")
+    return drawn
+
+
+def _moments(values: NDArray[np.float64]) -> dict[str, float | None]:
+    """Mean and its standard error; None where it is not defined."""
+    mean = float(values.mean())
+    error = float(values.std(ddof=1) / np.sqrt(len(values)))
+    return {
+        "mean": mean if np.isfinite(mean) else None,
+        "standard_error": error if np.isfinite(error) else None,
+    }

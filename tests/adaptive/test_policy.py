@@ -1,0 +1,206 @@
+"""The policy: begins as its rule, learns, and its runs and checkpoints."""
+
+import dataclasses
+import json
+import pathlib
+import textwrap
+
+import jax
+import numpy as np
+import pytest
+
+from jaxcal.adaptive.play import compare, play
+from jaxcal.adaptive.policy import run
+from jaxcal.adaptive.policy.config import PPO, PolicyConfig
+from jaxcal.adaptive.policy.network import Policy, initial
+from jaxcal.adaptive.rules import Gain, Priced, StateRule
+from jaxcal.adaptive.tasks import registry
+from jaxcal.adaptive.tasks.knee import STATE_RULE, knee
+from jaxcal.commands import evaluate as evaluate_command
+from jaxcal.commands import train as train_command
+from jaxcal.learning.runtime.weights import CheckpointError
+from jaxcal.learning.training import checkpoint
+
+SMALL = {"cells": 4, "sigma": 0.05, "seconds": (5.0, 9.0)}
+CONFIG = PolicyConfig(
+    task="knee",
+    base=STATE_RULE,
+    options=(SMALL, SMALL | {"rho": 0.2}),
+    per_group=2,
+    width=8,
+    ppo=dataclasses.replace(
+        PPO, num_episodes=4 * 128, episodes_per_update=128, num_minibatches=2
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    return folder, run.train(CONFIG, folder)
+
+
+def leaves(state):
+    return [np.asarray(x) for x in jax.tree.leaves(state)]
+
+
+def test_a_policy_begins_as_its_rule():
+    task = knee(**SMALL)
+    keys = jax.random.split(jax.random.key(3), 32)
+    policy = Policy(initial(jax.random.key(0), 2, 2, 8), STATE_RULE, 2, 8)
+    mine, rules = (play(task, decider, keys) for decider in (policy, STATE_RULE))
+    np.testing.assert_array_equal(
+        mine.designs * mine.alive, rules.designs * rules.alive
+    )
+
+
+def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished, tmp_path):
+    _, whole = finished
+    run.train(CONFIG, tmp_path, num_updates=1)
+    resumed = run.train(CONFIG, tmp_path, resume=True)
+    for one, other in zip(leaves(whole), leaves(resumed), strict=True):
+        np.testing.assert_array_equal(one, other)
+    rows = (tmp_path / "metrics.csv").read_text().splitlines()
+    assert rows[0] == ",".join(run.COLUMNS) and len(rows) == 5
+
+
+def test_a_checkpoint_gives_back_the_policy_and_its_configuration(finished, tmp_path):
+    folder, state = finished
+    trained = run.load(folder)
+    assert trained.step == 4
+    assert trained.config == CONFIG
+    for one, other in zip(leaves(trained.params), leaves(state.average), strict=True):
+        np.testing.assert_array_equal(one, other)
+    checkpoint.export(folder, tmp_path / "alone", run.load)
+    alone = run.load(tmp_path / "alone")
+    assert alone.config == CONFIG
+    assert not list((tmp_path / "alone").glob("*/state"))
+
+
+def test_checkpoints_of_another_kind_are_refused(finished):
+    folder, _ = finished
+    with pytest.raises(CheckpointError, match="must be jaxcal-sequential-policy"):
+        run.load(pathlib.Path(__file__).parents[2] / "checkpoints" / "default")
+    with pytest.raises(CheckpointError, match="must be jaxcal-policy"):
+        checkpoint.load(folder)
+
+
+@pytest.mark.slow
+def test_a_policy_mends_a_rule_that_ignores_trips(tmp_path):
+    config = dataclasses.replace(
+        CONFIG,
+        base=Priced(0.1, 0.2, 0.0),
+        options=(SMALL,),
+        per_group=3,
+        ppo=dataclasses.replace(
+            PPO, num_episodes=60 * 1024, episodes_per_update=1024, num_minibatches=4
+        ),
+    )
+    run.train(config, tmp_path)
+    deciders = {"rule": config.base, "policy": run.load(tmp_path).decider}
+    mean, error = compare(knee(**SMALL), deciders, 2048, seed=7).paired(
+        "policy", "rule"
+    )
+    assert mean > 5.0 * error
+
+
+FILE = '''
+import numpy as np
+from jaxcal.adaptive.grid import GridTask
+from jaxcal.adaptive.tasks import Entry
+
+def sides(sides=5, noise=0.1):
+    """Which side of a die is heavy: one is weighed at a time."""
+    hit = np.full((sides, sides), noise) + (1 - 2 * noise) * np.eye(sides)
+    return GridTask.make(
+        np.arange(sides), np.arange(sides), np.stack([1 - hit, hit], axis=1),
+        travel=1.0, seconds=(2.0, 4.0), most=4,
+    )
+
+ENTRY = Entry(sides, about="a heavy side")
+'''
+
+
+@pytest.fixture
+def own(tmp_path):
+    path = tmp_path / "own.py"
+    path.write_text(textwrap.dedent(FILE))
+    return path
+
+
+def test_a_users_task_is_one_file(own):
+    entry = registry.load(str(own))
+    assert entry.about == "a heavy side"
+    options = registry.options_from(entry, ["sides=3", "noise=0.2"])
+    task = entry.make(**options)
+    found = compare(task, {"gain": Gain(), "state": StateRule(0.1, 1.0, 1.0)}, 256)
+    assert (found.gain > 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["sides"], "--with must be NAME=VALUE with NAME of sides, noise, got 'sides'"),
+        (["size=3"], "got 'size=3'"),
+    ],
+)
+def test_bad_options_are_refused(own, given, message):
+    with pytest.raises(ValueError, match=message):
+        registry.options_from(registry.load(str(own)), given)
+
+
+def test_tasks_that_are_not_there_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"task must be one of .*knee.*, got 'nee'"):
+        registry.load("nee")
+    with pytest.raises(ValueError, match=r"nowhere\.py does not exist"):
+        registry.load(str(tmp_path / "nowhere.py"))
+    (tmp_path / "empty.py").write_text("")
+    with pytest.raises(ValueError, match="must define ENTRY"):
+        registry.load(str(tmp_path / "empty.py"))
+
+
+def test_commands_train_resume_and_compare(tmp_path, capsys):
+    small = ["--with", "cells=4", "sigma=0.05", "seconds=(5.0, 9.0)"]
+    out = str(tmp_path / "run")
+    flags = ["--num-minibatches", "2", "--num-epochs", "1", "--width", "8"]
+    start = ["--task", "knee", "--out", out]
+    assert (
+        train_command.main([*start, *small, *flags, "--updates", "1"], "train.py") == 0
+    )
+    assert train_command.main([*start, "--updates", "2"], "train.py") == 2
+    assert "already holds a run" in capsys.readouterr().err
+    exported = str(tmp_path / "alone")
+    again = [*start, "--resume", "--export", exported]
+    assert train_command.main(again, "train.py") == 0
+    document = tmp_path / "out.json"
+    report = tmp_path / "report"
+    arguments = ["--task", "knee", *small, "--checkpoint", exported, "--episodes", "64"]
+    arguments += ["--methods", "random,gain,state,policy", "--quiet"]
+    arguments += ["--json", str(document), "--report", str(report)]
+    assert evaluate_command.main(arguments, "evaluate.py") == 0
+    shown = capsys.readouterr().out
+    assert "policy" in shown and "less state, paired" in shown
+    found = json.loads(document.read_text())
+    assert found["format"] == "jaxcal-evaluation"
+    methods = found["results"][0]["methods"]
+    assert set(methods) == {"random", "gain", "state", "policy"}
+    assert methods["policy"]["paired"]["state"]["mean"] == pytest.approx(
+        methods["policy"]["nats"]["mean"] - methods["state"]["nats"]["mean"], abs=1e-9
+    )
+    assert (report / "index.html").is_file() and (report / "sequential.svg").is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--task", "nee"], "task must be one of"),
+        (["--task", "knee", "--methods", "best"], "methods must be of random"),
+        (["--task", "knee", "--with", "cell=3"], "--with must be NAME=VALUE"),
+        (["--task", "knee", "--checkpoint", "x", "--methods", "gain"], "not among"),
+        (["--task", "knee", "--checkpoint", "nowhere"], "does not exist"),
+    ],
+)
+def test_a_bad_evaluation_is_one_line(arguments, message, capsys):
+    assert evaluate_command.main(arguments, "evaluate.py") == 2
+    line = capsys.readouterr().err
+    assert message in line and line.count("\n") == 1
