@@ -2,8 +2,8 @@
 
 The information of a history h about its truth is ``log p(h | truth) - log p(h)``, and
 p(h) is an average over the unknown. Contrasts z_1..z_L from a proposal q estimate it:
-their average of ``p(h | z) p(z) / q(z)`` bounds the information from above, and with the
-truth among the contrasts from below (Foster et al. 2020, 2021).
+their average of ``p(h | z) p(z) / q(z)`` bounds the information from above, and with
+the truth among the contrasts from below (Foster et al. 2020, 2021).
 
 ``spce`` draws contrasts from the prior (sPCE below, sNMC above): it cannot report more
 than ``log(L + 1)``. ``sace`` draws them from the posterior, fitted by particles to each
@@ -90,7 +90,7 @@ def sace(
         particles: that the posterior is fitted to: anew, whatever the task's belief.
         moves: of the particles.
     """
-    finer = task.replace(num_particles=particles, num_moves=moves)
+    finer = dataclasses.replace(task, num_particles=particles, num_moves=moves)
     return _bounds(_sace(finer, episodes, key, contrasts), np.inf)
 
 
@@ -103,7 +103,8 @@ def _told(task: ParticleTask, episode: Episodes) -> ParticleBelief:
     """A belief of no particles with the history of one session."""
     belief, _ = jax.eval_shape(task.begin, jax.random.key(0))
     empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), belief)
-    return empty.replace(
+    return dataclasses.replace(
+        empty,
         designs=episode.designs,
         outcomes=episode.outcomes,
         made=episode.alive.sum().astype(jnp.int32),
@@ -185,7 +186,9 @@ def _kernels(belief: ParticleBelief, key: jax.Array) -> tuple[jax.Array, jax.Arr
     centres = belief.draws(count, key_centres)
     all_of = belief.draws(len(belief.z), key_all)
     scale = all_of.std(axis=0) + 1e-6
-    squared = (((centres[:, None] - all_of[None]) / scale[None, None]) ** 2).sum(axis=-1)
+    squared = (((centres[:, None] - all_of[None]) / scale[None, None]) ** 2).sum(
+        axis=-1
+    )
     nearest = all_of[jax.lax.top_k(-squared, _NEAREST)[1]]  # (M, n, d)
     apart = nearest - nearest.mean(axis=1, keepdims=True)
     covariance = jnp.einsum("mni,mnj->mij", apart, apart) / _NEAREST

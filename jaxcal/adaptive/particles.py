@@ -7,6 +7,7 @@ alters, is that of the unknowns themselves.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, Protocol
 
 import jax
@@ -109,7 +110,8 @@ class ParticleBelief:
         half of the particles effective; between them particles are resampled and moved.
         """
         at = self.made
-        told = self.replace(
+        told = dataclasses.replace(
+            self,
             designs=jax.tree.map(
                 lambda old, new: old.at[at].set(new), self.designs, design
             ),
@@ -119,9 +121,7 @@ class ParticleBelief:
         new = told._last(self.z)
         enough = _ENOUGH * len(self.z)
         whole = _effective(self.log_weight + new) >= enough
-        log_weight, evidence = _reweighted(
-            self.log_weight, jnp.where(whole, new, 0.0)
-        )
+        log_weight, evidence = _reweighted(self.log_weight, jnp.where(whole, new, 0.0))
         carry = (
             jnp.where(whole, 1.0, 0.0), jnp.int32(0), self.z, log_weight,
             self.log_likelihood, new, evidence, key,
@@ -157,7 +157,8 @@ class ParticleBelief:
         _, _, z, log_weight, old, new, evidence, _ = jax.lax.while_loop(
             more, temper, carry
         )
-        return told.replace(
+        return dataclasses.replace(
+            told,
             z=z,
             log_weight=log_weight,
             log_likelihood=old + new,
@@ -301,7 +302,7 @@ class ParticleTask:
             log_evidence=jnp.zeros(()),
             model=self.model,
         )
-        return belief, whole.replace(place=place, seconds=self.seconds)
+        return belief, dataclasses.replace(whole, place=place, seconds=self.seconds)
 
     def options(
         self, belief: ParticleBelief, session: Session, key: jax.Array
@@ -336,9 +337,7 @@ class ParticleTask:
     def log_likelihood(
         self, truth: jax.Array, design: Any, outcome: jax.Array
     ) -> jax.Array:
-        return _log_likelihood(
-            self.model, self.model.unknowns(truth), design, outcome
-        )
+        return _log_likelihood(self.model, self.model.unknowns(truth), design, outcome)
 
 
 def systematic(log_weight: jax.Array, count: int, key: jax.Array) -> jax.Array:
@@ -379,9 +378,7 @@ def _gain(model: Model, unknowns: Any, design: Any, keys: jax.Array) -> jax.Arra
 def _log_likelihood(
     model: Model, unknowns: Any, design: Any, outcome: jax.Array
 ) -> jax.Array:
-    return jnp.maximum(
-        model.log_prob(model.predict(unknowns, design), outcome), _FLOOR
-    )
+    return jnp.maximum(model.log_prob(model.predict(unknowns, design), outcome), _FLOOR)
 
 
 def _log_prior(z: jax.Array) -> jax.Array:

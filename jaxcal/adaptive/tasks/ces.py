@@ -9,8 +9,8 @@ information, without the rounding of marks near 1 in single precision.
 Constants of Foster et al. (2019, arXiv:1903.05480) and Blau et al. (2022,
 arXiv:2202.00821): rho uniform on [0.01, 1] (their code's; [0, 1] in the text), alpha
 uniform on the simplex, goods in [0.01, 100], ten measurements. The text has
-log u ~ N(1, 3): sd 3 in the published code, so by default here; sd 3^0.5 where 3 is read
-as a variance.
+log u ~ N(1, 3): sd 3 in the published code, so by default here; sd 3^0.5 where 3 is
+read as a variance.
 """
 
 from __future__ import annotations
@@ -98,9 +98,7 @@ class CES:
         count = len(who)
         keys = jax.random.split(key, 3)
         if session.place is None:
-            return jax.random.uniform(
-                keys[0], (count, 6), minval=_LEAST, maxval=_MOST
-            )
+            return jax.random.uniform(keys[0], (count, 6), minval=_LEAST, maxval=_MOST)
         left = jnp.minimum(session.seconds, 1e3)
         size = jax.random.uniform(keys[0], (count, 1), minval=-5.0, maxval=0.0)
         way = jax.random.normal(keys[1], (count, 6))
@@ -135,7 +133,7 @@ def _level(who: jax.Array, one: jax.Array, two: jax.Array) -> jax.Array:
 
 def _worth(unknowns: jax.Array, basket: jax.Array) -> jax.Array:
     rho = unknowns[0]
-    total = 0.0
+    total = jnp.zeros(())
     for good in range(3):  # by log1p and expm1, so that a small rho keeps its digits
         total = total + unknowns[1 + good] * jnp.expm1(rho * jnp.log(basket[good]))
     return jnp.exp(jnp.log1p(jnp.maximum(total, -1.0 + 1e-7)) / rho)

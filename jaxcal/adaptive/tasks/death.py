@@ -1,9 +1,9 @@
 """Death process: an infection rate, from how many of 50 are infected after a time.
 
 Each of N = 50 is infected at time xi with probability ``1 - exp(-theta xi)``; every
-measurement looks at 50 others. Constants of Foster et al. (2021, arXiv:2103.02438): theta
-normal with mean 1 and sd 1, above 0; four measurements. One unknown and 51 outcomes: the
-task is a grid and all its figures are exact for it.
+measurement looks at 50 others. Constants of Foster et al. (2021, arXiv:2103.02438):
+theta normal with mean 1 and sd 1, above 0; four measurements. One unknown and 51
+outcomes: the task is a grid, and all figures of the grid are exact.
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@ The person is offered R now or 100 after D days and takes the later sum with pro
 ``eps + (1 - 2 eps) Phi((V_later - R) / alpha)``, ``V_later = 100 / (1 + k D)``.
 Constants of Foster et al. (2021, arXiv:2103.02438) after Vincent and Rainforth (2017):
 log k ~ N(-4.25, 1.5^2), alpha half normal of sd 2, eps = 0.01, 20 choices. Their code
-(``hyperbolic_temporal_discount.py``) differs from their text: it has ``erf`` without the
-root of two, so alpha there counts root two times as much, and alpha starts at 1e-3.
-``as_code`` follows it.
+(``hyperbolic_temporal_discount.py``) differs from their text: it has ``erf`` without
+the root of two, so the choice is root two times as steep, and alpha starts at 1e-3.
+``as_code`` follows the code.
 """
 
 from __future__ import annotations
@@ -92,9 +92,7 @@ def hyperbolic(
         as_code: as the code of the published figures has it, not as the text has it.
         particles, candidates, contrasts, moves: see ``ParticleTask.make``.
     """
-    model = (
-        Hyperbolic() if as_code else Hyperbolic(least_alpha=1e-6, steepness=1.0)
-    )
+    model = Hyperbolic() if as_code else Hyperbolic(least_alpha=1e-6, steepness=1.0)
     return ParticleTask.make(
         model,
         measurements,

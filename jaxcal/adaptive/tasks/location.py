@@ -1,7 +1,7 @@
 """Location finding: sources in the plane, from the sum of their signals.
 
-The log of the signal at a point is measured with Gaussian noise of sd 0.5; the signal is
-``b + sum_k 1 / (m + |point - source_k|^2)``. Constants of Foster et al. (2021,
+The log of the signal at a point is measured with Gaussian noise of sd 0.5; the signal
+is ``b + sum_k 1 / (m + |point - source_k|^2)``. Constants of Foster et al. (2021,
 arXiv:2103.02438): b = 0.1, m = 1e-4, two sources, each N(0, I), 30 measurements.
 """
 

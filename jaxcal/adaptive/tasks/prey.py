@@ -3,9 +3,9 @@
 N prey are set out, and eaten at the rate ``a N^2 / (1 + a h N^2)`` (Holling's type III)
 for 24 hours; how many are gone is binomial with the share that the rate says. Constants
 of Moffat et al. (2020) and Blau et al. (2022, arXiv:2202.00821): log a and log h are
-N(-1.4, 1.35^2), N from 1 to 300, ten measurements. The rate is integrated in closed form;
-the published code takes 24 Runge-Kutta steps of an hour, which are far off where a N is
-large.
+N(-1.4, 1.35^2), N from 1 to 300, ten measurements. The rate is integrated in closed
+form; the published code takes 24 Runge-Kutta steps of an hour, which are inaccurate
+where a N is large.
 """
 
 from __future__ import annotations
