@@ -27,17 +27,30 @@ if hasattr(os, "sched_setaffinity"):
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 
 from jaxcal.adaptive.bounds import sace
 from jaxcal.adaptive.grid import GridTask
+from jaxcal.adaptive.particles import ParticleTask
 from jaxcal.adaptive.play import Episodes
 from jaxcal.adaptive.rules import Gain
+from jaxcal.adaptive.session import Session
 from jaxcal.adaptive.tasks.ces import ces
 from jaxcal.adaptive.tasks.death import death_process
 from jaxcal.adaptive.tasks.hyperbolic import hyperbolic
-from jaxcal.adaptive.tasks.location import location_finding
+from jaxcal.adaptive.tasks.location import LocationFinding, location_finding
 from jaxcal.adaptive.tasks.prey import prey
 from jaxcal.files import write_text
+
+
+@struct.dataclass
+class Anywhere(LocationFinding):
+    """Location finding at points drawn from the prior: a check of the task itself."""
+
+    def propose(
+        self, unknowns: jax.Array, session: Session, key: jax.Array, count: int
+    ) -> jax.Array:
+        return jax.random.normal(key, (count, 2))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,6 +66,11 @@ ROWS = {
     "location": Row(
         location_finding,
         "DAD 10.93, RL 11.73 (sPCE, capped at 13.1 to 13.8); ALINE, POLAR 13.5 (cap)",
+        512,
+    ),
+    "location-random": Row(
+        lambda: ParticleTask.make(Anywhere(), 30, candidates=1),
+        "random 8.30 (sPCE, capped)",
         512,
     ),
     "location-one": Row(

@@ -17,7 +17,7 @@ from jaxcal.adaptive.rules import Gain, GainRate, Priced, Random
 from jaxcal.adaptive.tasks.ces import CES, ces
 from jaxcal.adaptive.tasks.hyperbolic import Hyperbolic
 from jaxcal.adaptive.tasks.location import LocationFinding, location_finding
-from jaxcal.adaptive.tasks.prey import Prey
+from jaxcal.adaptive.tasks.prey import make_prey
 
 
 @struct.dataclass
@@ -270,6 +270,19 @@ def test_ces_is_that_of_the_text():
         assert inside + ends == pytest.approx(1.0, abs=1e-3)
 
 
+def test_marks_at_the_cut_are_as_likely_as_the_tail_says():
+    for mean in (40.0, 16.0, 15.0, 10.0, 0.0, -300.0):
+        prediction = jnp.asarray([mean, 1.5])
+        wanted = stats.norm.logsf(special.logit(1 - 2.0**-22), mean, 1.5)
+        found = model_log_prob(prediction, 15.25)
+        assert found == pytest.approx(wanted, rel=1e-4, abs=1e-4)
+        assert model_log_prob(-prediction * jnp.asarray([1.0, -1.0]), -15.25) == found
+
+
+def model_log_prob(prediction, outcome):
+    return float(CES().log_prob(prediction, jnp.asarray(outcome)))
+
+
 def test_alpha_of_ces_is_uniform_on_the_simplex():
     z = jax.random.normal(jax.random.key(0), (4000, 4))
     alpha = np.asarray(jax.vmap(CES().unknowns)(z))[:, 1:4]
@@ -286,7 +299,7 @@ def test_a_ces_session_with_a_budget_stays_within_it():
 
 
 def test_prey_is_that_of_the_differential_equation():
-    model = Prey()
+    model = make_prey()
     for z, count in (([0.0, 0.0], 40.0), ([1.5, -1.0], 300.0), ([-1.0, 2.0], 3.0)):
         a, h = (math.exp(-1.4 + 1.35 * v) for v in z)
         solved = integrate.solve_ivp(

@@ -19,24 +19,25 @@ __all__ = ["death_process"]
 def death_process(
     measurements: int = 4,
     *,
-    cells: int = 600,
-    times: int = 120,
-    latest: float = 6.0,
+    cells: int = 500,
+    times: int = 160,
+    latest: float = 60.0,
     people: int = 50,
 ) -> GridTask:
     """The task.
 
     Args:
         measurements: of a session.
-        cells: values of theta, each as likely: the middles of equal shares.
+        cells: values of theta, evenly spaced in their logarithm.
         times: to look at, evenly spaced in their logarithm.
         latest: of them.
         people: looked at in one measurement.
     """
-    share = (np.arange(cells) + 0.5) / cells
-    below = special.ndtr(-1.0)  # of the normal law, cut off
-    theta = 1.0 + special.ndtri(below + (1.0 - below) * share)
-    xi = np.geomspace(0.02, latest, times)
+    edges = np.geomspace(0.003, 6.0, cells + 1)
+    theta = np.sqrt(edges[1:] * edges[:-1])
+    edges[0], edges[-1] = 0.0, np.inf
+    prior = np.diff(special.ndtr(edges - 1.0))
+    xi = np.geomspace(0.1, latest, times)
     infected = -np.expm1(-xi[:, None] * theta)
     count = np.arange(people + 1)
     likelihood = stats.binom.pmf(count[None, :, None], people, infected[:, None, :])
@@ -44,6 +45,7 @@ def death_process(
         theta,
         xi,
         likelihood,
+        prior=prior,
         most=measurements,
         theta_names=["rate"],
         design_names=["time"],
