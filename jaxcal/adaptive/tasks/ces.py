@@ -38,6 +38,7 @@ class CES:
     log_u_sd: Any = 3.0
     noise: Any = 0.005
     walks: bool = struct.field(pytree_node=False, default=False)  # baskets cost a way
+    squeezed: bool = struct.field(pytree_node=False, default=False)  # see ces
 
     dim = 4
     support = None
@@ -48,7 +49,12 @@ class CES:
         second = (1.0 - first) * share[2]
         third = jnp.maximum(1.0 - first - second, 0.0)
         log_u = 1.0 + self.log_u_sd * z[3]
-        return jnp.stack([0.01 + 0.99 * share[0], first, second, third, log_u])
+        rho = 0.01 + 0.99 * share[0]
+        alpha = jnp.stack([first, second, third])
+        if self.squeezed:
+            rho = 0.01 + 0.98 * jax.nn.sigmoid(rho)
+            alpha, log_u = jax.nn.softmax(alpha), jnp.clip(log_u, -10.0, 10.0)
+        return jnp.concatenate([rho[None], alpha, log_u[None]])
 
     def predict(self, unknowns: jax.Array, design: jax.Array) -> jax.Array:
         u = jnp.exp(unknowns[4])
@@ -154,9 +160,10 @@ def ces(
     *,
     log_u_sd: float = 3.0,
     budget: float | None = None,
+    squeezed: bool = False,
     particles: int = 1000,
-    candidates: int = 120,
-    contrasts: int = 200,
+    candidates: int = 80,
+    contrasts: int = 100,
     moves: int = 5,
 ) -> ParticleTask:
     """The task.
@@ -167,11 +174,13 @@ def ces(
         budget: of the Euclidean way from design to design, as in COPEx (2026,
             arXiv:2605.26990): a session then begins at a pair drawn from the box,
             which costs nothing, with one measurement more.
+        squeezed: draws of rho and alpha once more through a logistic function and a
+            softmax, and log u within 10 of 0, as COPEx's code simulates.
         particles, candidates, contrasts, moves: see ``ParticleTask.make``.
     """
     walks = budget is not None
     return ParticleTask.make(
-        CES(log_u_sd=log_u_sd, walks=walks),
+        CES(log_u_sd=log_u_sd, walks=walks, squeezed=squeezed),
         measurements + walks,
         seconds=float("inf") if budget is None else budget,
         particles=particles,
