@@ -26,7 +26,11 @@ _STEPS = 40  # temperatures that one outcome may take
 
 
 class Model(Protocol):
-    """What is measured: a pytree with these methods, for one z and one design each."""
+    """What is measured: a pytree with these methods, for one z and one design each.
+
+    Write sums over products of a design and an unknown term by term: XLA on the CPU
+    compiles a reduction wrongly whose operand a vmapped axis shares.
+    """
 
     @property
     def dim(self) -> int:

@@ -33,7 +33,7 @@ class Line:
         return z
 
     def predict(self, unknowns, design):
-        return (unknowns * design).sum()
+        return unknowns[0] * design[0] + unknowns[1] * design[1]
 
     def log_prob(self, prediction, outcome):
         error = (outcome - prediction) / self.sigma

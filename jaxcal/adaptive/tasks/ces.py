@@ -59,7 +59,8 @@ class CES:
     def predict(self, unknowns: jax.Array, design: jax.Array) -> jax.Array:
         u = jnp.exp(unknowns[4])
         better = _worth(unknowns, design[:3]) - _worth(unknowns, design[3:])
-        apart = jnp.sqrt(((design[:3] - design[3:]) ** 2).sum())
+        squares = [(design[i] - design[i + 3]) ** 2 for i in range(3)]
+        apart = jnp.sqrt(squares[0] + squares[1] + squares[2])
         return jnp.stack([u * better, u * self.noise * (1.0 + apart)])
 
     def log_prob(self, prediction: jax.Array, outcome: jax.Array) -> jax.Array:
