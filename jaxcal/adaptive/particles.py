@@ -1,0 +1,402 @@
+"""Tasks of continuous unknowns, and their belief: particles.
+
+The unknowns of a :class:`Model` are functions of d independent standard normal
+coordinates z, so every prior is N(0, I) and information, which no change of coordinates
+alters, is that of the unknowns themselves.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxcal.adaptive.session import Options, Session
+from jaxcal.checks import numbers, whole_number
+
+__all__ = ["Model", "ParticleBelief", "ParticleTask", "log_mean", "systematic"]
+
+_FLOOR = -1e6  # log likelihood of what is next to impossible
+_ENOUGH = 0.5  # effective share of the particles below which they are moved
+_HALVINGS = 10  # bisections for a temperature
+_STEPS = 40  # temperatures that one outcome may take
+
+
+class Model(Protocol):
+    """What is measured: a pytree with these methods, for one z and one design each.
+
+    Write sums over products of a design and an unknown term by term: XLA on the CPU
+    compiles a reduction wrongly whose operand a vmapped axis shares.
+    """
+
+    @property
+    def dim(self) -> int:
+        """Coordinates z."""
+
+    @property
+    def support(self) -> jax.Array | None:
+        """(Y,) all outcomes where they are few; None where they are continuous."""
+
+    def unknowns(self, z: jax.Array) -> Any:
+        """The unknowns, from coordinates (d,)."""
+
+    def predict(self, unknowns: Any, design: Any) -> Any:
+        """The parameters of the outcome's distribution."""
+
+    def log_prob(self, prediction: Any, outcome: jax.Array) -> jax.Array:
+        """() log probability, or density, of an outcome."""
+
+    def sample(self, prediction: Any, key: jax.Array) -> jax.Array:
+        """() an outcome, drawn."""
+
+    def propose(
+        self, unknowns: Any, session: Session, key: jax.Array, count: int
+    ) -> Any:
+        """``count`` designs worth a look, given draws of the unknowns, leaves (N, ..).
+
+        Designs that cost more than ``session.seconds`` are not taken: one must not.
+        """
+
+    def cost(self, session: Session, design: Any) -> jax.Array:
+        """() what a design costs, in the terms of ``session.seconds``."""
+
+
+@struct.dataclass
+class ParticleBelief:
+    """N weighted draws of the coordinates, and the T measurements they follow from."""
+
+    z: jax.Array  # (N, d)
+    log_weight: jax.Array  # (N,) sum to one
+    log_likelihood: jax.Array  # (N,) of the measurements made
+    designs: Any  # leaves (T, ...)
+    outcomes: jax.Array  # (T,)
+    made: jax.Array  # () int32 measurements made
+    log_evidence: jax.Array  # () estimated log density of the measurements made
+    model: Model
+
+    def entropy(self) -> jax.Array:
+        """() nats of z: the estimated evidence less what the particles have of it."""
+        joint = _log_prior(self.z) + self.log_likelihood
+        return self.log_evidence - (jnp.exp(self.log_weight) * joint).sum()
+
+    def log_density(self, truth: jax.Array) -> jax.Array:
+        """() estimated log posterior density at coordinates (d,)."""
+        mine = self._history(truth[None])[0]
+        return _log_prior(truth) + mine - self.log_evidence
+
+    def draws(self, count: int, key: jax.Array) -> jax.Array:
+        """(count, d) equally weighted particles."""
+        return self.z[systematic(self.log_weight, count, key)]
+
+    def gains(self, task: ParticleTask, options: Options, key: jax.Array) -> jax.Array:
+        """(A,) nats, from ``task.num_contrasts`` particles.
+
+        Few outcomes are summed over; of continuous ones one a particle is drawn, with
+        the same luck for every design, and contrasted with all the others.
+        """
+        key_draws, key_luck = jax.random.split(key)
+        count = task.num_contrasts
+        unknowns = jax.vmap(self.model.unknowns)(self.draws(count, key_draws))
+        keys = jax.random.split(key_luck, count)
+        return jax.vmap(lambda design: _gain(self.model, unknowns, design, keys))(
+            options.designs
+        )
+
+    def update(
+        self, task: ParticleTask, design: Any, outcome: jax.Array, key: jax.Array
+    ) -> ParticleBelief:
+        """The belief after a measurement.
+
+        The outcome's likelihood comes in by powers of 0 to 1, each as large as leaves
+        half of the particles effective; between them particles are resampled and moved.
+        """
+        at = self.made
+        told = dataclasses.replace(
+            self,
+            designs=jax.tree.map(
+                lambda old, new: old.at[at].set(new), self.designs, design
+            ),
+            outcomes=self.outcomes.at[at].set(outcome),
+            made=at + 1,
+        )
+        new = told._last(self.z)
+        enough = _ENOUGH * len(self.z)
+        whole = _effective(self.log_weight + new) >= enough
+        log_weight, evidence = _reweighted(self.log_weight, jnp.where(whole, new, 0.0))
+        carry = (
+            jnp.where(whole, 1.0, 0.0), jnp.int32(0), self.z, log_weight,
+            self.log_likelihood, new, evidence, key,
+        )  # fmt: skip
+
+        def more(carry: Any) -> jax.Array:
+            return carry[0] < 1.0
+
+        def temper(carry: Any) -> Any:
+            power, steps, z, log_weight, old, new, evidence, key = carry
+            key, key_resample, key_move = jax.random.split(key, 3)
+            low, high = jnp.zeros(()), 1.0 - power
+
+            def halve(_: int, ends: Any) -> Any:
+                low, high = ends
+                middle = 0.5 * (low + high)
+                fits = _effective(log_weight + middle * new) >= enough
+                return jnp.where(fits, middle, low), jnp.where(fits, high, middle)
+
+            full = _effective(log_weight + high * new) >= enough
+            full = full | (steps + 1 >= _STEPS)
+            part = jax.lax.fori_loop(0, _HALVINGS, halve, (low, high))[0]
+            step = jnp.where(full, high, jnp.maximum(part, 1e-6 * high))
+            log_weight, add = _reweighted(log_weight, step * new)
+            power = jnp.where(full, 1.0, power + step)
+            index = systematic(log_weight, len(z), key_resample)
+            z, old, new = told._moved(
+                z[index], old[index], new[index], power, key_move, task.num_moves
+            )
+            log_weight = jnp.full_like(log_weight, -jnp.log(len(z)))
+            return power, steps + 1, z, log_weight, old, new, evidence + add, key
+
+        _, _, z, log_weight, old, new, evidence, _ = jax.lax.while_loop(
+            more, temper, carry
+        )
+        return dataclasses.replace(
+            told,
+            z=z,
+            log_weight=log_weight,
+            log_likelihood=old + new,
+            log_evidence=self.log_evidence + evidence,
+        )
+
+    def _moved(
+        self,
+        z: jax.Array,
+        old: jax.Array,
+        new: jax.Array,
+        power: jax.Array,
+        key: jax.Array,
+        num_moves: int,
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Metropolis moves along differences of two other particles, of many sizes."""
+        count, dim = z.shape
+
+        def move(carry: Any, key: jax.Array) -> tuple[Any, None]:
+            z, old, new = carry
+            key_shift, key_size, key_accept = jax.random.split(key, 3)
+            shift = jax.random.randint(key_shift, (2,), 1, count)
+            size = jax.random.uniform(key_size, (count, 1), minval=-3.0, maxval=0.5)
+            way = jnp.roll(z, shift[0], axis=0) - jnp.roll(z, shift[1], axis=0)
+            there = z + jnp.exp(size) * (1.2 / dim**0.5) * way
+            whole, last = self._history(there), self._last(there)
+            before = whole - last
+            change = (
+                _log_prior(there) - _log_prior(z)
+                + before - old + power * (last - new)
+            )  # fmt: skip
+            luck = jnp.log(jax.random.uniform(key_accept, (count,), minval=1e-30))
+            take = luck < change
+            kept = (
+                jnp.where(take[:, None], there, z),
+                jnp.where(take, before, old),
+                jnp.where(take, last, new),
+            )
+            return kept, None
+
+        return jax.lax.scan(move, (z, old, new), jax.random.split(key, num_moves))[0]
+
+    def _history(self, z: jax.Array) -> jax.Array:
+        """(N,) log likelihood of the measurements made."""
+        unknowns = jax.vmap(self.model.unknowns)(z)
+
+        def one(at: jax.Array, total: jax.Array) -> jax.Array:
+            design = jax.tree.map(lambda leaf: leaf[at], self.designs)
+            return total + jax.vmap(
+                lambda u: _log_likelihood(self.model, u, design, self.outcomes[at])
+            )(unknowns)
+
+        return jax.lax.fori_loop(0, self.made, one, jnp.zeros(len(z)))
+
+    def _last(self, z: jax.Array) -> jax.Array:
+        """(N,) log likelihood of the last measurement."""
+        at = self.made - 1
+        design = jax.tree.map(lambda leaf: leaf[at], self.designs)
+        unknowns = jax.vmap(self.model.unknowns)(z)
+        return jax.vmap(
+            lambda u: _log_likelihood(self.model, u, design, self.outcomes[at])
+        )(unknowns)
+
+
+@struct.dataclass
+class ParticleTask:
+    """A model, how long a session lasts, and how much is computed; see :func:`make`."""
+
+    model: Model
+    seconds: jax.Array  # () budget of a session; inf where nothing costs
+    most: int = struct.field(pytree_node=False)
+    num_particles: int = struct.field(pytree_node=False)
+    num_candidates: int = struct.field(pytree_node=False)
+    num_contrasts: int = struct.field(pytree_node=False)
+    num_moves: int = struct.field(pytree_node=False)
+
+    @staticmethod
+    def make(
+        model: Model,
+        most: int,
+        *,
+        seconds: float = float("inf"),
+        particles: int = 600,
+        candidates: int = 24,
+        contrasts: int = 100,
+        moves: int = 3,
+    ) -> ParticleTask:
+        """Check the numbers of a task.
+
+        Args:
+            model: what is measured.
+            most: measurements of a session.
+            seconds: budget of a session, in what ``model.cost`` counts.
+            particles: of the belief.
+            candidates: designs that are compared for every measurement.
+            contrasts: particles that gains are computed from.
+            moves: Metropolis steps each time that particles are resampled.
+
+        Raises:
+            ValueError: naming the argument, the rule and the value.
+        """
+        budget = numbers("seconds", seconds, finite=False)
+        if budget.ndim or not budget > 0.0:
+            raise ValueError(f"seconds must be one number above 0, got {seconds}")
+        return ParticleTask(
+            model=model,
+            seconds=jnp.asarray(budget, jnp.float32),
+            most=whole_number("most", most, 1),
+            num_particles=whole_number("particles", particles, 2),
+            num_candidates=whole_number("candidates", candidates, 1),
+            num_contrasts=whole_number("contrasts", contrasts, 2),
+            num_moves=whole_number("moves", moves, 1),
+        )
+
+    def draw(self, key: jax.Array) -> jax.Array:
+        """(d,) coordinates of the truth."""
+        return jax.random.normal(key, (self.model.dim,))
+
+    def begin(self, key: jax.Array) -> tuple[ParticleBelief, Session]:
+        """Particles of the prior, and a session at a design that is proposed first."""
+        key_z, key_place = jax.random.split(key)
+        z = jax.random.normal(key_z, (self.num_particles, self.model.dim))
+        unknowns = jax.vmap(self.model.unknowns)(z)
+        whole = Session(
+            place=None,
+            seconds=jnp.asarray(jnp.inf),
+            uses=jnp.int32(self.most),
+            made=jnp.int32(0),
+        )
+        first = self.model.propose(unknowns, whole, key_place, 1)
+        place = jax.tree.map(lambda leaf: leaf[0], first)
+        belief = ParticleBelief(
+            z=z,
+            log_weight=jnp.full(len(z), -jnp.log(float(len(z)))),
+            log_likelihood=jnp.zeros(len(z)),
+            designs=jax.tree.map(
+                lambda leaf: jnp.zeros((self.most, *leaf.shape), leaf.dtype), place
+            ),
+            outcomes=jnp.zeros(self.most),
+            made=jnp.int32(0),
+            log_evidence=jnp.zeros(()),
+            model=self.model,
+        )
+        return belief, dataclasses.replace(whole, place=place, seconds=self.seconds)
+
+    def options(
+        self, belief: ParticleBelief, session: Session, key: jax.Array
+    ) -> Options:
+        """Designs that the model proposes from draws of the belief."""
+        key_draws, key_designs = jax.random.split(key)
+        z = belief.draws(4 * self.num_candidates, key_draws)
+        designs = self.model.propose(
+            jax.vmap(self.model.unknowns)(z), session, key_designs, self.num_candidates
+        )
+        cost = jax.vmap(lambda design: self.model.cost(session, design))(designs)
+        return Options(designs, cost, cost <= session.seconds)
+
+    def measure(self, truth: jax.Array, design: Any, key: jax.Array) -> jax.Array:
+        """() an outcome, drawn."""
+        prediction = self.model.predict(self.model.unknowns(truth), design)
+        return self.model.sample(prediction, key)
+
+    def spend(self, session: Session, design: Any, outcome: jax.Array) -> Session:
+        return Session(
+            place=design,
+            seconds=session.seconds - self.model.cost(session, design),
+            uses=session.uses - 1,
+            made=session.made + 1,
+        )
+
+    def expected(
+        self, belief: ParticleBelief, session: Session, options: Options
+    ) -> tuple[jax.Array, jax.Array]:
+        return options.seconds, jnp.ones_like(options.seconds)
+
+    def log_likelihood(
+        self, truth: jax.Array, design: Any, outcome: jax.Array
+    ) -> jax.Array:
+        return _log_likelihood(self.model, self.model.unknowns(truth), design, outcome)
+
+
+def systematic(log_weight: jax.Array, count: int, key: jax.Array) -> jax.Array:
+    """(count,) int32 indices, each as often as its weight says, to within one."""
+    below = jnp.cumsum(jnp.exp(log_weight))
+    ticks = (jnp.arange(count) + jax.random.uniform(key)) / count * below[-1]
+    index = jnp.searchsorted(below, ticks, side="right")
+    return jnp.minimum(index, len(log_weight) - 1).astype(jnp.int32)
+
+
+def log_mean(values: jax.Array) -> jax.Array:
+    """Log of the mean over the last axis of values that are given by their logs."""
+    return jax.nn.logsumexp(values, axis=-1) - jnp.log(float(values.shape[-1]))
+
+
+def _gain(model: Model, unknowns: Any, design: Any, keys: jax.Array) -> jax.Array:
+    predictions = jax.vmap(lambda u: model.predict(u, design))(unknowns)
+    if model.support is None:
+        outcomes = jax.vmap(model.sample)(predictions, keys)
+        own = jax.vmap(model.log_prob)(predictions, outcomes)
+        all_of = jax.vmap(
+            lambda y: jax.vmap(lambda p: model.log_prob(p, y))(predictions)
+        )(outcomes)
+        # What is drawn is likely where it is drawn from: no overflow, so no maximum.
+        ratio = jnp.exp(jnp.minimum(all_of - own[:, None], 80.0))
+        found = -jnp.log(ratio.mean(axis=-1)).mean()
+    else:
+        log_p = jax.vmap(
+            lambda p: jax.vmap(lambda y: model.log_prob(p, y))(model.support)
+        )(predictions)  # (n, Y)
+        p = jnp.exp(log_p)
+        each = (p * jnp.maximum(log_p, _FLOOR)).sum(axis=-1).mean()
+        mixed = p.mean(axis=0)
+        found = each - (mixed * jnp.log(mixed + 1e-30)).sum()
+    return jnp.maximum(found, 0.0)
+
+
+def _log_likelihood(
+    model: Model, unknowns: Any, design: Any, outcome: jax.Array
+) -> jax.Array:
+    return jnp.maximum(model.log_prob(model.predict(unknowns, design), outcome), _FLOOR)
+
+
+def _log_prior(z: jax.Array) -> jax.Array:
+    dim = z.shape[-1]
+    return -0.5 * (z * z).sum(axis=-1) - 0.5 * dim * jnp.log(2.0 * jnp.pi)
+
+
+def _effective(log_weight: jax.Array) -> jax.Array:
+    """Effective sample size of weights that need not sum to one."""
+    weight = jnp.exp(log_weight - log_weight.max())
+    return weight.sum() ** 2 / (weight * weight).sum()
+
+
+def _reweighted(log_weight: jax.Array, add: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Weights that sum to one, and the log of what they summed to."""
+    total = jax.nn.logsumexp(log_weight + add)
+    return log_weight + add - total, total
