@@ -20,6 +20,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             _check_packages("pydantic", "pymodbus")
             if args.command != "stop":
                 _check_packages("jinja2")  # of the report, which is written last
+            if args.command in ("setup", "imu", "axes"):
+                _check_packages("tomlkit")  # of the corrections to rig.toml
             from rig import commands
         return commands.run(args)
     except KeyboardInterrupt:

@@ -41,6 +41,13 @@ def _within(low: float, high: float) -> Callable[[str], float]:
     return number
 
 
+def _axes(text: str) -> list[str]:
+    names = text.split(",")
+    if unknown := [name for name in names if name not in ("pitch", "yaw", "roll")]:
+        raise argparse.ArgumentTypeError(f"no axis {unknown[0]!r}: pitch, yaw, roll")
+    return names
+
+
 def _number(low: float, high: float, default: float, text: str) -> dict[str, Any]:
     text = f"{text} (default {default:g})"
     return {"type": _within(low, high), "default": default, "help": text}
@@ -56,6 +63,14 @@ MOTION: Options = {
     "--reset-alarms": _flag("before arming"),
     "--zero": _flag("confirm that the device stands in its zero posture"),
 }
+LIVE_HOST: Options = {
+    "--live-host": {
+        "metavar": "ADDRESS",
+        "help": "show the page on this address of this computer (default loopback); "
+        "another than loopback needs the token that is printed",
+    },
+}
+LIVE: Options = {"--live": _flag("show it as a page in the browser")} | LIVE_HOST
 SIMULATOR: Options = {
     "--simulate": _flag("run against a simulated rig"),
     "--transport": {
@@ -74,12 +89,15 @@ SIMULATOR: Options = {
     "--drift": _number(-90.0, 90.0, 0.0, "degrees per minute"),
     "--speedup": _number(0.01, 100.0, 1.0, "factor on the speed of the axes"),
     "--rate": _number(0.1, 1000.0, 100.0, "of the phone, Hz"),
+    "--reversed": {"type": _axes, "metavar": "AXES", "help": "turn the other way"},
+    "--swapped": {"type": _axes, "metavar": "A,B", "help": "two drives change cables"},
+    "--gearing": {"type": int, "metavar": "PULSES", "help": "per turn, in the drives"},
+    "--lost-origin": _number(-90.0, 90.0, 0.0, "degrees the counts are off"),
+    "--realistic": _flag("slow replies and enabling, jitter, idle watchdog"),
 }
-SESSION: Options = CONFIG | FOLDER | MOTION
-RUN: Options = {
-    "run": _path("the run's folder"),
-    "--config": _path("for a changed port"),
-}
+SESSION: Options = CONFIG | FOLDER | MOTION | LIVE
+FOLDER_OF: Options = {"run": _path("the run's folder")}
+RUN: Options = FOLDER_OF | {"--config": _path("for a changed port")}
 FILE: Options = {"file": _path("rig.toml", nargs="?")}
 NAME: Options = {"name": {"nargs": "?", "help": "without it the names are listed"}}
 PORT: Options = {"--bus-port": {"type": int, "help": "0: any free one"}}
@@ -93,6 +111,91 @@ TO: Options = {
         "help": "desired posture in degrees",
     }
 }
+
+YES: Options = {
+    "--yes": _flag("confirm everything and take every default"),
+    "--reset-alarms": _flag("before arming"),
+}
+STEP: Options = CONFIG | YES
+BUS: Options = {
+    "--bus": {
+        "metavar": "BUS",
+        "help": "rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT; without it "
+        "that of rig.toml",
+    },
+    "--units": {
+        "type": int,
+        "choices": range(1, 248),
+        "metavar": "N",
+        "default": 16,
+        "help": "ids 1 to N (default 16)",
+    },
+}
+TCP: Options = {
+    "--tcp": {
+        "action": "append",
+        "default": [],
+        "metavar": "HOST[:PORT]",
+        "help": "does anything answer there",
+    }
+}
+SECONDS: Options = {"--seconds": _number(1.0, 600.0, 5.0, "to look at the stream")}
+JOG: Options = {
+    "axis": {"choices": ("pitch", "yaw", "roll")},
+    "step": {
+        "type": _within(-3.0, 3.0),
+        "nargs": "?",
+        "help": "degrees, at most 3; without it the axis moves while a key is held",
+    },
+}
+HERE: Options = {
+    "--here": _flag("where the device stands is home; otherwise the drives' own homing")
+}
+NAMES_KNOWN: Options = {
+    "--names-known": _flag(
+        "every unit was seen to turn its own joint the right way; the phone may be "
+        "placed in any way"
+    )
+}
+SETUP: Options = {
+    "--imu": {"metavar": "APP[:PORT]", "help": "hyperimu, sensorlogger or lines"},
+    "--home": {"choices": ("here", "drive"), "default": "here", "help": "how"},
+    "--set": {
+        "action": "append",
+        "default": [],
+        "metavar": "KEY=VALUE",
+        "help": "of the new rig.toml, such as axes.pitch.reduction=50",
+    },
+}
+
+
+ORDER = {"choices": ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")}
+RECORDED: Options = {"run": _path("the run's folder")}
+REFIT: Options = RECORDED | {
+    "--order": {**ORDER, "help": "mechanism.order: axes of the joints"},
+    "--imu-order": {**ORDER, "help": "imu.order: of the phone's angles"},
+    "--signs": {
+        "type": int,
+        "choices": (1, -1),
+        "nargs": 3,
+        "help": "imu.signs: of the phone's angles, in the sequence of their order",
+    },
+    "--mounting": {
+        "type": _within(-360, 360),
+        "nargs": 3,
+        "metavar": ("Z", "Y", "X"),
+        "help": "imu.mounting_deg: turn of the phone on the end-effector",
+    },
+}
+EXPORT: Options = RECORDED | {
+    "--to": {
+        "choices": ("c", "st", "ros", "json", "csv"),
+        "required": True,
+        "help": "C header, IEC 61131-3 Structured Text, ROS 2 parameters, JSON, CSV",
+    },
+    "--out": _path("file to write (default: print it)", metavar="FILE"),
+}
+RUNS: Options = {"folder": _path("folder of runs, searched with its subfolders")}
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -113,6 +216,16 @@ def make_parser() -> argparse.ArgumentParser:
         for option, given in (SIMULATOR if simulated else {}).items():
             group.add_argument(option, **given)
 
+    text = "from cables to a device that may be calibrated; writes rig.toml"
+    add("setup", text, STEP | BUS | SETUP | NAMES_KNOWN)
+    add("ports", "list serial ports, and what answers on TCP", TCP, False)
+    add("scan", "which units answer, and of which family; reads only", CONFIG | BUS)
+    add("imu", "what to type into the phone, and what it sends", STEP | SECONDS)
+    add("jog", "move one axis by hand", JOG | STEP)
+    add("home", "make the drives' counts mean a place", HERE | STEP)
+    text = "check what turns, which way, how far; correct rig.toml"
+    add("axes", text, NAMES_KNOWN | STEP)
+    add("zero", "measure the zero posture", STEP)
     add("calibrate", "choose, visit, identify, verify and save", SESSION)
     text = "record random postures (Datasets 4 and 5)"
     add("collect", text, _count(50) | SESSION)
@@ -121,12 +234,20 @@ def make_parser() -> argparse.ArgumentParser:
     text = "move the end-effector to a posture, calibrated"
     add("goto", text, SAVED | TO | SESSION)
     text = "go on with a run that was paused, stopped or killed"
-    add("resume", text, RUN | MOTION)
+    add("resume", text, RUN | MOTION | LIVE)
+    text = "show a run, also a running one, as a page in the browser"
+    add("watch", text, FOLDER_OF | LIVE_HOST, False)
     text = "read identity and status of every drive; write nothing"
     add("identify", text, CONFIG)
     add("stop", "quick-stop every drive now, and verify", CONFIG, False)
     add("check", "check a configuration and list every fault", FILE | CONFIG, False)
     add("example", "print a commented example configuration", NAME, False)
+    add("refit", "identify a recorded calibration anew", REFIT, False)
+    add("report", "write report.html of any run, also unfinished", RECORDED, False)
+    text = "print the inverse map of a calibration for a controller"
+    add("export", text, EXPORT, False)
+    text = "compare the calibrations of a device over time"
+    add("trend", text, RUNS, False)
     text = "serve simulated drives and a phone on loopback"
     add("simulate", text, CONFIG | PORT)
     return parser

@@ -11,8 +11,11 @@ from rig.config import ConfigError, example_text, load_config
 from rig.config.files import example_names
 from rig.device.bus import Bus, BusError
 from rig.device.drives import Drive
-from rig.faults import EXIT_FAULT, EXIT_OK
+from rig.device.lock import BusLock
+from rig.faults import EXIT_FAULT, EXIT_OK, Refused
 from rig.sessions import load, make_simulator, run_session
+
+COMMISSIONING = ("ports", "scan", "imu", "jog", "home", "axes", "zero", "setup")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -29,8 +32,21 @@ def run(args: argparse.Namespace) -> int:
         "simulate": _simulate,
         "example": _example,
         "check": _check,
+        "watch": _watch,
+        **dict.fromkeys(("refit", "report", "export", "trend"), _of_recorded),
     }
+    if args.command in COMMISSIONING:
+        from rig.commissioning import run as run_step
+
+        return run_step(args)
     return commands.get(args.command, run_session)(args)
+
+
+def _of_recorded(args: argparse.Namespace) -> int:
+    from rig import results
+
+    command: Callable[[argparse.Namespace], int] = getattr(results, args.command)
+    return command(args)
 
 
 def _identify(args: argparse.Namespace) -> int:
@@ -39,6 +55,8 @@ def _identify(args: argparse.Namespace) -> int:
         if args.simulate:
             simulator = make_simulator(config, vars(args), args.fault)
             config = stack.enter_context(simulator).start()
+        # Its reads would delay those of a session that moves.
+        stack.enter_context(BusLock(config.bus).acquire("identify"))
         bus = stack.enter_context(Bus(config.bus, config.silence_s))
         for axis in config.axes:
             try:
@@ -63,23 +81,11 @@ def _described(drive: Drive) -> list[str]:
 
 
 def _stop(args: argparse.Namespace) -> int:
-    from rig.guard.stop import stop_all
+    from rig.stopping import stop_device
 
-    config = load(args)
-    bus = Bus(config.bus, config.silence_s)
-    try:
-        bus.open()
-    except BusError as error:
-        raise BusError(
-            f"NOTHING WAS STOPPED: {error}. If a session holds the port, press Ctrl-C "
-            "twice there; otherwise use the emergency stop"
-        ) from None
-    with bus:
-        results = stop_all([Drive(bus, axis) for axis in config.axes])
-    for result in results:
-        print(result)
-    stopped = all(r.acknowledged and r.standing for r in results)
-    return EXIT_OK if stopped else EXIT_FAULT
+    if args.config is None:
+        raise ConfigError("configuration", ["--config FILE is required"])
+    return stop_device(args.config)
 
 
 def _simulate(args: argparse.Namespace) -> int:
@@ -102,6 +108,21 @@ def _simulate(args: argparse.Namespace) -> int:
             return EXIT_OK
 
 
+def _watch(args: argparse.Namespace) -> int:
+    from jaxcal.extras import needs
+    from rig.live import launch
+
+    if not (args.run / "journal.jsonl").is_file():
+        raise Refused(f"{args.run} holds no run")
+    with needs("live", "the live page"):
+        from rig.live.server import serve
+    sock, token, url = launch.listen(args.live_host)
+    print(f"live page: {url}\nCtrl-C ends", flush=True)
+    with contextlib.suppress(KeyboardInterrupt):
+        serve(args.run, sock, token)
+    return EXIT_OK
+
+
 def _example(args: argparse.Namespace) -> int:
     if args.name is None:
         print("\n".join(example_names()))
@@ -122,4 +143,10 @@ def _check(args: argparse.Namespace) -> int:
             f"{axis.pulses_per_deg:.3f} pulses per degree, "
             f"{axis.min_pulses}..{axis.max_pulses} pulses"
         )
+    late = ", LONGER than the shortest step: shorten bus.timeout_s or slow the axes"
+    print(
+        f"  heartbeat {config.heartbeat_s:.3g} s, shortest step "
+        f"{config.shortest_step_s:.3g} s"
+        f"{late if config.heartbeat_s > config.shortest_step_s else ''}"
+    )
     return EXIT_OK

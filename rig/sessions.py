@@ -17,14 +17,18 @@ from rig.config import (
     load_config,
     parse_config,
 )
-from rig.config.axis import Pulses
 from rig.faults import Refused
 
 if TYPE_CHECKING:
+    from rig.device.record import DeviceRecord
+    from rig.session.reference import KeptZero
     from rig.session.run import Run
     from rig.simulator import Simulator
 
-SIMULATION = ("transport", "noise", "backlash", "drift", "speedup", "rate")
+SIMULATION = (
+    "transport", "noise", "backlash", "drift", "speedup", "rate", "reversed", "swapped",
+    "gearing", "lost_origin", "realistic",
+)  # fmt: skip
 
 
 def load(args: argparse.Namespace) -> RigConfig:
@@ -40,14 +44,9 @@ def make_simulator(
     config: RigConfig, options: dict[str, Any], faults: list[str]
 ) -> Simulator:
     """A simulated rig as the options of the command line describe it."""
-    from rig.simulator import Simulator, Truth, parse_fault
+    from rig.simulator import Simulator, parse_fault, truth_of
 
-    truth = Truth(
-        noise_deg=options["noise"],
-        backlash_deg=options["backlash"],
-        drift_deg_per_min=options["drift"],
-        seed=config.session.seed,
-    )
+    truth = truth_of(options, config.session.seed)
     return Simulator(
         config,
         truth,
@@ -60,26 +59,40 @@ def make_simulator(
 
 def run_session(args: argparse.Namespace) -> int:
     """Run a session, new or resumed; returns the exit code."""
+    from rig.device.lock import BusLock
+    from rig.device.record import DeviceRecord
     from rig.session.folder import new_run_folder
     from rig.session.run import Run
     from rig.session.runner import run_safely
 
     resumed = args.command == "resume"
-    config, start = _recorded(args) if resumed else _new(args)
+    config, start = recorded(args) if resumed else _new(args)
     mode = start["mode"]
-    procedure, zero_at = _procedure(mode, start["inputs"])
-    if args.zero:
-        zero_at = None  # the operator put the device into its zero posture
-    if resumed:
-        folder = args.run
-    else:
-        folder = new_run_folder(args.out or pathlib.Path(config.output), mode)
-        (folder / "rig.toml").write_text(config.text, encoding="utf-8")
+    procedure, kept_zero = _procedure(mode, start["inputs"], config)
+    # With --zero the operator put the device into its zero posture.
+    zero_at = kept_zero.pulses if kept_zero and not args.zero else None
+    dry_run = getattr(args, "dry_run", False)
     with contextlib.ExitStack() as stack:
-        simulator = None
+        simulator, text = None, config.text
         if start["simulated"] is not None:
             simulator = make_simulator(config, start["simulated"], args.fault)
             config = stack.enter_context(simulator).start()
+        lock = BusLock(config.bus)
+        if not dry_run:
+            stack.enter_context(lock.acquire(args.command))
+        record = DeviceRecord.load(config.device_path)
+        if simulator is None and not dry_run and (lack := record.missing(config)):
+            raise Refused(lack)
+        if resumed:
+            folder = args.run
+        else:
+            folder = new_run_folder(args.out or pathlib.Path(config.output), mode)
+            (folder / "rig.toml").write_text(text, encoding="utf-8")
+        lock.tell(run=str(folder.resolve()))
+        if simulator is not None:
+            record = DeviceRecord(folder / "device.json")
+            if not dry_run:
+                _commission(config, record, simulator)
         session = Run(
             config,
             folder,
@@ -87,14 +100,20 @@ def run_session(args: argparse.Namespace) -> int:
             functools.partial(print, flush=True),
             start={key: start[key] for key in ("simulated", "inputs", "maps_from")},
             reset_alarms=args.reset_alarms,
+            record=record,
             zero_at=zero_at,
-            dry_run=getattr(args, "dry_run", False),
+            kept_zero=kept_zero,
+            dry_run=dry_run,
         )
         if simulator is None:
             session.confirm = functools.partial(_confirm, args)
         else:
             session.on_imu_port = simulator.start_phone
             session.listeners.append(simulator.hear)
+        if args.live or args.live_host:
+            from rig.live import launch
+
+            session.say(launch.start(folder, args.live_host))
         return run_safely(session, procedure)
 
 
@@ -116,8 +135,8 @@ def _new(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
     }
 
 
-def _recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
-    """The same of a run that is resumed, from its folder."""
+def recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
+    """The same of a run that is resumed or identified anew, from its folder."""
     from rig.outputs.journal import read_journal
     from rig.session.folder import JOURNAL
 
@@ -125,16 +144,21 @@ def _recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
     if not records or records[0]["event"] != "start":
         raise Refused(f"{args.run} holds no run")
     start = records[0]
-    if args.config is not None:
+    if start["mode"] == "refit":
+        source = start["inputs"]["run"]
+        raise Refused(f"{args.run} is a refit of {source}; give that run instead")
+    if start["mode"] not in ("calibrate", "collect", "verify", "goto"):
+        raise Refused(f"{args.run} is a step of commissioning: run it again instead")
+    if getattr(args, "config", None) is not None:
         return load_config(args.config), start
     text = (args.run / "rig.toml").read_text(encoding="utf-8")
     return parse_config(text, pathlib.Path(start["maps_from"]), str(args.run)), start
 
 
 def _procedure(
-    mode: str, inputs: dict[str, Any]
-) -> tuple[Callable[[Run], int], Pulses | None]:
-    """What a session does, and the pulses of its zero posture where they are known."""
+    mode: str, inputs: dict[str, Any], config: RigConfig
+) -> tuple[Callable[[Run], int], KeptZero | None]:
+    """What a session does, and the zero posture that it must find."""
     import numpy as np
 
     from rig.session import calibrate, checking
@@ -144,13 +168,34 @@ def _procedure(
     count = inputs["count"]
     if mode == "collect":
         return lambda run: checking.collect(run, count), None
-    calibration, zero_at = checking.load_calibration(
-        pathlib.Path(inputs["calibration"])
-    )
+    saved = checking.load_calibration(pathlib.Path(inputs["calibration"]), config)
+    if saved.note:
+        print(saved.note, flush=True)
+    calibration = saved.calibration
     if mode == "verify":
-        return lambda run: checking.verify(run, calibration, count), zero_at
+        return lambda run: checking.verify(run, calibration, count), saved.zero
     desired = np.array(inputs["to"], dtype=np.float64)
-    return lambda run: checking.goto(run, calibration, desired), zero_at
+    return lambda run: checking.goto(run, calibration, desired), saved.zero
+
+
+def _commission(config: RigConfig, record: DeviceRecord, simulator: Simulator) -> None:
+    """Take a simulated device through every state as a real one is taken.
+
+    Raises:
+        MotionFault: its axes are not as configured.
+    """
+    from rig.commission.operator import Operator
+    from rig.commission.steps import Place, begin_simulated
+    from rig.device.record import SIGN_CHECKED
+
+    folder = record.path.parent / "axes"
+    folder.mkdir(exist_ok=True)
+    operator = Operator(yes=True, say=functools.partial(print, flush=True))
+    place = Place(
+        config, record, operator, folder=folder, full_speed=True, locked=True,
+        on_imu_port=simulator.start_phone,
+    )  # fmt: skip
+    begin_simulated(place, SIGN_CHECKED)
 
 
 def _confirm(args: argparse.Namespace, session: Run) -> None:

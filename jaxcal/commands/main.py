@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import os
 import sys
 
@@ -47,6 +48,9 @@ def main(argv: list[str] | None = None) -> int:
         return int(module.main(given[1:], prog=f"jaxcal {given[0]}"))
     arguments = _parser(given).parse_args(given)
     module = importlib.import_module(f"jaxcal.commands.{arguments.command}")
+    log, shown = logging.getLogger("jaxcal"), logging.StreamHandler()
+    log.setLevel(logging.INFO)
+    log.addHandler(shown)
     try:
         module.run(arguments)
         sys.stdout.flush()
@@ -54,6 +58,8 @@ def main(argv: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (ValueError, OSError, MissingExtraError) as error:
         return refused(f"jaxcal {arguments.command}", error)
+    finally:
+        log.removeHandler(shown)
     return 0
 
 

@@ -33,6 +33,8 @@ Mask = NDArray[np.bool_]
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)
+_LOSS = 1e-9  # of orthogonality that whitened rows may have
+_MENDED = 1e-3  # loss below which a second factor restores all of it
 
 
 def rank_rule(
@@ -149,14 +151,14 @@ def _stack(
     else:
         inverse = np.linalg.pinv(constant)
     shift = inverse @ (mean * ~same)
-    centred = blocks - (constant @ shift)[..., None, :, :]
+    rows = np.empty((*batch, count * q + len(root), p))
+    centred = rows[..., : count * q, :].reshape(*batch, count, q, p)  # a view
+    np.subtract(blocks, (constant @ shift)[..., None, :, :], out=centred)
     if usable is not None:
         centred *= weight
-    rows = centred.reshape(*batch, count * q, p)
-    largest = np.abs(blocks).max(axis=(-3, -2))
+    largest = np.maximum(blocks.max(axis=(-3, -2)), -blocks.min(axis=(-3, -2)))
     if len(root):
-        moved = root - root @ shift
-        rows = np.concatenate([rows, np.broadcast_to(moved, (*batch, *root.shape))], -2)
+        rows[..., count * q :, :] = root - root @ shift
         largest = np.maximum(largest, np.abs(root).max(axis=0))
     return rows, largest, shift
 
@@ -221,23 +223,22 @@ def whiten(blocks: Array, usable: Mask, root: Array) -> Whitened:
     num_sets, count, q, p = blocks.shape
     everything = bool(usable.all())
     rows, largest, shift = _stack(blocks, None if everything else usable, root)
-    norms = np.sqrt(np.einsum("sij,sij->sj", rows, rows))[:, None]
+    gram = np.matrix_transpose(rows) @ rows
+    norms = np.sqrt(np.diagonal(gram, axis1=1, axis2=2))
     scale = np.where(norms == 0.0, 1.0, norms)
-    scaled = rows / scale
-    triangle = _triangle(scaled)
+    triangle, inverse = _triangle(gram, rows, scale)
     pivots = np.abs(np.diagonal(triangle, axis1=1, axis2=2))
     # A cheap test first: only a set that looks nearly singular pays for the rule.
-    doubtful = (norms[:, 0] < 1e-6 * largest).any(axis=1) | (pivots < 1e-6).any(axis=1)
+    doubtful = (norms < 1e-6 * largest).any(axis=1) | (pivots < 1e-6).any(axis=1)
     at = np.flatnonzero(doubtful)
     if at.size:
         at = at[np.isneginf(rank_rule(rows[at], largest[at], count)[1])]
-        triangle[at] = np.eye(p)
-    inverse = np.linalg.inv(triangle)
+        inverse[at] = np.eye(p)
     with np.errstate(divide="ignore"):
-        log_scale = 2.0 * np.log(pivots * scale[:, 0]).sum(axis=1)
-    white = scaled @ inverse
+        log_scale = 2.0 * np.log(pivots * scale).sum(axis=1)
+    basis = inverse / scale[:, :, None]
+    white = rows @ basis
     of_prior = white[:, count * q :]
-    basis = inverse / np.matrix_transpose(scale)
     return Whitened(
         white[:, : count * q].reshape(num_sets, count, q, p),
         np.matrix_transpose(of_prior) @ of_prior,
@@ -247,16 +248,35 @@ def whiten(blocks: Array, usable: Mask, root: Array) -> Whitened:
     )
 
 
-def _triangle(rows: Array) -> Array:
-    """R (S, p, p) with ``R.T @ R = rows.T @ rows``, rows (S, R, p) of unit columns."""
-    p = rows.shape[-1]
-    try:  # twice as fast, and as exact where the columns are far from dependent
-        lower = np.linalg.cholesky(np.matrix_transpose(rows) @ rows)
-        if np.diagonal(lower, axis1=1, axis2=2).min() > 1e-3:
-            return np.matrix_transpose(lower)
+def _triangle(gram: Array, rows: Array, scale: Array) -> tuple[Array, Array]:
+    """R (S, p, p) with ``R.T @ R = rows.T @ rows`` in unit columns, and its inverse.
+
+    The factor of the Gram matrix is the cheapest; it leaves ``rows R^-1`` orthonormal
+    to about ``eps |R^-1|^2``. Where that is too much, the same of ``rows R^-1`` makes
+    up for it, and of nearly dependent columns the factor is by rotations.
+
+    Args:
+        gram: (S, p, p) of the rows.
+        rows: (S, R, p).
+        scale: (S, p) lengths of the columns, 1 where one is zero.
+    """
+    p = gram.shape[-1]
+    try:
+        lower = np.linalg.cholesky(gram / scale[:, :, None] / scale[:, None])
+        inverse = np.matrix_transpose(np.linalg.inv(lower))
+        lost = _EPS * float((inverse * inverse).sum(axis=(1, 2)).max())
+        if lost <= _LOSS:
+            return np.matrix_transpose(lower), inverse
+        if lost <= _MENDED:
+            near = rows @ (inverse / scale[:, :, None])
+            second = np.linalg.cholesky(np.matrix_transpose(near) @ near)
+            inverse = inverse @ np.matrix_transpose(np.linalg.inv(second))
+            return np.matrix_transpose(lower @ second), inverse
     except np.linalg.LinAlgError:
         pass
     short = max(0, p - rows.shape[1])
-    return np.asarray(
-        np.linalg.qr(np.pad(rows, ((0, 0), (0, short), (0, 0))), mode="r")
-    )
+    padded = np.pad(rows / scale[:, None], ((0, 0), (0, short), (0, 0)))
+    triangle = np.asarray(np.linalg.qr(padded, mode="r"))
+    regular = np.abs(np.diagonal(triangle, axis1=1, axis2=2)).all(axis=1)
+    whole = np.where(regular[:, None, None], triangle, np.eye(p))
+    return triangle, np.linalg.inv(whole)

@@ -38,8 +38,10 @@ def solve_many(problems: list[Problem]) -> list[Found]:
 def greedy_indices(problem: Problem) -> Indices:
     """(k,) candidates in the order picked, the required ones first.
 
-    For E the gain is that in the sum of the variances, which is at most p times and at
-    least once the largest: an incomplete selection has no least eigenvalue to raise.
+    On blocks, gains count a share of what the candidates not chosen yet will give, and
+    swaps mend a singular selection. For E the gain is that in the sum of the variances,
+    which is at most p times and at least once the largest: an incomplete selection has
+    no least eigenvalue to raise.
     """
     if problem.rank_one:
         return solve_many([problem])[0].indices

@@ -1,5 +1,6 @@
 """One ``[[axes]]`` table: a joint, its drive, and pulses against degrees."""
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any, Literal
 
@@ -11,6 +12,7 @@ from rig.config.schema import Section, key
 
 AXIS_NAMES = ("pitch", "yaw", "roll")  # the order of every (3,) in this package
 DEFAULT_ROTATES = {"pitch": "X", "yaw": "Z", "roll": "Y"}
+ROUNDING = 1e-9  # of a product that is a whole number of counts but for its last bits
 LOWEST, HIGHEST = -(2**31), 2**31 - 1
 
 Pulses = tuple[int, int, int]  # of pitch, yaw and roll
@@ -79,29 +81,69 @@ class Axis(Scale):
     speed_deg_s: float = key("of every move", ..., 1e-3, 5000)
     accel_deg_s2: float = key("of every move, also to brake", ..., 1e-3, 1e5)
     comm_timeout_s: float | None = key(
-        "the drive stops itself when the line is silent for so long", None, 0.01, 60
-    )
+        "the drive stops itself when the line is silent for so long",
+        "of [bus], where the map has it", 0.01, 60, by=lambda made: None,
+    )  # fmt: skip
 
     def pulses_within(self, angle_deg: float) -> int:
         """A tolerance in degrees as whole pulses, at least one."""
         return max(1, round(angle_deg * abs(self.pulses_per_deg)))
 
-    def motion_counts(self) -> dict[str, int]:
-        """Speed and ramps as register values; ValueError where one does not fit."""
+    @property
+    def _counts_per_deg(self) -> tuple[float, float]:
+        """Register counts of 1 deg/s and of 1 deg/s^2 (of its inverse for a time)."""
         units, turns = self.map.units, self.reduction / 360.0
-        speed, accel = self.speed_deg_s * turns, self.accel_deg_s2 * turns  # of motor
+        speed, accel = turns * units.speed_per_unit, turns * units.accel_per_unit
         if units.speed == "pulse_per_s":
             speed *= self.pulses_per_rev
         if units.accel == "pulse_per_s2":
             accel *= self.pulses_per_rev
         if units.accel == "s_per_rev_per_s":
-            accel = 1.0 / accel
-        counts = {"speed": max(1, round(speed * units.speed_per_unit))}
-        counts["accel"] = counts["decel"] = max(1, round(accel * units.accel_per_unit))
+            accel = units.accel_per_unit / turns
+        return speed, accel
+
+    def motion_counts(self) -> dict[str, int]:
+        """Speed and ramps as register values, never faster than configured.
+
+        Raises:
+            ValueError: ``key: rule, value`` where the drive cannot move so slowly, or
+                the register cannot hold the value.
+        """
+        per_speed, per_accel = self._counts_per_deg
+        counts = {"speed": math.floor(self.speed_deg_s * per_speed * (1.0 + ROUNDING))}
+        if self.map.units.accel == "s_per_rev_per_s":  # longer is gentler
+            accel = math.ceil(per_accel / self.accel_deg_s2 * (1.0 - ROUNDING))
+        else:
+            accel = math.floor(self.accel_deg_s2 * per_accel * (1.0 + ROUNDING))
+        counts["accel"] = counts["decel"] = accel
         for name, count in counts.items():
-            if place := self.map.move.place_of(name):
+            place = self.map.move.place_of(name)
+            if place is None:
+                continue
+            key_name, per, unit = (
+                ("speed_deg_s", per_speed, "deg/s")
+                if name == "speed"
+                else ("accel_deg_s2", per_accel, "deg/s^2")
+            )
+            if count < 1:
+                raise ValueError(
+                    f"{key_name}: must be at least {1.0 / per:.6g} {unit}, one count "
+                    f"of the drive's register, got {getattr(self, key_name):g}"
+                )
+            try:
                 encode(count, place[1], self.map.word_order)
+            except ValueError as error:
+                raise ValueError(f"{key_name}: the drive's register: {error}") from None
         return counts
+
+    @property
+    def drive_motion(self) -> tuple[float, float]:
+        """Speed in deg/s and acceleration in deg/s^2 that the registers come to."""
+        (per_speed, per_accel), counts = self._counts_per_deg, self.motion_counts()
+        accel = counts["accel"] / per_accel
+        if self.map.units.accel == "s_per_rev_per_s":
+            accel = per_accel / counts["accel"]
+        return counts["speed"] / per_speed, accel
 
     def broken_rules(self) -> Iterator[str]:
         for unit in ("deg", "pulses"):
@@ -117,7 +159,7 @@ class Axis(Scale):
         try:
             self.motion_counts()
         except ValueError as error:
-            yield f"speed_deg_s: or accel_deg_s2 does not fit the drive: {error}"
+            yield str(error)
         if self.comm_timeout_s is not None and self.map.comm_timeout is None:
             lack = f"the map {self.map.name} has no register for it"
             yield f"comm_timeout_s: {lack}; leave it out and use the maker's tool"

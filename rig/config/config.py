@@ -2,13 +2,18 @@
 
 import hashlib
 import json
+import math
+import pathlib
+import tomllib
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import PrivateAttr
 
 from rig.config.axis import AXIS_NAMES, Axis, Pulses, Scale
+from rig.config.maps import RegisterMap
 from rig.config.schema import Section, key
 from rig.config.settings import (
     BusSettings,
@@ -18,6 +23,73 @@ from rig.config.settings import (
     SessionSettings,
     SettleSettings,
 )
+
+POLLS, HICCUP_S = 4, 0.5  # of the motion loop's heartbeat
+PHONE = (
+    "format", "columns", "quaternion_columns", "unit", "order", "signs", "mounting_deg"
+)  # fmt: skip
+# Left out of ``fingerprint``: addresses, and what version 1 did not know. A key added
+# here leaves the fingerprints of older files as they are.
+UNCOUNTED = {
+    "imu": ("host", "port", "transport", "allow", "stale_s", "heading"),
+    "session": ("drift_limit_deg",),
+}
+# Where bus and phone are reached, and when a session gives up or says that it is good,
+# may change between a run and its resumption.
+UNMEASURED = {
+    "axes": ("comm_timeout_s",),
+    "imu": ("host", "port", "transport", "allow", "stale_s", "heading"),
+    "motion": (
+        "poll_s", "deadline_factor", "deadline_slack_s", "stall_s", "following_deg",
+        "envelope_margin_deg", "max_disagreement_deg", "heartbeat_s", "mirror_limits",
+    ),
+    "settle": ("timeout_s",),
+    "session": ("verify_limit_deg", "reference_tolerance_deg", "max_unreachable"),
+}  # fmt: skip
+
+
+def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
+    """``key: VALUE then, VALUE now`` of two flat tables, where they differ."""
+    return [
+        f"{key}: {then.get(key, 'not known')} then, {now.get(key, 'not known')} now"
+        for key in dict.fromkeys([*then, *now])
+        if then.get(key) != now.get(key)
+    ]
+
+
+def _without(data: dict[str, Any], left_out: dict[str, Any]) -> dict[str, Any]:
+    """A described configuration without its bus and some keys of its tables."""
+    found = {}
+    for name, table in data.items():
+        gone = left_out.get(name, ())
+        if isinstance(table, dict):
+            table = {key: table[key] for key in table if key not in gone}
+        elif name == "axes":
+            table = [{k: axis[k] for k in axis if k not in gone} for axis in table]
+        if name != "bus":
+            found[name] = table
+    return found
+
+
+def _flat(data: Any, at: str = "") -> dict[str, Any]:
+    """Dotted key to value; axes are called by their names."""
+    if isinstance(data, dict):
+        pairs = [(str(name), value) for name, value in data.items()]
+    elif data and isinstance(data, list) and isinstance(data[0], dict):
+        pairs = [(value["name"], value) for value in data]
+    else:
+        return {at: data}
+    flat: dict[str, Any] = {}
+    for name, value in pairs:
+        flat |= _flat(value, f"{at}.{name}" if at else name)
+    return flat
+
+
+def _family(register_map: RegisterMap) -> str:
+    data = tomllib.loads(register_map.text)
+    parts = [data.get(name) for name in ("word_order", "units", "position", "move")]
+    text = json.dumps(parts, sort_keys=True)
+    return f"{register_map.name} ({hashlib.sha256(text.encode()).hexdigest()[:8]})"
 
 
 class RigConfig(Section):
@@ -31,6 +103,16 @@ class RigConfig(Section):
     motion: MotionSettings = MotionSettings()
     session: SessionSettings = SessionSettings()
     output: str = key("every run makes its own folder in here", "runs")
+    device: str = key(
+        "record of how the device was commissioned, relative to this file",
+        "device.json",
+    )
+    _folder: pathlib.Path = PrivateAttr(pathlib.Path())
+
+    @property
+    def device_path(self) -> pathlib.Path:
+        """The device's record; ``device`` is relative to the configuration's folder."""
+        return self._folder / self.device
 
     @property
     def letters(self) -> tuple[str, str, str]:
@@ -53,6 +135,47 @@ class RigConfig(Section):
         """Silence between frames that the slowest of the drives wants."""
         return max(axis.map.inter_frame_s for axis in self.axes)
 
+    @property
+    def shortest_step_s(self) -> float:
+        """Time of a step of ``motion.max_step_deg`` on the quickest axis."""
+        motions = [axis.drive_motion for axis in self.axes]
+        step = self.motion.max_step_deg
+        return min(
+            step / speed + speed / accel
+            if step * accel > speed * speed
+            else 2.0 * math.sqrt(step / accel)  # it never reaches its speed
+            for speed, accel in motions
+        )
+
+    @property
+    def heartbeat_s(self) -> float:
+        """How long the motion loop may be silent while something moves.
+
+        Between two signs of life lies at most one exchange, which may have to connect
+        first, and the pause between polls; POLLS of these are allowed for, and a
+        computer that pauses for HICCUP_S.
+        """
+        longest = max(POLLS * self.motion.poll_s, HICCUP_S) + 2.0 * self.bus.timeout_s
+        return self.motion.heartbeat_s or longest
+
+    @property
+    def comm_timeouts_s(self) -> dict[str, float]:
+        """Axis to seconds, of the drives that watch their line.
+
+        Unless configured, a drive waits longer than the heartbeat, by one read with
+        all its tries.
+        """
+        default = self.heartbeat_s + self._slowest_read_s
+        return {
+            axis.name: axis.comm_timeout_s or default
+            for axis in self.axes
+            if axis.map.comm_timeout
+        }
+
+    @property
+    def _slowest_read_s(self) -> float:
+        return self.bus.timeout_s * (self.bus.read_retries + 1)
+
     def to_pulses(self, angles_deg: Any) -> Pulses:
         """Whole pulses of (3,) degrees."""
         a, b, c = (
@@ -68,7 +191,7 @@ class RigConfig(Section):
 
     def described(self) -> dict[str, Any]:
         """Everything as JSON values, in the layout of run folders of version 1."""
-        data = self.model_dump(exclude={"mechanism", "output", "axes"})
+        data = self.model_dump(exclude={"mechanism", "output", "axes", "device"})
         imu, session = data["imu"], data["session"]
         imu["quaternion"] = imu.pop("quaternion_columns")
         imu["angle_unit"] = imu.pop("unit")
@@ -87,21 +210,47 @@ class RigConfig(Section):
         return {**data, "axes": axes, "mechanism_order": self.mechanism.order}
 
     def fingerprint(self) -> str:
-        """SHA-256 of what a measurement depends on.
-
-        Where the bus and the phone are reached may change between a run and its
-        resumption; how the device moves and is measured may not.
-        """
-        data = self.described()
-        del data["bus"]
-        for name in ("host", "port", "transport", "stale_s"):
-            del data["imu"][name]
+        """SHA-256 of what a measurement depends on, as version 1 took it."""
+        data = _without(self.described(), UNCOUNTED)
+        data["motion"]["heartbeat_s"] = self.motion.heartbeat_s or 3.0  # default then
         text = json.dumps(data, sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()
 
+    def changed_since(self, described: dict[str, Any]) -> list[str]:
+        """Keys that would make a resumed run move or measure differently, in words.
+
+        Args:
+            described: ``described()`` when the run began, from its journal.
+        """
+        now = json.loads(json.dumps(self.described(), default=str))
+        then, now = (_flat(_without(each, UNMEASURED)) for each in (described, now))
+        # Keys that came after the run began had their defaults in it.
+        return differences(then, {key: now.get(key) for key in then})
+
+    def device_fingerprint(self) -> dict[str, Any]:
+        """Key of rig.toml to value, of all that says which place a pulse count means.
+
+        Of a map it is the part that turns counts into places: one that learns another
+        register by an update is the same family.
+        """
+        found: dict[str, Any] = {}
+        for axis in self.axes:
+            scale = axis.model_dump(include={*Scale.model_fields, "unit", "rotates"})
+            values = {"map": _family(axis.map), **scale}
+            found |= {f"axes.{axis.name}.{name}": values[name] for name in values}
+        found["mechanism.order"] = self.mechanism.order
+        imu = self.imu.model_dump(mode="json", include=set(PHONE))
+        return found | {f"imu.{name}": imu[name] for name in PHONE}
+
     def broken_rules(self) -> Iterator[str]:
         motion, session = self.motion, self.session
-        slowest = self.bus.timeout_s * (self.bus.read_retries + 1)
+        slowest, shortest = self._slowest_read_s, self.shortest_step_s
+        if motion.heartbeat_s is not None and motion.heartbeat_s > shortest:
+            yield (
+                "motion.heartbeat_s: must not exceed the shortest step, "
+                f"{shortest:.3g} s (max_step_deg at an axis's speed), got "
+                f"{motion.heartbeat_s:g}; leave it out to have it computed"
+            )
         overshoot = motion.approach_overshoot_deg
         if session.k >= session.candidates:
             yield f"session.k: must be under candidates ({session.candidates})"

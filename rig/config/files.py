@@ -24,7 +24,9 @@ def parse_config(
     """Check the text of a configuration; maps by path are relative to ``folder``."""
     config = parse(RigConfig, text, source, {"folder": folder}, _repeated)
     axes = sorted(config.axes, key=lambda axis: AXIS_NAMES.index(axis.name))
-    return config.model_copy(update={"axes": tuple(axes)})
+    config = config.model_copy(update={"axes": tuple(axes)})
+    config._folder = folder or pathlib.Path()
+    return config
 
 
 def _repeated(data: dict[str, Any]) -> Iterator[str]:

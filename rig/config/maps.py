@@ -17,6 +17,7 @@ from rig.config.registers import (
     CommTimeout,
     Move,
     Position,
+    Predicate,
     Read,
     StatusWord,
     Units,
@@ -24,6 +25,11 @@ from rig.config.registers import (
 )
 from rig.config.schema import Section, key, parse, read_text
 
+LATER_KEYS = (
+    "pulses_per_rev", "target", "home", "homed", "absolute_encoder", "ready_s",
+    "set_zero", "recognise",
+    "broadcast_stop",
+)  # fmt: skip
 MAP_FOLDER = pathlib.Path(__file__).parent.parent / "maps"
 
 
@@ -53,6 +59,7 @@ class RegisterMap(Section):
         "`trigger` is the last word"
     )
     stop: Writes = key("`write`: frames of the quick stop; torque must stay on")
+    broadcast_stop: bool = key("every unit of a serial line obeys its stop to 0", False)
     enable: Writes | None = key("`write`: switch the power stage on", None)
     alarm_reset: Writes | None = key("`write`: reset an alarm", None)
     comm_timeout: CommTimeout | None = key(
@@ -60,17 +67,45 @@ class RegisterMap(Section):
         None,
     )
     limits: Writes | None = key("`write` with `min` and `max` in pulses", None)
+    set_zero: Writes | None = key("`write`: the present position becomes 0", None)
     identity: dict[str, Read] = key("registers that `identify` prints", {})
+    recognise: dict[str, tuple[int, int]] = key(
+        "of identity registers: [lowest, highest] that a drive of this family holds", {}
+    )
+    pulses_per_rev: Read | None = key(
+        "register of the drive's own pulses for one motor turn", None
+    )
+    target: Position | None = key(
+        "register that holds the last target written, read back when the reply to a "
+        "move is lost",
+        None,
+    )
+    home: Writes | None = key("`write`: start the drive's own homing", None)
+    homed: Predicate | None = key(
+        "bits of the status word that are on from homing until the power fails", None
+    )
+    absolute_encoder: bool = key("the position outlasts a loss of power", False)
+    ready_s: float = key(
+        "the drive takes at most so long to enable, and to reset an alarm", 1.0, 0, 30
+    )
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the parsed file, for the run's fingerprint."""
-        data = json.dumps(tomllib.loads(self.text), sort_keys=True, default=str)
+        """SHA-256 of the parsed file, for the run's fingerprint.
+
+        Keys that change no move and came after version 1 are left out: run folders
+        of version 1 can still be resumed.
+        """
+        known = tomllib.loads(self.text)
+        known = {name: known[name] for name in known if name not in LATER_KEYS}
+        data = json.dumps(known, sort_keys=True, default=str)
         return hashlib.sha256(data.encode()).hexdigest()
 
     def broken_rules(self) -> Iterator[str]:
         if self.stop.place_of("position"):
             yield "stop.write: must not write a position"
+        for name in sorted(self.recognise.keys() - self.identity.keys()):
+            yield f"recognise.{name}: is no register of identity"
 
 
 def available_maps() -> list[str]:

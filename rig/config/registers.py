@@ -180,8 +180,13 @@ class Trigger(Section):
     value: Register
 
 
+# Words that make a family move by a distance, by the register they are written to:
+# Leadshine PR, Oriental AZ, Applied Motion.
+RELATIVE = {0x6200: (0x0041, 0x0081), 0x005B: (2, 3), 0x007C: (0x0066,)}
+
+
 class Move(Writes):
-    """An absolute move."""
+    """An absolute move; after a lost reply it may be sent twice."""
 
     trigger: Trigger
 
@@ -191,6 +196,13 @@ class Move(Writes):
         *_, (address, last) = self.write[-1].places()
         if (address, last.value) != (self.trigger.address, self.trigger.value):
             yield "trigger: must be the last word of the last frame"
+        places = (place for frame in self.write for place in frame.places())
+        for address, word in places:
+            if word.value in RELATIVE.get(address, ()):
+                yield (
+                    f"write: 0x{word.value:04X} in register 0x{address:04X} is a "
+                    "relative move; targets must be absolute"
+                )
 
 
 Positive = Annotated[float, Field(ge=1e-12, le=1e12)]

@@ -1,5 +1,6 @@
 """The tables of rig.toml but for its axes: one class a table, one field a key."""
 
+import ipaddress
 from collections.abc import Callable, Iterator
 from typing import Annotated, Any, Literal
 
@@ -31,7 +32,9 @@ class BusSettings(Section):
     stopbits: int = key("of an rtu bus", 1, 1, 2)
     bytesize: int = key("of an rtu bus", 8, 7, 8)
     timeout_s: float = key("for one reply", 0.3, 0.01, 5)
-    read_retries: int = key("of reads only; a motion write is sent once", 2, 0, 10)
+    read_retries: int = key(
+        "of reads, and of a move that the drive has not taken", 2, 0, 10
+    )
 
     @property
     def where(self) -> str:
@@ -96,10 +99,22 @@ class ImuSettings(Section):
     mounting_deg: tuple[Angle, Angle, Angle] = key(
         "turn of the phone on the end-effector about Z, then Y, then X", (0.0, 0.0, 0.0)
     )
+    allow: tuple[str, ...] = key(
+        "addresses that may send; none: the first phone that does", ()
+    )
+    heading: Literal["relative", "absolute"] = key(
+        "absolute: the phone comes back to the same heading whenever it is started",
+        "relative",
+    )
     stale_s: float = key("older than this while moving: stop", 0.4, 0.02, 10)
     max_jump_deg: float = key("between two readings", 20.0, 0.1, 180)
 
     def broken_rules(self) -> Iterator[str]:
+        for address in self.allow:
+            try:
+                ipaddress.ip_address(address)
+            except ValueError:
+                yield f"allow: must hold IP addresses, got {address!r}"
         if self.format == "sensorlogger" and self.transport != "listen":
             yield "transport: must be listen: Sensor Logger pushes its messages"
         named = (*self.columns, *(self.quaternion_columns or ()), self.stamp_column)
@@ -137,7 +152,10 @@ class MotionSettings(Section):
     max_disagreement_deg: float = key(
         "between IMU and command at a posture", 45.0, 0.1, 180
     )
-    heartbeat_s: float = key("a motion loop silent for so long: stop", 3.0, 0.2, 60)
+    heartbeat_s: float | None = key(
+        "a motion loop silent for so long: stop; at most the shortest step",
+        "of [bus] and poll_s", 0.1, 60, by=lambda made: None,
+    )  # fmt: skip
     mirror_limits: bool = key("write the soft limits to the drives too", False)
 
 
@@ -171,7 +189,12 @@ class SessionSettings(Section):
     roll_range_deg: Range | None = key("likewise", None)
     verify_postures: int = key("held out; each before and after", 4, 0, 1000)
     verify_limit_deg: float = key("largest good error once compensated", 0.5, 1e-3, 45)
-    reference_tolerance_deg: float = key("zero posture on `resume`", 0.5, 1e-3, 45)
+    drift_limit_deg: float = key(
+        "of the zero in a session, of what is not linear", 0.2, 1e-3, 45
+    )
+    reference_tolerance_deg: float = key(
+        "the zero posture may be found so far from where it was", 0.5, 1e-3, 45
+    )
     max_unreachable: int = key("postures out of reach until a fault", 3, 0, 1000)
     zero: Literal["here", "drive"] = key(
         "here: the device stands in its zero posture; drive: go to pulse 0", "here"

@@ -9,22 +9,25 @@ never be taken for the answer to a later request.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from rig.config.settings import BusSettings
 from rig.faults import Fault
 
 METHODS = {3: "read_holding_registers", 6: "write_register", 16: "write_registers"}
+TURNAROUND_S = 0.05  # for the units to act on a broadcast, which none answers
 EXCEPTIONS = {
     1: "illegal function", 2: "illegal address", 3: "illegal value",
     4: "device failure", 5: "acknowledge", 6: "busy", 8: "CRC or parity",
     10: "no gateway path", 11: "gateway target silent",
 }  # fmt: skip
+GATEWAY_CODES = (10, 11)  # the unit behind the gateway is silent
 
 
 class BusError(Fault):
@@ -51,8 +54,12 @@ class Bus:
         self.settings = settings
         # On Modbus TCP the gateway keeps the line's silence.
         self.silence_s = 0.0 if settings.transport == "tcp" else silence_s
+        self.check: Callable[[], None] = lambda: None  # before each exchange; may raise
+        self.silent: set[int] = set()  # units that did not answer the last time
         self._emit = emit  # told of every write before it is sent
         self._lock = threading.RLock()
+        self._urgent = False
+        self._timeout_s = settings.timeout_s
         self._quiet_until = 0.0
         self._client: Any = None
 
@@ -93,6 +100,22 @@ class Bus:
             if self._client is not None:
                 self._client.close()
                 self._client = None
+
+    @contextlib.contextmanager
+    def urgent(self, timeout_s: float | None = None) -> Iterator[None]:
+        """Keep the line for a stop: no exchange of another thread, no ``check``.
+
+        A reply is waited for ``timeout_s``, or as configured where that is shorter.
+        """
+        with self._lock:
+            before = self._urgent, self._timeout_s
+            configured = self.settings.timeout_s
+            self._urgent = True
+            self._timeout_s = min(timeout_s or configured, configured)
+            try:
+                yield
+            finally:
+                self._urgent, self._timeout_s = before
 
     def __enter__(self) -> Bus:
         return self.open()
@@ -149,34 +172,57 @@ class Bus:
             self._resynchronise(error)
             raise
 
+    def broadcast(self, address: int, function: int, words: list[int]) -> None:
+        """Write registers of every unit on a serial line; no unit answers."""
+        self._emit("write", unit=0, address=address, words=words)
+        value = words[0] if function == 6 else words
+        with self._lock:
+            self._send(function, 0, address, value, no_response_expected=True)
+            self._quiet_until += TURNAROUND_S
+
     def _exchange(
         self, function: int, unit: int, address: int, *args: Any, **more: Any
     ) -> Any:
         with self._lock:
-            if self._client is None:
-                self.open()
-            time.sleep(max(0.0, self._quiet_until - time.monotonic()))
-            try:
-                send = getattr(self._client, METHODS[function])
-                reply = send(address, *args, device_id=unit, **more)
-            except Exception as error:
-                # pymodbus lets struct, index and socket errors of mangled frames out.
-                text = " ".join(f"{type(error).__name__}: {error}".split())
-                if "No response" in text:
-                    text = f"silent for {self.settings.timeout_s:g} s"
-                raise BusError(f"unit {unit}: no valid reply ({text})") from None
-            finally:
-                self._quiet_until = time.monotonic() + self.silence_s
-        if reply is None or reply.dev_id != unit:
-            raise BusError(f"unit {unit}: the reply is from another unit")
-        if reply.isError():
+            if not self._urgent:
+                self.check()  # holding the lock: nothing is sent after another's stop
+            self.silent.add(unit)
+            reply = self._send(function, unit, address, *args, **more)
+            if reply is None or reply.dev_id != unit:
+                raise BusError(f"unit {unit}: the reply is from another unit")
             code = int(getattr(reply, "exception_code", 0))
+            if code not in GATEWAY_CODES:
+                self.silent.discard(unit)
+        if reply.isError():
             name = EXCEPTIONS.get(code, "unknown")
             text = f"unit {unit} answered exception {code} ({name}) at 0x{address:04X}"
             raise Rejected(text, code)
         if reply.function_code != function:
             raise BusError(f"unit {unit}: a reply of function {reply.function_code}")
         return reply
+
+    def _send(
+        self, function: int, unit: int, address: int, *args: Any, **more: Any
+    ) -> Any:
+        if self._client is None:
+            self.open()
+        time.sleep(max(0.0, self._quiet_until - time.monotonic()))
+        try:
+            # Connecting, where it is lost, may take as long as configured.
+            self._client.comm_params.timeout_connect = self.settings.timeout_s
+            if not self._client.connect():
+                raise ConnectionError("cannot connect")
+            self._client.comm_params.timeout_connect = self._timeout_s
+            send = getattr(self._client, METHODS[function])
+            return send(address, *args, device_id=unit, **more)
+        except Exception as error:
+            # pymodbus lets struct, index and socket errors of mangled frames out.
+            text = " ".join(f"{type(error).__name__}: {error}".split())
+            if "No response" in text:
+                text = f"silent for {self._timeout_s:g} s"
+            raise BusError(f"unit {unit}: no valid reply ({text})") from None
+        finally:
+            self._quiet_until = time.monotonic() + self.silence_s
 
     def _resynchronise(self, error: BusError) -> None:
         """Empty the line, so that a late reply is not taken for the next one's."""
@@ -190,7 +236,7 @@ class Bus:
             if port is None:
                 return
             gap = max(0.02, 20 * 11.0 / self.settings.baudrate, self.silence_s)
-            end = time.monotonic() + 2 * self.settings.timeout_s
+            end = time.monotonic() + 2 * self._timeout_s
             try:
                 while time.monotonic() < end:
                     time.sleep(gap)

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Callable
 
 from rig.config.axis import Axis
 from rig.config.registers import Read, Writes, decode, encode
 from rig.device.bus import Bus, BusError, Rejected
 from rig.faults import MotionFault
+
+POLL_S = 0.05
+PASSING = (5, 6, 8, 10, 11)  # exceptions: acknowledge, busy, CRC; silence at a gateway
+START_S = 0.2  # a drive that has taken a move shows it within this time
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,19 +29,40 @@ class Status:
     fault: bool
 
 
+def refusal(error: BusError) -> bool:
+    """Whether the drive refused, rather than the line failed or a gateway spoke."""
+    return isinstance(error, Rejected) and error.code not in PASSING
+
+
 class Drive:
     """One axis's drive on the bus."""
 
     def __init__(self, bus: Bus, axis: Axis) -> None:
         self.bus = bus
         self.axis = axis
+        self.last: Status | None = None  # as last read
 
     def status(self, retries: int | None = None) -> Status:
-        """Read status and position; ``retries`` as configured where not given."""
+        """Read status and position.
+
+        Args:
+            retries: of each read. Where not given they are as configured, and the whole
+                is asked for once more: spoilt frames now and then spoil all tries.
+        """
+        try:
+            return self._status(retries)
+        except BusError as error:
+            if retries is not None or refusal(error):
+                raise
+            return self._status(None)
+
+    def _status(self, retries: int | None) -> Status:
         status = self.axis.map.status
         word = self._read(status, retries)
         position = self._read(self.axis.map.position, retries)
-        return Status(word, position, time.monotonic(), **status.flags(word))
+        flags = status.flags(word)
+        self.last = Status(word, position, time.monotonic(), **flags)
+        return self.last
 
     def sound(self) -> Status:
         """Status; MotionFault where the fault bit is set."""
@@ -74,12 +100,69 @@ class Drive:
             )
         self.write(axis.map.move, position=pulses, **axis.motion_counts())
 
+    def took(self, pulses: int, start: Status, tolerance: int) -> bool | None:
+        """Whether the drive obeys a move whose reply was lost; None: unknown.
+
+        A drive that obeys moves, has left ``start`` by more than ``tolerance`` pulses,
+        or stands at its target. One that does not holds another target, or has stood
+        idle at ``start`` for START_S.
+
+        Raises:
+            MotionFault: it is in alarm. BusError: it does not answer.
+        """
+        begun = time.monotonic()
+        while True:
+            status = self.sound()
+            other = self._target() not in (None, pulses)
+            idle = status.done and not status.moving
+            if idle and abs(status.position - pulses) <= tolerance:
+                return True
+            if status.moving or abs(status.position - start.position) > tolerance:
+                return None if other else True
+            if idle and other:
+                return False
+            if time.monotonic() - begun > START_S:
+                return False if idle else None
+            time.sleep(POLL_S)
+
+    def _target(self) -> int | None:
+        """The target that the drive holds; None where it cannot be read."""
+        read = self.axis.map.target
+        try:
+            return None if read is None else self._read(read)
+        except Rejected:
+            return None
+
     def stop(self) -> None:
         """Quick stop; torque stays on."""
         self.write(self.axis.map.stop)
 
     def write(self, table: Writes | None, **values: int) -> None:
-        """Send the frames of one of the map's tables; none where the map lacks it."""
+        """Send the frames of one of the map's tables; none where the map lacks it.
+
+        What moves the drive, or stops it, is sent once; the rest may be written twice,
+        and is retried as reads are.
+        """
+        m = self.axis.map
+        once = any(table is each for each in (m.move, m.home, m.stop))
+        tries = 1 if once else 1 + self.bus.settings.read_retries
+        while True:
+            tries -= 1
+            try:
+                return self._write(table, values)
+            except BusError as error:
+                if not tries or refusal(error):
+                    raise
+
+    def bring(self, table: Writes | None, ready: Callable[[Status], bool]) -> Status:
+        """Write a table and poll until its effect shows, at most the map's ready_s."""
+        self.write(table)
+        end = time.monotonic() + self.axis.map.ready_s
+        while not ready(status := self.status()) and time.monotonic() < end:
+            time.sleep(POLL_S)
+        return status
+
+    def _write(self, table: Writes | None, values: dict[str, int]) -> None:
         order = self.axis.map.word_order
         for frame in table.write if table else ():
             words: list[int] = []
@@ -97,6 +180,19 @@ class Drive:
             except Rejected as error:
                 found[name] = f"exception {error.code}"
         return found
+
+    def pulses_per_rev(self) -> int | None:
+        """Pulses for one motor turn by the drive's own word; None where it has none."""
+        read = self.axis.map.pulses_per_rev
+        try:
+            return self._read(read) or None if read else None
+        except Rejected:  # a model of the family without this register
+            return None
+
+    def homed(self, word: int) -> bool:
+        """Whether a status word says that the drive is homed."""
+        bits = self.axis.map.homed
+        return bits is not None and bits.holds(word)
 
     def _read(self, read: Read, retries: int | None = None) -> int:
         unit, order = self.axis.unit, self.axis.map.word_order

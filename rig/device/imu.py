@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import contextlib
 import http.server
 import itertools
-import socket
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 from rig.config.settings import ImuSettings
-from rig.device.stream import MAX_BODY, LineSplitter, Parser, Reading, StreamFault
+from rig.device.receive import LineReceiver, Senders, make_web
+from rig.device.stream import Parser, Reading, StreamFault
 from rig.faults import Fault
 
 RING = 8192  # readings kept: over half a minute at 200 Hz
-RECONNECT_S = 0.2
 
 
 class ImuError(Fault):
@@ -24,34 +23,48 @@ class ImuError(Fault):
 
 
 class Imu:
-    """The attitude of the phone, now and over the last seconds."""
+    """The attitude of the phone, now and over the last seconds.
 
-    def __init__(self, settings: ImuSettings) -> None:
+    Args:
+        settings: of the phone.
+        report: called with the event ``sender_refused``, its ``address`` and
+            ``reason``, once for each address, on the receiving thread.
+    """
+
+    def __init__(
+        self, settings: ImuSettings, report: Callable[..., Any] | None = None
+    ) -> None:
         self.settings = settings
         self.port = settings.port
+        self._report = report
+        self._senders = Senders(settings.allow, self._refused)
         self.connections = 0
         self._parser = Parser(settings)
         self._ring: deque[Reading] = deque(maxlen=RING)
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
-        self._listener: socket.socket | None = None
+        self._lines: LineReceiver | None = None
         self._web: http.server.HTTPServer | None = None
         self._arrived = 0.0
         self._fault = ""
 
     def open(self) -> Imu:
         """Listen, or begin to connect; ImuError where the port cannot be opened."""
-        s, receive = self.settings, self._receive_lines
+        s = self.settings
+        receive: Callable[[], None]
         try:
             if s.format == "sensorlogger":
-                self._web = _make_web(self._take_body, s.host, s.port)
-                self.port = self._web.server_address[1]
-                receive = self._web.serve_forever
-            elif s.transport == "listen":
-                self._listener = socket.create_server((s.host, s.port), backlog=2)
-                self._listener.settimeout(0.1)
-                self.port = self._listener.getsockname()[1]
+                self._web = make_web(s, self._take_body)
+                self.port, receive = (
+                    self._web.server_address[1],
+                    self._web.serve_forever,
+                )
+            else:
+                self._lines = LineReceiver(
+                    s, self._senders, self._begin, self._take_lines
+                )
+                self.port, receive = self._lines.port, self._lines.run
         except OSError as error:
             raise ImuError(
                 f"cannot open the IMU port {s.host}:{s.port}: {error.strerror or error}"
@@ -63,13 +76,18 @@ class Imu:
     def close(self) -> None:
         """Close every socket and end the thread."""
         self._closing.set()
+        if self._lines is not None:
+            self._lines.stop()
         if self._web is not None:
             self._web.shutdown()
             self._web.server_close()
         if self._thread is not None:
             self._thread.join(2.0)
-        if self._listener is not None:
-            self._listener.close()
+
+    @property
+    def sender(self) -> str:
+        """Address of the phone that is heard; empty while there is none."""
+        return self._senders.phone
 
     def __enter__(self) -> Imu:
         return self.open()
@@ -102,6 +120,12 @@ class Imu:
             recent = itertools.takewhile(lambda r: r.time >= start, newest)
             return [*recent][::-1]
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """Records that were accepted, and those dropped by reason."""
+        with self._lock:
+            return dict(self._parser.counts)
+
     def check_fault(self) -> None:
         """Raise ImuError where the stream was found not to be trusted."""
         if self._fault:
@@ -127,10 +151,45 @@ class Imu:
                     ) from None
             time.sleep(0.01)
 
-    def _take_body(self, body: bytes) -> None:
+    # On the receiving thread
+
+    def _refused(self, address: str, reason: str) -> None:
+        if self._report is None:
+            return
+        try:
+            self._report("sender_refused", address=address, reason=reason)
+        except Fault as fault:  # the journal cannot be written
+            self._fault = str(fault)
+
+    def _begin(self) -> None:
+        self.connections += 1
+        with self._lock:
+            self._parser.reconnected()
+
+    def _take_lines(self, lines: list[bytes], now: float) -> bool:
+        with self._lock:
+            try:
+                readings = [] if self._fault else self._parser.lines(lines, now)
+            except StreamFault as fault:
+                self._fault = str(fault)
+                return False
+            self._store(readings)
+        return bool(readings)
+
+    def _take_body(self, body: bytes, address: str) -> bool:
+        # A phone that keeps its connection must learn that nobody listens any more.
+        if self._closing.is_set() or not self._senders.admits(address):
+            return False
         with self._lock:
             self.connections = 1
-            self._store(self._parser.body(body, time.monotonic()))
+            readings = self._parser.body(body, time.monotonic())
+            self._store(readings)
+            foreign = self._parser.foreign
+        if foreign:
+            self._senders.refuse(address, "another device than before sends from there")
+        elif readings:
+            self._senders.phone = address
+        return not foreign
 
     def _store(self, readings: list[Reading]) -> None:
         if readings:
@@ -140,71 +199,3 @@ class Imu:
                 self._ring.append(reading)
             elif self._ring[-1].time - reading.time < 1e-3:
                 self._ring.append(Reading(self._ring[-1].time, reading.matrix))
-
-    def _receive_lines(self) -> None:
-        """Connection after connection, until closed or at a fault of the stream."""
-        s = self.settings
-        while not self._closing.is_set() and not self._fault:
-            with contextlib.suppress(OSError):  # none came in time, or it broke
-                if self._listener is not None:
-                    connection, _ = self._listener.accept()
-                else:
-                    connection = socket.create_connection((s.host, s.port), timeout=1.0)
-                with contextlib.closing(connection):
-                    self._receive(connection)
-            if self._listener is None:
-                self._closing.wait(RECONNECT_S)
-
-    def _receive(self, connection: socket.socket) -> None:
-        """Read one connection until it ends, is silent too long, or faults.
-
-        A phone that lost its Wi-Fi leaves a half-open connection behind and comes back
-        on a new one, so a silent connection is given up for the next.
-        """
-        self.connections += 1
-        splitter = LineSplitter()
-        connection.settimeout(0.1)
-        heard = time.monotonic()
-        patience = max(1.0, 2 * self.settings.stale_s)
-        with self._lock:
-            self._parser.reconnected()
-        while not self._closing.is_set():
-            try:
-                data = connection.recv(4096)
-            except TimeoutError:
-                if time.monotonic() - heard > patience:
-                    return
-                continue
-            if not data:
-                return
-            heard = time.monotonic()
-            with self._lock:
-                try:
-                    self._store(self._parser.lines(splitter.feed(data), heard))
-                except StreamFault as fault:
-                    self._fault = str(fault)
-                    return
-
-
-def _make_web(
-    take: Callable[[bytes], None], host: str, port: int
-) -> http.server.HTTPServer:
-    class Handler(http.server.BaseHTTPRequestHandler):
-        timeout = 5.0
-        protocol_version = "HTTP/1.1"
-
-        def do_POST(self) -> None:
-            length = self.headers.get("Content-Length", "")
-            if not length.isdecimal() or int(length) > MAX_BODY:
-                self.send_error(413)
-                self.close_connection = True
-                return
-            take(self.rfile.read(int(length)))
-            self.send_response(200)
-            self.send_header("Content-Length", "0")
-            self.end_headers()
-
-        def log_message(self, format: str, *args: object) -> None:
-            """Keep the terminal for the session."""
-
-    return http.server.ThreadingHTTPServer((host, port), Handler)

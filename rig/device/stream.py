@@ -83,6 +83,8 @@ class Parser:
         self._settings = settings
         self._width = settings.column_count or None
         self.counts: Counter[str] = Counter()
+        self.foreign = False  # the last message was of another device
+        self._device: Any = None  # deviceId of the phone that is heard
         self.reconnected()
 
     def reconnected(self) -> None:
@@ -101,18 +103,28 @@ class Parser:
         return self._accept(lines, self._line, now)
 
     def body(self, body: bytes, now: float) -> list[Reading]:
-        """Readings of one message Sensor Logger pushed."""
+        """Readings of one message Sensor Logger pushed; ``foreign`` says that it is
+        another phone's than those before."""
+        self.foreign = False
         try:
-            payload = json.loads(body)["payload"]
+            message = json.loads(body)
+            device = message.get("deviceId")
             entries = [
                 entry
-                for entry in payload
+                for entry in message["payload"]
                 if isinstance(entry, dict) and entry.get("name") == "orientation"
             ]
-        except (ValueError, TypeError, KeyError, RecursionError):
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
             self.counts["not a Sensor Logger message"] += 1
             return []
-        return self._accept(entries, self._entry, now)
+        if self._device is not None and device != self._device:
+            self.foreign = True
+            self.counts["of another device"] += 1
+            return []
+        readings = self._accept(entries, self._entry, now)
+        if readings:
+            self._device = device
+        return readings
 
     def _accept(self, records: list[Any], parse: Any, now: float) -> list[Reading]:
         readings = []

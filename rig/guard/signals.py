@@ -15,15 +15,18 @@ class Signals:
     """Ctrl-C once: finish the posture and pause; twice, SIGTERM or SIGHUP: stop now.
 
     While armed, a signal only sets a flag, so that no frame on the bus and no line of
-    the journal is cut in two; every loop looks at the flag at least every
-    ``bus.timeout_s``. While nothing can move, it ends the program at once.
+    the journal is cut in two; the flag is looked at before every frame and in every
+    loop. While nothing can move, it ends the program at once, but not a run that is
+    ending. Nothing is printed here: ``tell`` says from a loop what was asked for.
     """
 
     def __init__(self, say: Callable[[str], None] = lambda text: None) -> None:
         self.armed = False
+        self.ending = False  # the stop and the last lines of the journal are under way
         self.pause = False
         self._stop: StopRequested | None = None
         self._say = say
+        self._told = False
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> Signals:
@@ -39,15 +42,20 @@ class Signals:
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if number == signal.SIGINT and not self.pause and self.armed:
             self.pause = True
-            self._say("Ctrl-C: finishing this posture, then pausing; again to stop now")
             return
         self.request_stop(signal.Signals(number).name, 128 + number)
-        if not self.armed:
+        if not (self.armed or self.ending):
             self.check_stop()
 
     def request_stop(self, reason: str, exit_code: int) -> None:
         """Ask for a stop; the first request is the one that is kept."""
         self._stop = self._stop or StopRequested(reason, exit_code)
+
+    def tell(self) -> None:
+        """Say, once, that a pause was asked for."""
+        if self.pause and not self._told:
+            self._told = True
+            self._say("Ctrl-C: finishing this posture, then pausing; again to stop now")
 
     def check_stop(self) -> None:
         """Raise StopRequested where one has been asked for."""

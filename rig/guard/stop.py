@@ -1,25 +1,31 @@
 """Stopping: every unit, whatever happened, and proof that it stands.
 
-Nothing here touches JAX, the IMU or the plan. A stop goes to each unit by itself, goes
-on past units that fail, is repeated (a stop may be sent twice, unlike a move) and is
-verified by reading the status back. After a fault the latch stays on: only a new
-process, armed by a person, moves again.
+Nothing here touches JAX, the IMU or the plan. A stop goes to each unit by itself, to
+those that answered last first, and goes on past units that fail. It is repeated (a stop
+may be sent twice, unlike a move) and is verified by reading the status back. After a
+fault the latch stays on: only a new process, armed by a person, moves again.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import threading
 import time
 from collections.abc import Callable
 from typing import Any
 
+from rig.config.registers import encode
+from rig.device.bus import Bus
 from rig.device.drives import Drive
 from rig.faults import EXIT_FAULT, StopRequested
 
 ROUNDS = 3  # times a stop is sent to a unit that does not acknowledge
+QUICK_S = 0.05  # for a reply in the first round, besides the time of the frames
+FRAME_BITS = 2 * 24 * 11  # of a stop and its reply on a serial line, at most
 VERIFY_S = 3.0  # for all units together to come to rest
 POLL_S = 0.02
+STILL_COUNTS = 2  # between two readings of a position that flickers by one count
 
 
 @dataclasses.dataclass
@@ -40,39 +46,60 @@ class UnitStop:
 
 
 def stop_all(drives: list[Drive]) -> list[UnitStop]:
-    """Quick-stop every drive, and wait for them to come to rest.
+    """Quick-stop every drive of one bus, and wait for them to come to rest.
+
+    The first round waits a short time for each reply, so that a dead unit delays the
+    others by no more than that; units that did not answer before come last. The next
+    rounds wait as long as configured for those that have not acknowledged.
 
     Never raises, never leaves one out: one that fails does not keep the others from
     their stop.
     """
     results = [UnitStop(d.axis.name, d.axis.unit) for d in drives]
-    pairs = list(zip(drives, results, strict=True))
-    for _ in range(ROUNDS):
-        for drive, result in pairs:
-            if not result.acknowledged:
-                _send(drive, result)
-    end = time.monotonic() + VERIFY_S
-    before: dict[str, int] = {}
-    while not all(result.standing for result in results):
-        for drive, result in pairs:
-            if result.standing:
-                continue
-            try:
-                status = drive.status(retries=0)
-            except Exception as error:
-                result.detail = str(error)
-                continue
-            if not result.acknowledged:
-                _send(drive, result)
-            still = status.position == before.get(result.axis)
-            result.standing = still and not status.moving
-            before[result.axis] = status.position
-            if result.standing and result.acknowledged:
-                result.detail = "alarm" if status.fault else ""
-        if time.monotonic() > end:
-            break
-        time.sleep(POLL_S)
+    if not drives:
+        return results
+    bus, pairs = drives[0].bus, list(zip(drives, results, strict=True))
+    with bus.urgent():
+        with bus.urgent(_quick_s(bus)):
+            _broadcast(drives)
+            _round(pairs)
+        for _ in range(ROUNDS - 1):
+            _round(pairs)
+        _verify(pairs)
     return results
+
+
+Pairs = list[tuple[Drive, UnitStop]]
+
+
+def _quick_s(bus: Bus) -> float:
+    return QUICK_S + FRAME_BITS / bus.settings.baudrate
+
+
+def _responsive_first(pairs: Pairs) -> Pairs:
+    return sorted(pairs, key=lambda pair: pair[0].axis.unit in pair[0].bus.silent)
+
+
+def _broadcast(drives: list[Drive]) -> None:
+    """One frame for all of a serial line, where all are of a family that takes it."""
+    bus, family = drives[0].bus, drives[0].axis.map
+    alike = all(drive.axis.map.stop == family.stop for drive in drives)
+    if bus.settings.transport == "tcp" or not (alike and family.broadcast_stop):
+        return
+    with contextlib.suppress(Exception):  # an extra: each unit gets its own as well
+        for frame in family.stop.write:
+            words = [
+                word
+                for value, kind in frame.words
+                for word in encode(int(value), kind, family.word_order)
+            ]
+            bus.broadcast(frame.address, frame.function, words)
+
+
+def _round(pairs: Pairs) -> None:
+    for drive, result in _responsive_first(pairs):
+        if not result.acknowledged:
+            _send(drive, result)
 
 
 def _send(drive: Drive, result: UnitStop) -> None:
@@ -82,6 +109,33 @@ def _send(drive: Drive, result: UnitStop) -> None:
         result.detail = ""
     except Exception as error:
         result.detail = str(error)
+
+
+def _verify(pairs: Pairs) -> None:
+    """Poll until each stands; one that answers again is told to stop once more."""
+    end = time.monotonic() + VERIFY_S
+    before: dict[str, int] = {}
+    while moving := [pair for pair in pairs if not pair[1].standing]:
+        for drive, result in _responsive_first(moving):
+            bus = drive.bus
+            wait_s = _quick_s(bus) if drive.axis.unit in bus.silent else None
+            try:
+                with bus.urgent(wait_s):
+                    status = drive.status(retries=0)
+            except Exception as error:
+                result.detail = str(error)
+                continue
+            if not result.acknowledged:
+                _send(drive, result)
+            last = before.get(result.axis)
+            still = last is not None and abs(status.position - last) <= STILL_COUNTS
+            result.standing = still and not status.moving
+            before[result.axis] = status.position
+            if result.standing and result.acknowledged:
+                result.detail = "alarm" if status.fault else ""
+        if time.monotonic() > end:
+            return
+        time.sleep(POLL_S)
 
 
 class Stopper:
@@ -100,9 +154,9 @@ class Stopper:
 
     def stop(self, reason: str, latch: bool = True) -> list[UnitStop]:
         """Stop every unit now; the first reason is the one that is kept."""
+        if latch and not self.reason:  # before the lock: whoever moves looks at it
+            self.reason = reason or "stopped"
         with self._lock:
-            if latch and not self.reason:
-                self.reason = reason or "stopped"
             self.results = stop_all(self.drives)
             units = [dataclasses.asdict(result) for result in self.results]
             self._emit("stop", reason=reason, units=units)

@@ -23,8 +23,22 @@ def event_lines(record: dict[str, Any]) -> list[str]:
             return [f"zero taken at pulses {record['pulses']}"]
         case "void":
             return [f"  withdrawn, to be measured again: {', '.join(record['names'])}"]
+        case "lost_reply":
+            found = {
+                "obeyed": "the drive obeys",
+                "not taken": "the drive did not take it, so it is sent again",
+                "unknown": "whether the drive took it is unknown, so all stop",
+            }[record["outcome"]]
+            return [f"  the reply to a move of {record['axis']} was lost: {found}"]
+        case "sender_refused":
+            return [f"WARNING: {record['reason']}"]
         case "unreachable":
             return [f"  {record['name']} is out of reach: {record['reason']}"]
+        case "comm_restored" if record["error"]:
+            return [
+                f"{record['axis']}: its communication timeout was not put back to "
+                f"{record['counts']} ({record['error']}); `resume` does it"
+            ]
         case "stop":
             units = [f"  {UnitStop(**unit)}" for unit in record["units"]]
             return [f"stop: {record['reason'] or 'end of run'}", *units]
@@ -68,29 +82,84 @@ def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
         values = "  ".join(f"{a[i]:8.5f} +- {wide[i]:.5f}" for i in range(3))
         lines.append(f"  {name:<5} [{values}]   {b:8.4f} +- {wide[3]:.4f}")
     lines.append(f"  {noise_text(summary)}")
-    if "before" in summary:
+    if "after" in summary:
         lines.append(f"held-out {error_text(summary)}")
-    if summary["drift_deg"] is not None:
+    elif "prediction_max" in summary:  # a refit: nothing was compensated by it
+        lines.append(
+            f"held-out postures predicted to {summary['prediction_rms']:.4f} deg rms "
+            f"(max {summary['prediction_max']:.4f})"
+        )
+    if summary.get("drift"):
+        lines.append(f"drift: {drift_text(summary['drift'])}")
+    elif summary["drift_deg"] is not None:  # of version 1
         lines.append(
             f"zero posture at the end: {summary['drift_deg']:.4f} deg from zero"
         )
     if summary["orders"]["warning"]:
         lines.append(f"WARNING: {summary['orders']['warning']}")
-    if "after" in summary and summary["after"]["max"] > limit_deg:
+    if reasons := recalibrate(summary, limit_deg):
         lines.append(
-            "RECALIBRATE: the error after compensation exceeds "
-            f"session.verify_limit_deg ({limit_deg:g}). Do not use this calibration "
-            "before the cause is known"
+            f"RECALIBRATE: {' and '.join(reasons)}. Do not use this calibration before "
+            "the cause is known"
         )
     return lines
 
 
-def noise_text(summary: dict[str, Any]) -> str:
-    """Where the noise was taken from, and its size."""
-    return (
-        f"noise of one posture {summary['noise_std_deg'][0]:.4f} deg, from "
-        f"{summary['basis']} ({summary['dof']} degrees of freedom)"
+def recalibrate(summary: dict[str, Any], limit_deg: float) -> list[str]:
+    """Why a calibration is not to be used; nothing where all is well."""
+    reasons = []
+    what, worst = "after compensation", summary.get("after", {}).get("max", 0.0)
+    if "after" not in summary:
+        what, worst = "of the prediction", summary.get("prediction_max", 0.0)
+    if worst > limit_deg:
+        limit = f"session.verify_limit_deg ({limit_deg:g})"
+        reasons.append(f"the error {what} exceeds {limit}")
+    if summary.get("drift") and summary["drift"]["over"]:
+        limit = f"session.drift_limit_deg ({summary['drift']['limit_deg']:g})"
+        reasons.append(f"the drift of the zero that is left exceeds {limit}")
+    return reasons
+
+
+def drift_text(drift: dict[str, Any]) -> str:
+    """How far the zero drifted, and what was done about it."""
+    worst = int(np.argmax(np.abs(drift["angles_deg"]).max(axis=0)))
+    text = (
+        f"the zero posture read up to {drift['size_deg']:.4f} deg from zero "
+        f"({AXIS_NAMES[worst]}) on later visits (limit {drift['limit_deg']:g})"
     )
+    if drift["corrected"]:
+        rate = drift["rate_deg_per_min"][worst]
+        text += (
+            f"; linear, {rate:+.4f} deg/min, and taken out: {drift['left_deg']:.4f} "
+            "deg are left"
+        )
+    if drift["over"]:
+        kind = "" if drift["bend_deg"] is None else "It is not linear. "
+        text += (
+            f". {kind}Look for a loose phone, play, or a magnetic heading near the "
+            "motors"
+        )
+    return text
+
+
+def noise_text(summary: dict[str, Any]) -> str:
+    """How large the noise is, axis by axis, and where it was taken from."""
+    noise = (f"{name} {value:.4f}" for name, value in _named(summary["noise_std_deg"]))
+    text = (
+        f"noise of one posture {', '.join(noise)} deg, from {summary['basis']} "
+        f"({summary['dof']} degrees of freedom"
+    )
+    if "effective_samples" not in summary:  # of version 1
+        return f"{text})"
+    as_good = (f"{value:.1f}" for value in summary["effective_samples"])
+    return (
+        f"{text} each); {summary['samples']} readings are correlated and count as "
+        f"{', '.join(as_good)}"
+    )
+
+
+def _named(values: Any) -> Any:
+    return zip(AXIS_NAMES, values, strict=True)
 
 
 def choice_text(choice: dict[str, Any]) -> str:

@@ -55,6 +55,30 @@ def read_journal(path: pathlib.Path) -> list[Record]:
         raise JournalError(f"{path}: {error.strerror or error}") from None
 
 
+def is_written(path: pathlib.Path) -> bool:
+    """A running session holds the journal; the lock ends with its process."""
+    try:
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        pass
+    return False
+
+
+def measured_postures(records: list[Record]) -> dict[str, Record]:
+    """Every posture measured and not withdrawn since, by name, in order."""
+    found: dict[str, Record] = {}
+    for record in records:
+        if record["event"] == "posture":
+            found[record["name"]] = record
+        elif record["event"] == "void":
+            for name in record["names"]:
+                found.pop(name, None)
+    return found
+
+
 class Journal:
     """The one writer of a journal; a second one on the same run is refused."""
 
@@ -67,7 +91,7 @@ class Journal:
         except OSError as error:
             raise JournalError(f"{path}: {error.strerror or error}") from None
         try:
-            fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._claim()
             self.records, self._size = _parse(path.read_bytes(), path)
             os.ftruncate(self._fd, self._size)
         except BlockingIOError:
@@ -76,6 +100,15 @@ class Journal:
         except BaseException:
             self.close()
             raise
+
+    def _claim(self) -> None:
+        """Lock the file. A live page that asks `is_written` holds it for an instant."""
+        for _ in range(20):
+            with contextlib.suppress(BlockingIOError):
+                fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+            time.sleep(0.01)
+        fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def write(self, event: str, *, sync: bool = False, **fields: Any) -> Record:
         """Append one record; with ``sync`` it is on the disk when this returns.
@@ -94,9 +127,11 @@ class Journal:
                     written += os.write(self._fd, data[written:])
                 if sync:
                     os.fsync(self._fd)
-            except OSError as error:
+            except BaseException as error:  # a signal's too, while nothing is armed
                 with contextlib.suppress(OSError):  # or the next writer cuts it off
                     os.ftruncate(self._fd, self._size)
+                if not isinstance(error, OSError):
+                    raise
                 raise JournalError(
                     f"cannot write {self.path}: {error.strerror or error}"
                 ) from None

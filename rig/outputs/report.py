@@ -1,78 +1,187 @@
-"""report.html of a calibration: all numbers and figures in one file.
+"""report.html of a run of any kind, also of one that is not finished.
 
-Loaded after the last move. Figures need matplotlib; without it the page says so.
+Made from the journal and, where there is one, the summary; loaded after the last move.
+Figures need matplotlib; without it the page says so.
 """
 
 from __future__ import annotations
 
+import datetime
+import json
 import pathlib
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from jaxcal.pages import Figure, Page, Section, Strong, Table, Text, write_page
+from jaxcal.pages import Page, Section, Strong, Table, Text, write_page
 from rig.config import AXIS_NAMES
-from rig.outputs.console import choice_text, noise_text
+from rig.faults import Refused
+from rig.outputs import figures
+from rig.outputs.console import (
+    choice_text,
+    drift_text,
+    event_lines,
+    noise_text,
+    numbers,
+    recalibrate,
+)
+from rig.outputs.figures import drawn as _drawn
+from rig.outputs.journal import Record, measured_postures
+from rig.readings import angles, recorded_frame
 
 FOOTER = (
     "Research software, not a medical device. Calibrate with no patient attached; a "
     "hardware emergency stop is required."
 )
-MARKERS = {"select": "o", "before": "^", "after": "v", "reference": "s"}
-PLANES = ((0, 1), (0, 2), (1, 2))
+ENDS = ("end", "paused", "fault", "stopped", "refused")
+TOLD = (*ENDS, "resume", "stop", "void", "unreachable", "replan", "sender_refused")
+MOST_ROWS = 60  # of the table of postures; more are in pairs.csv
 
 
-def write_report(
-    folder: pathlib.Path,
-    summary: dict[str, Any],
-    start: dict[str, Any],
-    postures: dict[str, dict[str, Any]],
-) -> pathlib.Path:
-    """Write ``report.html`` of a run; returns its path."""
-    records, orders = list(postures.values()), summary["orders"]
+def write_report(folder: pathlib.Path, records: list[Record]) -> pathlib.Path:
+    """Write ``report.html`` of a run, from the records of its journal.
+
+    Raises:
+        Refused: they are not those of a run.
+    """
+    if not records or records[0]["event"] != "start":
+        raise Refused(f"{folder} holds no run")
+    start, summary = records[0], {}
+    if (folder / "summary.json").is_file():
+        text = (folder / "summary.json").read_text(encoding="utf-8")
+        summary = json.loads(text)
     made = f"{start['started']} on {start['host']}, jaxcal {start['jaxcal']}"
     intro = [Text([made, "."])]
-    if summary.get("simulated"):
+    if start.get("simulated"):
         intro = [Text([made, ", ", Strong("simulated rig"), "."])]
-    if orders["warning"]:
-        intro.append(Text(orders["warning"], "warning"))
+    intro += [_ending(records), *_warnings(summary, start)]
+    blocks: dict[str, list[Any]] = {
+        **(_calibrated(summary) if "A" in summary else {}),
+        **_checked(summary),
+        **_measured(start, records),
+        **_told(records),
+    }
+    sections = [Section(title, parts) for title, parts in blocks.items()]
+    path, kind = folder / "report.html", str(start["mode"])
+    kind = {"calibrate": "Calibration"}.get(kind, kind.capitalize())
+    title = f"{kind} {folder.name}"
+    write_page(path, Page(title, sections, intro=intro, footer=(FOOTER,)))
+    return path
+
+
+def _ending(records: list[Record]) -> Text:
+    """How the run ended, or that it did not."""
+    last = next((r for r in reversed(records) if r["event"] in (*ENDS, "resume")), None)
+    if last is None or last["event"] == "resume":
+        if any(record["event"] == "phase" for record in records[-3:]):
+            text = "The report was written by the run itself, before its last record."
+            if records[-1].get("phase") == "finishing":
+                return Text(text, "note")
+        return Text("This run has no end: it still runs, or it was killed.", "warning")
+    if last["event"] == "end":
+        return Text(f"Ended with exit code {last['code']}.")
+    return Text(f"Ended: {last['event']}. {last['reason']}", "warning")
+
+
+def _warnings(summary: Record, start: Record) -> list[Text]:
+    found = []
+    if text := summary.get("orders", {}).get("warning"):
+        found.append(Text(text, "warning"))
+    limit = start["config"]["session"]["verify_limit_deg"]
+    if reasons := recalibrate(summary, summary.get("limit_deg", limit)):
+        found.append(Text(f"RECALIBRATE: {' and '.join(reasons)}.", "warning"))
+    return found
+
+
+def _calibrated(summary: Record) -> dict[str, list[Any]]:
+    """A and b, how they were found, and what was changed by a refit."""
     blocks: dict[str, list[Any]] = {
         "y = A u + b, degrees, ± 95 % for all twelve at once": [
             _fitted(summary),
             f"{noise_text(summary).capitalize()}. Measured postures: "
             f"{', '.join(summary['postures'])}.",
-        ],
-        "Choice": [
-            f"{choice_text(summary['choice'])}. {summary['choice']['note']}",
-            _drawn(_postures, records, (10, 3.2), "commanded postures, three planes"),
-        ],
+        ]
     }
-    if "before" in summary:
-        alt = "held-out errors, raw and compensated"
-        blocks["Held-out error, degrees"] = [
-            _compared(summary), _drawn(_errors, summary, (9, 3.4), alt)
+    if changes := summary.get("changed"):
+        rows = [[key, str(old), str(new)] for key, (old, new) in changes.items()]
+        head = ["key of rig.toml", "as recorded", "here"]
+        blocks[f"Identified anew from {summary['refit_of']}"] = [
+            Table(head, rows, numeric=False), _moved(summary)
         ]  # fmt: skip
-    if orders["rms"]:
+    if choice := summary.get("choice"):
+        blocks["Choice"] = [f"{choice_text(choice)}. {choice['note']}"]
+    if summary.get("drift"):
+        blocks["Drift"] = [f"{drift_text(summary['drift']).capitalize()}."]
+    elif summary.get("drift_deg") is not None:  # of version 1
+        text = f"The zero posture read {summary['drift_deg']:.4f} deg from zero."
+        blocks["Drift"] = [text]
+    if (orders := summary["orders"])["rms"]:
         rows = [
             [order + " (configured)" * (order == orders["configured"]), f"{rms:.4f}"]
             for order, rms in orders["rms"].items()
         ]
         title = "Residual under each Euler order, degrees rms"
         blocks[title] = [Table(["order", "residual"], rows)]
+    return blocks
+
+
+def _checked(summary: Record) -> dict[str, list[Any]]:
+    """Errors at held-out targets."""
+    if "before" not in summary:
+        return {}
+    alt = "held-out errors, raw and compensated"
+    rows = []
+    for title, key in (("raw", "before"), ("compensated", "after")):
+        if key in summary:
+            found = summary[key]
+            values = (*found["rms_axis"], found["rms"], found["max"])
+            rows.append([title, *(f"{value:.4f}" for value in values)])
+    parts: list[Any] = [Table(["", *AXIS_NAMES, "rms", "max"], rows)]
+    if "after" in summary:
+        parts.append(_drawn(figures.errors, summary, (9, 3.4), alt))
+    if "prediction_rms" in summary:
+        rms = summary["prediction_rms"]
+        parts.append(f"Predicted by the calibration to {rms:.4f} deg rms.")
+    return {"Held-out error, degrees": parts}
+
+
+def _measured(start: Record, records: list[Record]) -> dict[str, list[Any]]:
+    """Every posture measured so far, and its readings."""
+    postures = list(measured_postures(records).values())
+    planned = next((r for r in records if r["event"] in ("plan", "collection")), None)
+    if not postures:
+        what = "planned" if planned else "planned or measured"
+        return {"Postures": [f"Nothing was {what if planned is None else 'measured'}."]}
+    shown = [
+        [r["name"], *(numbers(r[f"{what}_deg"], 0, 3) for what in ("commanded",
+         "measured")), numbers(r["std_deg"], 0, 4)]
+        for r in postures[:MOST_ROWS]
+    ]  # fmt: skip
+    head = ["posture", "commanded [deg]", "measured [deg]", "scatter [deg]"]
+    table = Table(head, shown, f"{len(postures)} measured; in order, of them the first")
+    alt = "commanded postures, three planes"
+    parts = [_drawn(figures.postures, postures, (10, 3.2), alt), table]
+    zero = [record for record in records if record["event"] == "zero"][-1]
+    frame = recorded_frame(start["config"], zero)
+    off = [angles(r, frame) - np.array(r["measured_deg"]) for r in postures]
     alt = "readings of every posture about their mean"
-    blocks["Readings"] = [_drawn(_readings, records, (9, 4), alt)]
-    if (drift := summary["drift_deg"]) is not None:
-        text = f"The zero posture read {drift:.4f} deg from zero at the end."
-        blocks["Readings"].append(text)
-    sections = [Section(title, parts) for title, parts in blocks.items()]
-    path = folder / "report.html"
-    title = f"Calibration {folder.name}"
-    write_page(path, Page(title, sections, intro=intro, footer=(FOOTER,)))
-    return path
+    return {"Postures": parts, "Readings": [_drawn(figures.readings, off, (9, 4), alt)]}
 
 
-def _fitted(summary: dict[str, Any]) -> Table:
+def _told(records: list[Record]) -> dict[str, list[Any]]:
+    """Faults, stops, and whatever else happened on the way."""
+    rows = []
+    for record in records:
+        if record["event"] in TOLD:
+            when = datetime.datetime.fromtimestamp(record["time"])
+            words = " ".join(event_lines(record)) or record.get("reason", "")
+            rows.append([f"{when:%H:%M:%S}", record["event"], words])
+    if not rows:
+        return {}
+    return {"What happened": [Table(["", "event", ""], rows, numeric=False)]}
+
+
+def _fitted(summary: Record) -> Table:
     values = np.column_stack([summary["A"], summary["b"]])
     rows = [
         [name, *(f"{v:.5f} ± {w:.5f}" for v, w in zip(row, wide, strict=True))]
@@ -81,64 +190,12 @@ def _fitted(summary: dict[str, Any]) -> Table:
     return Table(["", *(f"u {name}" for name in AXIS_NAMES), "b"], rows)
 
 
-def _compared(summary: dict[str, Any]) -> Table:
-    rows = []
-    for title, key in (("raw", "before"), ("compensated", "after")):
-        found = summary[key]
-        values = (*found["rms_axis"], found["rms"], found["max"])
-        rows.append([title, *(f"{value:.4f}" for value in values)])
-    return Table(["", *AXIS_NAMES, "rms", "max"], rows)
-
-
-def _drawn(
-    draw: Callable[[Any, Any], None], data: Any, size: tuple[float, float], alt: str
-) -> Any:
-    try:
-        import matplotlib.figure
-
-        from jaxcal.plots import as_bytes
-    except ModuleNotFoundError:
-        missing = "no figure: matplotlib is not installed (pip install 'jaxcal[study]')"
-        return Text(f"{alt}: {missing}", "note")
-    figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
-    draw(figure, data)
-    return Figure(as_bytes(figure, "png"), alt)
-
-
-def _errors(figure: Any, summary: dict[str, Any]) -> None:
-    axes = figure.subplots(1, 2, sharex=True)
-    for axis, key, title in zip(
-        axes, ("before", "after"), ("raw", "compensated"), strict=True
-    ):
-        each = np.array(summary[key]["each"])
-        axis.axhline(0.0, color="#9aa5b1", linewidth=0.8)
-        places = np.arange(3) + np.linspace(-0.15, 0.15, len(each))[:, None]
-        axis.plot(places, each, "o")
-        axis.set_xticks(range(3), AXIS_NAMES)
-        axis.set_ylabel("measured - desired [deg]")
-        axis.set_title(f"{title}: {summary[key]['rms']:.4f} deg rms")
-
-
-def _postures(figure: Any, records: list[dict[str, Any]]) -> None:
-    axes = figure.subplots(1, 3)
-    for axis, (a, b) in zip(axes, PLANES, strict=True):
-        for role, marker in MARKERS.items():
-            points = [r["commanded_deg"] for r in records if r.get("role") == role]
-            if points:
-                u = np.array(points)
-                axis.plot(u[:, a], u[:, b], marker, label=role)
-        axis.set_xlabel(f"{AXIS_NAMES[a]} [deg]")
-        axis.set_ylabel(f"{AXIS_NAMES[b]} [deg]")
-    axes[0].legend(fontsize=8)
-
-
-def _readings(figure: Any, records: list[dict[str, Any]]) -> None:
-    off = [np.array(r["raw_deg"]) - np.array(r["measured_deg"]) for r in records]
-    ends = np.cumsum([len(values) for values in off])
-    axes = figure.subplots(3, 1, sharex=True)
-    for column, (axis, name) in enumerate(zip(axes, AXIS_NAMES, strict=True)):
-        for values, end in zip(off, ends, strict=True):
-            place = np.arange(end - len(values), end)
-            axis.plot(place, values[:, column], ".", markersize=2)
-        axis.set_ylabel(f"{name} [deg]")
-    axes[-1].set_xlabel("reading, posture by posture, less the posture's mean")
+def _moved(summary: Record) -> Table:
+    then = np.column_stack([summary["was"]["A"], summary["was"]["b"]])
+    moved = np.column_stack([summary["A"], summary["b"]]) - then
+    rows = [
+        [name, *(f"{value:+.5f}" for value in row)]
+        for name, row in zip(AXIS_NAMES, moved, strict=True)
+    ]
+    head = ["changed by", *(f"u {name}" for name in AXIS_NAMES), "b"]
+    return Table(head, rows)

@@ -8,18 +8,14 @@ from typing import Any
 import numpy as np
 
 from rig.attitude import Array
-from rig.config import AXIS_NAMES
+from rig.device.record import SIGN_CHECKED
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault
 from rig.guard.limits import check_plan
-from rig.outputs.console import plan_lines, summary_lines
+from rig.identification.conclusion import Evidence, conclude
+from rig.identification.fit import fit, held_out_errors
+from rig.outputs.console import plan_lines, recalibrate, summary_lines
 from rig.outputs.journal import Record
-from rig.session.identification import (
-    errors,
-    fit,
-    mean_variance,
-    order_residuals,
-    uncertainty,
-)
+from rig.session.checks import check_matrix
 from rig.session.planning import (
     Choice,
     choose,
@@ -29,33 +25,36 @@ from rig.session.planning import (
 )
 from rig.session.run import Run
 
+MIDDLE, END = "reference:middle", "reference:end"  # visits of the zero posture
+
 
 def calibrate(run: Run) -> int:
     """Run the whole session; returns the exit code."""
     config, session = run.config, run.config.session
     candidates, choice = _plan(run)
     check_plan(config, [tuple(candidates[i].tolist()) for i in choice.indices])
-    run.planned = session.k + 2 * session.verify_postures + 1
+    run.planned = session.k + 2 * session.verify_postures + 2
     if run.zero_pulses is None:
         run.ready()
     chosen = _visit_chosen(run, candidates, choice)
     run.emit("phase", phase="saving")
     first = fit(chosen)
+    _check_gains(run, first.matrix)
     first.save(run.folder / "calibration.partial.json")
     held = _held_out(run, first)
-    run.planned = session.k + 2 * len(held) + 1
-    held_out, off = visit_pairs(run, held)
-    end = run.visit("reference:end", run.zero_pulses, role="reference")
+    run.planned = session.k + 2 * len(held) + 2
+    # A run of version 1 that has visited the end already had no visit in the middle.
+    if held and END not in run.postures():
+        run.visit(MIDDLE, run.zero_pulses, role="reference")
+    held_out, _ = visit_pairs(run, held)
+    run.visit(END, run.zero_pulses, role="reference")
     run.say("drives at rest; identifying")
     run.emit("phase", phase="finishing")
     run.stop("", latch=False)
     run.disarm()
     run.signals.check_stop()
-    summary = _identify(run, first, chosen, held_out) | off
+    summary = _identify(run, chosen, held, held_out)
     summary["choice"] = dataclasses.asdict(choice)
-    summary["drift_deg"] = None
-    if end is not None:
-        summary["drift_deg"] = float(np.abs(end["measured_deg"]).max())
     return _save(run, summary)
 
 
@@ -90,7 +89,9 @@ def _visit_chosen(run: Run, candidates: Array, choice: Choice) -> list[Record]:
     plans = iter(run.journal.events("replan"))
     while True:
         left = np.array([i for i in choice.indices if i not in records], dtype=int)
-        for index in left[travel_order(config, degrees[left], here)].tolist():
+        queue = left[travel_order(config, degrees[left], here)].tolist()
+        run.emit("queue", names=[f"select:{index}" for index in queue])
+        for index in queue:
             record = run.visit(
                 f"select:{index}", candidates[index], role="select", index=index
             )
@@ -115,6 +116,15 @@ def _visit_chosen(run: Run, candidates: Array, choice: Choice) -> list[Record]:
             f"  selected again without {index}: log det {choice.log_det:.4f}, "
             f"{len(records)} measured postures kept"
         )
+
+
+def _check_gains(run: Run, matrix: Any) -> None:
+    """Refuse a fit whose axes are reversed or exchanged: the sign check is void."""
+    try:
+        run.say(*(f"WARNING: {text}" for text in check_matrix(matrix)))
+    except MotionFault as fault:
+        run.record.void(SIGN_CHECKED, str(fault))
+        raise
 
 
 def _held_out(run: Run, calibration: Any) -> list[Any]:
@@ -160,54 +170,29 @@ def visit_pairs(run: Run, held: list[Any]) -> tuple[list[Record], dict[str, Any]
     points = config.to_deg([pulses for *_, pulses in visits] or np.empty((0, 3)))
     start = config.to_deg(run.zero_pulses or (0, 0, 0))
     found: dict[str, Record] = {}
-    for number in travel_order(config, points, start):
+    queue = travel_order(config, points, start)
+    run.emit("queue", names=[visits[number][0] for number in queue])
+    for number in queue:
         name, role, pulses = visits[number]
         if record := run.visit(name, pulses, role=role):
             found[name] = record
-    both = [i for i in range(len(held)) if found.keys() >= {f"{r}:{i}" for r in roles}]
-    if not both:
-        return [], {}
-    records = {role: [found[f"{role}:{i}"] for i in both] for role in roles}
-    desired = config.to_deg([held[i][0] for i in both])
-    off = {role: errors(records[role], desired) for role in roles}
-    return records["before"] + records["after"], off
+    return held_out_errors(config, held, found)
 
 
 def _identify(
-    run: Run, first: Any, chosen: list[Record], held_out: list[Record]
+    run: Run, chosen: list[Record], held: list[Any], held_out: list[Record]
 ) -> dict[str, Any]:
     """Identify A and b, save calibration.json; what the summary says of them."""
-    assert run.frame is not None
-    config = run.config
+    postures = run.postures()
+    references = [postures[name] for name in (MIDDLE, END) if name in postures]
     zero = run.journal.events("zero")[-1]
-    limits = uncertainty(first, chosen, held_out, zero)
-    shared = {
-        "zero_pulses": list(run.zero_pulses or ()),
-        "fingerprint": config.fingerprint(),
-        "postures": [record["name"] for record in chosen],
-    }
-    notes = shared | {
-        "mechanism_order": config.mechanism.order,
-        "noise_from": limits["basis"],
-        "run": run.folder.name,
-    }
-    noise = float(np.mean(limits["noise_std_deg"]))
-    zero_std = float(np.sqrt(mean_variance(zero).mean()))
-    calibration = fit(chosen, noise, notes, zero_std)
+    evidence = Evidence(zero, chosen, held, held_out, references)
+    notes = {"run": run.folder.name}
+    calibration, summary = conclude(run.config, evidence, notes)
     calibration.save(run.folder / "calibration.json")
     (run.folder / "calibration.partial.json").unlink(missing_ok=True)
-    return {
-        "schema": 1,
-        "mode": "calibrate",
-        "axes": list(AXIS_NAMES),
-        "unit": "deg",
-        "A": np.asarray(calibration.matrix).tolist(),
-        "b": np.asarray(calibration.bias).tolist(),
-        **limits,
-        **shared,
-        "orders": order_residuals(config, run.frame, chosen + held_out),
-        "simulated": run.journal.records[0].get("simulated"),
-    }
+    simulated = run.journal.records[0].get("simulated")
+    return {"mode": "calibrate", **summary, "simulated": simulated}
 
 
 def _save(run: Run, summary: dict[str, Any]) -> int:
@@ -216,11 +201,10 @@ def _save(run: Run, summary: dict[str, Any]) -> int:
 
     run.save_pairs()
     run.save_summary(summary)
-    write_report(run.folder, summary, run.journal.records[0], run.postures())
+    write_report(run.folder, run.journal.records)
     limit = run.config.session.verify_limit_deg
     run.say(
         *summary_lines(summary, limit),
         f"saved: {run.folder}/calibration.json, pairs.csv, summary.json, report.html",
     )
-    off = "after" in summary and summary["after"]["max"] > limit
-    return EXIT_RECALIBRATE if off else EXIT_OK
+    return EXIT_RECALIBRATE if recalibrate(summary, limit) else EXIT_OK

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import pathlib
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxcal.files import atomic_write
 from rig.attitude import Array
-from rig.config.axis import Pulses
+from rig.config import RigConfig
+from rig.config.config import differences
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
+from rig.identification.fit import pairs
 from rig.outputs.console import error_text, numbers
 from rig.session.calibrate import visit_pairs
-from rig.session.identification import pairs
 from rig.session.planning import draw, draw_held_out
+from rig.session.reference import KeptZero
 from rig.session.run import Run
 
 
@@ -52,8 +54,20 @@ def collect(run: Run, count: int) -> int:
     return EXIT_OK
 
 
-def load_calibration(path: pathlib.Path) -> tuple[Any, Pulses | None]:
-    """A saved calibration and the pulses of its zero posture (None where unknown)."""
+class Saved(NamedTuple):
+    """A calibration that this device can use, and what is known of its zero posture."""
+
+    calibration: Any
+    zero: KeptZero
+    note: str  # for the operator; empty where all is well
+
+
+def load_calibration(path: pathlib.Path, config: RigConfig) -> Saved:
+    """A calibration that was made with a device configured as this one.
+
+    Raises:
+        Refused: not a calibration, or of another device; names the keys.
+    """
     import jaxcal
 
     if path.is_dir():
@@ -62,11 +76,36 @@ def load_calibration(path: pathlib.Path) -> tuple[Any, Pulses | None]:
         calibration = jaxcal.Calibration.load(path)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise Refused(f"{path}: not a calibration: {error}") from None
-    zero = calibration.provenance.get("notes", {}).get("zero_pulses")
-    if zero is None:
-        return calibration, None
-    a, b, c = map(int, zero)
-    return calibration, (a, b, c)
+    notes = calibration.provenance.get("notes", {})
+    note = _check_device(path, notes, config)
+    zero, attitude = notes.get("zero_pulses"), notes.get("zero_attitude")
+    kept = KeptZero(
+        f"calibration {notes.get('run', path)}",
+        None if zero is None else (int(zero[0]), int(zero[1]), int(zero[2])),
+        None if attitude is None else np.array(attitude, dtype=np.float64),
+    )
+    return Saved(calibration, kept, note)
+
+
+def _check_device(path: pathlib.Path, notes: dict[str, Any], config: RigConfig) -> str:
+    """What to tell of a calibration's device; Refused where it is another one."""
+    if "device" in notes:
+        if changed := differences(notes["device"], config.device_fingerprint()):
+            raise Refused(
+                f"{path}: made with another device: {'; '.join(changed)}. Calibrate "
+                "this one"
+            )
+        return ""
+    if notes.get("fingerprint") != config.fingerprint():
+        raise Refused(
+            f"{path}: does not say with which device it was made, and this "
+            "configuration is not that of its run. Calibrate again"
+        )
+    return (
+        f"WARNING: {path} is of version 1: the configuration is that of its run, but "
+        "it keeps no attitude of the zero posture, so that lost origins cannot be "
+        "seen. Calibrate again"
+    )
 
 
 def verify(run: Run, calibration: Any, count: int) -> int:

@@ -6,7 +6,7 @@ do nothing else: no JAX, no files but the callback of events.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rig.attitude import Frame
@@ -18,7 +18,7 @@ from rig.device.imu import Imu, ImuError
 from rig.faults import MotionFault
 from rig.guard.signals import Signals
 from rig.guard.stop import Stopper
-from rig.guard.watchdog import Heartbeat
+from rig.guard.watchdog import Heartbeat, LineWatch
 
 
 class Device:
@@ -31,6 +31,7 @@ class Device:
         imu: Imu,
         signals: Signals,
         emit: Callable[..., Any],
+        timeouts_left: Mapping[str, Mapping[str, Any]] | None = None,
     ) -> None:
         self.config = config
         self.bus = bus
@@ -41,10 +42,12 @@ class Device:
         self.armed = False
         self.frame: Frame | None = None  # once the zero is taken
         self._signals = signals
-        watched = [a.comm_timeout_s for a in config.axes if a.comm_timeout_s]
+        timeouts = config.comm_timeouts_s
+        self.line_watch = LineWatch(self.drives, timeouts, emit, timeouts_left or {})
         self.heartbeat = Heartbeat(
-            self.stopper, config.motion.heartbeat_s, min(watched, default=0.0) / 4
+            self.stopper, config.heartbeat_s, min(timeouts.values(), default=0.0) / 4
         )
+        bus.check = self._before_exchange
 
     def arm(self, reset_alarms: bool = False) -> None:
         """Check everything that must hold before anything may move.
@@ -56,24 +59,21 @@ class Device:
         self.stopper.check()
         for drive in self.drives:
             self._check_fit(drive, reset_alarms)
-            axis, watch = drive.axis, drive.axis.map.comm_timeout
-            if watch and axis.comm_timeout_s is not None:
-                counts = max(1, round(axis.comm_timeout_s * watch.per_s))
-                drive.write(watch, timeout=counts)
+            axis = drive.axis
             if self.config.motion.mirror_limits:
                 drive.write(axis.map.limits, min=axis.min_pulses, max=axis.max_pulses)
         try:
             self.imu.latest()
         except ImuError as error:
             raise MotionFault(str(error)) from None
+        self.line_watch.apply()
         self.armed = True
         self.heartbeat.start()
 
     def _check_fit(self, drive: Drive, reset_alarms: bool) -> None:
         axis, status = drive.axis, drive.status()
         if status.fault and reset_alarms and axis.map.alarm_reset:
-            drive.write(axis.map.alarm_reset)
-            status = drive.status()
+            status = drive.bring(axis.map.alarm_reset, lambda s: not s.fault)
         if status.fault:
             raise MotionFault(
                 f"{axis.name} is in alarm: {drive.alarm() or 'no code given'}. Find "
@@ -85,8 +85,7 @@ class Device:
                 "`stop`"
             )
         if not status.enabled:
-            drive.write(axis.map.enable)
-            if not drive.status().enabled:
+            if not drive.bring(axis.map.enable, lambda s: s.enabled).enabled:
                 raise MotionFault(
                     f"{axis.name} does not enable its power stage. Check its "
                     "supply and its enable and STO inputs"
@@ -100,9 +99,15 @@ class Device:
 
     def guard(self, moving: bool = False) -> None:
         """The loop is alive; raise StopRequested where a stop was asked for."""
+        self._signals.tell()
+        self._before_exchange()
+        self.heartbeat.feed(moving)
+
+    def _before_exchange(self) -> None:
+        """Before every frame: a stop is not kept waiting for the rest of a loop."""
         self._signals.check_stop()
         self.stopper.check()
-        self.heartbeat.feed(moving)
+        self.heartbeat.feed()
 
     def statuses(self) -> list[Status]:
         """Of all drives; raises MotionFault on a fault bit."""
@@ -117,5 +122,7 @@ class Device:
         """Nothing more will move: close bus and phone."""
         self.heartbeat.close()
         self.armed = False
+        results = self.stopper.results
+        self.line_watch.restore({r.axis for r in results if r.standing})
         self.bus.close()
         self.imu.close()

@@ -6,6 +6,7 @@ import csv
 import datetime
 import io
 import json
+import os
 import pathlib
 import platform
 import sys
@@ -15,10 +16,14 @@ from typing import Any
 from jaxcal.files import write_text
 from rig.config import AXIS_NAMES, RigConfig
 from rig.faults import Refused
-from rig.outputs.journal import Journal, JournalError, Record
+from rig.outputs.journal import Journal, JournalError, Record, measured_postures
 
 JOURNAL = "journal.jsonl"
-SPARED = ("write", "stop")  # a full disk must not keep a stop from the bus
+SPARED = (
+    "write",
+    "stop",
+    "comm_restored",
+)  # a full disk must not keep a stop from the bus
 
 
 def new_run_folder(output: pathlib.Path, mode: str) -> pathlib.Path:
@@ -60,22 +65,24 @@ class RunFolder:
             "jaxcal": jaxcal.__version__,
             "python": platform.python_version(),
             "host": platform.node(),
+            "pid": os.getpid(),
             "arguments": sys.argv[1:],
             "started": now.isoformat(timespec="seconds"),
         }
-        fingerprint = self.config.fingerprint()
         if known := self.journal.events("start"):
-            if known[0]["fingerprint"] != fingerprint:
+            if changed := self.config.changed_since(known[0]["config"]):
                 raise Refused(
-                    f"{self.folder}: the configuration changed since this run began "
-                    "(only the addresses of bus and phone may). Start a new run"
+                    f"{self.folder}: the configuration changed since this run began: "
+                    f"{'; '.join(changed)}. Addresses and limits may change, nothing "
+                    "else. Start a new run"
                 )
             if known[0]["mode"] != mode:
                 raise Refused(f"{self.folder} is a {known[0]['mode']} run")
             self.emit("resume", sync=True, **provenance)
             return
-        config = self.config.described()
-        start = {"config": config, **provenance, **start}
+        config, fingerprint = self.config.described(), self.config.fingerprint()
+        device = self.config.device_fingerprint()
+        start = {"config": config, "device": device, **provenance, **start}
         self.emit(
             "start", sync=True, schema=1, mode=mode, fingerprint=fingerprint, **start
         )
@@ -103,14 +110,7 @@ class RunFolder:
 
     def postures(self) -> dict[str, Record]:
         """Every posture measured and not withdrawn since, by name, in order."""
-        found: dict[str, Record] = {}
-        for record in self.journal.records:
-            if record["event"] == "posture":
-                found[record["name"]] = record
-            elif record["event"] == "void":
-                for name in record["names"]:
-                    found.pop(name, None)
-        return found
+        return measured_postures(self.journal.records)
 
     def save_pairs(self) -> None:
         """Write pairs.csv: role, commands, measurements, scatter of every posture."""

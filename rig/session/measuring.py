@@ -7,23 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from rig.attitude import Array, Frame, euler_to_matrix, mean_rotation
+from rig.attitude import Array, Frame, mean_rotation
 from rig.config.axis import AXIS_NAMES, Pulses
-from rig.config.config import RigConfig
 from rig.device.drives import Status
 from rig.device.stream import Reading
 from rig.faults import MotionFault, NotFollowing
+from rig.readings import frame_at, raw_fields
 from rig.session.device import Device
 
 FOLLOW_MIN_DEG = 3.0  # a commanded change this large must be seen by the IMU
 FOLLOW_SHARE = 0.1  # at least this share of it
 FOLLOW_LEADING = 0.3  # of axes that move at least this share of the largest move
-
-
-def frame_at(config: RigConfig, zero: Array) -> Frame:
-    """The frame in which the (3, 3) attitude ``zero`` of the phone is the zero."""
-    mounting = euler_to_matrix(config.imu.mounting_deg, "ZYX")
-    return Frame(zero, mounting, config.mechanism.order, config.letters)
 
 
 class Observer:
@@ -53,8 +47,8 @@ class Observer:
         Returns:
             For the journal: ``pulses`` commanded and ``feedback`` of the drives;
             ``commanded_deg``, ``measured_deg`` and, of single readings, ``std_deg``
-            (3,); ``samples`` and ``raw_deg`` (samples, 3); ``attitude`` (3, 3), the
-            mean of the phone's.
+            (3,); ``samples``; ``attitude`` (3, 3), the mean of the phone's;
+            ``quaternions`` and ``stamps`` of every reading.
 
         Raises:
             MotionFault: it does not settle in time, or the IMU disagrees with the
@@ -88,7 +82,7 @@ class Observer:
             "std_deg": std.round(6).tolist(),
             "samples": len(readings),
             "attitude": attitude.round(12).tolist(),
-            "raw_deg": raw.round(5).tolist(),
+            **raw_fields(readings),
         }
 
     def _frame(self, readings: list[Reading]) -> Frame:
@@ -191,17 +185,20 @@ class Observer:
                 "the command, more than motion.max_disagreement_deg. Check zero, axis "
                 "order and signs"
             )
-        asked = np.abs(commanded - self._seen[0])
-        seen = np.abs(measured - self._seen[1])
+        way = commanded - self._seen[0]
+        asked = np.abs(way)
+        seen = np.sign(way) * (measured - self._seen[1])
         leading = max(FOLLOW_MIN_DEG, FOLLOW_LEADING * float(asked.max()))
         for index, name in enumerate(AXIS_NAMES):
             if asked[index] < leading:
                 self._unproven[index].append(label)
             elif seen[index] < FOLLOW_SHARE * asked[index]:
+                hint = "a slipped coupling, a frozen stream, or axes mixed up"
+                if seen[index] < -FOLLOW_SHARE * asked[index]:
+                    hint = f"axes.{name}.direction, its wiring, and imu.signs"
                 raise NotFollowing(
                     f"the drive of {name} turned {asked[index]:.1f} deg, the IMU "
-                    f"saw {seen[index]:.2f}. Look for a slipped coupling, a frozen "
-                    "stream, or axes mixed up",
+                    f"saw {seen[index]:.2f}. Look for {hint}",
                     self._unproven[index],
                 )
             else:

@@ -7,10 +7,11 @@ import time
 import numpy as np
 
 from rig.config.axis import Pulses
-from rig.device.bus import Rejected
-from rig.device.drives import Drive, Status
+from rig.device.bus import BusError, Rejected
+from rig.device.drives import Drive, Status, refusal
 from rig.faults import LimitError, MotionFault, Unreachable
 from rig.guard.limits import approach, check_plan, outside
+from rig.guard.stop import STILL_COUNTS
 from rig.session.device import Device
 
 
@@ -52,8 +53,6 @@ class Motion:
             raise LimitError("; ".join(faults))
         device = self.device
         starts = device.statuses()
-        begun = time.monotonic()
-        deadline = begun + self._deadline_s(starts, target)
         device.heartbeat.feed(moving=True)
         try:
             for drive, start, pulses in zip(device.drives, starts, target, strict=True):
@@ -65,29 +64,52 @@ class Motion:
                     "command", number=self._moves, label=label, axis=drive.axis.name,
                     pulses=pulses,
                 )  # fmt: skip
-                self._send(drive, pulses)
+                self._send(drive, start, pulses)
+            begun = time.monotonic()
+            deadline = begun + self._deadline_s(starts, target)
             self._watch(starts, target, begun, deadline)
         finally:
             device.heartbeat.feed(moving=False)
 
-    def _send(self, drive: Drive, pulses: int) -> None:
-        try:
-            drive.move(pulses)
-        except Rejected as error:
-            if error.code in (2, 3):
-                raise Unreachable(
-                    f"{drive.axis.name} refused {pulses}: {error}"
-                ) from None
-            drive.sound()  # an alarm says more than a refusal
-            raise
+    def _send(self, drive: Drive, start: Status, pulses: int) -> None:
+        """Start one drive's move.
+
+        Where the reply is lost the drive is read: it obeys, or it does not and is sent
+        the same absolute target again, or that is unknown and everything stops.
+        """
+        motion, axis = self.config.motion, drive.axis
+        tries = 1 + self.config.bus.read_retries
+        while True:
+            tries -= 1
+            try:
+                return drive.move(pulses)
+            except BusError as error:
+                if refusal(error):
+                    if isinstance(error, Rejected) and error.code in (2, 3):
+                        raise Unreachable(
+                            f"{axis.name} refused {pulses}: {error}"
+                        ) from None
+                    drive.sound()  # an alarm says more than a refusal
+                    raise
+                tolerance = axis.pulses_within(motion.position_tolerance_deg)
+                took = drive.took(pulses, start, tolerance)
+                found = {True: "obeyed", False: "not taken", None: "unknown"}[took]
+                self.device.emit(
+                    "lost_reply", axis=axis.name, pulses=pulses, outcome=found
+                )
+                if took:
+                    return None
+                if took is None or not tries:
+                    raise
+                self.device.guard(moving=True)  # no move once a stop was asked for
 
     def _deadline_s(self, starts: list[Status], target: Pulses) -> float:
         motion = self.config.motion
         longest = 0.0
         for axis, start, end in zip(self.config.axes, starts, target, strict=True):
             way = abs(axis.to_deg(end - start.position))
-            ramp = axis.speed_deg_s / axis.accel_deg_s2
-            longest = max(longest, way / axis.speed_deg_s + ramp)
+            speed, accel = axis.drive_motion
+            longest = max(longest, way / speed + speed / accel)
         return motion.deadline_factor * longest + motion.deadline_slack_s
 
     def _watch(
@@ -107,7 +129,7 @@ class Motion:
                     arrived += status.done and not status.moving
                     continue
                 self._check_corridor(drive, start, goal, status.position)
-                if abs(status.position - last[index][0]) > 1:
+                if abs(status.position - last[index][0]) > STILL_COUNTS:
                     last[index] = (status.position, status.time)
                 elif (stood := status.time - last[index][1]) > motion.stall_s:
                     left = abs(axis.to_deg(goal - status.position))

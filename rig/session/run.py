@@ -13,20 +13,33 @@ from typing import Any
 
 import numpy as np
 
-from rig.attitude import Frame
+from rig.attitude import Array, Frame
 from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.device.bus import Bus
 from rig.device.imu import Imu
-from rig.faults import EXIT_FAULT, MotionFault, NotFollowing, PlanOnly, Unreachable
+from rig.device.record import ZEROED, DeviceRecord
+from rig.faults import (
+    EXIT_FAULT,
+    MotionFault,
+    NotFollowing,
+    PlanOnly,
+    Refused,
+    Unreachable,
+)
 from rig.guard.limits import check_plan
 from rig.guard.signals import Signals
+from rig.guard.watchdog import timeouts_left
 from rig.outputs.console import event_lines, numbers
 from rig.outputs.journal import Record
+from rig.outputs.telemetry import Telemetry
+from rig.readings import frame_at
+from rig.session.checks import check_drives, leave
 from rig.session.device import Device
 from rig.session.folder import RunFolder
-from rig.session.measuring import Observer, frame_at
+from rig.session.measuring import Observer
 from rig.session.motion import Motion
+from rig.session.reference import KeptZero, axes_text, check_zero
 
 STREAM_WAIT_S = 60.0  # time to start the app on the phone
 ZERO_FACTOR = 4  # readings of the zero posture, in those of a posture
@@ -42,18 +55,23 @@ class Run(RunFolder):
         mode: str,
         say: Callable[[str], None] = print,
         *,
+        record: DeviceRecord,
         start: Record | None = None,
         reset_alarms: bool = False,
         zero_at: Pulses | None = None,
+        kept_zero: KeptZero | None = None,
         dry_run: bool = False,
     ) -> None:
         self._say = say
         self.confirm: Callable[[Run], None] = lambda run: None  # before ports open
         self.on_imu_port: Callable[[int], object] = lambda port: None
         self.device: Device | None = None
+        self.telemetry: Telemetry | None = None
         self.frame: Frame | None = None
         self.zero_pulses: Pulses | None = None
+        self.record = record
         self.zero_at = zero_at
+        self.kept_zero = kept_zero
         self.dry_run = dry_run
         self.signals = Signals(self.say)
         self.planned = 0
@@ -62,8 +80,8 @@ class Run(RunFolder):
         self._reset_alarms = reset_alarms
         super().__init__(config, folder, mode, start or {})
         self.listeners.append(lambda record: self.say(*event_lines(record)))
-        for record in self.journal.events("zero")[-1:]:
-            self._set_zero(record)
+        for zero in self.journal.events("zero")[-1:]:
+            self._set_zero(zero)
 
     def say(self, *lines: str) -> None:
         """Print lines. A terminal that is gone ends the run, but never a stop."""
@@ -79,6 +97,7 @@ class Run(RunFolder):
         """Open, arm and zero, once; on a resumed run check the zero posture instead.
 
         Raises:
+            Refused: the device is not known well enough; no port was opened.
             MotionFault, BusError, ImuError: not fit to move.
             PlanOnly: this is a dry run.
         """
@@ -86,24 +105,43 @@ class Run(RunFolder):
             raise PlanOnly
         if self.device is not None:
             return self.device
+        if text := self.record.missing(self.config):
+            raise Refused(text)
+        device = self.arm()
+        if self.frame is None or self.zero_pulses is None or not self.postures():
+            self._zero(device)
+        else:
+            self.observer.zeroed(self.frame, self.zero_pulses)
+            self._check_reference(self.zero_pulses)
+        return device
+
+    def check_device(self, device: Device) -> None:
+        """Read from the drives what must hold before they are armed."""
+        check_drives(self.config, device.drives, self.record)
+
+    def arm(self) -> Device:
+        """Open bus and phone and arm; MotionFault, BusError, ImuError: not fit."""
         config = self.config
         self.confirm(self)
-        imu, bus = Imu(config.imu), Bus(config.bus, config.silence_s, self.emit)
-        self.device = Device(config, bus, imu, self.signals, self.emit)
+        imu = Imu(config.imu, report=self.emit)
+        bus = Bus(config.bus, config.silence_s, self.emit)
+        left = timeouts_left(self.journal.records)
+        self.device = device = Device(config, bus, imu, self.signals, self.emit, left)
         imu.open()
         self.say(f"IMU: waiting for the phone on port {imu.port} ({config.imu.format})")
         self.on_imu_port(imu.port)
         bus.open()
+        self.check_device(self.device)
+        self.telemetry = Telemetry(
+            self.folder, config, imu, device.drives, lambda: device.frame
+        )
+        self.telemetry.start()
         imu.wait_for_stream(STREAM_WAIT_S)
         self.signals.armed = True
         self.device.arm(self._reset_alarms)
+        self.record.left_at()  # not known until they stand again
         self.motion, self.observer = Motion(self.device), Observer(self.device)
         self.say(f"armed: {len(config.axes)} drives on {config.bus.where}")
-        if self.frame is None or self.zero_pulses is None or not self.postures():
-            self._zero(self.device)
-        else:
-            self.observer.zeroed(self.frame, self.zero_pulses)
-            self._check_reference(self.zero_pulses)
         return self.device
 
     def _zero(self, device: Device) -> None:
@@ -112,16 +150,30 @@ class Run(RunFolder):
         target = self.zero_at or self.zero_pulses
         if target is None and self.config.session.zero == "drive":
             target = (0, 0, 0)
-        if target is not None:
-            self.motion.move_to(target, "zero")
-        else:
-            target = device.positions()
+        here, target = target is None, target or device.positions()
+        if not here or self.config.motion.approach_overshoot_deg:
+            self.motion.move_to(target, "zero")  # from the side of all references
         check_plan(self.config, [target])  # it is where a resumed run looks again
         # Every posture is measured against this one, so its noise must be the smaller.
         samples = ZERO_FACTOR * self.config.settle.samples
         measured = self.observer.measure(target, "zero", samples)
+        self._compare_zero(target, np.array(measured["attitude"]))
         record = self.emit("zero", sync=True, **measured)
         self.observer.zeroed(self._set_zero(record), target)
+
+    def _compare_zero(self, pulses: Pulses, attitude: Array) -> None:
+        """With the calibration's zero posture, or else with the last one taken."""
+        config, known = self.config, self.record.state(ZEROED)
+        if self.kept_zero is not None:
+            self.say(self.kept_zero.check(config, pulses, attitude))
+        elif known and known["pulses"] == list(pulses):
+            try:
+                then = np.array(known["attitude"])
+                check_zero(config, then, attitude, "the last session")
+            except MotionFault as fault:  # a phone mounted anew is calibrated anew
+                self.say(f"WARNING: {fault}")
+        zero = {"pulses": list(pulses), "attitude": attitude.tolist()}
+        self.record.reach(ZEROED, config, **zero)
 
     def _set_zero(self, record: Record) -> Frame:
         a, b, c = record["pulses"]
@@ -139,8 +191,9 @@ class Run(RunFolder):
         self.emit("reference", sync=True, angles=angles, limit=limit)
         if worst > limit:
             raise MotionFault(
-                f"the zero posture now reads {worst:.3f} deg away from zero (limit "
-                f"{limit:g}): the phone or the device was moved. Start a new run"
+                f"the zero posture of this run has moved: {axes_text(angles)} (limit "
+                f"{limit:g}): the drives lost their origin, or the phone or the device "
+                "was moved. Start a new run"
             )
         self.say(f"reference posture reads {worst:.3f} deg from zero: going on")
 
@@ -158,6 +211,7 @@ class Run(RunFolder):
         self.signals.check_pause()
         pitch, yaw, roll = (int(count) for count in pulses)
         begun = time.monotonic()
+        self.emit("visit", name=name, pulses=[pitch, yaw, roll])
         try:
             self.motion.move_to((pitch, yaw, roll), name)
             measured = self.observer.measure((pitch, yaw, roll), name)
@@ -191,6 +245,15 @@ class Run(RunFolder):
 
     # The end
 
+    @property
+    def to_go_on(self) -> str:
+        """What goes on after a pause or a fault."""
+        resume = f"python -m rig resume {self.folder}"
+        if self.journal.records[0].get("simulated") is None:  # or it begins anew
+            if lack := self.record.missing(self.config):
+                return f"{lack}. Then {resume}"
+        return resume
+
     def stop(self, reason: str, latch: bool = True) -> None:
         """Stop every unit; before the device is about to be armed there is no need."""
         if self.device is not None and self.signals.armed:
@@ -198,7 +261,15 @@ class Run(RunFolder):
 
     def disarm(self) -> None:
         """Nothing more will move: close the device, free the signals."""
+        if self.telemetry is not None:
+            self.telemetry.close()
         if self.device is not None:
+            if self.signals.armed:
+                try:
+                    with self.device.bus.urgent():  # also after a stop that latched
+                        leave(self.device.drives, self.record)
+                except OSError as error:
+                    self.say(f"{self.record.path} cannot be written: {error}")
             self.device.close()
         self.device = None
         self.signals.armed = False

@@ -26,6 +26,7 @@ def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
         The exit code.
     """
     code, event, reason = EXIT_FAULT, "fault", ""
+    moved = len(run.journal.events("command"))
     with run.signals:
         try:
             code = procedure(run)
@@ -41,7 +42,7 @@ def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
             code, event, reason = 130, "stopped", "SIGINT"
         except Refused as error:
             reason = str(error)
-            if not run.journal.events("command"):
+            if len(run.journal.events("command")) == moved:
                 code, event = EXIT_BAD_INPUT, "refused"
         except Fault as error:
             reason = str(error)
@@ -50,15 +51,16 @@ def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
         except Exception as error:
             reason = f"{type(error).__name__}: {error}"
         finally:
+            run.signals.ending = True
             run.stop(reason, latch=event not in ("end", "paused"))
             run.disarm()
-    try:
-        run.emit(event, sync=True, code=code, reason=reason)
-    except JournalError as error:
-        run.say(f"the journal could not be closed with a last line: {error}")
-    if event != "end":
-        run.say(f"{event}: {reason}")
-        if event != "refused":
-            run.say(f"to go on: python -m rig resume {run.folder}")
-    run.close()
+        try:
+            run.emit(event, sync=True, code=code, reason=reason)
+        except JournalError as error:
+            run.say(f"the journal could not be closed with a last line: {error}")
+        if event != "end":
+            run.say(f"{event}: {reason}")
+            if event != "refused":
+                run.say(f"to go on: {run.to_go_on}")
+        run.close()
     return code

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
+import random
 import time
 from collections.abc import Callable, Sequence
 
@@ -31,8 +33,22 @@ class DriveException(Exception):
         super().__init__(f"exception {code}")
 
 
+@dataclasses.dataclass(frozen=True)
+class Habits:
+    """What real drives do besides what their registers say."""
+
+    enable_delay_s: float = 0.0  # > 0: it starts disabled, and takes so long to enable
+    reset_delay_s: float = 0.0  # until an alarm is gone after its reset
+    jitter_counts: int = 0  # of the position read while it stands
+    idle_watchdog: bool = False  # the comm timeout also acts while it stands
+
+
 class SimDrive:
-    """One unit; positions in pulses."""
+    """One unit; positions in pulses of its own counter.
+
+    ``offset`` is what the counter is away from the motor: the drive lost its origin by
+    so much, until it is homed.
+    """
 
     def __init__(
         self,
@@ -42,21 +58,29 @@ class SimDrive:
         speedup: float = 1.0,
         travel: Sequence[int] | None = None,
         stuck: Callable[[], object] = lambda: False,
+        habits: Habits | None = None,
+        seed: int = 0,
     ) -> None:
         self.map = register_map
+        self.pulses_per_rev = pulses_per_rev
+        self.offset = 0
+        self.homed = False
+        self.habits = habits or Habits()
         self.position = float(position)
         self.velocity = 0.0
         self.target = round(position)
         self.moving = False
         self.done = True
         self.alarm = 0
-        self.enabled = True
+        self.enabled = not self.habits.enable_delay_s
         self.executions: list[int] = []  # target of each move that was run
         self.stops: list[float] = []
         self.comm_stops = 0
         self._travel = travel  # targets outside are answered with exception 3
-        self._pulses_per_rev = pulses_per_rev
         self._stuck = stuck
+        self._random = random.Random(seed)
+        self._homing = False
+        self._enables = self._clears = math.inf  # when what was asked for is done
         self._speedup = speedup
         self._speed = self._accel = 1.0
         self._stopping = False
@@ -65,28 +89,37 @@ class SimDrive:
         self._registers = self._known()
 
     def _known(self) -> dict[int, int]:
-        """Every register of the map; the first of the identity is the resolution."""
+        """Every register of the map."""
         m = self.map
-        tables = (m.move, m.stop, m.enable, m.alarm_reset, m.comm_timeout, m.limits)
-        identity = list(m.identity.values())
-        places: list[Read | Write] = [m.status, m.position, *identity]
-        places += [m.alarm] if m.alarm else []
+        tables = (
+            m.move, m.stop, m.enable, m.alarm_reset, m.comm_timeout, m.limits, m.home,
+            m.set_zero,
+        )  # fmt: skip
+        reads = (m.status, m.position, m.alarm, m.target, m.pulses_per_rev)
+        places: list[Read | Write] = [*m.identity.values()]
+        places += [read for read in reads if read]
         places += [frame for table in tables if table for frame in table.write]
         known = {p.address + i: 0 for p in places for i in range(p.count)}
-        for read in identity[:1]:
-            known[read.address + read.count - 1] = self._pulses_per_rev & 0xFFFF
+        if read := m.pulses_per_rev:
+            shown = self.pulses_per_rev % (1 << 16 * read.count)
+            words = encode(shown, read.type, m.word_order)
+            known |= {read.address + i: word for i, word in enumerate(words)}
         return known
 
     def advance(self) -> None:
         """Bring position and velocity up to the clock."""
         now = time.monotonic()
-        if self.moving and self._comm_timeout:
-            lost = self._last_frame + self._comm_timeout
-            if now > lost and not self._stopping:
-                self._integrate(lost)
-                self.comm_stops += 1
-                self.alarm = COMM_ALARM
-                self._stopping = True
+        if now >= self._enables:
+            self.enabled, self._enables = True, math.inf
+        if now >= self._clears:
+            self.alarm, self._clears = 0, math.inf
+        watched = self.moving or self.habits.idle_watchdog
+        lost = self._last_frame + (self._comm_timeout or math.inf)
+        if watched and now > lost and not self._stopping and not self.alarm:
+            self._integrate(lost)
+            self.comm_stops += 1
+            self.alarm = COMM_ALARM
+            self._stopping = self.moving
         self._integrate(now)
 
     def _integrate(self, now: float) -> None:
@@ -123,6 +156,8 @@ class SimDrive:
         if near and abs(self.velocity) <= 20 * self._accel * dt + 1.0:
             self.position, self.velocity = float(self.target), 0.0
             self.moving, self.done = False, True
+            if self._homing:
+                self.find_origin()
             return
         self.position += step
 
@@ -133,13 +168,32 @@ class SimDrive:
         self.done = False
         self._stopping = self.moving
 
+    def find_origin(self) -> None:
+        """Count from the motor's origin again, as homing ends."""
+        self.position -= self.offset
+        self.target, self.offset = round(self.position), 0
+        self.homed, self._homing = True, False
+
+    def power_cycle(self, offset: int = 0) -> None:
+        """Off and on again: its counter comes back ``offset`` pulses away."""
+        self.advance()
+        self.offset += offset
+        self.position = float(round(self.position) + offset)
+        self.target, self.velocity, self.alarm = round(self.position), 0.0, 0
+        self.moving = self._stopping = self._homing = self.homed = False
+        self.done = True
+        self.enabled = not self.habits.enable_delay_s
+        self._enables = self._clears = math.inf
+        self._comm_timeout = 0.0
+        self._registers = self._known()
+
     def read(self, address: int, count: int) -> list[int]:
         """Holding registers; raises DriveException where there are none."""
         self.advance()
         self._last_frame = time.monotonic()
         m = self.map
         values: list[tuple[Read, int]]
-        values = [(m.status, self._status()), (m.position, round(self.position))]
+        values = [(m.status, self._status()), (m.position, self._counter())]
         values += [(m.alarm, self.alarm)] if m.alarm else []
         for place, value in values:
             for i, word in enumerate(encode(value, place.type, m.word_order)):
@@ -149,10 +203,15 @@ class SimDrive:
         except KeyError:
             raise DriveException(ILLEGAL_ADDRESS) from None
 
+    def _counter(self) -> int:
+        """The position as read: at rest it may flicker."""
+        most = 0 if self.velocity else self.habits.jitter_counts
+        return round(self.position) + self._random.randint(-most, most)
+
     def _status(self) -> int:
         resting = self.done and not self.moving and not self.alarm
-        on = (self.enabled, resting, self.moving, bool(self.alarm))
-        named = [getattr(self.map.status, name) for name in FLAGS]
+        on = (self.enabled, resting, self.moving, bool(self.alarm), self.homed)
+        named = [getattr(self.map.status, name) for name in FLAGS] + [self.map.homed]
         pairs = [bits for bits, holds in zip(named, on, strict=True) if bits and holds]
         return sum({1 << bit for bits in pairs for bit in bits.set})
 
@@ -176,9 +235,16 @@ class SimDrive:
             self._stopping = self.moving
             self.target = round(self.position)
         elif self._begins(m.alarm_reset, address, words):
-            self.alarm = 0
+            self._clears = time.monotonic() + self.habits.reset_delay_s
+            self.advance()
         elif self._begins(m.enable, address, words):
-            self.enabled = True
+            self._enables = time.monotonic() + self.habits.enable_delay_s
+            self.advance()
+        elif self._begins(m.home, address, words):
+            self._home()
+        elif self._begins(m.set_zero, address, words):
+            self.offset -= round(self.position)
+            self.position, self.target, self.homed = 0.0, 0, True
         elif m.comm_timeout and address == m.comm_timeout.write[0].address:
             counts = self._value(m.comm_timeout, "timeout")
             self._comm_timeout = counts / m.comm_timeout.per_s
@@ -197,6 +263,14 @@ class SimDrive:
         words = [self._registers[address + i] for i in range(registers_of(kind))]
         return decode(words, kind, self.map.word_order)
 
+    def _home(self) -> None:
+        """Go to where the motor's origin is, and count from there."""
+        if self.alarm or not self.enabled:
+            raise DriveException(DEVICE_FAILURE)
+        self._speed, self._accel = self.pulses_per_rev, 10.0 * self.pulses_per_rev
+        self.target, self.moving, self.done = self.offset, True, False
+        self._stopping, self._homing = False, True
+
     def _start(self) -> None:
         m = self.map
         if self.alarm or not self.enabled:
@@ -204,7 +278,7 @@ class SimDrive:
         target = self._value(m.move, "position")
         if self._travel and not self._travel[0] <= target <= self._travel[1]:
             raise DriveException(ILLEGAL_VALUE)
-        units, per_rev = m.units, float(self._pulses_per_rev)
+        units, per_rev = m.units, float(self.pulses_per_rev)
         speed = (self._value(m.move, "speed") or 1) / units.speed_per_unit
         accel = (self._value(m.move, "accel") or 1) / units.accel_per_unit
         if units.accel == "s_per_rev_per_s":
@@ -213,4 +287,4 @@ class SimDrive:
         self._accel = accel * (1.0 if units.accel == "pulse_per_s2" else per_rev)
         self.executions.append(target)
         self.target, self.moving, self.done = target, True, False
-        self._stopping = False
+        self._stopping = self._homing = False

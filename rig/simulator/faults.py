@@ -1,4 +1,4 @@
-"""Faults on demand: ``kind@when,count=N,axis=NAME,seconds=S``."""
+"""Faults on demand: ``kind@when,count=N,axis=NAME,seconds=S,share=P``."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ KINDS = {
     "lost_reply": "the drive obeys, its reply is lost",
     "lost_write_reply": "the drive obeys a write, its reply is lost",
     "lost_request": "the drive never sees the request",
+    "spoilt_frames": "a `share` (0.03) of requests and of replies is mangled",
     "delayed_reply": "the reply comes after `seconds` (0.5)",
     "noise_bytes": "random bytes before the reply",
     "exception_reply": "the drive answers exception 4 and does nothing",
@@ -29,6 +30,7 @@ KINDS = {
     "imu_frozen": "the phone repeats one attitude under new stamps",
     "imu_wrong_order": "the phone's angles are in another Euler order",
     "imu_columns": "the phone's lines get one column more",
+    "imu_second_sender": "in a gap another computer sends other angles",
     "imu_reorder": "the phone's lines come out of order",
 }
 
@@ -41,16 +43,18 @@ class FaultSpec:
     count: float = float("inf")  # replies or lines left to spoil
     axis: int | None = None  # None: any
     seconds: float | None = None  # length of a gap or delay
+    share: float = 0.03  # of frames that are spoilt
 
 
 def parse_fault(text: str) -> FaultSpec:
-    """Read ``kind[@phase | @SECONDSs][,count=N][,axis=NAME][,seconds=S]``."""
+    """Read ``kind[@phase | @SECONDSs][,count=N][,axis=NAME][,seconds=S][,share=P]``."""
     head, *options = text.split(",")
     kind, _, when = head.partition("@")
     if kind not in KINDS:
         raise ValueError(f"unknown fault {kind!r}: have {', '.join(KINDS)}")
     found: dict[str, Any] = {}
-    readers: dict[str, Any] = {"count": int, "seconds": float, "axis": AXIS_NAMES.index}
+    readers: dict[str, Any] = {"count": int, "seconds": float, "share": float}
+    readers["axis"] = AXIS_NAMES.index
     try:
         if when in PHASES:
             found["phase"] = when
@@ -62,7 +66,8 @@ def parse_fault(text: str) -> FaultSpec:
     except (KeyError, ValueError):
         raise ValueError(
             f"fault {text!r}: after @ comes one of {', '.join(PHASES)} or seconds; "
-            f"options are count=N, seconds=S, axis=NAME of {', '.join(AXIS_NAMES)}"
+            "options are count=N, seconds=S, share=P, axis=NAME of "
+            f"{', '.join(AXIS_NAMES)}"
         ) from None
     return FaultSpec(kind, **found)
 

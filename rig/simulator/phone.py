@@ -14,10 +14,11 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rig.attitude import Array, matrix_to_euler
+from rig.attitude import Array, euler_to_matrix, matrix_to_euler
 from rig.config.settings import ImuSettings
 from rig.simulator.faults import FaultInjector
 
+INTRUSION_S = 0.15  # that another sender is heard, where it is let
 BATCH = 5  # readings that Sensor Logger pushes at once
 
 
@@ -108,6 +109,10 @@ class Phone:
             while not self._closing.is_set():
                 if self._faults.take("imu_disconnect"):
                     return
+                if self._faults.take("imu_second_sender"):
+                    connection.close()
+                    self._intrude()
+                    return
                 if not self._faults.take("imu_gap"):
                     data = self._line()
                     if self._faults.take("imu_reorder") and held is None:
@@ -117,6 +122,19 @@ class Phone:
                         held = None
                 next_time += self._period
                 self._closing.wait(max(0.0, next_time - time.monotonic()))
+
+    def _intrude(self) -> None:
+        """Angles of something else, from another address, for as long as it is let."""
+        settings, other = self.settings, euler_to_matrix([40.0, 30.0, 20.0], "ZYX")
+        address, source = ("127.0.0.1", self.port), ("127.0.0.2", 0)
+        with (
+            contextlib.suppress(OSError),
+            socket.create_connection(address, 1.0, source) as connection,
+        ):
+            for _ in range(max(3, round(INTRUSION_S / self._period))):
+                line = format_line(settings, other, time.time(), str(settings.order))
+                connection.sendall(line.encode() + b"\r\n")
+                self._closing.wait(self._period)
 
     def _line(self) -> bytes:
         s, faults = self.settings, self._faults

@@ -5,11 +5,13 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rig.attitude import Array, euler_to_matrix
+from rig.config.axis import AXIS_NAMES, Axis
 from rig.config.config import RigConfig
 from rig.simulator.drive import SimDrive
 
@@ -33,11 +35,72 @@ class Truth:
     drift_deg_per_min: float = 0.0  # of the phone's heading
     heading_deg: float = 170.0  # of the base in the phone's world
     seed: int = 0
+    # What is wired, set or lost otherwise than the configuration says:
+    reversed: tuple[bool, ...] = (False, False, False)  # turns the other way
+    swapped: tuple[int, ...] = (0, 1, 2)  # joint i is turned by drive swapped[i]
+    drive_pulses_per_rev: tuple[int, ...] | None = None  # None: as configured
+    lost_origin_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the counters
+    # What real drives and lines do:
+    latency_s: float = 0.0  # of every reply
+    enable_delay_s: float = 0.0  # > 0: drives start disabled, and take so long
+    reset_delay_s: float = 0.0  # until an alarm is gone after its reset
+    jitter_counts: int = 0  # of the position read while a drive stands
+    idle_watchdog: bool = False  # the comm timeout also acts while a drive stands
 
     @property
     def jig_deg(self) -> Array:
-        """(3,) commands at which every joint stands at zero."""
-        return np.linalg.solve(np.array(self.matrix), -np.array(self.bias))
+        """(3,) turns of the motors, by axis, at which every joint stands at zero."""
+        joints = np.linalg.solve(np.array(self.matrix), -np.array(self.bias))
+        motors = np.empty(3)
+        motors[list(self.swapped)] = joints
+        return motors * self.signs
+
+    @property
+    def signs(self) -> Array:
+        """(3,) -1 where a motor turns the other way."""
+        return np.where(self.reversed, -1.0, 1.0)
+
+
+REALISTIC: dict[str, Any] = {
+    "latency_s": 0.004,
+    "enable_delay_s": 0.5,
+    "reset_delay_s": 0.3,
+    "jitter_counts": 1,
+    "idle_watchdog": True,
+}
+
+
+def truth_of(options: dict[str, Any], seed: int) -> Truth:
+    """The simulated device that the options of a command line describe.
+
+    Raises:
+        ValueError: ``swapped`` does not name two axes.
+    """
+    order = [0, 1, 2]
+    if names := options.get("swapped"):
+        if len(set(names)) != 2:
+            raise ValueError(f"--swapped must name two axes, got {','.join(names)}")
+        a, b = map(AXIS_NAMES.index, names)
+        order[a], order[b] = b, a
+    pulses = options.get("gearing")
+    lost = options.get("lost_origin", 0.0)
+    turned = options.get("reversed") or ()
+    return Truth(
+        noise_deg=options["noise"],
+        backlash_deg=options["backlash"],
+        drift_deg_per_min=options["drift"],
+        seed=seed,
+        reversed=tuple(name in turned for name in AXIS_NAMES),
+        swapped=tuple(order),
+        drive_pulses_per_rev=pulses and (pulses,) * 3,
+        lost_origin_deg=(lost,) * 3,
+        **(REALISTIC if options.get("realistic") else {}),
+    )
+
+
+def gearing(axis: Axis, pulses_per_rev: int) -> float:
+    """Signed pulses for one degree of a joint whose drive is set otherwise."""
+    return axis.direction * pulses_per_rev * axis.reduction / 360.0
 
 
 class Plant:
@@ -67,7 +130,12 @@ class Plant:
         self._slip[:] = 0.0
 
     def _commanded(self) -> Array:
-        return self._config.to_deg([drive.position for drive in self._drives])
+        """(3,) degrees by which the motors turn the joints."""
+        turned = [
+            (drive.position - drive.offset) / gearing(axis, drive.pulses_per_rev)
+            for axis, drive in zip(self._config.axes, self._drives, strict=True)
+        ]
+        return (np.array(turned) * self.truth.signs)[list(self.truth.swapped)]
 
     def joints(self) -> Array:
         """(3,) joint angles in degrees now: ``A u + b`` behind the play."""

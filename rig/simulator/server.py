@@ -20,6 +20,8 @@ from collections.abc import Callable
 from rig.simulator.drive import DriveException, SimDrive
 from rig.simulator.faults import FaultInjector
 
+TARGET_SILENT = 11  # what a gateway answers for a unit that does not
+
 Cut = Callable[[bytes], tuple[bytes, list[bytes]]]  # to the rest, and the answers
 
 
@@ -37,8 +39,13 @@ class ModbusServer:
     """Units by id behind one line; requests are served one at a time."""
 
     def __init__(
-        self, drives: dict[int, SimDrive], faults: FaultInjector, seed: int = 0
+        self,
+        drives: dict[int, SimDrive],
+        faults: FaultInjector,
+        seed: int = 0,
+        latency_s: float = 0.0,
     ) -> None:
+        self.latency_s = latency_s
         self.drives = drives
         self.faults = faults
         self.requests = 0
@@ -113,7 +120,9 @@ class ModbusServer:
                 break
             unit, pdu = buffer[6], buffer[7 : 6 + length]
             buffer = buffer[6 + length :]
-            for noise, reply in self._answer(unit, pdu):
+            for noise, reply, spoilt in self._answer(unit, pdu):
+                if spoilt:  # what is mangled on the drives' side, the gateway refuses
+                    reply = bytes([pdu[0] | 0x80, TARGET_SILENT])
                 head = struct.pack(">HHHB", tid, 0, len(reply) + 1, unit)
                 answers.append(noise + head + reply)
         return buffer, answers
@@ -129,20 +138,41 @@ class ModbusServer:
                 buffer = buffer[1:]
                 continue
             buffer = buffer[size:]
-            for noise, reply in self._answer(frame[0], frame[1:-2]):
+            for noise, reply, spoilt in self._answer(frame[0], frame[1:-2]):
                 body = frame[:1] + reply
-                answers.append(noise + body + crc16(body))
+                answer = bytearray(body + crc16(body))
+                if spoilt:
+                    place = self._random.randrange(len(answer))
+                    answer[place] ^= self._random.randrange(1, 256)
+                answers.append(noise + bytes(answer))
         return buffer, answers
 
-    def _answer(self, unit: int, pdu: bytes) -> list[tuple[bytes, bytes]]:
-        """Noise to send first and the reply's PDU; empty: silence."""
+    def _spoils(self, axis: int) -> bool:
+        fault = self.faults.take("spoilt_frames", axis)
+        return fault is not None and self._random.random() < fault.share
+
+    def _broadcast(self, pdu: bytes) -> None:
+        """A write to unit 0: every drive of a family that takes it obeys, none says."""
+        with self.lock:
+            for unit, drive in self.drives.items():
+                dead = self.faults.take("dead_drive", self._axis[unit])
+                if drive.map.broadcast_stop and not dead and pdu[0] in (6, 16):
+                    _execute(drive, pdu)
+
+    def _answer(self, unit: int, pdu: bytes) -> list[tuple[bytes, bytes, bool]]:
+        """Noise to send first, the reply's PDU, if that is spoilt; empty: silence."""
         axis, faults = self._axis.get(unit), self.faults
+        if unit == 0:
+            self._broadcast(pdu)
         if axis is None:
             return []
         if faults.take("dead_drive", axis) or faults.take("lost_request", axis):
             return []
+        if self._spoils(axis):  # some drives say that the CRC was wrong, most nothing
+            wrong_crc = [(b"", bytes([pdu[0] | 0x80, 8]), False)]
+            return self._random.choice([wrong_crc, []])
         if faults.take("exception_reply", axis):
-            return [(b"", bytes([pdu[0] | 0x80, 4]))]
+            return [(b"", bytes([pdu[0] | 0x80, 4]), False)]
         with self.lock:
             self.requests += 1
             reply = _execute(self.drives[unit], pdu)
@@ -152,10 +182,11 @@ class ModbusServer:
             return []
         if delayed := faults.take("delayed_reply", axis):
             time.sleep(0.5 if delayed.seconds is None else delayed.seconds)
+        time.sleep(self.latency_s)
         noise = b""
         if faults.take("noise_bytes", axis):
             noise = self._random.randbytes(self._random.randint(1, 6))
-        return [(noise, reply)]
+        return [(noise, reply, self._spoils(axis))]
 
 
 def _execute(drive: SimDrive, pdu: bytes) -> bytes:

@@ -7,10 +7,10 @@ from typing import Any
 
 from rig.attitude import Array
 from rig.config.config import RigConfig
-from rig.simulator.drive import SimDrive
+from rig.simulator.drive import Habits, SimDrive
 from rig.simulator.faults import FaultInjector, FaultSpec
 from rig.simulator.phone import Phone
-from rig.simulator.plant import Plant, Truth
+from rig.simulator.plant import Plant, Truth, gearing
 from rig.simulator.server import ModbusServer
 
 
@@ -33,27 +33,32 @@ class Simulator:
         self.faults = FaultInjector(faults)
         self.transport = transport
         self.drives: list[SimDrive] = []
+        t = self.truth
+        habits = Habits(
+            t.enable_delay_s, t.reset_delay_s, t.jitter_counts, t.idle_watchdog
+        )
         for number, axis in enumerate(config.axes):
-            travel = position = None
+            travel, position = None, 0
+            set_to = (t.drive_pulses_per_rev or [axis.pulses_per_rev] * 3)[number]
+            per_deg = gearing(axis, set_to)
             if travel_deg is not None:
                 travel = sorted(axis.to_pulses(end) for end in travel_deg)
             if config.session.zero == "here":
-                position = axis.to_pulses(float(self.truth.jig_deg[number]))
-            self.drives.append(
-                SimDrive(
-                    axis.map, axis.pulses_per_rev, position or 0, speedup, travel,
-                    functools.partial(self.faults.take, "stuck_axis", number),
-                )
+                position = round(float(t.jig_deg[number]) * per_deg)
+            drive = SimDrive(
+                axis.map, set_to, position, speedup, travel,
+                functools.partial(self.faults.take, "stuck_axis", number),
+                habits, t.seed + number,
             )  # fmt: skip
+            drive.power_cycle(round(t.lost_origin_deg[number] * per_deg))
+            self.drives.append(drive)
         slipping = functools.partial(self.faults.take, "slipping_axis")
         self.plant = Plant(config, self.truth, self.drives, slipping)
         units = [axis.unit for axis in config.axes]
         self.server = ModbusServer(
-            dict(zip(units, self.drives, strict=True)), self.faults, self.truth.seed
+            dict(zip(units, self.drives, strict=True)), self.faults, t.seed, t.latency_s
         )
-        self.phone = Phone(
-            config.imu, self._attitude, self.faults, rate_hz, self.truth.seed
-        )
+        self.phone = Phone(config.imu, self._attitude, self.faults, rate_hz, t.seed)
 
     def start(self, port: int = 0) -> RigConfig:
         """Serve the drives; the phone starts with ``start_phone``."""
@@ -66,7 +71,7 @@ class Simulator:
         phone_port = 0
         if self.config.imu.transport == "connect":
             phone_port = self.start_phone(0)
-        imu = {"host": "127.0.0.1", "port": phone_port}
+        imu = {"host": "127.0.0.1", "port": phone_port, "allow": ("127.0.0.1",)}
         return self.config.model_copy(
             update={
                 "bus": self.config.bus.model_copy(update=bus),
@@ -99,10 +104,22 @@ class Simulator:
         with self.server.lock:
             return self.plant.attitude()
 
+    def power_cycle(self, lost_deg: tuple[float, float, float] = (0, 0, 0)) -> None:
+        """All drives off and on: their counters come back so many degrees away."""
+        with self.server.lock:
+            for axis, drive, lost in zip(
+                self.config.axes, self.drives, lost_deg, strict=True
+            ):
+                drive.power_cycle(round(lost * gearing(axis, drive.pulses_per_rev)))
+
     def repair(self) -> None:
         """Undo every fault, as a technician would before the run is resumed."""
         self.faults.clear()
         self.plant.tighten()
+        with self.server.lock:
+            for drive in self.drives:
+                if drive.offset:
+                    drive.find_origin()
 
     def executions(self) -> list[list[int]]:
         """Targets in pulses each drive really ran, pitch, yaw, roll."""

@@ -15,12 +15,16 @@ import subprocess
 import sys
 import tempfile
 import time
+from typing import Any
 
 import numpy as np
 from harness import (
+    ENTERED,
     HASTY,
     HOST_FAULTS,
+    OTHERS,
     UNSETTLED,
+    WATCHED,
     changed,
     fast_config,
     fast_text,
@@ -32,7 +36,7 @@ from harness import (
 from rig.config import parse_config
 from rig.outputs.journal import read_journal
 from rig.session.run import Run
-from rig.simulator import Simulator, parse_fault
+from rig.simulator import Simulator, Truth, parse_fault
 
 PHASES = ("zeroing", "moving", "settling", "measuring", "saving")
 FAULTS = (
@@ -61,7 +65,33 @@ FAULTS = (
     "imu_wrong_order",
     "imu_columns",
     "imu_reorder,count=20",
+    "imu_second_sender,count=1",
 )
+# Frames are spoilt on a serial line, all along: twice, as a session takes long then.
+SPOILT, SPOILT_PHASES = "spoilt_frames", ("zeroing", "measuring")
+# What is so from the start: reality, which must be ridden out, ...
+REAL: dict[str, dict[str, Any]] = {
+    "enable_delay": {"enable_delay_s": 0.3, "reset_delay_s": 0.3},
+    "jitter": {"jitter_counts": 1},
+    "latency": {"latency_s": 0.01},
+    "idle_watchdog": {"idle_watchdog": True},
+}
+# ... and mistakes, which must be refused.
+MISTAKES: dict[str, dict[str, Any]] = {
+    "reversed_axis": {"reversed": (False, False, True)},
+    "swapped_axes": {"swapped": (1, 0, 2)},
+    "wrong_gearing": {"drive_pulses_per_rev": (10000, 9000, 10000)},
+}
+# What happens to a device without power, between a session and the next:
+# degrees by which the counters, or the joints, are elsewhere.
+OVERNIGHT = {"lost_origin": (1.4, 0.0), "moved_while_off": (0.0, 1.4)}
+# In another process, or to this one; not in all phases, as the time differs only.
+HOST_PHASES = {
+    "sigkill_watched": ("moving", "measuring"),
+    "second_session": ("zeroing",),
+    "other_stop": ("moving", "measuring"),
+}
+COLUMNS = (*PHASES, "finishing", "start", "overnight")
 DEAF = ("dead_drive", "lost_request", "exception_reply")  # cannot take a stop
 MAX_RESUMES = 6
 HARNESS = pathlib.Path(__file__).with_name("harness.py")
@@ -77,9 +107,12 @@ class Outcome:
     resumes: int
     reason: str
     worst: float  # largest difference of A and b from the uninterrupted run's
+    refused: bool = False  # no calibration came of it
 
     @property
     def word(self) -> str:
+        if self.refused:
+            return "refused"
         if self.first_code == 0:
             return "ridden out"
         if self.first_code == 4:
@@ -139,8 +172,12 @@ def run_cell(
     fault: str, phase: str, truth: np.ndarray, folder: pathlib.Path
 ) -> Outcome:
     """Run one cell of the matrix; raises AssertionError where a promise is broken."""
-    if fault in HOST_FAULTS:
+    if fault in HOST_FAULTS or fault in HOST_PHASES:
         return _host_cell(fault, phase, truth, folder)
+    if phase == "start":
+        return _start_cell(fault, truth, folder)
+    if phase == "overnight":
+        return _overnight_cell(fault, truth, folder)
     said: list[str] = []
     spec = parse_fault(fault)
     hasty = fast_config(HASTY)
@@ -150,7 +187,9 @@ def run_cell(
     # likelier a changed digit is read that looks right.
     config = fast_config(UNSETTLED if fault == "imu_garbage" else None)
 
-    with simulator(config) as sim:
+    transport = "rtu" if fault == SPOILT else "tcp"
+
+    with simulator(config, transport=transport) as sim:
 
         def listen(run: Run, entered: str) -> None:
             if entered == phase and not done and in_the_middle(run, entered):
@@ -166,6 +205,9 @@ def run_cell(
         assert done, f"the session never entered {phase}"
         reason = next((s for s in reversed(said) if s.startswith("fault:")), "")
         check_invariants(folder, sim, alive=True, deaf=spec.kind in DEAF)
+        if spec.kind == "imu_second_sender":
+            events = {r["event"] for r in read_journal(folder / "journal.jsonl")}
+            assert "sender_refused" in events, "another sender was not refused"
         sim.repair()
         resumes = 0
         while code != 0 and resumes < MAX_RESUMES:
@@ -173,9 +215,72 @@ def run_cell(
             code = session(served, folder, sim, said)
             check_invariants(folder, sim, alive=True, deaf=False)
     assert code == 0, said[-12:]
+    return Outcome(fault, phase, first, resumes, reason, _equal(folder, truth))
+
+
+def _equal(folder: pathlib.Path, truth: np.ndarray) -> float:
     worst = float(np.abs(calibration(folder) - truth).max())
-    assert worst < 1e-6, f"resumed to another calibration: {worst}"
-    return Outcome(fault, phase, first, resumes, reason, worst)
+    assert worst < 1e-6, f"another calibration: {worst}"
+    return worst
+
+
+def _start_cell(fault: str, truth: np.ndarray, folder: pathlib.Path) -> Outcome:
+    """A device that is so from the start: ridden out, or refused."""
+    config = fast_config(WATCHED if fault == "idle_watchdog" else None)
+    device = Truth(noise_deg=0.0, **REAL.get(fault, MISTAKES.get(fault)))
+    said: list[str] = []
+    with simulator(config, truth=device) as sim:
+        code = session(sim.start(), folder, sim, said)
+        reason = next((s for s in said if s.startswith(("fault:", "refused:"))), "")
+        if fault in REAL:
+            assert code == 0, said[-12:]
+            check_invariants(folder, sim, alive=True, deaf=False)
+            return Outcome(fault, "start", code, 0, "", _equal(folder, truth))
+        assert code in (2, 3), (code, said[-12:])
+        if code == 2:
+            assert sim.executions() == [[], [], []], "refused, but something moved"
+        else:
+            check_invariants(folder, sim, alive=True, deaf=False)
+    assert not (folder / "calibration.json").exists()
+    return Outcome(fault, "start", code, 0, reason, 0.0, refused=True)
+
+
+def _overnight_cell(fault: str, truth: np.ndarray, folder: pathlib.Path) -> Outcome:
+    """A session that was stopped, a night without power, and a resumption."""
+    counters, joints = OVERNIGHT[fault]
+    said: list[str] = []
+    with simulator(fast_config()) as sim:
+
+        def stop(run: Run, entered: str) -> None:
+            if entered == "moving" and in_the_middle(run, entered):
+                run.signals.request_stop("in the evening", 143)
+
+        served = sim.start()
+        assert session(served, folder, sim, said, [stop]) == 143, said[-12:]
+        kept = len(_postures(folder))
+        sim.power_cycle((counters,) * 3)
+        for axis, drive in zip(served.axes, sim.drives, strict=True):
+            drive.offset -= round(joints * axis.pulses_per_deg)
+        before = sim.executions()
+        code = session(served, folder, sim, said)
+        reason = said[-1] if code == 2 else said[-2]
+        assert code in (2, 3), (code, said[-12:])
+        assert len(_postures(folder)) == kept, "measured with a lost origin"
+        assert code == 3 or sim.executions() == before, "refused, but something moved"
+        sim.repair()
+        resumes = 0
+        while code != 0 and resumes < MAX_RESUMES:
+            resumes += 1
+            code = session(served, folder, sim, said)
+        assert code == 0, said[-12:]
+        check_invariants(folder, sim, alive=True, deaf=False)
+    worst = _equal(folder, truth)
+    return Outcome(fault, "overnight", 143, resumes, reason, worst, refused=True)
+
+
+def _postures(folder: pathlib.Path) -> list[Any]:
+    records = read_journal(folder / "journal.jsonl")
+    return [record for record in records if record["event"] == "posture"]
 
 
 def _free_port() -> int:
@@ -183,14 +288,32 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+FIRST_CODES = {
+    "sigint": (4, 0),  # 0: in the last phase there is nothing left to pause
+    "sigint_twice": (130,),
+    "sigterm": (143,),
+    "sigkill": (-9,),
+    "sigkill_watched": (-9,),
+    "full_disk": (3,),
+    "second_session": (0,),
+    "other_stop": (143,),
+}
+
+
 def _host_cell(
     fault: str, phase: str, truth: np.ndarray, folder: pathlib.Path
 ) -> Outcome:
     folder.mkdir(parents=True, exist_ok=True)
-    with simulator(fast_config()) as sim:
+    watched = fault == "sigkill_watched"
+    given = fast_config(WATCHED if watched else None)
+    device = Truth(noise_deg=0.0, idle_watchdog=watched)
+    # Slow where somebody in another terminal must come in time.
+    speedup = {"second_session": 0.3, "other_stop": 0.1}.get(fault, 1.0)
+    with simulator(given, truth=device, speedup=speedup) as sim:
         served, phone_port = sim.start(), _free_port()
         text = fast_text(
-            {
+            (WATCHED if watched else {})
+            | {
                 "port = 5020": f"port = {served.bus.port}",
                 "port = 2055": f"port = {phone_port}",
             }
@@ -198,21 +321,22 @@ def _host_cell(
         path = folder / "given.toml"
         path.write_text(text)
         sim.start_phone(phone_port)
-        child = subprocess.run(
-            [sys.executable, str(HARNESS), str(folder), str(path), fault,
-             phase],
-            capture_output=True, text=True, timeout=90, check=False,
-        )  # fmt: skip
+        with subprocess.Popen(
+            [sys.executable, str(HARNESS), str(folder), str(path), fault, phase],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        ) as child:  # fmt: skip
+            if fault in OTHERS:
+                _elsewhere(fault, folder, path)
+            said_by_child, errors = child.communicate(timeout=90)
         first = child.returncode
-        expected = {
-            "sigint": (4, 0),  # 0: in the last phase there is nothing left to pause
-            "sigint_twice": (130,),
-            "sigterm": (143,),
-            "sigkill": (-9,),
-            "full_disk": (3,),
-        }[fault]
-        assert first in expected, (first, child.stdout, child.stderr)
-        check_invariants(folder, sim, alive=fault != "sigkill", deaf=False)
+        assert first in FIRST_CODES[fault], (first, said_by_child, errors)
+        alive = first != -9
+        check_invariants(folder, sim, alive=alive, deaf=False)
+        if watched:
+            time.sleep(1.0)  # longer than their timeout: they have found out
+            for drive in sim.drives:
+                drive.advance()
+                assert drive.alarm and not drive.moving, "a drive did not stop itself"
         config = parse_config(text)
         code, resumes, said = first, 0, []
         while code != 0 and resumes < MAX_RESUMES:
@@ -220,19 +344,49 @@ def _host_cell(
             code = session(config, folder, sim, said, on_imu_port=lambda port: None)
             # Killed in its last phase, the run has nothing left to move or to stop.
             over = fault == "sigkill" and phase == "finishing"
-            check_invariants(folder, sim, alive=not over, deaf=False)
-    assert code == 0, said[-12:]
-    worst = float(np.abs(calibration(folder) - truth).max())
-    assert worst < 1e-6, f"resumed to another calibration: {worst}"
-    found = re.findall(r"^(?:fault|stopped|paused): .*", child.stdout, re.M)
-    return Outcome(fault, phase, first, resumes, found[-1] if found else "", worst)
+            armed = not over and code != 2
+            check_invariants(folder, sim, alive=armed, deaf=False)
+        assert code == 0, said[-12:]
+        if watched:  # what was lent is given back: no alarm when the line falls silent
+            time.sleep(1.0)
+            for drive in sim.drives:
+                drive.advance()
+                assert not drive.alarm, "the session ended well, its drive in alarm"
+    found = re.findall(r"^(?:fault|stopped|paused): .*", said_by_child, re.M)
+    reason = found[-1] if found else ""
+    return Outcome(fault, phase, first, resumes, reason, _equal(folder, truth))
+
+
+def _elsewhere(fault: str, folder: pathlib.Path, config: pathlib.Path) -> None:
+    """In another terminal, once the session is in the phase."""
+    deadline = time.monotonic() + 60
+    while not (folder / ENTERED).exists():
+        assert time.monotonic() < deadline, "the session never entered the phase"
+        time.sleep(0.02)
+    command = {
+        "second_session": ["calibrate", "--arm", "--zero", "--out", str(folder / "2")],
+        "other_stop": ["stop"],
+    }[fault]
+    done = subprocess.run(
+        [sys.executable, "-m", "rig", *command, "--config", str(config)],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    said = done.stdout + done.stderr
+    if fault == "second_session":
+        assert done.returncode == 2 and "held by" in said, (done.returncode, said)
+        assert not (folder / "2").exists(), "a second session was begun"
+    else:
+        assert done.returncode == 0, said
 
 
 def cells() -> list[tuple[str, str]]:
-    """Every fault with every phase."""
+    """Every fault with every phase in which it makes a difference."""
     simulated = [(fault, phase) for fault in FAULTS for phase in PHASES]
+    simulated += [(SPOILT, phase) for phase in SPOILT_PHASES]
     host = [(fault, p) for fault in HOST_FAULTS for p in (*PHASES, "finishing")]
-    return simulated + host
+    host += [(fault, p) for fault, phases in HOST_PHASES.items() for p in phases]
+    started = [(fault, "start") for fault in (*REAL, *MISTAKES)]
+    return simulated + host + started + [(fault, "overnight") for fault in OVERNIGHT]
 
 
 def table(outcomes: list[Outcome]) -> str:
@@ -264,19 +418,33 @@ def table(outcomes: list[Outcome]) -> str:
         "ends; a full disk is a limit on the size of the process's files, set by the "
         "operating system.",
         "",
-        "| fault | " + " | ".join((*PHASES, "finishing")) + " |",
-        "|---" * (len(PHASES) + 2) + "|",
+        "*start*: the device is so from the start. What real drives do (slow to "
+        "enable, a position that flickers, slow replies, a watchdog on idle lines) is "
+        "ridden out. A mistake (an axis that turns the other way, two drives on each "
+        "other's cables, another gearing in the drive) is *refused*: no calibration is "
+        "saved, and with exit code 2 nothing moved. *overnight*: between a stopped "
+        "session and its resumption the drives were without power and count from "
+        "elsewhere, or the joints were moved; the resumption is refused and measures "
+        "nothing until the origin is found again. `second_session` and `other_stop` "
+        "are commands in another terminal; `sigkill_watched` leaves drives whose "
+        "communication timeout is set, which must stop themselves, and get their own "
+        "timeout back. Faults are left out of the phases in which they would do the "
+        "same again.",
+        "",
+        "| fault | " + " | ".join(COLUMNS) + " |",
+        "|---" * (len(COLUMNS) + 1) + "|",
     ]
     by_cell = {(o.fault, o.phase): o for o in outcomes}
-    for fault in (*FAULTS, *HOST_FAULTS):
+    faults = list(dict.fromkeys(fault for fault, _ in cells()))
+    for fault in faults:
         row = []
-        for phase in (*PHASES, "finishing"):
+        for phase in COLUMNS:
             found = by_cell.get((fault, phase))
             row.append("" if found is None else f"{found.word} ({found.first_code})")
         lines.append(f"| `{fault}` | " + " | ".join(row) + " |")
     lines += ["", "In brackets the exit code of the first session.", "",
               "## What stopped each", ""]  # fmt: skip
-    for fault in (*FAULTS, *HOST_FAULTS):
+    for fault in faults:
         reasons = {
             re.sub(r"/\S*/", "", o.reason.partition(": ")[2])
             for o in outcomes

@@ -17,6 +17,8 @@ from unittest import mock
 
 from rig.config import RigConfig, parse_config
 from rig.config.files import EXAMPLES
+from rig.device.lock import BusLock
+from rig.device.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
 from rig.guard import stop
 from rig.outputs import report
 from rig.session.calibrate import calibrate
@@ -28,7 +30,13 @@ from rig.simulator import Simulator, Truth
 stop.VERIFY_S = 0.6
 
 RATE_HZ = 250.0
+ENTERED = "entered"  # the file by which a session says that it is in the phase
 HOST_FAULTS = ("sigint", "sigint_twice", "sigterm", "sigkill", "full_disk")
+OTHERS = ("second_session", "other_stop")  # what somebody does in another terminal
+WATCHED = {  # drives that stop themselves when the line is silent
+    'map = "leadshine_pr"': 'map = "generic"\ncomm_timeout_s = 0.8',
+    "timeout_s = 0.5": "timeout_s = 0.25",
+}
 FAST = {  # quick axes and short windows; a busy computer may still answer late
     "speed_deg_s = 120": "speed_deg_s = 400",
     "accel_deg_s2 = 1200": "accel_deg_s2 = 8000",
@@ -65,11 +73,30 @@ def fast_config(changes: dict[str, str] | None = None) -> RigConfig:
     return parse_config(fast_text(changes))
 
 
+def commissioned(
+    config: RigConfig, folder: pathlib.Path, sim: Simulator | None = None
+) -> DeviceRecord:
+    """The record in a folder, with every state that a session needs.
+
+    What was lost is reached again, as `home` and `axes` would.
+    """
+    record = DeviceRecord.load(folder / "device.json")
+    if record.state(HOMED) is None:
+        record.left_at()
+        for drive in sim.drives if sim else ():
+            drive.alarm = 0
+    for name in (IDENTIFIED, HOMED, SIGN_CHECKED):
+        if record.state(name) is None:
+            record.reach(name, config)
+    return record
+
+
 def simulator(config: RigConfig, **options) -> Simulator:
     """Noise-free, so that an interrupted run must give the very same calibration."""
     noise = options.pop("noise_deg", 0.0)
+    truth = options.pop("truth", Truth(noise_deg=noise))
     options.setdefault("rate_hz", RATE_HZ)
-    return Simulator(config, Truth(noise_deg=noise), **options)
+    return Simulator(config, truth, **options)
 
 
 def session(
@@ -92,6 +119,7 @@ def session(
         folder,
         "calibrate",
         (said if said is not None else []).append,
+        record=commissioned(config, folder, sim),
         start={"simulated": {"noise": 0.0}, "inputs": {}, "maps_from": "."},
         reset_alarms=True,
     )
@@ -126,9 +154,14 @@ def _spoil(fault: str, journal: pathlib.Path) -> None:
         size = journal.stat().st_size + 20
         resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
         return
-    number = {"sigkill": signal.SIGKILL, "sigterm": signal.SIGTERM}.get(
-        fault, signal.SIGINT
-    )
+    if fault in OTHERS:
+        (journal.parent / ENTERED).touch()
+        return
+    number = {
+        "sigkill": signal.SIGKILL,
+        "sigkill_watched": signal.SIGKILL,
+        "sigterm": signal.SIGTERM,
+    }.get(fault, signal.SIGINT)
     os.kill(os.getpid(), number)
     if fault == "sigint_twice":
         time.sleep(0.01)
@@ -146,7 +179,10 @@ def _main(folder: str, config_path: str, fault: str, phase: str) -> int:
 
     said: list[str] = []
     whole = fault == "full_disk"  # the figures are what no longer fits on the disk
-    code = session(config, pathlib.Path(folder), None, said, [listen], figures=whole)
+    with BusLock(config.bus).acquire("calibrate"):
+        code = session(
+            config, pathlib.Path(folder), None, said, [listen], figures=whole
+        )
     print("\n".join(said[-6:]))
     return code
 

@@ -1,7 +1,10 @@
-/* Three Leadshine-type drives served by libmodbus, for the cross-check of the rig.
+/* Three drives served by libmodbus, for the cross-check of the rig. Addresses, bits and
+ * opcodes are typed in from the makers' manuals, not from rig/maps.
  *
- * slave tcp PORT | slave rtu DEVICE
- * Prints "ready", then "move UNIT PULSES" and "stop UNIT" as they are commanded.
+ * slave tcp PORT [FAMILY] | slave rtu DEVICE [FAMILY]
+ * FAMILY: leadshine, oriental (AZ) or applied (SCL table), to be enabled first; without
+ * it they are leadshine drives, enabled.
+ * Prints "ready", then "enable UNIT", "move UNIT PULSES" and "stop UNIT" as commanded.
  */
 #include <errno.h>
 #include <modbus/modbus.h>
@@ -11,48 +14,84 @@
 #include <string.h>
 #include <unistd.h>
 
-enum { UNITS = 3, REGISTERS = 0x7000, STATUS = 0x1003, MOVE = 0x6200, TRIGGER = 0x6002,
-       POSITION = 0x602C, IDLE = 0x32, MOVING = 0x06, POLLS = 2 };
+enum { UNITS = 3, REGISTERS = 0x7000, POLLS = 2 };
 
+typedef struct {
+    const char *name;
+    int status;              /* register that holds the bits */
+    int off, idle, moving;   /* its word before enabling, at rest, on the way */
+    int position;            /* high word; the low one follows */
+    int target;
+} family_t;
+
+static const family_t families[] = {
+    {"leadshine", 0x1003, 0x30, 0x32, 0x06, 0x602C, 0x6201},
+    {"oriental", 0x007F, 0x4020, 0x4020, 0x2000, 0x00CC, 0x005C},
+    {"applied", 0x0001, 0x0008, 0x0009, 0x0011, 0x0006, 0x001E},
+};
+static const family_t *family = families;
 static modbus_mapping_t *drive[UNITS + 1];
 static int32_t target[UNITS + 1];
 static int busy[UNITS + 1];
 
-static void set_position(int unit, int32_t pulses) {
-    drive[unit]->tab_registers[POSITION] = (uint32_t)pulses >> 16;
-    drive[unit]->tab_registers[POSITION + 1] = (uint32_t)pulses & 0xFFFF;
+static void go(int unit) {
+    uint16_t *r = drive[unit]->tab_registers;
+    if (r[family->status] == family->off && family->off != family->idle) return;
+    target[unit] = (int32_t)((uint32_t)r[family->target] << 16 | r[family->target + 1]);
+    busy[unit] = POLLS;
+    r[family->status] = family->moving;
+    printf("move %d %d\n", unit, (int)target[unit]);
+}
+
+static void rest(int unit, const char *word) {
+    busy[unit] = 0;
+    drive[unit]->tab_registers[family->status] = family->idle;
+    printf("%s %d\n", word, unit);
 }
 
 static void act(int unit, const uint8_t *pdu) {
     uint16_t *r = drive[unit]->tab_registers;
-    int address = pdu[1] << 8 | pdu[2];
-    if (pdu[0] == 3 && address == STATUS && busy[unit] > 0 && --busy[unit] == 0) {
-        set_position(unit, target[unit]);
-        r[STATUS] = IDLE;
-    }
-    if (pdu[0] == 16 && address == MOVE && r[MOVE + 7] == 0x10) {
-        target[unit] = (int32_t)((uint32_t)r[MOVE + 1] << 16 | r[MOVE + 2]);
-        busy[unit] = POLLS;
-        r[STATUS] = MOVING;
-        printf("move %d %d\n", unit, (int)target[unit]);
-    }
-    if (pdu[0] == 6 && address == TRIGGER && r[TRIGGER] == 0x40) {
-        busy[unit] = 0;
-        r[STATUS] = IDLE;
-        printf("stop %d\n", unit);
+    int function = pdu[0], address = pdu[1] << 8 | pdu[2], last = address;
+    if (function == 16 || function == 3) last += (pdu[3] << 8 | pdu[4]) - 1;
+    if (function == 3) {
+        int asked = address <= family->status && family->status <= last;
+        if (asked && busy[unit] > 0 && --busy[unit] == 0) {
+            r[family->position] = (uint32_t)target[unit] >> 16;
+            r[family->position + 1] = (uint32_t)target[unit] & 0xFFFF;
+            r[family->status] = family->idle;
+        }
+    } else if (family == &families[0]) {
+        /* PR0: mode at 6200h, 1 = absolute; 6207h = 10h runs it; 6002h = 40h stops */
+        if (function == 16 && last == 0x6207 && r[0x6207] == 0x10 && r[0x6200] == 1)
+            go(unit);
+        if (address == 0x6002 && r[0x6002] == 0x40) rest(unit, "stop");
+        if (address == 0x000F && r[0x000F] == 1) rest(unit, "enable");
+    } else if (family == &families[1]) {
+        /* direct data: type at 5Ah/5Bh, 1 = absolute; trigger 66h/67h; STOP: bit 5 */
+        if (function == 16 && address == 0x58 && last == 0x67 && !r[0x5A] &&
+            r[0x5B] == 1 && r[0x67] == 1)
+            go(unit);
+        if (address == 0x7D && r[0x7D] & 0x20) rest(unit, "stop");
+    } else if (address == 124) {
+        /* opcode at 40125: 67h feed to position, E1h stop and kill, 9Fh motor enable */
+        if (r[124] == 0x67) go(unit);
+        if (r[124] == 0xE1) rest(unit, "stop");
+        if (r[124] == 0x9F) rest(unit, "enable");
     }
     fflush(stdout);
 }
 
 int main(int argc, char **argv) {
-    int tcp = argc == 3 && strcmp(argv[1], "tcp") == 0;
     uint8_t query[MODBUS_TCP_MAX_ADU_LENGTH];
-    if (argc != 3) return 2;
+    if (argc < 3) return 2;
+    int tcp = strcmp(argv[1], "tcp") == 0;
+    for (size_t i = 0; argc > 3 && i < sizeof families / sizeof *families; i++)
+        if (strcmp(argv[3], families[i].name) == 0) family = &families[i];
     for (int unit = 1; unit <= UNITS; unit++) {
         drive[unit] = modbus_mapping_new(0, 0, REGISTERS, 0);
         if (!drive[unit]) return 1;
-        drive[unit]->tab_registers[STATUS] = IDLE;
-        drive[unit]->tab_registers[1] = 10000;
+        drive[unit]->tab_registers[family->status] = argc > 3 ? family->off : family->idle;
+        if (family == families) drive[unit]->tab_registers[1] = 10000;
     }
     modbus_t *bus = tcp ? modbus_new_tcp("127.0.0.1", atoi(argv[2]))
                         : modbus_new_rtu(argv[2], 115200, 'N', 8, 1);

@@ -1,4 +1,4 @@
-"""Drives: the makers' published frames, three transports, retries, and other stacks."""
+"""Drives: three transports, retries, and other stacks."""
 
 import asyncio
 import contextlib
@@ -11,53 +11,19 @@ import threading
 import time
 
 import pytest
-from harness import HASTY, changed, fast_config, simulator
+from harness import HASTY, changed, fast_config, fast_text, simulator
+from hypothesis import given
+from hypothesis import strategies as st
+from recorder import Recorder, axis_with, rtu_over_tcp
 
-from rig.config.maps import load_map
+from rig.config import ConfigError, parse_config
+from rig.config.maps import available_maps, load_map
 from rig.config.settings import BusSettings
 from rig.device.bus import Bus, BusError, Rejected
 from rig.device.drives import Drive
 from rig.guard.stop import stop_all
 from rig.simulator import parse_fault
 from rig.simulator.server import crc16
-
-
-class Recorder:
-    """A TCP peer that keeps what it is sent and answers from a script."""
-
-    def __init__(self, answer):
-        self.received = b""
-        self._answer = answer
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self.port = self._listener.getsockname()[1]
-        self._connections = []
-        threading.Thread(target=self._run, daemon=True).start()
-
-    def _run(self):
-        while True:
-            try:
-                connection, _ = self._listener.accept()
-            except OSError:
-                return
-            self._connections.append(connection)
-            threading.Thread(
-                target=self._serve, args=(connection,), daemon=True
-            ).start()
-
-    def _serve(self, connection):
-        try:
-            while data := connection.recv(4096):
-                self.received += data
-                reply = self._answer(data)
-                if reply:
-                    connection.sendall(reply)
-        except OSError:
-            return
-
-    def close(self):
-        self._listener.close()
-        for connection in self._connections:
-            connection.close()
 
 
 @pytest.fixture
@@ -73,73 +39,6 @@ def recorder():
         peer.close()
 
 
-def rtu_over_tcp(port, retries=2):
-    return BusSettings(
-        transport="rtu_tcp", host="127.0.0.1", port=port, timeout_s=0.1,
-        read_retries=retries,
-    )  # fmt: skip
-
-
-def echo_write(frame):
-    """The RTU reply to a write of many registers."""
-    head = frame[:6]
-    return head + crc16(head)
-
-
-def axis_with(name, **changes):
-    axis = fast_config().axes[0]
-    return changed(axis, map=load_map(name), unit=7, **changes)
-
-
-def test_crc_is_the_standards():
-    assert crc16(bytes.fromhex("010300000001")) == bytes.fromhex("840a")
-
-
-def test_leadshine_move_is_the_frame_printed_in_the_makers_manual(recorder):
-    """CS2RS manual, page 43: absolute move to 10000, both ramps 10000 ms."""
-    manual = bytes.fromhex("07106200000810000100002710000027102710000000108D50")
-    assert crc16(manual[:-2]) == manual[-2:]
-    peer = recorder(echo_write)
-    with Bus(rtu_over_tcp(peer.port)) as bus:
-        words = list(struct.unpack(">8H", manual[7:23]))
-        bus.write(7, 0x6200, 16, words)
-        assert peer.received == manual
-        peer.received = b""
-        drive = Drive(bus, axis_with("leadshine_pr", max_pulses=20000))
-        drive.move(10000)
-    frame = peer.received
-    assert frame[:7] == manual[:7] and len(frame) == len(manual)
-    assert frame[7:13] == manual[7:13]  # absolute, 10000, high word first
-    assert frame[-4:-2] == bytes.fromhex("0010")  # run PR path 0 at once
-    assert crc16(frame[:-2]) == frame[-2:]
-    assert peer.received.count(frame) == 1
-
-
-def test_oriental_move_is_one_frame_of_sixteen_registers(recorder):
-    peer = recorder(echo_write)
-    with Bus(rtu_over_tcp(peer.port)) as bus:
-        Drive(bus, axis_with("oriental_az")).move(-1000)
-    frame = peer.received
-    assert frame[:7] == bytes([7, 16, 0x00, 0x58, 0, 16, 32])
-    words = struct.unpack(">16H", frame[7:39])
-    assert words[:4] == (0, 0, 0, 1)  # data 0, type 1: absolute
-    assert words[4:6] == (0xFFFF, 0xFC18)  # -1000, high word first
-    assert words[12:] == (0, 1000, 0, 1)  # full current; start
-
-
-def test_applied_motion_sends_its_parameters_then_the_opcode(recorder):
-    def answer(frame):
-        return echo_write(frame) if frame[1] == 16 else frame
-
-    peer = recorder(answer)
-    with Bus(rtu_over_tcp(peer.port)) as bus:
-        Drive(bus, axis_with("applied_motion")).move(4321)
-    first, second = peer.received[:-8], peer.received[-8:]
-    assert first[:7] == bytes([7, 16, 0, 27, 0, 5, 10])
-    assert first[13:17] == struct.pack(">i", 4321)
-    assert second[:6] == bytes([7, 6, 0, 124, 0, 0x67])
-
-
 def test_speed_and_ramp_arrive_in_the_makers_units():
     axis = axis_with("leadshine_pr", speed_deg_s=36.0, accel_deg_s2=360.0)
     # reduction 10: 36 deg/s is 1 rev/s = 60 rpm; 360 deg/s^2 is 10 rev/s^2, so
@@ -149,6 +48,63 @@ def test_speed_and_ramp_arrive_in_the_makers_units():
     assert axis.motion_counts() == {"speed": 240, "accel": 60, "decel": 60}
     axis = changed(axis, map=load_map("oriental_az"))
     assert axis.motion_counts()["speed"] == 10000
+
+
+def test_a_speed_is_never_rounded_up_to_the_registers_unit():
+    """1 rpm of a motor without a gear is 6 deg/s: 1 deg/s became 6 deg/s."""
+    axis = axis_with("leadshine_pr", reduction=1.0, speed_deg_s=11.9, accel_deg_s2=600)
+    assert axis.motion_counts()["speed"] == 1
+    assert axis.drive_motion[0] == pytest.approx(6.0)
+    slow = changed(axis, speed_deg_s=1.0)
+    with pytest.raises(ValueError, match=r"speed_deg_s: must be at least 6 deg/s"):
+        slow.motion_counts()
+    assert changed(axis, speed_deg_s=6.0).motion_counts()["speed"] == 1
+    text = fast_text({"speed_deg_s = 400": "speed_deg_s = 0.5"})
+    with pytest.raises(ConfigError, match=r"pitch.speed_deg_s: must be at least 0\.6"):
+        parse_config(text)
+
+
+def test_a_ramp_register_holds_a_time_that_is_rounded_up():
+    axis = axis_with("leadshine_pr", reduction=1.0, speed_deg_s=60, accel_deg_s2=3e5)
+    assert axis.motion_counts()["accel"] == 20  # ms per 1000 rpm, of 20 exactly
+    assert changed(axis, accel_deg_s2=2.95e5).motion_counts()["accel"] == 21
+    with pytest.raises(ValueError, match=r"accel_deg_s2: .*does not fit u16"):
+        changed(axis, accel_deg_s2=1.0).motion_counts()
+    coarse = axis_with("applied_motion", reduction=1.0, accel_deg_s2=59.0)
+    with pytest.raises(ValueError, match="accel_deg_s2: must be at least 60 deg/s"):
+        coarse.motion_counts()
+
+
+@given(
+    name=st.sampled_from(available_maps()),
+    speed=st.floats(1e-3, 5000),
+    accel=st.floats(1e-3, 1e5),
+    reduction=st.floats(0.01, 500),
+    per_rev=st.integers(200, 100_000),
+)
+def test_no_drive_is_told_to_be_quicker_than_configured(
+    name, speed, accel, reduction, per_rev
+):
+    axis = axis_with(
+        name, speed_deg_s=speed, accel_deg_s2=accel, reduction=reduction,
+        pulses_per_rev=per_rev,
+    )  # fmt: skip
+    try:
+        counts = axis.motion_counts()
+    except ValueError as error:
+        assert str(error).startswith(("speed_deg_s: ", "accel_deg_s2: "))
+        return
+    units = axis.map.units  # what the makers' units come to, worked out again
+    in_unit = reduction / 360 * (per_rev if units.speed == "pulse_per_s" else 1)
+    told = counts["speed"] / units.speed_per_unit / in_unit
+    least = 1 / units.speed_per_unit / in_unit
+    assert speed - least < told <= speed * (1 + 1e-8)
+    turns = counts["accel"] / units.accel_per_unit
+    if units.accel == "s_per_rev_per_s":
+        turns = 1 / turns
+    in_unit = reduction / 360 * (per_rev if units.accel == "pulse_per_s2" else 1)
+    assert turns / in_unit <= accel * (1 + 1e-8)
+    assert axis.drive_motion == pytest.approx((told, turns / in_unit))
 
 
 @pytest.mark.parametrize("transport", ["tcp", "rtu_tcp", "rtu"])

@@ -15,11 +15,12 @@ import time
 import numpy as np
 import pytest
 from fault_matrix import _free_port
-from harness import no_figures
+from harness import commissioned, no_figures
 from scipy.spatial.transform import Rotation
 
 from rig.__main__ import main
 from rig.attitude import angle_between_deg, euler_to_matrix
+from rig.config import load_config
 
 MATRIX = np.array([[0.95, 0.03, -0.02], [0.01, 1.04, 0.02], [-0.015, 0.01, 0.9]])
 PULSES_PER_DEG = 1000
@@ -227,18 +228,20 @@ def test_a_whole_calibration_with_a_strangers_slave_and_phone(
         AXIS.format(name=name, unit=unit)
         for unit, name in enumerate(("pitch", "yaw", "roll"), 1)
     )
-    (tmp_path / "rig.toml").write_text(
+    path, session = tmp_path / "rig.toml", 'method = "exact"'
+    path.write_text(
         CONFIG.format(bus=slave.port, imu=imu, axes=axes, phone=settings,
-                      session='method = "exact"')
+                      session=session)
     )  # fmt: skip
+    commissioned(load_config(path), tmp_path)
     thread = threading.Thread(
         target=phone, args=(slave, imu, closing, rate), daemon=True
     )
     thread.start()
     try:
         with no_figures():
-            code = main(["calibrate", "--config", str(tmp_path / "rig.toml"), "--arm",
-                     "--zero", "--out", str(tmp_path / "runs")])  # fmt: skip
+            code = main(["calibrate", "--config", str(path), "--arm", "--zero",
+                     "--out", str(tmp_path / "runs")])  # fmt: skip
     finally:
         closing.set()
         thread.join(5)

@@ -6,6 +6,7 @@ import sys
 
 import pytest
 
+from rig.faults import StopRequested
 from rig.outputs.journal import Journal, JournalError, read_journal
 
 
@@ -76,6 +77,24 @@ def test_a_full_disk_leaves_whole_lines(tmp_path, monkeypatch):
     journal.write("posture", number=2)
     journal.close()
     assert [r["number"] for r in read_journal(tmp_path / "j")] == [0, 2]
+
+
+def test_a_signal_during_a_write_leaves_whole_lines(tmp_path, monkeypatch):
+    """While nothing is armed a signal ends the program at once, from its handler."""
+
+    def interrupted(fd):
+        raise StopRequested("SIGTERM", 143)
+
+    path = tmp_path / "journal.jsonl"
+    journal = Journal(path)
+    journal.write("start")
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", interrupted)
+        with pytest.raises(StopRequested):
+            journal.write("resume", sync=True)
+    journal.write("stopped", sync=True)
+    journal.close()
+    assert [record["event"] for record in read_journal(path)] == ["start", "stopped"]
 
 
 def test_sigkill_at_any_moment_leaves_a_readable_journal(tmp_path):

@@ -17,7 +17,7 @@ import tty
 import numpy as np
 import pytest
 from fault_matrix import _free_port
-from harness import fast_text
+from harness import commissioned, fast_text
 from scipy.spatial.transform import Rotation
 
 from rig.__main__ import main
@@ -54,6 +54,7 @@ class Slave:
     def __init__(self, program, *arguments):
         self.moves: list[tuple[int, int]] = []
         self.stops: list[int] = []
+        self.enabled: list[int] = []
         self.position = {1: 0, 2: 0, 3: 0}
         self.process = subprocess.Popen(
             [str(program), *arguments], stdout=subprocess.PIPE, text=True
@@ -67,6 +68,8 @@ class Slave:
             if word == "move":
                 self.moves.append((int(unit), int(rest[0])))
                 self.position[int(unit)] = int(rest[0])
+            elif word == "enable":
+                self.enabled.append(int(unit))
             else:
                 self.stops.append(int(unit))
 
@@ -121,6 +124,7 @@ def test_a_whole_calibration_over_tcp(program, tmp_path):
     config = parse_config(text)
     path = tmp_path / "rig.toml"
     path.write_text(text)
+    commissioned(config, tmp_path)
     closing = threading.Event()
     with Slave(program, "tcp", str(bus)) as slave:
         sender = threading.Thread(target=phone, args=(slave, config, imu, closing))
@@ -140,6 +144,40 @@ def test_a_whole_calibration_over_tcp(program, tmp_path):
     records = [json.loads(line) for line in (folder / "journal.jsonl").open()]
     asked = [r["pulses"] for r in records if r["event"] == "command"]
     assert [pulses for _, pulses in slave.moves] == asked
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("register_map", "family"),
+    [
+        ("leadshine_pr", "leadshine"),
+        ("oriental_az", "oriental"),
+        ("applied_motion", "applied"),
+    ],
+)
+def test_every_family_enables_moves_and_stops(program, register_map, family):
+    """Registers, bits and opcodes of the C program are typed in from the manuals."""
+    text = fast_text({'map = "leadshine_pr"': f'map = "{register_map}"'})
+    axis, port = parse_config(text).axes[1], _free_port()
+    settings = BusSettings(transport="tcp", host="127.0.0.1", port=port, timeout_s=0.5)
+    with Slave(program, "tcp", str(port), family) as slave, Bus(settings) as bus:
+        drive = Drive(bus, axis)
+        if axis.map.enable:
+            assert not drive.status().enabled
+            assert drive.bring(axis.map.enable, lambda s: s.enabled).enabled
+            assert slave.enabled == [2]
+        start = drive.status()
+        assert start.enabled and start.done and not start.moving and not start.fault
+        assert drive.took(-4321, start, 14) is False
+        drive.move(-4321)
+        assert drive.took(-4321, start, 14) is True
+        end = time.monotonic() + 5
+        while not (status := drive.status()).done:
+            assert status.moving and time.monotonic() < end
+        assert status.position == -4321
+        (result,) = stop_all([drive])
+        assert result.acknowledged and result.standing
+        assert slave.moves == [(2, -4321)] and set(slave.stops) == {2}
 
 
 @pytest.mark.slow

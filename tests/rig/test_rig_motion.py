@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from harness import HASTY, UNSETTLED, fast_config, fast_text, simulator
+from harness import HASTY, UNSETTLED, WATCHED, fast_config, fast_text, simulator
 
 from rig.config import parse_config
 from rig.device.bus import Bus
@@ -26,11 +26,6 @@ from rig.session.device import Device
 from rig.session.measuring import Observer
 from rig.session.motion import Motion
 from rig.simulator import parse_fault
-
-WATCHED = {
-    'map = "leadshine_pr"': 'map = "generic"\ncomm_timeout_s = 0.8',
-    "timeout_s = 0.5": "timeout_s = 0.25",
-}
 
 
 @contextlib.contextmanager
@@ -263,8 +258,7 @@ def test_sigterm_stops_a_move_under_way():
 
 
 def test_a_lost_heartbeat_stops_the_drives():
-    text = fast_text({"[motion]": "[motion]\nheartbeat_s = 0.3"})
-    with bench(parse_config(text), speedup=0.02) as motion:
+    with bench(fast_config(HASTY), speedup=0.02) as motion:
         for drive, pulses in zip(
             motion.device.drives, motion.config.to_pulses([15, 15, 15]), strict=True
         ):

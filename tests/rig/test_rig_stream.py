@@ -1,8 +1,10 @@
 """The phone's stream: published formats, and everything a Wi-Fi does to them."""
 
+import contextlib
 import http.client
 import json
 import socket
+import threading
 import time
 
 import numpy as np
@@ -217,8 +219,12 @@ def test_a_phone_that_comes_back_on_a_new_connection_is_heard():
 def test_a_half_open_connection_is_given_up_for_the_next():
     with Imu(changed(PLAIN, port=0, stale_s=0.1)) as imu:
         with connect(imu), connect(imu) as second:
-            second.sendall(b"?\r\n1,2,3\r\n")
-            wait_for(lambda: imu.since(0))  # or it fails: the second is heard
+
+            def heard():  # what it sent while it waited is lost
+                second.sendall(b"1,2,3\r\n")
+                return imu.since(0)
+
+            wait_for(heard)  # or it fails: the second is heard
             assert imu.connections == 2
 
 
@@ -292,3 +298,111 @@ def test_http_push_is_received_and_an_oversized_one_refused():
         web.endheaders()
         assert web.getresponse().status == 413
         web.close()
+
+
+def streaming(imu, angle, source="127.0.0.1", seconds=30.0):
+    """A sender of ``angle`` at 100 Hz from an address of its own, until refused."""
+    ended = threading.Event()
+
+    def send():
+        made = socket.socket()
+        made.bind((source, 0))
+        made.settimeout(2)
+        with made, contextlib.suppress(OSError):
+            made.connect(("127.0.0.1", imu.port))
+            made.sendall(b"?\r\n")
+            end = time.monotonic() + seconds
+            while time.monotonic() < end and not ended.is_set():
+                made.sendall(f"{angle},0,0\r\n".encode())
+                time.sleep(0.01)
+        ended.set()
+
+    threading.Thread(target=send, daemon=True).start()
+    return ended
+
+
+def angles_of(imu):
+    return {round(float(matrix_to_euler(r.matrix, "ZXY")[0]), 3) for r in imu.since(0)}
+
+
+@pytest.mark.parametrize("second", ["127.0.0.1", "127.0.0.2"])
+def test_a_second_sender_is_refused_reported_and_never_mixed_in(second):
+    told = []
+    with Imu(
+        changed(PLAIN, port=0, stale_s=0.2),
+        report=lambda event, **fields: told.append((event, fields["address"])),
+    ) as imu:
+        first = streaming(imu, 10)
+        wait_for(lambda: imu.sender)
+        for _ in range(2):  # it comes again
+            refused = streaming(imu, 40, second)
+            assert refused.wait(5.0)
+        time.sleep(0.1)
+        assert angles_of(imu) == {10.0} and imu.sender == "127.0.0.1"
+        assert told == [("sender_refused", second)]
+        assert not first.is_set()
+        first.set()  # the first goes: an address that was refused stays refused
+        other = streaming(imu, 40, "127.0.0.2")
+        assert other.wait(5.0)
+        assert angles_of(imu) == {10.0}
+
+
+def test_only_an_address_that_is_allowed_is_heard():
+    settings, told = changed(PLAIN, port=0, allow=("127.0.0.2",)), []
+    with Imu(settings, lambda event, **more: told.append(more)) as imu:
+        assert streaming(imu, 40).wait(5.0)
+        ended = streaming(imu, 10, "127.0.0.2")
+        wait_for(lambda: imu.sender)
+        ended.set()
+        assert angles_of(imu) == {10.0} and imu.sender == "127.0.0.2"
+    assert [each["address"] for each in told] == ["127.0.0.1"]
+    assert "127.0.0.2" in told[0]["reason"]
+
+
+def test_whoever_connects_and_says_nothing_does_not_become_the_phone():
+    with Imu(changed(PLAIN, port=0, stale_s=0.2)) as imu:
+        idle = socket.create_connection(("127.0.0.1", imu.port), 2, ("127.0.0.2", 0))
+        with idle:
+            ended = streaming(imu, 10)
+            wait_for(lambda: imu.sender == "127.0.0.1")
+            ended.set()
+
+
+def test_what_was_sent_while_another_was_heard_is_not_taken_for_new():
+    """The phone's new connection waits until the half-open one is given up."""
+    with Imu(changed(PLAIN, port=0, stale_s=0.2)) as imu, connect(imu) as old:
+        old.sendall(b"?\r\n10,0,0\r\n")
+        wait_for(lambda: imu.sender)
+        with connect(imu) as new:
+            new.sendall(b"?\r\n" + b"20,0,0\r\n" * 5)  # at once, then 30
+            end = time.monotonic() + 5.0
+            while 30.0 not in angles_of(imu):
+                assert time.monotonic() < end
+                new.sendall(b"30,0,0\r\n")
+                time.sleep(0.01)
+        assert angles_of(imu) == {10.0, 30.0}
+
+
+def push(imu, angle, source="127.0.0.1", device="a"):
+    """The status of one pushed message."""
+    web = http.client.HTTPConnection(
+        "127.0.0.1", imu.port, timeout=2, source_address=(source, 0)
+    )
+    q = Rotation.from_euler("ZXY", [angle, 0, 0], degrees=True).as_quat()
+    values = dict(zip(("qx", "qy", "qz", "qw"), q.tolist(), strict=True))
+    entry = {"name": "orientation", "time": time.time_ns(), "values": values}
+    with contextlib.closing(web):
+        web.request("POST", "/", json.dumps({"deviceId": device, "payload": [entry]}))
+        return web.getresponse().status
+
+
+@pytest.mark.parametrize("second", [("127.0.0.2", "a"), ("127.0.0.1", "b")])
+def test_a_second_sender_of_pushed_messages_is_refused_too(second):
+    told = []
+    settings = changed(HYPER, format="sensorlogger", port=0)
+    with Imu(settings, report=lambda e, **more: told.append(more["address"])) as imu:
+        for _ in range(3):
+            assert push(imu, 10) == 200
+            assert push(imu, 15, *second) == 403
+        assert angles_of(imu) == {10.0}
+    assert told == [second[0]]

@@ -169,13 +169,13 @@ class Arm:
         """(N, q, S) derivative of the outputs by the steps ``at`` (S,)."""
         steps = self._steps(commands, parameters)
         frame, axes, origins = forward(len(commands), steps)
-        position = np.empty((len(commands), 3, len(at)))
+        motion = np.empty((len(at), 3, len(commands)))
         for k, i in enumerate(at):
             if steps[i].turns:
-                lever = np.radians(frame[3] - origins[i])
-                position[..., k] = cross(axes[i], lever).T
+                cross(axes[i], np.radians(frame[3] - origins[i]), motion[k])
             else:
-                position[..., k] = axes[i].T
+                motion[k] = axes[i]
+        position = np.ascontiguousarray(motion.transpose(2, 1, 0))
         if self.output == "position":
             return position
         vector = np.radians(self._outputs(commands, frame)[:, 3:])

@@ -31,11 +31,16 @@ class Step(NamedTuple):
     value: Array | float  # one number, or (N,)
 
 
-def cross(left: Array, right: Array) -> Array:
+def cross(left: Array, right: Array, out: Array | None = None) -> Array:
     """Cross products of (..., 3, N): over the axis before the last."""
-    x, y, z = np.moveaxis(left, -2, 0)
-    u, v, w = np.moveaxis(right, -2, 0)
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-2)
+    x, y, z = (left[..., k, :] for k in range(3))
+    u, v, w = (right[..., k, :] for k in range(3))
+    if out is None:
+        out = np.empty(np.broadcast_shapes(left.shape, right.shape))
+    np.subtract(y * w, z * v, out=out[..., 0, :])
+    np.subtract(z * u, x * w, out=out[..., 1, :])
+    np.subtract(x * v, y * u, out=out[..., 2, :])
+    return out
 
 
 def forward(

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 __all__ = ["TOLERANCE", "BranchResult", "branch_and_bound"]
 
 TOLERANCE = 1e-10  # of phi of "det"; of the others a share of it
-_CHUNK = 16  # nodes between looks at the clock, where there is a deadline
-_ALL = 1 << 40
+_CHUNK = 16  # nodes between looks at the clock, where ``enough`` may stop the search
+_PACE = 0.01  # seconds between looks where not, at which an interrupt is seen too
 _MEMORY = 64 * 2**20  # bytes of open nodes up to which the best bound goes first
 _FREE = 3e6  # node x M q p^2 spent on a proof although ``enough`` is reached: 10 ms
 _SHARE = 0.05  # of its distance to the incumbent, how far a node is left from solved
@@ -82,7 +82,7 @@ def branch_and_bound(
     nodes, bounds = np.empty((64, 3, num_blocks)), np.full(64, np.inf)
     nodes[0] = lower, upper, start
     counts = best_counts
-    size, done, free, bound = 1, 0, _ALL, np.inf
+    size, done, free, bound, chunk = 1, 0, 0, np.inf, 1
     while size:
         bound = max(bounds[:size].max(), best_values[0])
         late = deadline is not None and time.perf_counter() > deadline
@@ -100,10 +100,10 @@ def branch_and_bound(
             nodes, bounds = (
                 np.concatenate([a, np.empty_like(a)]) for a in (nodes, bounds)
             )
-        chunk = _CHUNK if deadline is not None or done >= free else free - done
+        begun = time.perf_counter()
         size, more = search(
             problem, TOLERANCE, _SHARE, nodes, bounds, size, counts, best_values,
-            max(256, _MEMORY // (24 * width)), chunk if done else 1,
+            max(256, _MEMORY // (24 * width)), chunk,
         )  # fmt: skip
         if not done and size:
             # Incumbents may use what the root rules out as no better than they are.
@@ -115,6 +115,10 @@ def branch_and_bound(
             if enough is not None:
                 free = int(_FREE / (width * q * p * p))
         done += more
+        chunk = _CHUNK
+        if enough is None:
+            seconds = max(time.perf_counter() - begun, 1e-6)
+            chunk = max(1, int(more * _PACE / seconds))
     proven = size == 0
     found = np.isfinite(best_values)
     best_counts[:, alive] = counts

@@ -15,28 +15,20 @@ from numba import njit
 from jaxcal.information.linear_algebra import INNER, gram_of
 from jaxcal.selection.exact.criterion_kernel import (
     RANK,
+    RANK_TRACE,
+    TRACE,
     D,
-    Local,
-    eigen,
     evaluate,
+    new_local,
 )
 from jaxcal.selection.exact.relaxation_kernel import relax
+from jaxcal.selection.exact.spectral_kernel import share_out, weigh, whiten
 
 __all__ = ["offer_start", "process", "search"]
 
 _WHOLE = 1e-9  # a count this near a whole number is that number
 _SAME = 1e-7  # apart in value, selections are two without a look at their counts
-_SINGULAR = 1e-12  # smallest over largest eigenvalue of what is known
 _SMOOTHING = 30.0  # of E at first, where the eigenvalue is about 1
-
-
-@njit(inline="always")
-def _new_local(p):
-    square = np.empty((6, p, p))
-    return Local(
-        square[0], square[1], square[2], square[3], np.empty(p), square[4], square[5],
-        np.empty(4),
-    )  # fmt: skip
 
 
 @njit(inline="always")
@@ -48,9 +40,8 @@ def value_of(problem, counts, local):
 
 
 @njit(**INNER)
-def offer(problem, counts, local, best_counts, best_values):
+def offer(value, counts, best_counts, best_values):
     """Insert a selection into the sorted list of the best, once."""
-    value = value_of(problem, counts, local)
     size = len(best_values)
     if not value > best_values[size - 1]:
         return
@@ -75,16 +66,16 @@ def offer(problem, counts, local, best_counts, best_values):
 def offer_start(problem, low, high, counts, local, best_counts, best_values):
     """Offer a selection and, where several are wanted, all one swap away from it."""
     num_blocks = len(counts)
-    offer(problem, counts, local, best_counts, best_values)
-    for i in range(num_blocks):
-        if counts[i] > low[i] and len(best_values) > 1:
+    swaps = num_blocks * num_blocks if len(best_values) > 1 else 1
+    for swap in range(swaps):  # from i to j; the first is none
+        i, j = swap // num_blocks, swap % num_blocks
+        if (i != j and counts[i] > low[i] and counts[j] < high[j]) or swap == 0:
             counts[i] -= 1
-            for j in range(num_blocks):
-                if j != i and counts[j] < high[j]:
-                    counts[j] += 1
-                    offer(problem, counts, local, best_counts, best_values)
-                    counts[j] -= 1
+            counts[j] += 1
+            value = value_of(problem, counts, local)
+            offer(value, counts, best_counts, best_values)
             counts[i] += 1
+            counts[j] -= 1
 
 
 @njit(**INNER)
@@ -95,7 +86,7 @@ def _copy(node, out):
             out[a, i] = node[a, i]
 
 
-@njit(inline="always")
+@njit(**INNER)
 def _balance(node, k, leverage):
     """Move c into its bounds and back to sum k, keeping it near where it was."""
     low, high, c = node[0], node[1], node[2]
@@ -123,7 +114,11 @@ def _balance(node, k, leverage):
 
 @njit(**INNER)
 def _kind_of(problem, root, low, local):
-    """RANK where what is still to be chosen has too few readings for D to be sharp."""
+    """Set P; RANK or RANK_TRACE where too few readings are left for the natural bound.
+
+    That is where what is still to be chosen has fewer readings than parameters.
+    """
+    gram_of(problem.blocks, low, problem.prior, local.known)
     if root is None:
         return problem.kind
     local.settings[1] = _SMOOTHING
@@ -131,20 +126,18 @@ def _kind_of(problem, root, low, local):
     left = problem.k
     for i in range(len(low)):
         left -= low[i]
-    places = left * problem.rank
-    if problem.kind != D or places >= p or places == 0:
+    places = int(left) * problem.rank
+    sharper = problem.kind == D or problem.kind == TRACE
+    if not sharper or places >= p or places == 0:
         return problem.kind
-    gram_of(problem.blocks, low, problem.prior, local.known)
-    values = np.empty(p)
-    eigen(local.known, values, local.half)
-    if not values[0] > _SINGULAR * values[p - 1]:
+    log_det = whiten(local.known, local.half)
+    if not log_det > -np.inf:
         return problem.kind
-    local.settings[2], local.settings[3] = places, 0.0
-    for a in range(p):
-        local.settings[3] += np.log(values[a])
-        for b in range(p):
-            local.half[a, b] /= np.sqrt(values[a])
-    return RANK
+    local.settings[2], local.settings[3] = places, log_det
+    if problem.kind == D:
+        return RANK
+    weigh(root, local)
+    return RANK_TRACE if share_out(local, p - 1 - places) else TRACE
 
 
 @njit(inline="always")
@@ -211,7 +204,7 @@ def process(
             c[i] = np.floor(c[i] + 0.5)
             total += c[i]
         if total == k:
-            offer(problem, c, local, best_counts, best_values)
+            offer(value_of(problem, c, local), c, best_counts, best_values)
     if settled or bound <= best_values[last] + slack:
         return -np.inf, -1
     return bound, branch
@@ -238,7 +231,7 @@ def search(
         Open nodes left and nodes processed.
     """
     room, last = len(bounds), len(best_values) - 1
-    local = _new_local(problem.blocks.shape[2])
+    local = new_local(problem.blocks.shape[2])
     node = np.empty(nodes.shape[1:])
     low, high, c = node[0], node[1], node[2]
     leverage = np.empty(len(c))

@@ -14,13 +14,16 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from jaxcal.information.linear_algebra import INNER, gram_of
+from jaxcal.information.linear_algebra import INNER
 from jaxcal.selection.exact.criterion_kernel import (
-    FAST,
+    RANK_TRACE,
+    TRACE,
     E,
     evaluate,
     hessian,
 )
+from jaxcal.selection.exact.eigen_kernel import FAST
+from jaxcal.selection.exact.spectral_kernel import best_place, share_out
 
 __all__ = ["linear_gain", "relax"]
 
@@ -29,10 +32,11 @@ _MAX_STEPS = 80
 _FRACTIONAL = 400  # counts that a Newton step moves at most
 _RIDGE = 1e-10  # share of the largest curvature
 _ROUNDING = 1e-12  # of a count that is whole
+_TUNES = 2  # of mu of RANK_TRACE in one node
 _SHARPEST = 1e5  # smoothing of E, where the eigenvalue is about 1
 
 
-@njit(inline="always")
+@njit(**INNER)
 def _leverages(blocks, gradient, low, high, leverage):
     """Fill leverage (M,), ``trace(B_i G B_i.T)``, where the count is not fixed."""
     num_blocks, q, p = blocks.shape
@@ -51,7 +55,7 @@ def _leverages(blocks, gradient, low, high, leverage):
                     leverage[i] += reach[a] * blocks[i, r, a]
 
 
-@njit(inline="always")
+@njit(**INNER)
 def linear_gain(low, high, c, k, leverage):
     """Largest ``sum of (c'_i - c_i) d_i`` within the bounds, and its multiplier.
 
@@ -225,7 +229,7 @@ def _quadratic_step(curvature, slope, least, most, move):
         side[best] = 0
 
 
-@njit(inline="always")
+@njit(**INNER)
 def _spread(low, high, c, k):
     """Share what the lower bounds leave in proportion to the room of each count."""
     room, fixed = 0.0, 0.0
@@ -236,13 +240,37 @@ def _spread(low, high, c, k):
         c[i] = low[i] + (k - fixed) * (high[i] - low[i]) / max(room, 1.0)
 
 
+@njit(**INNER)
+def _move(blocks, low, c, local):
+    """N and M of the counts c, P being there."""
+    _, q, p = blocks.shape
+    rest, gram = local.rest, local.gram
+    for a in range(p):
+        for b in range(p):
+            rest[a, b] = 0.0
+    for i in range(len(c)):
+        weight = c[i] - low[i]
+        if weight != 0.0:
+            for r in range(q):
+                for a in range(p):
+                    scaled = weight * blocks[i, r, a]
+                    for b in range(a + 1):
+                        rest[a, b] += scaled * blocks[i, r, b]
+    for a in range(p):
+        for b in range(a + 1):
+            rest[b, a] = rest[a, b]
+            gram[a, b] = local.known[a, b] + rest[a, b]
+            gram[b, a] = gram[a, b]
+
+
 @njit(inline="always")
 def relax(problem, kind, low, high, c, goal, share, local, leverage):
     """Climb the relaxation of a node until it is pruned, or solved well enough.
 
     Args:
         problem: a Relaxation.
-        kind: its kind, or RANK, for which ``local`` has been set.
+        kind: its kind, or RANK or RANK_TRACE, for which ``local`` has been set, as P
+            always has.
         low, high, c: (M,) bounds, and the counts to start from, changed in place.
         goal: a bound at or below it ends the climb.
         share: so does a bound this share of its distance to the goal from solved.
@@ -259,26 +287,40 @@ def relax(problem, kind, low, high, c, goal, share, local, leverage):
     for attempt in range(2):
         if attempt == 1:
             _spread(low, high, c, k)
-        gram_of(blocks, c, problem.prior, local.gram)
+        _move(blocks, low, c, local)
         value, base = evaluate(kind, problem.root, local)
         if value > -np.inf:
             break
     if not value > -np.inf:
         return value, 0.0
     bound, cut = np.inf, 0.0
+    tunes = _TUNES
     for step in range(_MAX_STEPS):
         _leverages(blocks, local.gradient, low, high, leverage)
         gain, cut = linear_gain(low, high, c, k, leverage)
         bound = base + gain
         enough = max(_SOLVED, share * (value - goal))
-        if bound <= goal or bound - value <= enough or step == _MAX_STEPS - 1:
+        if bound <= goal or step == _MAX_STEPS - 1:
             break
-        if problem.root is not None and kind == E and gain <= 0.3 * (base - value):
-            if local.settings[1] >= _SHARPEST:
+        solved = bound - value <= enough
+        changed = False
+        if problem.root is None:
+            pass
+        elif kind == RANK_TRACE:
+            changed = tunes > 0 and (solved or step == 0)
+            if changed:
+                tunes -= 1
+                kind = RANK_TRACE if share_out(local, best_place(local)) else TRACE
+        elif kind == E and not solved:
+            changed = gain <= 0.3 * (base - value)
+            if changed and local.settings[1] >= _SHARPEST:
                 break
-            local.settings[1] *= 4.0
+            local.settings[1] *= 4.0 if changed else 1.0
+        if changed:
             value, base = evaluate(kind, problem.root, local)
             continue
+        if solved:
+            break
         which = _working_set(low, high, c, leverage, cut, 2 * p + 4)
         m = len(which)
         curvature, move, before = np.empty((m, m)), np.empty(m), np.empty(m)
@@ -299,7 +341,7 @@ def relax(problem, kind, low, high, c, goal, share, local, leverage):
                 whole = np.floor(c[j] + 0.5)
                 if abs(c[j] - whole) < _ROUNDING:
                     c[j] = whole
-            gram_of(blocks, c, problem.prior, local.gram)
+            _move(blocks, low, c, local)
             after, base = evaluate(kind, problem.root, local)
             if after >= value + 1e-4 * part * promised or part < 1e-6:
                 break

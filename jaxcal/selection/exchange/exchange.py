@@ -1,9 +1,9 @@
 """Fedorov exchange with restarts: near-optimal in milliseconds, no proof.
 
 Each chosen candidate in turn is swapped for the one that raises the criterion most,
-until no swap helps; the starts are the greedy selection and random ones that are not
-singular. Source: Fedorov, Theory of Optimal Experiments, 1972; Cook and Nachtsheim 1980
-for one candidate at a time.
+until no swap helps. Rank-one problems start from random selections that are not
+singular, all others from greedy ones first. Source: Fedorov, Theory of Optimal
+Experiments, 1972; Cook and Nachtsheim 1980 for one candidate at a time.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ __all__ = ["default_restarts", "exchange_from", "exchange_indices", "solve"]
 
 Indices = NDArray[np.int64]
 
-_WORK = 7e6  # k M q^2 p of the default starts of one call, about 15 ms
+# (k + 8) M q^2 p of the default starts of one call, about 10 ms; swaps for a trace or a
+# subset of the parameters cost twice those for D.
+_WORK = {"D": 24e6, "other": 12e6}
 
 
 def solve(problem: Problem, *, seed: int, restarts: int | None) -> Found:
@@ -41,7 +43,7 @@ def default_restarts(problem: Problem) -> int:
 
     None of 12,000 distinct selections was missed (4, 8 or 12 of 50, three inputs) by
     200; replicates leave more local optima, and 1 in 1,000 selections of 12 was by 400.
-    Large problems of blocks get fewer, so that they take 10 to 30 ms.
+    Large problems of blocks get fewer, so that they take 10 to 15 ms.
     """
     most = 200 if problem.max_replicates == 1 else 400
     if problem.rank_one:
@@ -49,7 +51,8 @@ def default_restarts(problem: Problem) -> int:
     if problem.criterion.name == "E":  # not compiled, and from local optima of A
         most = 20
     count, q, p = problem.blocks.shape
-    return int(min(max(_WORK / (problem.k * count * q * q * p), 1.0), most))
+    work = _WORK["D" if problem.criterion.name == "D" else "other"]
+    return int(min(max(work / ((problem.k + 8) * count * q * q * p), 1.0), most))
 
 
 def exchange_indices(

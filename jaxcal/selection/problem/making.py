@@ -36,6 +36,11 @@ __all__ = ["make_block_problem", "make_problem", "make_problems"]
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+# The C library keeps freed memory for the next array once an array as large as this was
+# freed. Else every array of a problem is given back to the system and asked for again,
+# which takes longer than what is computed in it. No page of this one is touched.
+np.empty(2**21)
+
 
 class _Rules(NamedTuple):
     """What may be chosen, over a batch of S sets."""

@@ -70,8 +70,10 @@ class Modelled:
         if self.noise.command_std is not None:
             slopes = np.zeros((count, q, candidates.shape[1]))
             slopes[available] = self.model.command_jacobian(used, self._mean)
-        blocks = np.zeros((count, q, len(self.names)))
         white = self.noise.whitening(count, q, slopes)
+        if available.all():
+            return _weighted(white, jacobian)
+        blocks = np.zeros((count, q, len(self.names)))
         blocks[available] = white[available] @ jacobian
         return blocks
 
@@ -97,7 +99,7 @@ class Modelled:
             noise = dataclasses.replace(noise, command_std=None)
         jacobian = self._jacobian(argument, points)
         white = noise.whitening(len(points), jacobian.shape[1], slopes)
-        return white @ jacobian
+        return _weighted(white, jacobian)
 
     def _jacobian(self, argument: str, commands: Array) -> Array:
         """(N, q, p) derivative by the free parameters, checked."""
@@ -110,12 +112,20 @@ class Modelled:
             raise ValueError(
                 f"model.jacobian must return shape {shape}, got {jacobian.shape}"
             )
-        bad = np.argwhere(~np.isfinite(jacobian))
-        if len(bad):
-            i, output, at = bad[0]
+        finite = np.isfinite(jacobian)
+        if not finite.all():
+            i, output, at = np.argwhere(~finite)[0]
             raise ValueError(
                 f"model.jacobian must be finite, got {jacobian[i, output, at]} for "
                 f"parameter {model.names[at]}, output {output + 1}, at {argument} "
                 f"{commands[i].tolist()}"
             )
-        return jacobian[..., self._free]
+        return jacobian if self._free.all() else jacobian[..., self._free]
+
+
+def _weighted(white: Array, jacobian: Array) -> Array:
+    """``white @ jacobian`` (N, q, p), by columns where white is one diagonal matrix."""
+    scale = np.diagonal(white[0]) if len(white) else np.ones(white.shape[1])
+    if white.strides[0] == 0 and (white[0] == np.diag(scale)).all():
+        return jacobian * scale[:, None]
+    return white @ jacobian

@@ -136,9 +136,10 @@ def check_k(
         regressors: the blocks are [u, 1].
     """
     q, p = raw.shape[2:]
-    most = 1 if q == 1 else largest_rank(raw[mask])
+    usable = raw.reshape(-1, q, p) if mask.all() else raw[mask]
+    most = 1 if q == 1 else largest_rank(usable)
     if k is None:
-        k = p if regressors else _cover(raw[mask])
+        k = p if regressors else _cover(usable)
     k = whole_number("k", k, 1)
     known = int(rank_of_blocks(root[None], root[:0])) if len(root) else 0
     if k * most + known >= p:

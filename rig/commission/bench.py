@@ -1,0 +1,129 @@
+"""The armed device of a moving step, under the guards of a session and slower."""
+
+from __future__ import annotations
+
+import pathlib
+from collections.abc import Callable
+from typing import Any
+
+from rig.attitude import Array, angle_between_deg
+from rig.config import RigConfig
+from rig.config.axis import Axis
+from rig.device.record import DeviceRecord
+from rig.faults import MotionFault
+from rig.session.checks import check_record
+from rig.session.device import Device
+from rig.session.folder import new_run_folder
+from rig.session.motion import Motion
+from rig.session.run import Run
+
+SLOW_DEG_S = 5.0
+# The phone may turn by this factor of what is commanded, and always by so much: a first
+# move of half a degree is to show a gearing that is ten times what it should be.
+ALLOWED_FACTOR, LEAST_ALLOWED_DEG = 2.0, 9.0
+
+
+class SmallMotion(Motion):
+    """Moves that stop where the phone turns further than they may turn it.
+
+    The gearing is not proved yet: a drive may turn its joint ten times as far as it is
+    told, and neither its own counts nor the limits show that.
+    """
+
+    def __init__(self, device: Device) -> None:
+        super().__init__(device)
+        self.allowed_deg = 0.0
+        self.meanwhile: Callable[[], None] | None = None  # called at every poll
+        self._origin: Array | None = None  # (3, 3)
+
+    def stay_near(self, attitude: Array, commanded_deg: float) -> None:
+        """Moves of so many degrees begin at this attitude of the phone."""
+        self._origin = attitude
+        self.allowed_deg = max(LEAST_ALLOWED_DEG, ALLOWED_FACTOR * commanded_deg)
+
+    def _check_attitude(self) -> None:
+        if self.meanwhile is not None:
+            self.meanwhile()
+        super()._check_attitude()
+        if self._origin is None:
+            return
+        turned = angle_between_deg(self._origin, self.device.imu.latest().matrix)
+        if turned > self.allowed_deg:
+            raise MotionFault(
+                f"the phone turned {turned:.1f} deg in a move that may turn it "
+                f"{self.allowed_deg:.1f}. Check pulses_per_rev and reduction, and that "
+                "the phone is fixed"
+            )
+
+
+class Bench(Run):
+    """A run that commissions. It has a folder and a journal; it is not resumed."""
+
+    small: SmallMotion  # once armed
+
+    def __init__(
+        self,
+        config: RigConfig,
+        step: str,
+        record: DeviceRecord,
+        say: Callable[[str], None],
+        *,
+        plain: RigConfig | None = None,
+        folder: pathlib.Path | None = None,
+        again: str = "",
+        homed: bool = True,
+        full_speed: bool = False,
+        start: dict[str, Any] | None = None,
+        reset_alarms: bool = False,
+    ) -> None:
+        self.plain = plain or config  # as it stands in the file
+        self.again = again
+        self.homed = homed
+        folder = folder or new_run_folder(pathlib.Path(config.output), step)
+        moved = config if full_speed else slowed(config)
+        # Every way to a place is straight, so that play is seen and not made a bias.
+        motion = config.motion.model_copy(update={"approach_overshoot_deg": 0.0})
+        moved = moved.model_copy(update={"motion": motion})
+        super().__init__(
+            moved, folder, step, say,
+            record=record, start=start, reset_alarms=reset_alarms,
+        )  # fmt: skip
+
+    def check_device(self, device: Device) -> None:
+        """Homed drives are where they were left; the gearing is still to be checked."""
+        if self.homed:
+            check_record(self.plain, device.drives, self.record)
+
+    def arm(self) -> Device:
+        """Open, arm; nothing is zeroed, and the moves are small ones."""
+        if self.device is None:
+            super().arm()
+            assert self.device is not None
+            self.small = SmallMotion(self.device)
+        return self.device
+
+    def device_guard(self, moving: bool = False) -> None:
+        """The loop is alive; StopRequested where a stop was asked for."""
+        self.arm().guard(moving)
+
+    @property
+    def to_go_on(self) -> str:
+        return self.again
+
+
+def slowed(config: RigConfig) -> RigConfig:
+    """The same with axes that are no faster than a person can follow."""
+    axes = tuple(_slow(axis) for axis in config.axes)
+    return config.model_copy(update={"axes": axes})
+
+
+def _slow(axis: Axis) -> Axis:
+    speed = min(SLOW_DEG_S, axis.speed_deg_s)
+    while speed < axis.speed_deg_s:
+        slow = axis.model_copy(update={"speed_deg_s": speed})
+        try:
+            slow.motion_counts()
+            return slow
+        except ValueError:  # slower than the drive's register can say
+            speed *= 2.0
+    return axis

@@ -1,0 +1,218 @@
+"""ports, scan, imu, jog, home, axes, zero, setup: from arguments to an exit code."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import pathlib
+import socket
+import tomllib
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+from rig.commission import setup, steps
+from rig.commission.operator import Operator
+from rig.commission.ports import MODBUS_PORT, serial_lines, tcp_line
+from rig.commission.scan import Found, parse_bus, scan
+from rig.config import (
+    AXIS_NAMES,
+    RigConfig,
+    example_text,
+    load_config,
+    parse_config,
+)
+from rig.device.lock import BusLock
+from rig.device.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
+from rig.faults import EXIT_FAULT, EXIT_OK, Refused
+from rig.session.folder import new_run_folder
+from rig.sessions import load, make_simulator
+
+if TYPE_CHECKING:
+    from rig.simulator import Simulator
+
+FILE = pathlib.Path("rig.toml")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run a commissioning command; returns the exit code."""
+    commands: dict[str, Callable[[argparse.Namespace], int]] = {
+        "ports": _ports,
+        "scan": _scan,
+        "imu": _imu,
+        "jog": _jog,
+        "home": _home,
+        "axes": _axes,
+        "zero": _zero,
+        "setup": _setup,
+    }
+    return commands[args.command](args)
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
+
+
+def _ports(args: argparse.Namespace) -> int:
+    lines = serial_lines()
+    print(*(lines or ["no serial port on this computer"]), sep="\n")
+    code = EXIT_OK
+    for address in args.tcp:
+        host, _, port = address.rpartition(":") if ":" in address else (address, "", "")
+        try:
+            answers, text = tcp_line(host, int(port or MODBUS_PORT))
+        except ValueError:
+            raise Refused(f"--tcp must be HOST or HOST:PORT, got {address}") from None
+        print(text)
+        code = code if answers else EXIT_FAULT
+    return code
+
+
+def _scan(args: argparse.Namespace) -> int:
+    if args.bus:
+        bus, maps = parse_bus(args.bus), ()
+        with BusLock(bus).acquire("scan"):
+            return _told(scan(bus, args.units, _say, maps))
+    with _place(args) as place:
+        config = place.config
+        own = tuple(axis.map for axis in config.axes)
+        with BusLock(config.bus).acquire("scan"):
+            code = _told(scan(config.bus, args.units, _say, own))
+        if code == EXIT_OK:
+            steps.identify(place)
+        return code
+
+
+def _told(found: list[Found]) -> int:
+    if not found:
+        _say(
+            "no unit answers. Check power, wiring, termination, the line format (baud "
+            "rate and parity) and the units' ids"
+        )
+        return EXIT_FAULT
+    return EXIT_OK
+
+
+def _imu(args: argparse.Namespace) -> int:
+    with _place(args) as place:
+        stream = steps.look_at_phone(place, args.seconds)
+        setup.pin(place, stream.sender)
+    return EXIT_OK
+
+
+def _jog(args: argparse.Namespace) -> int:
+    with _place(args, IDENTIFIED) as place:
+        return steps.jog(place, AXIS_NAMES.index(args.axis), args.step)
+
+
+def _home(args: argparse.Namespace) -> int:
+    with _place(args, IDENTIFIED) as place:
+        return steps.go_home(place, args.here)
+
+
+def _axes(args: argparse.Namespace) -> int:
+    with _place(args, HOMED) as place:
+        return steps.axes(place, args.names_known)
+
+
+def _zero(args: argparse.Namespace) -> int:
+    with _place(args, SIGN_CHECKED) as place:
+        return steps.take_zero(place)
+
+
+def _setup(args: argparse.Namespace) -> int:
+    path = args.config or FILE
+    operator = Operator(args.yes, _say)
+    given = setup.Given(
+        bus=args.bus or "",
+        imu=args.imu or "",
+        units=args.units,
+        values=dict(map(setting, args.set)),
+        home=args.home,
+        names_known=args.names_known,
+    )
+    with contextlib.ExitStack() as stack:
+        if args.simulate:
+            simulator = stack.enter_context(_simulator(args))
+            given = _given(simulator, given)
+            path = args.config or _own_folder(simulator.config) / "rig.toml"
+        operator.confirm(setup.SAFETY)
+        if path.exists() and args.set:
+            raise Refused(f"{path} exists: edit it, or leave out --set")
+        if path.exists():
+            config = load_config(path)
+            operator.say(f"{path} exists and is used; delete it to begin anew")
+        else:
+            config = setup.write_config(path, given, operator)
+        place = steps.Place(
+            config, DeviceRecord.load(config.device_path), operator, path,
+            reset_alarms=args.reset_alarms, full_speed=args.simulate,
+        )  # fmt: skip
+        return setup.go(place, given)
+
+
+def _simulator(args: argparse.Namespace) -> Simulator:
+    config = parse_config(example_text("simulate"))
+    return make_simulator(config, vars(args), args.fault)
+
+
+def _given(simulator: Simulator, given: setup.Given) -> setup.Given:
+    """What an operator would answer of a simulated device, and its phone started."""
+    bus = simulator.start().bus
+    where = f"{bus.transport}:{bus.host}:{bus.port}"
+    if bus.transport == "rtu":
+        where = f"rtu:{bus.device},{bus.baudrate},N,8,1"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    simulator.start_phone(port)
+    values: dict[str, Any] = {"imu.host": "127.0.0.1"}
+    for axis in simulator.config.axes:
+        for name in ("reduction", "speed_deg_s", "accel_deg_s2"):
+            values[f"axes.{axis.name}.{name}"] = getattr(axis, name)
+    return dataclasses.replace(
+        given, bus=where, imu=f"{simulator.config.imu.format}:{port}",
+        values=values | given.values,
+    )  # fmt: skip
+
+
+def setting(text: str) -> tuple[str, Any]:
+    """A key of rig.toml and its value; what is no TOML is a text."""
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise Refused(f"--set must be KEY=VALUE, got {text!r}")
+    try:
+        return key, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key, value
+
+
+@contextlib.contextmanager
+def _place(args: argparse.Namespace, state: str = "") -> Iterator[steps.Place]:
+    """The device that a command is about.
+
+    A simulated one is first taken through the states before the command's own.
+    """
+    operator = Operator(getattr(args, "yes", False), _say)
+    path = args.config
+    if path is None and not args.simulate and FILE.exists():
+        path = args.config = FILE
+    config = load(args)
+    with contextlib.ExitStack() as stack:
+        if not args.simulate:
+            record = DeviceRecord.load(config.device_path)
+            place = steps.Place(config, record, operator, path)
+        else:
+            simulator = make_simulator(config, vars(args), args.fault)
+            served = stack.enter_context(simulator).start()
+            record = DeviceRecord(_own_folder(served) / "device.json")
+            place = steps.Place(
+                served, record, operator, path, full_speed=True,
+                on_imu_port=simulator.start_phone, listeners=(simulator.hear,),
+            )  # fmt: skip
+            steps.begin_simulated(place, state)
+        place.reset_alarms = getattr(args, "reset_alarms", False)
+        yield place
+
+
+def _own_folder(config: RigConfig) -> pathlib.Path:
+    return new_run_folder(pathlib.Path(config.output), "simulated")

@@ -1,0 +1,181 @@
+"""What small moves say, against a chain of joints built by products of rotations."""
+
+import itertools
+
+import numpy as np
+import pytest
+from harness import changed, fast_config
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from rig.attitude import ORDERS, angle_between_deg, euler_to_matrix
+from rig.commission.findings import find
+from rig.commission.proposals import proposals
+from rig.commission.stands import Stand
+from rig.config import AXIS_NAMES
+from rig.faults import MotionFault
+
+CONFIG = fast_config()
+START = (0, 0, 0)  # the zero posture: the axes are at right angles
+AXIS = {"X": [1.0, 0, 0], "Y": [0, 1.0, 0], "Z": [0, 0, 1.0]}
+
+
+class Chain:
+    """Three joints in an order; ``drives[j]`` turns joint ``joints[j]``."""
+
+    def __init__(self, order="ZXY", joints=(0, 1, 2), deg_per_pulse=None, turned=None):
+        self.order, self.joints = order, joints
+        config_scale = [1.0 / axis.pulses_per_deg for axis in CONFIG.axes]
+        self.deg_per_pulse = np.array(
+            config_scale if deg_per_pulse is None else deg_per_pulse
+        )
+        self.mounting = np.eye(3) if turned is None else turned
+        self.play = np.zeros(3)
+        self.noise = np.random.default_rng(0)
+        self.std = 0.0
+
+    def attitude(self, pulses, lag=(0, 0, 0)):
+        """Phone to its world; the joints are turned one after another from the base."""
+        angle = np.zeros(3)
+        for drive, joint in enumerate(self.joints):
+            angle[joint] = self.deg_per_pulse[drive] * pulses[drive] + lag[drive]
+        whole = Rotation.from_rotvec([0, 0, 170.0], degrees=True)
+        for letter in self.order:
+            joint = CONFIG.letters.index(letter)
+            whole *= Rotation.from_rotvec(
+                np.multiply(AXIS[letter], angle[joint]), degrees=True
+            )
+        whole *= Rotation.from_matrix(self.mounting)
+        return whole.as_matrix()
+
+    def stands(self, reach_deg=3.0, samples=25):
+        """The places of the axis check, visited as it visits them."""
+        stands, end = {}, np.array([0.0, 0.0, 0.0])  # sense of each drive's last move
+        here = np.array(START, dtype=float)
+
+        def stand(name, offset):
+            nonlocal here, end
+            target = np.array(START, dtype=float)
+            for axis, way in offset.items():
+                target[axis] += CONFIG.axes[axis].to_pulses(way)
+            sense = np.sign((target - here) * self.deg_per_pulse)
+            end = np.where(sense, sense, end)
+            here = target
+            matrix = self.attitude(target, -end * self.play / 2.0)
+            noise = self.noise.normal(0.0, self.std / np.sqrt(samples), 3)
+            matrix = matrix @ Rotation.from_rotvec(noise, degrees=True).as_matrix()
+            stands[name] = Stand(target, matrix, self.std, samples)
+
+        stand("start", {})
+        for j, name in enumerate(AXIS_NAMES):
+            for part, way in (
+                ("look", 0.5), ("plus", reach_deg), ("back", 0.0),
+                ("minus", -reach_deg), ("up", 0.0),
+            ):  # fmt: skip
+                stand(f"{name}:{part}", {j: way})
+        for a, b in itertools.combinations(range(3), 2):
+            for sign, way in (("-", -reach_deg), ("+", reach_deg)):
+                stand(f"{AXIS_NAMES[a]}{sign}{AXIS_NAMES[b]}+", {a: way, b: reach_deg})
+        return stands
+
+
+signs = st.tuples(*[st.sampled_from((-1.0, 1.0))] * 3)
+gains = st.tuples(*[st.floats(0.4, 1.4)] * 3)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    order=st.sampled_from(ORDERS),
+    joints=st.permutations(range(3)),
+    signs=signs,
+    gains=gains,
+    turned=st.tuples(*[st.floats(-15.0, 15.0)] * 3),
+)
+def test_units_signs_gains_order_and_placement_are_found(
+    order, joints, signs, gains, turned
+):
+    base = [1.0 / abs(axis.pulses_per_deg) for axis in CONFIG.axes]
+    rates = np.multiply(np.multiply(base, gains), signs)
+    mounting = euler_to_matrix(turned, "ZYX")
+    chain = Chain(order, tuple(joints), rates, mounting)
+    found = find(CONFIG, chain.stands())
+    assert found.joints == tuple(joints)
+    np.testing.assert_allclose(found.deg_per_pulse, rates, rtol=2e-3)
+    assert found.order == order
+    assert angle_between_deg(found.mounting, mounting) < 0.3
+
+
+def test_a_device_as_configured_needs_no_correction():
+    assert proposals(CONFIG, find(CONFIG, Chain().stands()), [None] * 3) == []
+
+
+def test_play_is_the_difference_of_the_two_ways_to_one_place():
+    chain = Chain()
+    chain.play = np.array([0.5, 0.1, 0.0])
+    found = find(CONFIG, chain.stands())
+    np.testing.assert_allclose(found.backlash_deg, chain.play, atol=0.01)
+    own = [
+        abs(r * a.pulses_per_deg)
+        for r, a in zip(found.deg_per_pulse, CONFIG.axes, strict=True)
+    ]
+    np.testing.assert_allclose(own, 1.0, atol=0.01)  # play does not enter the gain
+
+
+@pytest.mark.parametrize("turned", [(90, 0, 0), (0, 180, 0), (30, 80, -60)])
+def test_with_names_known_the_phone_may_lie_in_any_way(turned):
+    mounting = euler_to_matrix(turned, "ZYX")
+    chain = Chain(turned=mounting)
+    found = find(CONFIG, chain.stands(), names_known=True)
+    assert found.joints == (0, 1, 2)
+    assert angle_between_deg(found.mounting, mounting) < 0.3
+
+
+def test_with_names_known_a_mirrored_axis_is_refused_not_put_on_the_phone():
+    rates = [1.0 / axis.pulses_per_deg for axis in CONFIG.axes]
+    rates[2] = -rates[2]
+    with pytest.raises(MotionFault, match="mirrored"):
+        find(CONFIG, Chain(deg_per_pulse=rates).stands(), names_known=True)
+
+
+def test_a_phone_placed_quite_otherwise_is_refused_not_explained_by_exchanged_axes():
+    chain = Chain(turned=euler_to_matrix((45, 35, 40), "ZYX"))
+    with pytest.raises(MotionFault, match=r"imu\.mounting_deg"):
+        find(CONFIG, chain.stands())
+
+
+@pytest.mark.parametrize("changes", [{"signs": (1, -1, -1)}, {"signs": (-1, 1, -1)}])
+def test_mirrored_readings_are_not_taken_for_a_reversed_axis(changes):
+    told, read = CONFIG.imu, changed(CONFIG.imu, **changes)
+    stands = Chain().stands()
+    for name, stand in stands.items():
+        angles = Rotation.from_matrix(stand.attitude).as_euler(told.order, degrees=True)
+        sent = angles * told.signs
+        matrix = euler_to_matrix(sent * read.signs, read.order)
+        stands[name] = Stand(stand.pulses, matrix, 0.0, 25)
+    config = CONFIG.model_copy(update={"imu": read})
+    with pytest.raises(MotionFault, match=r"imu.signs = \[-1, -1, -1\]"):
+        find(config, stands)
+
+
+def test_a_noisy_phone_leaves_the_order_open_and_mirrored_axes_uncorrected():
+    chain = Chain()
+    chain.std = 0.3
+    assert find(CONFIG, chain.stands()).order is None
+    rates = [1.0 / axis.pulses_per_deg for axis in CONFIG.axes]
+    rates[0] = -rates[0]
+    chain = Chain(deg_per_pulse=rates)
+    chain.std = 0.3
+    with pytest.raises(MotionFault, match="too noisy"):
+        find(CONFIG, chain.stands())
+
+
+def test_the_drives_word_goes_before_the_measured_ratio():
+    rates = np.array([1.0 / axis.pulses_per_deg for axis in CONFIG.axes])
+    found = find(CONFIG, Chain(deg_per_pulse=rates * 2.5).stands())
+    told = [CONFIG.axes[0].pulses_per_rev * 2 // 5] * 3
+    keys = {change.key: change.new for change in proposals(CONFIG, found, told)}
+    assert keys == {f"axes.{name}.pulses_per_rev": told[0] for name in AXIS_NAMES}
+    keys = {change.key: change.new for change in proposals(CONFIG, found, [None] * 3)}
+    for name in AXIS_NAMES:
+        assert keys[f"axes.{name}.reduction"] == pytest.approx(4.0, rel=2e-3)

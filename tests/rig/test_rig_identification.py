@@ -1,0 +1,229 @@
+"""Noise that is correlated, a zero that drifts, and intervals that keep their word."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
+
+import jaxcal
+from rig.attitude import ORDERS, Frame, euler_to_matrix, mean_rotation
+from rig.device.stream import Reading
+from rig.identification import noise
+from rig.identification.drift import estimate_drift, without_drift
+from rig.identification.fit import uncertainty
+from rig.outputs.console import drift_text, recalibrate
+from rig.readings import angles, attitudes, raw_fields
+from rig.simulator import Truth
+
+TRUTH = np.column_stack([Truth().matrix, Truth().bias])
+LETTERS = ("X", "Z", "Y")
+
+
+def autoregression(rng, phi, n, size=3):
+    """(n, size) of unit variance, stationary from the first reading on."""
+    steps = rng.normal(size=(n, size)) * np.sqrt(1 - phi**2)
+    steps[0] /= np.sqrt(1 - phi**2)
+    return lfilter([1.0], [1.0, -phi], steps, axis=0)
+
+
+# Correlated readings
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.5, 0.8, 0.95])
+def test_the_autocorrelation_time_of_an_autoregression_is_found(rng, phi):
+    """Records far shorter than the correlation lasts: 25 readings where 39 are one."""
+    series = [autoregression(rng, phi, n) for n in [25] * 600 + [100] * 60]
+    found = noise.autocorrelation_time(noise.correlation(series))
+    np.testing.assert_allclose(found, (1 + phi) / (1 - phi), rtol=0.25)
+
+
+def test_each_axis_has_its_own_correlation(rng):
+    phis = np.array([0.0, 0.6, 0.9])
+    series = [
+        np.column_stack([autoregression(rng, phi, 50, 1) for phi in phis])
+        for _ in range(200)
+    ]
+    np.testing.assert_allclose(noise.correlation(series), phis, atol=0.05)
+
+
+def test_readings_that_do_not_vary_are_not_correlated():
+    assert noise.correlation([np.ones((25, 3)), np.zeros((1, 3))]).tolist() == [0] * 3
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.7, 0.95])
+def test_the_variance_of_a_mean_is_that_of_the_covariance_matrix(rng, phi):
+    n = 25
+    lags = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    exact = (phi**lags).mean()  # of unit noise
+    assert noise.mean_share(np.array(phi), n) == pytest.approx(exact)
+    assert noise.effective_samples(np.array(phi), n) == pytest.approx(1 / exact)
+    drawn = [autoregression(rng, phi, n, 1) for _ in range(4000)]
+    stated = np.mean(
+        [
+            noise.mean_variance({"std_deg": x.std(0, ddof=1), "samples": n}, phi)
+            for x in drawn
+        ]
+    )
+    assert np.var([x.mean() for x in drawn]) == pytest.approx(stated, rel=0.1)
+
+
+def record(rng, u, zero, phi, sigma, samples, repeat):
+    """What the journal keeps of a posture whose readings are correlated."""
+    truth = TRUTH[:, :3] @ u + TRUTH[:, 3] - zero + rng.normal(0, repeat, 3)
+    y = truth + sigma * autoregression(rng, phi, samples)
+    return {
+        "commanded_deg": u.tolist(),
+        "measured_deg": y.mean(axis=0).tolist(),
+        "std_deg": y.std(axis=0, ddof=1).tolist(),
+        "samples": samples,
+    }, y
+
+
+@pytest.mark.parametrize("held_out", [0, 8])
+def test_intervals_hold_as_often_as_they_say_under_correlated_noise(rng, held_out):
+    """Taken for independent, 25 readings would be 9 times as sure as they are."""
+    phi, sigma = 0.8, np.array([0.02, 0.05, 0.1])  # each axis has its own
+    repeat = 0.02 if held_out else 0.0  # what single readings cannot know
+    covered, together = [], []
+    for _ in range(150):
+        u = rng.uniform(-18, 18, (4 + held_out, 3))
+        off = sigma * autoregression(rng, phi, 100)
+        zero = {"std_deg": off.std(axis=0, ddof=1), "samples": 100}
+        made = [record(rng, x, off.mean(0), phi, sigma, 25, repeat) for x in u]
+        records = [each for each, _ in made]
+        found = noise.correlation([off, *(y for _, y in made)])
+        fitted = jaxcal.identify(u[:4], [r["measured_deg"] for r in records[:4]])
+        stated = uncertainty(fitted, records[:4], records[4:], zero, found)
+        error = np.abs(np.column_stack([fitted.matrix, fitted.bias]) - TRUTH)
+        covered.append(error <= stated["ci95_each"])
+        together.append((error <= stated["ci95"]).all())
+    assert 0.93 < np.mean(covered) < 0.97
+    assert np.mean(together) > 0.9
+    assert np.all(np.mean(covered, axis=(0, 2)) > 0.92)  # axis by axis
+
+
+def test_the_noise_of_each_axis_is_its_own(rng):
+    sigma, found = np.array([0.01, 0.05, 0.2]), []
+    for _ in range(60):
+        u = rng.uniform(-18, 18, (12, 3))
+        y = u @ TRUTH[:, :3].T + TRUTH[:, 3] + sigma * rng.normal(size=(12, 3))
+        records = [
+            {"commanded_deg": a, "measured_deg": b, "std_deg": [0.1] * 3, "samples": 25}
+            for a, b in zip(u.tolist(), y.tolist(), strict=True)
+        ]
+        fitted = jaxcal.identify(u[:4], y[:4])
+        stated = uncertainty(fitted, records[:4], records[4:], records[0], np.zeros(3))
+        found.append(np.square(stated["noise_std_deg"]))
+    np.testing.assert_allclose(np.sqrt(np.mean(found, axis=0)), sigma, rtol=0.15)
+
+
+# Drift
+
+
+def visit(minute, joints, frame, turn=(0.0, 0.0, 0.0), std=0.001):
+    """A posture at a minute, seen by a phone whose world has turned by (3,) degrees."""
+    world = Rotation.from_rotvec(turn, degrees=True).as_matrix()
+    attitude = world @ frame.matrix(joints)
+    return {
+        "time": 1e9 + 60.0 * minute,
+        "attitude": attitude.tolist(),
+        "measured_deg": frame.angles(attitude).tolist(),
+        "std_deg": [std] * 3,
+        "samples": 25,
+    }
+
+
+def a_frame(order="ZXY", heading=170.0):
+    zero = euler_to_matrix([heading, 4.0, -7.0], "ZYX")
+    return Frame(zero, euler_to_matrix([10.0, 20.0, 30.0], "ZYX"), order, LETTERS)
+
+
+@given(
+    st.sampled_from(ORDERS),
+    st.tuples(*[st.floats(-2, 2)] * 3).filter(lambda w: np.linalg.norm(w) > 0.1),
+    st.tuples(*[st.floats(-20, 20)] * 3),
+)
+@settings(max_examples=40, deadline=None)
+def test_a_linear_drift_of_the_phones_world_is_taken_out(order, rate, joints):
+    """Of attitudes, so also where the joint angles do not shift by equal amounts."""
+    frame, rate = a_frame(order), np.array(rate)
+    visits = [visit(t, np.zeros(3), frame, rate * t) for t in (0.0, 0.6, 1.0)]
+    drift = estimate_drift(visits, np.zeros(3), 0.2)
+    assert drift.corrected and not drift.over
+    moved = visit(0.8, joints, frame, 0.8 * rate)
+    assert np.abs(np.subtract(moved["measured_deg"], joints)).max() > 0.02
+    (mended,) = without_drift([moved], drift, visits[0], frame)
+    np.testing.assert_allclose(mended["measured_deg"], joints, atol=2e-3)
+
+
+def test_a_drift_that_is_not_linear_stays_and_is_judged():
+    frame = a_frame()
+    turns = [(0, 0, 0), (0, 0, 0.5), (0, 0, 0.5)]  # the phone slipped once
+    visits = [
+        visit(t, np.zeros(3), frame, turn)
+        for t, turn in zip((0, 0.5, 1), turns, strict=True)
+    ]
+    drift = estimate_drift(visits, np.zeros(3), 0.2)
+    assert not drift.corrected and drift.over
+    assert without_drift(visits, drift, visits[0], frame) is visits
+    told = {"drift": vars(drift)}
+    assert "session.drift_limit_deg (0.2)" in " ".join(recalibrate(told, 0.5))
+    assert "not linear" in drift_text(vars(drift))
+    assert not estimate_drift(visits, np.zeros(3), 0.6).over
+
+
+def test_a_drift_within_the_noise_or_under_a_tenth_of_the_limit_is_left_alone():
+    frame = a_frame()
+    for end, std in ((0.015, 0.001), (0.1, 0.3)):
+        visits = [
+            visit(t, np.zeros(3), frame, (0, 0, end * t), std) for t in (0, 0.5, 1)
+        ]
+        drift = estimate_drift(visits, np.zeros(3), 0.2)
+        assert not drift.corrected and not drift.over
+
+
+def test_correlated_readings_make_a_drift_less_sure():
+    frame = a_frame()
+    visits = [visit(t, np.zeros(3), frame, (0, 0, 0.05 * t), 0.03) for t in (0, 0.5, 1)]
+    assert estimate_drift(visits, np.zeros(3), 0.2).corrected
+    assert not estimate_drift(visits, np.full(3, 0.9), 0.2).corrected
+
+
+def test_two_visits_say_how_far_and_not_whether_in_a_line():
+    frame = a_frame()
+    visits = [visit(t, np.zeros(3), frame, (0, 0, 0.5 * t)) for t in (0, 1)]
+    drift = estimate_drift(visits, np.zeros(3), 0.2)
+    assert drift.size_deg == pytest.approx(0.5, rel=0.3)
+    assert drift.bend_deg is None and not drift.corrected and drift.over
+    assert estimate_drift(visits[:1], np.zeros(3), 0.2) is None
+
+
+# Raw data
+
+
+def test_the_readings_of_a_record_come_back(rng):
+    frame = a_frame()
+    matrices = frame.matrix(rng.normal([3, -5, 8], 0.1, (25, 3)))
+    readings = [Reading(100.0 + 0.01 * i, m) for i, m in enumerate(matrices)]
+    kept = raw_fields(readings)
+    np.testing.assert_allclose(attitudes(kept, frame), matrices, atol=1e-7)
+    np.testing.assert_allclose(np.diff(kept["stamps"]), 0.01, atol=2e-4)
+
+
+@pytest.mark.parametrize("at_zero", [True, False])
+def test_the_angles_of_version_1_tell_the_attitudes(rng, at_zero):
+    """The zero's were read against the first of its own readings, kept by nobody."""
+    frame = a_frame()
+    joints = rng.normal(0 if at_zero else 12, 0.1, (50, 3))
+    matrices = frame.matrix(joints)
+    against = frame
+    if at_zero:
+        against = Frame(matrices[0], frame.mounting, frame.order, frame.letters)
+    old = {
+        "raw_deg": against.angles(matrices).round(5).tolist(),
+        "attitude": mean_rotation(matrices).tolist(),
+    }
+    np.testing.assert_allclose(attitudes(old, frame), matrices, atol=1e-6)
+    np.testing.assert_allclose(angles(old, frame), joints, atol=1e-4)

@@ -1,0 +1,326 @@
+"""What the live page shows, from records alone: no browser, no web framework."""
+
+import itertools
+import json
+import pathlib
+import re
+import tempfile
+
+import numpy as np
+import pytest
+from harness import fast_config, fast_text, session, simulator
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rig.config import parse_config
+from rig.live import charts, words
+from rig.live.state import RunState
+from rig.live.tail import Tail
+from rig.live.watcher import Watcher
+from rig.live.worth import ellipsoid, prediction_std, reasons
+from rig.outputs.journal import Journal, is_written, read_journal
+
+PICTURE = charts.LIGHT
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Folder and configuration of a finished calibration."""
+    folder = tmp_path_factory.mktemp("live") / "run"
+    config = fast_config()
+    with simulator(config) as sim:
+        assert session(sim.start(), folder, sim) == 0
+    return folder, config
+
+
+def state_of(records):
+    state = RunState()
+    for record in records:
+        state.apply(record)
+    return state
+
+
+def begun(**more):
+    """Records with which a run of three postures begins."""
+    config = parse_config(fast_text()).described()
+    candidates = [[100 * i, -50 * i * i, 300 - i] for i in range(6)]
+    choice = {"indices": [4, 1, 3], "method": "exact", "log_det": 1.0}
+    records = [
+        {"event": "start", "mode": "calibrate", "config": config, "pid": 7} | more,
+        {"event": "plan", "candidates": candidates, "choice": choice},
+        {"event": "queue", "names": ["select:3", "select:4", "select:1"]},
+        {"event": "visit", "name": "select:3", "pulses": candidates[3]},
+    ]
+    return numbered(json.loads(json.dumps(records)))
+
+
+def numbered(records):
+    return [{"seq": i, "time": 100.0 + i} | r for i, r in enumerate(records)]
+
+
+def posture(name, **more):
+    values = {"pulses": [0, 0, 0], "measured_deg": [1.0, 2.0, 3.0], "samples": 4}
+    return {"event": "posture", "name": name, "std_deg": [0.1] * 3} | values | more
+
+
+def test_a_finished_run_shows_what_its_journal_holds(run):
+    folder, config = run
+    records = read_journal(folder / "journal.jsonl")
+    state = state_of(records)
+    measured = [r for r in records if r["event"] == "posture"]
+    assert [p.name for p in state.done] == [r["name"] for r in measured]
+    for shown, record in zip(state.done, measured, strict=True):
+        assert shown.measured == record["measured_deg"]
+        wanted = config.to_deg(record["pulses"])
+        np.testing.assert_allclose(shown.commanded, wanted, atol=1e-6)
+    assert state.planned == len(measured)
+    assert not state.queue
+    assert not state.damaged
+    assert words.headline(state, running=False) == ("good", "Done")
+    assert words.trouble(state, False, "run") == ""
+    end = [r for r in measured if r["role"] == "reference"][-1]
+    assert state.drift_deg == max(map(abs, end["measured_deg"]))
+
+
+def test_the_gains_told_add_up_to_the_log_det_of_the_choice(run):
+    state = state_of(read_journal(run[0] / "journal.jsonl"))
+    texts = [p.why for p in state.by_role("select")]
+    gains = [float(g) for text in texts for g in re.findall(r"([+-][\d.]+) log", text)]
+    assert len(gains) == len(texts) - 1
+    assert sum(gains) == pytest.approx(state.choice["log_det"], abs=0.05 * len(gains))
+
+
+def test_every_moment_of_a_run_can_be_drawn(run):
+    state = RunState()
+    for record in read_journal(run[0] / "journal.jsonl"):
+        state.apply(record)
+        for text in (
+            words.queue(state),
+            words.uncertainty(state),
+            words.numbers(state, {}, True),
+            words.trouble(state, True, "run"),
+            words.happened(state, str),
+        ):
+            assert "nan" not in text and "None" not in text
+        samples = [{"time": state.time, "drives": [None] * 3, "deg": [1, 2, 3]}]
+        drawn = [
+            charts.attitude(state, samples, state.time, PICTURE),
+            charts.settling(state, samples, state.time, PICTURE),
+            charts.noise(state, PICTURE),
+            charts.drift(state, PICTURE),
+        ]
+        json.dumps(drawn, allow_nan=False)
+
+
+def test_runs_of_older_versions_without_visits_and_queues_are_shown(run):
+    records = read_journal(run[0] / "journal.jsonl")
+    old = numbered([r for r in records if r["event"] not in ("visit", "queue")])
+    new, state = state_of(records), state_of(old)
+    assert {p.name: p.measured for p in state.done} == {
+        p.name: p.measured for p in new.done
+    }
+    moving = next(r for r in old if r["event"] == "command")
+    early = state_of([r for r in old if r["seq"] <= moving["seq"]])
+    assert early.current == moving["label"]
+    assert early.postures[moving["label"]].state == "moving"
+
+
+def test_the_posture_under_way_goes_through_its_states():
+    records = begun()
+    seen = [state_of(records).postures["select:3"].state]
+    for phase in ("moving", "settling", "measuring"):
+        records += [{"event": "phase", "phase": phase}]
+        seen.append(state_of(numbered(records)).postures["select:3"].state)
+    assert seen == ["moving", "moving", "settling", "measuring"]
+    state = state_of(numbered(records))
+    assert words.headline(state, True) == ("run", "Measuring posture 3")
+    records += [posture("select:3")]
+    state = state_of(numbered(records))
+    assert state.postures["select:3"].state == "done"
+    assert state.queue == ["select:4", "select:1"]
+
+
+def test_out_of_reach_and_withdrawn_postures_say_why():
+    records = [
+        *begun(),
+        {"event": "unreachable", "name": "select:3", "reason": "yaw ended short <b>"},
+        posture("select:4"),
+        {"event": "void", "names": ["select:4"]},
+    ]
+    state = state_of(numbered(records))
+    told = words.trouble(state, True, "run")
+    assert "posture 3 is out of reach: yaw ended short &lt;b&gt;" in told
+    assert "posture 4 was withdrawn" in told
+    assert not state.done
+    again = [*records, {"event": "queue", "names": ["select:4", "select:1"]}]
+    assert state_of(numbered(again)).postures["select:4"].state == "waiting"
+
+
+def test_what_a_session_warned_of_is_in_sight():
+    records = [*begun(), {"event": "sender_refused", "reason": "a second phone"}]
+    assert "a second phone" in words.trouble(state_of(numbered(records)), True, "run")
+
+
+def test_another_choice_forgets_what_was_only_waiting():
+    choice = {"indices": [4, 5], "method": "exact", "log_det": 1.0}
+    records = [*begun(), posture("select:3"), {"event": "replan", "choice": choice}]
+    state = state_of(numbered(records))
+    assert set(state.postures) == {"select:3", "select:4", "select:5"}
+
+
+@pytest.mark.parametrize(
+    ("last", "running", "tone", "part"),
+    [
+        ({"event": "end", "code": 0, "reason": ""}, False, "good", "Done"),
+        ({"event": "end", "code": 1, "reason": ""}, False, "warn", "recalibrate"),
+        ({"event": "paused", "code": 4, "reason": "Ctrl-C"}, False, "warn", "Paused"),
+        ({"event": "stopped", "code": 143, "reason": "SIGTERM"}, False, "bad", "Stop"),
+        ({"event": "fault", "code": 3, "reason": "pitch stuck"}, False, "bad", "fault"),
+        (None, False, "bad", "without a last record"),
+        (None, True, "run", "Moving"),
+    ],
+)
+def test_the_headline_says_how_it_stands(last, running, tone, part):
+    records = [*begun(), {"event": "phase", "phase": "moving"}]
+    state = state_of(numbered(records + ([last] if last else [])))
+    shown = words.headline(state, running)
+    assert shown[0] == tone and part in shown[1]
+    told = words.trouble(state, running, "runs/one")
+    if last and last["event"] != "end":
+        assert last["reason"] in told
+    if tone == "bad":
+        assert "jaxcal-rig resume runs/one" in told
+
+
+@pytest.mark.parametrize("event", ["fault", "stopped", "resume"])
+def test_the_posture_that_was_interrupted_waits_again(event):
+    records = [*begun(), {"event": "phase", "phase": "measuring"}]
+    state = state_of(numbered([*records, {"event": event, "reason": "why"}]))
+    assert state.postures["select:3"].state == "waiting"
+    assert state.queue == ["select:3", "select:4", "select:1"]
+    assert state.current is None
+
+
+def test_a_resumed_run_is_alive_again_under_its_new_process():
+    ended = {"event": "paused", "code": 4, "reason": "paused by Ctrl-C"}
+    resumed = {"event": "resume", "pid": 8, "host": "here"}
+    state = state_of(numbered([*begun(), ended, resumed]))
+    assert (state.pid, state.host, state.ended, state.sessions) == (8, "here", None, 2)
+
+
+def test_a_missing_record_is_told_and_a_foreign_one_harms_nothing(tmp_path):
+    records = begun()
+    del records[2]
+    assert state_of(records).damaged
+    lines = [*begun(), {"event": "posture", "name": 3}, {"event": "new in version 9"}]
+    text = "".join(json.dumps(r) + "\n" for r in numbered(lines))
+    (tmp_path / "journal.jsonl").write_text(text)
+    watcher = Watcher(tmp_path)
+    watcher.poll()
+    assert watcher.state.damaged
+    assert watcher.state.current == "select:3"
+    assert not watcher.running
+
+
+@st.composite
+def _postures(draw, least):
+    count = draw(st.integers(least, 9))
+    seed = draw(st.integers(0, 2**32 - 1))
+    return np.random.default_rng(seed).uniform(-20, 20, (count, 3))
+
+
+def _gain(text):
+    found = re.search(r"([+-][\d.]+) log det", text)
+    return float(found[1]) if found else 0.0
+
+
+@given(_postures(4))
+def test_gains_are_those_of_the_determinant(postures):
+    def log_det(count):
+        rows = np.column_stack([postures[:count], np.ones(count)])
+        return 3.0 * np.linalg.slogdet(rows.T @ rows)[1]
+
+    gains = [_gain(text) for text in reasons(postures)]
+    assert sum(gains[:4]) == pytest.approx(log_det(4), abs=0.2)
+    for count in range(5, len(postures) + 1):
+        expected = log_det(count) - log_det(count - 1)
+        assert gains[count - 1] == pytest.approx(expected, abs=0.006)
+
+
+def test_a_posture_in_the_plane_of_the_others_adds_no_new_direction():
+    texts = reasons([[0, 0, 0], [10, 0, 0], [0, 10, 0], [10, 10, 0], [0, 0, 10]])
+    assert ["twelve" in text for text in texts] == [False] * 4 + [True]
+    assert reasons([[1, 2, 3], [1, 2, 3]])[1] == "+2.08 log det given those before"
+
+
+@given(_postures(4), st.floats(1e-4, 1.0))
+def test_the_ellipsoid_is_that_of_the_covariance_of_least_squares(postures, noise):
+    rows = np.column_stack([postures, np.ones(len(postures))])
+    covariance = noise**2 * np.linalg.inv(rows.T @ rows)
+    std, directions = ellipsoid(postures, noise)
+    shape = directions @ np.diag(std**2) @ directions.T
+    np.testing.assert_allclose(shape, covariance[:3, :3], rtol=1e-6, atol=1e-12)
+    assert np.linalg.det(directions) == pytest.approx(1.0)
+    at = np.column_stack([postures, np.ones(len(postures))])
+    each = np.sqrt(np.einsum("ij,jk,ik->i", at, covariance, at))
+    wanted = (np.median(each), each.max())
+    np.testing.assert_allclose(prediction_std(postures, postures, noise), wanted)
+
+
+def test_directions_that_no_posture_measured_are_unknown():
+    for count, unknown in ((0, 3), (1, 3), (2, 2), (3, 1), (4, 0)):
+        points = np.array([[0, 0, 0], [9, 1, 0], [0, 8, 1], [2, 0, 7.0]])[:count]
+        std, _ = ellipsoid(points, 0.01)
+        assert np.isinf(std).sum() == unknown
+        finite = np.isfinite(prediction_std(points, [[1, 1, 1]], 0.01)[1])
+        assert finite == (count == 4)
+
+
+@settings(deadline=None)
+@given(
+    st.lists(st.integers(0, 10**9), max_size=12),
+    st.lists(st.integers(1, 40), min_size=1, max_size=20),
+)
+def test_a_tail_gives_each_record_once_however_the_bytes_arrive(numbers, sizes):
+    data = b"".join(json.dumps({"n": n}).encode() + b"\n" for n in numbers)
+    with tempfile.TemporaryDirectory() as folder:
+        path = pathlib.Path(folder) / "file.jsonl"
+        tail, found = Tail(path), list(Tail(path).read())
+        for size in itertools.cycle(sizes):
+            with path.open("ab") as file:
+                file.write(data[:size])
+            data = data[size:]
+            found += tail.read()
+            if not data:
+                break
+    assert [record["n"] for record in found] == numbers
+
+
+def test_a_tail_follows_a_file_that_was_replaced(tmp_path):
+    path = tmp_path / "telemetry.jsonl"
+    path.write_text('{"n":1}\n{"n":2}\n')
+    tail = Tail(path)
+    assert len(tail.read()) == 2
+    path.rename(tmp_path / "old")
+    assert tail.read() == []
+    path.write_text('{"n":3}\n')
+    assert tail.read() == [{"n": 3}]
+
+
+def test_a_tail_of_a_long_file_begins_near_its_end(tmp_path):
+    path = tmp_path / "telemetry.jsonl"
+    path.write_text("".join(f'{{"n":{n}}}\n' for n in range(1000)))
+    found = Tail(path, last_bytes=100).read()
+    assert 5 < len(found) < 15 and found[-1] == {"n": 999}
+
+
+def test_a_session_is_known_by_the_lock_on_its_journal(tmp_path):
+    path = tmp_path / "journal.jsonl"
+    assert not is_written(path)
+    journal = Journal(path)
+    assert is_written(path)
+    journal.close()
+    assert not is_written(path)
+    asked = [is_written(path) for _ in range(50)]
+    Journal(path).close()  # asking has left nothing behind
+    assert not any(asked)

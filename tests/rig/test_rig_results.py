@@ -1,0 +1,564 @@
+"""What is made of recorded runs: refit, report, export, trend."""
+
+import csv
+import dataclasses
+import hashlib
+import io
+import json
+import re
+import shutil
+import socket
+import subprocess
+import threading
+from unittest import mock
+
+import numpy as np
+import pytest
+from harness import (
+    Run,
+    calibrate,
+    changed,
+    commissioned,
+    fast_config,
+    fast_text,
+    no_figures,
+    run_safely,
+    session,
+    simulator,
+)
+from scipy.spatial.transform import Rotation
+
+import jaxcal
+from rig.__main__ import main
+from rig.attitude import Frame
+from rig.config import AXIS_NAMES, parse_config
+from rig.identification.refit import reread
+from rig.outputs import trend
+from rig.outputs.export import LANGUAGES, load_inverse
+from rig.outputs.journal import read_journal
+from rig.outputs.report import write_report
+from rig.readings import attitudes
+from rig.simulator import Simulator, Truth
+
+TRUTH = np.column_stack([Truth().matrix, Truth().bias])
+SESSION = '\n[session]\nmethod = "exact"\nverify_postures = 2\n'
+WRONG = 'order = "ZYX"'  # of the joints, where ZXY is right
+
+
+def run_in(folder, text, truth=None, serve=None):
+    """A calibration in a folder with its rig.toml; the exit code."""
+    folder.mkdir(parents=True)
+    (folder / "rig.toml").write_text(text)
+    config = parse_config(text)
+    with Simulator(serve or config, truth or Truth(noise_deg=0.01)) as sim:
+        served = sim.start()
+        mended = changed(config, bus=served.bus, imu=changed(
+            config.imu, port=0, host="127.0.0.1"))  # fmt: skip
+        return session(mended, folder, sim)
+
+
+@pytest.fixture(autouse=True)
+def quick_pages():
+    """Without figures, which take most of the time."""
+    with no_figures(), mock.patch.object(trend, "drawn", lambda *_: "no figure"):
+        yield
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A calibration under a wrong mechanism order: done, but it says recalibrate."""
+    runs = tmp_path_factory.mktemp("runs")
+    right = fast_config()
+    text = fast_text({'order = "ZXY"': WRONG}, SESSION)
+    assert run_in(runs / "run", text, serve=right) == 1
+    return runs / "run"
+
+
+@pytest.fixture
+def run(finished, tmp_path):
+    """A copy in a folder of its own, so that a test may add runs beside it."""
+    return shutil.copytree(finished, tmp_path / "run")
+
+
+def beside(run, kind="refit"):
+    return [path for path in run.parent.iterdir() if path.name.startswith(kind)]
+
+
+def found(folder):
+    summary = json.loads((folder / "summary.json").read_text())
+    return np.column_stack([summary["A"], summary["b"]])
+
+
+def files(folder):
+    return {path: path.read_bytes() for path in folder.iterdir()}
+
+
+def rewritten(run, change):
+    """The journal with every record changed, None leaving it out, numbered anew."""
+    kept = [change(r) for r in read_journal(run / "journal.jsonl")]
+    kept = [record for record in kept if record is not None]
+    lines = [json.dumps(r | {"seq": i}) + "\n" for i, r in enumerate(kept)]
+    (run / "journal.jsonl").write_text("".join(lines))
+
+
+def as_version_1(record):
+    """Only angles of the readings, read against the first where it is the zero."""
+    if "quaternions" not in record:
+        return record
+    seen = attitudes(record, None)
+    # Any zero will do: what is read from the angles does not depend on it.
+    frame = Frame(seen[0], np.eye(3), "ZYX", fast_config().letters)
+    old = {k: v for k, v in record.items() if k not in ("quaternions", "stamps")}
+    return old | {"raw_deg": frame.angles(seen).round(5).tolist()}
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_refit_mends_a_wrong_order_without_new_recording(run, capsys, version):
+    if version == 1:
+        rewritten(run, as_version_1)
+    before = files(run)
+    assert np.abs(found(run) - TRUTH).max() > 0.05
+    assert main(["refit", str(run), "--order", "ZXY"]) == 0
+    said = capsys.readouterr().out
+    assert 'mechanism.order = "ZXY"  # was "ZYX"' in said
+    (folder,) = beside(run)
+    assert np.abs(found(folder) - TRUTH)[:, :3].max() < 0.01
+    np.testing.assert_allclose(found(folder)[:, 3], TRUTH[:, 3], atol=0.05)
+    assert files(run) == before  # nothing in the run was touched
+    loaded = jaxcal.Calibration.load(folder / "calibration.json")
+    assert loaded.provenance["notes"]["device"]["mechanism.order"] == "ZXY"
+    page = (folder / "report.html").read_text()
+    assert "Identified anew from run" in page and "as recorded" in page
+    assert main(["refit", str(run)]) == 1  # as it was, again beside
+    assert len(beside(run)) == 2
+    capsys.readouterr()
+    assert main(["refit", str(folder)]) == 2
+    assert "give that run instead" in capsys.readouterr().err
+
+
+def test_refit_mends_the_mounting_of_the_phone(tmp_path):
+    """Turned by 20 degrees on the end-effector, which the configuration did not say."""
+    mounted = {"column_count = 4": "column_count = 4\nmounting_deg = [0, 0, 20]"}
+    right = parse_config(fast_text(mounted))
+    assert run_in(tmp_path / "run", fast_text(session=SESSION), serve=right) == 1
+    given = ["refit", str(tmp_path / "run"), "--mounting", "0", "0", "20"]
+    assert main(given) == 0
+    (folder,) = beside(tmp_path / "run")
+    assert np.abs(found(folder) - TRUTH)[:, :3].max() < 0.01
+    config = parse_config((folder / "rig.toml").read_text())
+    assert config.imu.mounting_deg == (0.0, 0.0, 20.0)
+
+
+def test_reread_takes_the_phones_angles_as_they_were_sent(finished):
+    """Other order and signs of the phone: what they made of the same lines."""
+    then = parse_config((finished / "rig.toml").read_text())
+    imu = changed(then.imu, order="XYZ", signs=(1, -1, 1))
+    now = changed(then, imu=imu)
+    records = read_journal(finished / "journal.jsonl")
+    kept, evidence = reread(records, then, now)
+    zero = next(r for r in records if r["event"] == "zero")
+    postures = {r["name"]: r for r in records if r["event"] == "posture"}
+    for record in evidence.chosen:
+        seen = Rotation.from_matrix(attitudes(postures[record["name"]], None))
+        sent = seen.as_euler("ZYX", degrees=True) * [-1, -1, -1]
+        made = Rotation.from_euler("XYZ", sent * [1, -1, 1], degrees=True)
+        off = made.inv() * Rotation.from_quat(record["quaternions"])
+        assert np.degrees(off.magnitude()).max() < 1e-5
+    assert kept[0]["pulses"] == zero["pulses"]
+    back, _ = reread(kept, now, then)
+    for record in back[2:]:
+        expected = postures[record["name"]]["measured_deg"]
+        np.testing.assert_allclose(record["measured_deg"], expected, atol=1e-5)
+
+
+def test_refit_says_why_it_refuses(run, capsys, tmp_path):
+    quaternions = (run / "rig.toml").read_text().replace(
+        "column_count = 4", "column_count = 5\nquaternion_columns = [1, 2, 3, 4]"
+    )  # fmt: skip
+    assert main(["refit", str(run), "--signs", "1", "1", "-1"]) == 2
+    assert "nothing was written" in capsys.readouterr().err  # roll is reversed
+    assert main(["refit", str(tmp_path / "none"), "--order", "ZXY"]) == 2
+    (run / "rig.toml").write_text(quaternions)
+    assert main(["refit", str(run), "--imu-order", "XYZ"]) == 2
+    assert "sent quaternions" in capsys.readouterr().err
+    dropped = []
+
+    def cut(record):
+        if record["event"] == "posture" and len(dropped) < 10:
+            dropped.append(record)
+            return None
+        return record
+
+    rewritten(run, cut)
+    assert main(["refit", str(run), "--order", "ZXY"]) == 2
+    assert "Resume it first" in capsys.readouterr().err
+    assert not beside(run)
+
+
+# Drift in a session, and runs of version 1
+
+
+def test_a_heading_that_drifts_is_taken_out_of_a_session(tmp_path):
+    truth = Truth(noise_deg=0.0, drift_deg_per_min=3.0)
+    assert run_in(tmp_path / "run", fast_text(session=SESSION), truth) == 0
+    summary = json.loads((tmp_path / "run/summary.json").read_text())
+    assert summary["drift"]["corrected"] and len(summary["drift"]["minutes"]) == 3
+    assert max(map(abs, summary["drift"]["rate_deg_per_min"])) == pytest.approx(3, 0.1)
+    rows = [*csv.DictReader((tmp_path / "run/pairs.csv").open())]
+    chosen = [row for row in rows if row["role"] == "select"]
+    u, y = ([[float(row[f"{what}_deg_{axis}"]) for axis in AXIS_NAMES]
+             for row in chosen] for what in "uy")  # fmt: skip
+    plain = jaxcal.identify(u, y)
+    left = np.abs(found(tmp_path / "run") - TRUTH).max(axis=0)
+    before = np.abs(np.column_stack([plain.matrix, plain.bias]) - TRUTH).max(axis=0)
+    assert (left < 0.3 * before).all()
+
+
+def test_a_run_of_version_1_resumes_without_the_visit_in_the_middle(run, capsys):
+    def change(record):
+        if record.get("name") == "reference:middle":
+            return None
+        return as_version_1(record)
+
+    rewritten(run, change)
+    text = (run / "rig.toml").read_text()
+    assert session(parse_config(text), run) == 1  # without a phone: nothing moves
+    summary = json.loads((run / "summary.json").read_text())
+    assert len(summary["drift"]["minutes"]) == 2 and not summary["drift"]["corrected"]
+
+
+def test_new_keys_leave_the_fingerprint_as_version_1_took_it():
+    text = fast_text(session=SESSION + "drift_limit_deg = 0.1\n")
+    text = text.replace("column_count = 4", 'column_count = 4\nallow = ["10.0.0.2"]')
+    assert parse_config(text).fingerprint() == parse_config(
+        fast_text(session=SESSION)
+    ).fingerprint()  # fmt: skip
+
+
+def test_a_journal_keeps_every_reading_in_little_room(finished):
+    records = read_journal(finished / "journal.jsonl")
+    postures = [r for r in records if r["event"] in ("posture", "zero")]
+    assert len(postures) == 11
+    for record in postures:
+        assert np.shape(record["quaternions"]) == (record["samples"], 4)
+        assert len(record["stamps"]) == record["samples"]
+        raw = {key: record[key] for key in ("quaternions", "stamps")}
+        assert len(json.dumps(raw, separators=(",", ":"))) < 80 * record["samples"]
+
+
+# Report of every kind of run
+
+
+@pytest.mark.parametrize("kept", [1, 4, 12, 30, 10_000])
+def test_a_report_says_what_there_is_of_an_unfinished_run(run, capsys, kept):
+    lines = (run / "journal.jsonl").read_text().splitlines(keepends=True)
+    (run / "journal.jsonl").write_text("".join(lines[:kept]))
+    if kept < len(lines):
+        (run / "summary.json").unlink()
+    assert main(["report", str(run)]) == 0
+    page = (run / "report.html").read_text()
+    if kept < len(lines):
+        assert "it still runs, or it was killed" in page
+        assert "y = A u + b" not in page
+    else:
+        assert "Ended with exit code 1" in page and "RECALIBRATE" in page
+    measured = sum('"event":"posture"' in line for line in lines[:kept])
+    assert (f"{measured} measured" in page) == (measured > 0)
+
+
+def test_reports_of_collect_verify_and_goto(run, tmp_path, capsys):
+    (tmp_path / "rig.toml").write_text((run / "rig.toml").read_text())
+    given = ["--config", str(tmp_path / "rig.toml"), "--simulate", "--rate", "250"]
+    given += ["--noise", "0"]
+    out = ["--out", str(tmp_path / "more")]
+    assert main(["collect", *given, *out, "--count", "3"]) == 0
+    assert main(["verify", str(run), *given, *out, "--count", "1"]) in (0, 1)
+    assert main(["goto", str(run), *given, *out, "--to", "1", "-4", "2"]) == 0
+    capsys.readouterr()
+    folders = sorted((tmp_path / "more").iterdir())
+    assert [path.name.split("-")[0] for path in folders] == [
+        "collect", "goto", "verify"
+    ]  # fmt: skip
+    for folder in folders:
+        assert main(["report", str(folder)]) == 0
+        page = (folder / "report.html").read_text()
+        assert "measured [deg]" in page and "Ended with exit code" in page
+        assert folder.name in page
+        assert ("Held-out error" in page) == folder.name.startswith("verify")
+
+
+def test_a_refused_sender_is_in_the_journal_and_in_the_report(run):
+    records = read_journal(run / "journal.jsonl")
+    told = {"event": "sender_refused", "time": 0.0, "reason": "refused 10.0.0.9"}
+    page = write_report(run, [*records, told]).read_text()
+    assert "refused 10.0.0.9" in page
+
+
+# Export
+
+
+@pytest.fixture(scope="module")
+def inverse(finished):
+    return load_inverse(finished, read_journal(finished / "journal.jsonl"))
+
+
+def targets(finished, rng, count=200):
+    """Desired postures, half of them out of reach, and what command_for says."""
+    calibration = jaxcal.Calibration.load(finished / "calibration.json")
+    desired = rng.uniform(-15, 15, (count, 3))
+    limits = [[-20, 20]] * 3
+    free = calibration.command_for(desired)
+    return desired, calibration.command_for(desired, limits, clip=True), free
+
+
+PROGRAM = r"""
+#include <stdio.h>
+#include "calibration.h"
+int main(void) {
+    double d[3], u[3];
+    float df[3], uf[3];
+    int32_t p[3], pf[3];
+    while (scanf("%lf %lf %lf", d, d + 1, d + 2) == 3) {
+        for (int i = 0; i < 3; ++i) { u[i] = 99; p[i] = 77; df[i] = (float)d[i]; }
+        int s = jaxcal_command(d, u, p), sf = jaxcal_commandf(df, uf, pf);
+        printf("%d %.17g %.17g %.17g %d %d %d %d", s, u[0], u[1], u[2], p[0], p[1],
+               p[2], sf);
+        printf(" %.9g %.9g %.9g\n", uf[0], uf[1], uf[2]);
+    }
+    return jaxcal_command(d, 0, 0) == 16;
+}
+"""
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="gcc is not installed")
+def test_the_c_header_computes_what_command_for_does(finished, inverse, rng, tmp_path):
+    (tmp_path / "calibration.h").write_text(LANGUAGES["c"](inverse))
+    (tmp_path / "main.c").write_text(PROGRAM)
+    flags = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic"]
+    subprocess.run(
+        ["gcc", *flags, "main.c", "-o", "main"], cwd=tmp_path, check=True,
+        capture_output=True,
+    )  # fmt: skip
+    desired, clipped, free = targets(finished, rng)
+    given = "".join(f"{a!r} {b!r} {c!r}\n" for a, b, c in desired.tolist())
+    given += "nan 0 0\n0 inf 0\n"
+    out = subprocess.run(
+        [tmp_path / "main"], input=given, text=True, capture_output=True, check=True
+    ).stdout
+    rows = np.array([list(map(float, line.split())) for line in out.splitlines()])
+    values, odd = rows[: len(desired)], rows[len(desired) :]
+    np.testing.assert_allclose(values[:, 1:4], clipped, atol=1e-12)
+    beyond = (np.abs(free) > 20) @ [1, 2, 4]
+    assert values[:, 0].tolist() == beyond.tolist() == values[:, 7].tolist()
+    assert 0 < np.mean(beyond > 0) < 1
+    config = fast_config()
+    assert values[:, 4:7].tolist() == [list(config.to_pulses(u)) for u in clipped]
+    np.testing.assert_allclose(values[:, 8:11], clipped, atol=2e-5)  # of float
+    assert odd[:, 0].tolist() == [8, 8]  # the last command stays
+    assert odd[:, 1:7].tolist() == [[99, 99, 99, 77, 77, 77]] * 2
+
+
+def test_structured_text_parses(inverse):
+    blark = pytest.importorskip(
+        "blark", reason="blark, the parser of TwinCAT sources, is not installed"
+    )
+    text = LANGUAGES["st"](inverse)
+    parsed = blark.parse_source_code(text)
+    assert parsed.exception is None
+    assert "FB_JaxcalCommand" in str(parsed.transform())
+
+
+def translated(text):
+    """The body of the function block as Python, for its few kinds of statements."""
+    body = re.sub(r"\(\*.*?\*\)", "", text, flags=re.S)
+    body = body.rpartition("END_VAR")[2].replace("END_FUNCTION_BLOCK", "")
+    body = re.sub(r"\bDINT#", "", body)
+    body = re.sub(r"(?<![<>:=])=(?!=)", "==", body).replace(":==", "=")
+    body = body.replace(":=", "=").replace("AND", "and").replace("OR", "or")
+    body = body.replace("NOT", "not")
+    lines, depth = [], 0
+    for statement in " ".join(body.split()).split(";"):
+        if (head := re.match(r"\s*IF (.*?) THEN(.*)", statement)) is not None:
+            lines.append(f"if {head[1]}:")
+            depth, statement = 1, head[2]
+        if statement.strip() == "END_IF":
+            depth = 0
+        elif statement.strip():
+            lines.append("    " * depth + statement.strip())
+    return "\n".join(lines)
+
+
+def test_structured_text_computes_what_command_for_does(finished, inverse, rng):
+    code = compile(translated(LANGUAGES["st"](inverse)), "ST", "exec")
+    known = {
+        "LIMIT": lambda low, value, high: min(max(low, value), high),
+        "LREAL_TO_DINT": round,
+    }
+    config = fast_config()
+    for y, clipped, free in zip(*targets(finished, rng, 40), strict=True):
+        state = known | {f"desired_{n}": v for n, v in zip(AXIS_NAMES, y, strict=True)}
+        exec(code, state)
+        u = [state[f"command_{name}"] for name in AXIS_NAMES]
+        np.testing.assert_allclose(u, clipped, atol=1e-12)
+        pulses = tuple(state[f"pulses_{name}"] for name in AXIS_NAMES)
+        assert pulses == config.to_pulses(clipped)
+        clamped = [state[f"clamped_{name}"] for name in AXIS_NAMES]
+        assert clamped == (np.abs(free) > 20).tolist() and not state["not_finite"]
+    state["desired_yaw"], last = float("nan"), u
+    exec(code, state)
+    assert state["not_finite"]
+    assert [state[f"command_{name}"] for name in AXIS_NAMES] == last
+
+
+FIELDS = ("matrix", "offset_deg", "min_deg", "max_deg", "pulses_per_deg", "min_pulses",
+          "max_pulses")  # fmt: skip
+
+
+def checksum(values):
+    numbers = [float(x) for name in FIELDS for x in np.ravel(values[name]).tolist()]
+    return hashlib.sha256("\n".join(map(repr, numbers)).encode()).hexdigest()
+
+
+def test_json_csv_and_ros_hold_the_numbers_and_their_checksum(inverse):
+    data = json.loads(LANGUAGES["json"](inverse))
+    assert data["checksum"] == checksum(data)
+    assert data["device"]["axes.yaw.direction"] == -1
+    rows = list(csv.DictReader(io.StringIO(LANGUAGES["csv"](inverse))))
+    read = {name: [r["value"] for r in rows if r["name"] == name] for name in FIELDS}
+    assert (
+        checksum({k: list(map(float, v)) for k, v in read.items()}) == data["checksum"]
+    )
+    (stated,) = [row["value"] for row in rows if row["name"] == "checksum"]
+    assert stated == data["checksum"]
+    for name in ("c", "st"):
+        assert data["checksum"] in LANGUAGES[name](inverse)
+    yaml = pytest.importorskip("yaml")
+    ros = yaml.safe_load(LANGUAGES["ros"](inverse))["/**"]["ros__parameters"]["jaxcal"]
+    assert checksum(ros) == ros["checksum"] == data["checksum"]
+    assert 'mechanism.order = "ZYX"' in ros["device"]
+
+
+def test_a_changed_number_changes_the_checksum(inverse):
+    other = dataclasses.replace(inverse, max_pulses=[1, 2, 3])
+    assert other.checksum != inverse.checksum
+
+
+def test_no_name_of_a_run_or_a_map_ends_a_comment(inverse):
+    wild = "a */ int x; *) \n \\"
+    nasty = dataclasses.replace(inverse, run=wild, device={wild: wild}, warnings=[wild])
+    for name in ("c", "st"):
+        comment = LANGUAGES[name](nasty).partition("*/" if name == "c" else "\n*)")[0]
+        assert "x;" in comment.splitlines()[-1] and wild not in comment
+    pytest.importorskip("yaml").safe_load(LANGUAGES["ros"](nasty))
+
+
+def test_export_prints_or_writes_and_warns(run, capsys, tmp_path):
+    assert main(["export", str(run), "--to", "json"]) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["run"] == "run"
+    assert "verify_limit_deg" in printed.err  # this one is not to be used
+    path = tmp_path / "c.h"
+    assert main(["export", str(run), "--to", "c", "--out", str(path)]) == 0
+    assert "WARNING: the error" in path.read_text()
+    (run / "calibration.json").unlink()
+    for folder in (run, tmp_path / "none"):
+        assert main(["export", str(folder), "--to", "c"]) == 2
+    assert capsys.readouterr().err.count("rig: ") == 2
+
+
+# Trend
+
+
+def test_trend_tells_what_moved_and_separates_devices(run, capsys):
+    later = shutil.copytree(run, run.parent / "later")
+    summary = json.loads((later / "summary.json").read_text())
+    summary["measured_at"] += 7 * 86400
+    summary["b"][1] += 5.0
+    summary["after"]["max"] = 0.1
+    (later / "summary.json").write_text(json.dumps(summary))
+    other = shutil.copytree(run, run.parent / "other")
+    rewritten(
+        other,
+        lambda r: (
+            r | {"device": r["device"] | {"axes.roll.reduction": 20.0}}
+            if r["event"] == "start"
+            else r
+        ),
+    )
+    unfinished = shutil.copytree(run, run.parent / "unfinished")
+    (unfinished / "summary.json").unlink()
+    broken = shutil.copytree(run, run.parent / "broken")
+    (broken / "summary.json").write_text("{")
+    assert main(["trend", str(run.parent)]) == 1  # the other device: recalibrate
+    said = capsys.readouterr()
+    assert said.out.count("device pitch") == 2
+    assert "b[yaw] +5.0000" in said.out and "b[pitch]" not in said.out
+    assert "the last calibration still holds" in said.out
+    assert "RECALIBRATE: other" in said.out and "unfinished" not in said.out
+    assert "broken" in said.err
+    page = (run.parent / "trend.html").read_text()
+    assert page.count("no figure") == 2 and "recalibrate" in page
+    shutil.rmtree(other)
+    assert main(["trend", str(run.parent)]) == 0
+    assert main(["trend", str(unfinished)]) == 2
+    assert main(["trend", str(run.parent / "none")]) == 2
+
+
+def test_parameters_are_drawn_over_time(finished):
+    from matplotlib.figure import Figure
+
+    from rig.outputs.figures import parameters
+
+    summary = json.loads((finished / "summary.json").read_text())
+    runs = [summary | {"time": 0.0}, summary | {"time": 86400.0}]
+    figure = Figure()
+    parameters(figure, runs)
+    assert len(figure.axes) == 12
+    line = figure.axes[3].containers[0].lines[0]  # b of pitch
+    assert line.get_xydata().tolist() == [[0, summary["b"][0]], [1, summary["b"][0]]]
+
+
+def test_help_of_every_new_command(capsys):
+    for command in ("refit", "report", "export", "trend"):
+        with pytest.raises(SystemExit) as ended:
+            main([command, "--help"])
+        assert ended.value.code == 0
+        assert "usage" in capsys.readouterr().out
+
+
+def test_a_phone_beside_the_right_one_changes_nothing_in_a_session(tmp_path):
+    """Two real senders: the second connects as soon as the port is open."""
+    allowed = {"column_count = 4": 'column_count = 4\nallow = ["127.0.0.1"]'}
+    config, ended = fast_config(allowed), threading.Event()
+    (tmp_path / "run").mkdir()
+    with simulator(config) as sim:
+        folder = tmp_path / "run"
+        known = commissioned(config, folder, sim)
+        run = Run(sim.start(), folder, "calibrate", [].append, record=known)
+        rogue = []
+
+        def intrude(port):
+            def send():
+                while not ended.is_set():
+                    made = socket.socket()
+                    made.bind(("127.0.0.5", 0))
+                    with made:
+                        try:
+                            made.connect(("127.0.0.1", port))
+                            while not ended.wait(0.01):
+                                made.sendall(b"1700000000000,90,10,10\r\n")
+                        except OSError:
+                            rogue.append("refused")
+
+            threading.Thread(target=send, daemon=True).start()
+            sim.start_phone(port)
+
+        run.on_imu_port = intrude
+        with no_figures():
+            code = run_safely(run, calibrate)
+        ended.set()
+    assert code == 0 and rogue
+    records = read_journal(tmp_path / "run/journal.jsonl")
+    told = [r for r in records if r["event"] == "sender_refused"]
+    assert [record["address"] for record in told] == ["127.0.0.5"]
+    np.testing.assert_allclose(found(tmp_path / "run"), TRUTH, atol=1e-3)

@@ -1,0 +1,417 @@
+"""Stopping: who is asked, who hears it first, and with what file it still works."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+from harness import HASTY, commissioned, fast_config, fast_text, simulator
+from test_rig_motion import bench
+
+from rig import stopping
+from rig.__main__ import main
+from rig.config import load_config
+from rig.config.salvage import read_for_stop
+from rig.device import lock
+from rig.device.bus import Bus, BusError
+from rig.device.drives import Drive
+from rig.device.lock import BusLock
+from rig.faults import StopRequested
+from rig.guard.signals import Signals
+from rig.guard.stop import stop_all
+from rig.simulator import parse_fault
+
+GENERIC = {'map = "leadshine_pr"': 'map = "generic"', **HASTY}
+
+
+@pytest.fixture
+def rig(tmp_path):
+    """A simulated rig, and the path of a configuration that reaches it."""
+    config = fast_config()
+    with simulator(config, speedup=0.02) as sim:
+        sim.path = tmp_path / "rig.toml"
+        sim.path.write_text(text_for(sim.start().bus.port))
+        commissioned(load_config(sim.path), tmp_path)
+        yield sim
+
+
+def text_for(port, **changes):
+    return fast_text({**HASTY, "port = 5020": f"port = {port}", **changes})
+
+
+def set_moving(sim, served):
+    with Bus(served.bus) as bus:
+        for axis, drive in zip(served.axes, sim.drives, strict=True):
+            Drive(bus, axis).move(
+                axis.to_pulses(0) + (5000 if drive.position < 0 else 0)
+            )
+
+
+def heard(sim):
+    """Units in the order in which their stops arrive; 0 is a broadcast."""
+    order = []
+    answer = sim.server._answer
+
+    def noted(unit, pdu):
+        if pdu[0] in (6, 16):
+            order.append(unit)
+        return answer(unit, pdu)
+
+    sim.server._answer = noted
+    return order
+
+
+# Who hears it first
+
+
+def test_units_that_answered_are_told_before_one_that_did_not():
+    config = fast_config(HASTY)
+    with simulator(config) as sim, Bus(sim.start().bus) as bus:
+        drives = [Drive(bus, axis) for axis in config.axes]
+        sim.faults.add(parse_fault("dead_drive,axis=pitch"))
+        with pytest.raises(BusError):
+            drives[0].status(retries=0)
+        order = heard(sim)
+        stop_all(drives)
+        assert order[:3] == [2, 3, 1]
+
+
+@pytest.mark.parametrize("transport", ["tcp", "rtu"])
+def test_one_short_wait_lies_between_a_dead_first_unit_and_the_others(
+    transport,
+):
+    """Nothing is known of it yet: the others wait for it once, and not for long."""
+    config = fast_config()  # bus.timeout_s = 0.5
+    with simulator(config, transport=transport) as sim, Bus(sim.start().bus) as bus:
+        drives = [Drive(bus, axis) for axis in config.axes]
+        sim.faults.add(parse_fault("dead_drive,axis=pitch"))
+        order, waited = heard(sim), []
+        send = bus._send
+
+        def noted(function, unit, *args, **more):
+            waited.append((unit, bus._timeout_s))
+            return send(function, unit, *args, **more)
+
+        bus._send = noted
+        pitch, *others = stop_all(drives)
+        assert order[:3] == [1, 2, 3]
+        assert [unit for unit, _ in waited[:3]] == [1, 2, 3]
+        assert max(seconds for _, seconds in waited[:3]) < 0.06
+        assert all(result.acknowledged and result.standing for result in others)
+        assert not pitch.acknowledged
+        tries = [seconds for unit, seconds in waited if unit == 1]
+        assert tries[1:3] == [0.5, 0.5]  # as long as configured, once they were told
+
+
+@pytest.mark.parametrize("transport", ["rtu_tcp", "rtu", "tcp"])
+def test_a_family_that_takes_a_broadcast_hears_one_first_on_a_serial_line(transport):
+    config = fast_config(GENERIC)
+    with simulator(config, transport=transport) as sim:
+        served, order = sim.start(), heard(sim)
+        with Bus(served.bus) as bus:
+            results = stop_all([Drive(bus, axis) for axis in config.axes])
+        assert order == ([] if transport == "tcp" else [0]) + [1, 2, 3]
+        assert all(result.acknowledged for result in results)
+        expected = 1 if transport == "tcp" else 2
+        assert [len(drive.stops) for drive in sim.drives] == [expected] * 3
+
+
+def test_families_that_differ_are_told_one_by_one():
+    """Where one of them keeps its stop, another may keep something else."""
+    scale = "pulses_per_rev = 10000\nreduction = 10\ndirection"  # of yaw alone
+    old, new = (f'map = "{name}"\n{scale}' for name in ("leadshine_pr", "generic"))
+    config = fast_config({old: new})
+    assert {axis.map.name for axis in config.axes} == {"generic", "leadshine_pr"}
+    with simulator(config, transport="rtu_tcp") as sim:
+        served, order = sim.start(), heard(sim)
+        with Bus(served.bus) as bus:
+            stop_all([Drive(bus, axis) for axis in config.axes])
+        assert order == [1, 2, 3]
+
+
+def test_a_signal_is_looked_at_before_every_frame():
+    with bench(fast_config(HASTY)) as motion, motion.signals as signals:
+        signals.armed = True
+        asked = []
+        send = motion.device.bus._send
+
+        def noted(function, unit, *args, **more):
+            asked.append(unit)
+            reply = send(function, unit, *args, **more)
+            signal.raise_signal(signal.SIGTERM)
+            return reply
+
+        motion.device.bus._send = noted
+        with pytest.raises(StopRequested):
+            motion.device.statuses()
+        assert asked == [1]  # one frame, where a look at three drives has six
+        sent = len(asked)
+        results = motion.device.stopper.stop("SIGTERM")
+        assert all(result.standing for result in results)
+        assert set(asked[sent : sent + 3]) == {1, 2, 3}
+
+
+def test_between_the_tries_of_a_dead_unit_a_signal_is_looked_at():
+    with bench(fast_config(HASTY)) as motion, motion.signals as signals:
+        signals.armed = True
+        motion.sim.faults.add(parse_fault("dead_drive,axis=pitch"))
+        asked = []
+        send = motion.device.bus._send
+
+        def noted(function, unit, *args, **more):
+            asked.append(unit)
+            signals.request_stop("SIGTERM", 143)
+            return send(function, unit, *args, **more)
+
+        motion.device.bus._send = noted
+        with pytest.raises(StopRequested):
+            motion.device.statuses()
+        assert asked == [1]
+
+
+def test_a_loop_that_waited_for_the_line_sends_nothing_after_the_stop():
+    """The heartbeat's thread stops while the motion loop is about to move."""
+    with bench(fast_config(HASTY)) as motion:
+        device, caught = motion.device, []
+        target = motion.config.axes[0].to_pulses(5)
+
+        def move():
+            try:
+                device.drives[0].move(target)
+            except StopRequested as error:
+                caught.append(error)
+
+        with device.bus.urgent():  # as a stop holds it
+            thread = threading.Thread(target=move)
+            thread.start()
+            time.sleep(0.05)
+            device.stopper.stop("heartbeat lost")
+        thread.join(5)
+        assert caught and motion.sim.executions() == [[], [], []]
+
+
+# The session that moves is asked first
+
+
+@contextlib.contextmanager
+def running_session(sim, tmp_path):
+    """`calibrate` in another process, while it moves."""
+    phone = sim.start_phone(0) if sim.config.imu.transport == "connect" else None
+    assert phone is None
+    from fault_matrix import _free_port
+
+    port = _free_port()
+    text = sim.path.read_text().replace("port = 2055", f"port = {port}")
+    sim.path.write_text(text)
+    child = subprocess.Popen(
+        [sys.executable, "-m", "rig", "calibrate", "--config", str(sim.path),
+         "--arm", "--zero", "--out", str(tmp_path / "runs")],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    said = []
+    reader = threading.Thread(target=lambda: said.extend(child.stdout))
+    reader.start()
+    sim.start_phone(port)
+    end = time.monotonic() + 60
+    while not any(drive.moving for drive in sim.drives):
+        assert time.monotonic() < end and child.poll() is None, said
+        time.sleep(0.01)
+    try:
+        yield child
+    finally:
+        child.kill()
+        child.wait()
+        reader.join()
+        child.stdout.close()
+
+
+def test_stop_ends_the_session_that_moves_and_then_stops_every_unit(
+    rig, tmp_path, capsys
+):
+    with running_session(rig, tmp_path) as child:
+        # A second session is refused meanwhile; it would have opened the same bus.
+        code = main(["identify", "--config", str(rig.path)])
+        assert code == 2 and f"process {child.pid}" in capsys.readouterr().err
+        assert main(["stop", "--config", str(rig.path)]) == 0
+        said = capsys.readouterr().out
+        assert f"held by `calibrate` in {tmp_path}" in said
+        assert f"process {child.pid}" in said and "told to stop now" in said
+        assert "the session reported:" in said
+        assert said.count("acknowledged, standing") == 6  # by the session, and by stop
+        assert child.wait(10) == 128 + signal.SIGTERM
+    assert not any(drive.moving for drive in rig.drives)
+    assert all(len(drive.stops) >= 2 for drive in rig.drives)
+
+
+def test_stop_goes_on_without_a_holder_that_does_not_let_go(
+    rig, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(stopping, "HOLDER_S", 0.2)
+    with running_session(rig, tmp_path) as child:
+        child.send_signal(signal.SIGSTOP)
+        assert main(["stop", "--config", str(rig.path)]) == 0
+        said = capsys.readouterr().out
+        assert "it has reported no stop" in said and "still holds the bus" in said
+        assert said.count("acknowledged, standing") == 3
+    assert not any(drive.moving for drive in rig.drives)
+
+
+def test_stop_says_so_when_it_cannot_open_the_port_of_a_holder(
+    tmp_path, capsys, monkeypatch
+):
+    pytest.importorskip("serial", reason="serial ports need pyserial")
+    monkeypatch.setattr(stopping, "HOLDER_S", 0.1)
+    with simulator(fast_config(), transport="rtu") as sim:
+        settings = sim.start().bus
+        path = tmp_path / "rig.toml"
+        path.write_text(fast_text({
+            'transport = "tcp"\nhost = "127.0.0.1"\nport = 5020':
+            f'transport = "rtu"\ndevice = "{settings.device}"'}))  # fmt: skip
+        with Bus(settings), BusLock(settings).acquire("calibrate"):
+            assert main(["stop", "--config", str(path)]) == 3
+        shown = capsys.readouterr()
+        assert f"process {os.getpid()}" in shown.out
+        assert "NOTHING WAS STOPPED BY THIS COMMAND" in shown.err
+        assert "held by another program" in shown.err
+        assert not any(drive.stops for drive in sim.drives)
+
+
+def test_what_a_dead_holder_left_is_not_believed(rig, capsys):
+    """Its pid may be somebody else's by now."""
+    innocent = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    try:
+        held = BusLock(read_for_stop(rig.path).bus)
+        with held.acquire("calibrate"):
+            stale = held.path.read_text().replace(str(os.getpid()), str(innocent.pid))
+        held.path.write_text(stale)
+        assert main(["stop", "--config", str(rig.path)]) == 0
+        assert "held by" not in capsys.readouterr().out
+        assert innocent.poll() is None
+    finally:
+        innocent.kill()
+        innocent.wait()
+
+
+def test_stop_works_where_no_lock_can_be_made(rig, capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(lock, "FOLDER", tmp_path / "no" / "such" / "folder")
+    assert main(["stop", "--config", str(rig.path)]) == 0
+    assert capsys.readouterr().out.count("acknowledged, standing") == 3
+
+
+# Signals while it stops
+
+
+def stop_in_a_process(sim, **options):
+    return subprocess.Popen(
+        [sys.executable, "-m", "rig", "stop", "--config", str(sim.path)],
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_no_signal_cuts_the_command_short(rig, number):
+    rig.faults.add(parse_fault("dead_drive,axis=pitch"))  # so that it takes seconds
+    child = stop_in_a_process(rig)
+    end = time.monotonic() + 30
+    while not rig.drives[2].stops:
+        assert time.monotonic() < end and child.poll() is None
+        time.sleep(0.005)
+    for _ in range(2):
+        child.send_signal(number)
+        time.sleep(0.02)
+    said, _ = child.communicate(timeout=30)
+    assert child.returncode == 3
+    assert said.count("acknowledged, standing") == 2 and "NOT acknowledged" in said
+    assert "Traceback" not in said
+
+
+def test_a_reader_that_went_away_does_not_keep_it_from_stopping(rig):
+    rig.path.write_text(rig.path.read_text().replace("samples = 5", "sampels = 5"))
+    child = stop_in_a_process(rig)
+    child.stdout.close()
+    child.wait(30)
+    assert all(drive.stops for drive in rig.drives)
+
+
+def test_a_handler_only_sets_a_flag_and_the_loop_says_it():
+    said = []
+    with Signals(said.append) as signals:
+        signals.armed = True
+        signal.raise_signal(signal.SIGINT)
+        assert signals.pause and not said
+        signals.tell()
+        signals.tell()
+        assert len(said) == 1 and "pausing" in said[0]
+        signals.armed, signals.ending = False, True
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.raise_signal(number)  # while the run ends: nothing is raised
+
+
+# Broken files
+
+BROKEN = {
+    "a wrong value": ("settle", 'std_deg = "much"', [1, 2, 3]),
+    "an unknown key": ("settle", "sampels = 3", [1, 2, 3]),
+    "a line that is not TOML": ("settle", "std deg 3", [1, 2, 3]),
+    "a text without its end": ("settle", 'app = "phone', [1, 2, 3]),
+    "a key given twice": ("mechanism", 'order = "ZXY"\norder = "ZYX"', [1, 2, 3]),
+    "a wrong bus key": ("bus", 'read_retries = "two"', [1, 2, 3]),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_stop_takes_what_a_file_with_faults_still_says(name, rig, capsys):
+    section, line, _ = BROKEN[name]
+    text = rig.path.read_text()
+    key = line.partition(" =")[0]
+    old = [each for each in text.splitlines() if each.startswith(f"{key} = ")]
+    text = text.replace(old[0] if old else f"[{section}]", line if old
+                        else f"[{section}]\n{line}", 1)  # fmt: skip
+    rig.path.write_text(text)
+    assert main(["check", str(rig.path)]) == 2
+    capsys.readouterr()
+    assert main(["stop", "--config", str(rig.path)]) == 0
+    said = capsys.readouterr().out
+    assert "ignored in" in said and said.count("acknowledged, standing") == 3
+    assert all(drive.stops for drive in rig.drives)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "why"),
+    [
+        ("unit = 2", "unit = 900", "yaw: unit must be in [1, 247], got 900"),
+        ("unit = 2", "unti = 2", "yaw: unit must be"),
+        ("unit = 2", "unit 2", "yaw: unit must be"),
+        ('name = "yaw"\nunit = 2\nmap = "leadshine_pr"',
+         'name = "yaw"\nunit = 2\nmap = "leadshin"', "yaw (unit 2): no register map"),
+        ('[[axes]]\nname = "yaw"', '[[axes]\nname = "yaw"',
+         "the file has 2 of 3 [[axes]]"),
+    ],
+)  # fmt: skip
+def test_units_that_it_cannot_stop_are_named_loudly(old, new, why, rig, capsys):
+    text = rig.path.read_text()
+    assert old in text
+    rig.path.write_text(text.replace(old, new))
+    assert main(["stop", "--config", str(rig.path)]) == 3
+    said = capsys.readouterr().out
+    assert f"NOT STOPPED: {why}" in said and "emergency stop" in said
+    assert said.count("acknowledged, standing") == 2
+    assert [bool(drive.stops) for drive in rig.drives] == [True, False, True]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "[bus]\n", "axes = 3\nbus = 4", "\0", '[bus]\ntransport = "tcp"\nport = 1'],
+)
+def test_a_file_of_no_use_says_that_nothing_was_stopped(text, tmp_path, capsys):
+    path = tmp_path / "rig.toml"
+    path.write_text(text)
+    assert main(["stop", "--config", str(path)]) == 3
+    assert "NOTHING WAS STOPPED BY THIS COMMAND" in capsys.readouterr().err
+    path.unlink()
+    assert main(["stop", "--config", str(path)]) == 3
+    assert "NOTHING WAS STOPPED BY THIS COMMAND" in capsys.readouterr().err
