@@ -7,8 +7,6 @@ the static solvers. The task is there so that one interface holds both.
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -42,7 +40,7 @@ class GaussianBelief:
         count, q, p = blocks.shape
         rows = solve_triangular(self.root, blocks.reshape(-1, p).T, trans="T").T
         rows = rows.reshape(count, q, p)
-        whole = jnp.eye(q) + rows @ jnp.matrix_transpose(rows)
+        whole = jnp.eye(q)[None] + rows @ jnp.matrix_transpose(rows)
         return jnp.maximum(0.5 * jnp.linalg.slogdet(whole)[1], 0.0)
 
     def update(
@@ -74,9 +72,7 @@ class GaussianBelief:
         """() of z (p,)."""
         off = self.root @ truth - self.right
         p = len(self.right)
-        return (
-            -0.5 * (off @ off) - 0.5 * p * jnp.log(2.0 * jnp.pi) + self._log_root()
-        )
+        return -0.5 * (off @ off) - 0.5 * p * jnp.log(2.0 * jnp.pi) + self._log_root()
 
     def _log_root(self) -> jax.Array:
         return jnp.log(jnp.abs(jnp.diagonal(self.root))).sum()
@@ -86,7 +82,8 @@ class GaussianBelief:
 class GaussianTask:
     """A candidates of a model, each to be measured once or a few times.
 
-    A design is an index in [0, A), an outcome the model's outputs (q,), the truth z (p,).
+    A design is an index in [0, A), an outcome the model's outputs (q,); the truth is
+    z (p,).
     """
 
     designs: jax.Array  # (A, n) candidates
@@ -133,14 +130,15 @@ class GaussianTask:
                 f"none for {', '.join(unknown)}: give prior=Prior(std)"
             )
         if noise is None:
-            has_own = hasattr(model, "default_noise")
-            noise = model.default_noise() if has_own else Noise()
+            default = getattr(model, "default_noise", Noise)
+            noise = default()
         slopes = None
         if noise.command_std is not None:
             slopes = model.command_jacobian(at, known.mean)
-        white = noise.whitening(len(at), model.num_outputs, slopes)
+        jacobian = model.jacobian(at, known.mean)
+        white = noise.whitening(len(at), jacobian.shape[1], slopes)
         std = precision**-0.5
-        blocks = white @ model.jacobian(at, known.mean)[..., known.free] * std
+        blocks = white @ jacobian[..., known.free] * std
         if not np.isfinite(blocks).all():
             bad = at[np.argwhere(~np.isfinite(blocks))[0][0]]
             raise ValueError(
@@ -182,10 +180,11 @@ class GaussianTask:
     def begin(self, key: jax.Array) -> tuple[GaussianBelief, Session]:
         """The prior, and a session of ``most`` measurements."""
         p = len(self.std)
+        there_are = self.replicates * len(self.designs)
         session = Session(
             place=jnp.full(len(self.designs), self.replicates, jnp.int32),
             seconds=jnp.float32(jnp.inf),
-            uses=jnp.int32(self.most),
+            uses=jnp.int32(min(self.most, there_are)),
             made=jnp.int32(0),
         )
         return GaussianBelief(jnp.eye(p), jnp.zeros(p)), session

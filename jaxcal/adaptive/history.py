@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.session import Session, Task
-from jaxcal.checks import in_words, numbers
+from jaxcal.checks import in_words, numbers, whole_number
 from jaxcal.checks import seconds as checked_seconds
-from jaxcal.checks import whole_number
 
 __all__ = [
     "History",
@@ -172,7 +171,7 @@ def _as_designs(
     """A design in the structure, the shapes and the types of the task's options."""
     leaves, structure = jax.tree.flatten(_like(task, belief, session))
     try:
-        given = structure.flatten_up_to(design)
+        given = structure.flatten_up_to(design)  # type: ignore[attr-defined]  # jaxlib
     except ValueError:
         raise ValueError(
             f"{where} must have the structure {structure}, got {design!r}"
@@ -183,14 +182,13 @@ def _as_designs(
             raise ValueError(
                 f"{where} must have shape {leaf.shape[1:]}, got {each.shape}"
             )
-    return structure.unflatten(
-        jnp.asarray(each, leaf.dtype) for each, leaf in zip(found, leaves, strict=True)
-    )
+    typed = [jnp.asarray(x, leaf.dtype) for x, leaf in zip(found, leaves, strict=True)]
+    return jax.tree.unflatten(structure, typed)
 
 
 def from_leaves(task: Task, belief: Any, session: Session, leaves: list[Any]) -> Any:
     """A design from the list of its leaves, as a journal has it."""
-    return jax.tree.structure(_like(task, belief, session)).unflatten(leaves)
+    return jax.tree.unflatten(jax.tree.structure(_like(task, belief, session)), leaves)
 
 
 def _like(task: Task, belief: Any, session: Session) -> Any:

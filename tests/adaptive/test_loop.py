@@ -102,7 +102,9 @@ def test_an_entry_that_cannot_be_is_named(task, entry, words):
 
 def test_a_history_that_cannot_have_happened_is_refused(sharp):
     # Joint 0 trips at 2/6, then does not at 5/6.
-    with pytest.raises(ValueError, match=r"history\[1\]: outcome 0 of design \(0, 0.83"):
+    with pytest.raises(
+        ValueError, match=r"history\[1\]: outcome 0 of design \(0, 0.83"
+    ):
         next_measurement(sharp, [(1, 1), (4, 0)])
     next_measurement(sharp, [(1, 1), (0, 0)])
 
@@ -113,7 +115,7 @@ def test_what_follows_a_spent_budget_is_refused(task):
 
 
 def test_a_drawn_budget_must_be_given(task):
-    with pytest.raises(ValueError, match="seconds must be given.* 8 to 32 s"):
+    with pytest.raises(ValueError, match=r"seconds must be given.* 8 to 32 s"):
         next_measurement(task, uses=2)
     with pytest.raises(ValueError, match="uses must be given"):
         next_measurement(task, seconds=20.0)
@@ -148,7 +150,9 @@ def test_a_killed_loop_goes_on_as_if_it_had_not_been(tmp_path, sharp, decider):
             run(sharp, decider, device(truth, None, fail_at), journal=path, seed=3)
         asked = []
         resumed = run(sharp, decider, device(truth, asked), journal=path, seed=3)
-        assert [int(d) for d, _ in resumed.history] == [int(d) for d, _ in whole.history]
+        assert [int(d) for d, _ in resumed.history] == [
+            int(d) for d, _ in whole.history
+        ]
         assert len(asked) == len(whole.history) - fail_at
         np.testing.assert_array_equal(resumed.belief.weights, whole.belief.weights)
     again = run(sharp, decider, device(truth, asked := []), journal=path, seed=3)
