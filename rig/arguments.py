@@ -140,8 +140,8 @@ TCP: Options = {
     }
 }
 SECONDS: Options = {"--seconds": _number(1.0, 600.0, 5.0, "to look at the stream")}
-JOG: Options = {
-    "axis": {"choices": ("pitch", "yaw", "roll")},
+AXIS: Options = {"axis": {"choices": ("pitch", "yaw", "roll")}}
+JOG: Options = AXIS | {
     "step": {
         "type": _within(-3.0, 3.0),
         "nargs": "?",
@@ -222,6 +222,8 @@ def make_parser() -> argparse.ArgumentParser:
     add("scan", "which units answer, and of which family; reads only", CONFIG | BUS)
     add("imu", "what to type into the phone, and what it sends", STEP | SECONDS)
     add("jog", "move one axis by hand", JOG | STEP)
+    text = "measure the play of one axis, with an interval"
+    add("characterise", text, AXIS | STEP)
     add("home", "make the drives' counts mean a place", HERE | STEP)
     text = "check what turns, which way, how far; correct rig.toml"
     add("axes", text, NAMES_KNOWN | STEP)

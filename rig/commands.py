@@ -15,7 +15,10 @@ from rig.device.lock import BusLock
 from rig.faults import EXIT_FAULT, EXIT_OK, Refused
 from rig.sessions import load, make_simulator, run_session
 
-COMMISSIONING = ("ports", "scan", "imu", "jog", "home", "axes", "zero", "setup")
+COMMISSIONING = (
+    *("ports", "scan", "imu", "jog", "home", "axes", "zero", "setup"),
+    "characterise",
+)
 
 
 def run(args: argparse.Namespace) -> int:

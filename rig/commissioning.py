@@ -11,6 +11,7 @@ import tomllib
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
+from jaxcal.extras import needs
 from rig.commission import setup, steps
 from rig.commission.operator import Operator
 from rig.commission.ports import MODBUS_PORT, serial_lines, tcp_line
@@ -41,6 +42,7 @@ def run(args: argparse.Namespace) -> int:
         "scan": _scan,
         "imu": _imu,
         "jog": _jog,
+        "characterise": _characterise,
         "home": _home,
         "axes": _axes,
         "zero": _zero,
@@ -103,6 +105,13 @@ def _imu(args: argparse.Namespace) -> int:
 def _jog(args: argparse.Namespace) -> int:
     with _place(args, IDENTIFIED) as place:
         return steps.jog(place, AXIS_NAMES.index(args.axis), args.step)
+
+
+def _characterise(args: argparse.Namespace) -> int:
+    with needs("policy", "characterise"):
+        import jax  # noqa: F401  # before anything moves
+    with _place(args, SIGN_CHECKED) as place:
+        return steps.measure_play(place, AXIS_NAMES.index(args.axis))
 
 
 def _home(args: argparse.Namespace) -> int:

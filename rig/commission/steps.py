@@ -163,6 +163,18 @@ def jog(place: Place, axis: int, way_deg: float | None) -> int:
     return place.run("jog", procedure, limits=homed)
 
 
+def measure_play(place: Place, axis: int) -> int:
+    """Measure the backlash of one axis in a closed loop."""
+    from rig.commission.characterise import FAR_DEG, characterise  # loads JAX
+
+    place.require(SIGN_CHECKED)
+    place.operator.confirm(
+        f"characterise: {AXIS_NAMES[axis]} will move up to {FAR_DEG:g} deg either way "
+        "from where it stands, many times. Keep out of the device's reach"
+    )
+    return place.run("characterise", lambda run: characterise(run, axis))
+
+
 def axes(place: Place, names_known: bool = False) -> int:
     """Check each axis, correct rig.toml after a yes, and check again: SIGN_CHECKED."""
     place.require(HOMED)

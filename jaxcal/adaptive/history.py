@@ -1,0 +1,238 @@
+"""What was measured so far, checked entry by entry, and the belief that follows."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.adaptive.grid import GridTask
+from jaxcal.adaptive.session import Session, Task
+from jaxcal.checks import in_words, numbers, whole_number
+from jaxcal.checks import seconds as checked_seconds
+
+__all__ = [
+    "History",
+    "after",
+    "begin",
+    "checked",
+    "from_leaves",
+    "replay",
+    "step_keys",
+]
+
+History = Iterable[tuple[Any, Any]]  # (design, outcome) of each measurement, in order
+
+_NEAR = 1e-5  # of a design's range: coordinates this near to a design are that design
+
+
+def begin(
+    task: Task, seconds: float | None, uses: int | None, seed: int
+) -> tuple[Any, Session]:
+    """The belief and the session at the start, with this budget.
+
+    Args:
+        task: what is measured.
+        seconds: of the session; the task's when not given.
+        uses: that end the session; the task's when not given.
+        seed: of whatever the task draws.
+
+    Raises:
+        ValueError: a budget is not given and the task draws it at random.
+    """
+    belief, session = task.begin(jax.random.key(seed))
+    if isinstance(task, GridTask):
+        low, high = np.asarray(task.seconds)
+        ends = np.asarray(task.num_uses)
+        if seconds is None and low < high:
+            raise ValueError(
+                f"seconds must be given: the task draws its budget from {low:g} to "
+                f"{high:g} s"
+            )
+        if uses is None and len(ends) > 1:
+            raise ValueError(
+                "uses must be given: the task draws its budget from "
+                f"{in_words(ends.astype(float))}"
+            )
+    if seconds is not None:
+        left = jnp.float32(checked_seconds("seconds", seconds))
+        session = session.replace(seconds=left)  # type: ignore[attr-defined]  # flax
+    if uses is not None:
+        left = jnp.int32(whole_number("uses", uses, 1))
+        session = session.replace(uses=left)  # type: ignore[attr-defined]  # flax
+    return belief, session
+
+
+def step_keys(seed: int, number: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Keys of options, choice and update of measurement ``number``, from 0.
+
+    They depend on the number alone, so that a resumed session goes on as it would have.
+    """
+    key = jax.random.fold_in(jax.random.key(seed), number)
+    key_options, key_choice, key_update = jax.random.split(key, 3)
+    return key_options, key_choice, key_update
+
+
+def replay(
+    task: Task, history: History, belief: Any, session: Session, seed: int
+) -> tuple[Any, Session, list[tuple[Any, Any]]]:
+    """Belief and session after a history, and its entries as the task has them.
+
+    Raises:
+        ValueError: naming the entry, from 0: a design that is not there, an outcome
+            that is none, one that cannot follow what was measured before, or an entry
+            after the budget was spent.
+    """
+    entries = []
+    for number, entry in enumerate(history):
+        where = f"history[{number}]"
+        try:
+            design, outcome = entry
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"{where} must be a pair (design, outcome), got {entry!r}"
+            ) from None
+        if bool(session.over):
+            raise ValueError(
+                f"{where} was measured after the budget was spent: {_left(session)}"
+            )
+        entries.append(checked(task, belief, session, design, outcome, where))
+        _, _, key = step_keys(seed, number)
+        belief, session = after(task, belief, session, *entries[-1], key)
+        if any(np.isnan(leaf).any() for leaf in _floats(belief)):
+            raise ValueError(
+                f"{where}: outcome {outcome!r} cannot follow what was measured before"
+            )
+    return belief, session, entries
+
+
+@jax.jit
+def after(
+    task: Task, belief: Any, session: Session, design: Any, outcome: Any, key: jax.Array
+) -> tuple[Any, Session]:
+    """Belief and session after one measurement."""
+    return (
+        belief.update(task, design, outcome, key),
+        task.spend(session, design, outcome),
+    )
+
+
+def checked(
+    task: Task, belief: Any, session: Session, design: Any, outcome: Any, where: str
+) -> tuple[Any, Any]:
+    """Design and outcome as the task has them.
+
+    A task with a table ``designs`` (A, e) takes a whole number as an index of it and
+    anything else as coordinates; other tasks take designs as their options have them.
+    A task with ``outcome_shape`` takes outcomes of that shape alone.
+
+    Raises:
+        ValueError: naming the entry, the rule and the value.
+    """
+    table = getattr(task, "designs", None)
+    if table is not None:
+        at = _index(np.asarray(table, np.float64), design, f"{where}: design")
+        design = jnp.int32(at)
+    else:
+        design = _as_designs(task, belief, session, design, f"{where}: design")
+    if isinstance(task, GridTask):
+        count = task.likelihood.shape[1]
+        found = _whole(outcome)
+        if found is None or not 0 <= found < count:
+            raise ValueError(
+                f"{where}: outcome must be a whole number in [0, {count}), "
+                f"got {outcome!r}"
+            )
+        told = np.asarray(task.likelihood[design, found], np.float64)
+        if not (told * np.asarray(belief.weights, np.float64)).sum() > 0.0:
+            raise ValueError(
+                f"{where}: outcome {found} of design "
+                f"{in_words(np.asarray(task.designs[design], np.float64))} cannot "
+                "follow what was measured before: the model gives it probability 0"
+            )
+        return design, jnp.int32(found)
+    values = numbers(f"{where}: outcome", outcome)
+    shape = getattr(task, "outcome_shape", None)
+    if shape is not None and values.shape != shape:
+        raise ValueError(
+            f"{where}: outcome must have shape {shape}, got {values.shape}"
+        )
+    return design, jnp.asarray(values, jnp.float32)
+
+
+def _as_designs(
+    task: Task, belief: Any, session: Session, design: Any, where: str
+) -> Any:
+    """A design in the structure, the shapes and the types of the task's options."""
+    leaves, structure = jax.tree.flatten(_like(task, belief, session))
+    try:
+        given = structure.flatten_up_to(design)  # type: ignore[attr-defined]  # jaxlib
+    except ValueError:
+        raise ValueError(
+            f"{where} must have the structure {structure}, got {design!r}"
+        ) from None
+    found = [numbers(where, values) for values in given]
+    for each, leaf in zip(found, leaves, strict=True):
+        if each.shape != leaf.shape[1:]:
+            raise ValueError(
+                f"{where} must have shape {leaf.shape[1:]}, got {each.shape}"
+            )
+    typed = [jnp.asarray(x, leaf.dtype) for x, leaf in zip(found, leaves, strict=True)]
+    return jax.tree.unflatten(structure, typed)
+
+
+def from_leaves(task: Task, belief: Any, session: Session, leaves: list[Any]) -> Any:
+    """A design from the list of its leaves, as a journal has it."""
+    return jax.tree.unflatten(jax.tree.structure(_like(task, belief, session)), leaves)
+
+
+def _like(task: Task, belief: Any, session: Session) -> Any:
+    """Shapes and types of the task's options, leaves (A, ...)."""
+    return jax.eval_shape(task.options, belief, session, jax.random.key(0)).designs
+
+
+def _index(table: NDArray[np.float64], design: Any, where: str) -> int:
+    """The row of ``table`` (A, e) that a whole number or coordinates name."""
+    index = _whole(design)
+    if index is not None:
+        if not 0 <= index < len(table):
+            raise ValueError(f"{where} must lie in [0, {len(table)}), got {index}")
+        return index
+    given = np.atleast_1d(numbers(where, design))
+    if given.shape != table.shape[1:]:
+        raise ValueError(
+            f"{where} must be an index or have {table.shape[1]} coordinates, "
+            f"got {design!r}"
+        )
+    span = np.ptp(table, axis=0)
+    off = np.abs(table - given) / np.where(span > 0.0, span, np.abs(table).max() or 1.0)
+    nearest = int(off.max(axis=1).argmin())
+    if off[nearest].max() > _NEAR:
+        raise ValueError(
+            f"{where} must be one of the task's, got {in_words(given)}; the nearest "
+            f"is {nearest}, {in_words(table[nearest])}"
+        )
+    return nearest
+
+
+def _whole(value: Any) -> int | None:
+    if isinstance(value, bool | np.bool_):
+        return None
+    try:
+        return operator.index(value)
+    except TypeError:
+        return None
+
+
+def _floats(tree: Any) -> list[Any]:
+    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
+    return [leaf for leaf in leaves if leaf.dtype.kind == "f"]
+
+
+def _left(session: Session) -> str:
+    return f"{float(session.seconds):.6g} s and {int(session.uses)} uses were left"

@@ -1,0 +1,190 @@
+"""The next measurement for a user at the bench, and the closed loop that makes it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxcal.adaptive.history import (
+    History,
+    after,
+    begin,
+    checked,
+    from_leaves,
+    replay,
+    step_keys,
+)
+from jaxcal.adaptive.journal import Journal, fingerprint
+from jaxcal.adaptive.rules import Gain, GainRate
+from jaxcal.adaptive.session import Decider, Session, Task
+
+__all__ = ["Finished", "Proposal", "next_measurement", "run"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Proposal:
+    """What to measure next, what it is expected to bring, and what is known now."""
+
+    design: Any  # an index where the task has a table of designs; None: session is over
+    coordinates: Any  # the design itself, (e,); None: session is over
+    gain: float  # nats it is expected to tell
+    seconds: float  # it is expected to take
+    uses: float  # it is expected to take
+    number: int  # measurements made before it
+    belief: Any
+    session: Session  # what is left
+
+
+@dataclasses.dataclass(frozen=True)
+class Finished:
+    """A session that has ended."""
+
+    history: list[tuple[Any, Any]]  # (design, outcome)
+    belief: Any
+    session: Session
+
+
+def next_measurement(
+    task: Task,
+    history: History = (),
+    decider: Decider | None = None,
+    *,
+    seconds: float | None = None,
+    uses: int | None = None,
+    seed: int = 0,
+) -> Proposal:
+    """What to measure next, given what was measured.
+
+    Args:
+        task: what is unknown and what may be measured.
+        history: (design, outcome) of each measurement in order. A design is an index of
+            ``task.designs`` (a whole number) or its coordinates.
+        decider: the largest expected gain when not given, a second where time counts.
+        seconds: budget of the whole session; the task's when not given.
+        uses: likewise of what is countable.
+        seed: of deciders and beliefs that draw. The same arguments, the same proposal.
+
+    Raises:
+        ValueError: an entry of the history that cannot be, by its number.
+    """
+    belief, session = begin(task, seconds, uses, seed)
+    decider = _default(session) if decider is None else decider
+    belief, session, _ = replay(task, history, belief, session, seed)
+    return _proposal(task, decider, belief, session, seed)
+
+
+def run(
+    task: Task,
+    decider: Decider | None,
+    measure: Callable[[Proposal], Any],
+    *,
+    journal: str | os.PathLike[str] | None = None,
+    seconds: float | None = None,
+    uses: int | None = None,
+    seed: int = 0,
+    enough: Callable[[Proposal], bool] = lambda proposal: False,
+) -> Finished:
+    """Propose, measure, update, until the budget is spent.
+
+    Args:
+        task, decider, seconds, uses, seed: as in :func:`next_measurement`.
+        measure: makes the measurement and returns its outcome; whatever it raises ends
+            the loop, and what was measured before is in the journal.
+        journal: file of the session. Where it is there the session goes on as if it had
+            not been interrupted.
+        enough: asked before each measurement; True ends the session.
+
+    Raises:
+        ValueError: the journal is of another task, decider or budget; an outcome is
+            none, or cannot follow what was measured before.
+    """
+    belief, session = begin(task, seconds, uses, seed)
+    decider = _default(session) if decider is None else decider
+    header = {
+        "task": fingerprint(task),
+        "decider": fingerprint(decider),
+        "seconds": _budget(float(session.seconds)),
+        "uses": int(session.uses),
+        "seed": seed,
+    }
+    file = None if journal is None else Journal(journal, header)
+    try:
+        kept = [] if file is None else file.entries
+        made = [
+            (from_leaves(task, belief, session, each["design"]), each["outcome"])
+            for each in kept
+        ]
+        belief, session, entries = replay(task, made, belief, session, seed)
+        while True:
+            proposal = _proposal(task, decider, belief, session, seed)
+            if proposal.design is None or enough(proposal):
+                return Finished(entries, belief, session)
+            outcome = measure(proposal)
+            where = f"measurement {proposal.number}"
+            entry = checked(task, belief, session, proposal.design, outcome, where)
+            if file is not None:
+                file.append(design=_leaves(entry[0]), outcome=_leaves(entry[1])[0])
+            _, _, key = step_keys(seed, proposal.number)
+            belief, session = after(task, belief, session, *entry, key)
+            entries.append(entry)
+    finally:
+        if file is not None:
+            file.close()
+
+
+def _default(session: Session) -> Decider:
+    return GainRate() if math.isfinite(session.seconds) else Gain()
+
+
+def _proposal(
+    task: Task, decider: Decider, belief: Any, session: Session, seed: int
+) -> Proposal:
+    number = int(session.made)
+    if bool(session.over) or number >= task.most:
+        return Proposal(None, None, 0.0, 0.0, 0.0, number, belief, session)
+    key_options, key_choice, _ = step_keys(seed, number)
+    design, gain, took, uses, any_left = _choose(
+        task, decider, belief, session, key_options, key_choice
+    )
+    if not any_left:
+        return Proposal(None, None, 0.0, 0.0, 0.0, number, belief, session)
+    table = getattr(task, "designs", None)
+    design = jax.tree.map(np.asarray, design)
+    coordinates = design if table is None else np.asarray(table[int(design)])
+    return Proposal(
+        design if table is None else int(design), coordinates,
+        float(gain), float(took), float(uses), number, belief, session,
+    )  # fmt: skip
+
+
+@jax.jit
+def _choose(
+    task: Task,
+    decider: Decider,
+    belief: Any,
+    session: Session,
+    key_options: jax.Array,
+    key_choice: jax.Array,
+) -> tuple[Any, ...]:
+    options = task.options(belief, session, key_options)
+    index = decider(task, belief, session, options, key_choice)
+    gains = belief.gains(task, options, key_choice)
+    seconds, uses = task.expected(belief, session, options)
+    design = jax.tree.map(lambda leaf: leaf[index], options.designs)
+    left = options.allowed.any()
+    return design, gains[index], seconds[index], uses[index], left
+
+
+def _budget(seconds: float) -> float | str:
+    return seconds if math.isfinite(seconds) else "no limit"
+
+
+def _leaves(value: Any) -> list[Any]:
+    """Numbers, or lists of them, for JSON."""
+    return [np.asarray(leaf).tolist() for leaf in jax.tree.leaves(value)]

@@ -1,0 +1,167 @@
+"""Backlash and dead zone: what a joint does when its drive turns back.
+
+With play of some width between drive and joint, the joint stays behind the drive by
+half the width, on the side it comes from, and a move the other way first takes up the
+play. A measurement is a posture and the direction in which it is reached: the axis
+comes to zero against that direction, from far enough, and then goes on to the posture.
+Postures within the play leave the joint where it was; which ones those are is unknown,
+so what a posture tells depends on the width.
+
+A dead zone gives nothing while the command is within half its width of a centre, and
+the command less that half outside; no direction matters.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.adaptive.grid import GridTask
+from jaxcal.adaptive.tasks.readings import Bins
+from jaxcal.checks import numbers
+
+__all__ = ["backlash", "backlash_bins", "dead_zone", "dead_zone_bins", "residual"]
+
+Array = NDArray[np.float64]
+
+
+def residual(
+    posture: ArrayLike, direction: ArrayLike, width: ArrayLike, offset: ArrayLike
+) -> Array:
+    """Reading less command at a posture that is reached in a direction.
+
+    Args:
+        posture: distance from zero, at least 0, in ``direction``.
+        direction: 1 or -1, of the last move.
+        width: of the play.
+        offset: reading less command in the middle of the play.
+    """
+    half = np.asarray(width) / 2.0
+    behind = np.maximum(half - np.asarray(posture), -half)
+    return np.asarray(offset) + np.asarray(direction) * behind
+
+
+def backlash_bins(max_width: float, max_offset: float, bin_width: float) -> Bins:
+    """Bins of the residual reading that hold everything without noise."""
+    reach = max_width / 2.0 + max_offset + bin_width
+    count = int(np.ceil(2.0 * reach / bin_width))
+    return Bins(-count * bin_width / 2.0, count * bin_width / 2.0, count)
+
+
+def backlash(
+    max_width: float = 1.0,
+    max_offset: float = 0.1,
+    *,
+    cells: int = 50,
+    offset_cells: int = 11,
+    postures: ArrayLike | None = None,
+    sigma: float = 0.02,
+    bin_width: float = 0.04,
+    outliers: float = 1e-3,
+    measure_s: float = 1.0,
+    speed: float = 5.0,
+    measurements: int = 20,
+) -> GridTask:
+    """The task: theta = (width, offset), design = (posture, direction).
+
+    An outcome is the bin, of :func:`backlash_bins`, of the reading less the signed
+    posture. All angles are in one unit, such as degrees.
+
+    Args:
+        max_width: of the play; cells are equal from 0, the values their centres.
+        max_offset: largest offset of the reading either way.
+        cells: of the width.
+        offset_cells: of the offset.
+        postures: (N,) distances from zero, at least 0; 12 up to 1.5 of ``max_width``
+            when not given.
+        sigma: noise of a reading.
+        bin_width: of the outcomes.
+        outliers: share of readings that say nothing.
+        measure_s: seconds of a reading.
+        speed: of the axis, a second. Each measurement runs up from 1.5 of ``max_width``
+            on the other side.
+        measurements: that end a session.
+    """
+    far = 1.5 * max_width
+    at = (
+        np.linspace(0.0, far, 12) if postures is None else numbers("postures", postures)
+    )
+    if at.ndim != 1 or not len(at) or (at < 0.0).any():
+        raise ValueError(f"postures must be (N,), at least 0, got {at.tolist()}")
+    bins = backlash_bins(max_width, max_offset, bin_width)
+    widths = (np.arange(cells) + 0.5) * max_width / cells
+    offsets = (np.arange(offset_cells) + 0.5) * 2.0 * max_offset / offset_cells
+    theta = np.array([(w, o - max_offset) for w in widths for o in offsets])
+    designs = np.array([(u, d) for d in (1.0, -1.0) for u in at])
+    mean = residual(
+        designs[:, :1], designs[:, 1:], theta[None, :, 0], theta[None, :, 1]
+    )
+    # From where it stands to far on the other side, and back to the posture.
+    stands = np.append(designs[:, 0] * designs[:, 1], 0.0)
+    turn = -designs[:, 1] * far
+    way = np.abs(stands[:, None] - turn) + far + designs[:, 0]
+    return GridTask.make(
+        theta,
+        designs,
+        bins.likelihood(mean, sigma, outliers),
+        groups=np.repeat([0, 1], len(at)),
+        travel=measure_s + way / speed,
+        uses=1,
+        num_uses=measurements,
+        most=measurements,
+        theta_names=["width", "offset"],
+        design_names=["posture", "direction"],
+    )
+
+
+def dead_zone_bins(max_width: float, reach: float, bin_width: float) -> Bins:
+    """Bins of the reading that hold everything without noise."""
+    most = reach + max_width / 2.0 + bin_width
+    count = int(np.ceil(2.0 * most / bin_width))
+    return Bins(-count * bin_width / 2.0, count * bin_width / 2.0, count)
+
+
+def dead_zone(
+    max_width: float = 1.0,
+    max_offset: float = 0.25,
+    *,
+    cells: int = 40,
+    offset_cells: int = 20,
+    reach: float = 1.0,
+    num_postures: int = 33,
+    sigma: float = 0.05,
+    bin_width: float = 0.05,
+    outliers: float = 1e-3,
+    measurements: int = 20,
+) -> GridTask:
+    """The task: theta = (width, centre), design = (command,), outcome a bin.
+
+    Args:
+        max_width: of the zone; the values are the centres of equal cells from 0.
+        max_offset: largest distance of the zone's centre from zero.
+        cells: of the width.
+        offset_cells: of the centre.
+        reach: largest command either way.
+        num_postures: commands, evenly spaced.
+        sigma: noise of a reading.
+        bin_width: of the outcomes, of :func:`dead_zone_bins`.
+        outliers: share of readings that say nothing.
+        measurements: that end a session.
+    """
+    bins = dead_zone_bins(max_width, reach, bin_width)
+    widths = (np.arange(cells) + 0.5) * max_width / cells
+    centres = (np.arange(offset_cells) + 0.5) * 2.0 * max_offset / offset_cells
+    theta = np.array([(w, c - max_offset) for w in widths for c in centres])
+    at = np.linspace(-reach, reach, num_postures)
+    off = at[:, None] - theta[None, :, 1]
+    mean = np.sign(off) * np.maximum(np.abs(off) - theta[None, :, 0] / 2.0, 0.0)
+    return GridTask.make(
+        theta,
+        at,
+        bins.likelihood(mean, sigma, outliers),
+        uses=1,
+        num_uses=measurements,
+        most=measurements,
+        theta_names=["width", "centre"],
+        design_names=["command"],
+    )

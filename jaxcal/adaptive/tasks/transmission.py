@@ -1,0 +1,75 @@
+"""Transmission error of unknown frequency: ``amplitude sin(2 pi frequency u + phase)``.
+
+A gear's error repeats with a period that is known only where the teeth are; a bent
+shaft or a loose belt brings one that is not. What a posture tells about the frequency
+depends on what is known of it: postures far apart tell it finely, and only once it is
+known so well that the turns between them can be counted.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jaxcal.adaptive.grid import GridTask
+from jaxcal.adaptive.tasks.readings import Bins
+
+__all__ = ["transmission_error"]
+
+
+def transmission_error(
+    frequencies: tuple[float, float] = (0.5, 6.0),
+    *,
+    cells: int = 48,
+    amplitudes: tuple[float, ...] = (0.5, 1.0),
+    phases: int = 16,
+    sigma: float = 0.3,
+    num_postures: int = 49,
+    num_bins: int = 24,
+    measure_s: float = 1.0,
+    travel_s: float = 2.0,
+    measurements: int = 20,
+) -> GridTask:
+    """The task: theta = (frequency, amplitude, phase), design = (posture,) in [0, 1].
+
+    Args:
+        frequencies: lowest and highest, in periods over the range of the axis; cells
+            are equal between them.
+        cells: of the frequency.
+        amplitudes: that there may be, in the reading's unit.
+        phases: evenly spaced over a turn.
+        sigma: noise of a reading.
+        num_postures: evenly spaced over the range.
+        num_bins: outcomes, from below the lowest to above the highest reading.
+        measure_s: seconds of a reading.
+        travel_s: over the full range.
+        measurements: that end a session.
+    """
+    low, high = frequencies
+    if not 0.0 < low < high:
+        raise ValueError(f"frequencies must be 0 < low < high, got {frequencies}")
+    step = (high - low) / cells
+    theta = np.stack(
+        np.meshgrid(
+            low + step * (np.arange(cells) + 0.5),
+            np.asarray(amplitudes, np.float64),
+            2.0 * np.pi * np.arange(phases) / phases,
+            indexing="ij",
+        ),
+        axis=-1,
+    ).reshape(-1, 3)
+    at = np.linspace(0.0, 1.0, num_postures)
+    frequency, amplitude, phase = theta.T[:, None]
+    mean = amplitude * np.sin(2.0 * np.pi * frequency * at[:, None] + phase)
+    most = float(np.max(amplitudes)) + 2.0 * sigma
+    here = np.append(at, 0.0)
+    return GridTask.make(
+        theta,
+        at,
+        Bins(-most, most, num_bins).likelihood(mean, sigma),
+        travel=measure_s + travel_s * np.abs(here[:, None] - at),
+        uses=1,
+        num_uses=measurements,
+        most=measurements,
+        theta_names=["frequency", "amplitude", "phase"],
+        design_names=["posture"],
+    )
