@@ -79,6 +79,7 @@ class RunState:
     pid: int | None = None
     host: str = ""
     phase: str = "opening"
+    pausing: bool = False  # a pause was asked for: one more SIGINT is a stop
     phases: list[tuple[float, str]] = dataclasses.field(default_factory=list)
     current: str | None = None  # name of the posture being visited
     target: Degrees | None = None  # commanded last
@@ -123,6 +124,8 @@ class RunState:
                 self._plan(names)
             case "queue":
                 self._plan(record["names"])
+            case "pausing":
+                self.pausing = True
             case "phase":
                 self._enter(record["phase"], now)
             case "command":
@@ -160,6 +163,7 @@ class RunState:
         self.pid, self.host = record.get("pid"), record.get("host", "")
         self._interrupt()
         self.ended = self.stop = None
+        self.pausing = False
         self.phase, self.warnings = "opening", []
 
     def _interrupt(self) -> None:

@@ -64,7 +64,8 @@ def headline(state: RunState, running: bool) -> tuple[str, str]:
         words = PHASES.get(state.phase, state.phase)
         if state.phase == "saving" and posture is None:
             return "run", "Saving"
-        return "run", words.format(title)
+        then = ", then pausing" if state.pausing else ""
+        return "run", words.format(title) + then
     code = ended.get("code", 0)
     match ended["event"]:
         case "end" if code == EXIT_RECALIBRATE:
