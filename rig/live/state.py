@@ -24,6 +24,7 @@ Visit = Literal[
 ENDS = ("end", "fault", "stopped", "paused", "refused")
 KEPT_PHASES = 400  # newest changes of phase: more than the plots show
 LOGGED = 200  # newest lines of what happened
+SESSIONS = ("calibrate", "collect", "verify", "goto")
 REFERENCES = {"reference:middle", "reference:end"}  # visits of a calibration
 ACTIVE = ("moving", "settling", "measuring")
 
@@ -141,6 +142,8 @@ class RunState:
                 self.drift.append((now, record["angles"]))
             case "posture":
                 self._measured(record, now)
+            case "stand":
+                self._stood(record, now)
             case "unreachable":
                 self._drop(record["name"], "unreachable", record["reason"])
             case "void":
@@ -199,6 +202,13 @@ class RunState:
             self.drift.append((now, record["measured_deg"]))
         self.current = None
         self._leave_queue(record["name"])
+
+    def _stood(self, record: Record, now: float) -> None:
+        """A place of a commissioning step; it has no zero to measure against."""
+        posture = self._posture(record["name"], record["pulses"])
+        posture.state, posture.time = "done", now
+        posture.std, posture.samples = record["std_deg"], record["samples"]
+        self.target = posture.commanded
 
     def _leave_queue(self, name: str) -> None:
         if name in self.queue:
@@ -269,6 +279,11 @@ class RunState:
     @property
     def mode(self) -> str:
         return str(self.start.get("mode", ""))
+
+    @property
+    def session(self) -> bool:
+        """Postures are measured against a zero; a commissioning step has none."""
+        return self.mode in SESSIONS
 
     def setting(self, table: str, key: str, default: Any = math.nan) -> Any:
         """A value of the run's configuration."""

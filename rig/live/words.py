@@ -29,7 +29,6 @@ PHASES = {
     "saving": "Saving {}",
     "finishing": "Drives at rest; identifying",
 }
-RESUME = "To go on: jaxcal-rig resume {}"
 
 
 def text(value: Any) -> str:
@@ -81,6 +80,10 @@ def headline(state: RunState, running: bool) -> tuple[str, str]:
     return "bad", "Stopped by a fault"
 
 
+def _go_on(state: RunState, folder: str) -> str:
+    return f"To go on: jaxcal-rig {f'resume {folder}' if state.session else state.mode}"
+
+
 def trouble(state: RunState, running: bool, folder: str) -> str:
     """Faults and stops in plain words; empty where there is nothing to say."""
     lines: list[str] = []
@@ -92,13 +95,13 @@ def trouble(state: RunState, running: bool, folder: str) -> str:
             "The session's process is gone. A move that had begun ran to its end "
             "unless the drive watches its line. Look at the device first."
         )
-        lines.append(RESUME.format(folder))
+        lines.append(_go_on(state, folder))
     if ended is not None and ended["event"] != "end":
         lines.append(ended.get("reason", ""))
         if stop is not None:
             lines += [str(UnitStop(**unit)) for unit in stop["units"]]
         if ended["event"] != "refused":
-            lines.append(RESUME.format(folder))
+            lines.append(_go_on(state, folder))
     elif ended is None and stop is not None and stop["reason"]:
         lines.append(f"Stopped: {stop['reason']}")
     lines += state.warnings
@@ -116,8 +119,9 @@ def numbers(state: RunState, sample: Record, live: bool) -> str:
     measured: Degrees | list[None] = sample.get("deg") or [None] * 3
     scatter = sample.get("std") or [None] * 3
     if not live and state.done:
-        commanded, measured = state.done[-1].commanded, state.done[-1].measured or []
-        scatter = state.done[-1].std or []
+        last = state.done[-1]
+        commanded, measured = last.commanded, last.measured or [None] * 3
+        scatter = last.std or [None] * 3
     rows = []
     for index, name in enumerate(AXIS_NAMES):
         asked = commanded[index] if commanded else None
@@ -132,7 +136,14 @@ def numbers(state: RunState, sample: Record, live: bool) -> str:
         rows.append(f"<tr><th class='axis {name}'>{name}</th>{row}</tr>")
     head = "".join(
         f"<th>{title}</th>"
-        for title in ("", "commanded", "drive", "measured", "difference", "scatter")
+        for title in (
+            "degrees",
+            "commanded",
+            "drive",
+            "measured",
+            "difference",
+            "scatter",
+        )
     )
     return f"<table class='numbers'><tr>{head}</tr>{''.join(rows)}</table>"
 

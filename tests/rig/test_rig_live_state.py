@@ -125,6 +125,21 @@ def test_runs_of_older_versions_without_visits_and_queues_are_shown(run):
     assert early.postures[moving["label"]].state == "moving"
 
 
+def test_places_of_a_commissioning_step_are_shown_and_what_goes_on_is_the_step():
+    stand = posture("pitch:plus", pulses=[100, 0, 0]) | {"event": "stand"}
+    start = begun(mode="axes")[0]
+    fault = {"event": "fault", "code": 3, "reason": "the phone fell silent"}
+    state = state_of(numbered([start, stand, fault]))
+    assert "pitch:plus" in words.queue(state)
+    commanded = words.angle(state.to_deg([100, 0, 0])[0])
+    for live in (True, False):
+        assert commanded in words.numbers(state, {}, live)
+    told = words.trouble(state, False, "runs/axes")
+    assert "To go on: jaxcal-rig axes<" in told and "resume" not in told
+    killed = words.trouble(state_of(numbered([start, stand])), False, "runs/axes")
+    assert "To go on: jaxcal-rig axes<" in killed
+
+
 def test_the_posture_under_way_goes_through_its_states():
     records = begun()
     seen = [state_of(records).postures["select:3"].state]
