@@ -85,8 +85,8 @@ def _limit(value: float, palette: Palette) -> dict[str, Any]:
         "symbol": "none",
         "lineStyle": {"color": "#d1453b", "type": "dashed"},
         "label": {
-            "formatter": f"limit {value:g}",
-            "position": "insideEndTop",
+            "formatter": f"limit {value:g}°",
+            "position": "insideStartTop",
             "color": palette.text,
             "fontSize": 10,
         },

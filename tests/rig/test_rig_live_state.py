@@ -176,6 +176,30 @@ def test_what_a_session_warned_of_is_in_sight():
     assert "a second phone" in words.trouble(state_of(numbered(records)), True, "run")
 
 
+def test_the_queue_shows_the_present_then_what_comes_then_the_newest():
+    records = [
+        *begun(),
+        {"event": "held_out", "pairs": [[[0, 0, 0], [1, 1, 1]]]},
+        posture("select:3"),
+        posture("select:4"),
+        {"event": "visit", "name": "select:1", "pulses": [0, 0, 0]},
+    ]
+    shown = re.findall(r"<b>(.*?)</b>", words.queue(state_of(numbered(records))))
+    held_out = ["target 0, raw", "target 0, compensated"]
+    assert shown == ["posture 1", *held_out, "posture 4", "posture 3"]
+
+
+def test_of_a_long_queue_the_present_and_the_newest_are_shown():
+    count = 100
+    waiting = {"event": "collection", "pulses": [[i, 0, 0] for i in range(count)]}
+    records = [*begun(mode="collect")[:1], waiting]
+    records += [posture(f"collect:{i}") for i in range(60)]
+    told = words.queue(state_of(numbered(records)))
+    shown = [int(n) for n in re.findall(r"<b>posture (\d+)</b>", told)]
+    assert shown == [*range(60, 80), *range(59, 39, -1)]
+    assert f"{count} in all" in told
+
+
 def test_another_choice_forgets_what_was_only_waiting():
     choice = {"indices": [4, 5], "method": "exact", "log_det": 1.0}
     records = [*begun(), posture("select:3"), {"event": "replan", "choice": choice}]
