@@ -73,7 +73,10 @@ class Drive:
                 text = self.alarm() or text
             except BusError:
                 pass  # the fault bit alone is reason enough to stop
-            raise MotionFault(f"{self.axis.name}: {text}")
+            raise MotionFault(
+                f"{self.axis.name}: {text}. The drive has stopped itself: find the "
+                "cause, in its manual too, before you go on with --reset-alarms"
+            )
         return status
 
     def alarm(self) -> str:

@@ -17,15 +17,15 @@ class Signals:
     While armed, a signal only sets a flag, so that no frame on the bus and no line of
     the journal is cut in two; the flag is looked at before every frame and in every
     loop. While nothing can move, it ends the program at once, but not a run that is
-    ending. Nothing is printed here: ``tell`` says from a loop what was asked for.
+    ending. Nothing is written here: ``tell`` reports "pausing" from a loop, once.
     """
 
-    def __init__(self, say: Callable[[str], None] = lambda text: None) -> None:
+    def __init__(self, report: Callable[[str], object] = lambda event: None) -> None:
         self.armed = False
         self.ending = False  # the stop and the last lines of the journal are under way
         self.pause = False
         self._stop: StopRequested | None = None
-        self._say = say
+        self._report = report
         self._told = False
         self._previous: dict[int, Any] = {}
 
@@ -52,10 +52,10 @@ class Signals:
         self._stop = self._stop or StopRequested(reason, exit_code)
 
     def tell(self) -> None:
-        """Say, once, that a pause was asked for."""
+        """Report, once, that a pause was asked for."""
         if self.pause and not self._told:
             self._told = True
-            self._say("Ctrl-C: finishing this posture, then pausing; again to stop now")
+            self._report("pausing")
 
     def check_stop(self) -> None:
         """Raise StopRequested where one has been asked for."""

@@ -85,8 +85,8 @@ def _limit(value: float, palette: Palette) -> dict[str, Any]:
         "symbol": "none",
         "lineStyle": {"color": "#d1453b", "type": "dashed"},
         "label": {
-            "formatter": f"limit {value:g}",
-            "position": "insideEndTop",
+            "formatter": f"limit {value:g}°",
+            "position": "insideStartTop",
             "color": palette.text,
             "fontSize": 10,
         },
@@ -117,7 +117,7 @@ def attitude(
     state: RunState, samples: Sequence[Record], end: float, palette: Palette
 ) -> dict[str, Any]:
     """Measured (solid) and drive (dashed) angles; bands where it was measured."""
-    options = _frame(palette, "s", "degrees")
+    options = _frame(palette, "seconds", "degrees")
     options["xAxis"] |= {"min": -SHOWN_S, "max": 0}
     for axis, (name, color) in enumerate(zip(AXIS_NAMES, AXIS_COLORS, strict=True)):
         data = _over_time(samples, "deg", axis, end)
@@ -133,7 +133,7 @@ def settling(
     state: RunState, samples: Sequence[Record], end: float, palette: Palette
 ) -> dict[str, Any]:
     """Scatter over the settle window against its limit, logarithmic."""
-    options = _frame(palette, "s", "degrees")
+    options = _frame(palette, "seconds", "degrees")
     options["xAxis"] |= {"min": -SHOWN_S, "max": 0}
     options["yAxis"] |= {"type": "log", "min": 0.001, "max": 100}
     limit = state.setting("settle", "std_deg")
@@ -155,7 +155,7 @@ def noise(state: RunState, palette: Palette) -> dict[str, Any]:
     """Scatter of the readings of every posture."""
     options = _frame(palette, "posture", "degrees")
     done = [posture for posture in state.done if posture.std][-POINTS:]
-    options["xAxis"] |= {"min": 0.5, "max": max(5, len(done)) + 0.5, "minInterval": 1}
+    options["xAxis"] |= {"min": 0, "max": max(5, len(done)) + 1, "minInterval": 1}
     options["yAxis"]["min"] = 0
     for axis, (name, color) in enumerate(zip(AXIS_NAMES, AXIS_COLORS, strict=True)):
         data = [[i + 1, (p.std or [0] * 3)[axis]] for i, p in enumerate(done)]

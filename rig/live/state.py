@@ -24,6 +24,7 @@ Visit = Literal[
 ENDS = ("end", "fault", "stopped", "paused", "refused")
 KEPT_PHASES = 400  # newest changes of phase: more than the plots show
 LOGGED = 200  # newest lines of what happened
+SESSIONS = ("calibrate", "collect", "verify", "goto")
 REFERENCES = {"reference:middle", "reference:end"}  # visits of a calibration
 ACTIVE = ("moving", "settling", "measuring")
 
@@ -79,6 +80,7 @@ class RunState:
     pid: int | None = None
     host: str = ""
     phase: str = "opening"
+    pausing: bool = False  # a pause was asked for: one more SIGINT is a stop
     phases: list[tuple[float, str]] = dataclasses.field(default_factory=list)
     current: str | None = None  # name of the posture being visited
     target: Degrees | None = None  # commanded last
@@ -123,6 +125,8 @@ class RunState:
                 self._plan(names)
             case "queue":
                 self._plan(record["names"])
+            case "pausing":
+                self.pausing = True
             case "phase":
                 self._enter(record["phase"], now)
             case "command":
@@ -138,6 +142,8 @@ class RunState:
                 self.drift.append((now, record["angles"]))
             case "posture":
                 self._measured(record, now)
+            case "stand":
+                self._stood(record, now)
             case "unreachable":
                 self._drop(record["name"], "unreachable", record["reason"])
             case "void":
@@ -160,6 +166,7 @@ class RunState:
         self.pid, self.host = record.get("pid"), record.get("host", "")
         self._interrupt()
         self.ended = self.stop = None
+        self.pausing = False
         self.phase, self.warnings = "opening", []
 
     def _interrupt(self) -> None:
@@ -195,6 +202,13 @@ class RunState:
             self.drift.append((now, record["measured_deg"]))
         self.current = None
         self._leave_queue(record["name"])
+
+    def _stood(self, record: Record, now: float) -> None:
+        """A place of a commissioning step; it has no zero to measure against."""
+        posture = self._posture(record["name"], record["pulses"])
+        posture.state, posture.time = "done", now
+        posture.std, posture.samples = record["std_deg"], record["samples"]
+        self.target = posture.commanded
 
     def _leave_queue(self, name: str) -> None:
         if name in self.queue:
@@ -265,6 +279,11 @@ class RunState:
     @property
     def mode(self) -> str:
         return str(self.start.get("mode", ""))
+
+    @property
+    def session(self) -> bool:
+        """Postures are measured against a zero; a commissioning step has none."""
+        return self.mode in SESSIONS
 
     def setting(self, table: str, key: str, default: Any = math.nan) -> Any:
         """A value of the run's configuration."""

@@ -88,7 +88,10 @@ class Watcher:
         if not self.here or pid is None or not is_written(self.folder / JOURNAL):
             raise Refused("nothing was sent: no session of this run is running here")
         if number == signal.SIGINT:
-            if self._paused == self.state.sessions:  # a second SIGINT is a stop
+            if self.state.phase in ("opening", "finishing"):  # SIGINT would end the run
+                raise Refused("there is nothing to pause: nothing is moving now")
+            # A second SIGINT is a stop, also after one Ctrl-C in the terminal.
+            if self.state.pausing or self._paused == self.state.sessions:
                 raise Refused("a pause was asked for already; STOP stops at once")
             self._paused = self.state.sessions
         try:

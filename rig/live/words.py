@@ -29,7 +29,6 @@ PHASES = {
     "saving": "Saving {}",
     "finishing": "Drives at rest; identifying",
 }
-RESUME = "To go on: jaxcal-rig resume {}"
 
 
 def text(value: Any) -> str:
@@ -64,7 +63,8 @@ def headline(state: RunState, running: bool) -> tuple[str, str]:
         words = PHASES.get(state.phase, state.phase)
         if state.phase == "saving" and posture is None:
             return "run", "Saving"
-        return "run", words.format(title)
+        then = ", then pausing" if state.pausing else ""
+        return "run", words.format(title) + then
     code = ended.get("code", 0)
     match ended["event"]:
         case "end" if code == EXIT_RECALIBRATE:
@@ -80,6 +80,10 @@ def headline(state: RunState, running: bool) -> tuple[str, str]:
     return "bad", "Stopped by a fault"
 
 
+def _go_on(state: RunState, folder: str) -> str:
+    return f"To go on: jaxcal-rig {f'resume {folder}' if state.session else state.mode}"
+
+
 def trouble(state: RunState, running: bool, folder: str) -> str:
     """Faults and stops in plain words; empty where there is nothing to say."""
     lines: list[str] = []
@@ -91,13 +95,13 @@ def trouble(state: RunState, running: bool, folder: str) -> str:
             "The session's process is gone. A move that had begun ran to its end "
             "unless the drive watches its line. Look at the device first."
         )
-        lines.append(RESUME.format(folder))
+        lines.append(_go_on(state, folder))
     if ended is not None and ended["event"] != "end":
         lines.append(ended.get("reason", ""))
         if stop is not None:
             lines += [str(UnitStop(**unit)) for unit in stop["units"]]
         if ended["event"] != "refused":
-            lines.append(RESUME.format(folder))
+            lines.append(_go_on(state, folder))
     elif ended is None and stop is not None and stop["reason"]:
         lines.append(f"Stopped: {stop['reason']}")
     lines += state.warnings
@@ -115,8 +119,9 @@ def numbers(state: RunState, sample: Record, live: bool) -> str:
     measured: Degrees | list[None] = sample.get("deg") or [None] * 3
     scatter = sample.get("std") or [None] * 3
     if not live and state.done:
-        commanded, measured = state.done[-1].commanded, state.done[-1].measured or []
-        scatter = state.done[-1].std or []
+        last = state.done[-1]
+        commanded, measured = last.commanded, last.measured or [None] * 3
+        scatter = last.std or [None] * 3
     rows = []
     for index, name in enumerate(AXIS_NAMES):
         asked = commanded[index] if commanded else None
@@ -129,10 +134,8 @@ def numbers(state: RunState, sample: Record, live: bool) -> str:
         ]  # fmt: skip
         row = "".join(f"<td>{cell}</td>" for cell in cells)
         rows.append(f"<tr><th class='axis {name}'>{name}</th>{row}</tr>")
-    head = "".join(
-        f"<th>{title}</th>"
-        for title in ("", "commanded", "drive", "measured", "difference", "scatter")
-    )
+    titles = "degrees commanded drive measured difference scatter".split()
+    head = "".join(f"<th>{title}</th>" for title in titles)
     return f"<table class='numbers'><tr>{head}</tr>{''.join(rows)}</table>"
 
 
@@ -172,23 +175,19 @@ def head(state: RunState, running: bool, folder: str) -> str:
 
 
 def queue(state: RunState) -> str:
-    """The postures: state, commanded, measured and why."""
+    """The postures: the present one, those to come, then those done, newest first."""
     postures = list(state.postures.values())
     order = {name: number for number, name in enumerate(state.queue)}
-
-    def place(posture: Posture) -> tuple[int, float]:
-        if posture.state in ACTIVE:
-            return 1, 0.0
-        return (2, order[posture.name]) if posture.name in order else (0, posture.time)
-
-    postures.sort(key=place)
+    ahead = [p for p in postures if p.state in ("waiting", *ACTIVE)]
+    ahead.sort(key=lambda p: (p.state == "waiting", order.get(p.name, len(order))))
+    behind = [p for p in postures if p.state not in ("waiting", *ACTIVE)]
+    behind.sort(key=lambda p: -p.time)
+    shown = ahead[: SHOWN - min(len(behind), SHOWN // 2)]
+    shown += behind[: SHOWN - len(shown)]
     cut = ""
     if len(postures) > SHOWN:
-        at = sum(p.state == "done" for p in postures)
-        first = max(0, min(at - SHOWN // 2, len(postures) - SHOWN))
         cut = f"<p class='note'>{len(postures)} in all; those around the present</p>"
-        postures = postures[first : first + SHOWN]
-    rows = "".join(_row(posture) for posture in postures)
+    rows = "".join(_row(posture) for posture in shown)
     if not rows:
         return "<p class='note'>No postures yet.</p>"
     return f"<ol class='queue'>{rows}</ol>{cut}"
@@ -197,9 +196,9 @@ def queue(state: RunState) -> str:
 def _row(posture: Posture) -> str:
     asked = " ".join(angle(value, 2) for value in posture.commanded or [])
     found = " ".join(angle(value, 2) for value in posture.measured or [])
-    detail = f"commanded {asked}" if asked else ""
+    detail = f"commanded {asked}°" if asked else ""
     if found:
-        detail += f"<br>measured {found}"
+        detail += f"<br>measured {found}°"
     return (
         f"<li class='{posture.state}'><span class='mark'>{MARKS[posture.state]}</span>"
         f"<div><b>{text(posture.title)}</b> <span class='state'>{posture.state}</span>"
@@ -222,7 +221,9 @@ def uncertainty(state: RunState) -> str:
     words = [f"{len(known)} of 3 directions of the commands measured"]
     if len(known) == 3:
         low, high = 1.96 * known.min(), 1.96 * known.max()
-        words = [f"slopes of A: ±{low:.1g} to ±{high:.1g} (95 %, best and worst way)"]
+        words = [
+            f"slopes of A: ±{low:.1g} to ±{high:.1g} deg/deg (95 %, best and worst)"
+        ]
     typical, worst = prediction_std(points, state.candidates or points, noise)
     if math.isfinite(worst):
         words.append(

@@ -23,6 +23,8 @@ def event_lines(record: dict[str, Any]) -> list[str]:
             return [f"zero taken at pulses {record['pulses']}"]
         case "void":
             return [f"  withdrawn, to be measured again: {', '.join(record['names'])}"]
+        case "pausing":
+            return ["pausing after this posture; another Ctrl-C stops at once"]
         case "lost_reply":
             found = {
                 "obeyed": "the drive obeys",

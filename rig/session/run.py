@@ -73,7 +73,7 @@ class Run(RunFolder):
         self.zero_at = zero_at
         self.kept_zero = kept_zero
         self.dry_run = dry_run
-        self.signals = Signals(self.say)
+        self.signals = Signals(self.emit)
         self.planned = 0
         self._visited = 0
         self._visit_s: list[float] = []

@@ -16,7 +16,7 @@ import pytest
 
 from rig.__main__ import main
 from rig.faults import Refused
-from rig.live import launch
+from rig.live import launch, words
 from rig.live.guard import Guard
 from rig.live.watcher import Watcher
 from rig.outputs.journal import Journal
@@ -181,6 +181,7 @@ def _journal(tmp_path, pid, **more):
     journal.write(
         "start", mode="goto", config={}, pid=pid, **{"host": platform.node()} | more
     )
+    journal.write("phase", phase="moving")
     return journal
 
 
@@ -192,6 +193,8 @@ def test_buttons_reach_the_process_that_holds_the_journal_and_no_other(tmp_path)
         assert sleeper.wait(10) == -signal.SIGINT
     with subprocess.Popen(["sleep", "60"]) as sleeper:
         journal.write("resume", pid=sleeper.pid, host=platform.node())
+        with pytest.raises(Refused, match="nothing to pause"):  # it waits for the phone
+            watcher.ask(signal.SIGINT)
         assert str(sleeper.pid) in watcher.ask(signal.SIGTERM)
         assert sleeper.wait(10) == -signal.SIGTERM
     with pytest.raises(Refused, match="emergency stop"):  # the process has gone
@@ -209,6 +212,16 @@ def test_a_second_pause_is_not_sent_as_it_would_be_a_stop(tmp_path):
         with pytest.raises(Refused, match="asked for already"):
             watcher.ask(signal.SIGINT)
         journal.close()
+
+
+def test_a_pause_after_ctrl_c_in_the_terminal_is_not_sent(tmp_path):
+    journal = _journal(tmp_path, os.getpid())
+    journal.write("pausing")
+    watcher = Watcher(tmp_path)
+    with pytest.raises(Refused, match="asked for already"):
+        watcher.ask(signal.SIGINT)
+    assert words.headline(watcher.state, True)[1].endswith(", then pausing")
+    journal.close()
 
 
 def test_a_session_on_another_computer_is_not_signalled(tmp_path):

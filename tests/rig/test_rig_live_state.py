@@ -125,6 +125,21 @@ def test_runs_of_older_versions_without_visits_and_queues_are_shown(run):
     assert early.postures[moving["label"]].state == "moving"
 
 
+def test_places_of_a_commissioning_step_are_shown_and_what_goes_on_is_the_step():
+    stand = posture("pitch:plus", pulses=[100, 0, 0]) | {"event": "stand"}
+    start = begun(mode="axes")[0]
+    fault = {"event": "fault", "code": 3, "reason": "the phone fell silent"}
+    state = state_of(numbered([start, stand, fault]))
+    assert "pitch:plus" in words.queue(state)
+    commanded = words.angle(state.to_deg([100, 0, 0])[0])
+    for live in (True, False):
+        assert commanded in words.numbers(state, {}, live)
+    told = words.trouble(state, False, "runs/axes")
+    assert "To go on: jaxcal-rig axes<" in told and "resume" not in told
+    killed = words.trouble(state_of(numbered([start, stand])), False, "runs/axes")
+    assert "To go on: jaxcal-rig axes<" in killed
+
+
 def test_the_posture_under_way_goes_through_its_states():
     records = begun()
     seen = [state_of(records).postures["select:3"].state]
@@ -159,6 +174,30 @@ def test_out_of_reach_and_withdrawn_postures_say_why():
 def test_what_a_session_warned_of_is_in_sight():
     records = [*begun(), {"event": "sender_refused", "reason": "a second phone"}]
     assert "a second phone" in words.trouble(state_of(numbered(records)), True, "run")
+
+
+def test_the_queue_shows_the_present_then_what_comes_then_the_newest():
+    records = [
+        *begun(),
+        {"event": "held_out", "pairs": [[[0, 0, 0], [1, 1, 1]]]},
+        posture("select:3"),
+        posture("select:4"),
+        {"event": "visit", "name": "select:1", "pulses": [0, 0, 0]},
+    ]
+    shown = re.findall(r"<b>(.*?)</b>", words.queue(state_of(numbered(records))))
+    held_out = ["target 0, raw", "target 0, compensated"]
+    assert shown == ["posture 1", *held_out, "posture 4", "posture 3"]
+
+
+def test_of_a_long_queue_the_present_and_the_newest_are_shown():
+    count = 100
+    waiting = {"event": "collection", "pulses": [[i, 0, 0] for i in range(count)]}
+    records = [*begun(mode="collect")[:1], waiting]
+    records += [posture(f"collect:{i}") for i in range(60)]
+    told = words.queue(state_of(numbered(records)))
+    shown = [int(n) for n in re.findall(r"<b>posture (\d+)</b>", told)]
+    assert shown == [*range(60, 80), *range(59, 39, -1)]
+    assert f"{count} in all" in told
 
 
 def test_another_choice_forgets_what_was_only_waiting():

@@ -183,6 +183,9 @@ def test_a_resume_that_is_refused_before_it_moves_is_bad_input(tmp_path):
     with simulator(config) as sim:
         served = sim.start()
         assert session(served, tmp_path, sim, listeners=[pause]) == 4
+        events = [r["event"] for r in read_journal(tmp_path / "journal.jsonl")]
+        assert events.count("pausing") == 1
+        assert events.index("pausing") < events.index("paused")
         record = commissioned(served, tmp_path)
         run = Run(served, tmp_path, "calibrate", said.append, record=record)
         run.confirm = refuse
