@@ -18,9 +18,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.tasks.readings import Bins
+from jaxcal.adaptive.tasks.registry import Entry
 from jaxcal.checks import numbers
 
-__all__ = ["backlash", "backlash_bins", "dead_zone", "dead_zone_bins", "residual"]
+__all__ = [
+    "DEAD_ZONE",
+    "ENTRY",
+    "backlash",
+    "backlash_bins",
+    "dead_zone",
+    "dead_zone_bins",
+    "residual",
+]
 
 Array = NDArray[np.float64]
 
@@ -165,3 +174,7 @@ def dead_zone(
         theta_names=["width", "centre"],
         design_names=["command"],
     )
+
+
+ENTRY = Entry(backlash, about="width of a joint's play, by posture and direction")
+DEAD_ZONE = Entry(dead_zone, about="width and centre of a dead zone, by command")

@@ -20,7 +20,12 @@ from jaxcal.learning.settings import installed
 __all__ = ["Entry", "load", "names", "options_from"]
 
 _GROUP = "jaxcal.tasks"  # entry points
-_OWN = {"knee": "jaxcal.adaptive.tasks.knee:ENTRY"}
+_OWN = {
+    "backlash": "jaxcal.adaptive.tasks.backlash:ENTRY",
+    "dead_zone": "jaxcal.adaptive.tasks.backlash:DEAD_ZONE",
+    "knee": "jaxcal.adaptive.tasks.knee:ENTRY",
+    "transmission": "jaxcal.adaptive.tasks.transmission:ENTRY",
+}
 
 
 @dataclasses.dataclass(frozen=True)

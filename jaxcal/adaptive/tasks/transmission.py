@@ -12,8 +12,9 @@ import numpy as np
 
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.tasks.readings import Bins
+from jaxcal.adaptive.tasks.registry import Entry
 
-__all__ = ["transmission_error"]
+__all__ = ["ENTRY", "transmission_error"]
 
 
 def transmission_error(
@@ -73,3 +74,6 @@ def transmission_error(
         theta_names=["frequency", "amplitude", "phase"],
         design_names=["posture"],
     )
+
+
+ENTRY = Entry(transmission_error, about="a transmission error of unknown frequency")
