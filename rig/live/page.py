@@ -135,7 +135,8 @@ class LivePage:
         ))  # fmt: skip
         report = watcher.report is not None
         self._show(self._verdict, words.verdict(state, watcher.summary, report))
-        self._verdict.classes(tone, remove="run good warn bad")
+        for card in (self._trouble, self._verdict):
+            card.classes(tone, remove="run good warn bad")
         self._queue.set_content(words.queue(state))
         self._uncertainty.set_content(words.uncertainty(state))
         self._log.set_content(words.happened(state, _clock))
