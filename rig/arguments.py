@@ -53,7 +53,7 @@ def _number(low: float, high: float, default: float, text: str) -> dict[str, Any
     return {"type": _within(low, high), "default": default, "help": text}
 
 
-CONFIG: Options = {"--config": _path("rig.toml", metavar="FILE")}
+CONFIG: Options = {"--config": _path("default: rig.toml here", metavar="FILE")}
 FOLDER: Options = {
     "--out": _path("folder for the run's folder"),
     "--dry-run": _flag("plan; open no port"),
@@ -170,8 +170,7 @@ SETUP: Options = {
 
 
 ORDER = {"choices": ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")}
-RECORDED: Options = {"run": _path("the run's folder")}
-REFIT: Options = RECORDED | {
+REFIT: Options = FOLDER_OF | {
     "--order": {**ORDER, "help": "mechanism.order: axes of the joints"},
     "--imu-order": {**ORDER, "help": "imu.order: of the phone's angles"},
     "--signs": {
@@ -187,7 +186,7 @@ REFIT: Options = RECORDED | {
         "help": "imu.mounting_deg: turn of the phone on the end-effector",
     },
 }
-EXPORT: Options = RECORDED | {
+EXPORT: Options = FOLDER_OF | {
     "--to": {
         "choices": ("c", "st", "ros", "json", "csv"),
         "required": True,
@@ -245,7 +244,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("check", "check a configuration and list every fault", FILE | CONFIG, False)
     add("example", "print a commented example configuration", NAME, False)
     add("refit", "identify a recorded calibration anew", REFIT, False)
-    add("report", "write report.html of any run, also unfinished", RECORDED, False)
+    add("report", "write report.html of any run, also unfinished", FOLDER_OF, False)
     text = "print the inverse map of a calibration for a controller"
     add("export", text, EXPORT, False)
     text = "compare the calibrations of a device over time"

@@ -7,13 +7,13 @@ import contextlib
 import time
 from collections.abc import Callable
 
-from rig.config import ConfigError, example_text, load_config
+from rig.config import example_text, load_config
 from rig.config.files import example_names
 from rig.device.bus import Bus, BusError
 from rig.device.drives import Drive
 from rig.device.lock import BusLock
 from rig.faults import EXIT_FAULT, EXIT_OK, Refused
-from rig.sessions import load, make_simulator, run_session
+from rig.sessions import FILE, load, make_simulator, run_session
 
 COMMISSIONING = (
     *("ports", "scan", "imu", "jog", "home", "axes", "zero", "setup"),
@@ -86,9 +86,7 @@ def _described(drive: Drive) -> list[str]:
 def _stop(args: argparse.Namespace) -> int:
     from rig.stopping import stop_device
 
-    if args.config is None:
-        raise ConfigError("configuration", ["--config FILE is required"])
-    return stop_device(args.config)
+    return stop_device(args.config or FILE)
 
 
 def _simulate(args: argparse.Namespace) -> int:
@@ -135,9 +133,7 @@ def _example(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> int:
-    path = args.config or args.file
-    if path is None:
-        raise ConfigError("configuration", ["--config FILE is required"])
+    path = args.config or args.file or FILE
     config = load_config(path)
     print(f"{path}: valid; fingerprint {config.fingerprint()[:16]}")
     for axis in config.axes:

@@ -27,12 +27,10 @@ from rig.device.lock import BusLock
 from rig.device.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
 from rig.faults import EXIT_FAULT, EXIT_OK, Refused
 from rig.session.folder import new_run_folder
-from rig.sessions import load, make_simulator
+from rig.sessions import FILE, load, make_simulator
 
 if TYPE_CHECKING:
     from rig.simulator import Simulator
-
-FILE = pathlib.Path("rig.toml")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -202,10 +200,8 @@ def _place(args: argparse.Namespace, state: str = "") -> Iterator[steps.Place]:
     A simulated one is first taken through the states before the command's own.
     """
     operator = Operator(getattr(args, "yes", False), _say)
-    path = args.config
-    if path is None and not args.simulate and FILE.exists():
-        path = args.config = FILE
     config = load(args)
+    path = args.config
     with contextlib.ExitStack() as stack:
         if not args.simulate:
             record = DeviceRecord.load(config.device_path)

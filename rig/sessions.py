@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from rig.session.run import Run
     from rig.simulator import Simulator
 
+FILE = pathlib.Path("rig.toml")  # without --config
 SIMULATION = (
     "transport", "noise", "backlash", "drift", "speedup", "rate", "reversed", "swapped",
     "gearing", "lost_origin", "realistic",
@@ -32,12 +33,15 @@ SIMULATION = (
 
 
 def load(args: argparse.Namespace) -> RigConfig:
-    """The configuration a command was given, or the simulator's own."""
-    if args.config is not None:
-        return load_config(args.config)
-    if getattr(args, "simulate", False) or args.command == "simulate":
-        return parse_config(example_text("simulate"))
-    raise ConfigError("configuration", ["--config FILE is required (or --simulate)"])
+    """The configuration a command was given, the simulator's own, or rig.toml here."""
+    if args.config is None:
+        if getattr(args, "simulate", False) or args.command == "simulate":
+            return parse_config(example_text("simulate"))
+        if not FILE.exists():
+            lack = "there is no rig.toml here: --config FILE is required, or --simulate"
+            raise ConfigError("configuration", [lack])
+        args.config = FILE
+    return load_config(args.config)
 
 
 def make_simulator(

@@ -92,8 +92,8 @@ def _check_device(path: pathlib.Path, notes: dict[str, Any], config: RigConfig) 
     if "device" in notes:
         if changed := differences(notes["device"], config.device_fingerprint()):
             raise Refused(
-                f"{path}: made with another device: {'; '.join(changed)}. Calibrate "
-                "this one"
+                f"{path}: made with another device: {'; '.join(changed)}. Correct "
+                "rig.toml, or calibrate this device"
             )
         return ""
     if notes.get("fingerprint") != config.fingerprint():

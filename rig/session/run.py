@@ -39,7 +39,7 @@ from rig.session.device import Device
 from rig.session.folder import RunFolder
 from rig.session.measuring import Observer
 from rig.session.motion import Motion
-from rig.session.reference import KeptZero, axes_text, check_zero
+from rig.session.reference import KeptZero, axes_text
 
 STREAM_WAIT_S = 60.0  # time to start the app on the phone
 ZERO_FACTOR = 4  # readings of the zero posture, in those of a posture
@@ -166,10 +166,11 @@ class Run(RunFolder):
         config, known = self.config, self.record.state(ZEROED)
         if self.kept_zero is not None:
             self.say(self.kept_zero.check(config, pulses, attitude))
-        elif known and known["pulses"] == list(pulses):
+        elif known:
+            then = np.array(known["attitude"])
+            last = KeptZero("the last session", known["pulses"], then)
             try:
-                then = np.array(known["attitude"])
-                check_zero(config, then, attitude, "the last session")
+                last.check(config, pulses, attitude)
             except MotionFault as fault:  # a phone mounted anew is calibrated anew
                 self.say(f"WARNING: {fault}")
         zero = {"pulses": list(pulses), "attitude": attitude.tolist()}

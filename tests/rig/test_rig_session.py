@@ -681,10 +681,13 @@ def test_check_takes_its_file_with_and_without_config(tmp_path, capsys, monkeypa
     monkeypatch.chdir(tmp_path)
     assert main(["example", "leadshine_pr"]) == 0
     (tmp_path / "rig.toml").write_text(capsys.readouterr().out)
-    for given in (["--config", "rig.toml"], ["rig.toml"]):
+    for given in (["--config", "rig.toml"], ["rig.toml"], []):
         assert main(["check", *given]) == 0
         assert "valid" in capsys.readouterr().out
-    assert main(["check"]) == 2
+    assert main(["verify", "calibration.json"]) == 2  # the file is found, not this
+    assert "calibration.json: not a calibration" in capsys.readouterr().err
+    (tmp_path / "rig.toml").unlink()
+    assert main(["check"]) == main(["calibrate"]) == 2
     assert "--config FILE is required" in capsys.readouterr().err
 
 

@@ -405,11 +405,15 @@ def test_units_that_it_cannot_stop_are_named_loudly(old, new, why, rig, capsys):
     "text",
     ["", "[bus]\n", "axes = 3\nbus = 4", "\0", '[bus]\ntransport = "tcp"\nport = 1'],
 )
-def test_a_file_of_no_use_says_that_nothing_was_stopped(text, tmp_path, capsys):
+def test_a_file_of_no_use_says_that_nothing_was_stopped(
+    text, tmp_path, capsys, monkeypatch
+):
     path = tmp_path / "rig.toml"
     path.write_text(text)
     assert main(["stop", "--config", str(path)]) == 3
     assert "NOTHING WAS STOPPED BY THIS COMMAND" in capsys.readouterr().err
     path.unlink()
-    assert main(["stop", "--config", str(path)]) == 3
-    assert "NOTHING WAS STOPPED BY THIS COMMAND" in capsys.readouterr().err
+    monkeypatch.chdir(tmp_path)
+    for given in (["--config", str(path)], []):
+        assert main(["stop", *given]) == 3
+        assert "NOTHING WAS STOPPED BY THIS COMMAND" in capsys.readouterr().err

@@ -278,6 +278,22 @@ def test_a_zero_by_the_drives_is_compared_with_the_last_one(tmp_path):
     assert record.state(ZEROED)["pulses"] == [0, 0, 0]
 
 
+def test_a_zero_at_other_pulses_than_the_last_one_is_told(tmp_path):
+    config = fast_config()
+    with simulator(config) as sim:
+        served = sim.start()
+        record = commissioned(served, tmp_path)
+        said = []
+        for name, here in (("a", (0.0, 0.0, 0.0)), ("b", (2.0, 0.0, 0.0))):
+            (tmp_path / name).mkdir()
+            run = Run(served, tmp_path / name, "collect", said.append, record=record)
+            run.on_imu_port = sim.start_phone
+            run.zero_at = served.to_pulses(here)  # as if an operator had put it there
+            assert run_safely(run, lambda r: collect(r, 1)) == 0
+    told = [text for text in said if text.startswith("WARNING")]
+    assert len(told) == 1 and "pitch stands +2.00 deg away" in told[0]
+
+
 # Gearing
 
 
