@@ -11,9 +11,7 @@ from typing import Any
 from jaxcal.files import write_text
 from rig.config import parse_config
 from rig.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault, Refused
-from rig.sessions import recorded
-
-Record = dict[str, Any]
+from rig.sessions import recorded, records_of
 
 
 def refit(args: argparse.Namespace) -> int:
@@ -26,7 +24,7 @@ def refit(args: argparse.Namespace) -> int:
     from rig.session.checks import check_matrix
     from rig.session.folder import RunFolder, new_run_folder
 
-    held = _records(args.run)
+    held = records_of(args.run)
     then, start = recorded(args)
     if start["mode"] != "calibrate":
         raise Refused(f"{args.run} is a {start['mode']} run; refit takes a calibration")
@@ -88,19 +86,6 @@ def refit(args: argparse.Namespace) -> int:
     return EXIT_RECALIBRATE if recalibrate(summary, limit) else EXIT_OK
 
 
-def _records(run: pathlib.Path) -> list[Record]:
-    from rig.outputs.journal import JournalError, read_journal
-    from rig.session.folder import JOURNAL
-
-    try:
-        records = read_journal(run / JOURNAL)
-    except JournalError as error:
-        raise Refused(str(error)) from None
-    if not records or records[0]["event"] != "start":
-        raise Refused(f"{run} holds no run")
-    return records
-
-
 def _saved(path: pathlib.Path, *keys: str) -> dict[str, Any] | None:
     if not path.is_file():
         return None
@@ -112,7 +97,7 @@ def report(args: argparse.Namespace) -> int:
     """Write report.html of a run of any kind, also of an unfinished one."""
     from rig.outputs.report import write_report
 
-    print(write_report(args.run, _records(args.run)))
+    print(write_report(args.run, records_of(args.run)))
     return EXIT_OK
 
 
@@ -120,7 +105,7 @@ def export(args: argparse.Namespace) -> int:
     """Print or write the inverse map of a run's calibration."""
     from rig.outputs.export import LANGUAGES, load_inverse
 
-    inverse = load_inverse(args.run, _records(args.run))
+    inverse = load_inverse(args.run, records_of(args.run))
     for text in inverse.warnings:
         print(f"WARNING: {text}", file=sys.stderr)
     text = LANGUAGES[args.to](inverse)

@@ -139,15 +139,23 @@ def _new(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
     }
 
 
-def recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
-    """The same of a run that is resumed or identified anew, from its folder."""
-    from rig.outputs.journal import read_journal
+def records_of(run: pathlib.Path) -> list[dict[str, Any]]:
+    """The journal of a run; Refused where its folder holds none, or a damaged one."""
+    from rig.outputs.journal import JournalError, read_journal
     from rig.session.folder import JOURNAL
 
-    records = read_journal(args.run / JOURNAL)
+    try:
+        records = read_journal(run / JOURNAL)
+    except JournalError as error:
+        raise Refused(str(error)) from None
     if not records or records[0]["event"] != "start":
-        raise Refused(f"{args.run} holds no run")
-    start = records[0]
+        raise Refused(f"{run} holds no run")
+    return records
+
+
+def recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
+    """The same of a run that is resumed or identified anew, from its folder."""
+    start = records_of(args.run)[0]
     if start["mode"] == "refit":
         source = start["inputs"]["run"]
         raise Refused(f"{args.run} is a refit of {source}; give that run instead")

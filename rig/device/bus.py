@@ -249,7 +249,10 @@ class Bus:
 
 def _why_closed(settings: BusSettings) -> str:
     if settings.transport != "rtu":
-        return "nothing answers there, or its connections are all taken"
+        return (
+            "nothing answers there, or its connections are all taken. Check power, "
+            "cable and address"
+        )
     if not os.path.exists(settings.device):
         return "there is no such port. Is the adapter plugged in?"
     if not os.access(settings.device, os.R_OK | os.W_OK):

@@ -74,7 +74,10 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> InverseMap:
         columns = [calibration.command_for(unit) - at_zero for unit in np.eye(3)]
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise Refused(f"{folder}: no calibration to export: {error}") from None
+        raise Refused(
+            f"{folder}: no calibration to export: {error}. Give the run of a "
+            "`calibrate` that has ended, or its refit"
+        ) from None
     config = records[0]["config"]  # of the run, also where it was refitted
     axes = {axis["name"]: axis for axis in config["axes"]}
     ordered = [axes[name] for name in AXIS_NAMES]
