@@ -164,6 +164,7 @@ def test_no_rule_passes_the_optimum_and_more_never_hurts():
     assert played.mean("state")[0] > 0.95 * found.mean
 
 
+@pytest.mark.slow
 def test_deciders_run_unchanged_on_another_task():
     """Three outcomes, uneven costs, a place of its own, no limit of time."""
     rng = np.random.default_rng(0)

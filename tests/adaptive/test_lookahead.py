@@ -48,6 +48,7 @@ def gains_of(task, belief):
     return entropy(p.T) - entropy(table.transpose(1, 0, 2)) @ belief
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("measured", [((), ()), ((2, 7), (0, 1)), ((4, 1), (1, 0))])
 def test_two_steps_are_those_of_a_second_implementation(measured):
     """With prices of nothing but 1, in float64 by loops."""
@@ -129,6 +130,7 @@ def test_rollouts_are_better_than_their_base():
     assert mean > 4.0 * error
 
 
+@pytest.mark.slow
 def test_deciders_that_look_ahead_run_on_another_task():
     rng = np.random.default_rng(0)
     task = GridTask.make(

@@ -155,6 +155,7 @@ def test_particles_are_the_posterior_that_a_grid_has(rng):
         assert float(belief.log_evidence) == pytest.approx(math.log(evidence), abs=0.3)
 
 
+@pytest.mark.slow
 def test_gains_of_few_outcomes_are_those_of_the_grid():
     task = step(particles=8000, contrasts=8000)
     designs, found = first_gains(task, jax.random.key(0))
@@ -176,6 +177,7 @@ def test_gains_of_continuous_outcomes_are_those_of_the_closed_form():
     np.testing.assert_allclose(found, wanted, atol=0.12)
 
 
+@pytest.mark.slow
 def test_three_estimators_and_the_closed_form_agree(lines):
     _, episodes = lines
     wanted = closed_form(episodes.designs)
@@ -184,6 +186,7 @@ def test_three_estimators_and_the_closed_form_agree(lines):
         assert abs(gap.mean()) < 4.0 * gap.std() / 8.0 + 0.1, name
 
 
+@pytest.mark.slow
 def test_bounds_hold_the_closed_form_between_them(lines):
     task, episodes = lines
     wanted = closed_form(episodes.designs).mean()
@@ -202,6 +205,7 @@ def test_bounds_hold_the_closed_form_between_them(lines):
     assert abs(gap.mean()) < 0.2
 
 
+@pytest.mark.slow
 def test_sessions_end_where_the_budget_does():
     task = line(seconds=3.0)
     found = compare(task, {"rate": GainRate(), "random": Random()}, 64)
@@ -229,6 +233,7 @@ def plain_location(sources, design):
     return math.log(signal)
 
 
+@pytest.mark.slow
 def test_location_finding_is_that_of_the_second_implementation():
     task = location_finding(measurements=6, particles=100, candidates=6, contrasts=20)
     episodes = play(task, Gain(), jax.random.split(jax.random.key(0), 4))

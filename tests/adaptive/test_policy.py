@@ -44,6 +44,7 @@ def leaves(state):
     return [np.asarray(x) for x in jax.tree.leaves(state)]
 
 
+@pytest.mark.slow
 def test_a_policy_begins_as_its_rule():
     task = knee(**SMALL)
     keys = jax.random.split(jax.random.key(3), 32)
@@ -54,6 +55,7 @@ def test_a_policy_begins_as_its_rule():
     )
 
 
+@pytest.mark.slow
 def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished, tmp_path):
     _, whole = finished
     run.train(CONFIG, tmp_path, num_updates=1)
@@ -159,6 +161,7 @@ def test_tasks_that_are_not_there_are_refused(tmp_path):
         registry.load(str(tmp_path / "empty.py"))
 
 
+@pytest.mark.slow
 def test_commands_train_resume_and_compare(tmp_path, capsys):
     small = ["--with", "cells=4", "sigma=0.05", "seconds=(5.0, 9.0)"]
     out = str(tmp_path / "run")

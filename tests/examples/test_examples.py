@@ -50,6 +50,7 @@ def test_force_sensor_loads_are_a_weight_on_a_lever():
     assert np.abs((loads[:, :3] * loads[:, 3:]).sum(axis=1)).max() < 1e-12
 
 
+@pytest.mark.slow
 def test_camera_views_beat_covering_the_image(tmp_path):
     found, rows = quick("camera", tmp_path)
     assert [row["views"] for row in rows] == list(found)

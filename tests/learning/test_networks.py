@@ -67,6 +67,7 @@ def test_the_papers_network_has_its_size_and_its_share():
 slow = pytest.mark.slow
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("k", "chosen"),
     [
@@ -193,6 +194,7 @@ def test_the_last_pair_is_the_best_one_unless_little_is_spanned(rng, k, close):
     assert 0.5 < exact.mean() < 0.95 if close else exact.all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lookahead", [1, pytest.param(3, marks=slow)])
 def test_a_loop_over_like_choices_chooses_as_if_written_out(rng, lookahead):
     config = NetworkConfig(width=8, encoder_rounds=1, lookahead=lookahead)

@@ -37,6 +37,7 @@ def measured(tmp_path, monkeypatch):
     return measure
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("axis", "play"), [(0, 0.31), (2, 0.0)])
 def test_the_play_lies_in_a_narrow_interval(measured, axis, play):
     code, records, told = measured(axis, noise_deg=0.005, backlash_deg=play)
@@ -50,6 +51,7 @@ def test_the_play_lies_in_a_narrow_interval(measured, axis, play):
     assert "play" in told
 
 
+@pytest.mark.slow
 def test_more_play_than_is_looked_for_is_said(measured):
     code, records, told = measured(1, noise_deg=0.005, backlash_deg=1.45)
     assert code != 0
@@ -57,6 +59,7 @@ def test_more_play_than_is_looked_for_is_said(measured):
     assert not [record for record in records if record["event"] == "backlash"]
 
 
+@pytest.mark.slow
 def test_no_room_is_said_before_anything_moves(measured, monkeypatch):
     monkeypatch.setattr(characterise, "FAR_DEG", 170.0)
     code, records, told = measured(0, noise_deg=0.005)

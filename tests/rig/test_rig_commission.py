@@ -121,6 +121,7 @@ def test_setup_finds_exchanged_reversed_and_wrongly_geared_axes(at, transport, c
     assert len(list(at.glob("rig.toml.*.bak"))) == 2  # the phone's address, the axes
 
 
+@pytest.mark.slow
 def test_gearing_that_no_register_tells_is_taken_from_the_phone(at):
     text = (EXAMPLES / "generic.toml").read_text()
     config = load_config_text(text)
@@ -154,6 +155,7 @@ def load_config_text(text):
     return parse_config(re.sub(r"(?m)^(speed_deg_s =) .*", r"\1 100", text))
 
 
+@pytest.mark.slow
 def test_setup_goes_on_where_it_was_left(at, capsys):
     with device() as (sim, bus, port):
         with pytest.MonkeyPatch.context() as patch:
@@ -191,6 +193,7 @@ def test_setup_asks_with_defaults_and_moves_nothing_without_a_yes(at):
     assert all(re.search(r"\[.+\]: $", question) for question in asked)
 
 
+@pytest.mark.slow
 def test_setup_of_a_simulated_device_in_one_command(at):
     wrong = ["--reversed", "yaw", "--noise", "0.005"]
     quick = [word for value in QUICK for word in ("--set", value)]
@@ -225,6 +228,7 @@ def commissioned(at):
         yield sim
 
 
+@pytest.mark.slow
 def test_steps_want_the_states_before_them(at, capsys):
     with device() as (_, bus, port):
         place = ["--config", "rig.toml", "--yes"]
@@ -391,6 +395,7 @@ def test_a_step_is_not_resumed(commissioned, at, capsys):
     assert "run it again" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_declined_correction_leaves_the_file_and_the_state(at):
     with device(Truth(noise_deg=0.005, reversed=(False, False, True))) as d:
         _, bus, port = d
@@ -425,6 +430,7 @@ def test_imu_pins_the_sender_and_tells_what_to_type(commissioned, capsys):
 # Reads only
 
 
+@pytest.mark.slow
 def test_scan_tells_families_apart_and_writes_nothing(at, capsys):
     for family in ("leadshine_pr", "applied_motion", "oriental_az", "generic"):
         text = fast_text().replace("leadshine_pr", family)

@@ -208,6 +208,7 @@ def connected(port, closing):
     raise OSError
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("phone", "settings", "rate"),
     [

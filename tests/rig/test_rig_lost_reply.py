@@ -206,6 +206,7 @@ def rtu_session(seed, folder, said):
         return code, sim.executions()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "seed", [1, *(pytest.param(s, marks=pytest.mark.slow) for s in range(2, 6))]
 )

@@ -102,6 +102,7 @@ def test_a_zero_that_cannot_be_approached_moves_nothing(tmp_path):
     assert any("the plan leaves the limits: pitch" in line for line in said)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("register_map", ["leadshine_pr", "generic"])
 def test_a_whole_session_with_everything_real_drives_do(register_map, tmp_path):
     changes = {'map = "leadshine_pr"': f'map = "{register_map}"'}

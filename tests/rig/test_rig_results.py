@@ -112,6 +112,7 @@ def as_version_1(record):
     return old | {"raw_deg": frame.angles(seen).round(5).tolist()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", [1, 2])
 def test_refit_mends_a_wrong_order_without_new_recording(run, capsys, version):
     if version == 1:
@@ -136,6 +137,7 @@ def test_refit_mends_a_wrong_order_without_new_recording(run, capsys, version):
     assert "give that run instead" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_refit_mends_the_mounting_of_the_phone(tmp_path):
     """Turned by 20 degrees on the end-effector, which the configuration did not say."""
     mounted = {"column_count = 4": "column_count = 4\nmounting_deg = [0, 0, 20]"}
@@ -198,6 +200,7 @@ def test_refit_says_why_it_refuses(run, capsys, tmp_path):
 # Drift in a session, and runs of version 1
 
 
+@pytest.mark.slow
 def test_a_heading_that_drifts_is_taken_out_of_a_session(tmp_path):
     truth = Truth(noise_deg=0.0, drift_deg_per_min=3.0)
     assert run_in(tmp_path / "run", fast_text(session=SESSION), truth) == 0
@@ -268,6 +271,7 @@ def test_a_report_says_what_there_is_of_an_unfinished_run(run, finished, kept):
     assert (f"{measured} measured" in page) == (measured > 0)
 
 
+@pytest.mark.slow
 def test_reports_of_collect_verify_and_goto(run, tmp_path, capsys):
     (tmp_path / "rig.toml").write_text((run / "rig.toml").read_text())
     given = ["--config", str(tmp_path / "rig.toml"), "--simulate", "--rate", "250"]

@@ -62,6 +62,7 @@ def finished(tmp_path_factory):
     return folder, said
 
 
+@pytest.mark.slow
 def test_the_truth_lies_in_the_stated_intervals(finished):
     summary = json.loads((finished[0] / "summary.json").read_text())
     found = np.column_stack([summary["A"], summary["b"]])
@@ -77,6 +78,7 @@ def test_the_truth_lies_in_the_stated_intervals(finished):
     assert summary["after"]["rms"] < 0.1 < 1.0 < summary["before"]["rms"]
 
 
+@pytest.mark.slow
 def test_stated_intervals_hold_the_truth_as_often_as_they_say(rng):
     """The arithmetic alone, many times: 95 % of each, and 95 % of all at once."""
     covered, all_covered = [], []
@@ -285,6 +287,7 @@ def test_a_terminal_that_goes_away_stops_the_run_and_not_the_stop(tmp_path):
         assert session(served, folder, sim) == 0
 
 
+@pytest.mark.slow
 def test_held_out_targets_are_drawn_again_when_a_chosen_posture_is_void(tmp_path):
     """A slip found during verification: the first calibration was wrong."""
     config = fast_config()
@@ -355,6 +358,7 @@ def test_the_wrong_euler_order_is_named(finished):
     assert "the order ZXY leaves" in wrong["warning"]
 
 
+@pytest.mark.slow
 def test_the_shipped_policy_makes_the_default_choice():
     """Not its stand-in: a session without a configuration selects with the policy."""
     config = parse_config(example_text("simulate"))
@@ -486,6 +490,7 @@ def test_calibrate_simulate_needs_no_configuration(tmp_path, capsys):
     np.testing.assert_allclose(loaded.matrix, TRUTH[:, :3], atol=0.005)
 
 
+@pytest.mark.slow
 def test_verify_and_goto_use_a_saved_calibration(finished, tmp_path, capsys):
     path = tmp_path / "rig.toml"
     path.write_text(fast_text())
@@ -498,6 +503,7 @@ def test_verify_and_goto_use_a_saved_calibration(finished, tmp_path, capsys):
     assert max(abs(float(v)) for v in reached.group(1).split(",")) < 0.1
 
 
+@pytest.mark.slow
 def test_verify_says_when_it_is_time_to_recalibrate(finished, tmp_path, capsys):
     """A calibration whose device has changed since."""
     stale = jaxcal.identify(
@@ -532,6 +538,7 @@ def test_every_example_calibrates_on_the_simulator(name, tmp_path):
     np.testing.assert_allclose(found.bias, TRUTH[:, 3], atol=0.05)
 
 
+@pytest.mark.slow
 def test_goto_refuses_what_the_limits_do_not_reach(finished, tmp_path, capsys):
     code = main(["goto", str(finished[0]), "--simulate", "--to", "40", "0", "0",
                  "--out", str(tmp_path)])  # fmt: skip
@@ -665,16 +672,15 @@ def readme_commands():
     """The rig's commands of README, without their comments."""
     text = (pathlib.Path(__file__).parents[2] / "README.md").read_text()
     lines = [line.partition("#")[0].strip() for line in text.splitlines()]
-    return [shlex.split(line) for line in lines if line.startswith("python -m rig ")]
+    return [shlex.split(line)[1:] for line in lines if line.startswith("jaxcal-rig ")]
 
 
 def test_the_commands_of_the_readme_parse():
     commands = readme_commands()
-    assert {"calibrate", "example", "check"} <= {words[3] for words in commands}
+    named = {words[0] for words in commands}
+    assert {"setup", "calibrate", "verify", "export", "stop"} <= named
     for words in commands:
-        if ">" in words:
-            words = words[: words.index(">")]
-        make_parser().parse_args(words[3:])
+        make_parser().parse_args(words)
 
 
 def test_check_takes_its_file_with_and_without_config(tmp_path, capsys, monkeypatch):

@@ -258,6 +258,7 @@ def test_stop_goes_on_without_a_holder_that_does_not_let_go(
     assert not any(drive.moving for drive in rig.drives)
 
 
+@pytest.mark.slow
 def test_stop_says_so_when_it_cannot_open_the_port_of_a_holder(
     tmp_path, capsys, monkeypatch
 ):
@@ -310,6 +311,7 @@ def stop_in_a_process(sim, **options):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_no_signal_cuts_the_command_short(rig, number):
     rig.faults.add(parse_fault("dead_drive,axis=pitch"))  # so that it takes seconds

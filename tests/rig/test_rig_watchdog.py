@@ -162,6 +162,7 @@ def test_they_are_as_before_on_every_way_out(way, tmp_path):
         assert set_to[0] != BEFORE and timeouts(sim) == BEFORE
 
 
+@pytest.mark.slow
 def test_a_drive_that_was_not_seen_to_stand_keeps_its_watch_until_a_resume(tmp_path):
     config, said = fast_config(WATCHED | HASTY), []
     with watched_simulator(config) as sim:
@@ -180,6 +181,7 @@ def test_a_drive_that_was_not_seen_to_stand_keeps_its_watch_until_a_resume(tmp_p
         assert timeouts(sim) == BEFORE
 
 
+@pytest.mark.slow
 def test_a_resumed_run_puts_back_what_a_killed_one_left(tmp_path):
     from fault_matrix import _free_port
 

@@ -55,6 +55,7 @@ def every_run(candidates, k, start, required=(), available=None):
     return np.array(runs)
 
 
+@pytest.mark.slow
 @settings(max_examples=12)
 @given(st.integers(0, 2**31), st.floats(0.5, 1.0), st.booleans(), st.integers(0, 2))
 def test_exact_is_the_least_of_every_subset_and_order(seed, least, started, r):

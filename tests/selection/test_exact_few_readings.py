@@ -218,6 +218,7 @@ def test_algdesigns_example_of_14_trials() -> None:
     assert np.exp(found.log_det / 10) / 14 == pytest.approx(0.4630447, rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "value"), [("D", 8 * np.log(8)), ("A", 1), ("E", 8)])
 def test_eight_chemical_weighings_are_a_hadamard_design(
     name: str, value: float

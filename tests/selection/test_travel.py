@@ -67,6 +67,7 @@ def worth_of(task, price, order):
     return np.linalg.slogdet(gram)[1] - toll * (task.start[order[0]] + moves)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("price", [0.0, 0.3, 3.0])
 def test_the_first_posture_is_where_greedy_leads_furthest(price):
     task = task_of(drawn(1))
