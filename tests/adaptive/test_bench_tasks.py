@@ -136,3 +136,6 @@ def test_transmission_error_is_a_sine():
     centres = -1.04 + 2.08 * (np.arange(60) + 0.5) / 60
     p = np.asarray(task.likelihood)[a, :, s]
     assert p @ centres == pytest.approx(expected, abs=5e-3)
+
+
+pytestmark = pytest.mark.slow  # minutes together

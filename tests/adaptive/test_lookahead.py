@@ -177,3 +177,6 @@ def test_bad_sizes_of_a_search_are_refused():
         tune(TASK, STATE_RULE, population=4, elite=4)
     with pytest.raises(ValueError, match="length must be"):
         static.optimise(TASK, length=0)
+
+
+pytestmark = pytest.mark.slow  # minutes together

@@ -372,3 +372,6 @@ def test_an_answer_that_no_particle_expects_is_survived():
     z = np.asarray(belief.z)
     assert np.isfinite(z).all() and np.isfinite(np.asarray(belief.log_weight)).all()
     assert z[:, 0].mean() == pytest.approx(9.0 / (1 + 0.09), abs=0.15)
+
+
+pytestmark = pytest.mark.slow  # minutes together

@@ -66,3 +66,6 @@ def test_no_room_is_said_before_anything_moves(measured, monkeypatch):
     assert code != 0
     assert "from a limit" in told
     assert not [record for record in records if record["event"] == "command"]
+
+
+pytestmark = pytest.mark.slow  # minutes together
