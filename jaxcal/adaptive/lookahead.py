@@ -62,9 +62,10 @@ class Rollouts:
     """The measurement after which a base rule gains most, by simulation.
 
     Each shortlisted measurement is followed by the base rule, ``rollouts`` times, for
-    at most ``depth`` measurements in all. Every candidate meets the same truths and
-    the same luck: with luck of its own each, the best-looking one is mostly the
-    luckiest, and the choice is worse than the base rule's.
+    at most ``depth`` measurements in all. All candidates share their
+    truths and random numbers (common random numbers): with numbers of its own each,
+    the largest estimate is mostly the noisiest, and the choice is worse than the base
+    rule's.
     """
 
     base: Scored
