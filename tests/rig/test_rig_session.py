@@ -259,6 +259,23 @@ def test_a_disk_that_fills_while_saving_loses_nothing(tmp_path, monkeypatch):
     assert (tmp_path / "report.html").is_file()
 
 
+def test_a_stop_that_is_lost_while_planning_opens_no_port(tmp_path, monkeypatch):
+    """As where it comes in a garbage collection, whose exceptions are dropped."""
+    said = []
+
+    def lost(config, candidates):
+        runs[0].signals.request_stop("SIGTERM", 143)
+        return choose(config, candidates)
+
+    monkeypatch.setattr("rig.session.calibrate.choose", lost)
+    config = fast_config()
+    runs = [Run(config, tmp_path, "calibrate", said.append,
+                record=commissioned(config, tmp_path))]  # fmt: skip
+    assert run_safely(runs[0], calibrate) == 143
+    assert said[0].startswith("planning: 4 of 50 candidates by exact")
+    assert not any(line.startswith("IMU") for line in said)
+
+
 def test_too_many_out_of_reach_is_a_fault(tmp_path):
     text = fast_text(session=SESSION + "max_unreachable = 1\nseed = 3\n")
     config, said = parse_config(text), []
