@@ -193,6 +193,22 @@ def test_setup_asks_with_defaults_and_moves_nothing_without_a_yes(at):
     assert all(re.search(r"\[.+\]: $", question) for question in asked)
 
 
+@pytest.mark.parametrize("simulated", [False, True])
+def test_the_next_command_of_a_simulated_device_simulates_it(
+    commissioned, at, simulated
+):
+    """The device that `setup --simulate` served is gone when it ends."""
+    told: list[str] = []
+    config = load_config("rig.toml")
+    record = DeviceRecord.load(config.device_path)
+    record.reach(ZEROED, config)
+    operator = Operator(yes=True, say=told.append)
+    place = steps.Place(config, record, operator, at / "rig.toml", full_speed=simulated)
+    assert setup.go(place, setup.Given()) == 0
+    again = " --simulate" if simulated else ""
+    assert told[-1] == f"next: jaxcal-rig calibrate{again} --config rig.toml"
+
+
 @pytest.mark.slow
 def test_setup_of_a_simulated_device_in_one_command(at):
     wrong = ["--reversed", "yaw", "--noise", "0.005"]
@@ -201,6 +217,8 @@ def test_setup_of_a_simulated_device_in_one_command(at):
     assert main(["setup", *common, *wrong, *quick]) == 0
     (path,) = at.glob("runs/simulated-*/rig.toml")
     yaw = load_config(path).axes[1]
+    with no_figures():
+        assert main(["calibrate", "--simulate", "--config", str(path)]) == 0
     assert yaw.direction == 1  # the simulator's own has -1
     assert DeviceRecord.load(path.with_name("device.json")).state(ZEROED)
 
