@@ -30,6 +30,7 @@ from rig.simulator import Simulator, Truth
 stop.VERIFY_S = 0.6
 
 RATE_HZ = 250.0
+SPEEDUP = 3.0  # of the drives over what the configuration says of them
 ENTERED = "entered"  # the file by which a session says that it is in the phase
 HOST_FAULTS = ("sigint", "sigint_twice", "sigterm", "sigkill", "full_disk")
 OTHERS = ("second_session", "other_stop")  # what somebody does in another terminal
@@ -95,6 +96,7 @@ def simulator(config: RigConfig, **options) -> Simulator:
     noise = options.pop("noise_deg", 0.0)
     truth = options.pop("truth", Truth(noise_deg=noise))
     options.setdefault("rate_hz", RATE_HZ)
+    options.setdefault("speedup", SPEEDUP)
     return Simulator(config, truth, **options)
 
 

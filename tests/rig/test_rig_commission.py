@@ -15,7 +15,7 @@ import time
 
 import numpy as np
 import pytest
-from harness import fast_config, fast_text, no_figures
+from harness import SPEEDUP, fast_config, fast_text, no_figures
 
 from rig import commissioning
 from rig.__main__ import main
@@ -65,6 +65,7 @@ def at(tmp_path, monkeypatch):
 def device(truth=None, transport="tcp", config=None, **options):
     """A simulated device, the bus as the command line names it, and a phone's port."""
     config = config or fast_config()
+    options.setdefault("speedup", SPEEDUP)
     with Simulator(
         config, truth or Truth(noise_deg=0.005), transport=transport, rate_hz=250.0,
         **options,
@@ -109,10 +110,13 @@ def test_setup_finds_exchanged_reversed_and_wrongly_geared_axes(at, transport, c
             assert record.state(state) is not None, state
         assert config.imu.allow == ("127.0.0.1",)
         assert record.missing(config) is None
-        with no_figures():
-            assert main(["calibrate", "--config", "rig.toml", "--arm", "--zero"]) == 0
-    summary = json.loads(next(at.glob("runs/calibrate-*/summary.json")).read_text())
-    np.testing.assert_allclose(summary["A"], truth.matrix, atol=0.005)
+        if transport == "rtu":  # the slow one goes on to the calibration
+            with no_figures():
+                go_on = ["calibrate", "--config", "rig.toml", "--arm", "--zero"]
+                assert main(go_on) == 0
+            (path,) = at.glob("runs/calibrate-*/summary.json")
+            found = json.loads(path.read_text())["A"]
+            np.testing.assert_allclose(found, truth.matrix, atol=0.005)
     said = capsys.readouterr().out
     assert "next: jaxcal-rig calibrate --config rig.toml" in said
     # the corrected file is the written one with other values: comments stay

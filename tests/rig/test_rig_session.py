@@ -489,19 +489,28 @@ def test_travel_order_takes_the_least_time(rng):
 # The command line
 
 
-def test_calibrate_simulate_needs_no_configuration(tmp_path, capsys):
-    """The shipped settings and the shipped policy."""
-    quick = ["--speedup", "5", "--rate", "250"]
+@pytest.mark.parametrize(
+    ("method", "session_table"),
+    [("exact", SESSION), pytest.param("policy", "", marks=pytest.mark.slow)],
+)
+def test_calibrate_simulate_takes_a_device_from_the_bus_to_its_calibration(
+    method, session_table, tmp_path, capsys
+):
+    """Quickly with short windows; slowly without a configuration, as users do first."""
+    given = ["--speedup", "5", "--rate", "250", "--out", str(tmp_path / "runs")]
+    if session_table:
+        (tmp_path / "rig.toml").write_text(fast_text(session=session_table))
+        given += ["--config", str(tmp_path / "rig.toml")]
     with no_figures():
-        assert main(["calibrate", "--simulate", *quick, "--out", str(tmp_path)]) == 0
+        assert main(["calibrate", "--simulate", *given]) == 0
     said = capsys.readouterr().out
     assert "95 % confidence" in said and "after compensation" in said
     commissioned, _, said = said.partition("each unit turns its own joint")
     assert "IDENTIFIED" in commissioned and "roll: 3.00 deg" in commissioned
     plan, _, moved = said.partition("armed:")
-    assert moved and "by policy: log det" in plan
+    assert moved and f"by {method}: log det" in plan
     assert "proven optimum" in plan and "gap 0." in plan and "note:" not in plan
-    (folder,) = tmp_path.iterdir()
+    (folder,) = (tmp_path / "runs").iterdir()
     loaded = jaxcal.Calibration.load(folder / "calibration.json")
     assert loaded.num_measurements == 4
     np.testing.assert_allclose(loaded.matrix, TRUTH[:, :3], atol=0.005)

@@ -42,7 +42,7 @@ LOST = 1.4  # degrees, as was seen
 
 def device(config, **truth):
     """A noise-free one that is not as configured."""
-    return Simulator(config, Truth(noise_deg=0.0, **truth), rate_hz=RATE_HZ)
+    return simulator(config, truth=Truth(noise_deg=0.0, **truth))
 
 
 def run_verify(config, calibration, folder, sim, record=None, here=False):
