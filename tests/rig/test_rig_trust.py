@@ -33,7 +33,7 @@ from rig.session.checks import check_matrix
 from rig.session.reference import KeptZero, check_zero, moved, unseen
 from rig.session.run import Run
 from rig.session.runner import run_safely
-from rig.simulator import Simulator, Truth
+from rig.simulator import Truth
 from rig.simulator.faults import FaultInjector
 from rig.simulator.phone import Phone
 
