@@ -9,6 +9,7 @@ in which the axis came, so that no play enters.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from jaxcal.adaptive.estimates import Estimate
@@ -32,7 +33,7 @@ CENTRE_DEG = 0.2  # of its centre from where the axis stands, at most
 REACH_DEG = 0.5 * ZONE_DEG + CENTRE_DEG + 0.2  # either way, to be past the zone
 BASE_DEG = FAR_DEG + REACH_DEG + MOST_DEG / 2.0  # where the play is measured
 STEPS = 64  # of a breakaway; its threshold is looked for under so many
-STEP_DEG = 0.01  # or one pulse, where that is more
+STEP_DEG = 0.01  # or the next whole number of pulses
 OVERSHOOT_DEG = 0.1  # by which a step may exceed the threshold
 RISK = 0.05  # that it exceeds it by more
 MOST = 20  # measurements of the play, and of the dead zone
@@ -85,7 +86,7 @@ def _kept(found: Estimate) -> dict[str, float]:
 
 def _too_much(probe: Probe, what: str, deg: float, most: float) -> MotionFault:
     return MotionFault(
-        f"{probe.name} has {deg:.2f} deg of {what}; at most {most:g} deg is looked "
+        f"{probe.name} has {deg:.2f} deg of {what}; at most {most:.3g} deg is looked "
         "for. Look for a loose coupling, or a joint that binds"
     )
 
@@ -142,7 +143,8 @@ def _zone(probe: Probe, play: float, sigma: float) -> tuple[Estimate, Estimate]:
 
 def _breakaway(probe: Probe, sigma: float) -> tuple[Estimate, Estimate]:
     """Steps up and down that the joint does not answer, on the probe's side."""
-    least = max(STEP_DEG, 1.0 / abs(probe.scale.pulses_per_deg))
+    per_deg = abs(probe.scale.pulses_per_deg)
+    least = math.ceil(STEP_DEG * per_deg) / per_deg
 
     def measure(label: str, design: Any) -> int:
         step, direction = design

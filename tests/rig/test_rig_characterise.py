@@ -94,7 +94,7 @@ def test_each_lies_in_a_narrow_interval_that_the_calibration_keeps(
     [
         ({"backlash_deg": 1.45}, "of play; at most 1.5 deg is looked for"),
         ({"dead_zone_deg": 1.1}, "of dead zone; at most 0.8 deg is looked for"),
-        ({"breakaway_deg": 0.8}, "of breakaway; at most 0.64 deg is looked for"),
+        ({"breakaway_deg": 0.8}, "of breakaway; at most 0.691 deg is looked for"),
     ],
 )
 def test_more_than_is_looked_for_is_said(measured, truth, says):

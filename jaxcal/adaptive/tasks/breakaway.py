@@ -91,7 +91,8 @@ class Cautious:
         risk = past @ belief.weights
         gains = belief.gains(task, options, key)
         allowed = risk <= jnp.maximum(self.risk, risk.min() + 1e-6)
-        return best(gains, options.replace(allowed=options.allowed & allowed))
+        safe = options.allowed & allowed
+        return best(gains, Options(options.designs, options.seconds, safe))
 
 
 ENTRY = Entry(breakaway, about="steps from rest that a joint does not answer")
