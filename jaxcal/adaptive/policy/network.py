@@ -32,9 +32,9 @@ class Network(nn.Module):
         hidden = nn.tanh(nn.Dense(self.width)(seen.features))
         valid = seen.valid[..., None]
         pool = jnp.where(valid, hidden, -1.0).max(axis=-2)
-        beside = jnp.broadcast_to(pool[..., None, :], hidden.shape)
-        both = jnp.concatenate([hidden, beside], axis=-1)
-        late = nn.tanh(nn.Dense(self.width)(both))
+        # Two layers in place of one over both: the pool's is computed once.
+        beside = nn.Dense(self.width, use_bias=False)(pool)[..., None, :]
+        late = nn.tanh(nn.Dense(self.width)(hidden) + beside)
         change = nn.Dense(1, kernel_init=nn.initializers.zeros)(late)[..., 0]
         beta = self.param("beta", nn.initializers.constant(_BETA), ())
         logits = beta * seen.log_score + _GAIN * change
