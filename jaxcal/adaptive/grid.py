@@ -34,9 +34,9 @@ class GridBelief:
     def _parts(self, task: GridTask) -> list[tuple[Part, jax.Array]]:
         """The task's parts with the (K,) marginal that each depends on."""
         grid = self.weights.reshape(task.shape)
-        axes = range(len(task.shape))
+        axes = set(range(len(task.shape)))
         return [
-            (part, grid.sum([i for i in axes if i not in part.axes]).ravel())
+            (part, grid.sum(tuple(axes - set(part.axes))).ravel())
             for part in task.parts
         ]
 

@@ -157,11 +157,17 @@ def test_no_rule_passes_the_optimum_and_more_never_hurts():
     found = solve(task, 0.2)
     assert (np.diff(found.values, axis=0) >= -1e-6).all()
     assert (np.diff(found.values, axis=1) >= -1e-6).all()
-    played = compare(task, {"state": STATE_RULE, "gain": Gain()}, 2048)
+    rules = {"state": STATE_RULE, "gain": Gain(), "optimum": found.decider}
+    played = compare(task, rules, 2048)
     for name in played.names:
         mean, error = played.mean(name)
         assert mean < found.mean + 4.0 * error
     assert played.mean("state")[0] > 0.95 * found.mean
+    mean, error = played.mean("optimum")
+    assert mean > found.mean - 4.0 * error
+    for name in ("state", "gain"):
+        mean, error = played.paired("optimum", name)
+        assert mean > 2.0 * error
 
 
 @pytest.mark.slow
