@@ -95,7 +95,8 @@ ROWS = {
     "hyperbolic": Row(hyperbolic, "DAD 5.02", 1024),
     "hyperbolic-text": Row(lambda: hyperbolic(as_code=False), "none", 1024),
     "death": Row(death_process, "DAD 2.113", 4096),
-    "prey": Row(prey, "SMC 4.521, RL 4.456", 512),
+    "prey": Row(prey, "none", 512),
+    "prey-code": Row(lambda: prey(as_code=True), "SMC 4.521, RL 4.456", 512),
 }
 
 

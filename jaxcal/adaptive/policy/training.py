@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.policy.config import LENGTH
 from jaxcal.adaptive.policy.features import Seen, see
 from jaxcal.adaptive.policy.network import Network
@@ -158,9 +159,11 @@ def _stream(
             seen = see(task, then, left, options, keys[1], base, per_group)
             return jnp.where(ended, 0.0, _apply(network, params, seen)[1])
 
-        outcomes, p = belief.outcomes(task, design, keys[1])
-        others = (outcome + outcomes[1:]) % len(outcomes)
-        elsewhere = p[others] @ jax.vmap(value_after)(others)
+        chance, elsewhere = jnp.float32(1.0), jnp.float32(0.0)
+        if isinstance(task, GridTask):  # all outcomes are known, and few
+            outcomes, p = belief.outcomes(task, design, keys[1])
+            others = (outcome + outcomes[1:]) % len(outcomes)
+            chance, elsewhere = p[outcome], p[others] @ jax.vmap(value_after)(others)
         belief, session, ended = after(outcome)
         carry = jax.tree.map(
             lambda new, old: jnp.where(ended, new, old),
@@ -169,7 +172,7 @@ def _stream(
         entropy = -(jnp.exp(log_probs) * log_probs).sum()
         return carry, (
             seen, action, log_probs[action], value, seen.gain[action],
-            ended.astype(jnp.float32), entropy, p[outcome], elsewhere,
+            ended.astype(jnp.float32), entropy, chance, elsewhere,
         )  # fmt: skip
 
     key_begin, key_steps = jax.random.split(key)
