@@ -15,7 +15,7 @@ from jaxcal.adaptive.session import Options, Session
 
 __all__ = ["Network", "Policy"]
 
-_BETA, _GAIN = 12.0, 3.0
+_BETA, _GAIN = 5.0, 3.0
 
 
 class Network(nn.Module):
@@ -39,7 +39,9 @@ class Network(nn.Module):
         beta = self.param("beta", nn.initializers.constant(_BETA), ())
         logits = beta * seen.log_score + _GAIN * change
         mean = (hidden * valid).sum(axis=-2) / jnp.maximum(valid.sum(axis=-2), 1)
-        value = nn.tanh(nn.Dense(self.width)(jnp.concatenate([pool, mean], axis=-1)))
+        value = jnp.concatenate([pool, mean], axis=-1)
+        for _ in range(2):
+            value = nn.tanh(nn.Dense(2 * self.width)(value))
         value = nn.Dense(1)(value)[..., 0]
         return jnp.where(seen.valid, logits, -1e9), value
 
