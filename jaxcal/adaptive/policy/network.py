@@ -25,7 +25,7 @@ class Network(nn.Module):
     scored beside the pool. The last layer begins at zero: a policy begins as its rule.
     """
 
-    width: int = 48
+    width: int = 64
 
     @nn.compact
     def __call__(self, seen: Seen) -> tuple[jax.Array, jax.Array]:
@@ -52,8 +52,8 @@ class Policy:
 
     params: Any
     base: Scored
-    per_group: int = struct.field(pytree_node=False, default=8)
-    width: int = struct.field(pytree_node=False, default=48)
+    per_group: int = struct.field(pytree_node=False, default=6)
+    width: int = struct.field(pytree_node=False, default=64)
     sample: bool = struct.field(pytree_node=False, default=False)
 
     def __call__(
@@ -66,7 +66,7 @@ class Policy:
         return seen.index[jnp.argmax(logits)]
 
 
-def initial(key: jax.Array, per_group: int, num_groups: int, width: int = 48) -> Any:
+def initial(key: jax.Array, per_group: int, num_groups: int, width: int = 64) -> Any:
     """Parameters before training."""
     c = per_group * num_groups
     blank = Seen(
