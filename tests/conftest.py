@@ -28,6 +28,25 @@ hypothesis.settings.register_profile("new", deadline=None)
 hypothesis.settings.load_profile("same")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """A file's tests share a worker, and so do all tests of the solvers.
+
+    These come first, on one worker, so that numba compiles the solvers once while the
+    other worker compiles JAX's programs; what needs both finds them compiled.
+    """
+    first = ("selection", "learning", "adaptive", "models", "paper")
+
+    def folder(item: pytest.Item) -> str:
+        return item.path.parent.name
+
+    for item in items:
+        whole = "solvers" if folder(item) == "selection" else item.path.stem
+        item.add_marker(pytest.mark.xdist_group(whole))
+    items.sort(
+        key=lambda item: (*first, folder(item)).index(folder(item))
+    )  # stable: files and tests keep their order
+
+
 @pytest.fixture
 def key() -> jax.Array:
     return jax.random.key(0)

@@ -3,7 +3,7 @@
 | | |
 |---|---|
 | observation | (C (F + 2),): features, log score and validity of the shortlist |
-| action | () int32, a place in the shortlist; one that is void counts as the first |
+| action | () int32, a place in the shortlist; an invalid one counts as the first |
 | reward | nats: the expected information gain of the measurement |
 | end | time or uses are spent, or ``task.most`` measurements are made |
 

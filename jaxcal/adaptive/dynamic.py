@@ -109,7 +109,10 @@ def solve(task: GridTask, tick: float) -> Optimum:
     travel = _ticks("task.travel", np.asarray(task.travel, np.float64), tick)
     extra = _ticks("task.extra", np.asarray(task.extra, np.float64), tick)
     if travel.min() < 1:
-        raise ValueError("task.travel must be at least one tick for every measurement")
+        raise ValueError(
+            "task.travel must be at least one tick for every measurement, got "
+            f"{travel.min()} of {tick:g} s"
+        )
     high = float(np.asarray(task.seconds)[1])
     if not np.isfinite(high):
         raise ValueError(f"task.seconds must be finite, got {high}")

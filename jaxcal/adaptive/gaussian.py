@@ -60,8 +60,8 @@ class GaussianBelief:
 
     def draw(self, key: jax.Array) -> jax.Array:
         """(p,) z, drawn."""
-        luck = jax.random.normal(key, self.right.shape)
-        return solve_triangular(self.root, self.right + luck)
+        noise = jax.random.normal(key, self.right.shape)
+        return solve_triangular(self.root, self.right + noise)
 
     def entropy(self) -> jax.Array:
         """() nats of z."""
@@ -114,8 +114,8 @@ class GaussianTask:
             model: linearised about the mean of the prior.
             candidates: (A, n) commands.
             most: measurements in a session.
-            prior: the model's own by default; its std must be finite, since the gain of
-                what nothing is known of is not.
+            prior: the model's own by default; its std must be finite: under an
+                unbounded prior the gain is infinite.
             noise: the model's own by default, else of unit variance.
             replicates: how often a candidate may be measured.
         """
@@ -203,8 +203,8 @@ class GaussianTask:
     def measure(self, truth: jax.Array, design: jax.Array, key: jax.Array) -> jax.Array:
         """(q,) outputs, drawn."""
         white = self.blocks[design] @ truth
-        luck = jax.random.normal(key, white.shape)
-        return self.expected_outcomes[design] + self.colouring[design] @ (white + luck)
+        noise = jax.random.normal(key, white.shape)
+        return self.expected_outcomes[design] + self.colouring[design] @ (white + noise)
 
     def spend(self, session: Session, design: jax.Array, outcome: jax.Array) -> Session:
         """A measurement is a use; where it was made may be measured once less."""

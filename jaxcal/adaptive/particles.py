@@ -94,13 +94,14 @@ class ParticleBelief:
     def gains(self, task: ParticleTask, options: Options, key: jax.Array) -> jax.Array:
         """(A,) nats, from ``task.num_contrasts`` particles.
 
-        Few outcomes are summed over; of continuous ones one a particle is drawn, with
-        the same luck for every design, and contrasted with all the others.
+        Few outcomes are summed over. Of continuous ones, one is drawn for each
+        particle, with common random numbers for all designs, and contrasted with all
+        other particles.
         """
-        key_draws, key_luck = jax.random.split(key)
+        key_draws, key_noise = jax.random.split(key)
         count = task.num_contrasts
         unknowns = jax.vmap(self.model.unknowns)(self.draws(count, key_draws))
-        keys = jax.random.split(key_luck, count)
+        keys = jax.random.split(key_noise, count)
         return jax.vmap(lambda design: _gain(self.model, unknowns, design, keys))(
             options.designs
         )
@@ -194,8 +195,8 @@ class ParticleBelief:
                 _log_prior(there) - _log_prior(z)
                 + before - old + power * (last - new)
             )  # fmt: skip
-            luck = jnp.log(jax.random.uniform(key_accept, (count,), minval=1e-30))
-            take = luck < change
+            level = jnp.log(jax.random.uniform(key_accept, (count,), minval=1e-30))
+            take = level < change
             kept = (
                 jnp.where(take[:, None], there, z),
                 jnp.where(take, before, old),

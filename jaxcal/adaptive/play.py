@@ -39,7 +39,7 @@ class Episodes:
 def play(task: Task, decider: Decider, keys: jax.Array) -> Episodes:
     """Play a session a key (B,).
 
-    The truth, the budget and the luck of every measurement depend on the key alone, so
+    The truth, the budget and the noise of every measurement depend on the key alone, so
     deciders that are given the same keys can be compared in pairs.
     """
     key_truth, key_begin, key_steps = jax.vmap(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 from typing import Any, ClassVar
 
 import jax
@@ -98,17 +99,17 @@ class GainRate:
         return best(gains / jnp.maximum(seconds, 1e-9), options)
 
 
-class Scored:
+class Scored(abc.ABC):
     """A rule by a price: the largest log (gain / price)."""
 
     num_free: ClassVar[int]  # constants that can be tuned; the price's unit is free
 
+    @abc.abstractmethod
     def moved(self, by: Any) -> Any:
         """The rule with other constants, ``by`` (num_free,) away: what a tuner tries.
 
         Prices are multiplied by ``exp(by)``, exponents are added to.
         """
-        raise NotImplementedError
 
     def judged(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
@@ -118,9 +119,9 @@ class Scored:
         seconds, uses = task.expected(belief, session, options)
         return gains, self.price(session, seconds, uses)
 
+    @abc.abstractmethod
     def price(self, session: Session, seconds: jax.Array, uses: jax.Array) -> jax.Array:
         """(A,) what the measurements are taken to cost."""
-        raise NotImplementedError
 
     def __call__(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array

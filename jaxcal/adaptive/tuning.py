@@ -36,8 +36,8 @@ def tune(
     """The rule with the constants that gain most on a task's sessions.
 
     Every set of constants plays the same sessions, others in each generation, so that
-    sets are compared in pairs and no set is chosen for its luck. Rules are pytrees:
-    all sets run through one compiled program.
+    sets are compared in pairs and none is chosen for the sessions it drew.
+    Rules are pytrees: all sets run through one compiled program.
 
     Args:
         task: whose sessions are played.

@@ -19,7 +19,7 @@ from jaxcal.pages import Block, Code, Figure, Page, Section, Table, Text, render
 __all__ = ["figure", "json_document", "text_table", "write_report"]
 
 _ABOUT = (
-    "All methods play the same sessions: the truth, the budget and the luck of every "
+    "All methods play the same sessions: the truth, the budget and the noise of every "
     "measurement are equal. Nats: the sum of the expected information gains of the "
     "measurements made, with its standard error (95 % intervals in the figure). Time: "
     "of one core, a choice, averaged over a batch."

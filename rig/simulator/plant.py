@@ -124,6 +124,7 @@ class Plant:
         self._drive_deg = self._commanded()
         self._loose = self._drive_deg.copy()  # behind the play
         self._slip = np.zeros(3)
+        self._mounting = euler_to_matrix(config.imu.mounting_deg, "ZYX")
 
     def tighten(self) -> None:
         """Put slipped joints back to where their drives say."""
@@ -162,7 +163,7 @@ class Plant:
         attitude = (
             euler_to_matrix([heading, 0.0, 0.0], "ZYX")
             @ euler_to_matrix(sequence, order)
-            @ euler_to_matrix(config.imu.mounting_deg, "ZYX")
+            @ self._mounting
         )
         if self.truth.noise_deg:
             noise = self._rng.normal(0.0, self.truth.noise_deg, 3)

@@ -227,7 +227,10 @@ def test_a_state_of_another_configuration_is_refused(finished, tmp_path):
         training.train(other, copy, resume=True)
 
 
-def test_killed_save_leaves_the_previous_checkpoint(finished, tmp_path):
+@pytest.mark.parametrize(
+    "pause", [0.05, *(pytest.param(s, marks=pytest.mark.slow) for s in (0.01, 0.11))]
+)
+def test_killed_save_leaves_the_previous_checkpoint(finished, tmp_path, pause):
     # Saves in a loop and is killed at a random moment; whatever step is newest loads.
     script = tmp_path / "save.py"
     script.write_text(
@@ -243,23 +246,22 @@ def test_killed_save_leaves_the_previous_checkpoint(finished, tmp_path):
             """
         )
     )
-    for attempt, pause in enumerate((0.01, 0.05, 0.11)):
-        folder = tmp_path / f"kill{attempt}"
-        process = subprocess.Popen(
-            [sys.executable, script, folder],
-            stdout=subprocess.PIPE,
-            text=True,
-            cwd=ROOT,
-        )
-        for _ in range(2):
-            seen = int(process.stdout.readline())
-        time.sleep(pause)
-        process.send_signal(signal.SIGKILL)
-        rest = process.stdout.read().split()
-        process.wait()
-        last = int(rest[-1]) if rest else seen
-        policy = checkpoint.load(folder)
-        assert policy.step in (last, last + 1)
+    folder = tmp_path / "killed"
+    process = subprocess.Popen(
+        [sys.executable, script, folder],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
+    for _ in range(2):
+        seen = int(process.stdout.readline())
+    time.sleep(pause)
+    process.send_signal(signal.SIGKILL)
+    rest = process.stdout.read().split()
+    process.wait()
+    last = int(rest[-1]) if rest else seen
+    policy = checkpoint.load(folder)
+    assert policy.step in (last, last + 1)
 
 
 @pytest.mark.parametrize("preset", presets.names())
@@ -439,6 +441,7 @@ def test_help_says_what_every_number_is(capsys):
         assert f"\n  {name} " in text
 
 
+@pytest.mark.slow
 def test_one_trains_on_ones_own_pool_and_resumes_with_it(tmp_path, rng, capsys):
     pool = tmp_path / "mine.csv"
     rows = 1e4 * rng.uniform(size=(20, 2)) + 5e4  # pulses

@@ -25,7 +25,7 @@ from jaxcal.paper.reproduce import main
 
 ROOT = pathlib.Path(__file__).parents[2]
 
-pytestmark = pytest.mark.xdist_group("report")  # one report, made by one worker
+pytestmark = pytest.mark.slow  # one report for all; its parts are tested quickly too
 
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:

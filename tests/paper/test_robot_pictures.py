@@ -66,7 +66,7 @@ def test_both_draw_the_same_robot() -> None:
         with draw(CONFIG, SIZE, "mujoco") as (name, picture):
             theirs = picture(angles).astype(int)
     except RuntimeError as error:
-        pytest.skip(str(error))  # no OpenGL here; the error says what is missing
+        pytest.skip(f"MuJoCo cannot draw without OpenGL: {error}")
     assert name == "mujoco" and os.environ.get("PYOPENGL_PLATFORM") == before
     with draw(CONFIG, SIZE, "matplotlib") as (name, picture):
         ours = picture(angles).astype(int)

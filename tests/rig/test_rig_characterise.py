@@ -43,7 +43,7 @@ def test_the_play_lies_in_a_narrow_interval(measured, axis, play):
     code, records, told = measured(axis, noise_deg=0.005, backlash_deg=play)
     assert code == 0, told
     (found,) = [record for record in records if record["event"] == "backlash"]
-    # A luckless 95 % interval is off by some of its standard deviations of 0.005.
+    # An unlucky 95 % interval is off by some of its standard deviations of 0.005.
     assert found["low_deg"] - 0.01 <= play <= found["high_deg"] + 0.01
     assert found["high_deg"] - found["low_deg"] <= characterise.ENOUGH_DEG
     stands = [record for record in records if record["event"] == "stand"]

@@ -34,16 +34,14 @@ MATRIX = np.array([[0.95, 0.03, -0.02], [0.01, 1.04, 0.02], [-0.015, 0.01, 0.9]]
 @pytest.fixture(scope="module")
 def program(tmp_path_factory):
     if shutil.which("gcc") is None:
-        # The slave is C, compiled here: there is nothing to test against without gcc.
-        pytest.skip("gcc is not installed: no libmodbus slave to test against")
+        pytest.skip("gcc, which compiles the libmodbus slave, is not installed")
     target = tmp_path_factory.mktemp("slave") / "slave"
     built = subprocess.run(
         ["gcc", "-O1", "-o", str(target), str(SOURCE), "-lmodbus"],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     if "modbus.h" in built.stderr or "-lmodbus" in built.stderr:
-        # A system library, which pip cannot install.
-        pytest.skip("libmodbus is not installed (apt-get install libmodbus-dev)")
+        pytest.skip("libmodbus is no pip package: apt-get install libmodbus-dev")
     assert built.returncode == 0, built.stderr
     return target
 

@@ -149,14 +149,17 @@ def test_asking_who_holds_it_never_keeps_anyone_out():
     askers = [threading.Thread(target=ask) for _ in range(2)]
     for thread in askers:
         thread.start()
+    held = []
     try:
         for _ in range(20):
-            with BusLock(tcp()).acquire("verify"):
+            with BusLock(tcp()).acquire("verify"):  # Refused if an asker kept us out
+                held.append(BusLock(tcp()).holder()["command"])
                 time.sleep(0.001)
     finally:
         stop.set()
         for thread in askers:
             thread.join()
+    assert held == ["verify"] * 20
 
 
 def test_a_lock_folder_of_somebody_else_is_refused(folder, monkeypatch):

@@ -368,6 +368,7 @@ def test_whoever_connects_and_says_nothing_does_not_become_the_phone():
             ended = streaming(imu, 10)
             wait_for(lambda: imu.sender == "127.0.0.1")
             ended.set()
+            assert angles_of(imu) == {10.0} and imu.sender == "127.0.0.1"
 
 
 def test_what_was_sent_while_another_was_heard_is_not_taken_for_new():
