@@ -46,8 +46,18 @@ class GridBelief:
         """(A,) nats: entropy of the outcome less its entropy if theta were known."""
         p = self.predictive(task)
         outcome = -(p * jnp.log(p + _SMALL)).sum(axis=-1)
-        noise = [part.noise_entropy @ w for part, w in self._parts(task)]
-        return jnp.maximum(outcome - task.by_design(noise), 0.0)
+        noise = [(part.p_log_p @ w).sum(axis=-1) for part, w in self._parts(task)]
+        return jnp.maximum(outcome + task.by_design(noise), 0.0)
+
+    def entropies_after(self, task: GridTask) -> jax.Array:
+        """(A, Y) nats after each outcome, of what its design depends on alone."""
+
+        def of(part: Part, w: jax.Array) -> jax.Array:
+            p = part.likelihood @ w + _SMALL
+            told = part.likelihood @ (w * jnp.log(w + _SMALL)) + part.p_log_p @ w
+            return jnp.maximum(jnp.log(p) - told / p, 0.0)
+
+        return task.by_design([of(part, w) for part, w in self._parts(task)])
 
     def update(
         self,
@@ -90,7 +100,7 @@ class Part:
     """
 
     likelihood: jax.Array  # (A', Y, K)
-    noise_entropy: jax.Array  # (A', K) of the outcome where theta is known
+    p_log_p: jax.Array  # (A', Y, K) of the likelihood
     axes: tuple[int, ...] = struct.field(pytree_node=False)
 
 
@@ -354,9 +364,9 @@ def _split(
         for i in sorted(others, reverse=True):
             mine = mine.take(0, axis=2 + i)
         mine = mine.reshape(*mine.shape[:2], -1)
-        log = np.log(np.where(mine > 0.0, mine, 1.0))
-        entropy = jnp.asarray(-(mine * log).sum(axis=1), jnp.float32)
-        parts.append(Part(jnp.asarray(mine, jnp.float32), entropy, axes))
+        product = mine * np.log(np.where(mine > 0.0, mine, 1.0))
+        tables = (jnp.asarray(t, jnp.float32) for t in (mine, product))
+        parts.append(Part(*tables, axes))
     return tuple(parts), np.argsort(np.concatenate(list(members.values())))
 
 

@@ -69,6 +69,17 @@ def test_gains_are_those_of_the_whole_table(task):
     np.testing.assert_allclose(found, wanted, atol=1e-6)
 
 
+def test_entropies_after_are_of_what_a_design_depends_on():
+    task = three_joints()
+    weights = np.random.default_rng(3).dirichlet(np.ones(24)).astype(np.float32)
+    found = np.asarray(jax.jit(GridBelief.entropies_after)(GridBelief(weights), task))
+    for design, axes in ((0, (0, 2)), (1, (1, 2)), (2, (1,)), (3, (0, 1, 2))):
+        table = np.asarray(task.likelihood)[design]
+        after = (weights * table).reshape(3, 3, 4, 2).sum(tuple(1 + i for i in axes))
+        wanted = stats.entropy(after.reshape(3, -1), axis=1)
+        np.testing.assert_allclose(found[design], wanted, atol=1e-5)
+
+
 def chosen(task, deciders):
     """What each picks after one measurement; one program."""
 
