@@ -1,7 +1,11 @@
 """One policy on tasks it was not trained on, and with a belief that is wrong.
 
     python benchmarks/adaptive_transfer.py [--checkpoint DIR] [--episodes 4096]
-        [--seed 0] [--parts other wrong] [--json FILE]
+        [--seed 0] [--parts small other wrong] [--small DIR] [--json FILE]
+
+small   KNEE with 10 cells and no noise, whose optimum dynamic programming finds: the
+        share of it that the rules reach, the policy, and with --small a policy that
+        was trained on it (docs/adaptive.md has the command).
 
 other   KNEE with another sigma, rho, slip, grid, number of joints or budget: the state
         rule with KNEE's constants, the state rule tuned on that task, and the policy.
@@ -24,9 +28,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxcal.adaptive.dynamic import solve
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.play import compare
 from jaxcal.adaptive.policy import run
+from jaxcal.adaptive.rules import Gain, GainRate
 from jaxcal.adaptive.tasks.knee import PRICED, STATE_RULE, knee
 from jaxcal.adaptive.tuning import tune
 from jaxcal.files import require_writable_folder, write_text
@@ -76,6 +82,37 @@ class Misled:
         return self.real.measure(truth, design, key)
 
 
+def tuned_on(task: GridTask, seed: int) -> Any:
+    """The state rule, its constants tuned on another task."""
+    return tune(
+        task, STATE_RULE, episodes=1024, generations=10, population=16, elite=4,
+        seed=seed + 1,
+    )  # fmt: skip
+
+
+def small(policies: dict[str, Any], episodes: int, seed: int) -> dict[str, Any]:
+    """Shares of the optimum."""
+    task = knee(10, sigma=0.0, slip=0.0)
+    optimum = solve(task, 0.2)
+    task = arrays(task)
+    deciders = {
+        "optimum": optimum.decider, "gain": Gain(), "rate": GainRate(),
+        "priced": PRICED, "state": STATE_RULE, "tuned": tuned_on(task, seed),
+    }  # fmt: skip
+    found = compare(task, arrays(deciders | policies), episodes, seed)
+    rows: dict[str, Any] = {"optimum": optimum.mean, "nats": {}, "share": {}}
+    print(f"small: the optimum is {optimum.mean:.3f} nats")
+    print(f"{'decider':12}{'nats':>16}{'% of the optimum':>20}")
+    for name in found.names:
+        rows["nats"][name] = found.mean(name)
+        less, error = found.paired(name, "optimum")
+        share = [100 * (1 + less / optimum.mean), 100 * error / optimum.mean]
+        rows["share"][name] = share
+        nats = "{:.3f} ± {:.3f}".format(*found.mean(name))
+        print(f"{name:12}{nats:>16}" + "{:.2f} ± {:.2f}".format(*share).rjust(20))
+    return rows
+
+
 def other(policy: Any, episodes: int, seed: int) -> dict[str, Any]:
     """Nats on tasks that differ from KNEE."""
     rows = {}
@@ -85,10 +122,7 @@ def other(policy: Any, episodes: int, seed: int) -> dict[str, Any]:
         task = arrays(knee(**options))
         tuned = STATE_RULE
         if options:
-            tuned = tune(
-                task, STATE_RULE, episodes=1024, generations=10, population=16, elite=4,
-                seed=seed + 1,
-            )  # fmt: skip
+            tuned = tuned_on(task, seed)
         deciders = {"priced": PRICED, "state": STATE_RULE, "tuned": tuned}
         deciders = arrays(deciders | {"policy": policy})
         found = compare(task, deciders, episodes, seed, batch=512)
@@ -146,9 +180,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--checkpoint", help="the one that ships when not given")
     parser.add_argument("--episodes", type=int, default=4096)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument(
-        "--parts", nargs="+", choices=("other", "wrong"), default=["other", "wrong"]
-    )
+    parts = ("small", "other", "wrong")
+    parser.add_argument("--parts", nargs="+", choices=parts, default=list(parts))
+    parser.add_argument("--small", help="a policy trained on the small version")
     parser.add_argument("--json", type=pathlib.Path)
     options = parser.parse_args(argv)
     if options.json is not None:
@@ -159,7 +193,13 @@ def main(argv: list[str] | None = None) -> int:
         "versions": package_versions(), "policy": trained.meta, "seed": options.seed,
         "episodes": options.episodes,
     }  # fmt: skip
+    policies = {"policy": trained.decider}
+    if options.small is not None:
+        policies["trained"] = run.load(options.small).decider
     for part in options.parts:
+        if part == "small":
+            document[part] = small(policies, options.episodes, options.seed)
+            continue
         play = {"other": other, "wrong": wrong}[part]
         document[part] = play(trained.decider, options.episodes, options.seed)
     if options.json is not None:

@@ -76,8 +76,8 @@ def sace(
     episodes: Episodes,
     key: jax.Array,
     *,
-    contrasts: int = 4096,
-    particles: int = 2048,
+    contrasts: int = 8192,
+    particles: int = 8192,
     moves: int = 6,
 ) -> Bounds:
     """Bounds that meet, with contrasts from each session's posterior.
@@ -106,7 +106,7 @@ def _told(task: ParticleTask, episode: Episodes) -> ParticleBelief:
     return dataclasses.replace(
         empty,
         designs=episode.designs,
-        outcomes=episode.outcomes,
+        answers=episode.outcomes,
         made=episode.alive.sum().astype(jnp.int32),
         model=task.model,
     )

@@ -89,11 +89,12 @@ class SequentialEnv(Env):
 
     @property
     def observation_size(self) -> int:
-        return self.action_size * (NUM_FEATURES + 2)
+        key = jax.random.PRNGKey(0)  # brax's own kind
+        return int(jax.eval_shape(self.reset, key).obs.shape[-1])
 
     @property
     def action_size(self) -> int:
-        return self.task.num_groups * min(self._per_group, len(self.task.designs))
+        return self.observation_size // (NUM_FEATURES + 2)
 
     @property
     def backend(self) -> str:

@@ -1,4 +1,4 @@
-"""The optimum of a small task by dynamic programming.
+"""The optimum of a small task, and its decider, by dynamic programming.
 
 Where outcomes are certain once theta is known, a belief is the prior restricted to the
 values that every answer allows: a set. The sets that can be reached are few, and with
@@ -9,19 +9,51 @@ problem, solved backwards in time. Every other decider is measured against its v
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numba as nb
 import numpy as np
+from flax import struct
 from numpy.typing import NDArray
 
-from jaxcal.adaptive.grid import GridTask
+from jaxcal.adaptive.grid import GridBelief, GridTask
+from jaxcal.adaptive.session import Options, Session
 from jaxcal.checks import seconds as checked_seconds
 
-__all__ = ["Optimum", "solve"]
+__all__ = ["Optimal", "Optimum", "solve"]
 
 Array = NDArray[np.float64]
 
 _MOST_STATES = 2**28
+
+
+@struct.dataclass
+class Optimal:
+    """The decider of the optimum: the best measurement of every state, in a table."""
+
+    chosen: jax.Array  # (T + 1, E + 1, P, B) int16
+    codes: jax.Array  # (S,) uint32, random
+    sums: jax.Array  # (B,) uint32, ascending: the codes of a belief's values, summed
+    belief: jax.Array  # (B,) int32 the belief of each sum
+    tick: Any  # seconds
+
+    def __call__(
+        self,
+        task: GridTask,
+        belief: GridBelief,
+        session: Session,
+        options: Options,
+        key: jax.Array,
+    ) -> jax.Array:
+        code = jnp.where(belief.weights > 0.0, self.codes, 0).sum(dtype=jnp.uint32)
+        at = jnp.minimum(jnp.searchsorted(self.sums, code), len(self.sums) - 1)
+        ticks = jnp.ceil(session.seconds / self.tick - 1e-3).astype(jnp.int32)
+        ticks = jnp.clip(ticks, 0, len(self.chosen) - 1)
+        uses = jnp.clip(session.uses, 0, self.chosen.shape[1] - 1)
+        best = self.chosen[ticks, uses, session.place, self.belief[at]]
+        return best.astype(jnp.int32)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +63,7 @@ class Optimum:
     values: NDArray[np.float32]  # (ticks + 1, uses + 1) nats at the start
     tick: float  # seconds
     task: GridTask
+    decider: Optimal
 
     def value(self, seconds: float, uses: int) -> float:
         """Nats of a session with this budget."""
@@ -84,7 +117,8 @@ def solve(task: GridTask, tick: float) -> Optimum:
     if not np.isfinite(high):
         raise ValueError(f"task.seconds must be finite, got {high}")
     ticks = int(np.ceil(high / tick - 1e-6))
-    after, chance = _beliefs(likelihood > 0.5, np.asarray(task.prior, np.float64))
+    prior = np.asarray(task.prior, np.float64)
+    sets, after, chance = _beliefs(likelihood > 0.5, prior)
     uses = int(np.asarray(task.num_uses).max())
     size = (ticks + 1) * (uses + 1) * len(travel) * len(after)
     if size > _MOST_STATES:
@@ -92,12 +126,22 @@ def solve(task: GridTask, tick: float) -> Optimum:
             f"task must have at most {_MOST_STATES:,} states for dynamic programming, "
             f"got {size:,}: use fewer cells or a longer tick"
         )
-    values = _backwards(
+    values, chosen = _backwards(
         after, chance, travel, extra,
         np.asarray(task.place_after, np.int64), np.asarray(task.uses, np.int64),
         ticks, uses,
     )  # fmt: skip
-    return Optimum(values[:, :, int(task.place), 0], tick, task)
+    codes = np.random.default_rng(0).integers(2**32, size=len(prior), dtype=np.uint32)
+    sums = (sets * codes).sum(axis=1, dtype=np.uint32)
+    ascending = np.argsort(sums)
+    decider = Optimal(
+        chosen=jnp.asarray(chosen),
+        codes=jnp.asarray(codes),
+        sums=jnp.asarray(sums[ascending]),
+        belief=jnp.asarray(ascending, jnp.int32),
+        tick=tick,
+    )
+    return Optimum(values[:, :, int(task.place), 0], tick, task, decider)
 
 
 def _ticks(name: str, values: Array, tick: float) -> NDArray[np.int64]:
@@ -111,8 +155,8 @@ def _ticks(name: str, values: Array, tick: float) -> NDArray[np.int64]:
 
 def _beliefs(
     answers: NDArray[np.bool_], prior: Array
-) -> tuple[NDArray[np.int64], Array]:
-    """All sets that answers can leave: the next set, and its chance, (B, A, Y)."""
+) -> tuple[NDArray[np.bool_], NDArray[np.int64], Array]:
+    """All sets (B, S) that answers can leave; the next set, its chance, (B, A, Y)."""
     number: dict[bytes, int] = {}
     sets: list[NDArray[np.bool_]] = []
 
@@ -136,15 +180,16 @@ def _beliefs(
         after.append(follow)
         chance.append(p)
         done += 1
-    return np.stack(after), np.stack(chance)
+    return np.stack(sets), np.stack(after), np.stack(chance)
 
 
 @nb.njit(cache=True)
 def _backwards(after, chance, travel, extra, place_after, taken, ticks, uses):
-    """(ticks + 1, uses + 1, P, B) nats still to gain."""
+    """(ticks + 1, uses + 1, P, B) nats still to gain, and the best measurement."""
     num_beliefs, num_designs, num_outcomes = after.shape
     places = len(travel)
     values = np.zeros((ticks + 1, uses + 1, places, num_beliefs), np.float32)
+    chosen = np.zeros(values.shape, np.int16)
     gains = np.zeros((num_beliefs, num_designs))
     for b in range(num_beliefs):
         for a in range(num_designs):
@@ -172,6 +217,8 @@ def _backwards(after, chance, travel, extra, place_after, taken, ticks, uses):
                                         p
                                         * values[left, more, place_after[a, y], follow]
                                     )
-                        best = max(best, total)
+                        if total > best:
+                            best = total
+                            chosen[t, e, place, b] = a
                     values[t, e, place, b] = best
-    return values
+    return values, chosen

@@ -63,6 +63,12 @@ class GaussianBelief:
         noise = jax.random.normal(key, self.right.shape)
         return solve_triangular(self.root, self.right + noise)
 
+    def outcomes(
+        self, task: GaussianTask, design: jax.Array, key: jax.Array | None = None
+    ) -> tuple[jax.Array, jax.Array]:
+        """(1, q) and (1,): whatever a design answers, what follows gains the same."""
+        return task.expected_outcomes[design][None], jnp.ones(1)
+
     def entropy(self) -> jax.Array:
         """() nats of z."""
         p = len(self.right)

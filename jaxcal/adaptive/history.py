@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.adaptive.grid import GridTask
+from jaxcal.adaptive.particles import ParticleBelief, ParticleTask
 from jaxcal.adaptive.session import Session, Task
 from jaxcal.checks import in_words, numbers, whole_number
 from jaxcal.checks import seconds as checked_seconds
@@ -162,7 +163,23 @@ def checked(
         raise ValueError(
             f"{where}: outcome must have shape {shape}, got {values.shape}"
         )
-    return design, jnp.asarray(values, jnp.float32)
+    told = jnp.asarray(values, jnp.float32)
+    if isinstance(task, ParticleTask):
+        support = task.model.support
+        if support is not None and not (told == support).any():
+            raise ValueError(
+                f"{where}: outcome must be one of the {len(support)} of model.support, "
+                f"from {support[0]:g} to {support[-1]:g}, got {outcome!r}"
+            )
+        if not _can_answer(belief, design, told):
+            raise ValueError(
+                f"{where}: outcome {outcome!r} cannot follow what was measured before: "
+                "every particle gives it probability 0"
+            )
+    return design, told
+
+
+_can_answer = jax.jit(ParticleBelief.can_answer)
 
 
 def _as_designs(

@@ -1,12 +1,13 @@
 """Measurements on disk, one a line, for a closed loop that may be killed.
 
 The first line says what is measured and how; each further one is a measurement and is
-on the disk (fsync) before the next begins. A torn last line, as a kill or a full disk
-leave it, is dropped; other damage is an error.
+on the disk (fsync) before the next begins. One process writes it at a time. A torn
+last line, as a kill or a full disk leave it, is dropped; other damage is an error.
 """
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
@@ -41,23 +42,31 @@ class Journal:
         header: of this session. A file of another session is refused.
 
     Raises:
-        ValueError: the file is of another task, decider or budget, or damaged.
+        ValueError: the file is of another task, decider or budget, damaged, or another
+            process is writing it.
         OSError: it cannot be written.
     """
 
     def __init__(self, path: str | os.PathLike[str], header: dict[str, Any]) -> None:
         self.path = pathlib.Path(path)
         header = {"kind": _KIND, "version": 1, **header}
-        data = self.path.read_bytes() if self.path.exists() else b""
-        lines, self._size = _whole_lines(data, self.path)
-        self.entries = lines[1:]
-        """What is there already: dicts with ``design`` and ``outcome``."""
-        if lines:
-            _require_same(self.path, lines[0], header)
         self._file = self.path.open("ab")
-        self._file.truncate(self._size)
-        if not lines:
-            self._write(header)
+        try:
+            try:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise ValueError(f"{path}: a running session is writing it") from None
+            lines, self._size = _whole_lines(self.path.read_bytes(), self.path)
+            self.entries = lines[1:]
+            """What is there already: dicts with ``design`` and ``outcome``."""
+            if lines:
+                _require_same(self.path, lines[0], header)
+            self._file.truncate(self._size)
+            if not lines:
+                self._write(header)
+        except BaseException:
+            self._file.close()
+            raise
 
     def append(self, **entry: Any) -> None:
         """Write a measurement; it is on the disk when this returns."""

@@ -62,16 +62,17 @@ class Rollouts:
     """The measurement after which a base rule gains most, by simulation.
 
     Each shortlisted measurement is followed by the base rule, ``rollouts`` times, for
-    at most ``depth`` measurements in all. All candidates share their
-    truths and random numbers (common random numbers): with numbers of its own each,
-    the largest estimate is mostly the noisiest, and the choice is worse than the base
-    rule's.
+    at most ``depth`` measurements in all. Every candidate meets the same truths and
+    the same random numbers. The base rule's choice is kept unless another gains more
+    by ``doubt`` standard errors of the difference: the best of some noisy means is
+    mostly the luckiest, and taking it is worse than the base rule.
     """
 
     base: Scored
     rollouts: int = struct.field(pytree_node=False, default=16)
     depth: int = struct.field(pytree_node=False, default=16)
     per_group: int = struct.field(pytree_node=False, default=4)
+    doubt: Any = 2.0
 
     def __call__(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
@@ -89,8 +90,13 @@ class Rollouts:
             return self._after(task, truth, belief, session, design, key_steps)
 
         alone = jax.vmap(follow, in_axes=(None, 0))
-        later = jax.vmap(alone, in_axes=(0, None))(index, jnp.stack(keys)).mean(axis=1)
-        return index[jnp.argmax(jnp.where(valid, gains[index] + later, -jnp.inf))]
+        later = jax.vmap(alone, in_axes=(0, None))(index, jnp.stack(keys))
+        total = gains[index][:, None] + later
+        own = jnp.argmax(jnp.where(valid, score[index], -jnp.inf))
+        more = total - total[own]
+        error = more.std(axis=1) / max(self.rollouts - 1, 1) ** 0.5
+        least = more.mean(axis=1) - self.doubt * error
+        return index[jnp.argmax(jnp.where(valid, least, -jnp.inf))]
 
     def _after(
         self,

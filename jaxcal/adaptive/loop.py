@@ -152,6 +152,8 @@ def _proposal(
     design, gain, took, uses, any_left = _choose(
         task, decider, belief, session, key_options, key_choice
     )
+    if not took >= 0.0:
+        raise ValueError(f"a measurement must cost at least 0 s, got {float(took):g}")
     if not any_left:
         return Proposal(None, None, 0.0, 0.0, 0.0, number, belief, session)
     table = getattr(task, "designs", None)

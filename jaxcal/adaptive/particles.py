@@ -12,10 +12,12 @@ from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
+from jaxcal import xla
 from jaxcal.adaptive.session import Options, Session
-from jaxcal.checks import numbers, whole_number
+from jaxcal.checks import in_words, numbers, whole_number
 
 __all__ = ["Model", "ParticleBelief", "ParticleTask", "log_mean", "systematic"]
 
@@ -23,14 +25,12 @@ _FLOOR = -1e6  # log likelihood of what is next to impossible
 _ENOUGH = 0.5  # effective share of the particles below which they are moved
 _HALVINGS = 10  # bisections for a temperature
 _STEPS = 40  # temperatures that one outcome may take
+_FEW = 8  # outcomes that a look past the next measurement follows
+_AT_ONCE = 2**25  # log probabilities that sessions played at once may hold
 
 
 class Model(Protocol):
-    """What is measured: a pytree with these methods, for one z and one design each.
-
-    Write sums over products of a design and an unknown term by term: XLA on the CPU
-    compiles a reduction wrongly whose operand a vmapped axis shares.
-    """
+    """What is measured: a pytree with these methods, for one z and one design each."""
 
     @property
     def dim(self) -> int:
@@ -72,7 +72,7 @@ class ParticleBelief:
     log_weight: jax.Array  # (N,) sum to one
     log_likelihood: jax.Array  # (N,) of the measurements made
     designs: Any  # leaves (T, ...)
-    outcomes: jax.Array  # (T,)
+    answers: jax.Array  # (T,) their outcomes
     made: jax.Array  # () int32 measurements made
     log_evidence: jax.Array  # () estimated log density of the measurements made
     model: Model
@@ -90,6 +90,41 @@ class ParticleBelief:
     def draws(self, count: int, key: jax.Array) -> jax.Array:
         """(count, d) equally weighted particles."""
         return self.z[systematic(self.log_weight, count, key)]
+
+    def draw(self, key: jax.Array) -> jax.Array:
+        """(d,) coordinates, drawn."""
+        return self.draws(1, key)[0]
+
+    def outcomes(
+        self, task: ParticleTask, design: Any, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """(Y,) outcomes of a design and (Y,) their probabilities.
+
+        All there are, up to eight; of more, or of continuous ones, eight drawn.
+        """
+        model, support = self.model, self.model.support
+        if support is not None and len(support) <= _FEW:
+            z, weight = self.z, jnp.exp(self.log_weight)
+        else:
+            key, key_draws = jax.random.split(key)
+            z, weight = self.draws(_FEW, key_draws), jnp.full(_FEW, 1.0 / _FEW)
+        predictions = jax.vmap(
+            lambda z: model.predict(model.unknowns(z), design)
+        )(z)  # fmt: skip
+        if support is None or len(support) > _FEW:
+            keys = jax.random.split(key, _FEW)
+            return jax.vmap(model.sample)(predictions, keys), weight
+        log_p = jax.vmap(
+            lambda p: jax.vmap(lambda y: model.log_prob(p, y))(support)
+        )(predictions)  # fmt: skip
+        return support, weight @ jnp.exp(log_p)
+
+    def can_answer(self, design: Any, outcome: jax.Array) -> jax.Array:
+        """() bool: some particle gives an outcome more than no probability."""
+        unknowns = jax.vmap(self.model.unknowns)(self.z)
+        return jax.vmap(
+            lambda u: _log_likelihood(self.model, u, design, outcome) > _FLOOR
+        )(unknowns).any()
 
     def gains(self, task: ParticleTask, options: Options, key: jax.Array) -> jax.Array:
         """(A,) nats, from ``task.num_contrasts`` particles.
@@ -120,7 +155,7 @@ class ParticleBelief:
             designs=jax.tree.map(
                 lambda old, new: old.at[at].set(new), self.designs, design
             ),
-            outcomes=self.outcomes.at[at].set(outcome),
+            answers=self.answers.at[at].set(outcome),
             made=at + 1,
         )
         new = told._last(self.z)
@@ -213,7 +248,7 @@ class ParticleBelief:
         def one(at: jax.Array, total: jax.Array) -> jax.Array:
             design = jax.tree.map(lambda leaf: leaf[at], self.designs)
             return total + jax.vmap(
-                lambda u: _log_likelihood(self.model, u, design, self.outcomes[at])
+                lambda u: _log_likelihood(self.model, u, design, self.answers[at])
             )(unknowns)
 
         return jax.lax.fori_loop(0, self.made, one, jnp.zeros(len(z)))
@@ -224,7 +259,7 @@ class ParticleBelief:
         design = jax.tree.map(lambda leaf: leaf[at], self.designs)
         unknowns = jax.vmap(self.model.unknowns)(z)
         return jax.vmap(
-            lambda u: _log_likelihood(self.model, u, design, self.outcomes[at])
+            lambda u: _log_likelihood(self.model, u, design, self.answers[at])
         )(unknowns)
 
 
@@ -263,12 +298,15 @@ class ParticleTask:
             moves: Metropolis steps each time that particles are resampled.
 
         Raises:
-            ValueError: naming the argument, the rule and the value.
+            ValueError: naming the argument, the rule and the value; a model whose costs
+                are below 0, or whose probabilities do not sum to 1.
+            RuntimeError: XLA of this process compiles sums wrongly.
         """
+        xla.require_sums()
         budget = numbers("seconds", seconds, finite=False)
         if budget.ndim or not budget > 0.0:
             raise ValueError(f"seconds must be one number above 0, got {seconds}")
-        return ParticleTask(
+        task = ParticleTask(
             model=model,
             seconds=jnp.asarray(budget, jnp.float32),
             most=whole_number("most", most, 1),
@@ -276,6 +314,22 @@ class ParticleTask:
             num_candidates=whole_number("candidates", candidates, 1),
             num_contrasts=whole_number("contrasts", contrasts, 2),
             num_moves=whole_number("moves", moves, 1),
+        )
+        _check(task)
+        return task
+
+    @property
+    def outcome_shape(self) -> tuple[int, ...]:
+        """()."""
+        return ()
+
+    @property
+    def batch(self) -> int:
+        """Sessions that are played at once, for the memory that their gains take."""
+        support = self.model.support
+        wide = self.num_contrasts if support is None else len(support)
+        return max(
+            1, min(256, _AT_ONCE // (self.num_candidates * self.num_contrasts * wide))
         )
 
     def draw(self, key: jax.Array) -> jax.Array:
@@ -302,7 +356,7 @@ class ParticleTask:
             designs=jax.tree.map(
                 lambda leaf: jnp.zeros((self.most, *leaf.shape), leaf.dtype), place
             ),
-            outcomes=jnp.zeros(self.most),
+            answers=jnp.zeros(self.most),
             made=jnp.int32(0),
             log_evidence=jnp.zeros(()),
             model=self.model,
@@ -343,6 +397,49 @@ class ParticleTask:
         self, truth: jax.Array, design: Any, outcome: jax.Array
     ) -> jax.Array:
         return _log_likelihood(self.model, self.model.unknowns(truth), design, outcome)
+
+
+def _check(task: ParticleTask) -> None:
+    """Try the model on some designs and draws of the prior."""
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(task)):
+        return
+    cost, outcomes, own, total = jax.device_get(_tried(task))
+    if not (cost >= 0.0).all():
+        raise ValueError(f"model.cost must be at least 0, got {in_words(cost)}")
+    if outcomes.shape != own.shape or own.ndim != 1:
+        raise ValueError(
+            "model.sample and model.log_prob must give one number each, got shapes "
+            f"{outcomes.shape[1:]} and {own.shape[1:]}"
+        )
+    if not (own > _FLOOR).all():
+        raise ValueError(
+            "model.log_prob must be finite for what model.sample draws, got "
+            f"{own.min():g} for the outcome {outcomes[own.argmin()]:g}"
+        )
+    if (np.abs(total - 1.0) > 1e-3).any():
+        worst = total[np.abs(total - 1.0).argmax()]
+        raise ValueError(
+            "model.log_prob must be of probabilities that sum to 1 over model.support, "
+            f"got {worst:.6g}"
+        )
+
+
+@jax.jit
+def _tried(task: ParticleTask) -> tuple[jax.Array, ...]:
+    """(A,) costs, (A,) outcomes, (A,) their log probabilities, (A,) of all outcomes."""
+    model, keys = task.model, jax.random.split(jax.random.key(0), 4)
+    belief, session = task.begin(keys[0])
+    options = task.options(belief, session, keys[1])
+    unknowns = jax.vmap(model.unknowns)(belief.draws(task.num_candidates, keys[2]))
+    predictions = jax.vmap(model.predict)(unknowns, options.designs)
+    outcomes = jax.vmap(model.sample)(
+        predictions, jax.random.split(keys[3], task.num_candidates)
+    )
+    own = jax.vmap(model.log_prob)(predictions, outcomes)
+    if model.support is None:
+        return options.seconds, outcomes, own, jnp.ones(1)
+    each = jax.vmap(lambda p: jax.vmap(lambda y: model.log_prob(p, y))(model.support))
+    return options.seconds, outcomes, own, jnp.exp(each(predictions)).sum(axis=-1)
 
 
 def systematic(log_weight: jax.Array, count: int, key: jax.Array) -> jax.Array:

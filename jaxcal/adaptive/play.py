@@ -35,13 +35,30 @@ class Episodes:
         return (self.gains * self.alive).sum(axis=-1)
 
 
-@jax.jit
 def play(task: Task, decider: Decider, keys: jax.Array) -> Episodes:
-    """Play a session a key (B,).
+    """Play a session a key (B,); no more at once than ``task.batch``, where it has one.
 
     The truth, the budget and the noise of every measurement depend on the key alone, so
     deciders that are given the same keys can be compared in pairs.
     """
+    count = len(keys)
+    size = min(getattr(task, "batch", count), count)
+    padded = keys[jnp.arange(-(-count // size) * size) % count]
+    parts = [
+        _played(task, decider, padded[at : at + size])
+        for at in range(0, len(padded), size)
+    ]
+    if len(parts) == 1:
+        return parts[0]
+    whole: Episodes = jax.tree.map(
+        lambda *leaves: jnp.concatenate(leaves)[:count], *parts
+    )
+    return whole
+
+
+@jax.jit
+def _played(task: Task, decider: Decider, keys: jax.Array) -> Episodes:
+    """Sessions played at once."""
     key_truth, key_begin, key_steps = jax.vmap(
         lambda key: jax.random.split(key, 3), out_axes=1
     )(keys)

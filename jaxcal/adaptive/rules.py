@@ -19,6 +19,7 @@ __all__ = [
     "Random",
     "StateRule",
     "best",
+    "groups_of",
     "log_score",
     "shortlist",
 ]
@@ -32,6 +33,12 @@ def best(score: jax.Array, options: Options) -> jax.Array:
 def log_score(gains: jax.Array, prices: jax.Array) -> jax.Array:
     """log (gain / price), finite also where one is zero."""
     return jnp.log(gains + 1e-9) - jnp.log(prices + 1e-9)
+
+
+def groups_of(task: Any, count: int) -> tuple[jax.Array, int]:
+    """(A,) the group of each option, and how many groups: one where a task has none."""
+    number = getattr(task, "num_groups", 1)
+    return task.groups if number > 1 else jnp.zeros(count, jnp.int32), number
 
 
 def shortlist(
@@ -50,8 +57,7 @@ def shortlist(
         leaves places void.
     """
     score = jnp.where(options.allowed, score, -jnp.inf)
-    number = getattr(task, "num_groups", 1)
-    groups = task.groups if number > 1 else jnp.zeros(len(score), jnp.int32)
+    groups, number = groups_of(task, len(score))
     values, index = jax.vmap(
         lambda group: jax.lax.top_k(
             jnp.where(groups == group, score, -jnp.inf), min(per_group, len(score))

@@ -64,12 +64,11 @@ def _parser(prog: str, typed: str) -> Parser:
     add("--task", required=True, metavar="NAME", help="see below")
     add("--with", dest="options", nargs="+", default=[], metavar="OPTION=VALUE",
         help="options of the task")  # fmt: skip
-    add("--methods", type=several(str, "names"), default=_METHODS.split(","),
-        metavar="LIST", help=f"comma separated; {_METHODS}")  # fmt: skip
+    add("--methods", type=several(str, "names"), metavar="LIST",
+        help=f"comma separated; {_METHODS}, or the task's own")  # fmt: skip
     add("--checkpoint", metavar="DIR", help="of the policy; the shipped one")
-    add(
-        "--episodes", type=at_least(2), default=4096, metavar="N", help="sessions; 4096"
-    )
+    add("--episodes", type=at_least(2), metavar="N",
+        help="sessions; 4096, fewer where a task takes long")  # fmt: skip
     add("--seed", type=at_least(0), default=0, metavar="S", help="of the sessions; 0")
     add("--rollouts", type=at_least(1), default=16, metavar="N",
         help="simulations of each candidate of the method rollouts; 16")  # fmt: skip
@@ -98,9 +97,12 @@ def _run(options: argparse.Namespace, command: list[str]) -> None:
             import jinja2  # noqa: F401  # looks whether it is there
             import matplotlib  # noqa: F401  # looks whether it is there
         require_writable_folder(options.report)
-    if options.checkpoint is not None and "policy" not in options.methods:
-        raise ValueError("--checkpoint is given, but policy is not among --methods")
     entry = registry.load(options.task)
+    methods = options.methods or list(entry.methods) or _METHODS.split(",")
+    if options.checkpoint is not None and "policy" not in methods:
+        if options.methods:
+            raise ValueError("--checkpoint is given, but policy is not among --methods")
+        methods.append("policy")
     chosen = registry.options_from(entry, options.options)
     cache.keep_compiled_programs()
     progress = Progress(quiet=options.quiet)
@@ -109,9 +111,9 @@ def _run(options: argparse.Namespace, command: list[str]) -> None:
             options.task,
             entry,
             chosen,
-            options.methods,
+            methods,
             checkpoint=options.checkpoint,
-            episodes=options.episodes,
+            episodes=options.episodes or entry.episodes,
             seed=options.seed,
             rollouts=options.rollouts,
             retune=options.retune,

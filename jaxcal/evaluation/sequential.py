@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.adaptive import static
+from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.lookahead import Rollouts, TwoStep
 from jaxcal.adaptive.play import Comparison, compare
 from jaxcal.adaptive.policy import run as policies
@@ -89,6 +90,11 @@ def evaluate(
         if method not in METHODS:
             raise ValueError(f"methods must be of {', '.join(METHODS)}, got {method!r}")
     task = jax.tree.map(jnp.asarray, entry.make(**options))
+    if "static" in methods and not isinstance(task, GridTask):
+        raise ValueError(
+            f"methods must not have static for {name}: a sequence is chosen from a "
+            "table of designs, and this task proposes its own from the belief"
+        )
     trained = policies.load(checkpoint) if "policy" in methods else None
     needed = [m for m in ("priced", "state") if m in methods]
     if {"two_step", "rollouts"} & set(methods) and "state" not in needed:
@@ -220,7 +226,8 @@ def _choose(task: Any, decider: Any, belief: Any, session: Any, keys: Any) -> An
 
 def _seconds(task: Any, decider: Any, seed: int) -> float:
     """Processor time of one choice, in a batch; that of all threads counts."""
-    keys = jax.random.split(jax.random.key(seed), _TIMED)
+    count = min(_TIMED, getattr(task, "batch", _TIMED))
+    keys = jax.random.split(jax.random.key(seed), count)
     states = _middle(task, keys)
     jax.block_until_ready(_choose(task, decider, *states, keys))
     best = np.inf
@@ -229,5 +236,5 @@ def _seconds(task: Any, decider: Any, seed: int) -> float:
         while passes == 0 or time.process_time() - begun < 0.05:
             jax.block_until_ready(_choose(task, decider, *states, keys))
             passes += 1
-        best = min(best, (time.process_time() - begun) / passes / _TIMED)
+        best = min(best, (time.process_time() - begun) / passes / count)
     return best

@@ -1,11 +1,13 @@
 """Backlash, dead zone and transmission error, against the mechanism played."""
 
+import jax
 import numpy as np
 import pytest
 
 from jaxcal.adaptive.estimates import estimates
+from jaxcal.adaptive.grid import GridBelief
 from jaxcal.adaptive.loop import next_measurement, run
-from jaxcal.adaptive.play import compare
+from jaxcal.adaptive.play import compare, play
 from jaxcal.adaptive.rules import Gain, Random
 from jaxcal.adaptive.tasks.backlash import (
     backlash,
@@ -97,7 +99,7 @@ def test_a_loop_finds_the_width_of_a_played_mechanism():
     assert found["width"].width < 0.06
 
 
-def test_intervals_hold_as_often_as_they_say():
+def test_intervals_of_the_prior_are_its_quantiles():
     task = backlash(sigma=0.05, **SMALL)
     prior = estimates(task, next_measurement(task).belief, level=0.5)
     assert prior["width"].mean == pytest.approx(0.5)
@@ -106,6 +108,22 @@ def test_intervals_hold_as_often_as_they_say():
     assert prior["offset"].low == pytest.approx(-0.05, abs=1e-6)
     with pytest.raises(ValueError, match="level"):
         estimates(task, next_measurement(task).belief, level=1.0)
+
+
+def test_intervals_hold_as_often_as_they_say():
+    """Truths anywhere in their cells; posteriors by the definition, float64."""
+    task = backlash(sigma=0.05, measurements=4, **SMALL)
+    episodes = play(task, Gain(), jax.random.split(jax.random.key(0), 400))
+    table = np.asarray(task.likelihood, np.float64)
+    designs, outcomes = np.asarray(episodes.designs), np.asarray(episodes.outcomes)
+    rng = np.random.default_rng(4)
+    widths = np.asarray(task.theta)[np.asarray(episodes.truth), 0]
+    held = 0
+    for row, width in enumerate(widths + rng.uniform(-0.05, 0.05, 400)):
+        weights = np.asarray(task.prior) * table[designs[row], outcomes[row]].prod(0)
+        found = estimates(task, GridBelief(weights / weights.sum()), level=0.8)["width"]
+        held += found.low < width < found.high
+    assert held / 400 == pytest.approx(0.8, abs=4.0 * (0.8 * 0.2 / 400) ** 0.5)
 
 
 @pytest.mark.parametrize(

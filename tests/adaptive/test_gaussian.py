@@ -9,6 +9,7 @@ from jaxcal.adaptive.gaussian import GaussianTask
 from jaxcal.adaptive.loop import next_measurement, run
 from jaxcal.adaptive.play import compare, play
 from jaxcal.adaptive.rules import Gain, Random
+from jaxcal.adaptive.static import Static
 from jaxcal.models import Affine, FromJax, Linear, Noise, Prior
 
 COMMANDS = np.random.default_rng(5).uniform(-1, 1, (14, 2))
@@ -61,6 +62,21 @@ def test_one_at_a_time_gains_what_score_says(case):
     known = prior.resolve(model)
     before = np.log(np.diag(known.precision)[known.free]).sum()
     assert total == pytest.approx(0.5 * (log_det(chosen) - before), rel=1e-4)
+
+
+def test_all_at_once_is_a_decider_of_the_same_task():
+    """What ``select`` plans gains what it says, and no less than one at a time."""
+    given = {"model": Affine(2, 2), "prior": Prior(2.0), "noise": Noise(std=0.1)}
+    plan = jaxcal.select(COMMANDS, 4, "exact", criterion="D", **given)
+    task = GaussianTask.make(
+        given["model"], COMMANDS, most=4, prior=given["prior"], noise=given["noise"]
+    )
+    planned, myopic = (
+        float(play(task, decider, jax.random.split(jax.random.key(0), 1)).gain[0])
+        for decider in (Static(plan.indices), Gain())
+    )
+    assert planned == pytest.approx(0.5 * (plan.log_det - 6 * np.log(0.25)), rel=1e-3)
+    assert myopic < planned + 1e-3
 
 
 def test_the_belief_is_that_of_regularised_least_squares(case):

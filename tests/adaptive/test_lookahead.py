@@ -6,10 +6,9 @@ import pytest
 from scipy import stats
 
 from jaxcal.adaptive import static
-from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.lookahead import Rollouts, TwoStep
 from jaxcal.adaptive.play import compare, play
-from jaxcal.adaptive.rules import Priced, StateRule, shortlist
+from jaxcal.adaptive.rules import Priced, shortlist
 from jaxcal.adaptive.session import Options
 from jaxcal.adaptive.tasks.knee import STATE_RULE, knee
 from jaxcal.adaptive.tuning import tune
@@ -128,24 +127,6 @@ def test_rollouts_are_better_than_their_base():
     }
     mean, error = compare(TASK, deciders, 512, batch=128).paired("rollouts", "base")
     assert mean > 4.0 * error
-
-
-@pytest.mark.slow
-def test_deciders_that_look_ahead_run_on_another_task():
-    rng = np.random.default_rng(0)
-    task = GridTask.make(
-        np.arange(5.0),
-        np.arange(4.0),
-        rng.dirichlet(np.ones(3), size=(4, 5)).transpose(0, 2, 1),
-        most=4,
-    )
-    rule = StateRule(0.1, 1.0, 1.0)
-    deciders = {"state": rule, "two": TwoStep(rule), "roll": Rollouts(rule, 4, 4, 2)}
-    found = compare(task, deciders, 256)
-    assert (found.choices == 4).all()
-    for other in ("two", "roll"):
-        mean, error = found.paired(other, "state")
-        assert abs(mean) < 0.2 + 4.0 * error
 
 
 def test_a_static_sequence_is_as_good_as_the_best_of_all():

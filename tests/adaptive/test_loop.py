@@ -1,6 +1,9 @@
 """The next measurement at the bench, and the closed loop with its journal."""
 
 import json
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -171,6 +174,46 @@ def test_every_cut_of_the_file_is_a_session_that_goes_on(tmp_path, sharp):
         complete = max(data[:size].count(b"\n") - 1, 0)
         assert len(asked) == len(whole.history) - complete
         assert path.read_bytes() == data
+
+
+def test_a_second_writer_is_refused(tmp_path, sharp):
+    path = tmp_path / "session.jsonl"
+    tried = []
+
+    def measure(proposal):
+        with pytest.raises(ValueError, match="a running session is writing it"):
+            run(sharp, PRICED, tried.append, journal=path)
+        return device((0.4, 0.7))(proposal)
+
+    once = run(sharp, PRICED, measure, journal=path)
+    assert not tried
+    again = run(sharp, PRICED, tried.append, journal=path)
+    assert not tried and len(again.history) == len(once.history)
+
+
+KILLED = """
+import os, signal, sys
+from jaxcal.adaptive.loop import run
+from jaxcal.adaptive.tasks.knee import PRICED, knee
+
+def measure(proposal):
+    if proposal.number == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return 0
+
+task = knee(cells=6, sigma=0.0, slip=0.0, seconds=9.0, trips=2)
+run(task, PRICED, measure, journal=sys.argv[1])
+"""
+
+
+@pytest.mark.slow
+def test_a_session_goes_on_after_sigkill(tmp_path, sharp):
+    path = tmp_path / "session.jsonl"
+    killed = subprocess.run([sys.executable, "-c", KILLED, str(path)])
+    assert killed.returncode == -signal.SIGKILL
+    asked = []
+    finished = run(sharp, PRICED, lambda p: asked.append(p.number) or 0, journal=path)
+    assert asked[0] == 2 and len(finished.history) == len(asked) + 2
 
 
 def test_a_measurement_is_on_the_disk_before_the_next_is_asked(tmp_path, sharp):

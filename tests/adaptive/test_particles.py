@@ -16,7 +16,7 @@ from jaxcal.adaptive.play import compare, play
 from jaxcal.adaptive.rules import Gain, GainRate, Random
 from jaxcal.adaptive.tasks.ces import CES, ces
 from jaxcal.adaptive.tasks.hyperbolic import Hyperbolic
-from jaxcal.adaptive.tasks.location import LocationFinding, location_finding
+from jaxcal.adaptive.tasks.location import LocationFinding
 from jaxcal.adaptive.tasks.prey import make_prey
 
 
@@ -33,7 +33,7 @@ class Line:
         return z
 
     def predict(self, unknowns, design):
-        return unknowns[0] * design[0] + unknowns[1] * design[1]
+        return (unknowns * design).sum()
 
     def log_prob(self, prediction, outcome):
         error = (outcome - prediction) / self.sigma
@@ -223,37 +223,8 @@ def test_systematic_draws_are_as_many_as_the_weights_say(rng):
     assert (np.abs(count - 1000 * weight) <= 1.0 + 1e-2).all()
 
 
-def plain_location(sources, design):
-    """Mean of the log signal, by the text of the paper."""
-    signal = 0.1
-    for source in sources:
-        signal += 1.0 / (
-            1e-4 + sum((s - x) ** 2 for s, x in zip(source, design, strict=True))
-        )
-    return math.log(signal)
-
-
 @pytest.mark.slow
-def test_location_finding_is_that_of_the_second_implementation():
-    task = location_finding(measurements=6, particles=100, candidates=6, contrasts=20)
-    episodes = play(task, Gain(), jax.random.split(jax.random.key(0), 4))
-    for number in range(4):
-        truth = np.asarray(episodes.truth[number], np.float64)
-        total = 0.0
-        for design, outcome in zip(
-            np.asarray(episodes.designs[number], np.float64),
-            np.asarray(episodes.outcomes[number], np.float64),
-            strict=True,
-        ):
-            mean = plain_location(truth.reshape(2, 2), design)
-            total += stats.norm.logpdf(outcome, mean, 0.5)
-        mine = sum(
-            float(task.log_likelihood(episodes.truth[number], d, y))
-            for d, y in zip(
-                episodes.designs[number], episodes.outcomes[number], strict=True
-            )
-        )
-        assert mine == pytest.approx(total, abs=2e-3)
+def test_signals_of_location_finding_are_drawn_with_their_noise():
     model = LocationFinding()
     keys = jax.random.split(jax.random.key(1), 2000)
     drawn = jax.vmap(lambda k: model.sample(jnp.asarray(1.5), k))(keys)
@@ -334,6 +305,25 @@ def test_prey_is_that_of_the_differential_equation():
         p = jax.vmap(lambda y, q=prediction: model.log_prob(q, y))(model.support)
         wanted = stats.binom.logpmf(np.arange(301), int(count), eaten)
         np.testing.assert_allclose(np.exp(p), np.exp(wanted), atol=2e-3)
+
+
+def test_prey_as_code_is_by_runge_kutta_steps():
+    a, h, count = math.exp(-1.4), math.exp(-1.4), 40.0
+    left = count
+    for _ in range(24):
+        one, two, three, four = 0.0, 0.0, 0.0, 0.0
+        rate = lambda n: -a * n * n / (1 + a * h * n * n)  # noqa: E731  # as published
+        one = rate(left)
+        two = rate(left + one / 3)
+        three = rate(left + two - one / 3)
+        four = rate(left + one - two + three)
+        left += (one + 3 * two + 3 * three + four) / 8
+    model = make_prey(as_code=True)
+    prediction = model.predict(model.unknowns(jnp.zeros(2)), jnp.asarray(count))
+    assert math.exp(float(prediction[2])) == pytest.approx(left / count, abs=1e-4)
+    # Where a N is large the steps overshoot: nothing is left.
+    far = model.predict(jnp.asarray([1.0, -3.0]), jnp.asarray(count))
+    assert float(far[2]) == pytest.approx(math.log(1e-6), abs=0.1)
 
 
 def test_hyperbolic_is_that_of_the_text_and_of_the_code():

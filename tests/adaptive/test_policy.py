@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxcal.adaptive.play import compare, play
-from jaxcal.adaptive.policy import run
+from jaxcal.adaptive.policy import run, training
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.policy.network import Policy, initial
 from jaxcal.adaptive.rules import Gain, Priced, StateRule
@@ -42,6 +42,23 @@ def finished(tmp_path_factory):
 
 def leaves(state):
     return [np.asarray(x) for x in jax.tree.leaves(state)]
+
+
+def test_an_advantage_counts_what_follows_by_its_chance():
+    """A session of two choices, then one of another: by hand, lambda 0.5."""
+    row = {
+        "reward": [1.0, 2.0, 4.0, 0.0],
+        "value": [10.0, 20.0, 30.0, 40.0],
+        "ended": [0.0, 1.0, 0.0, 0.0],
+        "chance": [0.25, 0.5, 1.0, 1.0],
+        "elsewhere": [3.0, 8.0, 0.0, 0.0],
+    }
+    given = {name: np.array([values]) for name, values in row.items()}
+    found = training._advantages(**given, discount=1.0, lam=0.5)
+    last = 4.0 + 40.0 - 30.0  # cut: closed by the last value
+    second = 2.0 + 8.0 - 20.0  # this outcome ended the session, another would not
+    first = 1.0 + 0.25 * 20.0 + 3.0 - 10.0 + 0.5 * second
+    np.testing.assert_allclose(found, [[first, second, last]])
 
 
 @pytest.mark.slow

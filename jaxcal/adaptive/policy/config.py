@@ -18,16 +18,17 @@ LENGTH = 32  # choices that one stream of sessions makes in an update
 _RULES: tuple[type[Scored], ...] = (rules.Priced, rules.StateRule)
 
 PPO = PPOConfig(
-    num_episodes=600 * 4096,
+    num_episodes=300 * 4096,
     episodes_per_update=4096,
     episodes_per_set=1,
     num_epochs=4,
     num_minibatches=8,
     learning_rate=2e-3,
     final_learning_rate=6e-5,
-    entropy_start=0.003,
+    value_coefficient=5.0,
+    entropy_start=0.01,
     entropy_end=0.0,
-    gae_lambda=0.92,
+    gae_lambda=1.0,
     average_decay=0.998,
 )
 """Its episodes are choices: sessions differ in length."""
@@ -40,8 +41,8 @@ class PolicyConfig:
     task: str  # as registered
     base: Scored  # the rule that the network corrects, its constants numbers
     options: tuple[Mapping[str, Any], ...] = ({},)  # update u trains on u modulo n
-    per_group: int = setting(8, "options of a group that the network sees")
-    width: int = setting(48, "of the network's layers")
+    per_group: int = setting(6, "options of a group that the network sees")
+    width: int = setting(64, "of the network's layers")
     ppo: PPOConfig = PPO
     validate_every: float = 30.0  # seconds between validations
     save_every: float = 60.0  # seconds between checkpoints

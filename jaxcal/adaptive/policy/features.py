@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcal.adaptive.rules import Scored, log_score, shortlist
+from jaxcal.adaptive.rules import Scored, groups_of, log_score, shortlist
 from jaxcal.adaptive.session import Options, Session
 
 __all__ = ["NUM_FEATURES", "Seen", "see"]
 
-NUM_FEATURES = 29
+NUM_FEATURES = 31
 _SCALE = 20.0  # seconds
 
 
@@ -42,25 +42,26 @@ def see(
     seconds, uses = task.expected(belief, session, options)
     score = log_score(gains, base.price(session, seconds, uses))
     index, valid = shortlist(task, score, options, per_group)
-    mine = task.groups[index]
+    groups, number = groups_of(task, len(gains))
+    mine = groups[index]
     below = score[index] - jnp.where(options.allowed, score, -jnp.inf).max()
 
     left = jnp.where(jnp.isfinite(session.seconds), session.seconds, 2 * _SCALE)
     g, s, u = gains[index], seconds[index], uses[index]
-    members = task.groups[None] == jnp.arange(task.num_groups)[:, None]
+    members = groups[None] == jnp.arange(number)[:, None]
     within = jnp.where(members & options.allowed[None], gains[None], 0.0)  # (G, A)
     # Summed over a group's options, the gains measure how much of it is unknown.
     tops, sums = within.max(axis=1), within.sum(axis=1)
     own, whole = tops[mine], sums[mine]
-    others = jnp.where(
-        jnp.arange(task.num_groups)[None] == mine[:, None], 0.0, tops[None]
-    ).max(axis=1)
+    others = jnp.where(jnp.arange(number)[None] == mine[:, None], 0.0, tops[None]).max(
+        axis=1
+    )
     nearest = jnp.where(members, options.seconds[None], jnp.inf).min(axis=1)
     rate = gains / jnp.maximum(seconds, 1e-6)
     first, second = session.uses <= 1, session.uses <= 2
     ones = jnp.ones_like(g)
-    low, high = (f(task.designs, axis=0, keepdims=True) for f in (jnp.min, jnp.max))
-    where = ((task.designs - low) / jnp.maximum(high - low, 1e-9))[index, -1]
+    where = _along(task, len(gains))[index]
+    spent, free = _left_after(task, belief, len(gains))
     features = jnp.stack(
         [
             0.2 * jnp.log(g + 1e-6), g, u, s / 5.0,
@@ -70,12 +71,13 @@ def see(
             where, u * first, u * second, u * u,
             (left - s) / _SCALE, own, others, u * left / _SCALE,
             g / (u + 0.05), jnp.sqrt(g),
+            spent[index] / 3.0, free[index] / 3.0,
             jnp.log1p(whole), jnp.log1p(jnp.maximum(sums.sum() - whole, 0.0)),
             # the same of all options
             ones * left / _SCALE, ones * jnp.minimum(left / 5.0, 1.0),
             ones * first, ones * second, ones * jnp.minimum(session.uses, 4) / 4.0,
             ones * gains.max(), ones * rate.max(),
-            ones * session.made / 10.0, ones * belief.entropy() / 5.0,
+            ones * session.made / 10.0, ones * jnp.nan_to_num(belief.entropy()) / 5.0,
         ],
         axis=-1,
     )  # fmt: skip
@@ -86,3 +88,24 @@ def see(
         gain=g,
         valid=valid,
     )
+
+
+def _along(task: Any, count: int) -> jax.Array:
+    """(A,) the last column of a task's designs, from 0 to 1; 0 without a table."""
+    if not hasattr(task, "designs"):
+        return jnp.zeros(count)
+    u = task.designs[:, -1]
+    return (u - u.min()) / jnp.maximum(u.max() - u.min(), 1e-9)
+
+
+def _left_after(task: Any, belief: Any, count: int) -> tuple[jax.Array, jax.Array]:
+    """(A,) entropy expected after an outcome that takes uses, and after one that not.
+
+    0 where a belief does not tell it, or no outcome is such.
+    """
+    if not hasattr(belief, "entropies_after"):
+        return jnp.zeros(count), jnp.zeros(count)
+    p, after = belief.predictive(task), belief.entropies_after(task)
+    chances = (jnp.where(task.uses > 0, p, 0.0), jnp.where(task.uses > 0, 0.0, p))
+    spent, free = ((c * after).sum(-1) / (c.sum(-1) + 1e-9) for c in chances)
+    return spent, free

@@ -15,7 +15,7 @@ from jaxcal.adaptive.session import Options, Session
 
 __all__ = ["Network", "Policy"]
 
-_BETA, _GAIN = 12.0, 3.0
+_BETA, _GAIN = 5.0, 3.0
 
 
 class Network(nn.Module):
@@ -25,21 +25,23 @@ class Network(nn.Module):
     scored beside the pool. The last layer begins at zero: a policy begins as its rule.
     """
 
-    width: int = 48
+    width: int = 64
 
     @nn.compact
     def __call__(self, seen: Seen) -> tuple[jax.Array, jax.Array]:
         hidden = nn.tanh(nn.Dense(self.width)(seen.features))
         valid = seen.valid[..., None]
         pool = jnp.where(valid, hidden, -1.0).max(axis=-2)
-        beside = jnp.broadcast_to(pool[..., None, :], hidden.shape)
-        both = jnp.concatenate([hidden, beside], axis=-1)
-        late = nn.tanh(nn.Dense(self.width)(both))
+        # Two layers in place of one over both: the pool's is computed once.
+        beside = nn.Dense(self.width, use_bias=False)(pool)[..., None, :]
+        late = nn.tanh(nn.Dense(self.width)(hidden) + beside)
         change = nn.Dense(1, kernel_init=nn.initializers.zeros)(late)[..., 0]
         beta = self.param("beta", nn.initializers.constant(_BETA), ())
         logits = beta * seen.log_score + _GAIN * change
         mean = (hidden * valid).sum(axis=-2) / jnp.maximum(valid.sum(axis=-2), 1)
-        value = nn.tanh(nn.Dense(self.width)(jnp.concatenate([pool, mean], axis=-1)))
+        value = jnp.concatenate([pool, mean], axis=-1)
+        for _ in range(2):
+            value = nn.tanh(nn.Dense(2 * self.width)(value))
         value = nn.Dense(1)(value)[..., 0]
         return jnp.where(seen.valid, logits, -1e9), value
 
@@ -50,8 +52,8 @@ class Policy:
 
     params: Any
     base: Scored
-    per_group: int = struct.field(pytree_node=False, default=8)
-    width: int = struct.field(pytree_node=False, default=48)
+    per_group: int = struct.field(pytree_node=False, default=6)
+    width: int = struct.field(pytree_node=False, default=64)
     sample: bool = struct.field(pytree_node=False, default=False)
 
     def __call__(
@@ -64,7 +66,7 @@ class Policy:
         return seen.index[jnp.argmax(logits)]
 
 
-def initial(key: jax.Array, per_group: int, num_groups: int, width: int = 48) -> Any:
+def initial(key: jax.Array, per_group: int, num_groups: int, width: int = 64) -> Any:
     """Parameters before training."""
     c = per_group * num_groups
     blank = Seen(

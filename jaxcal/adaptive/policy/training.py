@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.policy.config import LENGTH
 from jaxcal.adaptive.policy.features import Seen, see
 from jaxcal.adaptive.policy.network import Network
@@ -45,11 +46,13 @@ def updater(config: PPOConfig, per_group: int, width: int) -> Update:
 
     def gather(params: Any, given: Any, key: jax.Array) -> tuple[Steps, Metrics]:
         keys, task, base = given
-        seen, action, log_prob, value, reward, ended, entropy = jax.vmap(
+        played = jax.vmap(
             lambda key: _stream(params, network, task, base, per_group, key)
         )(keys)
+        seen, action, log_prob, value, reward, ended, entropy = played[:-2]
+        chance, elsewhere = played[-2:]
         advantage = _advantages(
-            reward[:, :-1], value, ended[:, :-1], config.discount, config.gae_lambda
+            reward, value, ended, chance, elsewhere, config.discount, config.gae_lambda
         )
         metrics = {
             "reward_mean": reward.sum() / jnp.maximum(ended.sum(), 1.0),
@@ -92,15 +95,33 @@ def _apply(network: Network, params: Any, seen: Seen) -> tuple[jax.Array, jax.Ar
 
 
 def _advantages(
-    reward: jax.Array, value: jax.Array, ended: jax.Array, discount: float, lam: float
+    reward: jax.Array,
+    value: jax.Array,
+    ended: jax.Array,
+    chance: jax.Array,
+    elsewhere: jax.Array,
+    discount: float,
+    lam: float,
 ) -> jax.Array:
-    """(B, T) generalised advantage estimates; ``value`` (B, T + 1) closes the cut."""
-    on = discount * (1.0 - ended)
-    deltas = reward + on * value[:, 1:] - value[:, :-1]
+    """(B, T) generalised advantage estimates of the first T choices.
+
+    What follows a choice counts in expectation over its outcomes, not as it happened:
+    the luck of the outcome, most of the variance, is left out. The expectation of the
+    estimates is the same.
+
+    Args:
+        reward, value, ended: (B, T + 1); the last value closes the cut.
+        chance: (B, T + 1) of the outcome that happened.
+        elsewhere: (B, T + 1) values after the other outcomes, times their chances.
+        discount, lam: of later rewards, of later differences.
+    """
+    on = (1.0 - ended)[:, :-1]
+    follow = chance[:, :-1] * on * value[:, 1:] + elsewhere[:, :-1]
+    deltas = reward[:, :-1] + discount * follow - value[:, :-1]
 
     def back(carry: jax.Array, now: Any) -> tuple[jax.Array, jax.Array]:
         delta, on = now
-        carry = delta + lam * on * carry
+        carry = delta + lam * discount * on * carry
         return carry, carry
 
     start = jnp.zeros_like(reward[:, 0])
@@ -126,9 +147,24 @@ def _stream(
         log_probs = jax.nn.log_softmax(logits)
         design = jax.tree.map(lambda leaf: leaf[seen.index[action]], options.designs)
         outcome = task.measure(truth, design, keys[3])
-        belief = belief.update(task, design, outcome, keys[4])
-        session = task.spend(session, design, outcome)
-        ended = session.over | (session.made >= task.most)
+
+        def after(outcome: jax.Array) -> tuple[Any, Any, jax.Array]:
+            then = belief.update(task, design, outcome, keys[4])
+            left = task.spend(session, design, outcome)
+            return then, left, left.over | (left.made >= task.most)
+
+        def value_after(outcome: jax.Array) -> jax.Array:
+            then, left, ended = after(outcome)
+            options = task.options(then, left, keys[0])
+            seen = see(task, then, left, options, keys[1], base, per_group)
+            return jnp.where(ended, 0.0, _apply(network, params, seen)[1])
+
+        chance, elsewhere = jnp.float32(1.0), jnp.float32(0.0)
+        if isinstance(task, GridTask):  # all outcomes are known, and few
+            outcomes, p = belief.outcomes(task, design, keys[1])
+            others = (outcome + outcomes[1:]) % len(outcomes)
+            chance, elsewhere = p[outcome], p[others] @ jax.vmap(value_after)(others)
+        belief, session, ended = after(outcome)
         carry = jax.tree.map(
             lambda new, old: jnp.where(ended, new, old),
             begin(keys[5]), (truth, belief, session),
@@ -136,7 +172,7 @@ def _stream(
         entropy = -(jnp.exp(log_probs) * log_probs).sum()
         return carry, (
             seen, action, log_probs[action], value, seen.gain[action],
-            ended.astype(jnp.float32), entropy,
+            ended.astype(jnp.float32), entropy, chance, elsewhere,
         )  # fmt: skip
 
     key_begin, key_steps = jax.random.split(key)

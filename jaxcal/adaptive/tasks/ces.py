@@ -23,8 +23,9 @@ from flax import struct
 
 from jaxcal.adaptive.particles import ParticleTask
 from jaxcal.adaptive.session import Session
+from jaxcal.adaptive.tasks.registry import FREE, Entry
 
-__all__ = ["CES", "ces"]
+__all__ = ["CES", "ENTRY", "ces"]
 
 _LEAST, _MOST = 0.01, 100.0  # of a good
 _CUT = 15.249238  # logit of 1 - 2^-22
@@ -189,3 +190,12 @@ def ces(
         contrasts=contrasts,
         moves=moves,
     )
+
+
+ENTRY = Entry(
+    ces,
+    about="what two baskets of goods are worth to a person",
+    rules=FREE,
+    methods=("random", "gain"),
+    episodes=256,
+)

@@ -12,8 +12,9 @@ import numpy as np
 from scipy import special, stats
 
 from jaxcal.adaptive.grid import GridTask
+from jaxcal.adaptive.tasks.registry import FREE, Entry
 
-__all__ = ["death_process"]
+__all__ = ["ENTRY", "death_process"]
 
 
 def death_process(
@@ -50,3 +51,11 @@ def death_process(
         theta_names=["rate"],
         design_names=["time"],
     )
+
+
+ENTRY = Entry(
+    death_process,
+    about="an infection rate, from how many are infected when",
+    rules=FREE,
+    methods=("random", "static", "gain"),
+)

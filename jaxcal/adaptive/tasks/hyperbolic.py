@@ -19,8 +19,9 @@ from flax import struct
 
 from jaxcal.adaptive.particles import ParticleTask
 from jaxcal.adaptive.session import Session
+from jaxcal.adaptive.tasks.registry import FREE, Entry
 
-__all__ = ["Hyperbolic", "hyperbolic"]
+__all__ = ["ENTRY", "Hyperbolic", "hyperbolic"]
 
 _LATER = 100.0  # money
 
@@ -101,3 +102,12 @@ def hyperbolic(
         contrasts=contrasts,
         moves=moves,
     )
+
+
+ENTRY = Entry(
+    hyperbolic,
+    about="how a person values money later",
+    rules=FREE,
+    methods=("random", "gain"),
+    episodes=512,
+)

@@ -19,7 +19,7 @@ __all__ = ["PRICED", "STATE_RULE", "knee"]
 # Tuned on this task with its default constants.
 PRICED = Priced(c0=0.015, c1=0.182, c2=2.392)
 STATE_RULE = StateRule(
-    c0=0.0760, c1=0.272, c2=2.107, d0=-1.005, d1=-1.084, d2=2.85, scale=20.0
+    c0=0.157, c1=0.272, c2=1.99, d0=-0.386, d1=-1.172, d2=3.20, scale=20.0
 )
 
 

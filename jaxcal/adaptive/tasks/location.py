@@ -15,8 +15,9 @@ from flax import struct
 
 from jaxcal.adaptive.particles import ParticleTask
 from jaxcal.adaptive.session import Session
+from jaxcal.adaptive.tasks.registry import FREE, Entry
 
-__all__ = ["LocationFinding", "location_finding"]
+__all__ = ["ENTRY", "LocationFinding", "location_finding"]
 
 
 @struct.dataclass
@@ -96,3 +97,12 @@ def location_finding(
         contrasts=contrasts,
         moves=moves,
     )
+
+
+ENTRY = Entry(
+    location_finding,
+    about="two sources in the plane, from the sum of their signals",
+    rules=FREE,
+    methods=("random", "gain"),
+    episodes=256,
+)

@@ -15,18 +15,27 @@ import pathlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from jaxcal.adaptive.rules import Priced, StateRule
 from jaxcal.learning.settings import installed
 
-__all__ = ["Entry", "load", "names", "options_from"]
+__all__ = ["FREE", "Entry", "load", "names", "options_from"]
 
 _GROUP = "jaxcal.tasks"  # entry points
 _OWN = {
     "backlash": "jaxcal.adaptive.tasks.backlash:ENTRY",
     "breakaway": "jaxcal.adaptive.tasks.breakaway:ENTRY",
+    "ces": "jaxcal.adaptive.tasks.ces:ENTRY",
     "dead_zone": "jaxcal.adaptive.tasks.backlash:DEAD_ZONE",
+    "death": "jaxcal.adaptive.tasks.death:ENTRY",
+    "hyperbolic": "jaxcal.adaptive.tasks.hyperbolic:ENTRY",
     "knee": "jaxcal.adaptive.tasks.knee:ENTRY",
+    "location": "jaxcal.adaptive.tasks.location:ENTRY",
+    "prey": "jaxcal.adaptive.tasks.prey:ENTRY",
     "transmission": "jaxcal.adaptive.tasks.transmission:ENTRY",
 }
+
+FREE = {"priced": Priced(1.0, 0.0, 0.0), "state": StateRule(1.0, 0.0, 0.0)}
+"""Rules of a task whose measurements cost nothing: the largest gain."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +48,10 @@ class Entry:
     """Deciders with constants tuned on the default task, such as ``priced``."""
     train_on: tuple[Mapping[str, Any], ...] = ({},)
     """Options of the tasks that a policy is trained on: update u takes u modulo n."""
+    methods: tuple[str, ...] = ()
+    """What ``evaluate.py`` compares unless told; all quick methods when empty."""
+    episodes: int = 4096
+    """Sessions that ``evaluate.py`` plays unless told."""
 
 
 def names() -> list[str]:
