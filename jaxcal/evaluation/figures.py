@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from jaxcal.evaluation.parameters import parameter_names
 from jaxcal.evaluation.results import Evaluation, MethodResult, log_mean
+from jaxcal.plots import selection
 from jaxcal.plots.style import BLACK, COLOURS, GREY, boxes, legend_right, numbered
 from jaxcal.plots.style import panels as _panels
 
@@ -26,6 +27,7 @@ __all__ = [
     "det_means",
     "det_per_episode",
     "evaluation_figures",
+    "first_selection",
     "gap_to_optimum",
     "variances",
 ]
@@ -42,10 +44,39 @@ _FIXED: dict[str, dict[str, Any]] = {  # the style of random and exact in every 
 
 def evaluation_figures(evaluation: Evaluation) -> dict[str, Figure]:
     """Every figure the evaluation holds data for, by file name without suffix."""
-    drawn = [det_per_episode, det_means, det_distributions, gap_to_optimum, best_so_far]
+    drawn = [
+        first_selection,
+        det_per_episode,
+        det_means,
+        det_distributions,
+        gap_to_optimum,
+        best_so_far,
+    ]
     if evaluation.dataset.measured is not None:
         drawn.append(parameter_variance)
     return {draw.__name__: draw(evaluation) for draw in drawn}
+
+
+def first_selection(evaluation: Evaluation) -> Figure:
+    """Candidates of the first episode and what two methods chose of them."""
+    dataset = evaluation.dataset
+    points = dataset.candidates[0]
+    solid = dataset.num_inputs > 2
+    kind = {"subplot_kw": {"projection": "3d"}} if solid else {}
+    figure = Figure(figsize=(6.4, 5.0), layout="constrained")
+    axes = figure.subplots(**kind)
+    if dataset.num_inputs < 2:
+        points = np.hstack([points, np.zeros_like(points)])
+    shown = [r for r in evaluation.results if r.method != "random"] or [
+        *evaluation.results
+    ]
+    for i, result in enumerate(shown[:: max(len(shown) - 1, 1)][:2]):
+        look = {key: numbered(i)[key] for key in ("color", "marker")}
+        label = _label(evaluation, result)
+        selection(axes, points, result.indices[0, 0], label=label, **look)
+    axes.set_title(_title(evaluation, "First episode"), fontsize=10)
+    axes.legend(frameon=False)
+    return figure
 
 
 def det_per_episode(evaluation: Evaluation) -> Figure:

@@ -1,25 +1,51 @@
-"""Figures of how many postures, and of how long they take."""
+"""Curves against the number of measurements, and against time."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike
 
-from jaxcal.plots.style import BLACK, COLOURS, GREY, MARKERS, plain_axes
+from jaxcal.plots.style import BLACK, COLOURS, GREY, MARKERS, numbered, plain_axes
 
-__all__ = ["pareto_figure", "plan_figure"]
+__all__ = ["against_count", "pareto", "plan"]
 
 
-def pareto_figure(fronts: dict[str, Any]) -> Figure:
+def against_count(
+    axes: Any, counts: Sequence[int], values: dict[str, ArrayLike], label: str = ""
+) -> Any:
+    """A criterion or an error against the number of measurements K.
+
+    Args:
+        axes: matplotlib axes.
+        counts: values of K.
+        values: label of a curve to one value for each K.
+        label: of the vertical axis.
+
+    Returns:
+        ``axes``.
+    """
+    for i, (name, each) in enumerate(values.items()):
+        axes.plot(counts, each, label=name, markersize=4, **numbered(i))
+    axes.set(xlabel="number of measurements K", ylabel=label)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.legend(frameon=False)
+    plain_axes(axes)
+    return axes
+
+
+def pareto(axes: Any, fronts: dict[str, Any]) -> Any:
     """Time against efficiency; filled markers are proven, hollow ones are not.
 
     Args:
+        axes: matplotlib axes.
         fronts: ``ParetoFront`` by the name to show.
+
+    Returns:
+        ``axes``.
     """
-    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
-    axes = figure.add_subplot()
     for i, (name, front) in enumerate(fronts.items()):
         colour = COLOURS[i % len(COLOURS)]
         axes.plot(
@@ -37,28 +63,29 @@ def pareto_figure(fronts: dict[str, Any]) -> Figure:
     axes.set_ylabel("time of the run (s): travel and settling")
     axes.legend(frameon=False)
     plain_axes(axes)
-    return figure
+    return axes
 
 
-def plan_figure(plan: Any) -> Figure:
+def plan(axes: Any, plan: Any) -> Any:
     """Accuracy against K: the designs, what no design beats, and the target.
 
     Args:
+        axes: matplotlib axes.
         plan: a ``Plan``; the output that is furthest from its target is drawn.
+
+    Returns:
+        ``axes``.
     """
-    worst = plan.hardest_output
-    ks = [row.k for row in plan.rows]
-    figure = Figure(figsize=(6.4, 4.0), layout="constrained")
-    axes = figure.add_subplot()
     series = (
         ("standard_error", "design found", MARKERS[0], "-", COLOURS[0]),
         ("d_optimal_error", "D-optimal selection", MARKERS[1], "--", COLOURS[1]),
         ("least_error", "no design below", "", ":", GREY),
     )
+    ks = [row.k for row in plan.rows]
     for field, label, marker, style, colour in series:
         values = [plan.worst(getattr(row, field)) for row in plan.rows]
         axes.plot(ks, values, marker=marker, linestyle=style, color=colour, label=label)
-    target = plan.target_accuracy[worst]
+    target = plan.target_accuracy[plan.hardest_output]
     axes.axhline(target, color=BLACK, linewidth=0.8, label="target")
     axes.axvline(plan.k, color=BLACK, linewidth=0.8, linestyle=":")
     axes.set_xlabel("number of measurements K")
@@ -67,4 +94,4 @@ def plan_figure(plan: Any) -> Figure:
     axes.set_ylim(bottom=0.0)
     axes.legend(frameon=False)
     plain_axes(axes)
-    return figure
+    return axes

@@ -1,7 +1,7 @@
 """Calibrate an accelerometer triad: which orientations, against the textbook six.
 
-    python examples/triad/triad.py            # table, errors.csv and errors.png
-    python examples/triad/triad.py --quick    # fewer triads
+    python examples/triad.py           # 20 triads
+    python examples/triad.py --full    # 200
 
 The sensor is held still in known orientations and reads ``y = C g + b``. Scale and
 misalignment are an upper triangular C, so that the frame is fixed by the first axis:
@@ -10,17 +10,15 @@ three of its nine entries are held at zero by the prior, nine parameters are unk
 
 from __future__ import annotations
 
-import argparse
-import csv
-import pathlib
+import sys
 
+import common
 import numpy as np
 from numpy.typing import NDArray
 
 import jaxcal
 from jaxcal.models import Affine
 
-HERE = pathlib.Path(__file__).parent
 Array = NDArray[np.float64]
 
 MODEL = Affine(3, 3)
@@ -77,8 +75,9 @@ def efficiency(most: float) -> float:
     return jaxcal.score(offered, at, max_replicates=6, **about("I")).efficiency
 
 
-def study(triads: int) -> dict[tuple[str, int, str], Array]:
+def study(full: bool) -> dict[tuple[str, int, str], Array]:
     """(tilt, K, rule) to (triads, 3): errors of bias, of C, of all directions; mg."""
+    triads = 200 if full else 20
     found = {}
     everywhere = orientations(180.0)
     for tilt, most in TILTS.items():
@@ -107,62 +106,30 @@ def study(triads: int) -> dict[tuple[str, int, str], Array]:
     return found
 
 
-def table(found: dict[tuple[str, int, str], Array]) -> str:
-    """Markdown: root mean square over the triads, mg."""
-    lines = [
-        "| tilt | orientations | chosen by | bias | C | all directions |",
-        "|---|---|---|---|---|---|",
-    ]
-    for (tilt, k, rule), rows in found.items():
-        cells = " | ".join(f"{x:.2f}" for x in np.sqrt((rows**2).mean(axis=0)))
-        lines.append(f"| {tilt} | {k} | {rule} | {cells} |")
-    return "\n".join(lines)
+def rows(found: dict[tuple[str, int, str], Array]) -> common.Rows:
+    """Root mean square over the triads, mg."""
+    names = ("bias_mg", "matrix_mg", "directions_mg")
+    return [
+        common.row({"tilt": tilt, "k": k, "rule": rule, "triads": len(each)},
+                   names, common.rms(each), ".3f")
+        for (tilt, k, rule), each in found.items()
+    ]  # fmt: skip
 
 
-def save(found: dict[tuple[str, int, str], Array], folder: pathlib.Path) -> None:
-    """errors.csv and errors.png."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "errors.csv").open("w", newline="") as file:
-        write = csv.writer(file).writerow
-        write(["tilt", "k", "rule", "triads", "bias_mg", "matrix_mg", "directions_mg"])
-        for (tilt, k, rule), rows in found.items():
-            rms = np.sqrt((rows**2).mean(axis=0))
-            write([tilt, k, rule, len(rows), *(f"{x:.3f}" for x in rms)])
-    figure, both = plt.subplots(1, 2, figsize=(7.4, 3.6), layout="constrained")
-    for axes, tilt in zip(both, TILTS, strict=True):
-        for rule in RULES:
-            counts = [k for k in COUNTS if (tilt, k, rule) in found]
-            rms = [np.sqrt((found[tilt, k, rule][:, 2] ** 2).mean()) for k in counts]
-            style = "kx" if rule == "textbook" else "o-"
-            axes.plot(counts, rms, style, label=rule, zorder=3 + (style == "kx"))
-        axes.set(
-            title=f"tilt: {tilt}", xlabel="orientations", yscale="log",
-            ylabel="error in all directions, mg", xticks=COUNTS,
-        )  # fmt: skip
-    both[0].legend()
-    figure.savefig(folder / "errors.png", dpi=160)
+PANELS = 2
 
 
-def main(arguments: list[str] | None = None) -> dict[tuple[str, int, str], Array]:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="20 triads, not 200")
-    parser.add_argument(
-        "--out", type=pathlib.Path, default=HERE, help="folder to write"
-    )
-    options = parser.parse_args(arguments)
-    found = study(20 if options.quick else 200)
-    save(found, options.out)
-    print(table(found))
-    for tilt, most in TILTS.items():
-        share = 100.0 * efficiency(most)
-        print(f"tilt {tilt}: the textbook six are at least {share:.1f} % I-efficient")
-    return found
+def draw(axes, rows: common.Rows) -> None:
+    """Error in all directions by number of orientations."""
+    for each, tilt in zip(axes, TILTS, strict=True):
+        shown = [row for row in rows if row["tilt"] == tilt]
+        label = "error in all directions, mg"
+        common.curves(each, shown, "rule", "k", "directions_mg", label)
+        each.set(title=f"tilt: {tilt}", xlabel="orientations")
 
 
 if __name__ == "__main__":
-    main()
+    common.main(sys.modules[__name__])
+    for tilt, most in TILTS.items():
+        share = 100.0 * efficiency(most)
+        print(f"tilt {tilt}: the textbook six are at least {share:.1f} % I-efficient")

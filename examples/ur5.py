@@ -1,7 +1,7 @@
 """Calibrate a real UR5 from a few of the 1,000 poses that a laser tracker measured.
 
-    python examples/ur5/ur5.py            # table, errors.csv and errors.png, minutes
-    python examples/ur5/ur5.py --quick    # two sub-pools instead of sixty
+    python examples/ur5.py           # two sub-pools
+    python examples/ur5.py --full    # sixty, and the tables of ur5.md
 
 For K = 6 to 40 poses of sub-pools of 300, chosen by several rules, 39 parameters are
 fitted from the chosen poses alone, and the position error is judged on the poses that
@@ -10,18 +10,18 @@ were not chosen and on 20 test poses that were in no pool.
 
 from __future__ import annotations
 
-import argparse
 import csv
-import pathlib
+import sys
 
+import common
 import numpy as np
 from numpy.typing import NDArray
 
 import jaxcal
 from jaxcal.models import SerialChain
+from jaxcal.plots.style import plain_log
 from jaxcal.progress import Progress
 
-HERE = pathlib.Path(__file__).parent
 Array = NDArray[np.float64]
 
 # The controller's Denavit-Hartenberg rows (a mm, alpha deg, d mm, theta deg): with them
@@ -47,7 +47,7 @@ def arm() -> SerialChain:
 
 def load(name: str) -> tuple[Array, Array]:
     """Joint angles (N, 6) in degrees and measured positions (N, 3) in mm."""
-    with (HERE / name).open(newline="") as file:
+    with (common.HERE / "ur5" / name).open(newline="") as file:
         rows = list(csv.DictReader(file))
 
     def columns(*names: str) -> Array:
@@ -87,8 +87,9 @@ def distances(calibration: jaxcal.Calibration, angles: Array, reached: Array) ->
     return np.linalg.norm(calibration.predict(angles) - reached, axis=1)
 
 
-def study(pools: int, draws: int) -> dict[tuple[str, int], Array]:
+def study(full: bool) -> dict[tuple[str, int], Array]:
     """(rule, K) to (runs, 3): mean and largest error of the rest, mean of the tests."""
+    pools = POOLS if full else 2
     angles, reached = load("ur5_grid_1000.csv")
     tests = load("ur5_random_20.csv")
     found: dict[tuple[str, int], Array] = {}
@@ -100,7 +101,7 @@ def study(pools: int, draws: int) -> dict[tuple[str, int], Array]:
         for pool in range(pools):
             rng = np.random.default_rng(pool)
             members = rng.permutation(len(angles))[:POOL]
-            for _ in range(draws if rule == "random" else 1):
+            for _ in range(10 if rule == "random" else 1):
                 chosen = members[choose(rule, angles[members], k, rng)]
                 rest = np.setdiff1d(np.arange(len(angles)), chosen)
                 fit = jaxcal.identify(
@@ -165,76 +166,42 @@ def outliers(pools: int) -> dict[str, float]:
     return {loss: float(np.mean(found)) for loss, found in errors.items()}
 
 
-def table(found: dict[tuple[str, int], Array]) -> str:
-    """Rules down, K across: rest mean / rest max / test mean, mm."""
-    lines = ["rule      " + "".join(f"{f'K = {k}':>20}" for k in COUNTS)]
-    for rule in RULES:
-        cells = ("/".join(f"{x:.3f}" for x in found[rule, k].mean(0)) for k in COUNTS)
-        lines.append(f"{rule:<10}" + "".join(f"{cell:>20}" for cell in cells))
-    return "\n".join(lines)
+def rows(found: dict[tuple[str, int], Array]) -> common.Rows:
+    """Errors of the poses that were not chosen and of the 20 test poses, mm."""
+    names = ("rest_mean_mm", "rest_max_mm", "test_mean_mm")
+    return [
+        common.row({"rule": rule, "k": k, "runs": len(each)}, names,
+                   each.mean(axis=0), ".4f")
+        for (rule, k), each in found.items()
+    ]  # fmt: skip
 
 
-def save(found: dict[tuple[str, int], Array], folder: pathlib.Path) -> None:
-    """errors.csv and errors.png."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "errors.csv").open("w", newline="") as file:
-        write = csv.writer(file).writerow
-        write(["rule", "k", "runs", "rest_mean_mm", "rest_max_mm", "test_mean_mm"])
-        for (rule, k), rows in found.items():
-            write([rule, k, len(rows), *(f"{x:.4f}" for x in rows.mean(axis=0))])
-    figure, axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")
-    for rule in RULES:
-        axes.plot(
-            COUNTS, [found[rule, k][:, 2].mean() for k in COUNTS], "o-", label=rule
-        )
-    axes.set(
-        xlabel="poses measured, K", ylabel="error on the 20 test poses, mean, mm",
-        xscale="log", yscale="log",
-    )  # fmt: skip
-    ticks = (0.1, 0.2, 0.3, 0.5, 0.8)
-    axes.set_yticks(ticks, [str(tick) for tick in ticks])
-    axes.set_yticks([], minor=True)
-    axes.set_xticks(COUNTS, [str(k) for k in COUNTS], minor=False)
-    axes.xaxis.minorticks_off()
+def draw(axes, rows: common.Rows) -> None:
+    """Error on the test poses against K."""
+    label = "error on the 20 test poses, mean, mm"
+    common.curves(axes, rows, "rule", "k", "test_mean_mm", label)
     axes.axhline(0.1549, color="grey", linestyle=":")
     axes.annotate("thesis, 1,000 poses", (COUNTS[-1], 0.157), ha="right", va="bottom")
-    axes.legend()
-    figure.savefig(folder / "errors.png", dpi=160)
+    plain_log(axes.yaxis)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="two sub-pools of sixty")
-    parser.add_argument(
-        "--out", type=pathlib.Path, default=HERE, help="folder to write"
-    )
-    options = parser.parse_args()
-    pools = 2 if options.quick else POOLS
-    found = study(pools, draws=10)
-    save(found, options.out)
-    print("rest mean / rest max / test mean, mm")
-    print(table(found))
+def more(found: dict[tuple[str, int], Array]) -> None:
+    """What ur5.md says beside the table."""
+    pools = len(found["I", 8])
     for k in (8, 20):
         error = found["I", k].std(axis=0) / np.sqrt(pools)
         print(f"I, K = {k}: standard errors", "/".join(f"{x:.4f}" for x in error))
         first = found["I", k][:20].mean(axis=0)
         print("  first 20 sub-pools", "/".join(f"{x:.3f}" for x in first))
-    best, random = found["I", 8], found["random", 8]
-    share = np.mean(random[:, 0] < best[:, 0].mean())
+    share = np.mean(found["random", 8][:, 0] < found["I", 8][:, 0].mean())
     print(f"random draws better than I at K = 8: {100 * share:.1f} %")
     print(f"test mean by prior, K = {', '.join(map(str, COUNTS[2:]))}:")
     for name, row in priors(pools).items():
         print(f"  {name:<24}" + "".join(f"{value:8.3f}" for value in row))
     means = outliers(pools)
-    print(
-        "one of 12 poses 5 mm off:", ", ".join(f"{k} {v:.3f}" for k, v in means.items())
-    )
+    values = ", ".join(f"{k} {v:.3f}" for k, v in means.items())
+    print("one of 12 poses 5 mm off:", values)
 
 
 if __name__ == "__main__":
-    main()
+    more(common.main(sys.modules[__name__]))

@@ -1,7 +1,7 @@
 """Calibrate a six-axis force sensor with 18 of 100 loads, against known truth.
 
-    python examples/force_sensor/force_sensor.py            # table, errors.csv and .png
-    python examples/force_sensor/force_sensor.py --quick    # fewer sensors and draws
+    python examples/force_sensor.py           # 40 sensors
+    python examples/force_sensor.py --full    # 1,000
 
 Six readings answer to a wrench, ``y = C f + b``: a 6 x 6 matrix with crosstalk and six
 zeros, 42 parameters. A wrench is made by hanging a weight on a cross that is bolted to
@@ -10,17 +10,15 @@ the sensor, with the sensor mounted upright or on one of its sides.
 
 from __future__ import annotations
 
-import argparse
-import csv
 import itertools
-import pathlib
+import sys
 
+import common
 import numpy as np
 from numpy.typing import NDArray
 
 import jaxcal
 
-HERE = pathlib.Path(__file__).parent
 Array = NDArray[np.float64]
 
 AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
@@ -77,8 +75,9 @@ def sensor(rng: np.random.Generator) -> tuple[Array, Array]:
     return FULL_SCALE * (np.eye(6) + crosstalk) / RATED, rng.normal(0.0, 100.0, 6)
 
 
-def study(sensors: int, draws: int) -> dict[str, Array]:
+def study(full: bool) -> dict[str, Array]:
     """Rule to (runs, 3): error of C, and of measured forces and torques, % of rated."""
+    sensors, draws = (1000, 100) if full else (40, 10)
     loads, _ = wrenches()
     used = region(1)
     found = {}
@@ -102,54 +101,24 @@ def study(sensors: int, draws: int) -> dict[str, Array]:
     return found
 
 
-def table(found: dict[str, Array]) -> str:
-    """Markdown: root mean square over the sensors, and against one axis at a time."""
-    base = np.sqrt((found["one axis at a time"] ** 2).mean(axis=0))
-    lines = [
-        "| loads | C | forces | torques | forces, relative |",
-        "|---|---|---|---|---|",
-    ]
-    for rule in RULES:
-        rms = np.sqrt((found[rule] ** 2).mean(axis=0))
-        cells = " | ".join(f"{x:.4f}" for x in rms)
-        lines.append(f"| {rule} | {cells} | {rms[1] / base[1]:.2f} |")
-    return "\n".join(lines)
+def rows(found: dict[str, Array]) -> common.Rows:
+    """Root mean square over the sensors; forces also against one axis at a time."""
+    names = ("matrix_percent", "force_percent", "torque_percent", "forces_relative")
+    base = common.rms(found["one axis at a time"])[1]
+    errors = {rule: common.rms(each) for rule, each in found.items()}
+    return [
+        common.row({"loads": rule, "sensors": len(found[rule])}, names,
+                   [*each, each[1] / base], ".4f")
+        for rule, each in errors.items()
+    ]  # fmt: skip
 
 
-def save(found: dict[str, Array], folder: pathlib.Path) -> None:
-    """errors.csv and errors.png."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "errors.csv").open("w", newline="") as file:
-        write = csv.writer(file).writerow
-        write(["loads", "sensors", "matrix_percent", "force_percent", "torque_percent"])
-        for rule, rows in found.items():
-            rms = np.sqrt((rows**2).mean(axis=0))
-            write([rule, len(rows), *(f"{x:.5f}" for x in rms)])
-    figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
-    errors = [found[rule][:, 1] for rule in RULES]
-    axes.boxplot(errors, whis=(5, 95), showfliers=False)
-    axes.set_xticks(range(1, len(RULES) + 1), RULES, rotation=20)
-    axes.set(ylabel="error of measured forces, % of rated", yscale="log")
-    figure.savefig(folder / "errors.png", dpi=160)
-
-
-def main(arguments: list[str] | None = None) -> dict[str, Array]:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="40 sensors, not 1,000")
-    parser.add_argument(
-        "--out", type=pathlib.Path, default=HERE, help="folder to write"
-    )
-    options = parser.parse_args(arguments)
-    found = study(*((40, 10) if options.quick else (1000, 100)))
-    save(found, options.out)
-    print(table(found))
-    return found
+def draw(axes, rows: common.Rows) -> None:
+    """Error of the measured forces."""
+    label = "error of measured forces, % of rated"
+    common.bars(axes, rows, "loads", "force_percent", label)
+    axes.set_yscale("log")
 
 
 if __name__ == "__main__":
-    main()
+    common.main(sys.modules[__name__])

@@ -1,7 +1,7 @@
 """Calibrate a camera from 10 of 60 views of a board, against known truth.
 
-    python examples/camera/camera.py            # table, errors.csv and errors.png
-    python examples/camera/camera.py --quick    # fewer cameras
+    python examples/camera.py           # 24 cameras
+    python examples/camera.py --full    # 100
 
 Focal lengths, principal point and two terms of radial distortion are wanted. Where the
 board stood in each view is not known well: its pose is six commands of the model with
@@ -11,10 +11,9 @@ identification finds the ten poses with the six intrinsic parameters.
 
 from __future__ import annotations
 
-import argparse
-import csv
-import pathlib
+import sys
 
+import common
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,6 @@ from numpy.typing import NDArray
 import jaxcal
 from jaxcal.models import FromJax
 
-HERE = pathlib.Path(__file__).parent
 Array = NDArray[np.float64]
 
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2")
@@ -104,10 +102,10 @@ def choose(rule: str, poses: Array, pixels: Array, seed: int) -> NDArray[np.int6
     ).indices
 
 
-def study(cameras: int) -> dict[str, Array]:
+def study(full: bool) -> dict[str, Array]:
     """Rule to (cameras, 4): errors of fx, fy, centre, and of held-out pixels."""
     found: dict[str, list[list[float]]] = {rule: [] for rule in RULES}
-    for seed in range(cameras):
+    for seed in range(100 if full else 24):
         rng = np.random.default_rng(seed)
         theta = NOMINAL + rng.normal(size=6) * [20.0, 20.0, 10.0, 10.0, 0.05, 0.02]
         true = views(rng, VIEWS, theta)
@@ -128,51 +126,23 @@ def study(cameras: int) -> dict[str, Array]:
     return {rule: np.array(rows) for rule, rows in found.items()}
 
 
-def table(found: dict[str, Array]) -> str:
-    """Markdown: root mean square over the cameras, pixels."""
-    lines = ["| views | fx | fy | centre | held-out pixels |", "|---|---|---|---|---|"]
-    for rule in RULES:
-        rms = np.sqrt((found[rule] ** 2).mean(axis=0))
-        lines.append(f"| {rule} | " + " | ".join(f"{x:.3f}" for x in rms) + " |")
-    return "\n".join(lines)
+def rows(found: dict[str, Array]) -> common.Rows:
+    """Root mean square over the cameras, pixels."""
+    names = ("fx_px", "fy_px", "centre_px", "held_out_px")
+    return [
+        common.row({"views": rule, "cameras": len(e)}, names, common.rms(e), ".4f")
+        for rule, e in found.items()
+    ]
 
 
-def save(found: dict[str, Array], folder: pathlib.Path) -> None:
-    """errors.csv and errors.png."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "errors.csv").open("w", newline="") as file:
-        write = csv.writer(file).writerow
-        write(["views", "cameras", "fx_px", "fy_px", "centre_px", "held_out_px"])
-        for rule, rows in found.items():
-            rms = np.sqrt((rows**2).mean(axis=0))
-            write([rule, len(rows), *(f"{x:.4f}" for x in rms)])
-    figure, axes = plt.subplots(1, 2, figsize=(7.4, 3.6), layout="constrained")
-    for axis, column, label in zip(
-        axes, (0, 3), ("error of fx, pixels", "held-out pixels, error"), strict=True
-    ):
-        axis.boxplot([found[rule][:, column] for rule in RULES], whis=(5, 95))
-        axis.set_xticks(range(1, len(RULES) + 1), RULES, rotation=20)
-        axis.set(ylabel=label, ylim=(0.0, None))
-    figure.savefig(folder / "errors.png", dpi=160)
+PANELS = 2
 
 
-def main(arguments: list[str] | None = None) -> dict[str, Array]:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="24 cameras, not 100")
-    parser.add_argument(
-        "--out", type=pathlib.Path, default=HERE, help="folder to write"
-    )
-    options = parser.parse_args(arguments)
-    found = study(24 if options.quick else 100)
-    save(found, options.out)
-    print(table(found))
-    return found
+def draw(axes, rows: common.Rows) -> None:
+    """Errors of the focal length and of held-out pixels."""
+    common.bars(axes[0], rows, "views", "fx_px", "error of fx, pixels")
+    common.bars(axes[1], rows, "views", "held_out_px", "held-out pixels, error")
 
 
 if __name__ == "__main__":
-    main()
+    common.main(sys.modules[__name__])

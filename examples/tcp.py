@@ -1,26 +1,24 @@
 """Standard error at the tool of 90 arms: poses chosen by criterion or by an expert.
 
-    python examples/tcp/tcp.py            # table, errors.csv and errors.png
-    python examples/tcp/tcp.py --quick    # 6 arms instead of 90
+    python examples/tcp.py           # 6 arms
+    python examples/tcp.py --full    # 90
 
 After Jost, Kudruss, Koerkel and Walter (Journal of Mathematics in Industry 7:9, 2017),
 who chose poses for the precision at the tool centre point (TCP) of three KUKA arms and
-90 notional ones. README.md says where this differs.
+90 notional ones. tcp.md says where this differs.
 """
 
 from __future__ import annotations
 
-import argparse
-import csv
-import pathlib
+import sys
 
+import common
 import numpy as np
 from numpy.typing import NDArray
 
 import jaxcal
 from jaxcal.models import SerialChain
 
-HERE = pathlib.Path(__file__).parent
 Array = NDArray[np.float64]
 
 # About the size of a KR 6, a KR 16 and a KR 210: a1, a2, a3, d1, d4, d6 in mm.
@@ -116,10 +114,10 @@ def choose(rule: str, model: SerialChain, offered: Array, used: Array) -> Array:
     return offered[found.indices]
 
 
-def study(arms: int) -> dict[str, Array]:
+def study(full: bool) -> dict[str, Array]:
     """Rule to (arms, 2): standard error and true error at the TCP in the cell, mm."""
     found: dict[str, list[tuple[float, float]]] = {rule: [] for rule in RULES}
-    for number in range(arms):
+    for number in range(90 if full else 6):
         rng = np.random.default_rng(number)
         model = arm(rng, number)
         offered = postures(rng, model, CANDIDATES, cell=False)
@@ -148,62 +146,29 @@ def lower(found: dict[str, Array], rule: str, than: str) -> Array:
     return 100.0 * (1.0 - found[rule][:, 0] / found[than][:, 0])
 
 
-def table(found: dict[str, Array]) -> str:
-    """Markdown: means over the arms in mm; I against each rule, percent."""
-    lines = [
-        "| poses | standard error | true error | I is lower by | 5 to 95 % of arms |",
-        "|---|---|---|---|---|",
-    ]
-    for rule in RULES:
-        standard, true = found[rule].mean(axis=0)
+def rows(found: dict[str, Array]) -> common.Rows:
+    """Means over the arms in mm; by how much I is lower, percent."""
+    names = (
+        "standard_error_mm",
+        "true_error_mm",
+        "lower_percent",
+        "lower_5",
+        "lower_95",
+    )
+    table = []
+    for rule, each in found.items():
         gain = lower(found, "I", rule)
-        least, most = np.percentile(gain, (5, 95))
-        against = f"{gain.mean():.0f} % | {least:.0f} to {most:.0f} %"
-        lines.append(
-            f"| {rule} | {standard:.4f} | {true:.4f} | "
-            + ("| |" if rule == "I" else f"{against} |")
-        )
-    return "\n".join(lines)
+        values = [*each.mean(axis=0), gain.mean(), *np.percentile(gain, (5, 95))]
+        cells = {"poses": rule, "arms": len(each)}
+        table.append(common.row(cells, names, values, ".4f"))
+    return table
 
 
-def save(found: dict[str, Array], folder: pathlib.Path) -> None:
-    """errors.csv and errors.png."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / "errors.csv").open("w", newline="") as file:
-        write = csv.writer(file).writerow
-        write(["poses", "arms", "standard_error_mm", "true_error_mm", "lower_percent"])
-        for rule, rows in found.items():
-            gain = lower(found, "I", rule).mean()
-            write([rule, len(rows), *(f"{x:.5f}" for x in rows.mean(0)), f"{gain:.2f}"])
-    figure, axes = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
-    others = RULES[:-1]
-    axes.boxplot(
-        [lower(found, "I", rule) for rule in others], tick_labels=others, whis=(5, 95)
-    )
-    axes.axhline(0.0, color="grey", linewidth=0.8)
-    axes.set(
-        xlabel="poses compared with", ylabel="standard error at the TCP with I, % lower"
-    )
-    figure.savefig(folder / "errors.png", dpi=160)
-
-
-def main(arguments: list[str] | None = None) -> dict[str, Array]:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--quick", action="store_true", help="6 arms instead of 90")
-    parser.add_argument(
-        "--out", type=pathlib.Path, default=HERE, help="folder to write"
-    )
-    options = parser.parse_args(arguments)
-    found = study(6 if options.quick else 90)
-    save(found, options.out)
-    print(table(found))
-    return found
+def draw(axes, rows: common.Rows) -> None:
+    """How much lower the standard error is with I."""
+    label = "standard error at the TCP with I, % lower"
+    common.bars(axes, rows[:-1], "poses", "lower_percent", label)
 
 
 if __name__ == "__main__":
-    main()
+    common.main(sys.modules[__name__])
