@@ -59,15 +59,11 @@ $(BENCH)/.ready: pyproject.toml constraints.txt constraints-bench.txt
 benchmark: $(BENCH)/.ready ## every benchmark with its peers: table, JSON, figures (26 to 40 minutes; ARGS="--only steps", "--quick")
 	$(BENCH)/bin/python -m benchmarks $(ARGS)
 
-$(VENV)/.docs: $(READY)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[all,dev,docs]'
-	@touch $@
+docs: $(READY) ## the documentation site in site/, strictly and without a network
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet $(ARGS)
 
-docs: $(VENV)/.docs ## the documentation site in site/, strictly and without a network
-	$(BIN)/mkdocs build --quiet $(ARGS)
-
-docs-serve: $(VENV)/.docs ## the site at http://127.0.0.1:8000, built again at each change
-	$(BIN)/mkdocs serve $(ARGS)
+docs-serve: $(READY) ## the site at http://127.0.0.1:8000, built again at each change
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve $(ARGS)
 
 release-check: $(READY) ## wheel and sdist in fresh environments of Python 3.11, 3.12, 3.13 (or ARGS="INTERPRETER...")
 	$(BIN)/python tests/release_check.py $(ARGS)

@@ -52,17 +52,14 @@ def fresh(python: str, package: str, folder: pathlib.Path) -> pathlib.Path:
     """A new environment with a package in it; its interpreter."""
     run(python, "-m", "venv", folder)
     interpreter = folder / "bin" / "python"
-    install = (
-        interpreter,
-        "-m",
-        "pip",
-        "install",
-        "-q",
-        "-c",
-        ROOT / "constraints.txt",
-    )
-    run(*install, package)
+    install(interpreter, package)
     return interpreter
+
+
+def install(interpreter: pathlib.Path, package: str) -> None:
+    """Into the interpreter's environment, by constraints.txt."""
+    pins = ("-c", ROOT / "constraints.txt")
+    run(interpreter, "-m", "pip", "install", "-q", *pins, package)
 
 
 def main(pythons: list[str]) -> int:
@@ -85,11 +82,9 @@ def main(pythons: list[str]) -> int:
             print(python, package.name + extra, run(interpreter, "-c", USE, cwd=folder))
             print(run(interpreter, "-m", "jaxcal", "doctor", cwd=folder))
             if extra:
-                run(interpreter, "-m", "pip", "install", "-q", "-c",
-                    ROOT / "constraints.txt", "mypy")  # fmt: skip
-                said = run(
-                    interpreter, "-m", "mypy", "--strict", "snippet.py", cwd=folder
-                )
+                install(interpreter, "mypy")
+                check = ("-m", "mypy", "--strict", "snippet.py")
+                said = run(interpreter, *check, cwd=folder)
                 if 'Revealed type is "builtins.bool"' not in said:
                     raise SystemExit(f"mypy does not see the types of jaxcal: {said}")
             shutil.rmtree(env)
