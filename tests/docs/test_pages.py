@@ -20,7 +20,7 @@ ROOT = pathlib.Path(__file__).parents[2]
 PAGES = sorted(
     [*ROOT.glob("docs/**/*.md"), *ROOT.glob("examples/*.md"), *ROOT.glob("*.md")]
 )
-SLOW = {"adaptive.md", "cost.md", "models.md", "README.md", "sequential.md", "arm.md"}
+QUICK = {"calibration.md", "datasets.md", "evaluation.md", "own_function.md"}
 RUN = {"candidates.md", "device.md"}  # their shell commands too are executed
 
 
@@ -31,8 +31,8 @@ def blocks(page: pathlib.Path) -> list[tuple[str, str]]:
 
 def commands(page: pathlib.Path) -> list[list[str]]:
     """Words of every command line, fenced or indented, without its comment."""
-    lines = [line for _, text in blocks(page) for line in text.splitlines()]
-    lines += re.findall(r"^    (\S.*)$", page.read_text(), re.M)
+    whole = page.read_text().replace("\\\n", " ")  # lines that go on
+    lines = [line.strip() for line in whole.splitlines()]
     starts = ("jaxcal ", "jaxcal-rig ", "python ", "make ")
     return [
         shlex.split(line, comments=True) for line in lines if line.startswith(starts)
@@ -45,7 +45,7 @@ def with_code() -> list:
     ]
     return [
         pytest.param(page, id=str(page.relative_to(ROOT)),
-                     marks=[pytest.mark.slow] if page.name in SLOW | RUN else [])
+                     marks=[] if page.name in QUICK else [pytest.mark.slow])
         for page in [*pages, ROOT / "docs" / "start" / "device.md"]
     ]  # fmt: skip
 
