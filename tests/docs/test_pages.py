@@ -32,7 +32,9 @@ def blocks(page: pathlib.Path) -> list[tuple[str, str]]:
 def commands(page: pathlib.Path) -> list[list[str]]:
     """Words of every command line, fenced or indented, without its comment."""
     whole = page.read_text().replace("\\\n", " ")  # lines that go on
-    lines = [line.strip() for line in whole.splitlines()]
+    fenced = re.findall(r"^```\w*\n(.*?)^```", whole, re.M | re.S)
+    lines = [line for text in fenced for line in text.splitlines()]
+    lines += re.findall(r"^    (\S.*)$", whole, re.M)
     starts = ("jaxcal ", "jaxcal-rig ", "python ", "make ")
     return [
         shlex.split(line, comments=True) for line in lines if line.startswith(starts)
@@ -107,7 +109,8 @@ def parse(words: list[str]) -> None:
     from jaxcal.commands.train_arguments import parser as train_parser
     from rig.arguments import make_parser
 
-    words = words[: next((i for i, w in enumerate(words) if w in "|>"), len(words))]
+    ends = [i for i, word in enumerate(words) if word in ("|", ">", "&&")]
+    words = words[: min(ends, default=len(words))]
     program, name, *rest = words
     if program == "jaxcal-rig":
         make_parser().parse_args([name, *rest])
