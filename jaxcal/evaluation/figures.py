@@ -18,7 +18,15 @@ from numpy.typing import NDArray
 from jaxcal.evaluation.parameters import parameter_names
 from jaxcal.evaluation.results import Evaluation, MethodResult, log_mean
 from jaxcal.plots import selection
-from jaxcal.plots.style import BLACK, COLOURS, GREY, boxes, legend_right, numbered
+from jaxcal.plots.style import (
+    BLACK,
+    COLOURS,
+    GREY,
+    boxes,
+    legend_below,
+    legend_right,
+    numbered,
+)
 from jaxcal.plots.style import panels as _panels
 
 __all__ = [
@@ -58,24 +66,22 @@ def evaluation_figures(evaluation: Evaluation) -> dict[str, Figure]:
 
 
 def first_selection(evaluation: Evaluation) -> Figure:
-    """Candidates of the first episode and what two methods chose of them."""
-    dataset = evaluation.dataset
-    points = dataset.candidates[0]
-    solid = dataset.num_inputs > 2
-    kind = {"subplot_kw": {"projection": "3d"}} if solid else {}
-    figure = Figure(figsize=(6.4, 5.0), layout="constrained")
-    axes = figure.subplots(**kind)
-    if dataset.num_inputs < 2:
+    """Candidates of the first episode and what two methods chose, in up to 3 planes."""
+    points = evaluation.dataset.candidates[0]
+    if points.shape[1] < 2:
         points = np.hstack([points, np.zeros_like(points)])
-    shown = [r for r in evaluation.results if r.method != "random"] or [
-        *evaluation.results
-    ]
-    for i, result in enumerate(shown[:: max(len(shown) - 1, 1)][:2]):
-        look = {key: numbered(i)[key] for key in ("color", "marker")}
-        label = _label(evaluation, result)
-        selection(axes, points, result.indices[0, 0], label=label, **look)
-    axes.set_title(_title(evaluation, "First episode"), fontsize=10)
-    axes.legend(frameon=False)
+    planes = list(itertools.combinations(range(min(points.shape[1], 3)), 2))
+    title = _title(evaluation, "First episode")
+    figure, panels = _panels((3.6 * len(planes), 3.9), title, (1, len(planes)))
+    found = [r for r in evaluation.results if r.method != "random"]
+    shown = (found or list(evaluation.results))[:: max(len(found) - 1, 1)][:2]
+    for axes, plane in zip(np.ravel(panels), planes, strict=True):
+        names = [f"command {i + 1}" for i in plane]
+        for i, result in enumerate(shown):
+            look = {key: numbered(i)[key] for key in ("color", "marker")}
+            label, indices = _label(evaluation, result), result.indices[0, 0]
+            selection(axes, points[:, plane], indices, names, label, **look)
+    legend_below(figure, figure.axes[0])
     return figure
 
 

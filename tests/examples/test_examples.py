@@ -61,6 +61,7 @@ def test_camera_views_beat_covering_the_image(tmp_path):
         assert rms(found["I"])[0] < rms(found[rule])[0]
 
 
+@pytest.mark.slow
 def test_camera_fit_is_the_joint_fit_of_all_poses():
     """Oracle: scipy's least squares over 6 + 6 x 10 unknowns and its own rotations."""
     example = load("camera")
@@ -90,6 +91,7 @@ def test_camera_fit_is_the_joint_fit_of_all_poses():
     np.testing.assert_allclose(fit.standard_errors, error, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_tcp_error_is_lower_with_i_on_every_arm(tmp_path):
     found, rows = quick("tcp", tmp_path)
     assert [row["poses"] for row in rows] == list(found)
