@@ -7,10 +7,10 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 
 .DEFAULT_GOAL := help
-.PHONY: help train checkpoint evaluate reproduce test test-all lint format benchmark clean
+.PHONY: help train checkpoint evaluate reproduce test test-all lint format benchmark docs docs-serve release-check clean
 
 help: ## this list
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
 
 $(READY): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "jaxcal needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 2; }
@@ -59,5 +59,14 @@ $(BENCH)/.ready: pyproject.toml constraints.txt constraints-bench.txt
 benchmark: $(BENCH)/.ready ## every benchmark with its peers: table, JSON, figures (26 to 40 minutes; ARGS="--only steps", "--quick")
 	$(BENCH)/bin/python -m benchmarks $(ARGS)
 
+docs: $(READY) ## the documentation site in site/, strictly and without a network
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet $(ARGS)
+
+docs-serve: $(READY) ## the site at http://127.0.0.1:8000, built again at each change
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve $(ARGS)
+
+release-check: $(READY) ## wheel and sdist in fresh environments of Python 3.11, 3.12, 3.13 (or ARGS="INTERPRETER...")
+	$(BIN)/python tests/release_check.py $(ARGS)
+
 clean: ## remove the virtual environment and caches
-	rm -rf $(VENV) $(BENCH) .cache .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(BENCH) site .cache .mypy_cache .ruff_cache .pytest_cache

@@ -18,7 +18,8 @@ import pathlib
 
 import numpy as np
 
-from jaxcal.plots.selection import pareto_figure
+from jaxcal import plots
+from jaxcal.plots.style import panels
 from jaxcal.selection import select
 from jaxcal.selection.fastest import (
     Motion,
@@ -124,7 +125,9 @@ def main() -> None:
                 f"the front in the mean, {np.max(above):.2%} at worst"
             )
     if arguments.figure:
-        pareto_figure(fronts).savefig(arguments.figure, dpi=150)
+        figure, axes = panels((6.4, 4.0))
+        plots.pareto(axes, fronts)
+        figure.savefig(arguments.figure, dpi=150)
         print(f"wrote {arguments.figure}")
 
 

@@ -224,11 +224,13 @@ class GaussianTask:
     def expected(
         self, belief: GaussianBelief, session: Session, options: Options
     ) -> tuple[jax.Array, jax.Array]:
+        """(A,) seconds and (A,) uses that each measurement is expected to take."""
         return options.seconds, jnp.ones_like(options.seconds)
 
     def log_likelihood(
         self, truth: jax.Array, design: jax.Array, outcome: jax.Array
     ) -> jax.Array:
+        """() log probability, or density, of an outcome."""
         white = self.whitening[design] @ (outcome - self.expected_outcomes[design])
         off = white - self.blocks[design] @ truth
         return self.log_scale[design] - 0.5 * (off @ off)

@@ -66,6 +66,7 @@ class GridBelief:
         outcome: jax.Array,
         key: jax.Array | None = None,
     ) -> GridBelief:
+        """The belief after a measurement."""
         weights = self.weights * task.likelihood[design, outcome]
         return GridBelief(weights / (weights.sum() + _SMALL))
 
@@ -84,6 +85,7 @@ class GridBelief:
         return jnp.arange(len(p)), p
 
     def entropy(self) -> jax.Array:
+        """() nats."""
         return -(self.weights * jnp.log(self.weights + _SMALL)).sum()
 
     def log_density(self, truth: jax.Array) -> jax.Array:
@@ -313,6 +315,7 @@ class GridTask:
         return (jax.random.uniform(key) >= below).sum().astype(jnp.int32)
 
     def spend(self, session: Session, design: jax.Array, outcome: jax.Array) -> Session:
+        """The session after a measurement."""
         took = self.travel[session.place, design] + self.extra[design, outcome]
         return Session(
             place=self.place_after[design, outcome],
@@ -324,6 +327,7 @@ class GridTask:
     def expected(
         self, belief: GridBelief, session: Session, options: Options
     ) -> tuple[jax.Array, jax.Array]:
+        """(A,) seconds and (A,) uses that each measurement is expected to take."""
         p = belief.predictive(self)
         uses = (p * self.uses).sum(axis=-1)
         return options.seconds + (p * self.extra).sum(axis=-1), uses
@@ -331,6 +335,7 @@ class GridTask:
     def log_likelihood(
         self, truth: jax.Array, design: jax.Array, outcome: jax.Array
     ) -> jax.Array:
+        """() log probability, or density, of an outcome."""
         return jnp.log(self.likelihood[design, outcome, truth] + _SMALL)
 
 

@@ -381,6 +381,7 @@ class ParticleTask:
         return self.model.sample(prediction, key)
 
     def spend(self, session: Session, design: Any, outcome: jax.Array) -> Session:
+        """The session after a measurement."""
         return Session(
             place=design,
             seconds=session.seconds - self.model.cost(session, design),
@@ -391,11 +392,13 @@ class ParticleTask:
     def expected(
         self, belief: ParticleBelief, session: Session, options: Options
     ) -> tuple[jax.Array, jax.Array]:
+        """(A,) seconds and (A,) uses that each measurement is expected to take."""
         return options.seconds, jnp.ones_like(options.seconds)
 
     def log_likelihood(
         self, truth: jax.Array, design: Any, outcome: jax.Array
     ) -> jax.Array:
+        """() log probability, or density, of an outcome."""
         return _log_likelihood(self.model, self.model.unknowns(truth), design, outcome)
 
 

@@ -10,7 +10,7 @@ import sys
 from jaxcal.arguments import Parser, refused
 from jaxcal.extras import MissingExtraError
 
-__all__ = ["main"]
+__all__ = ["COMMANDS", "main"]
 
 _HERE = {  # command: one line of help
     "select": "choose the few rows of a table worth measuring",
@@ -19,11 +19,13 @@ _HERE = {  # command: one line of help
     "identify": "fit y = A u + b, or a model, to measurements and save the calibration",
     "predict": "where a calibrated machine goes for given commands",
     "command": "what to command to reach given outputs",
+    "doctor": "versions, devices, caches, extras and ports, for a bug report",
 }
 _WHOLE = {  # commands that parse their own arguments
     "train": "train a policy (train.py)",
     "evaluate": "compare methods with the proven optimum (evaluate.py)",
 }
+COMMANDS = (*_HERE, *_WHOLE)
 _EPILOG = """\
 examples:
   jaxcal select candidates.csv -k 4                 the four rows to measure

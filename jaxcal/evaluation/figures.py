@@ -17,7 +17,16 @@ from numpy.typing import NDArray
 
 from jaxcal.evaluation.parameters import parameter_names
 from jaxcal.evaluation.results import Evaluation, MethodResult, log_mean
-from jaxcal.plots.style import BLACK, COLOURS, GREY, boxes, legend_right, numbered
+from jaxcal.plots import selection
+from jaxcal.plots.style import (
+    BLACK,
+    COLOURS,
+    GREY,
+    boxes,
+    legend_below,
+    legend_right,
+    numbered,
+)
 from jaxcal.plots.style import panels as _panels
 
 __all__ = [
@@ -26,6 +35,7 @@ __all__ = [
     "det_means",
     "det_per_episode",
     "evaluation_figures",
+    "first_selection",
     "gap_to_optimum",
     "variances",
 ]
@@ -42,10 +52,37 @@ _FIXED: dict[str, dict[str, Any]] = {  # the style of random and exact in every 
 
 def evaluation_figures(evaluation: Evaluation) -> dict[str, Figure]:
     """Every figure the evaluation holds data for, by file name without suffix."""
-    drawn = [det_per_episode, det_means, det_distributions, gap_to_optimum, best_so_far]
+    drawn = [
+        first_selection,
+        det_per_episode,
+        det_means,
+        det_distributions,
+        gap_to_optimum,
+        best_so_far,
+    ]
     if evaluation.dataset.measured is not None:
         drawn.append(parameter_variance)
     return {draw.__name__: draw(evaluation) for draw in drawn}
+
+
+def first_selection(evaluation: Evaluation) -> Figure:
+    """Candidates of the first episode and what two methods chose, in up to 3 planes."""
+    points = evaluation.dataset.candidates[0]
+    if points.shape[1] < 2:
+        points = np.hstack([points, np.zeros_like(points)])
+    planes = list(itertools.combinations(range(min(points.shape[1], 3)), 2))
+    title = _title(evaluation, "First episode")
+    figure, panels = _panels((3.6 * len(planes), 3.9), title, (1, len(planes)))
+    found = [r for r in evaluation.results if r.method != "random"]
+    shown = (found or list(evaluation.results))[:: max(len(found) - 1, 1)][:2]
+    for axes, plane in zip(np.ravel(panels), planes, strict=True):
+        names = [f"command {i + 1}" for i in plane]
+        for i, result in enumerate(shown):
+            look = {key: numbered(i)[key] for key in ("color", "marker")}
+            label, indices = _label(evaluation, result), result.indices[0, 0]
+            selection(axes, points[:, plane], indices, names, label, **look)
+    legend_below(figure, figure.axes[0])
+    return figure
 
 
 def det_per_episode(evaluation: Evaluation) -> Figure:

@@ -88,4 +88,5 @@ class Affine:
         return Prior(np.inf)
 
     def to_dict(self) -> dict[str, Any]:
+        """What a file holds of the model."""
         return {"kind": "affine", **dataclasses.asdict(self)}

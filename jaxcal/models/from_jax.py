@@ -64,6 +64,7 @@ class FromJax:
 
     @property
     def num_inputs(self) -> int:
+        """n."""
         if self._num_inputs is None:
             raise ValueError(
                 "num_inputs of this model is not known before its first commands: "
@@ -73,6 +74,7 @@ class FromJax:
 
     @property
     def num_outputs(self) -> int:
+        """m; 0 before the first commands."""
         return self._num_outputs if self.num_inputs else 0
 
     def predict(

@@ -1,5 +1,20 @@
-"""Figures: the style that all share, and those of a selection (``plots.selection``)."""
+"""Pictures of selections and calibrations: matplotlib axes in, the same axes out.
 
+``figure, axes = matplotlib.pyplot.subplots()``, then ``plots.selection(axes, ...)``.
+"""
+
+from jaxcal.plots.curves import against_count, pareto, plan
+from jaxcal.plots.errors import before_after, residuals
+from jaxcal.plots.scatter import ellipsoid, selection
 from jaxcal.plots.style import as_bytes
 
-__all__ = ["as_bytes"]
+__all__ = [
+    "against_count",
+    "as_bytes",
+    "before_after",
+    "ellipsoid",
+    "pareto",
+    "plan",
+    "residuals",
+    "selection",
+]

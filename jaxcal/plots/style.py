@@ -74,6 +74,11 @@ def numbered(index: int) -> dict[str, Any]:
     return {name: look[index % len(look)] for name, look in looks.items()}
 
 
+def points(index: int) -> dict[str, Any]:
+    """Colour and marker of points that no line joins, by their number."""
+    return numbered(index) | {"linestyle": "none", "markersize": 4}
+
+
 def band(axes: Any, x: Any, value: Any, low: Any, high: Any, **look: Any) -> None:
     """A curve (N,) with its interval shaded; ``look`` is that of the curve."""
     axes.fill_between(x, low, high, color=look["color"], alpha=0.25, linewidth=0)

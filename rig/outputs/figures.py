@@ -37,17 +37,13 @@ def drawn(
 
 def errors(figure: Any, summary: Record) -> None:
     """Errors at held-out targets, raw beside compensated."""
-    axes = figure.subplots(1, 2, sharex=True)
-    for axis, key, title in zip(
-        axes, ("before", "after"), ("raw", "compensated"), strict=True
-    ):
-        each = np.array(summary[key]["each"])
-        axis.axhline(0.0, color="#9aa5b1", linewidth=0.8)
-        places = np.arange(3) + np.linspace(-0.15, 0.15, len(each))[:, None]
-        axis.plot(places, each, "o")
-        axis.set_xticks(range(3), AXIS_NAMES)
-        axis.set_ylabel("measured - desired [deg]")
-        axis.set_title(f"{title}: {summary[key]['rms']:.4f} deg rms")
+    from jaxcal import plots
+
+    axes = figure.subplots(1, 2)
+    shown = (("raw", "before", "#D55E00"), ("compensated", "after", "#0072B2"))
+    for axis, (title, key, colour) in zip(axes, shown, strict=True):
+        each = {title: summary[key]["each"]}
+        plots.before_after(axis, each, AXIS_NAMES, "deg", color=colour)
 
 
 def postures(figure: Any, records: list[Record]) -> None:
@@ -66,13 +62,14 @@ def postures(figure: Any, records: list[Record]) -> None:
 
 def readings(figure: Any, off: list[Array]) -> None:
     """(samples, 3) of each posture about its mean, one after another."""
-    ends = np.cumsum([len(values) for values in off])
+    from jaxcal import plots
+
     axes = figure.subplots(3, 1, sharex=True)
-    for column, (axis, name) in enumerate(zip(axes, AXIS_NAMES, strict=True)):
-        for values, end in zip(off, ends, strict=True):
-            place = np.arange(end - len(values), end)
-            axis.plot(place, values[:, column], ".", markersize=2)
-        axis.set_ylabel(f"{name} [deg]")
+    for axis, name, column in zip(axes, AXIS_NAMES, np.vstack(off).T, strict=True):
+        plots.residuals(axis, column, markersize=2)
+        axis.set(ylabel=f"{name} [deg]", xlabel="")
+        for end in np.cumsum([len(values) for values in off])[:-1]:
+            axis.axvline(end + 0.5, color="#E6E6E6", linewidth=0.8)
     axes[-1].set_xlabel("reading, posture by posture, less the posture's mean")
 
 

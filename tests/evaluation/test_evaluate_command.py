@@ -125,7 +125,7 @@ def test_the_report_is_one_page_and_figures(
         f"{pathlib.Path(name).stem}.svg" for name in names if name.endswith(".png")
     }
     page = (tmp_path / "report" / "index.html").read_text()
-    assert page.count("<img") == 7 and "dataset3" in page
+    assert page.count("<img") == 8 and "dataset3" in page
 
 
 def test_baselines_load_no_jax() -> None:

@@ -400,6 +400,7 @@ def test_the_json_has_an_entry_for_each_checkpoint(shown: Evaluation) -> None:
 def test_figures_have_axes_units_and_legends(shown: Evaluation) -> None:
     drawn = evaluation_figures(shown)
     assert set(drawn) == {
+        "first_selection",
         "det_per_episode",
         "det_means",
         "det_distributions",
@@ -409,8 +410,10 @@ def test_figures_have_axes_units_and_legends(shown: Evaluation) -> None:
     }
     for name, figure in drawn.items():
         axes = figure.axes[0]
-        assert axes.get_title() and axes.get_xlabel(), name
-        has_names = axes.get_legend() is not None or len(axes.get_yticklabels()) > 2
+        assert axes.get_title() or figure.get_suptitle(), name
+        assert axes.get_xlabel(), name
+        named = axes.get_legend() is not None or figure.legends
+        has_names = named or len(axes.get_yticklabels()) > 2
         assert has_names, name
         assert texts_outside(figure) == [], name
     assert as_bytes(figure, "png").startswith(b"\x89PNG")

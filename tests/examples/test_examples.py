@@ -1,8 +1,9 @@
 """Each example runs in a few seconds and its claim holds against the known truth."""
 
 import csv
-import importlib.util
+import importlib
 import pathlib
+import sys
 
 import numpy as np
 import pytest
@@ -14,18 +15,19 @@ import jaxcal
 EXAMPLES = pathlib.Path(__file__).parents[2] / "examples"
 
 
+sys.path.insert(0, str(EXAMPLES))
+import common
+
+
 def load(name):
-    spec = importlib.util.spec_from_file_location(name, EXAMPLES / name / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return importlib.import_module(name)
 
 
 def quick(name, folder):
     """What a quick run found, and the rows that it wrote."""
-    found = load(name).main(["--quick", "--out", str(folder)])
-    assert (folder / "errors.png").stat().st_size > 5_000
-    with (folder / "errors.csv").open(newline="") as file:
+    found = common.main(load(name), ["--out", str(folder)])
+    assert (folder / f"{name}.png").stat().st_size > 5_000
+    with (folder / f"{name}.csv").open(newline="") as file:
         return found, list(csv.DictReader(file))
 
 
@@ -59,6 +61,7 @@ def test_camera_views_beat_covering_the_image(tmp_path):
         assert rms(found["I"])[0] < rms(found[rule])[0]
 
 
+@pytest.mark.slow
 def test_camera_fit_is_the_joint_fit_of_all_poses():
     """Oracle: scipy's least squares over 6 + 6 x 10 unknowns and its own rotations."""
     example = load("camera")
@@ -88,6 +91,7 @@ def test_camera_fit_is_the_joint_fit_of_all_poses():
     np.testing.assert_allclose(fit.standard_errors, error, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_tcp_error_is_lower_with_i_on_every_arm(tmp_path):
     found, rows = quick("tcp", tmp_path)
     assert [row["poses"] for row in rows] == list(found)
@@ -109,3 +113,35 @@ def test_triad_needs_no_better_than_the_textbook_but_four_will_do(tmp_path):
     assert 0.95 < example.efficiency(180.0) <= 1.0
     # six positions: the bias is a mean of six readings of each axis
     assert rms(found["any", 6, "textbook"])[0] == pytest.approx(1 / 6**0.5, rel=0.2)
+
+
+@pytest.mark.slow
+def test_the_ankle_session_leaves_a_hundredth_of_the_error(tmp_path):
+    found, rows = quick("ankle", tmp_path)
+    assert len(rows) == 8
+    assert found["after"]["rms"] < 0.01 * found["before"]["rms"]
+
+
+def test_chosen_baths_beat_evenly_spaced_ones_at_every_temperature(tmp_path):
+    found, _ = quick("own_function", tmp_path)
+    assert (rms(found["selected"]) < rms(found["evenly spaced"])).all()
+
+
+@pytest.mark.slow
+def test_two_chosen_postures_find_the_backlash_better_than_two_in_order(tmp_path):
+    found, _ = quick("backlash", tmp_path)
+    assert rms(found["chosen"])[1] < 0.7 * rms(found["in order"])[1]
+    assert rms(found["chosen"])[-1] < 0.04
+
+
+@pytest.mark.slow
+def test_a_policy_trained_on_its_own_postures_beats_greedy():
+    found = load("own_policy").study(False, episodes=20_000)
+    assert (found["own policy"] <= 1.0 + 1e-9).all()
+    assert found["own policy"].mean() > found["greedy"].mean()
+
+
+@pytest.mark.parametrize("name", common.NAMES)
+def test_the_picture_of_the_page_is_drawn_from_its_table(name):
+    (EXAMPLES / f"{name}.md").read_text()
+    assert common.picture(name).axes

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import pathlib
+import sys
 
 import numpy as np
 import pytest
 
-FILE = pathlib.Path(__file__).parents[2] / "examples" / "ur5" / "ur5.py"
+sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "examples"))
 
 
 @pytest.fixture(scope="module")
 def ur5():
-    spec = importlib.util.spec_from_file_location("ur5_example", FILE)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return importlib.import_module("ur5")
 
 
 def test_eight_chosen_poses_do_what_the_thesis_needed_a_thousand_for(ur5, monkeypatch):
     monkeypatch.setattr(ur5, "RULES", ("random", "I"))
     monkeypatch.setattr(ur5, "COUNTS", (8,))
-    found = ur5.study(pools=4, draws=4)
+    found = ur5.study(full=False)
     chosen, random = found["I", 8].mean(axis=0), found["random", 8].mean(axis=0)
     assert chosen[2] < 0.18 < random[2]
     assert (chosen < random).all()

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 
 import jaxcal
+from jaxcal import plots
 from jaxcal.information.regression import log_det_gram
 from jaxcal.models import Affine, Noise, Polynomial, SerialChain
-from jaxcal.plots.selection import pareto_figure
 from jaxcal.selection.fastest import (
     Motion,
     fastest_tour,
@@ -233,7 +234,7 @@ def test_out_of_time_is_said(rng):
 
 def test_the_figure_holds_every_point(rng):
     front = pareto_front(rng.uniform(-20, 20, (10, 3)), 4, motion=MOTION)
-    axes = pareto_figure({"K = 4": front}).axes[0]
+    axes = plots.pareto(Figure().add_subplot(), {"K = 4": front})
     assert len(axes.lines[0].get_xdata()) == len(front.points)
     assert "efficiency" in axes.get_xlabel()
     assert "(s)" in axes.get_ylabel()

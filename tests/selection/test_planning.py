@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 
 import jaxcal
+from jaxcal import plots
 from jaxcal.information.criteria import criteria
 from jaxcal.models import Affine, Noise, Polynomial, Prior, SerialChain
-from jaxcal.plots.selection import plan_figure
 from jaxcal.selection.plan import plan
 
 
@@ -238,7 +239,7 @@ def test_the_table_and_the_figure_show_every_row(rng):
     assert str(found) == found.table()
     assert len(lines) == len(found.rows) + 3
     assert sum(line.endswith("<-") for line in lines) == 1
-    axes = plan_figure(found).axes[0]
+    axes = plots.plan(Figure().add_subplot(), found)
     assert len(axes.lines[0].get_xdata()) == len(found.rows)
     assert "standard error" in axes.get_ylabel()
 

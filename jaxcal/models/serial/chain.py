@@ -163,6 +163,7 @@ class SerialChain(Arm):
 
     @property
     def num_parameters(self) -> int:
+        """p."""
         return len(self.names)
 
     @functools.cached_property
@@ -257,6 +258,7 @@ class SerialChain(Arm):
         )
 
     def to_dict(self) -> dict[str, Any]:
+        """What a file holds of the model."""
         data = dataclasses.asdict(self)
         for name in ("table", "base", "tool"):
             data[name] = data[name].tolist()

@@ -17,6 +17,7 @@ from jaxcal.paper.exhibits.devices import Device
 from jaxcal.paper.exhibits.exhibit import Exhibit, from_rows
 from jaxcal.paper.exhibits.intervals import share_interval
 from jaxcal.paper.exhibits.material import Material, commands_deg
+from jaxcal.plots import ellipsoid
 from jaxcal.plots.style import BLACK, COLOURS, GREY, legend_below, panels
 
 __all__ = ["exhibits"]
@@ -93,16 +94,14 @@ def _ellipses(
     names = (*PITCH_ROW[:3], "bx (°)")
     title = "95 % error ellipses of the pitch row of A and b (+: set values)"
     figure, axes = panels((10.0, 3.6), title, (1, 3))
-    turn = np.linspace(0.0, 2.0 * np.pi, 200)
-    circle = np.sqrt(stats.chi2.ppf(0.95, 2)) * np.stack([np.cos(turn), np.sin(turn)])
+    scale = np.sqrt(stats.chi2.ppf(0.95, 2))
     dots = {"linestyle": "none", "marker": ".", "markersize": 2.5, "color": COLOURS[5]}
     for each, pair in zip(axes, ([0, 1], [1, 2], [0, 3]), strict=True):
         each.plot(*estimates[:, pair].T, label="simulated, policy", **dots)
         for label, matrix in covariance.items():
             colour, line = LOOKS[label]
-            root = np.linalg.cholesky(matrix[np.ix_(pair, pair)])
-            ring = centre[pair, None] + root @ circle
-            each.plot(*ring, color=colour, linestyle=line, label=label)
+            look = {"color": colour, "linestyle": line, "label": label}
+            ellipsoid(each, centre[pair], matrix[np.ix_(pair, pair)], scale, **look)
         each.plot(*centre[pair], marker="+", color=BLACK, markersize=8)
         each.set(xlabel=names[pair[0]], ylabel=names[pair[1]])
         each.locator_params(nbins=5)

@@ -1,0 +1,97 @@
+"""Curves against the number of measurements, and against time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from matplotlib.ticker import MaxNLocator
+from numpy.typing import ArrayLike
+
+from jaxcal.plots.style import BLACK, COLOURS, GREY, MARKERS, numbered, plain_axes
+
+__all__ = ["against_count", "pareto", "plan"]
+
+
+def against_count(
+    axes: Any, counts: Sequence[int], values: dict[str, ArrayLike], label: str = ""
+) -> Any:
+    """A criterion or an error against the number of measurements K.
+
+    Args:
+        axes: matplotlib axes.
+        counts: values of K.
+        values: label of a curve to one value for each K.
+        label: of the vertical axis.
+
+    Returns:
+        ``axes``.
+    """
+    for i, (name, each) in enumerate(values.items()):
+        axes.plot(counts, each, label=name, markersize=4, **numbered(i))
+    axes.set(xlabel="number of measurements K", ylabel=label)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.legend(frameon=False)
+    plain_axes(axes)
+    return axes
+
+
+def pareto(axes: Any, fronts: dict[str, Any]) -> Any:
+    """Time against efficiency; filled markers are proven, hollow ones are not.
+
+    Args:
+        axes: matplotlib axes.
+        fronts: ``ParetoFront`` by the name to show.
+
+    Returns:
+        ``axes``.
+    """
+    for i, (name, front) in enumerate(fronts.items()):
+        colour = COLOURS[i % len(COLOURS)]
+        axes.plot(
+            [point.efficiency for point in front.points],
+            [point.seconds for point in front.points],
+            drawstyle="steps-pre",
+            color=colour,
+            linewidth=1.0,
+            marker=MARKERS[i % len(MARKERS)],
+            markersize=5,
+            markerfacecolor=colour if front.proven else "white",
+            label=name + ("" if front.proven else " (not proven)"),
+        )
+    axes.set_xlabel("D-efficiency against the optimum")
+    axes.set_ylabel("time of the run (s): travel and settling")
+    axes.legend(frameon=False)
+    plain_axes(axes)
+    return axes
+
+
+def plan(axes: Any, plan: Any) -> Any:
+    """Accuracy against K: the designs, what no design beats, and the target.
+
+    Args:
+        axes: matplotlib axes.
+        plan: a ``Plan``; the output that is furthest from its target is drawn.
+
+    Returns:
+        ``axes``.
+    """
+    series = (
+        ("standard_error", "design found", MARKERS[0], "-", COLOURS[0]),
+        ("d_optimal_error", "D-optimal selection", MARKERS[1], "--", COLOURS[1]),
+        ("least_error", "no design below", "", ":", GREY),
+    )
+    ks = [row.k for row in plan.rows]
+    for field, label, marker, style, colour in series:
+        values = [plan.worst(getattr(row, field)) for row in plan.rows]
+        axes.plot(ks, values, marker=marker, linestyle=style, color=colour, label=label)
+    target = plan.target_accuracy[plan.hardest_output]
+    axes.axhline(target, color=BLACK, linewidth=0.8, label="target")
+    axes.axvline(plan.k, color=BLACK, linewidth=0.8, linestyle=":")
+    axes.set_xlabel("number of measurements K")
+    axes.set_ylabel(f"{plan.summary} standard error of a prediction (measured unit)")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_ylim(bottom=0.0)
+    axes.legend(frameon=False)
+    plain_axes(axes)
+    return axes

@@ -1,0 +1,84 @@
+"""Errors before and after a calibration, and residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxcal.plots.style import BLACK, plain_axes, points
+
+__all__ = ["before_after", "residuals"]
+
+
+def before_after(
+    axes: Any,
+    errors: dict[str, ArrayLike],
+    names: Sequence[str] = (),
+    unit: str = "",
+    **look: Any,
+) -> Any:
+    """Errors of each output side by side, such as raw and calibrated.
+
+    Args:
+        axes: matplotlib axes.
+        errors: label to (N, q) measured less desired.
+        names: q names of the outputs.
+        unit: of the errors.
+        look: passed on to ``plot``.
+
+    Returns:
+        ``axes``; the legend gives each root mean square.
+    """
+    axes.axhline(0.0, color=BLACK, linewidth=0.8)
+    places = np.linspace(-0.2, 0.2, len(errors)) if len(errors) > 1 else [0.0]
+    count = 0
+    for i, (label, values) in enumerate(errors.items()):
+        each = np.atleast_2d(np.asarray(values, dtype=np.float64))
+        count = each.shape[1]
+        spread = np.linspace(-0.07, 0.07, len(each))[:, None]
+        at = np.arange(count) + places[i] + spread
+        rms = np.sqrt(np.mean(each**2))
+        text = " ".join(f"{label}: {rms:.3g} {unit} rms".split())
+        axes.plot(at.ravel(), each.ravel(), label=text, **points(i) | look)
+    axes.set_xticks(range(count), names or [str(i + 1) for i in range(count)])
+    axes.set_ylabel(f"error ({unit})" if unit else "error")
+    axes.legend(frameon=False)
+    plain_axes(axes)
+    return axes
+
+
+def residuals(
+    axes: Any,
+    values: ArrayLike,
+    names: Sequence[str] = (),
+    unit: str = "",
+    **look: Any,
+) -> Any:
+    """Measured less fitted, in the order of measurement.
+
+    Args:
+        axes: matplotlib axes.
+        values: (N, q) residuals, such as ``Calibration.residuals``.
+        names: q names of the outputs.
+        unit: of the residuals.
+        look: passed on to ``plot``.
+
+    Returns:
+        ``axes``.
+    """
+    each = np.asarray(values, dtype=np.float64)
+    each = each[:, None] if each.ndim == 1 else each
+    axes.axhline(0.0, color=BLACK, linewidth=0.8)
+    for i, column in enumerate(each.T):
+        label = names[i] if names else f"output {i + 1}"
+        places = np.arange(1, len(column) + 1)
+        axes.plot(places, column, label=label, **points(i) | look)
+    axes.set_xlabel("measurement")
+    axes.set_ylabel(f"measured - fitted ({unit})" if unit else "measured - fitted")
+    if each.shape[1] > 1:
+        axes.legend(frameon=False)
+    plain_axes(axes)
+    return axes

@@ -1,0 +1,122 @@
+"""Every code block of the site and of README runs, or is parsed by its command."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import pathlib
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+
+import jax
+import matplotlib
+import pytest
+
+ROOT = pathlib.Path(__file__).parents[2]
+PAGES = sorted(
+    [*ROOT.glob("docs/**/*.md"), *ROOT.glob("examples/*.md"), *ROOT.glob("*.md")]
+)
+QUICK = {"calibration.md", "datasets.md", "evaluation.md", "own_function.md"}
+RUN = {"candidates.md", "device.md"}  # their shell commands too are executed
+
+
+def blocks(page: pathlib.Path) -> list[tuple[str, str]]:
+    """(language, text) of each fenced block."""
+    return re.findall(r"^```(\w*)\n(.*?)^```", page.read_text(), re.M | re.S)
+
+
+def commands(page: pathlib.Path) -> list[list[str]]:
+    """Words of every command line, fenced or indented, without its comment."""
+    whole = page.read_text().replace("\\\n", " ")  # lines that go on
+    fenced = re.findall(r"^```\w*\n(.*?)^```", whole, re.M | re.S)
+    lines = [line for text in fenced for line in text.splitlines()]
+    lines += re.findall(r"^    (\S.*)$", whole, re.M)
+    starts = ("jaxcal ", "jaxcal-rig ", "python ", "make ")
+    return [
+        shlex.split(line, comments=True) for line in lines if line.startswith(starts)
+    ]
+
+
+def with_code() -> list:
+    pages = [
+        page for page in PAGES if any(lang == "python" for lang, _ in blocks(page))
+    ]
+    return [
+        pytest.param(page, id=str(page.relative_to(ROOT)),
+                     marks=[] if page.name in QUICK else [pytest.mark.slow])
+        for page in [*pages, ROOT / "docs" / "start" / "device.md"]
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("page", with_code())
+def test_the_blocks_of_a_page_run_in_their_order(page, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    matplotlib.use("Agg")
+    shutil.copytree(ROOT / "examples" / "ur5", tmp_path / "examples" / "ur5")
+    path = f"{pathlib.Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    names: dict[str, object] = {}
+    printed, shown = "", []
+    for language, text in blocks(page):
+        if language == "python":
+            out = io.StringIO()
+            with jax.numpy_rank_promotion("allow"), contextlib.redirect_stdout(out):
+                exec(compile(text, str(page), "exec"), names)
+            printed += out.getvalue()
+        elif language == "bash" and page.name in RUN:
+            done = subprocess.run(
+                ["bash", "-ec", text], env={**os.environ, "PATH": path},
+                capture_output=True, text=True, check=False,
+            )  # fmt: skip
+            assert done.returncode == 0, done.stdout + done.stderr
+        elif language == "text":
+            shown.append(text)
+    if page.name == "models.md":
+        assert shown == [printed]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_commands_of_a_page_parse(page, capsys):
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
+    for words in commands(page):
+        program, *rest = words
+        given = " ".join(words)
+        if program == "make":
+            assert {w for w in rest if "=" not in w} <= targets, given
+        elif program == "python" and rest[0] in ("-m", "-c"):
+            assert rest[0] == "-c" or importable(rest[1]), given
+        elif program == "python":
+            assert (ROOT / rest[0]).is_file(), given
+            if rest[0] in ("train.py", "evaluate.py"):
+                parse(["jaxcal", rest[0][:-3], *rest[1:]])
+        else:
+            parse(words)
+
+
+def importable(name: str) -> bool:
+    import importlib.util
+
+    return importlib.util.find_spec(name) is not None
+
+
+def parse(words: list[str]) -> None:
+    """Refused by exit code 2 where a flag or a value is wrong."""
+    from jaxcal.commands.evaluate_arguments import parser as evaluate_parser
+    from jaxcal.commands.main import _parser
+    from jaxcal.commands.train_arguments import parser as train_parser
+    from rig.arguments import make_parser
+
+    ends = [i for i, word in enumerate(words) if word in ("|", ">", "&&")]
+    words = words[: min(ends, default=len(words))]
+    program, name, *rest = words
+    if program == "jaxcal-rig":
+        make_parser().parse_args([name, *rest])
+    elif name in ("train", "evaluate"):
+        made = train_parser(name) if name == "train" else evaluate_parser(name, name)
+        if "--task" not in rest:
+            made.parse_args([word for word in rest if word != "--help"])
+    else:
+        _parser([name]).parse_args([name, *rest])

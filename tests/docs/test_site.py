@@ -1,0 +1,142 @@
+"""The site: every public name documented, every page in a browser, opened as files."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+import types
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parents[2]
+BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+SIZES = {"desktop": (1400, 900), "phone": (390, 844)}
+
+
+@pytest.fixture(scope="module")
+def hooks():
+    pytest.importorskip("mkdocs")
+    sys.path.insert(0, str(ROOT / "docs" / "tools"))
+    return importlib.import_module("hooks")
+
+
+def test_every_public_name_is_documented(hooks):
+    assert [name for each in hooks.PUBLIC for name in hooks.undocumented(each)] == []
+
+
+def test_a_public_name_without_a_docstring_is_found(hooks, monkeypatch):
+    module = types.ModuleType("bare", "A module.")
+
+    class Told:
+        """A class."""
+
+        def method(self): ...
+
+    module.function, module.Told = lambda: None, Told
+    module.__all__ = ["Told", "function"]
+    monkeypatch.setitem(sys.modules, "bare", module)
+    assert hooks.undocumented("bare") == ["bare.Told.method", "bare.function"]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    pytest.importorskip("mkdocs")
+    folder = tmp_path_factory.mktemp("site")
+    subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "-q", "-d", folder],
+        cwd=ROOT, check=True, env=os.environ | {"NO_MKDOCS_2_WARNING": "1"},
+    )  # fmt: skip
+    return folder
+
+
+@pytest.fixture
+def browser():
+    webdriver = pytest.importorskip("selenium.webdriver")
+    options = webdriver.ChromeOptions()
+    options.binary_location = BROWSER
+    for flag in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage"):
+        options.add_argument(flag)
+    driver = webdriver.Chrome(options, webdriver.ChromeService(DRIVER))
+    yield driver
+    driver.quit()
+
+
+PAGE = """
+const links = [...document.querySelectorAll("a[href]")].map(a => a.href);
+const images = [...document.images].filter(i => !(i.complete && i.naturalWidth));
+const loaded = performance.getEntriesByType("resource").map(e => e.name);
+return {
+  links, ids: [...document.querySelectorAll("[id]")].map(e => e.id),
+  broken: images.map(i => i.src), loaded,
+  wide: document.documentElement.scrollWidth - window.innerWidth,
+  colour: getComputedStyle(document.body).backgroundColor,
+};
+"""
+
+
+def brightness(colour: str) -> float:
+    red, green, blue = colour.partition("(")[2].rstrip(")").split(",")[:3]
+    return (float(red) + float(green) + float(blue)) / 765.0
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (BROWSER and DRIVER), reason="needs chromium and its driver")
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("size", SIZES)
+def test_every_page_and_link(site, browser, scheme, size):
+    browser.set_window_size(*SIZES[size])
+    feature = {"name": "prefers-color-scheme", "value": scheme}
+    width, height = SIZES[size]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [feature]})
+    browser.execute_cdp_cmd(
+        "Emulation.setDeviceMetricsOverride",
+        {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False},
+    )
+    todo, seen = [(site / "index.html").as_uri()], {}
+    while todo:
+        url = todo.pop()
+        browser.get(url)
+        page = seen[url] = browser.execute_script(PAGE)
+        assert not page["broken"], (url, page["broken"])
+        assert page["wide"] <= 0, (url, page["wide"])
+        outside = [name for name in page["loaded"] if name.startswith("http")]
+        assert not outside, (url, outside)
+        assert (brightness(page["colour"]) > 0.5) == (scheme == "light"), url
+        for link in page["links"]:
+            target = link.partition("#")[0]
+            if target.startswith("file:") and target not in {*seen, *todo}:
+                if target.endswith(".html"):
+                    todo.append(target)
+                else:
+                    assert (site / target.partition(site.name)[2][1:]).exists(), link
+    assert len(seen) >= 45
+    for url, page in seen.items():
+        for link in page["links"]:
+            target, _, fragment = link.partition("#")
+            if fragment and target in seen:
+                assert fragment in seen[target]["ids"] or fragment == "__skip", (
+                    url,
+                    link,
+                )
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (BROWSER and DRIVER), reason="needs chromium and its driver")
+def test_the_search_works_without_a_server(site, browser):
+    from selenium.webdriver.common.by import By
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    browser.set_window_size(1400, 900)
+    browser.get((site / "index.html").as_uri())
+    field = browser.find_element(By.CSS_SELECTOR, "input.md-search__input")
+    browser.execute_script("arguments[0].focus()", field)
+    field.send_keys("backlash")
+    place = ".md-search-result__item a"
+    found = WebDriverWait(browser, 60).until(
+        lambda _: browser.find_elements(By.CSS_SELECTOR, place)
+    )
+    assert any("backlash" in each.get_attribute("href") for each in found)

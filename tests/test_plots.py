@@ -1,0 +1,69 @@
+"""Pictures: axes in, the same axes out, and what is drawn is what was given."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from jaxcal import plots
+
+
+def test_an_ellipse_lies_at_its_mahalanobis_distance():
+    axes = Figure().add_subplot()
+    covariance, centre = np.array([[4.0, 1.0], [1.0, 2.0]]), np.array([1.0, -2.0])
+    assert plots.ellipsoid(axes, centre, covariance, 3.0) is axes
+    off = axes.lines[0].get_xydata() - centre
+    square = np.einsum("ni,ij,nj->n", off, np.linalg.inv(covariance), off)
+    np.testing.assert_allclose(square, 9.0)
+
+
+def test_an_ellipsoid_lies_at_its_mahalanobis_distance():
+    axes = Figure().add_subplot(projection="3d")
+    covariance = np.diag([4.0, 1.0, 9.0]) + 0.5
+    plots.ellipsoid(axes, np.zeros(3), covariance)
+    points = np.vstack(axes.collections[0]._segments3d)
+    inverse = np.linalg.inv(covariance)
+    square = np.einsum("ni,ij,nj->n", points, inverse, points)
+    np.testing.assert_allclose(square, 1.0)
+
+
+def test_a_selection_is_drawn_over_its_candidates_and_inside_its_ellipse(rng):
+    candidates = rng.random((20, 2))
+    axes = plots.selection(Figure().add_subplot(), candidates, [3, 5, 7], ("a", "b"))
+    every, chosen, ring = (line.get_xydata() for line in axes.lines)
+    np.testing.assert_array_equal(every, candidates)
+    np.testing.assert_array_equal(chosen, candidates[[3, 5, 7]])
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("a", "b")
+    # the ellipse of three points' scatter goes through them
+    for point in chosen:
+        assert np.linalg.norm(ring - point, axis=1).min() < 0.05
+
+
+def test_a_selection_in_a_line_has_no_ellipse():
+    axes = plots.selection(Figure().add_subplot(), np.eye(2).repeat(3, 0), [0, 3])
+    assert len(axes.lines) == 2
+
+
+def test_axes_of_three_dimensions_need_three_columns(rng):
+    axes = Figure().add_subplot(projection="3d")
+    with pytest.raises(ValueError, match=r"at least 3 columns .* \(5, 2\)"):
+        plots.selection(axes, rng.random((5, 2)), [0, 1])
+
+
+def test_errors_before_and_after_say_their_rms():
+    before, after = np.array([[3.0, -4.0]]), np.array([[0.0, 1.0]])
+    axes = plots.before_after(
+        Figure().add_subplot(), {"raw": before, "fitted": after}, ("x", "y"), "mm"
+    )
+    texts = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert texts == ["raw: 3.54 mm rms", "fitted: 0.707 mm rms"]
+    assert [t.get_text() for t in axes.get_xticklabels()] == ["x", "y"]
+
+
+def test_residuals_and_curves_hold_every_value(rng):
+    values = rng.normal(size=(6, 2))
+    axes = plots.residuals(Figure().add_subplot(), values, ("x", "y"))
+    np.testing.assert_array_equal(axes.lines[2].get_ydata(), values[:, 1])
+    axes = plots.against_count(Figure().add_subplot(), [4, 5], {"D": [1.0, 2.0]})
+    assert axes.lines[0].get_xydata().tolist() == [[4.0, 1.0], [5.0, 2.0]]
