@@ -89,7 +89,7 @@ class Misled:
 def tuned_on(task: GridTask, seed: int) -> Any:
     """The state rule, its constants tuned on another task."""
     return tune(
-        task, STATE_RULE, episodes=1024, generations=10, population=16, elite=4,
+        task, STATE_RULE, episodes=1024, generations=6, population=12, elite=4,
         seed=seed + 1,
     )  # fmt: skip
 
