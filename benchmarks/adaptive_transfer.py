@@ -1,11 +1,14 @@
 """One policy on tasks it was not trained on, and with a belief that is wrong.
 
     python benchmarks/adaptive_transfer.py [--checkpoint DIR] [--episodes 4096]
-        [--seed 0] [--parts small other wrong] [--small DIR] [--json FILE]
+        [--seed 0] [--parts small table other wrong] [--small DIR]
+        [--json FILE]
 
 small   KNEE with 10 cells and no noise, whose optimum dynamic programming finds: the
         share of it that the rules reach, the policy, and with --small a policy that
         was trained on it (docs/adaptive.md has the command).
+table   the optimum's table of nats by time and trips left as prices on KNEE itself,
+        less the state rule: what is simple and not learned.
 
 other   KNEE with another sigma, rho, slip, grid, number of joints or budget: the state
         rule with KNEE's constants, the state rule tuned on that task, and the policy.
@@ -19,6 +22,7 @@ Differences are in pairs, on the same sessions, with standard errors.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import pathlib
 import sys
@@ -29,10 +33,10 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxcal.adaptive.dynamic import solve
-from jaxcal.adaptive.grid import GridTask
+from jaxcal.adaptive.grid import GridBelief, GridTask
 from jaxcal.adaptive.play import compare
 from jaxcal.adaptive.policy import run
-from jaxcal.adaptive.rules import Gain, GainRate
+from jaxcal.adaptive.rules import Gain, GainRate, best
 from jaxcal.adaptive.tasks.knee import PRICED, STATE_RULE, knee
 from jaxcal.adaptive.tuning import tune
 from jaxcal.files import require_writable_folder, write_text
@@ -85,9 +89,59 @@ class Misled:
 def tuned_on(task: GridTask, seed: int) -> Any:
     """The state rule, its constants tuned on another task."""
     return tune(
-        task, STATE_RULE, episodes=1024, generations=10, population=16, elite=4,
+        task, STATE_RULE, episodes=1024, generations=6, population=12, elite=4,
         seed=seed + 1,
     )  # fmt: skip
+
+
+@struct.dataclass
+class Table:
+    """EIG, and what a table says of the time and trips that are left after it.
+
+    The table is of whole sessions: what is left counts by the share of the prior's
+    entropy that is still there, to a power.
+    """
+
+    values: jax.Array  # (ticks + 1, uses + 1) nats
+    tick: Any  # seconds
+    scale: Any
+    power: Any
+
+    def __call__(
+        self, task: Any, belief: Any, session: Any, options: Any, key: jax.Array
+    ) -> jax.Array:
+        seconds = session.seconds - options.seconds[:, None] - task.extra
+        uses = session.uses - task.uses
+        last, most = (length - 1 for length in self.values.shape)
+        at = jnp.clip(seconds / self.tick, 0, last)
+        low = jnp.minimum(at.astype(jnp.int32), last - 1)
+        kept = jnp.clip(uses, 0, most)
+        one, other = self.values[low, kept], self.values[low + 1, kept]
+        value = jnp.where(
+            (seconds > 0) & (uses > 0), one + (at - low) * (other - one), 0
+        )
+        share = belief.entropy() / GridBelief(task.prior).entropy()
+        later = (belief.predictive(task) * value).sum(-1)
+        scale = self.scale * jnp.maximum(share, 0.0) ** self.power
+        return best(belief.gains(task, options) + scale * later, options)
+
+
+def table(episodes: int, seed: int) -> list[dict[str, Any]]:
+    """KNEE by the small version's table."""
+    optimum = solve(knee(10, sigma=0.0, slip=0.0), 0.2)
+    values = jnp.asarray(optimum.values)
+    deciders: dict[str, Any] = {"state": STATE_RULE}
+    for scale, power in itertools.product((0.5, 0.7, 0.9, 1.1), (0.5, 1.0)):
+        name = f"scale {scale} power {power}"
+        deciders[name] = Table(values, optimum.tick, scale, power)
+    found = compare(arrays(knee()), arrays(deciders), episodes, seed)
+    rows = []
+    print(f"{'table':24}{'nats':>8}{'less state':>18}")
+    for name in found.names[1:]:
+        less = found.paired(name, "state")
+        rows.append({"table": name, "nats": found.mean(name), "less_state": less})
+        print(f"{name:24}{found.mean(name)[0]:8.3f}" + shown(less, 18), flush=True)
+    return rows
 
 
 def small(policies: dict[str, Any], episodes: int, seed: int) -> dict[str, Any]:
@@ -170,6 +224,9 @@ def shown(value: tuple[float, float], width: int) -> str:
 
 
 def arrays(tree: Any) -> Any:
+    """Numbers as arrays; a dict of deciders keeps its order."""
+    if isinstance(tree, dict):
+        return {name: arrays(leaf) for name, leaf in tree.items()}
     return jax.tree.map(jnp.asarray, tree)
 
 
@@ -180,7 +237,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--checkpoint", help="the one that ships when not given")
     parser.add_argument("--episodes", type=int, default=4096)
     parser.add_argument("--seed", type=int, default=0)
-    parts = ("small", "other", "wrong")
+    parts = ("small", "table", "other", "wrong")
     parser.add_argument("--parts", nargs="+", choices=parts, default=list(parts))
     parser.add_argument("--small", help="a policy trained on the small version")
     parser.add_argument("--json", type=pathlib.Path)
@@ -199,6 +256,9 @@ def main(argv: list[str] | None = None) -> int:
     for part in options.parts:
         if part == "small":
             document[part] = small(policies, options.episodes, options.seed)
+            continue
+        if part == "table":
+            document[part] = table(options.episodes, options.seed)
             continue
         play = {"other": other, "wrong": wrong}[part]
         document[part] = play(trained.decider, options.episodes, options.seed)

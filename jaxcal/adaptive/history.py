@@ -163,20 +163,20 @@ def checked(
         raise ValueError(
             f"{where}: outcome must have shape {shape}, got {values.shape}"
         )
-    told = jnp.asarray(values, jnp.float32)
+    answer = jnp.asarray(values, jnp.float32)
     if isinstance(task, ParticleTask):
         support = task.model.support
-        if support is not None and not (told == support).any():
+        if support is not None and not (answer == support).any():
             raise ValueError(
                 f"{where}: outcome must be one of the {len(support)} of model.support, "
                 f"from {support[0]:g} to {support[-1]:g}, got {outcome!r}"
             )
-        if not _can_answer(belief, design, told):
+        if not _can_answer(belief, design, answer):
             raise ValueError(
                 f"{where}: outcome {outcome!r} cannot follow what was measured before: "
                 "every particle gives it probability 0"
             )
-    return design, told
+    return design, answer
 
 
 _can_answer = jax.jit(ParticleBelief.can_answer)
