@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import base64
 import dataclasses
+import functools
 import os
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 from jaxcal.extras import needs
 from jaxcal.files import write_text
@@ -174,6 +175,12 @@ def render(page: Page) -> str:
         MissingExtraError: jinja2 is not installed.
         ValueError: a figure is not an SVG, PNG or GIF file.
     """
+    return str(_template().render(page=page)).lstrip()
+
+
+@functools.cache
+def _template() -> Any:
+    """The page's template; compiling it takes a quarter of a second."""
     with needs("study", "an HTML report"):
         import jinja2
 
@@ -189,7 +196,7 @@ def render(page: Page) -> str:
         "pieces": lambda c: c if isinstance(c, list | tuple) else (c,),
         "kind": lambda piece: type(piece).__name__.lower(),
     }
-    return environment.get_template("page.html.j2").render(page=page).lstrip()
+    return environment.get_template("page.html.j2")
 
 
 def write_page(path: str | os.PathLike[str], page: Page) -> None:

@@ -12,8 +12,8 @@ from rig.config.files import example_names
 from rig.device.bus import Bus, BusError
 from rig.device.drives import Drive
 from rig.device.lock import BusLock
-from rig.faults import EXIT_FAULT, EXIT_OK, Refused
-from rig.sessions import FILE, load, make_simulator, run_session
+from rig.faults import EXIT_FAULT, EXIT_OK
+from rig.sessions import FILE, journal_of, load, make_simulator, run_session
 
 COMMISSIONING = (
     *("ports", "scan", "imu", "jog", "home", "axes", "zero", "setup"),
@@ -113,8 +113,7 @@ def _watch(args: argparse.Namespace) -> int:
     from jaxcal.extras import needs
     from rig.live import launch
 
-    if not (args.run / "journal.jsonl").is_file():
-        raise Refused(f"{args.run} holds no run")
+    journal_of(args.run)
     with needs("live", "the live page"):
         from rig.live.server import serve
     sock, token, url = launch.listen(args.live_host)

@@ -109,7 +109,7 @@ def _characterise(args: argparse.Namespace) -> int:
     with needs("policy", "characterise"):
         import jax  # noqa: F401  # before anything moves
     with _place(args, SIGN_CHECKED) as place:
-        return steps.measure_play(place, AXIS_NAMES.index(args.axis))
+        return steps.characterise(place, AXIS_NAMES.index(args.axis), args.into)
 
 
 def _home(args: argparse.Namespace) -> int:
@@ -172,12 +172,13 @@ def _given(simulator: Simulator, given: setup.Given) -> setup.Given:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     simulator.start_phone(port)
-    values: dict[str, Any] = {"imu.host": "127.0.0.1"}
+    imu = simulator.config.imu
+    values: dict[str, Any] = {"imu.host": "127.0.0.1", "imu.stale_s": imu.stale_s}
     for axis in simulator.config.axes:
         for name in ("reduction", "speed_deg_s", "accel_deg_s2"):
             values[f"axes.{axis.name}.{name}"] = getattr(axis, name)
     return dataclasses.replace(
-        given, bus=where, imu=f"{simulator.config.imu.format}:{port}",
+        given, bus=where, imu=f"{imu.format}:{port}",
         values=values | given.values,
     )  # fmt: skip
 

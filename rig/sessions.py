@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 FILE = pathlib.Path("rig.toml")  # without --config
 SIMULATION = (
     "transport", "noise", "backlash", "drift", "speedup", "rate", "reversed", "swapped",
-    "gearing", "lost_origin", "realistic",
+    "gearing", "lost_origin", "realistic", "dead_zone", "breakaway",
 )  # fmt: skip
 
 
@@ -139,17 +139,25 @@ def _new(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
     }
 
 
+def journal_of(run: pathlib.Path) -> pathlib.Path:
+    """The journal in a run's folder; Refused where there is none."""
+    from rig.session.folder import JOURNAL
+
+    if not (run / JOURNAL).is_file():
+        raise Refused(f"{run} holds no run: there is no {JOURNAL} in it")
+    return run / JOURNAL
+
+
 def records_of(run: pathlib.Path) -> list[dict[str, Any]]:
     """The journal of a run; Refused where its folder holds none, or a damaged one."""
     from rig.outputs.journal import JournalError, read_journal
-    from rig.session.folder import JOURNAL
 
     try:
-        records = read_journal(run / JOURNAL)
+        records = read_journal(journal_of(run))
     except JournalError as error:
         raise Refused(str(error)) from None
     if not records or records[0]["event"] != "start":
-        raise Refused(f"{run} holds no run")
+        raise Refused(f"{run} holds no run: its journal has no start")
     return records
 
 
@@ -187,7 +195,8 @@ def _procedure(
     if mode == "verify":
         return lambda run: checking.verify(run, calibration, count), saved.zero
     desired = np.array(inputs["to"], dtype=np.float64)
-    return lambda run: checking.goto(run, calibration, desired), saved.zero
+    play = saved.play
+    return lambda run: checking.goto(run, calibration, desired, play), saved.zero
 
 
 def _commission(config: RigConfig, record: DeviceRecord, simulator: Simulator) -> None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from benchmarks.harness import ROOT, Budget, Line, Row, Verdict
 from benchmarks.peers import figaroh
+from examples.ur5.ur5 import arm
 from jaxcal import identify, select
 from jaxcal.models import Noise, SerialChain
 from jaxcal.selection.exact import branch_and_bound as search
@@ -30,22 +31,10 @@ NAME = "blocks"
 TITLE = "Poses of a measured UR5, and FIGAROH's rule"
 
 _NOISE = 0.1  # mm
-_TABLE = [
-    (0, 90, 89.159, 0),
-    (-425, 0, 0, 0),
-    (-392.25, 0, 0, 0),
-    (0, 90, 109.15, 0),
-    (0, -90, 94.56, 0),
-    (0, 0, 82.3, 0),
-]
 _PROOFS = ((1000, 20, 15.0), (200, 12, 8.0), (50, 8, 3.0))  # M, K, seconds wanted
 _LONGEST = 40.0  # seconds of a proof
 
 Array = NDArray[np.float64]
-
-
-def arm() -> SerialChain:
-    return SerialChain.from_dh(_TABLE, tool=(0, 0, 31))
 
 
 def poses(name: str) -> tuple[Array, Array]:

@@ -146,7 +146,9 @@ def go(place: steps.Place, given: Given) -> int:
         if code := steps.take_zero(place):
             return code
     say(f"the device is commissioned: {record.path}")
-    say(f"next: jaxcal-rig calibrate --config {os.path.relpath(place.path)}")
+    # A simulated device is gone with this command; another is made as rig.toml says.
+    again = " --simulate" * place.full_speed
+    say(f"next: jaxcal-rig calibrate{again} --config {os.path.relpath(place.path)}")
     return EXIT_OK
 
 

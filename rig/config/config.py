@@ -1,5 +1,6 @@
 """The whole of rig.toml, and what follows from several of its tables."""
 
+import functools
 import hashlib
 import json
 import math
@@ -13,7 +14,6 @@ from numpy.typing import NDArray
 from pydantic import PrivateAttr
 
 from rig.config.axis import AXIS_NAMES, Axis, Pulses, Scale
-from rig.config.maps import RegisterMap
 from rig.config.schema import Section, key
 from rig.config.settings import (
     BusSettings,
@@ -85,11 +85,13 @@ def _flat(data: Any, at: str = "") -> dict[str, Any]:
     return flat
 
 
-def _family(register_map: RegisterMap) -> str:
-    data = tomllib.loads(register_map.text)
+@functools.cache
+def _places(register_map: str) -> str:
+    """Digest of the part of a map's text that turns counts into places."""
+    data = tomllib.loads(register_map)
     parts = [data.get(name) for name in ("word_order", "units", "position", "move")]
     text = json.dumps(parts, sort_keys=True)
-    return f"{register_map.name} ({hashlib.sha256(text.encode()).hexdigest()[:8]})"
+    return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
 class RigConfig(Section):
@@ -236,7 +238,8 @@ class RigConfig(Section):
         found: dict[str, Any] = {}
         for axis in self.axes:
             scale = axis.model_dump(include={*Scale.model_fields, "unit", "rotates"})
-            values = {"map": _family(axis.map), **scale}
+            family = f"{axis.map.name} ({_places(axis.map.text)})"
+            values = {"map": family, **scale}
             found |= {f"axes.{axis.name}.{name}": values[name] for name in values}
         found["mechanism.order"] = self.mechanism.order
         imu = self.imu.model_dump(mode="json", include=set(PHONE))

@@ -158,12 +158,18 @@ class Drive:
                     raise
 
     def bring(self, table: Writes | None, ready: Callable[[Status], bool]) -> Status:
-        """Write a table and poll until its effect shows, at most the map's ready_s."""
+        """Write a table and poll until its effect shows, at most the map's ready_s.
+
+        The last look begins after that time: a look before it may have waited for the
+        tries of a spoilt frame, and tells of the time before them.
+        """
         self.write(table)
         end = time.monotonic() + self.axis.map.ready_s
-        while not ready(status := self.status()) and time.monotonic() < end:
+        while True:
+            last = time.monotonic() > end
+            if ready(status := self.status()) or last:
+                return status
             time.sleep(POLL_S)
-        return status
 
     def _write(self, table: Writes | None, values: dict[str, int]) -> None:
         order = self.axis.map.word_order

@@ -12,8 +12,9 @@ from rig.guard.stop import UnitStop
 
 
 def numbers(values: Any, width: int = 9, digits: int = 4) -> str:
-    """Numbers side by side."""
-    return " ".join(f"{value:{width}.{digits}f}" for value in values)
+    """Numbers side by side; what rounds to zero has no sign."""
+    rounded = (round(float(value), digits) + 0.0 for value in values)
+    return " ".join(f"{value:{width}.{digits}f}" for value in rounded)
 
 
 def event_lines(record: dict[str, Any]) -> list[str]:

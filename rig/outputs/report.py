@@ -15,7 +15,6 @@ import numpy as np
 
 from jaxcal.pages import Page, Section, Strong, Table, Text, write_page
 from rig.config import AXIS_NAMES
-from rig.faults import Refused
 from rig.outputs import figures
 from rig.outputs.console import (
     choice_text,
@@ -39,13 +38,7 @@ MOST_ROWS = 60  # of the table of postures; more are in pairs.csv
 
 
 def write_report(folder: pathlib.Path, records: list[Record]) -> pathlib.Path:
-    """Write ``report.html`` of a run, from the records of its journal.
-
-    Raises:
-        Refused: they are not those of a run.
-    """
-    if not records or records[0]["event"] != "start":
-        raise Refused(f"{folder} holds no run")
+    """Write ``report.html`` of a run, from the records of its journal."""
     start, summary = records[0], {}
     if (folder / "summary.json").is_file():
         text = (folder / "summary.json").read_text(encoding="utf-8")

@@ -63,6 +63,11 @@ def _plan(run: Run) -> tuple[Array, Choice]:
     config = run.config
 
     def make() -> dict[str, Any]:
+        session = config.session
+        run.say(
+            f"planning: {session.k} of {session.candidates} candidates by "
+            f"{session.method}, and the proven optimum; nothing moves yet"
+        )
         candidates = draw_candidates(config)
         choice = choose(config, config.to_deg(candidates))
         return {

@@ -123,6 +123,9 @@ class Run(RunFolder):
         """Open bus and phone and arm; MotionFault, BusError, ImuError: not fit."""
         config = self.config
         self.confirm(self)
+        # One that came while something was computed may have been raised in a callback
+        # that drops exceptions, as those of a garbage collection are.
+        self.signals.check_stop()
         imu = Imu(config.imu, report=self.emit)
         bus = Bus(config.bus, config.silence_s, self.emit)
         left = timeouts_left(self.journal.records)

@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
+import importlib.util
 import pathlib
 
 import numpy as np
 import pytest
 
 from jaxcal.calibration import identify
-from jaxcal.models import Prior, SerialChain
+from jaxcal.models import Prior
 
-DATA = pathlib.Path(__file__).parents[2] / "examples" / "ur5"
-ARM = SerialChain.from_dh(
-    [
-        *([0, 90, 89.159, 0], [-425, 0, 0, 0], [-392.25, 0, 0, 0]),
-        *([0, 90, 109.15, 0], [0, -90, 94.65, 0], [0, 0, 82.3, 0]),
-    ],
-    tool=[0, 0, 31.0],
+_SPEC = importlib.util.spec_from_file_location(
+    "ur5", pathlib.Path(__file__).parents[2] / "examples" / "ur5" / "ur5.py"
 )
+assert _SPEC is not None and _SPEC.loader is not None
+EXAMPLE = importlib.util.module_from_spec(_SPEC)
+_SPEC.loader.exec_module(EXAMPLE)
+ARM = EXAMPLE.arm()
 
-
-def poses(name: str) -> tuple[np.ndarray, np.ndarray]:
-    table = np.loadtxt(DATA / name, delimiter=",", skiprows=1)
-    return table[:, 7:13], table[:, 1:4] + table[:, 4:7]
-
-
-JOINTS, MEASURED = poses("ur5_grid_1000.csv")
-TEST_JOINTS, TEST = poses("ur5_random_20.csv")
+JOINTS, MEASURED = EXAMPLE.load("ur5_grid_1000.csv")
+TEST_JOINTS, TEST = EXAMPLE.load("ur5_random_20.csv")
 
 
 def error(found: object) -> float:

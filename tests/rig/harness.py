@@ -30,6 +30,7 @@ from rig.simulator import Simulator, Truth
 stop.VERIFY_S = 0.6
 
 RATE_HZ = 250.0
+SPEEDUP = 3.0  # of the drives over what the configuration says of them
 ENTERED = "entered"  # the file by which a session says that it is in the phase
 HOST_FAULTS = ("sigint", "sigint_twice", "sigterm", "sigkill", "full_disk")
 OTHERS = ("second_session", "other_stop")  # what somebody does in another terminal
@@ -40,7 +41,6 @@ WATCHED = {  # drives that stop themselves when the line is silent
 FAST = {  # quick axes and short windows; a busy computer may still answer late
     "speed_deg_s = 120": "speed_deg_s = 400",
     "accel_deg_s2 = 1200": "accel_deg_s2 = 8000",
-    "column_count = 4": "column_count = 4\nstale_s = 1.0",
     "poll_s = 0.01": "poll_s = 0.005\nstall_s = 0.3",
     "window_s = 0.2": "window_s = 0.04",
     "min_samples = 10": "min_samples = 5",
@@ -96,6 +96,7 @@ def simulator(config: RigConfig, **options) -> Simulator:
     noise = options.pop("noise_deg", 0.0)
     truth = options.pop("truth", Truth(noise_deg=noise))
     options.setdefault("rate_hz", RATE_HZ)
+    options.setdefault("speedup", SPEEDUP)
     return Simulator(config, truth, **options)
 
 

@@ -11,7 +11,6 @@ QUICK = {  # cell: how its first session ends
     ("slipping_axis,axis=roll", "settling"): "stopped",
     ("imu_wrong_order", "zeroing"): "stopped",
     ("sigkill", "moving"): "killed",
-    ("full_disk", "saving"): "stopped",
 }
 
 

@@ -14,7 +14,6 @@ import urllib.request
 
 import pytest
 
-from rig.__main__ import main
 from rig.faults import Refused
 from rig.live import launch, words
 from rig.live.guard import Guard
@@ -346,11 +345,6 @@ def test_watch_shows_a_run_until_it_is_interrupted(tmp_path):
         assert status == 200 and "Ended without a last record" in html
         watch.send_signal(signal.SIGINT)
         assert watch.wait(30) == 0
-
-
-def test_watch_of_what_is_no_run_is_refused(tmp_path, capsys):
-    assert main(["watch", str(tmp_path)]) == 2
-    assert "holds no run" in capsys.readouterr().err
 
 
 def test_a_page_that_nobody_looks_at_ends_by_itself(tmp_path):

@@ -1,14 +1,16 @@
 """What real drives do: they take time to enable, flicker at rest, and have play."""
 
 import json
+import time
 
 import numpy as np
 import pytest
-from harness import fast_text, session
+from harness import changed, fast_text, session
 from test_rig_motion import bench
 
 from rig.config import parse_config
 from rig.config.maps import MAP_FOLDER
+from rig.device.drives import Drive
 from rig.faults import MotionFault
 from rig.guard.stop import stop_all
 from rig.simulator import Simulator, Truth, parse_fault
@@ -51,6 +53,23 @@ def test_it_waits_as_long_as_the_map_says_and_no_longer(delays, says, tmp_path):
             motion.sim.drives[0].alarm = 0
         with pytest.raises(MotionFault, match=says):
             motion.device.arm(reset_alarms=True)
+
+
+def test_a_look_that_took_longer_than_the_wait_is_not_the_last(monkeypatch):
+    """A spoilt frame held it up: it tells of the time before the drive was ready."""
+    with realistic(enable_delay_s=0.1) as motion:
+        drive, real = motion.device.drives[0], Drive.status
+        drive.axis = changed(drive.axis, map=changed(drive.axis.map, ready_s=0.05))
+
+        def held_up(drive, retries=None):
+            status = real(drive, retries)
+            if not status.enabled:
+                time.sleep(0.2)
+            return status
+
+        monkeypatch.setattr(Drive, "status", held_up)
+        found = drive.bring(drive.axis.map.enable, lambda status: status.enabled)
+        assert found.enabled
 
 
 def test_one_count_of_jitter_is_not_motion():

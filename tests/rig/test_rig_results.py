@@ -34,6 +34,7 @@ from rig.attitude import Frame
 from rig.config import AXIS_NAMES, parse_config
 from rig.identification.refit import reread
 from rig.outputs import trend
+from rig.outputs.console import numbers
 from rig.outputs.export import LANGUAGES, load_inverse
 from rig.outputs.journal import read_journal
 from rig.outputs.report import write_report
@@ -524,12 +525,18 @@ def test_parameters_are_drawn_over_time(finished):
     assert line.get_xydata().tolist() == [[0, summary["b"][0]], [1, summary["b"][0]]]
 
 
-def test_help_of_every_new_command(capsys):
-    for command in ("refit", "report", "export", "trend"):
-        with pytest.raises(SystemExit) as ended:
-            main([command, "--help"])
-        assert ended.value.code == 0
-        assert "usage" in capsys.readouterr().out
+def test_a_folder_of_runs_is_no_run(tmp_path, capsys):
+    (tmp_path / "calibrate-1").mkdir()
+    for command in (["report"], ["refit"], ["export", "--to", "c"], ["watch"]):
+        assert main([command[0], str(tmp_path), *command[1:]]) == 2
+        lack = f"{tmp_path} holds no run: there is no journal.jsonl in it"
+        assert lack in capsys.readouterr().err
+
+
+def test_what_rounds_to_zero_has_no_sign():
+    assert numbers([-0.0004, -0.0, 0.0004, -0.0006], 6, 3).split() == [
+        "0.000", "0.000", "0.000", "-0.001"
+    ]  # fmt: skip
 
 
 def test_a_phone_beside_the_right_one_changes_nothing_in_a_session(tmp_path):

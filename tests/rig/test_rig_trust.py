@@ -33,7 +33,7 @@ from rig.session.checks import check_matrix
 from rig.session.reference import KeptZero, check_zero, moved, unseen
 from rig.session.run import Run
 from rig.session.runner import run_safely
-from rig.simulator import Simulator, Truth
+from rig.simulator import Truth
 from rig.simulator.faults import FaultInjector
 from rig.simulator.phone import Phone
 
@@ -42,7 +42,7 @@ LOST = 1.4  # degrees, as was seen
 
 def device(config, **truth):
     """A noise-free one that is not as configured."""
-    return Simulator(config, Truth(noise_deg=0.0, **truth), rate_hz=RATE_HZ)
+    return simulator(config, truth=Truth(noise_deg=0.0, **truth))
 
 
 def run_verify(config, calibration, folder, sim, record=None, here=False):

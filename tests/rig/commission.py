@@ -1,0 +1,63 @@
+"""A simulated device to commission over the real protocol, and its files."""
+
+import contextlib
+import socket
+
+from harness import SPEEDUP, fast_config
+
+from rig import commissioning
+from rig.__main__ import main
+from rig.commission.scan import parse_bus
+from rig.commission.toml import set_values
+from rig.config import AXIS_NAMES
+from rig.simulator import Simulator, Truth
+
+QUICK = (  # of the new rig.toml: short windows, quick axes
+    "settle.window_s=0.04", "settle.min_samples=5", "settle.samples=5",
+    "settle.slope_deg_s=0.5", "motion.poll_s=0.005", "imu.stale_s=1.0",
+    "session.method=exact", "session.verify_postures=1",
+    *(f"axes.{name}.{key}" for name in AXIS_NAMES
+      for key in ("speed_deg_s=400", "accel_deg_s2=8000", "reduction=10")),
+)  # fmt: skip
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return server.getsockname()[1]
+
+
+@contextlib.contextmanager
+def device(truth=None, transport="tcp", config=None, **options):
+    """A simulated device, the bus as the command line names it, and a phone's port."""
+    config = config or fast_config()
+    options.setdefault("speedup", SPEEDUP)
+    with Simulator(
+        config, truth or Truth(noise_deg=0.005), transport=transport, rate_hz=250.0,
+        **options,
+    ) as sim:  # fmt: skip
+        bus = sim.start().bus
+        port = free_port()
+        sim.start_phone(port)
+        where = f"{transport}:{bus.host}:{bus.port}"
+        if transport == "rtu":
+            where = f"rtu:{bus.device},115200,N,8,1"
+        yield sim, where, port
+
+
+def set_up(bus: str, port: int, *more: str, values=QUICK) -> int:
+    given = [word for value in values for word in ("--set", value)]
+    common = ["--yes", "--bus", bus, "--imu", f"hyperimu:{port}", "--units", "4"]
+    return main(["setup", *common, *given, *more])
+
+
+def quick_text(bus, port):
+    from rig.commission.toml import new_text
+
+    axes = [
+        {"name": name, "letter": letter, "unit": unit, "family": "leadshine_pr",
+         "pulses": 10000}
+        for unit, (name, letter) in enumerate(zip(AXIS_NAMES, "XZY", strict=True), 1)
+    ]  # fmt: skip
+    text = new_text(parse_bus(bus), axes, "hyperimu", port)
+    values = dict(commissioning.setting(value) for value in QUICK)
+    return set_values(text, values | {"axes.yaw.direction": -1})

@@ -1,0 +1,34 @@
+"""Fixtures of commissioning."""
+
+import pytest
+from commission import device, quick_text
+
+from rig.commission import bench, steps
+from rig.config import load_config
+from rig.device.record import (
+    HOMED,
+    IDENTIFIED,
+    SIGN_CHECKED,
+    DeviceRecord,
+)
+
+
+@pytest.fixture
+def at(tmp_path, monkeypatch):
+    """An empty folder to work in, and axes that need not be watched by a person."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(steps, "WATCH_S", 0.3)
+    monkeypatch.setattr(bench, "SLOW_DEG_S", 400.0)
+    return tmp_path
+
+
+@pytest.fixture
+def commissioned(at):
+    """A device of which all is known that a session needs."""
+    with device() as (sim, bus, port):
+        (at / "rig.toml").write_text(quick_text(bus, port))
+        config = load_config("rig.toml")
+        record = DeviceRecord.load(config.device_path)
+        for state in (IDENTIFIED, HOMED, SIGN_CHECKED):
+            record.reach(state, config)
+        yield sim

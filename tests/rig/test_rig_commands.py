@@ -1,0 +1,248 @@
+"""The command line of a session."""
+
+import importlib.util
+import os
+import pathlib
+import shlex
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from harness import (
+    HASTY,
+    SESSION,
+    commissioned,
+    fast_config,
+    fast_text,
+    no_figures,
+    simulator,
+)
+
+import jaxcal
+from rig.__main__ import main
+from rig.arguments import make_parser
+from rig.outputs.journal import read_journal
+from rig.simulator import Truth, parse_fault
+
+TRUTH = np.column_stack([Truth().matrix, Truth().bias])
+
+
+@pytest.mark.parametrize(
+    ("method", "session_table"),
+    [("exact", SESSION), pytest.param("policy", "", marks=pytest.mark.slow)],
+    ids=["short windows", "as users do first"],
+)
+def test_calibrate_simulate_takes_a_device_from_the_bus_to_its_calibration(
+    method, session_table, tmp_path, capsys
+):
+    """Quickly with short windows; slowly without a configuration, as users do first."""
+    given = ["--speedup", "5", "--rate", "250", "--out", str(tmp_path / "runs")]
+    if session_table:
+        (tmp_path / "rig.toml").write_text(fast_text(session=session_table))
+        given += ["--config", str(tmp_path / "rig.toml")]
+    with no_figures():
+        assert main(["calibrate", "--simulate", *given]) == 0
+    said = capsys.readouterr().out
+    assert "95 % confidence" in said and "after compensation" in said
+    commissioned, _, said = said.partition("each unit turns its own joint")
+    assert "IDENTIFIED" in commissioned and "roll: 3.00 deg" in commissioned
+    plan, _, moved = said.partition("armed:")
+    assert moved and f"by {method}: log det" in plan
+    assert "proven optimum" in plan and "gap 0." in plan and "note:" not in plan
+    (folder,) = (tmp_path / "runs").iterdir()
+    loaded = jaxcal.Calibration.load(folder / "calibration.json")
+    assert loaded.num_measurements == 4
+    np.testing.assert_allclose(loaded.matrix, TRUTH[:, :3], atol=0.005)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name", ["leadshine_pr", "oriental_az", "applied_motion", "generic"]
+)
+def test_every_example_calibrates_on_the_simulator(name, tmp_path):
+    """Each map, and HyperIMU, Sensor Logger and a line stream in client mode."""
+    from rig.config.files import EXAMPLES
+
+    code = main(["calibrate", "--simulate", "--speedup", "20", "--out", str(tmp_path),
+                 "--config", str(EXAMPLES / f"{name}.toml")])  # fmt: skip
+    assert code == 0
+    (folder,) = tmp_path.iterdir()
+    found = jaxcal.Calibration.load(folder / "calibration.json")
+    np.testing.assert_allclose(found.matrix, TRUTH[:, :3], atol=0.005)
+    np.testing.assert_allclose(found.bias, TRUTH[:, 3], atol=0.05)
+
+
+def test_dry_run_opens_no_port(tmp_path, capsys):
+    config = tmp_path / "rig.toml"
+    config.write_text(fast_text({"port = 5020": "port = 1", "port = 2055": "port = 1"}))
+    for command in (["calibrate"], ["collect", "--count", "3"]):
+        code = main([*command, "--config", str(config), "--dry-run", "--out",
+                     str(tmp_path / "runs")])  # fmt: skip
+        assert code == 0
+    said = capsys.readouterr().out
+    assert "nothing was sent to the bus" in said and "about" in said
+    for folder in (tmp_path / "runs").iterdir():
+        events = {r["event"] for r in read_journal(folder / "journal.jsonl")}
+        assert not events & {"write", "command", "stop"}
+
+
+def test_nothing_moves_without_confirmation(tmp_path, capsys):
+    config = fast_config()
+    with simulator(config) as sim:
+        served = sim.start()
+        text = fast_text({"port = 5020": f"port = {served.bus.port}"})
+        (tmp_path / "rig.toml").write_text(text)
+        commissioned(config, tmp_path)
+        code = main(["calibrate", "--config", str(tmp_path / "rig.toml"),
+                     "--out", str(tmp_path / "runs")])  # fmt: skip
+        assert code == 2
+        assert "confirm with --arm" in capsys.readouterr().out
+        assert sim.server.requests == 0
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["calibrate"],
+        ["calibrate", "--config", "/does/not/exist.toml"],
+        ["resume", "/does/not/exist"],
+        ["check", "/does/not/exist.toml"],
+        ["example", "nobody"],
+        ["verify", "/does/not/exist", "--simulate"],
+        ["calibrate", "--simulate", "--fault", "earthquake"],
+        ["collect", "--simulate", "--count", "0"],
+    ],
+)
+def test_bad_input_is_one_clear_line_and_exit_code_2(
+    arguments, capsys, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("rig: ") and "Traceback" not in error
+
+
+def test_stop_works_alone_and_says_when_it_cannot(tmp_path, capsys):
+    config = fast_config()
+    with simulator(config) as sim:
+        served = sim.start()
+        path = tmp_path / "rig.toml"
+        path.write_text(
+            fast_text({**HASTY, "port = 5020": f"port = {served.bus.port}"})
+        )
+        assert main(["stop", "--config", str(path)]) == 0
+        assert capsys.readouterr().out.count("acknowledged, standing") == 3
+        assert all(drive.stops for drive in sim.drives)
+        sim.faults.add(parse_fault("dead_drive,axis=yaw"))
+        assert main(["stop", "--config", str(path)]) == 3
+        assert "NOT acknowledged" in capsys.readouterr().out
+    assert main(["stop", "--config", str(path)]) == 3
+    error = capsys.readouterr().err
+    assert "NOTHING WAS STOPPED" in error and "cannot open" in error
+
+
+def test_identify_prints_every_drive(capsys):
+    assert main(["identify", "--simulate"]) == 0
+    said = capsys.readouterr().out
+    assert said.count("pulses_per_rev = 10000") == 3
+
+
+def test_help_and_stop_load_no_heavy_module(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text(fast_text({"port = 5020": "port = 1"}))
+    program = (
+        "import sys\n"
+        "from rig.__main__ import main\n"
+        "try:\n"
+        "    main({})\n"
+        "except SystemExit:\n"
+        "    pass\n"
+        "heavy = set('jax matplotlib numba scipy flax'.split()) & set(sys.modules)\n"
+        "sys.exit(' '.join(heavy) or 0)\n"
+    )
+    for arguments in (["--help"], ["stop", "--config", str(path)]):
+        subprocess.run(
+            [sys.executable, "-c", program.format(arguments)], check=True,
+            capture_output=True, cwd=tmp_path,
+        )  # fmt: skip
+
+
+def test_simulate_serves_a_session_in_another_process(tmp_path):
+    """Two programs, as with real hardware: the simulator and the session."""
+    from fault_matrix import _free_port
+
+    bus, phone = _free_port(), _free_port()
+    path = tmp_path / "rig.toml"
+    path.write_text(fast_text({"port = 5020": f"port = {bus}",
+                               "port = 2055": f"port = {phone}"}))  # fmt: skip
+    commissioned(fast_config(), tmp_path)
+    served = subprocess.Popen(
+        [sys.executable, "-m", "rig", "simulate", "--config", str(path),
+         "--rate", "250"], stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        for line in served.stdout:
+            if "Ctrl-C" in line:
+                break
+        with no_figures():
+            code = main(["calibrate", "--config", str(path), "--arm", "--zero",
+                         "--out", str(tmp_path / "runs")])  # fmt: skip
+        assert code == 0
+    finally:
+        os.kill(served.pid, signal.SIGINT)
+        assert served.wait(60) == 0
+        served.stdout.close()
+
+
+def readme_commands():
+    """The rig's commands of README, without their comments."""
+    text = (pathlib.Path(__file__).parents[2] / "README.md").read_text()
+    lines = [line.partition("#")[0].strip() for line in text.splitlines()]
+    return [shlex.split(line)[1:] for line in lines if line.startswith("jaxcal-rig ")]
+
+
+def test_the_commands_of_the_readme_parse():
+    commands = readme_commands()
+    named = {words[0] for words in commands}
+    assert {"setup", "calibrate", "verify", "export", "stop"} <= named
+    for words in commands:
+        make_parser().parse_args(words)
+
+
+def test_check_takes_its_file_with_and_without_config(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["example", "leadshine_pr"]) == 0
+    (tmp_path / "rig.toml").write_text(capsys.readouterr().out)
+    for given in (["--config", "rig.toml"], ["rig.toml"], []):
+        assert main(["check", *given]) == 0
+        assert "valid" in capsys.readouterr().out
+    assert main(["verify", "calibration.json"]) == 2  # the file is found, not this
+    assert "calibration.json: not a calibration" in capsys.readouterr().err
+    (tmp_path / "rig.toml").unlink()
+    assert main(["check"]) == main(["calibrate"]) == 2
+    assert "--config FILE is required" in capsys.readouterr().err
+
+
+def test_a_missing_package_is_one_line_with_the_command_that_installs_it(
+    monkeypatch, capsys, tmp_path
+):
+    path = tmp_path / "rig.toml"
+    path.write_text(fast_text({"port = 5020": "port = 1"}))
+    for missing, stop in (("pymodbus", 2), ("pydantic", 2), ("jinja2", 3)):
+        real = importlib.util.find_spec
+        with monkeypatch.context() as patch:
+            patch.setattr(
+                importlib.util,
+                "find_spec",
+                lambda name, *more, gone=missing, real=real: (
+                    None if name == gone else real(name, *more)
+                ),
+            )
+            assert main(["calibrate", "--simulate", "--out", str(tmp_path)]) == 2
+            error = capsys.readouterr().err
+            assert missing in error and error.count("\n") == 1
+            assert "pip install 'jaxcal[rig]'" in error
+            assert main(["stop", "--config", str(path)]) == stop
+            capsys.readouterr()

@@ -1,0 +1,126 @@
+"""What a session visits, and in which order; nothing moves."""
+
+import itertools
+
+import numpy as np
+import pytest
+from harness import (
+    changed,
+    fast_config,
+    fast_text,
+)
+
+import jaxcal
+from rig.config import example_text, parse_config
+from rig.session.planning import choose, draw_candidates, travel_order
+
+
+@pytest.mark.slow
+def test_the_shipped_policy_makes_the_default_choice():
+    """Not its stand-in: a session without a configuration selects with the policy."""
+    config = parse_config(example_text("simulate"))
+    candidates = config.to_deg(draw_candidates(config))
+    choice = choose(config, candidates)
+    assert (choice.method, choice.note, choice.proven) == ("policy", "", True)
+    alone = jaxcal.select(candidates, 4, method="policy")
+    assert sorted(choice.indices) == sorted(alone.indices.tolist())
+    assert choice.efficiency > 0.95
+
+
+def test_without_a_checkpoint_the_choice_is_the_exact_optimum(tmp_path, monkeypatch):
+    from jaxcal.learning.runtime import weights
+
+    config = parse_config(example_text("simulate"))
+    candidates = config.to_deg(draw_candidates(config))
+    monkeypatch.setattr(weights, "default_folder", lambda: tmp_path / "none")
+    choice = choose(config, candidates)
+    assert (choice.method, choice.efficiency) == ("exact", 1.0)
+    assert "no policy could be used" in choice.note
+
+
+def test_the_policys_place_is_taken_by_exact_when_it_is_missing_or_poor(monkeypatch):
+    config = parse_config(fast_text(session=""))
+    candidates = config.to_deg(draw_candidates(config))
+    real = jaxcal.select
+
+    def poor(points, k, method="policy", **options):
+        if method != "policy":
+            return real(points, k, method=method, **options)
+        return real(points, k, method="random", **options)
+
+    def absent(points, k, method="policy", **options):
+        if method == "policy":
+            raise FileNotFoundError("no checkpoint\nanywhere")
+        return real(points, k, method=method, **options)
+
+    best = float(real(candidates, 4, method="exact").log_det)
+    for stand_in, part in ((poor, "D-efficiency of"), (absent, "no checkpoint")):
+        monkeypatch.setattr(jaxcal, "select", stand_in)
+        choice = choose(config, candidates)
+        assert choice.log_det == pytest.approx(best)
+        assert part in choice.note and "\n" not in choice.note
+
+
+@pytest.mark.parametrize(
+    "method",
+    [
+        "auto", "exact", "greedy", "random",
+        pytest.param("exchange", marks=pytest.mark.slow),  # compiles for ten seconds
+    ],
+)  # fmt: skip
+def test_every_method_of_a_session_makes_a_choice(method):
+    text = f'\n[session]\nmethod = "{method}"\nmin_efficiency = 0.01\nseed = 3\n'
+    config = parse_config(fast_text(session=text))
+    degrees = config.to_deg(draw_candidates(config))
+    best = jaxcal.select(degrees, 4, method="exact")
+    choice = choose(config, degrees)
+    assert choice.method == ("exact" if method == "auto" else method)
+    assert choice.log_det <= best.log_det + 1e-9
+    if method in ("auto", "exact"):
+        assert choice.log_det == pytest.approx(best.log_det)
+    assert ("proved" in choice.note) == (method == "auto")
+
+
+@pytest.mark.parametrize("least", [0.5, 1.0])
+def test_auto_answers_within_the_efficiency_asked_for(least):
+    text = f'\n[session]\nmethod = "auto"\nmin_efficiency = {least}\n'
+    config = parse_config(fast_text(session=text))
+    degrees = config.to_deg(draw_candidates(config))
+    best = jaxcal.select(degrees, 4, method="exact")
+    choice = choose(config, degrees)
+    assert choice.efficiency >= least - 1e-9
+    assert choice.best_log_det == pytest.approx(best.log_det)
+
+
+def test_travel_order_takes_the_least_time(rng):
+    speeds = {"pitch": 10.0, "yaw": 20.0, "roll": 5.0}
+    plain = fast_config()
+    axes = (
+        changed(axis, speed_deg_s=speeds[axis.name], accel_deg_s2=50.0)
+        for axis in plain.axes
+    )
+    config = changed(plain, axes=tuple(axes))
+    points = rng.uniform(-20, 20, size=(12, 3))
+
+    def seconds(order, points=points):
+        """Trapezoid profiles, the slowest axis sets the time; written apart."""
+        path = np.vstack([np.zeros(3), points[list(order)]])
+        ways, total = np.abs(np.diff(path, axis=0)), 0.0
+        for way in ways:
+            total += max(
+                d / v + v / 50.0 if d > v * v / 50.0 else 2 * np.sqrt(d / 50.0)
+                for d, v in zip(way, speeds.values(), strict=True)
+            )
+        return total
+
+    order = travel_order(config, points, np.zeros(3))
+    assert sorted(order) == list(range(12))
+    assert seconds(order) < seconds(range(12))
+    few = points[:5]
+    best = min(seconds(o, few) for o in itertools.permutations(range(5)))
+    found = travel_order(config, few, np.zeros(3))
+    assert seconds(found, few) == pytest.approx(best)
+    for count in (14, 201):  # above 12 improved, above 200 nearest neighbours
+        many = travel_order(config, rng.uniform(-20, 20, (count, 3)), np.zeros(3))
+        assert sorted(many) == list(range(count))
+    assert travel_order(config, np.empty((0, 3)), np.zeros(3)) == []

@@ -1,0 +1,174 @@
+"""From cables to a calibration, against a simulated device that is miswired."""
+
+import json
+import os
+import pathlib
+import re
+
+import numpy as np
+import pytest
+from commission import QUICK, device, set_up
+from harness import no_figures
+
+from rig import commissioning
+from rig.__main__ import main
+from rig.commission import setup, steps
+from rig.commission.operator import Operator
+from rig.config import load_config, parse_config
+from rig.config.files import EXAMPLES
+from rig.device.record import (
+    HOMED,
+    IDENTIFIED,
+    SIGN_CHECKED,
+    ZEROED,
+    DeviceRecord,
+)
+from rig.faults import Refused
+from rig.simulator import Truth
+
+
+@pytest.mark.parametrize(
+    "transport", ["tcp", pytest.param("rtu", marks=pytest.mark.slow)]
+)
+def test_setup_finds_exchanged_reversed_and_wrongly_geared_axes(at, transport, capsys):
+    truth = Truth(
+        noise_deg=0.005, swapped=(1, 0, 2), reversed=(True, False, True),
+        drive_pulses_per_rev=(4000, 10000, 20000),
+    )  # fmt: skip
+    with device(truth, transport) as (_, bus, port):
+        assert set_up(bus, port) == 0
+        config = load_config("rig.toml")
+        # Joint i is turned by drive swapped[i], whose unit is that index plus one.
+        assert [axis.unit for axis in config.axes] == [2, 1, 3]
+        assert [axis.pulses_per_rev for axis in config.axes] == [10000, 4000, 20000]
+        assert [axis.reduction for axis in config.axes] == [10, 10, 10]
+        # Yaw's drive has direction -1 in the simulator; those of 1 and 3 are reversed.
+        assert [axis.direction for axis in config.axes] == [-1, -1, -1]
+        record = DeviceRecord.load(config.device_path)
+        for state in (IDENTIFIED, HOMED, SIGN_CHECKED, ZEROED):
+            assert record.state(state) is not None, state
+        assert config.imu.allow == ("127.0.0.1",)
+        assert record.missing(config) is None
+        if transport == "rtu":  # the slow one goes on to the calibration
+            with no_figures():
+                go_on = ["calibrate", "--config", "rig.toml", "--arm", "--zero"]
+                assert main(go_on) == 0
+            (path,) = at.glob("runs/calibrate-*/summary.json")
+            found = json.loads(path.read_text())["A"]
+            np.testing.assert_allclose(found, truth.matrix, atol=0.005)
+    said = capsys.readouterr().out
+    assert "next: jaxcal-rig calibrate --config rig.toml" in said
+    # the corrected file is the written one with other values: comments stay
+    text = pathlib.Path("rig.toml").read_text()
+    assert "# omega: pulses for one motor turn, as set in the drive" in text
+    assert len(list(at.glob("rig.toml.*.bak"))) == 2  # the phone's address, the axes
+
+
+@pytest.mark.slow
+def test_gearing_that_no_register_tells_is_taken_from_the_phone(at):
+    text = (EXAMPLES / "generic.toml").read_text()
+    config = load_config_text(text)
+    truth = Truth(noise_deg=0.005, drive_pulses_per_rev=(1000,) * 3)
+    turned = []
+    with device(truth, config=config, speedup=20.0) as (sim, bus, port):
+        start = sim.plant.attitude()
+        measure = sim.plant.attitude
+
+        def watched():
+            matrix = measure()
+            angle = np.arccos(np.clip((np.trace(start.T @ matrix) - 1) / 2, -1, 1))
+            turned.append(np.degrees(angle))
+            return matrix
+
+        sim.plant.attitude = watched
+        values = [value for value in QUICK if "reduction" not in value]
+        values += [f"axes.{a.name}.reduction={a.reduction}" for a in config.axes]
+        assert set_up(bus, port, values=values) == 0
+    written = load_config("rig.toml")
+    for axis, was, gain in zip(
+        written.axes, config.axes, (0.43, 0.71, 0.87), strict=True
+    ):
+        # ten times as far as commanded: now about as commanded
+        factor = was.pulses_per_rev / 1000 * gain
+        assert axis.reduction == pytest.approx(was.reduction / factor, rel=0.03)
+    assert max(turned) < 9.0  # and on the way to it nothing went far
+
+
+def load_config_text(text):
+    return parse_config(re.sub(r"(?m)^(speed_deg_s =) .*", r"\1 100", text))
+
+
+@pytest.mark.slow
+def test_setup_goes_on_where_it_was_left(at, capsys):
+    with device() as (sim, bus, port):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(
+                steps, "take_zero", lambda place: (_ for _ in ()).throw(OSError("gone"))
+            )
+            assert set_up(bus, port) == 2
+        capsys.readouterr()
+        moved = len(sim.executions()[0])
+        assert main(["setup", "--yes"]) == 0
+        said = capsys.readouterr().out
+        assert "9 zero" in said and "8 axes" not in said and "6 jog" not in said
+        assert len(sim.executions()[0]) == moved
+
+
+def test_setup_asks_with_defaults_and_moves_nothing_without_a_yes(at):
+    asked: list[str] = []
+    told: list[str] = []
+
+    def read(question):
+        asked.append(question)
+        return "no" if told[-1].startswith("axes: ") else ""
+
+    with device() as (sim, bus, port):
+        operator = Operator(say=told.append, read=read)
+        values = dict(commissioning.setting(value) for value in QUICK)
+        given = setup.Given(bus=bus, imu=f"hyperimu:{port}", units=4, values=values)
+        config = setup.write_config(at / "rig.toml", given, operator)
+        record = DeviceRecord.load(config.device_path)
+        place = steps.Place(config, record, operator, at / "rig.toml")
+        with pytest.raises(Refused, match="not confirmed"):
+            setup.go(place, given)
+        assert sim.executions() == [[], [], []]
+    assert record.state(HOMED) and not record.state(SIGN_CHECKED)
+    assert all(re.search(r"\[.+\]: $", question) for question in asked)
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_the_next_command_of_a_simulated_device_simulates_it(
+    commissioned, at, simulated
+):
+    """The device that `setup --simulate` served is gone when it ends."""
+    told: list[str] = []
+    config = load_config("rig.toml")
+    record = DeviceRecord.load(config.device_path)
+    record.reach(ZEROED, config)
+    operator = Operator(yes=True, say=told.append)
+    place = steps.Place(config, record, operator, at / "rig.toml", full_speed=simulated)
+    assert setup.go(place, setup.Given()) == 0
+    again = " --simulate" if simulated else ""
+    assert told[-1] == f"next: jaxcal-rig calibrate{again} --config rig.toml"
+
+
+@pytest.mark.slow
+def test_setup_of_a_simulated_device_in_one_command(at):
+    wrong = ["--reversed", "yaw", "--noise", "0.005"]
+    quick = [word for value in QUICK for word in ("--set", value)]
+    common = ["--simulate", "--yes", "--units", "3"]
+    assert main(["setup", *common, *wrong, *quick]) == 0
+    (path,) = at.glob("runs/simulated-*/rig.toml")
+    yaw = load_config(path).axes[1]
+    with no_figures():
+        assert main(["calibrate", "--simulate", "--config", str(path)]) == 0
+    assert yaw.direction == 1  # the simulator's own has -1
+    assert DeviceRecord.load(path.with_name("device.json")).state(ZEROED)
+
+
+def test_without_a_terminal_nothing_is_confirmed(at, monkeypatch, capsys):
+    monkeypatch.setattr("sys.stdin", open(os.devnull))
+    with device() as (_, bus, port):
+        assert main(["setup", "--bus", bus, "--imu", f"hyperimu:{port}"]) == 2
+    assert "--yes" in capsys.readouterr().err
+    assert not pathlib.Path("rig.toml").exists()
