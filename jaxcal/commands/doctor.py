@@ -115,7 +115,7 @@ def _caches() -> dict[str, str]:
 def _ports() -> dict[str, str]:
     if importlib.util.find_spec("serial") is None:
         return {"serial": "pyserial is not installed"}
-    from serial.tools import list_ports
+    from serial.tools import list_ports  # type: ignore[import-untyped]  # no stubs
 
     found: list[Any] = sorted(list_ports.comports())
     return {p.device: p.description for p in found} or {"serial": "none"}

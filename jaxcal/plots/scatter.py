@@ -38,8 +38,8 @@ def ellipsoid(
         axes.plot(*ring, **{"color": COLOURS[0]} | look)
         return axes
     tilt = np.linspace(0.0, np.pi, 13)[:, None]
-    ball = [np.sin(tilt) * np.cos(turn), np.sin(tilt) * np.sin(turn)]
-    ball = np.stack([*ball, np.cos(tilt) * np.ones_like(turn)])
+    across = np.sin(tilt) * np.stack([np.cos(turn), np.sin(turn)])[:, None]
+    ball = np.concatenate([across, (np.cos(tilt) * np.ones_like(turn))[None]])
     net = middle[:, None, None] + np.tensordot(root, ball, axes=1)
     axes.plot_wireframe(*net, **{"color": COLOURS[0], "linewidth": 0.4} | look)
     return axes
