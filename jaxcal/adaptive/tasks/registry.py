@@ -23,6 +23,7 @@ __all__ = ["FREE", "Entry", "load", "names", "options_from"]
 _GROUP = "jaxcal.tasks"  # entry points
 _OWN = {
     "backlash": "jaxcal.adaptive.tasks.backlash:ENTRY",
+    "breakaway": "jaxcal.adaptive.tasks.breakaway:ENTRY",
     "ces": "jaxcal.adaptive.tasks.ces:ENTRY",
     "dead_zone": "jaxcal.adaptive.tasks.backlash:DEAD_ZONE",
     "death": "jaxcal.adaptive.tasks.death:ENTRY",
