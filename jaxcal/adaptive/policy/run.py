@@ -92,7 +92,7 @@ def train(
     recipe = loop.Recipe(
         ppo=config.ppo,
         meta=config.as_meta(),
-        init=lambda: _init(config, tasks[0]),
+        init=lambda: _init(config),
         update=lambda done, state: update(state, tasks[done % len(tasks)], base),
         validate=validate,
         validate_every=config.validate_every,
@@ -115,9 +115,9 @@ def _arrays(tree: Any) -> Any:
     return jax.tree.map(jnp.asarray, tree)
 
 
-def _init(config: PolicyConfig, task: Any) -> TrainState:
+def _init(config: PolicyConfig) -> TrainState:
     keys = Keys.of(config.ppo.seed)
-    params = initial(keys.weights, config.per_group, task.num_groups, config.width)
+    params = initial(keys.weights, config.per_group, 1, config.width)
     return TrainState(
         params=params,
         average=jax.tree.map(jnp.copy, params),
