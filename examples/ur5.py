@@ -26,14 +26,7 @@ Array = NDArray[np.float64]
 
 # The controller's Denavit-Hartenberg rows (a mm, alpha deg, d mm, theta deg): with them
 # and the reflector 31 mm before the flange the targets come out to 0.003 mm.
-DH = [
-    (0.0, 90.0, 89.159, 0.0),
-    (-425.0, 0.0, 0.0, 0.0),
-    (-392.25, 0.0, 0.0, 0.0),
-    (0.0, 90.0, 109.15, 0.0),
-    (0.0, -90.0, 94.56, 0.0),
-    (0.0, 0.0, 82.3, 0.0),
-]
+DH = np.loadtxt(common.HERE / "ur5" / "dh.csv", delimiter=",", skiprows=1)
 NOISE = jaxcal.Noise(std=0.1)  # mm: the robot's repeatability
 RULES = ("random", "maximin", "D", "A", "I greedy", "I")
 COUNTS = (6, 8, 12, 20, 40)

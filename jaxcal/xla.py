@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import os
 
-import jaxlib.version
 import numpy as np
 
 __all__ = ["require_sums", "sidestep"]
@@ -21,10 +20,14 @@ _FLAG = "--xla_cpu_experimental_ynn_fusion_type"
 def sidestep() -> None:
     """Set the flag that avoids it, in ``XLA_FLAGS``: XLA reads them at its first use.
 
-    A flag of the user's own is left alone.
+    A flag of the user's own is left alone. Without jaxlib there is nothing to do.
     """
+    try:
+        from jaxlib.version import __version__ as version
+    except ImportError:
+        return
     flags = os.environ.get("XLA_FLAGS", "")
-    if jaxlib.version.__version__ == "0.10.2" and _FLAG not in flags:
+    if version == "0.10.2" and _FLAG not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {_FLAG}=-reduce".strip()
 
 

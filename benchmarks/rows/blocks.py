@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from benchmarks.harness import ROOT, Budget, Line, Row, Verdict
 from benchmarks.peers import figaroh
-from examples.ur5.ur5 import arm
 from jaxcal import identify, select
 from jaxcal.models import Noise, SerialChain
 from jaxcal.selection.exact import branch_and_bound as search
@@ -31,6 +30,7 @@ NAME = "blocks"
 TITLE = "Poses of a measured UR5, and FIGAROH's rule"
 
 _NOISE = 0.1  # mm
+_UR5 = ROOT / "examples" / "ur5"
 _PROOFS = ((1000, 20, 15.0), (200, 12, 8.0), (50, 8, 3.0))  # M, K, seconds wanted
 _LONGEST = 40.0  # seconds of a proof
 
@@ -39,9 +39,16 @@ Array = NDArray[np.float64]
 
 def poses(name: str) -> tuple[Array, Array]:
     """Joint angles (N, 6) in degrees and measured points (N, 3) in mm."""
-    path = ROOT / "examples" / "ur5" / name
-    rows = np.loadtxt(path, delimiter=",", skiprows=1)
+    rows = _table(name)
     return rows[:, 7:13], rows[:, 1:4] + rows[:, 4:7]
+
+
+def arm() -> SerialChain:
+    return SerialChain.from_dh(_table("dh.csv"), tool=(0, 0, 31))
+
+
+def _table(name: str) -> Array:
+    return np.loadtxt(_UR5 / name, delimiter=",", skiprows=1)
 
 
 def cpu_seconds(call: Callable[[], Any], rounds: int) -> float:

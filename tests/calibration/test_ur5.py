@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
-import importlib.util
 import pathlib
 
 import numpy as np
 import pytest
 
 from jaxcal.calibration import identify
-from jaxcal.models import Prior
+from jaxcal.models import Prior, SerialChain
 
-_SPEC = importlib.util.spec_from_file_location(
-    "ur5", pathlib.Path(__file__).parents[2] / "examples" / "ur5" / "ur5.py"
-)
-assert _SPEC is not None and _SPEC.loader is not None
-EXAMPLE = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(EXAMPLE)
-ARM = EXAMPLE.arm()
+DATA = pathlib.Path(__file__).parents[2] / "examples" / "ur5"
 
-JOINTS, MEASURED = EXAMPLE.load("ur5_grid_1000.csv")
-TEST_JOINTS, TEST = EXAMPLE.load("ur5_random_20.csv")
+
+def table(name: str) -> np.ndarray:
+    return np.loadtxt(DATA / name, delimiter=",", skiprows=1)
+
+
+def poses(name: str) -> tuple[np.ndarray, np.ndarray]:
+    rows = table(name)
+    return rows[:, 7:13], rows[:, 1:4] + rows[:, 4:7]
+
+
+ARM = SerialChain.from_dh(table("dh.csv"), tool=[0, 0, 31.0])
+JOINTS, MEASURED = poses("ur5_grid_1000.csv")
+TEST_JOINTS, TEST = poses("ur5_random_20.csv")
 
 
 def error(found: object) -> float:

@@ -11,14 +11,7 @@ from jaxcal.models import SerialChain
 UR5 = pathlib.Path(__file__).parents[2] / "examples" / "ur5"
 
 # The controller's lengths: with these the targets of the files come out to 0.003 mm.
-UR5_TABLE = [
-    (0, 90, 89.159, 0),
-    (-425, 0, 0, 0),
-    (-392.25, 0, 0, 0),
-    (0, 90, 109.15, 0),
-    (0, -90, 94.56, 0),
-    (0, 0, 82.3, 0),
-]
+UR5_TABLE = np.loadtxt(UR5 / "dh.csv", delimiter=",", skiprows=1).tolist()
 
 
 def ur5(**options):
