@@ -246,8 +246,8 @@ class GridTask:
                 f"groups must hold {count} whole numbers from 0, got {in_words(alike)}"
             )
         single, whole = jnp.float32, jnp.int32
-        shape = _grid(grid)
-        parts, order = _split(table, shape)
+        lengths = _grid(grid)
+        parts, order = _split(table, lengths)
         return GridTask(
             theta=jnp.asarray(grid, single),
             prior=jnp.asarray(weights / weights.sum(), single),
@@ -264,7 +264,7 @@ class GridTask:
             place=jnp.asarray(first, whole),
             groups=jnp.asarray(alike, whole),
             num_groups=int(alike.max()) + 1,
-            shape=shape,
+            shape=lengths,
             most=whole_number("most", most, 1),
             theta_names=_names("theta_names", theta_names, "theta", grid.shape[1]),
             design_names=_names("design_names", design_names, "u", at.shape[1]),
@@ -364,14 +364,18 @@ def _split(
         members.setdefault(tuple(np.flatnonzero(which).tolist()), []).append(design)
     parts = []
     for axes, designs in members.items():
-        others = tuple(i for i in range(len(shape)) if i not in axes)
-        mine = grid[designs]
-        for i in sorted(others, reverse=True):
-            mine = mine.take(0, axis=2 + i)
-        mine = mine.reshape(*mine.shape[:2], -1)
+        whole = slice(None)
+        first = [whole if i in axes else 0 for i in range(len(shape))]
+        mine = grid[designs][(whole, whole, *first)]
+        mine = mine.reshape(len(designs), table.shape[1], -1)
         product = mine * np.log(np.where(mine > 0.0, mine, 1.0))
-        tables = (jnp.asarray(t, jnp.float32) for t in (mine, product))
-        parts.append(Part(*tables, axes))
+        parts.append(
+            Part(
+                likelihood=jnp.asarray(mine, jnp.float32),
+                p_log_p=jnp.asarray(product, jnp.float32),
+                axes=axes,
+            )
+        )
     return tuple(parts), np.argsort(np.concatenate(list(members.values())))
 
 

@@ -106,8 +106,8 @@ def _advantages(
     """(B, T) generalised advantage estimates of the first T choices.
 
     What follows a choice counts in expectation over its outcomes, not as it happened:
-    the luck of the outcome, most of the variance, is left out. The expectation of the
-    estimates is the same.
+    the randomness of the outcome, most of the variance, is left out. The expectation of
+    the estimates is the same.
 
     Args:
         reward, value, ended: (B, T + 1); the last value closes the cut.
