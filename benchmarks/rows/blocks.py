@@ -15,11 +15,11 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from examples.ur5.ur5 import arm
 from numpy.typing import NDArray
 
 from benchmarks.harness import ROOT, Budget, Line, Row, Verdict
 from benchmarks.peers import figaroh
-from examples.ur5.ur5 import arm
 from jaxcal import identify, select
 from jaxcal.models import Noise, SerialChain
 from jaxcal.selection.exact import branch_and_bound as search

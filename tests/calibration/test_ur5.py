@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import importlib.util
-import pathlib
-
 import numpy as np
 import pytest
+import ur5
 
 from jaxcal.calibration import identify
 from jaxcal.models import Prior
 
-_SPEC = importlib.util.spec_from_file_location(
-    "ur5", pathlib.Path(__file__).parents[2] / "examples" / "ur5" / "ur5.py"
-)
-assert _SPEC is not None and _SPEC.loader is not None
-EXAMPLE = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(EXAMPLE)
-ARM = EXAMPLE.arm()
+ARM = ur5.arm()
 
-JOINTS, MEASURED = EXAMPLE.load("ur5_grid_1000.csv")
-TEST_JOINTS, TEST = EXAMPLE.load("ur5_random_20.csv")
+JOINTS, MEASURED = ur5.load("ur5_grid_1000.csv")
+TEST_JOINTS, TEST = ur5.load("ur5_random_20.csv")
 
 
 def error(found: object) -> float:
