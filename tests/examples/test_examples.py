@@ -4,6 +4,7 @@ import csv
 import importlib
 import pathlib
 
+import common
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -12,9 +13,6 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 
 EXAMPLES = pathlib.Path(__file__).parents[2] / "examples"
-
-
-import common
 
 
 def quick(name, folder):
