@@ -117,7 +117,6 @@ def draw(axes, rows: common.Rows) -> None:
     """Error of the measured forces."""
     label = "error of measured forces, % of rated"
     common.bars(axes, rows, "loads", "force_percent", label)
-    axes.set_yscale("log")
 
 
 if __name__ == "__main__":

@@ -65,6 +65,11 @@ CASES = {
         ("jax", "flax", "brax", "mujoco", "matplotlib"),
         [(["jaxcal-rig", "calibrate", "--simulate"], 0, "")],
     ),
+    "live": (
+        ("jax", "flax", "brax", "mujoco", "matplotlib"),
+        [(["jaxcal", "doctor"], 0, "nicegui")],
+    ),
+    "docs": (HEAVY, [(["mkdocs", "--version"], 0, "mkdocs")]),
     "study": (
         ("pymodbus", "pydantic"),
         [

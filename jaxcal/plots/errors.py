@@ -45,7 +45,8 @@ def before_after(
         axes.plot(at.ravel(), each.ravel(), label=text, **points(i) | look)
     axes.set_xticks(range(count), names or [str(i + 1) for i in range(count)])
     axes.set_ylabel(f"error ({unit})" if unit else "error")
-    axes.legend(frameon=False)
+    above = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0)}  # clear of the points
+    axes.legend(frameon=False, **above)
     plain_axes(axes)
     return axes
 

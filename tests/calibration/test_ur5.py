@@ -2,29 +2,17 @@
 
 from __future__ import annotations
 
-import pathlib
-
 import numpy as np
 import pytest
+import ur5
 
 from jaxcal.calibration import identify
-from jaxcal.models import Prior, SerialChain
+from jaxcal.models import Prior
 
-DATA = pathlib.Path(__file__).parents[2] / "examples" / "ur5"
+ARM = ur5.arm()
 
-
-def table(name: str) -> np.ndarray:
-    return np.loadtxt(DATA / name, delimiter=",", skiprows=1)
-
-
-def poses(name: str) -> tuple[np.ndarray, np.ndarray]:
-    rows = table(name)
-    return rows[:, 7:13], rows[:, 1:4] + rows[:, 4:7]
-
-
-ARM = SerialChain.from_dh(table("dh.csv"), tool=[0, 0, 31.0])
-JOINTS, MEASURED = poses("ur5_grid_1000.csv")
-TEST_JOINTS, TEST = poses("ur5_random_20.csv")
+JOINTS, MEASURED = ur5.load("ur5_grid_1000.csv")
+TEST_JOINTS, TEST = ur5.load("ur5_random_20.csv")
 
 
 def error(found: object) -> float:

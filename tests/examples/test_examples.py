@@ -3,8 +3,8 @@
 import csv
 import importlib
 import pathlib
-import sys
 
+import common
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -15,17 +15,9 @@ import jaxcal
 EXAMPLES = pathlib.Path(__file__).parents[2] / "examples"
 
 
-sys.path.insert(0, str(EXAMPLES))
-import common
-
-
-def load(name):
-    return importlib.import_module(name)
-
-
 def quick(name, folder):
     """What a quick run found, and the rows that it wrote."""
-    found = common.main(load(name), ["--out", str(folder)])
+    found = common.main(importlib.import_module(name), ["--out", str(folder)])
     assert (folder / f"{name}.png").stat().st_size > 5_000
     with (folder / f"{name}.csv").open(newline="") as file:
         return found, list(csv.DictReader(file))
@@ -44,7 +36,7 @@ def test_force_sensor_loads_beat_one_axis_at_a_time(tmp_path):
 
 
 def test_force_sensor_loads_are_a_weight_on_a_lever():
-    example = load("force_sensor")
+    example = importlib.import_module("force_sensor")
     loads, rows = example.wrenches()
     assert loads.shape == (100, 6) and len(set(rows)) == 100
     assert (np.abs(loads) <= example.RATED * (1.0 + 1e-12)).all()
@@ -64,7 +56,7 @@ def test_camera_views_beat_covering_the_image(tmp_path):
 @pytest.mark.slow
 def test_camera_fit_is_the_joint_fit_of_all_poses():
     """Oracle: scipy's least squares over 6 + 6 x 10 unknowns and its own rotations."""
-    example = load("camera")
+    example = importlib.import_module("camera")
     rng = np.random.default_rng(3)
     true = example.views(rng, 10, example.NOMINAL)
     rough = true + rng.normal(size=true.shape) * ([0.02] * 3 + [0.005] * 3)
@@ -109,7 +101,7 @@ def test_triad_needs_no_better_than_the_textbook_but_four_will_do(tmp_path):
     assert rms(found["any", 6, "I"])[everywhere] == pytest.approx(textbook, rel=0.15)
     four = rms(found["any", 4, "I"])[everywhere]
     assert textbook < four < 1.5 * textbook
-    example = load("triad")
+    example = importlib.import_module("triad")
     assert 0.95 < example.efficiency(180.0) <= 1.0
     # six positions: the bias is a mean of six readings of each axis
     assert rms(found["any", 6, "textbook"])[0] == pytest.approx(1 / 6**0.5, rel=0.2)
@@ -136,7 +128,7 @@ def test_two_chosen_postures_find_the_backlash_better_than_two_in_order(tmp_path
 
 @pytest.mark.slow
 def test_a_policy_trained_on_its_own_postures_beats_greedy():
-    found = load("own_policy").study(False, episodes=20_000)
+    found = importlib.import_module("own_policy").study(False, episodes=20_000)
     assert (found["own policy"] <= 1.0 + 1e-9).all()
     assert found["own policy"].mean() > found["greedy"].mean()
 

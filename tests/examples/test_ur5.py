@@ -2,22 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
-import pathlib
-import sys
-
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(pathlib.Path(__file__).parents[2] / "examples"))
-
-
-@pytest.fixture(scope="module")
-def ur5():
-    return importlib.import_module("ur5")
+import ur5
 
 
-def test_eight_chosen_poses_do_what_the_thesis_needed_a_thousand_for(ur5, monkeypatch):
+def test_eight_chosen_poses_do_what_the_thesis_needed_a_thousand_for(monkeypatch):
     monkeypatch.setattr(ur5, "RULES", ("random", "I"))
     monkeypatch.setattr(ur5, "COUNTS", (8,))
     found = ur5.study(full=False)
@@ -26,12 +16,12 @@ def test_eight_chosen_poses_do_what_the_thesis_needed_a_thousand_for(ur5, monkey
     assert (chosen < random).all()
 
 
-def test_students_loss_takes_no_harm_from_one_outlier(ur5):
+def test_students_loss_takes_no_harm_from_one_outlier():
     means = ur5.outliers(pools=2)
     assert means["student"] < 0.16 < 0.3 < means["gaussian"]
 
 
-def test_the_uncalibrated_arm_is_off_by_millimetres(ur5):
+def test_the_uncalibrated_arm_is_off_by_millimetres():
     angles, reached = ur5.load("ur5_random_20.csv")
     off = np.linalg.norm(ur5.arm().predict(angles) - reached, axis=1)
     assert off.mean() == pytest.approx(2.566, abs=0.005)  # the thesis' own figure
