@@ -15,7 +15,6 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from examples.ur5.ur5 import arm
 from numpy.typing import NDArray
 
 from benchmarks.harness import ROOT, Budget, Line, Row, Verdict
