@@ -86,6 +86,8 @@ SIMULATOR: Options = {
     },
     "--noise": _number(0.0, 90.0, 0.02, "degrees"),
     "--backlash": _number(0.0, 90.0, 0.0, "degrees"),
+    "--dead-zone": _number(0.0, 90.0, 0.0, "degrees"),
+    "--breakaway": _number(0.0, 90.0, 0.0, "degrees until a joint at rest yields"),
     "--drift": _number(-90.0, 90.0, 0.0, "degrees per minute"),
     "--speedup": _number(0.01, 100.0, 1.0, "factor on the speed of the axes"),
     "--rate": _number(0.1, 1000.0, 100.0, "of the phone, Hz"),
@@ -147,6 +149,9 @@ JOG: Options = AXIS | {
         "nargs": "?",
         "help": "degrees, at most 3; without it the axis moves while a key is held",
     },
+}
+INTO: Options = {
+    "--into": _path("a calibration that is to keep what is found", metavar="RUN")
 }
 HERE: Options = {
     "--here": _flag("where the device stands is home; otherwise the drives' own homing")
@@ -221,8 +226,8 @@ def make_parser() -> argparse.ArgumentParser:
     add("scan", "which units answer, and of which family; reads only", CONFIG | BUS)
     add("imu", "what to type into the phone, and what it sends", STEP | SECONDS)
     add("jog", "move one axis by hand", JOG | STEP)
-    text = "measure the play of one axis, with an interval"
-    add("characterise", text, AXIS | STEP)
+    text = "measure play, dead zone and breakaway of one axis, with intervals"
+    add("characterise", text, AXIS | INTO | STEP)
     add("home", "make the drives' counts mean a place", HERE | STEP)
     text = "check what turns, which way, how far; correct rig.toml"
     add("axes", text, NAMES_KNOWN | STEP)

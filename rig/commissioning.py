@@ -109,7 +109,7 @@ def _characterise(args: argparse.Namespace) -> int:
     with needs("policy", "characterise"):
         import jax  # noqa: F401  # before anything moves
     with _place(args, SIGN_CHECKED) as place:
-        return steps.measure_play(place, AXIS_NAMES.index(args.axis))
+        return steps.characterise(place, AXIS_NAMES.index(args.axis), args.into)
 
 
 def _home(args: argparse.Namespace) -> int:

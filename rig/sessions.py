@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 FILE = pathlib.Path("rig.toml")  # without --config
 SIMULATION = (
     "transport", "noise", "backlash", "drift", "speedup", "rate", "reversed", "swapped",
-    "gearing", "lost_origin", "realistic",
+    "gearing", "lost_origin", "realistic", "dead_zone", "breakaway",
 )  # fmt: skip
 
 
@@ -195,7 +195,8 @@ def _procedure(
     if mode == "verify":
         return lambda run: checking.verify(run, calibration, count), saved.zero
     desired = np.array(inputs["to"], dtype=np.float64)
-    return lambda run: checking.goto(run, calibration, desired), saved.zero
+    play = saved.play
+    return lambda run: checking.goto(run, calibration, desired, play), saved.zero
 
 
 def _commission(config: RigConfig, record: DeviceRecord, simulator: Simulator) -> None:

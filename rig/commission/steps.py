@@ -81,7 +81,11 @@ class Place:
             yield [Drive(bus, axis) for axis in config.axes]
 
     def run(
-        self, name: str, procedure: Callable[[Bench], object], limits: bool = True
+        self,
+        name: str,
+        procedure: Callable[[Bench], object],
+        limits: bool = True,
+        again: str = "",
     ) -> int:
         """Run a step that moves or writes; returns the exit code."""
         config = self.config if limits else unlimited(self.config)
@@ -90,7 +94,7 @@ class Place:
                 config, name, self.record, self.say,
                 folder=self.folder, plain=self.config, homed=limits,
                 full_speed=self.full_speed,
-                again=f"jaxcal-rig {name}", reset_alarms=self.reset_alarms,
+                again=f"jaxcal-rig {again or name}", reset_alarms=self.reset_alarms,
                 start={"simulated": None, "inputs": {}, "maps_from": ""},
             )  # fmt: skip
             lock.tell(run=str(bench.folder.resolve()))
@@ -163,16 +167,28 @@ def jog(place: Place, axis: int, way_deg: float | None) -> int:
     return place.run("jog", procedure, limits=homed)
 
 
-def measure_play(place: Place, axis: int) -> int:
-    """Measure the backlash of one axis in a closed loop."""
-    from rig.commission.characterise import FAR_DEG, characterise  # loads JAX
+def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> int:
+    """Measure play, dead zone and breakaway of an axis, into a calibration."""
+    from rig.commission import characterise as measured  # loads JAX
+    from rig.session.checking import calibration_path, keep, load_calibration
 
     place.require(SIGN_CHECKED)
+    path = None if into is None else calibration_path(into)
+    if path is not None:
+        load_calibration(path, place.config)  # of this device
+    name, most = AXIS_NAMES[axis], measured.BASE_DEG + measured.FAR_DEG
     place.operator.confirm(
-        f"characterise: {AXIS_NAMES[axis]} will move up to {FAR_DEG:g} deg either way "
-        "from where it stands, many times. Keep out of the device's reach"
+        f"characterise: {name} will move up to {most:.2f} deg from where it stands, "
+        "many times. Keep out of the device's reach"
     )
-    return place.run("characterise", lambda run: characterise(run, axis))
+
+    def procedure(run: Bench) -> None:
+        found = measured.characterise(run, axis)
+        if path is not None:
+            keep(path, name, found | {"run": run.folder.name})
+            run.say(f"kept in {path}: `goto` puts the play back")
+
+    return place.run("characterise", procedure, again=f"characterise {name}")
 
 
 def axes(place: Place, names_known: bool = False) -> int:

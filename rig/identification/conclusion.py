@@ -57,6 +57,7 @@ def conclude(
     notes = notes | shared
     notes |= {
         "mechanism_order": config.mechanism.order,
+        "approach_overshoot_deg": config.motion.approach_overshoot_deg,
         "noise_from": limits["basis"],
         "drift_corrected": drift is not None and drift.corrected,
     }

@@ -16,6 +16,7 @@ from rig.identification.fit import pairs
 from rig.outputs.console import error_text, numbers
 from rig.session.calibrate import visit_pairs
 from rig.session.planning import draw, draw_held_out
+from rig.session.play import CHARACTERISED, Play
 from rig.session.reference import KeptZero
 from rig.session.run import Run
 
@@ -59,6 +60,7 @@ class Saved(NamedTuple):
 
     calibration: Any
     zero: KeptZero
+    play: Play
     note: str  # for the operator; empty where all is well
 
 
@@ -70,8 +72,7 @@ def load_calibration(path: pathlib.Path, config: RigConfig) -> Saved:
     """
     import jaxcal
 
-    if path.is_dir():
-        path = path / "calibration.json"
+    path = calibration_path(path)
     try:
         calibration = jaxcal.Calibration.load(path)
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -84,7 +85,22 @@ def load_calibration(path: pathlib.Path, config: RigConfig) -> Saved:
         None if zero is None else (int(zero[0]), int(zero[1]), int(zero[2])),
         None if attitude is None else np.array(attitude, dtype=np.float64),
     )
-    return Saved(calibration, kept, note)
+    return Saved(calibration, kept, Play.of(notes), note)
+
+
+def calibration_path(path: pathlib.Path) -> pathlib.Path:
+    """The file of a calibration that is given by itself or by its run's folder."""
+    return path / "calibration.json" if path.is_dir() else path
+
+
+def keep(path: pathlib.Path, axis: str, found: dict[str, Any]) -> None:
+    """Write what was found of an axis into the notes of a calibration's file."""
+    from jaxcal.calibration import file
+
+    content = file.read(path)
+    notes = content["provenance"].setdefault("notes", {})
+    notes[CHARACTERISED] = notes.get(CHARACTERISED, {}) | {axis: found}
+    file.write(path, content)
 
 
 def _check_device(path: pathlib.Path, notes: dict[str, Any], config: RigConfig) -> str:
@@ -142,16 +158,25 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     return EXIT_RECALIBRATE if again else EXIT_OK
 
 
-def goto(run: Run, calibration: Any, desired: Array) -> int:
-    """Move the end-effector to (3,) desired degrees through a calibration."""
+def goto(run: Run, calibration: Any, desired: Array, play: Play) -> int:
+    """Move the end-effector to (3,) desired degrees through a calibration.
+
+    Args:
+        run, calibration, desired: what moves, by what, and where to.
+        play: of the axes, put back by the direction in which each arrives.
+    """
     config = run.config
     command = np.asarray(calibration.command_for(desired), dtype=np.float64)
-    for axis, value in zip(config.axes, command, strict=True):
-        if not axis.min_deg <= value <= axis.max_deg:
+    for axis, value, most in zip(config.axes, command, play.most, strict=True):
+        if not axis.min_deg + most <= value <= axis.max_deg - most:
             raise LimitError(
                 f"{desired.tolist()} deg needs {axis.name} commanded to {value:.3f} "
                 f"deg, outside [{axis.min_deg:g}, {axis.max_deg:g}]"
+                + f" less its play, {most:.3f} deg"
+                * bool(most)
             )
+    if play.known and "goto" not in run.postures() and not run.dry_run:
+        command = _with_play(run, command, play)
     pulses = config.to_pulses(command)
     run.say(
         f"desired {desired.tolist()} deg: command {command.round(4).tolist()} deg, "
@@ -167,3 +192,21 @@ def goto(run: Run, calibration: Any, desired: Array) -> int:
         f"{(reached - desired).round(4).tolist()}"
     )
     return EXIT_OK
+
+
+def _with_play(run: Run, command: Array, play: Play) -> Array:
+    """(3,) the command with the play put back, once what is too near has run up."""
+    config, one_way = run.config, run.config.motion.approach_overshoot_deg > 0.0
+    here = config.to_deg(run.ready().positions())
+    direction = np.ones(3) if one_way else np.where(command < here, -1.0, 1.0)
+    near = np.abs(command - here) < play.run_up
+    if near.any() and not one_way:  # so that the last move takes the play up
+        begin = np.where(near, command - direction * play.run_up, here)
+        low = [axis.min_deg for axis in config.axes]
+        high = [axis.max_deg for axis in config.axes]
+        turned = near & ((begin < low) | (begin > high))
+        direction = np.where(turned, -direction, direction)
+        begin = np.where(near, command - direction * play.run_up, here)
+        run.motion.move_to(config.to_pulses(begin), "goto")
+    run.say(*play.lines(command, direction))
+    return command + play.shift(direction)

@@ -32,6 +32,9 @@ class Truth:
     bias: tuple[float, float, float] = (3.1, -5.8, 2.41)  # degrees
     noise_deg: float = 0.02  # white, each reading
     backlash_deg: float = 0.0  # play of each joint
+    breakaway_deg: float = 0.0  # of its drive, until a joint at rest yields
+    dead_zone_deg: float = 0.0  # of each joint, about where it stands at the start
+    dead_centre_deg: float = 0.0  # of the zone, away from there
     drift_deg_per_min: float = 0.0  # of the phone's heading
     heading_deg: float = 170.0  # of the base in the phone's world
     seed: int = 0
@@ -88,6 +91,8 @@ def truth_of(options: dict[str, Any], seed: int) -> Truth:
     return Truth(
         noise_deg=options["noise"],
         backlash_deg=options["backlash"],
+        breakaway_deg=options.get("breakaway", 0.0),  # runs of before have none
+        dead_zone_deg=options.get("dead_zone", 0.0),
         drift_deg_per_min=options["drift"],
         seed=seed,
         reversed=tuple(name in turned for name in AXIS_NAMES),
@@ -124,6 +129,9 @@ class Plant:
         self._drive_deg = self._commanded()
         self._loose = self._drive_deg.copy()  # behind the play
         self._slip = np.zeros(3)
+        self._joint = self._drive_deg.copy()  # behind the friction too
+        self._sliding = np.zeros(3, dtype=bool)
+        self._centre = self._drive_deg + truth.dead_centre_deg
         self._mounting = euler_to_matrix(config.imu.mounting_deg, "ZYX")
 
     def tighten(self) -> None:
@@ -139,7 +147,11 @@ class Plant:
         return (np.array(turned) * self.truth.signs)[list(self.truth.swapped)]
 
     def joints(self) -> Array:
-        """(3,) joint angles in degrees now: ``A u + b`` behind the play."""
+        """(3,) joint angles in degrees now.
+
+        ``A u + b`` behind the play, the friction (a joint at rest stays until its drive
+        is ``breakaway_deg`` away, then follows it until that stands) and the dead zone.
+        """
         for drive in self._drives:
             drive.advance()
         now = self._commanded()
@@ -149,8 +161,15 @@ class Plant:
         self._drive_deg = now
         turned = now - self._slip
         half = self.truth.backlash_deg / 2.0
-        self._loose = np.clip(self._loose, turned - half, turned + half)
-        return self._matrix @ self._loose + self._bias
+        loose = np.clip(self._loose, turned - half, turned + half)
+        self._sliding &= loose != self._loose
+        self._loose = loose
+        self._sliding |= np.abs(loose - self._joint) > self.truth.breakaway_deg
+        self._joint = np.where(self._sliding, loose, self._joint)
+        off = self._joint - self._centre
+        zone = self.truth.dead_zone_deg / 2.0
+        past = np.sign(off) * np.maximum(np.abs(off) - zone, 0.0)
+        return self._matrix @ (self._centre + past) + self._bias
 
     def attitude(self) -> Array:
         """(3, 3) attitude of the phone in its world, as its sensors see it."""

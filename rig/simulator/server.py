@@ -54,13 +54,14 @@ class ModbusServer:
         self._random = random.Random(seed)
         self._closing = threading.Event()
         self._threads: list[threading.Thread] = []
+        self._listener: socket.socket | None = None
         self._open = contextlib.ExitStack()
 
     def serve_tcp(self, port: int = 0, rtu: bool = False) -> int:
         """Listen on loopback; returns the port."""
         listener = socket.create_server(("127.0.0.1", port), backlog=8)
         self._open.callback(listener.close)
-        listener.settimeout(0.1)
+        self._listener = listener
         self._start(self._accept, listener, self._cut_rtu if rtu else self._cut_mbap)
         return int(listener.getsockname()[1])
 
@@ -75,6 +76,9 @@ class ModbusServer:
 
     def close(self) -> None:
         self._closing.set()
+        if self._listener is not None:  # wakes the thread that accepts
+            with contextlib.suppress(OSError):
+                self._listener.shutdown(socket.SHUT_RDWR)
         for thread in list(self._threads):
             thread.join(2.0)
         self._open.close()
@@ -86,8 +90,8 @@ class ModbusServer:
         thread.start()
 
     def _accept(self, listener: socket.socket, cut: Cut) -> None:
-        while not self._closing.is_set():
-            with contextlib.suppress(TimeoutError):
+        with contextlib.suppress(OSError):  # as when it is shut down
+            while not self._closing.is_set():
                 connection, _ = listener.accept()
                 connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
                 self._start(self._serve_socket, connection, cut)

@@ -7,6 +7,7 @@ has no noise, few readings a second, and angles as its app writes them.
 
 import contextlib
 import json
+import re
 import socket
 import struct
 import threading
@@ -208,6 +209,20 @@ def connected(port, closing):
     raise OSError
 
 
+def configured(folder, slave, imu, phone):
+    """rig.toml of a device of which all is known that a session needs."""
+    axes = "".join(
+        AXIS.format(name=name, unit=unit)
+        for unit, name in enumerate(("pitch", "yaw", "roll"), 1)
+    )
+    path, session = folder / "rig.toml", 'method = "exact"'
+    path.write_text(
+        CONFIG.format(bus=slave.port, imu=imu, axes=axes, phone=phone, session=session)
+    )
+    commissioned(load_config(path), folder)
+    return path
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("phone", "settings", "rate"),
@@ -225,16 +240,7 @@ def test_a_whole_calibration_with_a_strangers_slave_and_phone(
     phone, settings, rate, tmp_path, capsys
 ):
     slave, imu, closing = Slave(), _free_port(), threading.Event()
-    axes = "".join(
-        AXIS.format(name=name, unit=unit)
-        for unit, name in enumerate(("pitch", "yaw", "roll"), 1)
-    )
-    path, session = tmp_path / "rig.toml", 'method = "exact"'
-    path.write_text(
-        CONFIG.format(bus=slave.port, imu=imu, axes=axes, phone=settings,
-                      session=session)
-    )  # fmt: skip
-    commissioned(load_config(path), tmp_path)
+    path = configured(tmp_path, slave, imu, settings)
     thread = threading.Thread(
         target=phone, args=(slave, imu, closing, rate), daemon=True
     )
@@ -256,3 +262,52 @@ def test_a_whole_calibration_with_a_strangers_slave_and_phone(
     assert slave.functions <= {3, 6, 16}
     assert set(slave.stops) == {1, 2, 3}
     assert angle_between_deg(attitude(slave)[0], np.eye(3)) < 20
+
+
+class Worn:
+    """Joints behind a slave's drives: they lag by play, and yield late from rest."""
+
+    def __init__(self, slave, play, breakaway):
+        self.slave, self.play, self.breakaway = slave, play, breakaway
+        self.seen = 0
+        self.loose, self.joint = dict.fromkeys((1, 2, 3), 0.0), [0.0, 0.0, 0.0]
+
+    def position(self, unit):
+        """Every move so far, one after the other: each is over at once."""
+        while self.seen < len(self.slave.moves):
+            moved, at = self.slave.moves[self.seen]
+            self.seen += 1
+            half = self.play / 2
+            self.loose[moved] = min(max(self.loose[moved], at - half), at + half)
+            if abs(self.loose[moved] - self.joint[moved - 1]) > self.breakaway:
+                self.joint[moved - 1] = self.loose[moved]
+        return self.joint[unit - 1]
+
+
+@pytest.mark.slow
+def test_a_strangers_worn_axis_is_characterised(tmp_path, capsys):
+    """No noise but that of the phone's four digits; nothing of our simulator."""
+    slave, imu, closing = Slave(), _free_port(), threading.Event()
+    path = configured(tmp_path, slave, imu, LINES + QUICK)
+    worn = Worn(slave, 0.284, 0.057)
+    arguments = (worn, imu, closing, 200)
+    thread = threading.Thread(target=line_phone, args=arguments, daemon=True)
+    thread.start()
+    try:
+        code = main(["characterise", "yaw", "--yes", "--config", str(path)])
+    finally:
+        closing.set()
+        thread.join(5)
+        slave.socket.close()
+    said = capsys.readouterr().out
+    assert code == 0, said
+    number = r"(-?[0-9.]+)"
+    for name, truth in (("play", 0.284), ("dead zone", 0.0), ("breakaway up", 0.057),
+                        ("breakaway down", 0.057)):  # fmt: skip
+        low, high = map(
+            float, re.search(f"yaw: {name} .* in {number}\\.\\.{number}", said).groups()
+        )
+        assert low - 0.005 <= truth <= high + 0.005, (name, said)
+        assert high - low <= 0.02
+    assert slave.functions <= {3, 6, 16}
+    assert set(slave.stops) == {1, 2, 3}

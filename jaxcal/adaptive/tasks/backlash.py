@@ -28,6 +28,7 @@ __all__ = [
     "backlash_bins",
     "dead_zone",
     "dead_zone_bins",
+    "past_zone",
     "residual",
 ]
 
@@ -123,9 +124,22 @@ def backlash(
     )
 
 
-def dead_zone_bins(max_width: float, reach: float, bin_width: float) -> Bins:
-    """Bins of the reading that hold everything without noise."""
-    most = reach + max_width / 2.0 + bin_width
+def past_zone(command: ArrayLike, width: ArrayLike, centre: ArrayLike) -> Array:
+    """What a dead zone lets through of a command."""
+    off = np.asarray(command) - np.asarray(centre)
+    return np.asarray(np.sign(off) * np.maximum(np.abs(off) - np.divide(width, 2), 0.0))
+
+
+def dead_zone_bins(
+    max_width: float, reach: float, bin_width: float, relative: bool = False
+) -> Bins:
+    """Bins of the reading that hold everything without noise.
+
+    Args:
+        max_width, reach, bin_width: as of the task.
+        relative: to the reading at a reference, and less the command.
+    """
+    most = max_width + bin_width if relative else reach + max_width / 2.0 + bin_width
     count = int(np.ceil(2.0 * most / bin_width))
     return Bins(-count * bin_width / 2.0, count * bin_width / 2.0, count)
 
@@ -137,6 +151,7 @@ def dead_zone(
     cells: int = 40,
     offset_cells: int = 20,
     reach: float = 1.0,
+    reference: float | None = None,
     num_postures: int = 33,
     sigma: float = 0.05,
     bin_width: float = 0.05,
@@ -151,19 +166,24 @@ def dead_zone(
         cells: of the width.
         offset_cells: of the centre.
         reach: largest command either way.
+        reference: command whose reading, less itself, is taken off every reading, less
+            its command: for an instrument that does not know where the zone's output
+            is. Readings as they are when not given.
         num_postures: commands, evenly spaced.
         sigma: noise of a reading.
         bin_width: of the outcomes, of :func:`dead_zone_bins`.
         outliers: share of readings that say nothing.
         measurements: that end a session.
     """
-    bins = dead_zone_bins(max_width, reach, bin_width)
+    relative = reference is not None
+    bins = dead_zone_bins(max_width, reach, bin_width, relative)
     widths = (np.arange(cells) + 0.5) * max_width / cells
     centres = (np.arange(offset_cells) + 0.5) * 2.0 * max_offset / offset_cells
     theta = np.array([(w, c - max_offset) for w in widths for c in centres])
     at = np.linspace(-reach, reach, num_postures)
-    off = at[:, None] - theta[None, :, 1]
-    mean = np.sign(off) * np.maximum(np.abs(off) - theta[None, :, 0] / 2.0, 0.0)
+    mean = past_zone(at[:, None], theta[:, 0], theta[:, 1])
+    if reference is not None:
+        mean -= at[:, None] + past_zone(reference, theta[:, 0], theta[:, 1]) - reference
     return GridTask.make(
         theta,
         at,
