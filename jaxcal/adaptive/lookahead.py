@@ -93,7 +93,7 @@ class Rollouts:
         later = jax.vmap(alone, in_axes=(0, None))(index, jnp.stack(keys))
         total = gains[index][:, None] + later
         own = jnp.argmax(jnp.where(valid, score[index], -jnp.inf))
-        more = total - total[own]
+        more = total - total[own][None]
         error = more.std(axis=1) / max(self.rollouts - 1, 1) ** 0.5
         least = more.mean(axis=1) - self.doubt * error
         return index[jnp.argmax(jnp.where(valid, least, -jnp.inf))]
