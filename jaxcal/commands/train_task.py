@@ -27,7 +27,7 @@ tasks:
   FILE.py   your own: a file that defines ENTRY (docs/adaptive.md)
 
 examples:
-  {program} --task knee                   about five minutes on one core
+  {program} --task knee                   about three minutes on one core
   {program} --task knee --resume          go on where a run stopped
   {program} --task knee --with cells=16 sigma=0.05
   {program} --task knee --export checkpoints/knee       what ships

@@ -32,7 +32,9 @@ def test_the_adapter_plays_sessions_and_draws_new_ones():
             after = np.asarray(state.pipeline_state.belief.weights)
             prior = np.broadcast_to(np.asarray(task.prior), after.shape)
             np.testing.assert_array_equal(after[done], prior[done])
-            assert (np.asarray(state.reward) > 0.0).all()
+            # 0 where a joint is known to float32's last digit.
+            reward = np.asarray(state.reward)
+            assert (reward >= 0.0).all() and reward.max() > 0.01
             changed = np.abs(after - before).max(axis=1) > 0.0
             assert changed[~done].all()
             ended += int(done.sum())
