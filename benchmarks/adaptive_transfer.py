@@ -33,8 +33,8 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxcal.adaptive.dynamic import solve
+from jaxcal.adaptive.episodes import compare
 from jaxcal.adaptive.grid import GridBelief, GridTask
-from jaxcal.adaptive.play import compare
 from jaxcal.adaptive.policy import run
 from jaxcal.adaptive.rules import Gain, GainRate, best
 from jaxcal.adaptive.tasks.knee import PRICED, STATE_RULE, knee

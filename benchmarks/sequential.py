@@ -32,9 +32,9 @@ import numpy as np
 from flax import struct
 
 from jaxcal.adaptive.bounds import sace
+from jaxcal.adaptive.episodes import Episodes
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.particles import ParticleTask
-from jaxcal.adaptive.play import Episodes
 from jaxcal.adaptive.rules import Gain
 from jaxcal.adaptive.session import Session
 from jaxcal.adaptive.tasks.ces import ces

@@ -12,11 +12,11 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from jaxcal.adaptive.episodes import compare, play
     from jaxcal.adaptive.gaussian import GaussianTask
     from jaxcal.adaptive.grid import GridBelief, GridTask
     from jaxcal.adaptive.loop import next_measurement, run
     from jaxcal.adaptive.particles import ParticleBelief, ParticleTask
-    from jaxcal.adaptive.play import compare, play
 
 __all__ = [
     "GaussianTask",
@@ -36,9 +36,9 @@ _HOME = {
     "GridTask": "grid",
     "ParticleBelief": "particles",
     "ParticleTask": "particles",
-    "compare": "play",
+    "compare": "episodes",
     "next_measurement": "loop",
-    "play": "play",
+    "play": "episodes",
     "run": "loop",
 }
 

@@ -20,8 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.adaptive.episodes import Episodes
 from jaxcal.adaptive.particles import ParticleBelief, ParticleTask, log_mean
-from jaxcal.adaptive.play import Episodes
 
 __all__ = ["Bounds", "sace", "spce"]
 

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxcal.adaptive.episodes import play
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.play import play
 from jaxcal.adaptive.session import Options, Session
 from jaxcal.checks import whole_number
 

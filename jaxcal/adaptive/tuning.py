@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxcal.adaptive.play import play
+from jaxcal.adaptive.episodes import play
 from jaxcal.adaptive.rules import Scored
 from jaxcal.adaptive.session import Task
 from jaxcal.checks import whole_number

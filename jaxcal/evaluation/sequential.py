@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.adaptive import static
+from jaxcal.adaptive.episodes import Comparison, compare
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.lookahead import Rollouts, TwoStep
-from jaxcal.adaptive.play import Comparison, compare
 from jaxcal.adaptive.policy import run as policies
 from jaxcal.adaptive.rules import Gain, GainRate, Priced, Random, Scored, StateRule
 from jaxcal.adaptive.tasks.registry import Entry

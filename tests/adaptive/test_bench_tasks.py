@@ -4,10 +4,10 @@ import jax
 import numpy as np
 import pytest
 
+from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.estimates import estimates
 from jaxcal.adaptive.grid import GridBelief
 from jaxcal.adaptive.loop import next_measurement, run
-from jaxcal.adaptive.play import compare, play
 from jaxcal.adaptive.rules import Gain, Random
 from jaxcal.adaptive.tasks.backlash import (
     backlash,

@@ -4,8 +4,8 @@ import jax
 import numpy as np
 import pytest
 
+from jaxcal.adaptive.episodes import play
 from jaxcal.adaptive.grid import GridBelief
-from jaxcal.adaptive.play import play
 from jaxcal.adaptive.rules import Gain
 from jaxcal.adaptive.tasks.backlash import dead_zone, dead_zone_bins
 from jaxcal.adaptive.tasks.breakaway import Cautious, breakaway

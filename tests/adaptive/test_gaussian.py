@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 import jaxcal
+from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.gaussian import GaussianTask
 from jaxcal.adaptive.loop import next_measurement, run
-from jaxcal.adaptive.play import compare, play
 from jaxcal.adaptive.rules import Gain, Random
 from jaxcal.adaptive.static import Static
 from jaxcal.models import Affine, FromJax, Linear, Noise, Prior

@@ -8,8 +8,8 @@ import pytest
 from scipy import stats
 
 from jaxcal.adaptive.dynamic import solve
+from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.play import compare, play
 from jaxcal.adaptive.rules import Gain, GainRate, Random
 from jaxcal.adaptive.tasks.knee import PRICED, STATE_RULE, knee
 

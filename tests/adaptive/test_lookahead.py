@@ -6,8 +6,8 @@ import pytest
 from scipy import stats
 
 from jaxcal.adaptive import static
+from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.lookahead import Rollouts, TwoStep
-from jaxcal.adaptive.play import compare, play
 from jaxcal.adaptive.rules import Priced, shortlist
 from jaxcal.adaptive.session import Options
 from jaxcal.adaptive.tasks.knee import STATE_RULE, knee

@@ -11,8 +11,8 @@ from flax import struct
 from scipy import integrate, special, stats
 
 from jaxcal.adaptive.bounds import sace, spce
+from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.particles import ParticleTask, systematic
-from jaxcal.adaptive.play import compare, play
 from jaxcal.adaptive.rules import Gain, GainRate, Random
 from jaxcal.adaptive.tasks.ces import CES, ces
 from jaxcal.adaptive.tasks.hyperbolic import Hyperbolic

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxcal.adaptive.play import compare, play
+from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.policy import run, training
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.policy.network import Policy, initial

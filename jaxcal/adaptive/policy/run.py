@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcal.adaptive.play import play
+from jaxcal.adaptive.episodes import play
 from jaxcal.adaptive.policy.config import PolicyConfig
 from jaxcal.adaptive.policy.network import Policy, initial
 from jaxcal.adaptive.policy.training import updater
