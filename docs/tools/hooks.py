@@ -30,12 +30,6 @@ PUBLIC = (
 CONSTANTS = (str, int, float, tuple, dict)  # documented where they are defined
 
 
-def public(module: Any, name: str) -> Any:
-    """A public name; where a module of the same name hides it, that module's."""
-    value = getattr(module, name)
-    return getattr(value, name) if inspect.ismodule(value) else value
-
-
 def undocumented(module_name: str) -> list[str]:
     """Public names of a module and members of its classes that have no docstring."""
     module = importlib.import_module(module_name)
@@ -43,7 +37,7 @@ def undocumented(module_name: str) -> list[str]:
         return [module_name]
     found = []
     for name in module.__all__:
-        value = public(module, name)
+        value = getattr(module, name)
         if isinstance(value, CONSTANTS):
             continue
         if not inspect.getdoc(value):
@@ -64,7 +58,7 @@ def api_page(module_name: str) -> str:
     module = importlib.import_module(module_name)
     lines = [f"# {module_name}", "", inspect.getdoc(module) or "", ""]
     for name in module.__all__:
-        value = public(module, name)
+        value = getattr(module, name)
         if isinstance(value, CONSTANTS):
             shown = ", ".join(f"`{each}`" for each in value)
             lines += [f"## {name}", "", shown, ""]
