@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import jaxlib.version
 import numpy as np
 import pytest
 from flax import struct
@@ -154,7 +155,7 @@ def test_gains_survive_a_sum_over_a_design_and_an_unknown():
 
 
 def test_a_flag_of_the_users_own_is_left_alone(monkeypatch):
-    monkeypatch.setattr(xla.jaxlib.version, "__version__", "0.10.2")
+    monkeypatch.setattr(jaxlib.version, "__version__", "0.10.2")
     for given, wanted in (
         ("", f"{xla._FLAG}=-reduce"),
         ("--xla_a=1", f"--xla_a=1 {xla._FLAG}=-reduce"),
@@ -163,7 +164,7 @@ def test_a_flag_of_the_users_own_is_left_alone(monkeypatch):
         monkeypatch.setenv("XLA_FLAGS", given)
         xla.sidestep()
         assert xla.os.environ["XLA_FLAGS"] == wanted
-    monkeypatch.setattr(xla.jaxlib.version, "__version__", "0.10.3")
+    monkeypatch.setattr(jaxlib.version, "__version__", "0.10.3")
     monkeypatch.setenv("XLA_FLAGS", "")
     xla.sidestep()
     assert xla.os.environ["XLA_FLAGS"] == ""
