@@ -89,7 +89,9 @@ def test_compact_is_blind_to_affine_maps(rng, k, chosen):
     np.testing.assert_allclose(other - value, moved, atol=5e-3)
 
 
-@pytest.mark.parametrize("config", [CLOSE, NetworkConfig(kind="paper", width=32)])
+@pytest.mark.parametrize(
+    "config", [CLOSE, pytest.param(NetworkConfig(kind="paper", width=32), marks=slow)]
+)
 def test_permuting_the_candidates_permutes_the_logits(rng, config):
     network, params = made(config)
     points = rng.uniform(size=(3, 12, 3))  # the shape, and program, of the test above

@@ -86,7 +86,9 @@ def test_the_first_posture_is_where_greedy_leads_furthest(price):
     )
 
 
-@pytest.mark.parametrize("price", [0.0, 0.3, 3.0])
+@pytest.mark.parametrize(
+    "price", [0.3, *(pytest.param(p, marks=pytest.mark.slow) for p in (0.0, 3.0))]
+)
 def test_the_last_two_choices_are_the_best_pair_in_order(price):
     for seed in range(5):
         task = task_of(drawn(seed))
