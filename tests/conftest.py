@@ -18,6 +18,8 @@ import hypothesis
 import jax
 import numpy as np
 import pytest
+from xdist.remote import Producer
+from xdist.scheduler import LoadFileScheduling
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -28,24 +30,28 @@ hypothesis.settings.register_profile("new", deadline=None)
 hypothesis.settings.load_profile("same")
 
 
-@pytest.hookimpl(tryfirst=True)  # before xdist reads the groups
+# Where `make test` begins: numba compiles the solvers on one worker, which runs all their
+# tests, while the other compiles JAX's programs; what needs both finds them compiled.
+FIRST = ("selection", "learning", "adaptive", "models", "paper")
+
+
+class ByFile(LoadFileScheduling):
+    """A file's tests share a worker, and so do all tests of the solvers."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        solvers = "tests/selection/"
+        return solvers if nodeid.startswith(solvers) else super()._split_scope(nodeid)
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> ByFile:
+    config.option.loadscopereorder = False
+    return ByFile(config, log)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """A file's tests share a worker, and so do all tests of the solvers.
-
-    These come first, on one worker, so that numba compiles the solvers once while the
-    other worker compiles JAX's programs; what needs both finds them compiled.
-    """
-    first = ("selection", "learning", "adaptive", "models", "paper")
-
-    def folder(item: pytest.Item) -> str:
-        return item.path.parent.name
-
-    for item in items:
-        whole = "solvers" if folder(item) == "selection" else item.path.stem
-        item.add_marker(pytest.mark.xdist_group(whole))
-    items.sort(
-        key=lambda item: (*first, folder(item)).index(folder(item))
-    )  # stable: files and tests keep their order
+    items.sort(  # stable: files and tests keep their order
+        key=lambda item: (*FIRST, item.path.parent.name).index(item.path.parent.name)
+    )
 
 
 @pytest.fixture
