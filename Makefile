@@ -48,8 +48,7 @@ test-all: $(DOCS) lint ## every test, the slow ones too, hypothesis drawing new 
 lint: $(READY) ## ruff (lint and format), mypy and the import contracts
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
-	$(BIN)/lint-imports
+	$(BIN)/mypy & mypy=$$!; $(BIN)/lint-imports; imports=$$?; wait $$mypy && exit $$imports
 
 format: $(READY) ## let ruff rewrite what it can
 	$(BIN)/ruff check --fix .

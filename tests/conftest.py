@@ -30,8 +30,8 @@ hypothesis.settings.register_profile("new", deadline=None)
 hypothesis.settings.load_profile("same")
 
 
-# Where `make test` begins: numba compiles the solvers on one worker, which runs all their
-# tests, while the other compiles JAX's programs; what needs both finds them compiled.
+# Where `make test` begins: numba compiles the solvers on one worker, which runs all
+# their tests, while the other compiles JAX's programs; what needs both comes after.
 FIRST = ("selection", "learning", "adaptive", "models", "paper")
 
 

@@ -56,10 +56,10 @@ def drawn_parameters(network, *call):
 
 SHAPES = [  # M, n, k, masked, required, decoding
     (16, 3, 6, 0.3, 2, "greedy"),
-    (12, 2, 3, 0.2, 0, "first"),
     *(
         pytest.param(*shape, marks=pytest.mark.slow)
         for shape in (
+            (12, 2, 3, 0.2, 0, "first"),
             (20, 3, 4, 0.0, 0, "greedy"),
             (50, 3, 4, 0.0, 0, "greedy"),
             (50, 3, 12, 0.0, 0, "greedy"),
@@ -115,7 +115,7 @@ VARIANTS = [
     ("config", "n", "k", "made"),
     [
         (VARIANTS[0], 3, 6, 2),
-        (VARIANTS[0], 3, 6, 4),
+        pytest.param(VARIANTS[0], 3, 6, 4, marks=pytest.mark.slow),
         (VARIANTS[1], 2, 3, 0),
         (VARIANTS[2], 2, 3, 0),
     ],
@@ -307,6 +307,7 @@ def test_deciding_needs_no_jax():
     assert json.loads(done.stdout) == [select_batch(points, 4)[0].tolist(), []]
 
 
+@pytest.mark.slow
 def test_commands_alone_have_jax_keep_compiled_code(tmp_path):
     code = (
         "import sys\n"
