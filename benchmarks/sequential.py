@@ -117,7 +117,7 @@ def session(task: Any, key: jax.Array) -> tuple[Episodes, jax.Array, jax.Array]:
         design = jax.tree.map(lambda leaf: leaf[index], options.designs)
         if isinstance(task, GridTask):
             gain = belief.gains(task, options)[index]
-        else:  # again with other luck: the largest of many is too large
+        else:  # again with other random numbers: the largest of many is too large
             chosen = jax.tree.map(lambda leaf: leaf[index][None], options)
             gain = belief.gains(task, chosen, key_gain)[0]
         outcome = task.measure(truth, design, key_outcome)
