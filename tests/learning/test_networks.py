@@ -103,7 +103,8 @@ def test_permuting_the_candidates_permutes_the_logits(rng, config):
     np.testing.assert_allclose(value, other, atol=1e-3)
 
 
-@pytest.mark.parametrize("k", [4, pytest.param(7, marks=slow)])
+@slow
+@pytest.mark.parametrize("k", [4, 7])
 def test_a_network_can_begin_as_the_look_ahead_rule(rng, k):
     start = dataclasses.replace(CLOSE, initial_trust=4.0, initial_actor=0.0)
     network = build(start)
@@ -164,9 +165,8 @@ def test_the_shipped_policy_chooses_what_it_always_chose(name, n, mask, how):
     assert (np.sort(found) == np.sort(picks)).all(axis=1).mean() > 0.98
 
 
-@pytest.mark.parametrize(
-    ("k", "close"), [(4, False), pytest.param(5, True, marks=slow)]
-)
+@slow
+@pytest.mark.parametrize(("k", "close"), [(4, False), (5, True)])
 def test_the_last_pair_is_the_best_one_unless_little_is_spanned(rng, k, close):
     # Three inputs. At K = n + 2 the choices before the pair do not span the space: the
     # pair is rated with a ridge beside them, which counts where they nearly coincide.
@@ -303,6 +303,7 @@ def test_a_bad_configuration_is_named(values, named):
         NetworkConfig(**values)
 
 
+@slow
 def test_the_papers_scores_are_those_of_keys_that_are_written_out(rng):
     # Attention as the paper has it: a key for every candidate, a query for the context.
     network, params = made(NetworkConfig(kind="paper", width=32), m=20)
