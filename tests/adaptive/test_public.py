@@ -184,7 +184,7 @@ def test_a_process_that_compiles_sums_wrongly_is_refused():
         capture_output=True,
         text=True,
     )
-    if xla.jaxlib.version.__version__ == "0.10.2":
+    if jaxlib.version.__version__ == "0.10.2":
         assert "Import jaxcal before JAX computes" in done.stderr
     else:
         assert done.returncode == 0, done.stderr
