@@ -7,8 +7,8 @@
 | reward | nats: the expected information gain of the measurement |
 | end | time or uses are spent, or ``task.most`` measurements are made |
 
-``learning.environments.brax_env.wrap_fresh`` makes the batch: it draws a new session
-for every episode, which brax's own ``AutoResetWrapper`` does not.
+``learning.environments.brax_env.wrap_fresh`` makes the batch and draws a new session
+for every episode. brax's own ``AutoResetWrapper`` replays the first one.
 """
 
 from __future__ import annotations

@@ -88,13 +88,14 @@ def chosen(task, deciders):
         belief = GridBelief(task.prior).update(task, 1, 2)
         session = task.spend(task.session(7.0, 2), 1, 2)
         options = task.options(belief, session)
-        return {
+        return options.allowed, {
             name: decider(task, belief, session, options, key)
             for name, decider in deciders.items()
         }
 
-    found = choose(task, deciders, jax.random.key(3))
+    allowed, found = choose(task, deciders, jax.random.key(3))
     assert all(0 <= int(index) < len(task.designs) for index in found.values())
+    assert all(allowed[index] for index in found.values())
     return found
 
 
@@ -111,7 +112,7 @@ def test_a_policy_begins_as_its_rule():
 
 @pytest.mark.slow
 def test_all_deciders_run_unchanged(task):
-    chosen(
+    found = chosen(
         task,
         {
             "random": Random(),
@@ -125,3 +126,5 @@ def test_all_deciders_run_unchanged(task):
             "policy": policy(task),
         },
     )
+    assert len(found) == 9
+    assert found["policy"] == found["state"]  # a policy begins as its rule
