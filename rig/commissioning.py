@@ -143,7 +143,7 @@ def _setup(args: argparse.Namespace) -> int:
             simulator = stack.enter_context(_simulator(args))
             given = _given(simulator, given)
             path = args.config or _own_folder(simulator.config) / "rig.toml"
-        operator.confirm(setup.SAFETY)
+        operator.confirm(setup.SAFETY, "setup")
         if path.exists() and args.set:
             raise Refused(f"{path} exists: edit it, or leave out --set")
         if path.exists():

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rig.attitude import Array, angle_between_deg
+from rig.commission.unproved import slowed
 from rig.config import RigConfig
 from rig.config.axis import Axis
 from rig.device.record import DeviceRecord
@@ -17,17 +18,14 @@ from rig.session.folder import new_run_folder
 from rig.session.motion import Motion
 from rig.session.run import Run
 
-SLOW_DEG_S = 5.0
-# The phone may turn by this factor of what is commanded, and always by so much: a first
-# move of half a degree is to show a gearing that is ten times what it should be.
-ALLOWED_FACTOR, LEAST_ALLOWED_DEG = 2.0, 9.0
+ALLOWED_DEG = 9.0  # that the phone may turn away from where it began
 
 
 class SmallMotion(Motion):
     """Moves that stop where the phone turns further than they may turn it.
 
-    The gearing is not proved yet: a drive may turn its joint ten times as far as it is
-    told, and neither its own counts nor the limits show that.
+    The gearing is not proved yet: a drive may turn its joint a hundred times as far as
+    it is told, and neither its own counts nor the limits show that.
     """
 
     def __init__(self, device: Device) -> None:
@@ -36,10 +34,16 @@ class SmallMotion(Motion):
         self.meanwhile: Callable[[], None] | None = None  # called at every poll
         self._origin: Array | None = None  # (3, 3)
 
-    def stay_near(self, attitude: Array, commanded_deg: float) -> None:
-        """Moves of so many degrees begin at this attitude of the phone."""
-        self._origin = attitude
-        self.allowed_deg = max(LEAST_ALLOWED_DEG, ALLOWED_FACTOR * commanded_deg)
+    def stay_near(self, attitude: Array, allowed_deg: float = ALLOWED_DEG) -> None:
+        """The phone may turn so far away from this attitude."""
+        self._origin, self.allowed_deg = attitude, allowed_deg
+
+    def pace(self, index: int, axis: Axis) -> None:
+        """Move an axis at the speed of this one from now on."""
+        axes = list(self.config.axes)
+        axes[index] = axis
+        self.config = self.config.model_copy(update={"axes": tuple(axes)})
+        self.device.drives[index].axis = axis
 
     def _check_attitude(self) -> None:
         if self.meanwhile is not None:
@@ -80,7 +84,11 @@ class Bench(Run):
         self.again = again
         self.homed = homed
         folder = folder or new_run_folder(pathlib.Path(config.output), step)
-        moved = config if full_speed else slowed(config)
+        self.full_speed = full_speed
+        moved = config
+        if not full_speed:
+            axes = tuple(slowed(axis) for axis in config.axes)
+            moved = config.model_copy(update={"axes": axes})
         # Every way to a place is straight, so that play is seen and not made a bias.
         motion = config.motion.model_copy(update={"approach_overshoot_deg": 0.0})
         moved = moved.model_copy(update={"motion": motion})
@@ -109,21 +117,3 @@ class Bench(Run):
     @property
     def to_go_on(self) -> str:
         return self.again
-
-
-def slowed(config: RigConfig) -> RigConfig:
-    """The same with axes that are no faster than a person can follow."""
-    axes = tuple(_slow(axis) for axis in config.axes)
-    return config.model_copy(update={"axes": axes})
-
-
-def _slow(axis: Axis) -> Axis:
-    speed = min(SLOW_DEG_S, axis.speed_deg_s)
-    while speed < axis.speed_deg_s:
-        slow = axis.model_copy(update={"speed_deg_s": speed})
-        try:
-            slow.motion_counts()
-            return slow
-        except ValueError:  # slower than the drive's register can say
-            speed *= 2.0
-    return axis

@@ -35,14 +35,15 @@ def can_home(config: RigConfig) -> bool:
     return all(axis.map.home is not None for axis in config.axes)
 
 
-def home(run: Bench, here: bool, confirm: Callable[[str], None]) -> None:
+def home(run: Bench, here: bool, confirm: Callable[[str, str], None]) -> None:
     """Make the drives' counts mean a place; the device is HOMED.
 
     Args:
         run: with ``unlimited`` axes.
         here: where the device stands is home: counts become 0 where the drive can be
             told so, and are noted where it cannot. Otherwise each drive homes itself.
-        confirm: is told what will happen, and raises Refused where it must not.
+        confirm: is told what will happen and the word to type, and raises Refused where
+            it must not.
     """
     names = [axis.name for axis in run.config.axes]
     if not here and not can_home(run.config):
@@ -56,7 +57,8 @@ def home(run: Bench, here: bool, confirm: Callable[[str], None]) -> None:
         "counts"
         if here
         else "home: the drives run their own homing one after another, "
-        f"{', '.join(names)}, as far and as fast as they are set to"
+        f"{', '.join(names)}, as far and as fast as they are set to",
+        "home",
     )
     device = run.arm()
     for drive in device.drives:
@@ -122,11 +124,12 @@ def _go_home(run: Bench, drive: Drive) -> None:
     run.device_guard()
 
 
-def zero(run: Bench, confirm: Callable[[str], None]) -> None:
+def zero(run: Bench, confirm: Callable[[str, str], None]) -> None:
     """Measure the attitude of the zero posture, where the device stands: ZEROED."""
     confirm(
         "zero: nothing moves; the device stands in its zero posture (jig, level), and "
-        "the phone's attitude there is measured"
+        "the phone's attitude there is measured",
+        "zero",
     )
     device = run.arm()
     target = device.positions()

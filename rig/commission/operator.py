@@ -32,12 +32,15 @@ class Operator:
                 raise Refused(f"{question}: there is no default; give it as an option")
             self.say(f"{question} [{default}]")
             return default
+        return self._answer(f"{question} [{default}]: ") or default
+
+    def _answer(self, prompt: str) -> str:
         if self._read is input and not sys.stdin.isatty():
-            raise Refused(f"{question}: no terminal to answer on; use --yes")
+            raise Refused(f"{prompt}no terminal to answer on; use --yes")
         try:
-            return self._read(f"{question} [{default}]: ").strip() or default
+            return self._read(prompt).strip()
         except EOFError:
-            raise Refused(f"{question}: no answer") from None
+            raise Refused(f"{prompt}no answer") from None
 
     def number(self, question: str, default: float) -> float:
         """A number; asked again where the answer is none."""
@@ -54,8 +57,10 @@ class Operator:
             self.say(f"  must be one of {', '.join(known)}, got {answer!r}")
         return answer
 
-    def confirm(self, what: str) -> None:
-        """Refused where the operator does not agree."""
+    def confirm(self, what: str, word: str) -> None:
+        """Refused where the operator does not type the word: Enter moves nothing."""
         self.say(what)
-        if self.choose("go on? yes or no", ["yes", "no"], "yes") != "yes":
+        if self.yes:
+            self.say(f"confirmed by --yes: {word}")
+        elif self._answer(f"Type {word} to go on: ") != word:
             raise Refused("not confirmed; nothing was done")

@@ -21,7 +21,7 @@ from jaxcal.adaptive.rules import Gain
 from jaxcal.adaptive.session import Decider
 from rig.attitude import Array
 from rig.commission.axes import ROOM_DEG, SEEN_DEG
-from rig.commission.bench import Bench
+from rig.commission.bench import ALLOWED_DEG, Bench
 from rig.commission.stands import Stand, turn
 from rig.config import AXIS_NAMES
 from rig.faults import MotionFault, Refused
@@ -53,7 +53,8 @@ class Probe:
         self.count = 0  # measurements
         self._base: Array | None = None  # (3, 3) attitude that readings are from
         self._line, self._rate = np.zeros(3), 1.0
-        run.small.stay_near(self.device.imu.latest().matrix, up_deg)
+        allowed = max(ALLOWED_DEG, 2.0 * up_deg)
+        run.small.stay_near(self.device.imu.latest().matrix, allowed)
 
     def stand(self, label: str, *ways_deg: float, samples: int = 1) -> Stand:
         """Go the ways one after the other, and measure at the last."""

@@ -11,11 +11,15 @@ import numpy as np
 
 from rig.attitude import matrix_to_euler
 from rig.commission.findings import MOUNTING_DEG, Findings
+from rig.commission.unproved import RADIANS
 from rig.config import AXIS_NAMES, RigConfig
 from rig.config.axis import Axis, Scale
+from rig.faults import MotionFault
 
 # Measured against commanded: what A may take up, and what only a wrong gearing does.
 SOUND_RATIO = (0.4, 1.5)
+# The same where the phone sends radians for degrees, and those are allowed for.
+NEAR_UNIT = (0.3, 2.0)
 DIGITS = 4  # of a reduction that was measured
 SKEW_DEG = 20.0  # axes of a sound device read at right angles but for cross-coupling
 OF_DRIVE = ("unit", "map", "pulses_per_rev", "comm_timeout_s")  # go with the cable
@@ -36,13 +40,58 @@ class Change:
         return f"{self.key} = {self.new!r} (is {self.old!r}): {self.reason}"
 
 
+def ratios_of(config: RigConfig, found: Findings) -> list[float]:
+    """What each drive turned the phone, as a share of what it was commanded."""
+    pairs = zip(found.deg_per_pulse, config.axes, strict=True)
+    return [float(abs(each * axis.pulses_per_deg)) for each, axis in pairs]
+
+
+def require_unit(
+    config: RigConfig, ratios: Sequence[float], proved: bool = False
+) -> None:
+    """The unit of the phone's angles is the configured one, by what the axes turned.
+
+    Two gearings of the file that agree with the phone prove it: both would have to be
+    wrong by 57.3. A gearing is corrected only where the unit is proved, so that no
+    phone's radians are taken for a gearbox.
+
+    Args:
+        config: names the unit.
+        ratios: of three axes, measured against commanded, by the drives' own registers
+            where they have one.
+        proved: only that all three do not turn as if the unit were the other.
+
+    Raises:
+        MotionFault: it is the other unit, or that is not clear.
+    """
+    unit = config.imu.unit
+    other, factor = ("rad", RADIANS) if unit == "deg" else ("deg", 1.0 / RADIANS)
+    seen = ", ".join(f"{ratio:.3g}" for ratio in ratios)
+    seen = f"the phone turned {seen} of what pitch, yaw and roll were commanded"
+    low, high = NEAR_UNIT
+    if all(low <= ratio * factor <= high for ratio in ratios):
+        raise MotionFault(
+            f'{seen}, about {1 / factor:.3g}: rig.toml says imu.unit = "{unit}", and '
+            f'the phone sends {other}. Set imu.unit = "{other}", then run `jaxcal-rig '
+            "axes` again"
+        )
+    low, high = SOUND_RATIO
+    if not proved and sum(low <= ratio <= high for ratio in ratios) < 2:
+        raise MotionFault(
+            f"{seen}, and none of its angles is over 6.3: either imu.unit or the "
+            "gearings are wrong. Nothing was corrected. Set pulses_per_rev and "
+            "reduction as the drives and the gearboxes' plates say, then run "
+            "`jaxcal-rig axes` again"
+        )
+
+
 def proposals(
     config: RigConfig, found: Findings, told: Sequence[int | None]
 ) -> list[Change]:
     """Corrections of the configuration.
 
     Args:
-        config: as the moves were made.
+        config: as the moves were made, with a phone whose unit is proved.
         found: what they showed.
         told: pulses for one turn by each drive's own word, None where it has none.
     """

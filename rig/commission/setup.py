@@ -68,7 +68,7 @@ def write_config(path: pathlib.Path, given: Given, operator: Operator) -> RigCon
             values[key] = operator.number(question, 1.0)
     text = set_values(new_text(bus, axes, form, int(port)), values)
     config = parse_config(text, path.parent, str(path))
-    operator.confirm(f"write {path}")
+    operator.confirm(f"setup writes {path}", "write")
     write_text(path, text)
     return config
 
@@ -156,7 +156,9 @@ def pin(place: steps.Place, sender: str) -> None:
     """Only this phone is listened to from now on."""
     if place.path is None or not sender or sender in place.config.imu.allow:
         return
-    place.operator.confirm(f"imu: listen to {sender} only, and to no other sender")
+    place.operator.confirm(
+        f"imu: listen to {sender} only, and to no other sender", "listen"
+    )
     place.take(edit(place.path, {"imu.allow": [sender]}))
 
 

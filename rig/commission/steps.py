@@ -12,7 +12,7 @@ from typing import Any
 from rig.commission.axes import check_axes
 from rig.commission.bench import Bench
 from rig.commission.home import home, identity, unlimited, zero
-from rig.commission.jog import MOST_STEP_DEG, by_keyboard, step
+from rig.commission.jog import MOST_STEP_DEG, by_keyboard, step, unproved
 from rig.commission.operator import Operator
 from rig.commission.phone import Stream, addresses_text, watch
 from rig.commission.proposals import Change
@@ -156,13 +156,13 @@ def jog(place: Place, axis: int, way_deg: float | None) -> int:
     if not homed:
         place.say("the device is not HOMED: the soft limits are not in force")
     move = "while a key is held" if way_deg is None else f"by {way_deg:g} deg"
-    place.operator.confirm(f"jog: {name} will move {move}, slowly")
+    place.operator.confirm(f"jog: {name} will move {move}, slowly", "jog")
 
     def procedure(run: Bench) -> None:
         if way_deg is None:
             by_keyboard(run, axis)
         else:
-            step(run, axis, way_deg)
+            step(run, axis, way_deg, unproved(run, axis))
 
     return place.run("jog", procedure, limits=homed)
 
@@ -179,7 +179,8 @@ def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> i
     name, most = AXIS_NAMES[axis], measured.BASE_DEG + measured.FAR_DEG
     place.operator.confirm(
         f"characterise: {name} will move up to {most:.2f} deg from where it stands, "
-        "many times. Keep out of the device's reach"
+        "many times. Keep out of the device's reach",
+        "characterise",
     )
 
     def procedure(run: Bench) -> None:
@@ -195,9 +196,10 @@ def axes(place: Place, names_known: bool = False) -> int:
     """Check each axis, correct rig.toml after a yes, and check again: SIGN_CHECKED."""
     place.require(HOMED)
     place.operator.confirm(
-        "axes: the device stands in its zero posture. Each axis in turn will move 0.5 "
-        "deg, then 3 deg either way; then two at a time. Watch that the joint that "
-        "moves is the one that is named, and keep out of the device's reach"
+        "axes: the device stands in its zero posture. Each axis in turn will move a "
+        "little, then up to 3 deg either way; then two at a time. Watch that the joint "
+        "that moves is the one that is named, and keep out of the device's reach",
+        "axes",
     )
     for again in (False, True):
         changes: list[Change] = []
@@ -215,7 +217,9 @@ def axes(place: Place, names_known: bool = False) -> int:
         if again or place.path is None:
             place.say("the device is NOT sign-checked")
             return EXIT_RECALIBRATE
-        place.operator.confirm(f"axes: write this to {place.path}, then check again")
+        place.operator.confirm(
+            f"axes: write this to {place.path}, then move the axes again", "correct"
+        )
         _correct(place, changes)
     raise AssertionError("unreachable")
 

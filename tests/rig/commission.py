@@ -15,7 +15,7 @@ from rig.simulator import Simulator, Truth
 QUICK = (  # of the new rig.toml: short windows, quick axes
     "settle.window_s=0.04", "settle.min_samples=5", "settle.samples=5",
     "settle.slope_deg_s=0.5", "motion.poll_s=0.005", "imu.stale_s=1.0",
-    "session.method=exact", "session.verify_postures=1",
+    "motion.max_speed_deg_s=400", "session.method=exact", "session.verify_postures=1",
     *(f"axes.{name}.{key}" for name in AXIS_NAMES
       for key in ("speed_deg_s=400", "accel_deg_s2=8000", "reduction=10")),
 )  # fmt: skip

@@ -41,7 +41,7 @@ WATCHED = {  # drives that stop themselves when the line is silent
 FAST = {  # quick axes and short windows; a busy computer may still answer late
     "speed_deg_s = 120": "speed_deg_s = 400",
     "accel_deg_s2 = 1200": "accel_deg_s2 = 8000",
-    "poll_s = 0.01": "poll_s = 0.005\nstall_s = 0.3",
+    "poll_s = 0.01": "poll_s = 0.005\nstall_s = 0.3\nmax_speed_deg_s = 400",
     "window_s = 0.2": "window_s = 0.04",
     "min_samples = 10": "min_samples = 5",
     "samples = 25": "samples = 5",
