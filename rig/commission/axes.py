@@ -14,8 +14,8 @@ from rig.commission.stands import Stand, turn
 from rig.commission.unproved import FIRST_MOTOR_DEG, Reach, unit_proved
 from rig.config import AXIS_NAMES
 from rig.config.axis import Axis, Pulses
-from rig.device.record import SIGN_CHECKED
-from rig.faults import MotionFault, Refused
+from rig.core.faults import MotionFault, Refused
+from rig.core.record import SIGN_CHECKED
 
 REACH_DEG = 3.0  # each way
 FAR_ENOUGH = 1.1  # a move that would be no longer than that is not made

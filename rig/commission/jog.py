@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from rig.attitude import Array, angle_between_deg
 from rig.commission.bench import ALLOWED_DEG, Bench
 from rig.commission.keyboard import Keyboard
 from rig.commission.unproved import Reach
 from rig.config import AXIS_NAMES
 from rig.config.axis import Pulses
-from rig.device.record import SIGN_CHECKED
+from rig.core.attitude import Array, angle_between_deg
+from rig.core.record import SIGN_CHECKED
 
 MOST_STEP_DEG = 3.0
 HOLD_DEG = 30.0  # a held key goes at most so far at a time

@@ -13,9 +13,9 @@ import math
 
 import numpy as np
 
-from rig.attitude import Array, matrix_to_euler
 from rig.config.axis import Axis
 from rig.config.settings import ImuSettings
+from rig.core.attitude import Array, matrix_to_euler
 
 FIRST_MOTOR_DEG = 0.36
 GROWTH = 4.0  # play of a third of a move can hide it

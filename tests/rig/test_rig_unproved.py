@@ -16,7 +16,7 @@ from rig.commission.proposals import require_unit
 from rig.commission.unproved import GROWTH, Reach
 from rig.config import ConfigError, load_config, parse_config
 from rig.config.files import EXAMPLES
-from rig.faults import MotionFault, Refused
+from rig.core.faults import MotionFault, Refused
 from rig.simulator import Truth, parse_fault
 
 
