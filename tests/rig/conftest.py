@@ -3,7 +3,6 @@
 import pytest
 from commission import device, quick_text
 
-from rig.commission import steps, unproved
 from rig.config import load_config
 from rig.core.record import (
     HOMED,
@@ -11,6 +10,7 @@ from rig.core.record import (
     SIGN_CHECKED,
     DeviceRecord,
 )
+from rig.workbench.commission import steps, unproved
 
 
 @pytest.fixture

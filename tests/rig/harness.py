@@ -21,11 +21,11 @@ from rig.core import stop
 from rig.core.lock import BusLock
 from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
 from rig.core.session import Run, run_safely
-from rig.outputs import report
-from rig.outputs.console import listen
-from rig.procedures.calibrate import calibrate
 from rig.signals import Signals
 from rig.simulator import Simulator, Truth
+from rig.workbench.outputs import report
+from rig.workbench.outputs.console import listen
+from rig.workbench.procedures.calibrate import calibrate
 
 # A simulated drive stands within 0.1 s; for a dead one the whole time is waited.
 stop.VERIFY_S = 0.6

@@ -10,14 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rig.__main__ import main
-from rig.commission import steps, unproved
-from rig.commission.operator import Operator
-from rig.commission.proposals import require_unit
-from rig.commission.unproved import GROWTH, Reach
 from rig.config import ConfigError, load_config, parse_config
 from rig.config.files import EXAMPLES
 from rig.core.faults import MotionFault, Refused
 from rig.simulator import Truth, parse_fault
+from rig.workbench.commission import steps, unproved
+from rig.workbench.commission.operator import Operator
+from rig.workbench.commission.proposals import require_unit
+from rig.workbench.commission.unproved import GROWTH, Reach
 
 
 @pytest.fixture
