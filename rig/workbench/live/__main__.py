@@ -1,4 +1,4 @@
-"""``python -m rig.workbench.live FOLDER --fd N``: a run's page, as `--live` starts it."""
+"""``python -m rig.workbench.live FOLDER --fd N``: the page, as `--live` starts it."""
 
 from __future__ import annotations
 
