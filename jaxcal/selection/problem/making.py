@@ -80,8 +80,10 @@ def make_problem(
         ValueError: naming the argument, the rule and the value.
     """
     array = numbers("candidates", candidates, finite=False)
-    if array.ndim != 2 or array.shape[1] < 1:
-        raise ValueError(f"candidates must have shape (M, n), got {array.shape}")
+    if array.ndim != 2 or 0 in array.shape:
+        raise ValueError(
+            f"candidates must have shape (M, n), neither of them 0, got {array.shape}"
+        )
     if model is None:
         m = array.shape[1] if num_outputs is None else num_outputs
         model = Affine(array.shape[1], whole_number("num_outputs", m, 1))
@@ -100,16 +102,19 @@ def make_problem(
         wanted = wanted_criterion(criterion, None, (), "D", region)
         std = None if noise is None else noise.std
         return _affine(model, array, rules, wanted, std, region, measured)[0]
+    if noise is None and hasattr(model, "default_noise"):
+        noise = model.default_noise()
     modelled = Modelled(model, prior, noise)
     default = "D" if isinstance(model, Affine) else "I"
     wanted = wanted_criterion(criterion, parameters, modelled.names, default, region)
     raw = modelled.blocks(array[0], mask[0])[None]
-    root = prior_root(modelled.precision)
-    if not np.diagonal(modelled.precision).all():
-        shown = [array[mask]] if measured is None else [array[mask], measured]
-        _require_identified(model, np.concatenate(shown), noise, prior)
+    root, shown = prior_root(modelled.precision), array[mask]
     if measured is not None:
         root = _with_measured(root, modelled.blocks_at("measured", measured, True))
+        shown = np.concatenate([shown, measured])
+    if not np.diagonal(modelled.precision).all():
+        known = None if noise is None else noise.of(mask[0])
+        _require_identified(model, shown, known, prior)
     if region is None and modelled.noise.command_std is not None:
         region = array[mask]  # predictions are for commands that are known
     if region is not None:
@@ -140,8 +145,10 @@ def make_problems(
         ValueError: naming the argument, the rule and the value.
     """
     array = numbers("candidates", candidates, finite=False)
-    if array.ndim != 3 or array.shape[2] < 1 or array.shape[0] < 1:
-        raise ValueError(f"candidates must have shape (B, M, n), got {array.shape}")
+    if array.ndim != 3 or 0 in array.shape:
+        raise ValueError(
+            f"candidates must have shape (B, M, n), none of them 0, got {array.shape}"
+        )
     mask = check_available(available, array.shape[:2], False)
     array = usable_numbers("candidates", array, mask, False)
     m = array.shape[2] if num_outputs is None else num_outputs
