@@ -9,10 +9,10 @@ from collections.abc import Callable
 
 from rig.config import example_text, load_config
 from rig.config.files import example_names
-from rig.device.bus import Bus, BusError
-from rig.device.drives import Drive
-from rig.device.lock import BusLock
-from rig.faults import EXIT_FAULT, EXIT_OK
+from rig.core.bus import Bus, BusError
+from rig.core.drive import Drive
+from rig.core.faults import EXIT_FAULT, EXIT_OK
+from rig.core.lock import BusLock
 from rig.sessions import FILE, journal_of, load, make_simulator, run_session
 
 COMMISSIONING = (
@@ -111,11 +111,11 @@ def _simulate(args: argparse.Namespace) -> int:
 
 def _watch(args: argparse.Namespace) -> int:
     from jaxcal.extras import needs
-    from rig.live import launch
+    from rig.workbench.live import launch
 
     journal_of(args.run)
     with needs("live", "the live page"):
-        from rig.live.server import serve
+        from rig.workbench.live.server import serve
     sock, token, url = launch.listen(args.live_host)
     print(f"live page: {url}\nCtrl-C ends", flush=True)
     with contextlib.suppress(KeyboardInterrupt):

@@ -14,8 +14,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rig.attitude import Array, euler_to_matrix, matrix_to_euler
 from rig.config.settings import ImuSettings
+from rig.core.attitude import Array, euler_to_matrix, matrix_to_euler
 from rig.simulator.faults import FaultInjector
 
 INTRUSION_S = 0.15  # that another sender is heard, where it is let
@@ -145,6 +145,8 @@ class Phone:
         if not faults.take("imu_frozen"):
             self._frozen = matrix
         matrix = self._frozen
+        if faults.take("imu_radians"):
+            s = s.model_copy(update={"unit": "rad"})
         text = format_line(s, matrix, time.time(), order)
         if faults.take("imu_nan"):
             fields = text.split(s.separator)

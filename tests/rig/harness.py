@@ -17,14 +17,15 @@ from unittest import mock
 
 from rig.config import RigConfig, parse_config
 from rig.config.files import EXAMPLES
-from rig.device.lock import BusLock
-from rig.device.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
-from rig.guard import stop
-from rig.outputs import report
-from rig.session.calibrate import calibrate
-from rig.session.run import Run
-from rig.session.runner import run_safely
+from rig.core import stop
+from rig.core.lock import BusLock
+from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
+from rig.core.session import Run, run_safely
+from rig.signals import Signals
 from rig.simulator import Simulator, Truth
+from rig.workbench.outputs import report
+from rig.workbench.outputs.console import listen
+from rig.workbench.procedures.calibrate import calibrate
 
 # A simulated drive stands within 0.1 s; for a dead one the whole time is waited.
 stop.VERIFY_S = 0.6
@@ -41,7 +42,7 @@ WATCHED = {  # drives that stop themselves when the line is silent
 FAST = {  # quick axes and short windows; a busy computer may still answer late
     "speed_deg_s = 120": "speed_deg_s = 400",
     "accel_deg_s2 = 1200": "accel_deg_s2 = 8000",
-    "poll_s = 0.01": "poll_s = 0.005\nstall_s = 0.3",
+    "poll_s = 0.01": "poll_s = 0.005\nstall_s = 0.3\nmax_speed_deg_s = 400",
     "window_s = 0.2": "window_s = 0.04",
     "min_samples = 10": "min_samples = 5",
     "samples = 25": "samples = 5",
@@ -100,6 +101,13 @@ def simulator(config: RigConfig, **options) -> Simulator:
     return Simulator(config, truth, **options)
 
 
+def make_run(*args, **more) -> Run:
+    """A run as the command line makes it: signals, console and telemetry listen."""
+    run = Run(*args, signals=Signals(), **more)
+    listen(run)
+    return run
+
+
 def session(
     config: RigConfig,
     folder: pathlib.Path,
@@ -115,7 +123,7 @@ def session(
     they are looked at.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    run = Run(
+    run = make_run(
         config,
         folder,
         "calibrate",

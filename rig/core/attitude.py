@@ -1,0 +1,128 @@
+"""Rotations: Euler angles in any of the six orders, zero reference, means.
+
+A matrix R is (3, 3) and takes vectors of the body to the fixed frame. An order such as
+``"ZXY"`` is intrinsic, outermost axis first: ``R = Rz(a) Rx(b) Ry(c)``. A chain of
+three joints whose axes stand in that order reads exactly its joint angles in that
+order, and no other; a wrong order leaves degrees of error no calibration removes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from rig.config.config import RigConfig
+
+Array = NDArray[np.float64]
+ORDERS = tuple("".join(order) for order in itertools.permutations("XYZ"))
+DIGITS = 8  # of a quaternion: 1e-6 degrees
+
+
+@dataclasses.dataclass(frozen=True)
+class Reading:
+    """One accepted attitude on the computer's clock."""
+
+    time: float  # monotonic seconds at which the phone measured, as far as known
+    matrix: Array  # (3, 3)
+
+
+def euler_to_matrix(angles_deg: ArrayLike, order: str) -> Array:
+    """(..., 3, 3) of (..., 3) degrees in the sequence of ``order``, one of ORDERS."""
+    return Rotation.from_euler(order, angles_deg, degrees=True).as_matrix()
+
+
+def matrix_to_euler(matrix: ArrayLike, order: str) -> Array:
+    """(..., 3) degrees; the middle one lies in [-90, 90], the others in +-180."""
+    return Rotation.from_matrix(matrix).as_euler(order, degrees=True)
+
+
+def angle_between_deg(first: ArrayLike, second: ArrayLike) -> float:
+    """Angle in degrees of the rotation that takes one (3, 3) attitude to another."""
+    turn = np.asarray(first).T @ np.asarray(second)  # for every reading: numpy is quick
+    sine = 0.5 * np.linalg.norm(
+        [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+    )
+    return float(np.degrees(np.arctan2(sine, 0.5 * (np.trace(turn) - 1.0))))
+
+
+def mean_rotation(matrices: ArrayLike) -> Array:
+    """Rotation nearest to all of (N, 3, 3), N >= 1; indifferent to any 0/360 wrap."""
+    return Rotation.from_matrix(matrices).mean().as_matrix()
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """From a phone's attitude to the joint angles of the mechanism.
+
+    With W the phone's world, B the base, E the end-effector and P the phone, the stream
+    gives ``R_WP = R_WB R_BE R_EP``. At the zero posture ``R_BE = I``, so
+    ``R_BE = R_EP (R0^T R) R_EP^T``: heading and placement of the world cancel.
+    """
+
+    zero: Array  # (3, 3) R0, attitude of the phone in the zero posture
+    mounting: Array  # (3, 3) R_EP, phone to end-effector
+    order: str  # axes of the mechanism from the base outwards
+    letters: tuple[str, str, str]  # axis letter of pitch, yaw and roll
+
+    def angles(self, matrix: ArrayLike, order: str | None = None) -> Array:
+        """(..., 3) pitch, yaw and roll in degrees of phone attitudes (..., 3, 3)."""
+        order = order or self.order
+        turned = self.zero.T @ np.asarray(matrix, dtype=np.float64)
+        sequence = matrix_to_euler(self.mounting @ turned @ self.mounting.T, order)
+        return sequence[..., [order.index(letter) for letter in self.letters]]
+
+    def matrix(self, angles_deg: ArrayLike) -> Array:
+        """(..., 3, 3) attitudes of the phone at (..., 3) pitch, yaw and roll."""
+        places = [self.letters.index(letter) for letter in self.order]
+        sequence = np.asarray(angles_deg, dtype=np.float64)[..., places]
+        turned = euler_to_matrix(sequence, self.order)
+        return self.zero @ self.mounting.T @ turned @ self.mounting
+
+
+def raw_fields(readings: Sequence[Reading]) -> dict[str, Any]:
+    """``quaternions`` (samples, 4), x y z w, and ``stamps`` (samples,), Unix time."""
+    turns = Rotation.from_matrix([reading.matrix for reading in readings])
+    clock = time.time() - time.monotonic()
+    return {
+        "quaternions": turns.as_quat(canonical=True).round(DIGITS).tolist(),
+        "stamps": [round(reading.time + clock, 4) for reading in readings],
+    }
+
+
+def frame_at(config: RigConfig, zero: Array) -> Frame:
+    """The frame in which the (3, 3) attitude ``zero`` of the phone is the zero."""
+    mounting = euler_to_matrix(config.imu.mounting_deg, "ZYX")
+    return Frame(zero, mounting, config.mechanism.order, config.letters)
+
+
+def recorded_frame(described: dict[str, Any], zero: dict[str, Any]) -> Frame:
+    """The same from the journal: ``config`` of its start, and a zero record."""
+    mounting = euler_to_matrix(described["imu"]["mounting_deg"], "ZYX")
+    a, b, c = (axis["letter"] for axis in described["axes"])
+    attitude = np.array(zero["attitude"])
+    return Frame(attitude, mounting, described["mechanism_order"], (a, b, c))
+
+
+def attitudes(record: dict[str, Any], frame: Frame) -> Array:
+    """(samples, 3, 3) of the phone in its world, of a posture's or zero's readings.
+
+    Args:
+        record: of any version.
+        frame: in which it was measured; only version 1 needs it.
+    """
+    if "quaternions" in record:
+        return Rotation.from_quat(record["quaternions"]).as_matrix()
+    turned = frame.matrix(record["raw_deg"])  # right but for a fixed turn of the world
+    return np.array(record["attitude"]) @ mean_rotation(turned).T @ turned
+
+
+def angles(record: dict[str, Any], frame: Frame) -> Array:
+    """(samples, 3) pitch, yaw and roll in degrees of every reading."""
+    return frame.angles(attitudes(record, frame))

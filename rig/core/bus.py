@@ -1,0 +1,260 @@
+"""The Modbus line. This is the only file that opens a drive port.
+
+pymodbus does the framing. What it leaves to its caller is done here: exception replies
+are errors, replies are checked against their request, the silence between frames is
+kept, reads are retried, and a motion write is sent exactly once. After any failed
+exchange the line is emptied (or the connection opened again), so that a late reply can
+never be taken for the answer to a later request.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from rig.config.settings import BusSettings
+from rig.core.faults import Fault
+
+METHODS = {3: "read_holding_registers", 6: "write_register", 16: "write_registers"}
+TURNAROUND_S = 0.05  # for the units to act on a broadcast, which none answers
+EXCEPTIONS = {
+    1: "illegal function", 2: "illegal address", 3: "illegal value",
+    4: "device failure", 5: "acknowledge", 6: "busy", 8: "CRC or parity",
+    10: "no gateway path", 11: "gateway target silent",
+}  # fmt: skip
+GATEWAY_CODES = (10, 11)  # the unit behind the gateway is silent
+
+
+class BusError(Fault):
+    """No valid reply: silence, noise, a closed port, or a reply to something else."""
+
+
+class Rejected(BusError):
+    """The drive answered with an exception."""
+
+    def __init__(self, text: str, code: int) -> None:
+        self.code = code
+        super().__init__(text)
+
+
+class Bus:
+    """One Modbus line with any number of units; safe to use from several threads."""
+
+    def __init__(
+        self,
+        settings: BusSettings,
+        silence_s: float = 0.0,
+        emit: Callable[..., Any] = lambda event, **fields: None,
+    ) -> None:
+        self.settings = settings
+        # On Modbus TCP the gateway keeps the line's silence.
+        self.silence_s = 0.0 if settings.transport == "tcp" else silence_s
+        self.check: Callable[[], None] = lambda: None  # before each exchange; may raise
+        self.silent: set[int] = set()  # units that did not answer the last time
+        self._emit = emit  # told of every write before it is sent
+        self._lock = threading.RLock()
+        self._urgent = False
+        self._timeout_s = settings.timeout_s
+        self._quiet_until = 0.0
+        self._client: Any = None
+
+    def _make_client(self) -> Any:
+        from pymodbus import FramerType
+        from pymodbus.client import ModbusSerialClient, ModbusTcpClient
+
+        logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
+        s = self.settings
+        if s.transport == "rtu":
+            return ModbusSerialClient(
+                s.device, framer=FramerType.RTU, baudrate=s.baudrate,
+                parity=s.parity, stopbits=s.stopbits, bytesize=s.bytesize,
+                timeout=s.timeout_s, retries=0,
+            )  # fmt: skip
+        framer = FramerType.SOCKET if s.transport == "tcp" else FramerType.RTU
+        return ModbusTcpClient(
+            s.host, port=s.port, framer=framer, timeout=s.timeout_s, retries=0
+        )
+
+    def open(self) -> Bus:
+        """Open the port; BusError where it is absent, refused or held by another."""
+        with self._lock:
+            hint = ""
+            try:
+                self._client = self._client or self._make_client()
+                if not self._client.connect():
+                    hint = _why_closed(self.settings)
+            except RuntimeError as error:  # pymodbus without pyserial
+                hint = " ".join(str(error).split())
+            if hint:
+                raise BusError(f"cannot open {self.settings.where}: {hint}")
+        return self
+
+    def close(self) -> None:
+        """Close the port; opening it again is possible."""
+        with self._lock:
+            if self._client is not None:
+                self._client.close()
+                self._client = None
+
+    @contextlib.contextmanager
+    def urgent(self, timeout_s: float | None = None) -> Iterator[None]:
+        """Keep the line for a stop: no exchange of another thread, no ``check``.
+
+        A reply is waited for ``timeout_s``, or as configured where that is shorter.
+        """
+        with self._lock:
+            before = self._urgent, self._timeout_s
+            configured = self.settings.timeout_s
+            self._urgent = True
+            self._timeout_s = min(timeout_s or configured, configured)
+            try:
+                yield
+            finally:
+                self._urgent, self._timeout_s = before
+
+    def __enter__(self) -> Bus:
+        return self.open()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def read_words(
+        self, unit: int, address: int, count: int, retries: int | None = None
+    ) -> list[int]:
+        """Read holding registers, with as many more tries as configured or given.
+
+        Raises:
+            BusError: no valid reply after all tries.
+            Rejected: the drive answered with an exception, every time.
+        """
+        tries = 1 + (self.settings.read_retries if retries is None else retries)
+        left = tries
+        while True:
+            left -= 1
+            try:
+                reply = self._exchange(3, unit, address, count=count)
+                words = list(getattr(reply, "registers", []))
+                if len(words) != count:
+                    raise BusError(
+                        f"unit {unit}: asked for {count} registers at 0x{address:04X}, "
+                        f"got {len(words)}"
+                    )
+                return words
+            except BusError as error:
+                self._resynchronise(error)
+                if not left:
+                    error.args = (f"{error} (tried {tries} times)",)
+                    raise
+
+    def write(self, unit: int, address: int, function: int, words: list[int]) -> None:
+        """Write registers once. Never retried: a lost reply may hide a started move.
+
+        Raises:
+            BusError: no valid reply; whether the drive obeyed is unknown.
+            Rejected: the drive refused.
+        """
+        self._emit("write", unit=unit, address=address, words=words)
+        try:
+            if function == 6:
+                reply = self._exchange(6, unit, address, words[0])
+                echoed = list(getattr(reply, "registers", [])) == words
+            else:
+                reply = self._exchange(16, unit, address, words)
+                echoed = getattr(reply, "count", None) == len(words)
+            if not echoed or getattr(reply, "address", None) != address:
+                raise BusError(f"unit {unit}: the reply to a write does not echo it")
+        except BusError as error:
+            self._resynchronise(error)
+            raise
+
+    def broadcast(self, address: int, function: int, words: list[int]) -> None:
+        """Write registers of every unit on a serial line; no unit answers."""
+        self._emit("write", unit=0, address=address, words=words)
+        value = words[0] if function == 6 else words
+        with self._lock:
+            self._send(function, 0, address, value, no_response_expected=True)
+            self._quiet_until += TURNAROUND_S
+
+    def _exchange(
+        self, function: int, unit: int, address: int, *args: Any, **more: Any
+    ) -> Any:
+        with self._lock:
+            if not self._urgent:
+                self.check()  # holding the lock: nothing is sent after another's stop
+            self.silent.add(unit)
+            reply = self._send(function, unit, address, *args, **more)
+            if reply is None or reply.dev_id != unit:
+                raise BusError(f"unit {unit}: the reply is from another unit")
+            code = int(getattr(reply, "exception_code", 0))
+            if code not in GATEWAY_CODES:
+                self.silent.discard(unit)
+        if reply.isError():
+            name = EXCEPTIONS.get(code, "unknown")
+            text = f"unit {unit} answered exception {code} ({name}) at 0x{address:04X}"
+            raise Rejected(text, code)
+        if reply.function_code != function:
+            raise BusError(f"unit {unit}: a reply of function {reply.function_code}")
+        return reply
+
+    def _send(
+        self, function: int, unit: int, address: int, *args: Any, **more: Any
+    ) -> Any:
+        if self._client is None:
+            self.open()
+        time.sleep(max(0.0, self._quiet_until - time.monotonic()))
+        try:
+            # Connecting, where it is lost, may take as long as configured.
+            self._client.comm_params.timeout_connect = self.settings.timeout_s
+            if not self._client.connect():
+                raise ConnectionError("cannot connect")
+            self._client.comm_params.timeout_connect = self._timeout_s
+            send = getattr(self._client, METHODS[function])
+            return send(address, *args, device_id=unit, **more)
+        except Exception as error:
+            # pymodbus lets struct, index and socket errors of mangled frames out.
+            text = " ".join(f"{type(error).__name__}: {error}".split())
+            if "No response" in text:
+                text = f"silent for {self._timeout_s:g} s"
+            raise BusError(f"unit {unit}: no valid reply ({text})") from None
+        finally:
+            self._quiet_until = time.monotonic() + self.silence_s
+
+    def _resynchronise(self, error: BusError) -> None:
+        """Empty the line, so that a late reply is not taken for the next one's."""
+        with self._lock:
+            if self._client is None or isinstance(error, Rejected):
+                return  # a refusal is a whole reply
+            if self.settings.transport != "rtu":
+                self._client.close()  # the next request connects again
+                return
+            port = self._client.socket
+            if port is None:
+                return
+            gap = max(0.02, 20 * 11.0 / self.settings.baudrate, self.silence_s)
+            end = time.monotonic() + 2 * self._timeout_s
+            try:
+                while time.monotonic() < end:
+                    time.sleep(gap)
+                    if not port.in_waiting:
+                        return
+                    port.reset_input_buffer()
+            except OSError:
+                self._client.close()
+
+
+def _why_closed(settings: BusSettings) -> str:
+    if settings.transport != "rtu":
+        return (
+            "nothing answers there, or its connections are all taken. Check power, "
+            "cable and address"
+        )
+    if not os.path.exists(settings.device):
+        return "there is no such port. Is the adapter plugged in?"
+    if not os.access(settings.device, os.R_OK | os.W_OK):
+        return "this user may not open it. Join its group, often dialout"
+    return "held by another program. Is a session running?"

@@ -1,0 +1,209 @@
+"""Drives: what a register map means, spoken over the bus."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+from rig.config.axis import Axis
+from rig.config.registers import Read, Writes, decode, encode
+from rig.core.bus import Bus, BusError, Rejected
+from rig.core.faults import MotionFault
+
+POLL_S = 0.05
+PASSING = (5, 6, 8, 10, 11)  # exceptions: acknowledge, busy, CRC; silence at a gateway
+START_S = 0.2  # a drive that has taken a move shows it within this time
+
+
+@dataclasses.dataclass(frozen=True)
+class Status:
+    """What a drive says about itself."""
+
+    word: int
+    position: int  # pulses
+    time: float  # monotonic seconds
+    enabled: bool
+    done: bool
+    moving: bool
+    fault: bool
+
+
+def refusal(error: BusError) -> bool:
+    """Whether the drive refused, rather than the line failed or a gateway spoke."""
+    return isinstance(error, Rejected) and error.code not in PASSING
+
+
+class Drive:
+    """One axis's drive on the bus."""
+
+    def __init__(self, bus: Bus, axis: Axis) -> None:
+        self.bus = bus
+        self.axis = axis
+        self.last: Status | None = None  # as last read
+
+    def status(self, retries: int | None = None) -> Status:
+        """Read status and position.
+
+        Args:
+            retries: of each read. Where not given they are as configured, and the whole
+                is asked for once more: spoilt frames now and then spoil all tries.
+        """
+        try:
+            return self._status(retries)
+        except BusError as error:
+            if retries is not None or refusal(error):
+                raise
+            return self._status(None)
+
+    def _status(self, retries: int | None) -> Status:
+        status = self.axis.map.status
+        word = self._read(status, retries)
+        position = self._read(self.axis.map.position, retries)
+        flags = status.flags(word)
+        self.last = Status(word, position, time.monotonic(), **flags)
+        return self.last
+
+    def sound(self) -> Status:
+        """Status; MotionFault where the fault bit is set."""
+        status = self.status()
+        if status.fault:
+            text = "fault bit set"
+            try:
+                text = self.alarm() or text
+            except BusError:
+                pass  # the fault bit alone is reason enough to stop
+            raise MotionFault(
+                f"{self.axis.name}: {text}. The drive has stopped itself: find the "
+                "cause, in its manual too, before you go on with --reset-alarms"
+            )
+        return status
+
+    def alarm(self) -> str:
+        """The alarm in words, empty where there is none or no register for it."""
+        read = self.axis.map.alarm
+        code = self._read(read) if read else 0
+        if not read or not code:
+            return ""
+        name = read.names.get(code)
+        return f"alarm 0x{code:X}" + (f" ({name})" if name else "")
+
+    def move(self, pulses: int) -> None:
+        """Start an absolute move; every frame is sent exactly once.
+
+        Raises:
+            ValueError: the target leaves the axis's limits.
+            BusError: a frame was not acknowledged.
+        """
+        axis = self.axis
+        if not axis.min_pulses <= pulses <= axis.max_pulses:
+            raise ValueError(
+                f"{axis.name}: {pulses} pulses leave the limits "
+                f"{axis.min_pulses}..{axis.max_pulses}"
+            )
+        self.write(axis.map.move, position=pulses, **axis.motion_counts())
+
+    def took(self, pulses: int, start: Status, tolerance: int) -> bool | None:
+        """Whether the drive obeys a move whose reply was lost; None: unknown.
+
+        A drive that obeys moves, has left ``start`` by more than ``tolerance`` pulses,
+        or stands at its target. One that does not holds another target, or has stood
+        idle at ``start`` for START_S.
+
+        Raises:
+            MotionFault: it is in alarm. BusError: it does not answer.
+        """
+        begun = time.monotonic()
+        while True:
+            status = self.sound()
+            other = self._target() not in (None, pulses)
+            idle = status.done and not status.moving
+            if idle and abs(status.position - pulses) <= tolerance:
+                return True
+            if status.moving or abs(status.position - start.position) > tolerance:
+                return None if other else True
+            if idle and other:
+                return False
+            if time.monotonic() - begun > START_S:
+                return False if idle else None
+            time.sleep(POLL_S)
+
+    def _target(self) -> int | None:
+        """The target that the drive holds; None where it cannot be read."""
+        read = self.axis.map.target
+        try:
+            return None if read is None else self._read(read)
+        except Rejected:
+            return None
+
+    def stop(self) -> None:
+        """Quick stop; torque stays on."""
+        self.write(self.axis.map.stop)
+
+    def write(self, table: Writes | None, **values: int) -> None:
+        """Send the frames of one of the map's tables; none where the map lacks it.
+
+        What moves the drive, or stops it, is sent once; the rest may be written twice,
+        and is retried as reads are.
+        """
+        m = self.axis.map
+        once = any(table is each for each in (m.move, m.home, m.stop))
+        tries = 1 if once else 1 + self.bus.settings.read_retries
+        while True:
+            tries -= 1
+            try:
+                return self._write(table, values)
+            except BusError as error:
+                if not tries or refusal(error):
+                    raise
+
+    def bring(self, table: Writes | None, ready: Callable[[Status], bool]) -> Status:
+        """Write a table and poll until its effect shows, at most the map's ready_s.
+
+        The last look begins after that time: a look before it may have waited for the
+        tries of a spoilt frame, and tells of the time before them.
+        """
+        self.write(table)
+        end = time.monotonic() + self.axis.map.ready_s
+        while True:
+            last = time.monotonic() > end
+            if ready(status := self.status()) or last:
+                return status
+            time.sleep(POLL_S)
+
+    def _write(self, table: Writes | None, values: dict[str, int]) -> None:
+        order = self.axis.map.word_order
+        for frame in table.write if table else ():
+            words: list[int] = []
+            for value, kind in frame.words:
+                number = values[value] if isinstance(value, str) else value
+                words += encode(number, kind, order)
+            self.bus.write(self.axis.unit, frame.address, frame.function, words)
+
+    def identity(self) -> dict[str, int | str]:
+        """Read what the map calls identity; a register that refuses says so."""
+        found: dict[str, int | str] = {}
+        for name, read in self.axis.map.identity.items():
+            try:
+                found[name] = self._read(read)
+            except Rejected as error:
+                found[name] = f"exception {error.code}"
+        return found
+
+    def pulses_per_rev(self) -> int | None:
+        """Pulses for one motor turn by the drive's own word; None where it has none."""
+        read = self.axis.map.pulses_per_rev
+        try:
+            return self._read(read) or None if read else None
+        except Rejected:  # a model of the family without this register
+            return None
+
+    def homed(self, word: int) -> bool:
+        """Whether a status word says that the drive is homed."""
+        bits = self.axis.map.homed
+        return bits is not None and bits.holds(word)
+
+    def _read(self, read: Read, retries: int | None = None) -> int:
+        unit, order = self.axis.unit, self.axis.map.word_order
+        words = self.bus.read_words(unit, read.address, read.count, retries)
+        return decode(words, read.type, order)

@@ -1,0 +1,189 @@
+"""One lock for each bus: who moves the device now, and how to ask them to stop.
+
+The lock is an flock on a file in a folder of this user, so the kernel frees it however
+its holder ends. The file says who holds it; what it says without the flock is stale.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import pathlib
+import re
+import signal
+import socket
+import time
+from typing import Any
+
+from rig.config.settings import BusSettings
+from rig.core.faults import Refused
+
+# The same for every login, service and TMPDIR of a user, or two sessions of one user
+# would not see each other's locks.
+FOLDER = pathlib.Path(f"/var/tmp/jaxcal-rig-{os.getuid()}")
+PATIENCE_S = 0.2  # a `holder` of another process keeps the flock for an instant
+LOOK_S = 0.02
+
+
+class BusLock:
+    """The right to write to one bus, taken before its port is opened.
+
+    A serial device is known by its real path and a network address by what its name
+    resolves to, so that two names of one bus are one lock.
+    """
+
+    def __init__(self, settings: BusSettings) -> None:
+        self.where = settings.where
+        self.path = FOLDER / (re.sub(r"[^\w.-]+", "_", _identity(settings)) + ".lock")
+        self._fd: int | None = None
+        self._told: dict[str, Any] = {}
+
+    def acquire(self, what: str) -> BusLock:
+        """Take the lock for the command ``what``.
+
+        Raises:
+            Refused: another process, or this one, holds it; names the holder.
+        """
+        self._fd = self._open(os.O_RDWR | os.O_CREAT)
+        end = time.monotonic() + PATIENCE_S
+        while not _flock(self._fd, fcntl.LOCK_EX):
+            if time.monotonic() > end:
+                told = _content(self._fd)
+                self.release()
+                raise Refused(
+                    f"{self.where} is {held_by(told)}. Wait until it ends, or end it "
+                    "with `stop`"
+                )
+            time.sleep(LOOK_S)
+        self._told = {}
+        since = time.strftime("%Y-%m-%d %H:%M:%S")
+        self.tell(pid=os.getpid(), command=what, since=since)
+        return self
+
+    def tell(self, **facts: Any) -> None:
+        """Add to what other processes are told of the holder, such as ``run``."""
+        if self._fd is not None:
+            self._told |= facts
+            text = json.dumps(self._told | {"bus": self.where}) + "\n"
+            os.ftruncate(self._fd, 0)
+            os.pwrite(self._fd, text.encode(), 0)
+
+    def release(self) -> None:
+        """Give the lock back, where it was taken."""
+        if self._fd is not None:
+            if self._told:
+                os.ftruncate(self._fd, 0)
+            os.close(self._fd)
+        self._fd, self._told = None, {}
+
+    def __enter__(self) -> BusLock:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.release()
+
+    def holder(self) -> dict[str, Any] | None:
+        """Who holds the lock now (pid, command, since, run), None where nobody does.
+
+        Never the word of a dead holder: the flock is tried first. The dictionary is
+        empty where the holder has not said yet who it is.
+        """
+        try:
+            fd = self._open(os.O_RDONLY)
+        except FileNotFoundError:
+            return None
+        try:
+            end = time.monotonic() + PATIENCE_S
+            while True:
+                if _flock(fd, fcntl.LOCK_SH):
+                    return None
+                told = _content(fd)
+                if told or time.monotonic() > end:
+                    return told
+                time.sleep(LOOK_S)
+        finally:
+            os.close(fd)
+
+    def signal_holder(self, number: int) -> dict[str, Any] | None:
+        """Send SIGTERM (stop now) or SIGINT (pause) to the holder; who that is.
+
+        None where nobody holds the lock. A holder that has ended since, or is this
+        process, is sent nothing.
+        """
+        told = self.holder()
+        if told and told["pid"] != os.getpid():
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(told["pid"], signal.Signals(number))
+        return told
+
+    def freed(self, seconds: float) -> bool:
+        """Wait so long for the holder to let go; whether it did."""
+        end = time.monotonic() + seconds
+        while self.holder() is not None:
+            if time.monotonic() > end:
+                return False
+            time.sleep(LOOK_S)
+        return True
+
+    def _open(self, flags: int) -> int:
+        if flags & os.O_CREAT:
+            with contextlib.suppress(FileExistsError):
+                FOLDER.mkdir(mode=0o700)
+        try:
+            owner = FOLDER.lstat().st_uid
+            if owner != os.getuid():
+                raise Refused(f"{FOLDER} belongs to user {owner}: remove it")
+            return os.open(self.path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        except FileNotFoundError:
+            raise
+        except OSError as error:
+            reason = error.strerror or error
+            raise Refused(f"cannot lock {self.where}: {self.path}: {reason}") from None
+
+
+def held_by(told: dict[str, Any]) -> str:
+    """What a holder says of itself, in words."""
+    if not told:
+        return "held by a process that has not said who it is"
+    run = f" in {told['run']}" if told.get("run") else ""
+    return (
+        f"held by `{told['command']}`{run} (process {told['pid']}, since "
+        f"{told['since']})"
+    )
+
+
+def _identity(settings: BusSettings) -> str:
+    """The same text for every name of a bus."""
+    if settings.transport == "rtu":
+        return os.path.realpath(settings.device)
+    try:
+        found = socket.getaddrinfo(
+            settings.host, settings.port, type=socket.SOCK_STREAM
+        )
+        addresses = {str(entry[4][0]).removeprefix("::ffff:") for entry in found}
+        # A name with addresses of both kinds is known by that of version 4.
+        address = min(addresses, key=lambda text: (":" in text, text))
+    except OSError:
+        address = settings.host.lower()  # opening it will fail, and say why
+    if address == "::1" or address.startswith("127."):
+        address = "localhost"
+    return f"{address}:{settings.port}"
+
+
+def _flock(fd: int, kind: int) -> bool:
+    try:
+        fcntl.flock(fd, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _content(fd: int) -> dict[str, Any]:
+    """What the file says, empty where that is not whole."""
+    try:
+        told = json.loads(os.pread(fd, 65536, 0))
+        return told if isinstance(told["pid"], int) and told["pid"] > 1 else {}
+    except (ValueError, KeyError, TypeError):
+        return {}

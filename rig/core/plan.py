@@ -1,0 +1,156 @@
+"""What to visit and in which order. Runs between moves; nothing here moves anything."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+
+from jaxcal.selection.fastest import Motion, fastest_tour, travel_times
+from rig.config import RigConfig
+from rig.config.axis import Pulses
+from rig.core.attitude import Array
+
+EXACT_LIMIT_S = 20.0  # for the proof that the choice is (or is not) the optimum
+REPLAN_LIMIT_S = 5.0  # the same while the drives stand armed
+MOST_IMPROVED = 200  # postures whose tour is searched; beyond, nearest neighbours
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """The postures to measure, and how good they are."""
+
+    indices: tuple[int, ...]
+    log_det: float  # of the 12 x 12 information matrix, commands in degrees
+    best_log_det: float  # of the best subset known
+    proven: bool  # that best is the proven optimum
+    method: str
+    note: str = ""
+
+    @property
+    def efficiency(self) -> float:
+        """D-efficiency ``(det S / det S*) ** (1/12)``."""
+        return math.exp((self.log_det - self.best_log_det) / 12.0)
+
+
+def draw(config: RigConfig, count: int, *seed: int) -> Array:
+    """(count, 3) int pulses, uniform in the ranges; only whole ones can be sent."""
+    low, high = np.array(config.ranges).T
+    rng = np.random.default_rng([config.session.seed, *seed])
+    angles = rng.uniform(low, high, size=(count, 3))
+    return np.array([config.to_pulses(angle) for angle in angles])
+
+
+def draw_candidates(config: RigConfig) -> Array:
+    """(M, 3) int pulses from which the postures are chosen."""
+    return draw(config, config.session.candidates)
+
+
+def choose(
+    config: RigConfig,
+    candidates_deg: Array,
+    available: Array | None = None,
+    required: tuple[int, ...] = (),
+    replanning: bool = False,
+) -> Choice:
+    """The K postures to measure of (M, 3) candidates.
+
+    Args:
+        config: names K, the method and the efficiency under which exact replaces it.
+        candidates_deg: (M, 3).
+        available: (M,) False where a posture cannot be reached.
+        required: indices measured already, which stay in the choice.
+        replanning: the drives stand armed: the exact solver alone, and less time.
+    """
+    import jaxcal
+
+    session = config.session
+    limit = REPLAN_LIMIT_S if replanning else EXACT_LIMIT_S
+
+    def select(method: str, **more: Any) -> Any:
+        if available is not None:
+            more["available"] = available
+        if required:
+            more["required"] = list(required)
+        if method != "greedy":  # which draws nothing
+            more["seed"] = session.seed
+        return jaxcal.select(candidates_deg, session.k, method=method, **more)
+
+    exact = select("exact", time_limit=limit)
+
+    def rated(selection: Any, note: str) -> Choice:
+        log_det = float(selection.log_det)
+        return Choice(
+            indices=tuple(int(i) for i in selection.indices),
+            log_det=log_det,
+            best_log_det=max(float(exact.log_det), log_det),
+            proven=bool(exact.proven),
+            method=str(selection.method),
+            note=note,
+        )
+
+    if session.method == "exact" or replanning:
+        return rated(exact, "")
+    more: dict[str, Any] = {}
+    if session.method == "auto":
+        more = {"least_efficiency": session.min_efficiency, "time_limit": limit}
+    try:
+        chosen = select(session.method, **more)
+        choice = rated(chosen, getattr(chosen, "reason", ""))
+        if choice.efficiency >= session.min_efficiency:
+            return choice
+        note = (
+            f"{session.method} reached a D-efficiency of {choice.efficiency:.3f}, "
+            f"under session.min_efficiency = {session.min_efficiency:g}; using exact"
+        )
+    except Exception as error:
+        if session.method not in ("policy", "auto"):
+            raise
+        # A missing or foreign checkpoint must not keep a rig from being calibrated.
+        reason = " ".join(str(error).split())[:200]
+        note = f"no policy could be used ({reason}); exact is used instead"
+    return rated(exact, note)
+
+
+def travel_order(config: RigConfig, points_deg: Array, start_deg: Array) -> list[int]:
+    """Order of visits of (N, 3) points of least travel time from (3,), ending anywhere.
+
+    The axes move at the same time, so the slowest of them sets the time. Optimal for N
+    up to 12; above 200 each next point is the nearest.
+    """
+    if not len(points_deg):
+        return []
+    speed = tuple(axis.speed_deg_s for axis in config.axes)
+    motion = Motion(speed, tuple(axis.accel_deg_s2 for axis in config.axes))
+    here = travel_times([start_deg], points_deg, motion)[0]
+    if len(points_deg) <= MOST_IMPROVED:
+        times = travel_times(points_deg, points_deg, motion)
+        return [int(i) for i in fastest_tour(times, here)[0]]
+    order: list[int] = []
+    left = np.arange(len(points_deg))
+    while len(left):
+        order.append(int(left[here[left].argmin()]))
+        left = left[left != order[-1]]
+        here = travel_times(points_deg[order[-1:]], points_deg, motion)[0]
+    return order
+
+
+def draw_held_out(
+    config: RigConfig, calibration: Any, count: int
+) -> list[tuple[Pulses, Pulses]]:
+    """Held-out targets in pulses, each as it is and as its compensated command.
+
+    Fewer than ``count`` where little of the range can be reached compensated.
+    """
+    low, high = np.array(config.ranges).T
+    pairs: list[tuple[Pulses, Pulses]] = []
+    for pulses in draw(config, 200 * count, 1):
+        if len(pairs) == count:
+            break
+        command = calibration.command_for(config.to_deg(pulses))
+        if ((command >= low) & (command <= high)).all():
+            a, b, c = pulses.tolist()
+            pairs.append(((a, b, c), config.to_pulses(command)))
+    return pairs

@@ -1,0 +1,300 @@
+"""device.json: what was proved of a device, what has voided it, where it was left.
+
+A device is trusted in steps: IDENTIFIED (these drives answer at these units), HOMED
+(the pulses mean a place), SIGN_CHECKED (each axis turns the joint it is named after,
+the way and about as far as it is told), ZEROED (the zero posture's attitude is known).
+ARMED lives in a running process only. No step stands without those before it. A
+session needs all but the last, which it reaches itself before it measures.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxcal.files import write_text
+from rig.config import AXIS_NAMES, RigConfig
+from rig.config.config import differences
+from rig.core.bus import BusError
+from rig.core.drive import Drive
+from rig.core.faults import MotionFault, Refused
+
+IDENTIFIED, HOMED = "IDENTIFIED", "HOMED"
+SIGN_CHECKED, ZEROED = "SIGN_CHECKED", "ZEROED"
+STATES = (IDENTIFIED, HOMED, SIGN_CHECKED, ZEROED)
+COMMANDS = {
+    IDENTIFIED: "scan",
+    HOMED: "home",
+    SIGN_CHECKED: "axes",
+    ZEROED: "zero",
+}  # that reach a state
+
+
+class DeviceRecord:
+    """The states of one device. ``reach``, ``void`` and ``left_at`` also save."""
+
+    def __init__(self, path: pathlib.Path) -> None:
+        self.path = path
+        self._states: dict[str, Any] = {}
+        self._voided: dict[str, Any] = {}
+        self._left: dict[str, Any] = {}
+
+    @classmethod
+    def load(cls, path: pathlib.Path) -> DeviceRecord:
+        """The record of a file; an empty one where there is no file yet.
+
+        Raises:
+            Refused: the file cannot be read or is not a device record.
+        """
+        record = cls(path)
+        try:
+            data = json.loads(path.read_text(encoding="utf-8"))
+            if data["schema"] != 1:
+                raise ValueError(f"schema must be 1, got {data['schema']!r}")
+            record._states = dict(data["states"])
+            record._voided = dict(data["voided"])
+            record._left = dict(data["left"])
+        except FileNotFoundError:
+            pass
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise Refused(
+                f"{path}: not a device record ({error!r}). Move it away and commission "
+                "the device again: jaxcal-rig setup"
+            ) from None
+        return record
+
+    def save(self) -> None:
+        """Write the file, atomically."""
+        data = {
+            "schema": 1,
+            "states": {n: self._states[n] for n in STATES if n in self._states},
+            "voided": self._voided,
+            "left": self._left,
+        }
+        write_text(self.path, json.dumps(data, indent=1) + "\n")
+
+    def state(self, name: str) -> dict[str, Any] | None:
+        """The evidence of a state; None where it does not stand."""
+        known = self._states.get(name)
+        return None if known is None else known["evidence"]
+
+    def reach(self, name: str, config: RigConfig, **evidence: Any) -> None:
+        """A state was reached, with JSON values as evidence.
+
+        Where the evidence is not the one known before, the states after it are void.
+
+        Raises:
+            Refused: a state before it is missing.
+        """
+        number = STATES.index(name)
+        if number and (text := self.missing(config, STATES[number - 1])):
+            raise Refused(text)
+        if self.state(name) not in (None, evidence):
+            self.void(name, f"{name} was reached again, with other evidence")
+        self._states[name] = {
+            "time": _now(),
+            "evidence": evidence,
+            "fingerprint": config.device_fingerprint(),
+        }
+        self._voided.pop(name, None)
+        if name == HOMED:
+            self._left = {}  # counts of before mean nothing now
+        self.save()
+
+    def void(self, name: str, reason: str) -> None:
+        """Take away a state and those after it; the operator is told the reason."""
+        for lost in STATES[STATES.index(name) :]:
+            if self._states.pop(lost, None) is not None:
+                self._voided[lost] = {"time": _now(), "reason": reason}
+        self.save()
+
+    def missing(self, config: RigConfig, through: str = SIGN_CHECKED) -> str | None:
+        """What keeps the states up to ``through`` from standing, and what to do."""
+        needed = STATES[: STATES.index(through) + 1]
+        for number, name in enumerate(needed):
+            if (reason := self._fault(name, config)) is not None:
+                words = [f"`jaxcal-rig {COMMANDS[each]}`" for each in needed[number:]]
+                return (
+                    f"the device is not {name}: {reason}. Run {', then '.join(words)} "
+                    f"(`jaxcal-rig setup` does all). Record: {self.path}"
+                )
+        return None
+
+    def _fault(self, name: str, config: RigConfig) -> str | None:
+        known = self._states.get(name)
+        if known is None:
+            lost = self._voided.get(name)
+            return lost["reason"] if lost else "it never was"
+        then, now = known["fingerprint"], config.device_fingerprint()
+        if name in (IDENTIFIED, HOMED):  # pulses: no gearing, direction or phone in it
+            drives = (".unit", ".map")
+            then, now = (
+                {key: value for key, value in each.items() if key.endswith(drives)}
+                for each in (then, now)
+            )
+        changed = differences(then, now)
+        return f"edited since: {'; '.join(changed)}" if changed else None
+
+    # Where the drives stand between sessions
+
+    def left_at(
+        self,
+        positions: Sequence[int | None] = (None, None, None),
+        homed: Sequence[str] = (),
+    ) -> None:
+        """Where the drives are left.
+
+        Args:
+            positions: pulses; None where it is not known, as while armed.
+            homed: names of the axes whose drives say that they are homed.
+        """
+        pulses = dict(zip(AXIS_NAMES, positions, strict=True))
+        self._left = {"time": _now(), "pulses": pulses, "homed": list(homed)}
+        self.save()
+
+    def left(self) -> dict[str, int]:
+        """Pulses at which the last session left the axes of which that is known."""
+        pulses = self._left.get("pulses", {})
+        return {name: count for name, count in pulses.items() if count is not None}
+
+    def left_homed(self) -> list[str]:
+        """Names of the axes whose drives said then that they are homed."""
+        return self._left.get("homed", [])
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+
+
+USUAL = (1 / 3, 3.0)  # degrees of a joint for one commanded; outside it is told
+
+
+def check_drives(
+    config: RigConfig, drives: Sequence[Drive], record: DeviceRecord
+) -> None:
+    """The drives are those of the record, geared as configured, and where they were.
+
+    Raises:
+        Refused: they are not. What no longer holds of the record is voided.
+        BusError: a drive does not answer.
+    """
+    for drive in drives:
+        axis, told = drive.axis, drive.pulses_per_rev()
+        if told is not None and told != axis.pulses_per_rev:
+            raise Refused(
+                f"the drive of {axis.name} (unit {axis.unit}) is set to {told} pulses "
+                f"per turn, axes.{axis.name}.pulses_per_rev says {axis.pulses_per_rev}."
+                " Correct the one that is wrong; nothing was moved"
+            )
+    check_record(config, drives, record)
+
+
+def check_record(
+    config: RigConfig, drives: Sequence[Drive], record: DeviceRecord
+) -> None:
+    """The drives are those of the record, and where they were; else Refused."""
+    for state, faults in (
+        (IDENTIFIED, [_exchanged(drive, record) for drive in drives]),
+        (HOMED, [_displaced(config, drive, record) for drive in drives]),
+    ):
+        if reason := "; ".join(filter(None, faults)):
+            record.void(state, reason)
+        if record.missing(config, state):
+            raise Refused(record.missing(config))
+
+
+def _exchanged(drive: Drive, record: DeviceRecord) -> str:
+    """What of a drive's identity differs from the record's."""
+    name = drive.axis.name
+    known = (record.state(IDENTIFIED) or {}).get("identity", {}).get(name, {})
+    found = drive.identity() if known else {}
+    return "; ".join(
+        f"the drive of {name} is another one ({key}: {value} then, {found.get(key)} "
+        "now)"
+        for key, value in known.items()
+        if found.get(key) != value
+    )
+
+
+def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
+    """Why the drive's pulses may no longer mean the place that they meant."""
+    axis, status = drive.axis, drive.status()
+    if axis.map.absolute_encoder:
+        return ""
+    if status.fault:
+        return f"{axis.name} is in alarm: {drive.alarm() or 'no code given'}"
+    if axis.name in record.left_homed() and not drive.homed(status.word):
+        return f"the homed bit of {axis.name} is gone: the drive was without power"
+    left = record.left().get(axis.name, status.position)
+    tolerance = axis.pulses_within(config.motion.position_tolerance_deg)
+    if abs(status.position - left) <= tolerance:
+        return ""
+    return (
+        f"{axis.name} stands at {status.position} pulses, "
+        f"{abs(axis.to_deg(status.position - left)):.2f} deg from {left}, where it was "
+        "left: it was without power, or another controller moved it"
+    )
+
+
+def leave(drives: Sequence[Drive], record: DeviceRecord) -> None:
+    """Keep where the drives stand, as far as they say; an alarm takes their place.
+
+    Raises:
+        OSError: the record cannot be written.
+    """
+    positions: list[int | None] = []
+    homed: list[str] = []
+    for drive in drives:
+        try:
+            with drive.bus.urgent():  # also after a stop, when nothing else is sent
+                status = drive.status(retries=0)
+                alarm = drive.alarm() or "no code given" if status.fault else ""
+        except BusError:
+            positions.append(None)
+            continue
+        if alarm and not drive.axis.map.absolute_encoder:
+            record.void(HOMED, f"{drive.axis.name} went into alarm: {alarm}")
+        positions.append(None if status.moving else status.position)
+        if drive.homed(status.word):
+            homed.append(drive.axis.name)
+    record.left_at(positions, homed)
+
+
+def check_matrix(matrix: ArrayLike) -> list[str]:
+    """A (3, 3) fitted matrix A is one of a device whose axes turn as they are named.
+
+    Returns:
+        Warnings: gains that are far from 1.
+
+    Raises:
+        MotionFault: an axis answers the other way, or another axis's command.
+    """
+    gains = np.asarray(matrix, dtype=np.float64)
+    faults, warnings = [], []
+    for i, name in enumerate(AXIS_NAMES):
+        gain, strongest = gains[i, i], int(np.abs(gains[i]).argmax())
+        if strongest != i:
+            faults.append(
+                f"{name} follows the command of {AXIS_NAMES[strongest]} "
+                f"({gains[i, strongest]:.2f} deg for each degree) more than its own "
+                f"({gain:.2f}): units, cables or `rotates` are exchanged"
+            )
+        elif gain <= 0:
+            faults.append(
+                f"{name} turns {gain:.2f} deg for each degree commanded, the other "
+                f"way: check axes.{name}.direction, wiring and imu.signs"
+            )
+        elif not USUAL[0] <= gain <= USUAL[1]:
+            warnings.append(
+                f"{name} turns {gain:.2f} deg for each degree commanded: check "
+                f"pulses_per_rev and reduction of axes.{name}"
+            )
+    if faults:
+        raise MotionFault(f"no calibration is saved: {'; '.join(faults)}")
+    return warnings

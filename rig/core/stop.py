@@ -1,0 +1,211 @@
+"""Stopping: every unit, whatever happened, and proof that it stands.
+
+Nothing here touches JAX, the IMU or the plan. A stop goes to each unit by itself, to
+those that answered last first, and goes on past units that fail. It is repeated (a stop
+may be sent twice, unlike a move) and is verified by reading the status back. After a
+fault the latch stays on: only a new process, armed by a person, moves again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rig.config.registers import encode
+from rig.core.bus import Bus
+from rig.core.drive import Drive
+from rig.core.faults import EXIT_FAULT, PauseRequested, StopRequested
+
+ROUNDS = 3  # times a stop is sent to a unit that does not acknowledge
+QUICK_S = 0.05  # for a reply in the first round, besides the time of the frames
+FRAME_BITS = 2 * 24 * 11  # of a stop and its reply on a serial line, at most
+VERIFY_S = 3.0  # for all units together to come to rest
+POLL_S = 0.02
+STILL_COUNTS = 2  # between two readings of a position that flickers by one count
+
+
+@dataclasses.dataclass
+class UnitStop:
+    """What became of the stop of one unit."""
+
+    axis: str
+    unit: int
+    acknowledged: bool = False  # the drive answered the stop
+    standing: bool = False  # its status says so, and its position holds still
+    detail: str = ""
+
+    def __str__(self) -> str:
+        state = "acknowledged" if self.acknowledged else "NOT acknowledged"
+        rest = "standing" if self.standing else "NOT seen standing"
+        detail = f" ({self.detail})" if self.detail else ""
+        return f"{self.axis} (unit {self.unit}): {state}, {rest}{detail}"
+
+
+def stop_all(drives: list[Drive]) -> list[UnitStop]:
+    """Quick-stop every drive of one bus, and wait for them to come to rest.
+
+    The first round waits a short time for each reply, so that a dead unit delays the
+    others by no more than that; units that did not answer before come last. The next
+    rounds wait as long as configured for those that have not acknowledged.
+
+    Never raises, never leaves one out: one that fails does not keep the others from
+    their stop.
+    """
+    results = [UnitStop(d.axis.name, d.axis.unit) for d in drives]
+    if not drives:
+        return results
+    bus, pairs = drives[0].bus, list(zip(drives, results, strict=True))
+    with bus.urgent():
+        with bus.urgent(_quick_s(bus)):
+            _broadcast(drives)
+            _round(pairs)
+        for _ in range(ROUNDS - 1):
+            _round(pairs)
+        _verify(pairs)
+    return results
+
+
+Pairs = list[tuple[Drive, UnitStop]]
+
+
+def _quick_s(bus: Bus) -> float:
+    return QUICK_S + FRAME_BITS / bus.settings.baudrate
+
+
+def _responsive_first(pairs: Pairs) -> Pairs:
+    return sorted(pairs, key=lambda pair: pair[0].axis.unit in pair[0].bus.silent)
+
+
+def _broadcast(drives: list[Drive]) -> None:
+    """One frame for all of a serial line, where all are of a family that takes it."""
+    bus, family = drives[0].bus, drives[0].axis.map
+    alike = all(drive.axis.map.stop == family.stop for drive in drives)
+    if bus.settings.transport == "tcp" or not (alike and family.broadcast_stop):
+        return
+    with contextlib.suppress(Exception):  # an extra: each unit gets its own as well
+        for frame in family.stop.write:
+            words = [
+                word
+                for value, kind in frame.words
+                for word in encode(int(value), kind, family.word_order)
+            ]
+            bus.broadcast(frame.address, frame.function, words)
+
+
+def _round(pairs: Pairs) -> None:
+    for drive, result in _responsive_first(pairs):
+        if not result.acknowledged:
+            _send(drive, result)
+
+
+def _send(drive: Drive, result: UnitStop) -> None:
+    try:
+        drive.stop()
+        result.acknowledged = True
+        result.detail = ""
+    except Exception as error:
+        result.detail = str(error)
+
+
+def _verify(pairs: Pairs) -> None:
+    """Poll until each stands; one that answers again is told to stop once more."""
+    end = time.monotonic() + VERIFY_S
+    before: dict[str, int] = {}
+    while moving := [pair for pair in pairs if not pair[1].standing]:
+        for drive, result in _responsive_first(moving):
+            bus = drive.bus
+            wait_s = _quick_s(bus) if drive.axis.unit in bus.silent else None
+            try:
+                with bus.urgent(wait_s):
+                    status = drive.status(retries=0)
+            except Exception as error:
+                result.detail = str(error)
+                continue
+            if not result.acknowledged:
+                _send(drive, result)
+            last = before.get(result.axis)
+            still = last is not None and abs(status.position - last) <= STILL_COUNTS
+            result.standing = still and not status.moving
+            before[result.axis] = status.position
+            if result.standing and result.acknowledged:
+                result.detail = "alarm" if status.fault else ""
+        if time.monotonic() > end:
+            return
+        time.sleep(POLL_S)
+
+
+class Stopper:
+    """The latch: after a stop for a fault nothing moves again."""
+
+    def __init__(
+        self,
+        drives: list[Drive],
+        emit: Callable[..., Any] = lambda event, **fields: None,
+    ) -> None:
+        self.drives = drives
+        self.reason = ""  # of the stop that has latched
+        self.results: list[UnitStop] = []
+        self._emit = emit
+        self._lock = threading.RLock()
+
+    def stop(self, reason: str, latch: bool = True) -> list[UnitStop]:
+        """Stop every unit now; the first reason is the one that is kept."""
+        if latch and not self.reason:  # before the lock: whoever moves looks at it
+            self.reason = reason or "stopped"
+        with self._lock:
+            self.results = stop_all(self.drives)
+            units = [dataclasses.asdict(result) for result in self.results]
+            self._emit("stop", reason=reason, units=units)
+            return self.results
+
+    def check(self) -> None:
+        """Raise StopRequested where a stop has latched."""
+        if self.reason:
+            raise StopRequested(f"stopped: {self.reason}", EXIT_FAULT)
+
+
+class Requests:
+    """What was asked of a session from outside: to pause, or to stop.
+
+    Setting a flag is all that a request does; it is looked at before every frame and in
+    every loop. ``rig.signals`` sets them from the signals of the operating system.
+    """
+
+    def __init__(self) -> None:
+        self.armed = False
+        self.ending = False  # the stop and the last lines of the journal are under way
+        self.pause = False
+        self.report: Callable[[str], object] = lambda event: None
+        self._stop: StopRequested | None = None
+        self._told = False
+
+    def __enter__(self) -> Requests:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def request_stop(self, reason: str, exit_code: int) -> None:
+        """Ask for a stop; the first request is the one that is kept."""
+        self._stop = self._stop or StopRequested(reason, exit_code)
+
+    def tell(self) -> None:
+        """Report "pausing" from a loop, once, where a pause was asked for."""
+        if self.pause and not self._told:
+            self._told = True
+            self.report("pausing")
+
+    def check_stop(self) -> None:
+        """Raise StopRequested where one has been asked for."""
+        if self._stop is not None:
+            raise self._stop
+
+    def check_pause(self) -> None:
+        """Raise PauseRequested where one has been asked for; between postures."""
+        self.check_stop()
+        if self.pause:
+            raise PauseRequested("paused by Ctrl-C")

@@ -1,0 +1,255 @@
+"""Bytes of a phone to attitudes: no sockets, no threads, bounded memory.
+
+A reading is accepted only if its whole record is well formed: the agreed number of
+columns, plain decimal numbers, angles a rotation can have, a stamp that does not run
+backwards, no impossible jump. Everything else is counted and dropped.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections import Counter, deque
+from typing import Any
+
+from scipy.spatial.transform import Rotation
+
+from rig.config.settings import ImuSettings
+from rig.core.attitude import Array, Reading, angle_between_deg, euler_to_matrix
+
+MAX_LINE = 1024  # bytes; a phone's line has under 200
+MAX_BODY = 1 << 20  # bytes of one pushed message
+NUMBER = re.compile(r"[+-]?[0-9]{1,15}(?:\.[0-9]{1,17})?(?:[eE][+-]?[0-9]{1,2})?")
+TOKEN = re.compile(r"[-+.:0-9A-Za-z_]{0,64}")
+RECOUNT = 3  # lines of one new width in a row that mean the phone's settings changed
+REJOIN = 5  # readings in a row that agree with each other after a jump
+ODD_STAMPS = 50  # stamps in a row out of line that mean the phone's clock was set
+ZEROS_S = 1.0  # all-zero records a new connection may begin with
+AHEAD_S = 1.0  # a stamp so far ahead of the clock is torn, not early
+ROUNDED = 1 + 1e-5  # full turns in radians are written a little too large
+CLOCK_CREEP = 2e-4  # the phone's clock may run this much faster or slower
+
+
+class StreamFault(RuntimeError):
+    """The stream cannot be trusted any more, for instance its columns changed."""
+
+
+class _Dropped(ValueError):
+    """A record is not used; the text is the counter's name."""
+
+
+class LineSplitter:
+    """A byte stream to lines; CR, LF and ``#`` end one. Never holds over MAX_LINE."""
+
+    def __init__(self) -> None:
+        self._tail = b""
+        self._skip = True  # the first line may be the end of one that began earlier
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Complete lines, without their ends; empty and over-long ones are left out."""
+        parts = re.split(rb"[\r\n#]", self._tail + data)
+        self._tail = parts.pop()
+        lines = []
+        for part in parts:
+            if self._skip or len(part) > MAX_LINE:
+                self._skip = False
+            elif part:
+                lines.append(part)
+        if len(self._tail) > MAX_LINE:
+            self._tail, self._skip = b"", True
+        return lines
+
+
+def _number(text: str) -> float:
+    if not NUMBER.fullmatch(text):
+        raise _Dropped("not a number")
+    return float(text)
+
+
+class Parser:
+    """Records of one phone to readings on the computer's clock."""
+
+    def __init__(self, settings: ImuSettings) -> None:
+        self._settings = settings
+        self._width = settings.column_count or None
+        self.counts: Counter[str] = Counter()
+        self.foreign = False  # the last message was of another device
+        self._device: Any = None  # deviceId of the phone that is heard
+        self.reconnected()
+
+    def reconnected(self) -> None:
+        """A new connection: the phone may have moved and its clock may have changed."""
+        self._widths: deque[int] = deque(maxlen=RECOUNT)
+        self._stamp: float | None = None
+        self._odd = 0
+        self._offset: float | None = None
+        self._offset_at = 0.0
+        self._last: Array | None = None
+        self._far: deque[Array] = deque(maxlen=REJOIN)
+        self._zeros_from: float | None = None
+
+    def lines(self, lines: list[bytes], now: float) -> list[Reading]:
+        """Readings of CSV lines that arrived at ``now`` (monotonic s)."""
+        return self._accept(lines, self._line, now)
+
+    def body(self, body: bytes, now: float) -> list[Reading]:
+        """Readings of one message Sensor Logger pushed; ``foreign`` says that it is
+        another phone's than those before."""
+        self.foreign = False
+        try:
+            message = json.loads(body)
+            device = message.get("deviceId")
+            entries = [
+                entry
+                for entry in message["payload"]
+                if isinstance(entry, dict) and entry.get("name") == "orientation"
+            ]
+        except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+            self.counts["not a Sensor Logger message"] += 1
+            return []
+        if self._device is not None and device != self._device:
+            self.foreign = True
+            self.counts["of another device"] += 1
+            return []
+        readings = self._accept(entries, self._entry, now)
+        if readings:
+            self._device = device
+        return readings
+
+    def _accept(self, records: list[Any], parse: Any, now: float) -> list[Reading]:
+        readings = []
+        for record in records:
+            try:
+                stamp, matrix = parse(record, now)
+                time = self._time(stamp, now)
+                self._gate(matrix)
+            except _Dropped as reason:
+                self.counts[str(reason)] += 1
+                continue
+            self.counts["accepted"] += 1
+            readings.append(Reading(time, matrix))
+        return readings
+
+    def _line(self, line: bytes, now: float) -> tuple[float | None, Array]:
+        """Seconds on the phone's clock, and (3, 3) phone to its world."""
+        s = self._settings
+        try:
+            text = line.decode("ascii").strip(" \t\0")
+        except UnicodeDecodeError:
+            raise _Dropped("not text") from None
+        fields = [field.strip(" \t") for field in text.split(s.separator)]
+        if fields[-1] == "" and len(fields) > 1:
+            fields.pop()
+        used = set(s.quaternion_columns or s.columns)
+        if s.stamp_column >= 0:
+            used.add(s.stamp_column)
+        if not all(TOKEN.fullmatch(field) for field in fields):
+            raise _Dropped("garbage")
+        self._check_width(fields, used)
+        values = {column: _number(fields[column]) for column in used}
+        stamp = values[s.stamp_column] / 1000.0 if s.stamp_column >= 0 else None
+        if s.quaternion_columns:
+            return stamp, _quaternion([values[c] for c in s.quaternion_columns])
+        angles = [values[c] for c in s.columns]
+        if not any(angles):
+            self._check_zeros(now)
+        return stamp, self._euler(angles)
+
+    def _check_width(self, fields: list[str], used: set[int]) -> None:
+        width = len(fields)
+        if self._width is None and width > max(used):
+            for column in used:
+                _number(fields[column])
+            self._width = width
+        if width == self._width:
+            self._widths.clear()
+            return
+        plain = sum(bool(NUMBER.fullmatch(field)) for field in fields)
+        if plain >= max(1, width - 1):
+            self._widths.append(width)
+        if len(self._widths) == RECOUNT and len(set(self._widths)) == 1:
+            raise StreamFault(
+                f"the phone sends {width} columns where {self._width} were agreed: its "
+                "sensor settings changed; set them back, or correct [imu] columns"
+            )
+        raise _Dropped("wrong number of columns")
+
+    def _check_zeros(self, now: float) -> None:
+        """A sensor without a reading sends zeros; one that lies level goes on to."""
+        if self._zeros_from is None:
+            self._zeros_from = now
+        if self._last is None and now - self._zeros_from < ZEROS_S:
+            raise _Dropped("all zero, as sensors send before their first reading")
+
+    def _euler(self, values: list[float]) -> Array:
+        s = self._settings
+        degrees = [*map(math.degrees, values)] if s.unit == "rad" else values
+        middle = degrees[1]  # an arc sine
+        if s.format == "lines":
+            middle = math.remainder(middle, 360.0)  # some write -10 as 350
+        if max(map(abs, degrees)) > 360.0 * ROUNDED or abs(middle) > 90.0 * ROUNDED:
+            raise _Dropped("an angle no rotation has")
+        signed = [v * sign for v, sign in zip(degrees, s.signs, strict=True)]
+        return euler_to_matrix(signed, str(s.order))
+
+    def _entry(self, entry: dict[str, Any], now: float) -> tuple[float | None, Array]:
+        values = entry.get("values")
+        if not isinstance(values, dict):
+            values = entry
+        stamp = entry.get("time")
+        try:
+            numbers = [float(values[key]) for key in ("qx", "qy", "qz", "qw")]
+            seconds = None if stamp is None else float(stamp) * 1e-9
+        except (KeyError, TypeError, ValueError, OverflowError):
+            raise _Dropped("no quaternion") from None
+        return seconds, _quaternion(numbers)
+
+    def _time(self, stamp: float | None, now: float) -> float:
+        """When the phone measured, on the computer's clock.
+
+        The least delay seen so far is taken for the clocks' difference, so a record
+        that waited in a buffer is as old as it really is.
+        """
+        if stamp is None:
+            return now
+        if not math.isfinite(stamp):
+            raise _Dropped("not a number")
+        odd = ""
+        if self._stamp is not None and stamp < self._stamp:
+            odd = "older than the reading before"
+        elif self._offset is not None and stamp + self._offset - now > AHEAD_S:
+            odd = "from the future"
+        if odd:
+            self._odd += 1
+            if self._odd < ODD_STAMPS:
+                raise _Dropped(odd)
+            self._offset = None
+        self._odd = 0
+        self._stamp = stamp
+        delay = now - stamp
+        if self._offset is None:
+            self._offset = delay
+        crept = self._offset + CLOCK_CREEP * max(0.0, now - self._offset_at)
+        self._offset, self._offset_at = min(delay, crept), now
+        return stamp + self._offset
+
+    def _gate(self, matrix: Array) -> None:
+        if self._last is not None:
+            limit = self._settings.max_jump_deg
+            if angle_between_deg(self._last, matrix) > limit:
+                if self._far and angle_between_deg(self._far[-1], matrix) > limit:
+                    self._far.clear()
+                self._far.append(matrix)
+                if len(self._far) < REJOIN:
+                    raise _Dropped("an impossible jump")
+        self._far.clear()
+        self._last = matrix
+
+
+def _quaternion(values: list[float]) -> Array:
+    if not all(math.isfinite(value) for value in values):
+        raise _Dropped("not a number")
+    if not 0.98 <= math.fsum(value * value for value in values) <= 1.02:
+        raise _Dropped("a quaternion that is not of length one")
+    return Rotation.from_quat(values).as_matrix()

@@ -1,0 +1,264 @@
+"""An append-only journal of JSON lines that survives the death of its writer.
+
+One record a line, numbered. A posture is on the disk (fsync) before the next begins. A
+torn last line, as SIGKILL or a full disk leave it, is dropped by the reader and cut off
+by the next writer; any other damage is an error, never a guess.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import datetime
+import fcntl
+import importlib.metadata
+import io
+import json
+import os
+import pathlib
+import platform
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+from jaxcal.files import write_text
+from rig.config import AXIS_NAMES, RigConfig
+
+Record = dict[str, Any]
+
+
+class JournalError(RuntimeError):
+    """The journal cannot be written, or is damaged."""
+
+
+def _parse(data: bytes, path: pathlib.Path) -> tuple[list[Record], int]:
+    """Records and the length in bytes of the undamaged part."""
+    records: list[Record] = []
+    good = 0
+    *lines, tail = data.split(b"\n")
+    for number, line in enumerate(lines):
+        try:
+            record = json.loads(line)
+            whole = record["seq"] == number
+        except (ValueError, KeyError, TypeError):
+            whole = False
+        if not whole:
+            if number == len(lines) - 1 and not tail:
+                break  # the last line, whole but mangled: also torn
+            raise JournalError(
+                f"{path}: line {number + 1} is damaged; the run cannot be resumed"
+            )
+        records.append(record)
+        good += len(line) + 1
+    return records, good
+
+
+def read_journal(path: pathlib.Path) -> list[Record]:
+    """All whole records; JournalError where one before the last is damaged."""
+    try:
+        return _parse(path.read_bytes(), path)[0]
+    except OSError as error:
+        raise JournalError(f"{path}: {error.strerror or error}") from None
+
+
+def is_written(path: pathlib.Path) -> bool:
+    """A running session holds the journal; the lock ends with its process."""
+    try:
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        pass
+    return False
+
+
+def measured_postures(records: list[Record]) -> dict[str, Record]:
+    """Every posture measured and not withdrawn since, by name, in order."""
+    found: dict[str, Record] = {}
+    for record in records:
+        if record["event"] == "posture":
+            found[record["name"]] = record
+        elif record["event"] == "void":
+            for name in record["names"]:
+                found.pop(name, None)
+    return found
+
+
+class Journal:
+    """The one writer of a journal; a second one on the same run is refused."""
+
+    def __init__(self, path: pathlib.Path) -> None:
+        self.path = path
+        self._lock = threading.Lock()
+        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
+        try:
+            self._fd = os.open(path, flags, 0o644)
+        except OSError as error:
+            raise JournalError(f"{path}: {error.strerror or error}") from None
+        try:
+            self._claim()
+            self.records, self._size = _parse(path.read_bytes(), path)
+            os.ftruncate(self._fd, self._size)
+        except BlockingIOError:
+            self.close()
+            raise JournalError(f"{path}: a running session is writing it") from None
+        except BaseException:
+            self.close()
+            raise
+
+    def _claim(self) -> None:
+        """Lock the file. A live page that asks `is_written` holds it for an instant."""
+        for _ in range(20):
+            with contextlib.suppress(BlockingIOError):
+                fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+            time.sleep(0.01)
+        fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+    def write(self, event: str, *, sync: bool = False, **fields: Any) -> Record:
+        """Append one record; with ``sync`` it is on the disk when this returns.
+
+        Raises:
+            JournalError: the disk is full or gone; the journal keeps its whole lines.
+        """
+        with self._lock:
+            now = round(time.time(), 4)
+            record = {"seq": len(self.records), "time": now, "event": event, **fields}
+            line = json.dumps(record, allow_nan=False, separators=(",", ":")) + "\n"
+            data = line.encode()
+            try:
+                written = 0
+                while written < len(data):
+                    written += os.write(self._fd, data[written:])
+                if sync:
+                    os.fsync(self._fd)
+            except BaseException as error:  # a signal's too, while nothing is armed
+                with contextlib.suppress(OSError):  # or the next writer cuts it off
+                    os.ftruncate(self._fd, self._size)
+                if not isinstance(error, OSError):
+                    raise
+                raise JournalError(
+                    f"cannot write {self.path}: {error.strerror or error}"
+                ) from None
+            self._size += len(data)
+            self.records.append(record)
+            return record
+
+    def events(self, event: str) -> list[Record]:
+        """Records of one kind."""
+        return [record for record in self.records if record["event"] == event]
+
+    def close(self) -> None:
+        os.close(self._fd)
+
+
+JOURNAL = "journal.jsonl"
+SPARED = (
+    "write",
+    "stop",
+    "comm_restored",
+)  # a full disk must not keep a stop from the bus
+
+
+def new_run_folder(output: pathlib.Path, mode: str) -> pathlib.Path:
+    """Make ``output/mode-date-time``, never an existing one."""
+    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S")
+    for number in range(100):
+        path = output / (f"{mode}-{stamp}" + (f"-{number}" if number else ""))
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise ValueError(f"cannot make {path}: {error.strerror or error}") from None
+        return path
+    raise ValueError(f"cannot make a new run under {output}")
+
+
+class RunFolder:
+    """The events of one run. A record that it holds is never made a second time."""
+
+    def __init__(
+        self, config: RigConfig, folder: pathlib.Path, mode: str, start: Record
+    ) -> None:
+        self.config = config
+        self.folder = folder
+        self.journal = Journal(folder / JOURNAL)
+        self.listeners: list[Callable[[Record], None]] = []
+        try:
+            self._begin(mode, start)
+        except BaseException:
+            self.journal.close()
+            raise
+
+    def _begin(self, mode: str, start: Record) -> None:
+        now = datetime.datetime.now(datetime.UTC)
+        provenance = {
+            "jaxcal": importlib.metadata.version("jaxcal"),
+            "python": platform.python_version(),
+            "host": platform.node(),
+            "pid": os.getpid(),
+            "arguments": sys.argv[1:],
+            "started": now.isoformat(timespec="seconds"),
+        }
+        if known := self.journal.events("start"):
+            if changed := self.config.changed_since(known[0]["config"]):
+                raise ValueError(
+                    f"{self.folder}: the configuration changed since this run began: "
+                    f"{'; '.join(changed)}. Addresses and limits may change, nothing "
+                    "else. Start a new run"
+                )
+            if known[0]["mode"] != mode:
+                raise ValueError(f"{self.folder} is a {known[0]['mode']} run")
+            self.emit("resume", sync=True, **provenance)
+            return
+        config, fingerprint = self.config.described(), self.config.fingerprint()
+        device = self.config.device_fingerprint()
+        start = {"config": config, "device": device, **provenance, **start}
+        self.emit(
+            "start", sync=True, schema=1, mode=mode, fingerprint=fingerprint, **start
+        )
+
+    def emit(self, event: str, *, sync: bool = False, **fields: Any) -> Record:
+        """Journal an event, then tell the listeners: the one stream of a run.
+
+        With ``sync`` it is on the disk before anything follows. Where the disk is full
+        JournalError is raised, but not for a stop and its frames.
+        """
+        record: Record = {"event": event, **fields}
+        try:
+            record = self.journal.write(event, sync=sync, **fields)
+        except JournalError:
+            if event not in SPARED:
+                raise
+        for listener in self.listeners:
+            listener(record)
+        return record
+
+    def remember(self, event: str, make: Callable[[], Record]) -> Record:
+        """The record of an event, made and journalled on first use only."""
+        known = self.journal.events(event)
+        return known[0] if known else self.emit(event, sync=True, **make())
+
+    def postures(self) -> dict[str, Record]:
+        """Every posture measured and not withdrawn since, by name, in order."""
+        return measured_postures(self.journal.records)
+
+    def save_pairs(self) -> None:
+        """Write pairs.csv: role, commands, measurements, scatter of every posture."""
+        of_axes = ("pulses", "u_deg", "y_deg", "std_deg")
+        columns = [f"{what}_{axis}" for what in of_axes for axis in AXIS_NAMES]
+        text = io.StringIO()
+        table = csv.writer(text, lineterminator="\n")
+        table.writerow(["name", "role", *columns, "samples"])
+        for r in self.postures().values():
+            values = r["pulses"] + r["commanded_deg"] + r["measured_deg"] + r["std_deg"]
+            table.writerow([r["name"], r.get("role", ""), *values, r["samples"]])
+        write_text(self.folder / "pairs.csv", text.getvalue())
+
+    def save_summary(self, summary: dict[str, Any]) -> None:
+        """Write summary.json."""
+        write_text(self.folder / "summary.json", json.dumps(summary, indent=1))
