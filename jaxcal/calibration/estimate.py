@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from jaxcal.calibration.discrepancy import WithDiscrepancy
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
 from jaxcal.checks import one_of, whole_number
-from jaxcal.models import Model, Noise, Prior, SerialChain
+from jaxcal.models import Model, Noise, Pose, Position, Prior, SerialChain
 
 __all__ = ["fit_model", "require_model"]
 
@@ -67,9 +67,10 @@ def fit_model(
             "give one of them"
         )
     _require_unit(model, commands[used], measured[used])
-    if spread.any() and isinstance(model, SerialChain) and model.num_outputs == 6:
+    pose = isinstance(model, SerialChain) and isinstance(model.sensor, Pose)
+    if spread.any() and pose:
         raise ValueError(
-            "command_std must not be given with output='pose': the orientations are "
+            "command_std must not be given with a Pose: the orientations are "
             "compared with those of the commands given; raise the std of the noise"
         )
     resolved = (prior or model.default_prior()).resolve(model)
@@ -103,6 +104,8 @@ def fit_model(
 def _require_unit(model: Any, commands: Array, measured: Array) -> None:
     """Refuse millimetres for metres, radians for degrees: an arm is not off tenfold."""
     if not isinstance(model, SerialChain):
+        return
+    if not isinstance(model.sensor, Position | Pose):
         return
     spread = []
     for points in (measured[:, :3], model.predict(commands)[:, :3]):

@@ -16,7 +16,7 @@ from jaxcal.calibration.checked import derivative, predict
 from jaxcal.calibration.discrepancy import WithDiscrepancy
 from jaxcal.calibration.reach import Carry, reach
 from jaxcal.checks import in_words
-from jaxcal.models import Affine, Model, SerialChain, from_dict, identifiability
+from jaxcal.models import Affine, Model, Pose, SerialChain, from_dict, identifiability
 from jaxcal.models.identifiability import Identifiability
 
 __all__ = ["ModelCalibration"]
@@ -257,7 +257,7 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
     def _carry(self, wanted: Array, start: Array | None) -> Carry | None:
         """Of an arm's pose, whose orientations are relative to the commands."""
         arm = self.model
-        if not (isinstance(arm, SerialChain) and arm.output == "pose"):
+        if not (isinstance(arm, SerialChain) and isinstance(arm.sensor, Pose)):
             return None
         if start is None:
             raise ValueError(

@@ -36,16 +36,12 @@ def _polynomial(data: Mapping[str, Any]) -> Polynomial:
     return Polynomial(data["degree"], data["num_inputs"], data["num_outputs"])
 
 
-def _serial_chain(data: Mapping[str, Any]) -> SerialChain:
-    return SerialChain.from_dh(**{key: data[key] for key in data if key != "kind"})
-
-
 _KINDS: dict[str, Callable[[Mapping[str, Any]], Model]] = {
     "affine": _affine,
     "jax": _of_function,
     "linear": _linear,
     "polynomial": _polynomial,
-    "serial_chain": _serial_chain,
+    "serial_chain": SerialChain.from_dict,
 }
 
 

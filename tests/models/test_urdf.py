@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxcal.models import SerialChain
+from jaxcal.models import Pose, SerialChain
 
 from .test_serial_chain import _matrix, _slide
 
@@ -45,10 +45,10 @@ def _tip(joints, command):
     return frame
 
 
-def _read(tmp_path, text, *args, **options):
+def _read(tmp_path, text, **options):
     path = tmp_path / "arm.urdf"
     path.write_text(text)
-    return SerialChain.from_urdf(path, *args, **options)
+    return SerialChain.from_urdf(path, **options)
 
 
 right = st.sampled_from([0.0, np.pi / 2, -np.pi / 2, np.pi, 1.5708, 0.3, -2.0])
@@ -67,7 +67,7 @@ lengths = st.sampled_from([0.0, 0.1, -0.4, 0.75])
 )
 def test_a_file_and_the_model_agree_at_every_posture(tmp_path_factory, joints, seed):
     joints = [("revolute", (0, 0, 0.2), (0, 0, 0), (0, 0, 1)), *joints]
-    model = _read(tmp_path_factory.mktemp("urdf"), _urdf(joints), output="pose")
+    model = _read(tmp_path_factory.mktemp("urdf"), _urdf(joints), sensor=Pose())
     command = np.random.default_rng(seed).uniform(-180.0, 180.0, model.num_inputs)
     frame = _tip(joints, command)
     outputs = model.predict(command[None])
@@ -111,7 +111,7 @@ def test_a_chain_between_two_links_of_a_tree(tmp_path):
     )
     with pytest.raises(ValueError, match=r"tip must be given: .* \(link3, camera"):
         _read(tmp_path, _urdf(joints, finger))
-    model = _read(tmp_path, _urdf(joints, finger), "link3", "link1")
+    model = _read(tmp_path, _urdf(joints, finger), tip="link3", base="link1")
     assert model.joints == "RP"
     expected = (np.linalg.inv(_slide("x", 1.0)) @ _tip(joints, (30.0, 0.2)))[:3, 3]
     np.testing.assert_allclose(model.predict([[30.0, 0.2]])[0], expected, atol=1e-12)
@@ -155,7 +155,7 @@ def test_a_file_that_is_no_chain_is_refused(tmp_path, text, message):
 
 def test_links_that_do_not_fit_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"tip must be a link of .* got 'flange'"):
-        _read(tmp_path, _urdf(ONE), "flange")
+        _read(tmp_path, _urdf(ONE), tip="flange")
     with pytest.raises(ValueError, match="base 'link1' is not above tip 'link0'"):
         _read(tmp_path, _urdf(ONE), "link0", "link1")
     ring = _urdf(
@@ -164,4 +164,4 @@ def test_links_that_do_not_fit_are_refused(tmp_path):
         '<child link="link0"/></joint>',
     )
     with pytest.raises(ValueError, match="the joints back, j1 form a loop"):
-        _read(tmp_path, ring, "link1")
+        _read(tmp_path, ring, tip="link1")
