@@ -240,9 +240,6 @@ TRAININGS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("look-ahead 3", {"lookahead": 3}),
     ("look-ahead 2", {"lookahead": 2}),
     ("look-ahead 1", {"lookahead": 1}),
-    ("look-ahead 1, no messages", {"lookahead": 1, "messages": False}),
-    ("no messages", {"messages": False}),
-    ("no endgame", {"endgame": False}),
     ("width 16", {"width": 16}),
     ("width 48", {"width": 48}),
 )

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.calibration.checked import facts
 from jaxcal.calibration.discrepancy import WithDiscrepancy
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
 from jaxcal.checks import one_of, whole_number
@@ -73,6 +74,8 @@ def fit_model(
             "command_std must not be given with a Pose: the orientations are "
             "compared with those of the commands given; raise the std of the noise"
         )
+    if hasattr(model, "located"):  # sensors that stand somewhere
+        model = model.located(commands[used], measured[used])
     resolved = (prior or model.default_prior()).resolve(model)
     whole, extra = model, np.zeros(0)
     if discrepancy is not None:
@@ -97,7 +100,7 @@ def fit_model(
     if common_noise is None and _levels_differ(task, found):
         task = dataclasses.replace(task, per_output=True)
         found = solve(task, found)
-    fields = _fields(task, found, commands, measured, used)
+    fields = _fields(task, found, commands, measured, weights)
     return fields | {"model": model, "loss": loss}
 
 
@@ -161,17 +164,19 @@ def _fields(
     found: Solution,
     commands: Array,
     measured: Array,
-    used: NDArray[np.bool_],
+    weights: Array,
 ) -> dict[str, Any]:
-    information = found.weights
+    used, information = weights > 0.0, found.weights
     if task.student:
         _, mean, efficiency = student_constants(found.left)
         information = efficiency * np.minimum(1.0, found.weights / mean)
     rows = np.sqrt(information)[:, None, None] * found.rows
     rows = rows.reshape(-1, rows.shape[-1])
+    known = facts(task.model, found.parameters)[1][:, task.free]
+    rows = np.concatenate([rows, known])
     covariance, null = _covariance(task, rows, found.precision[task.free], found.left)
     freedom = float(found.freedom.sum())
-    noise_std: Array | None = _noise(task, found)
+    noise_std: Array | None = _noise(task, found, weights[used])
     noise_dof = 0.0
     if not task.known:
         noise_dof = float(found.freedom.min()) if task.per_output else freedom
@@ -210,9 +215,9 @@ def _fields(
     }
 
 
-def _noise(task: Task, found: Solution) -> Array | None:
+def _noise(task: Task, found: Solution, weights: Array) -> Array:
     """(q,) of a reading of weight 1; root mean square where they were given apart."""
-    inverse = np.linalg.inv(task.white)
+    inverse = np.linalg.inv(task.white) * np.sqrt(weights)[:, None, None]
     each = inverse @ np.matrix_transpose(inverse)
     std = np.sqrt(np.diagonal(each, axis1=1, axis2=2).mean(axis=0))
     return np.asarray(std * found.level)

@@ -170,8 +170,8 @@ def test_value_and_policy_are_learned_in_a_probe_environment():
 
 @pytest.mark.slow
 def test_the_policy_learns_on_a_small_task():
-    # Without the look ahead and the endgame, so that it must learn by itself.
-    network = build(dataclasses.replace(SMALL, lookahead=1, endgame=False, width=16))
+    # Without the look ahead, so that it must learn by itself.
+    network = build(dataclasses.replace(SMALL, lookahead=1, width=16))
     config = dataclasses.replace(
         TINY, num_episodes=512 * 40, episodes_per_update=512, learning_rate=5e-3
     )

@@ -161,7 +161,7 @@ def _several():
 def test_several_sensors_read_what_each_reads_where_it_is_mounted():
     model, commands, parameters = _several()
     values = dict(zip(model.names, parameters, strict=True))
-    length = model.length
+    length, inputs = model.length, (*model.joint_names, *model.sensor.inputs)
     found = model.predict(commands, parameters)
     for i, one in enumerate(model.sensor.sensors):
         rows = commands[:, 6] == i
@@ -184,7 +184,7 @@ def test_several_sensors_read_what_each_reads_where_it_is_mounted():
         for k, name in enumerate(alone.names):
             if not name.startswith("tool"):
                 theta[k] = values[name]
-        columns = [model.inputs.index(name) for name in alone.inputs]
+        columns = [inputs.index(name) for name in (*alone.joint_names, *one.inputs)]
         expected = alone.predict(commands[np.ix_(rows, columns)], theta)
         width = len(one.outputs)
         np.testing.assert_allclose(

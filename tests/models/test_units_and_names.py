@@ -7,7 +7,7 @@ import pytest
 
 import jaxcal
 from jaxcal import Noise
-from jaxcal.models import Linear, Sensor, SerialChain
+from jaxcal.models import Linear, Pose, Sensor, SerialChain
 
 TABLE = np.array([[0, 90, 400, 0], [500, 0, 0, 0], [0, 90, 0, 0], [0, 0, 450, 0.0]])
 JOINTS = np.random.default_rng(0).uniform(-120, 120, (60, 4))

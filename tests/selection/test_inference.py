@@ -106,8 +106,8 @@ def test_the_picks_are_those_of_jax(rng, m, n, k, masked, required, how):
 
 VARIANTS = [
     None,  # the one that ships
-    NetworkConfig(width=8, encoder_rounds=1, decoder_rounds=2, endgame=False),
-    NetworkConfig(width=8, encoder_rounds=0, messages=False, lookahead=2),
+    NetworkConfig(width=8, encoder_rounds=1, decoder_rounds=2),
+    NetworkConfig(width=8, encoder_rounds=0, lookahead=2),
 ]
 
 
@@ -195,7 +195,7 @@ def test_of_many_candidates_the_512_of_largest_gain_are_starts(rng):
 
 
 def test_samples_are_drawn_from_the_policy(rng):
-    config = NetworkConfig(width=4, encoder_rounds=1, endgame=False)
+    config = NetworkConfig(width=4, encoder_rounds=1)
     network = build(config)
     problems, _, available, _ = drawn(rng, 1, 6, 2, 3)
     begin = jnp.zeros((1, 6, 2)), jnp.ones((1, 6), bool), jnp.full((1, 3), -1)

@@ -38,14 +38,12 @@ class _Round(nn.Module):
         width = self.config.width
         active = vectors.active[..., None].astype(h.dtype)
         u = nn.LayerNorm(name="norm")(h)
-        parts = [u]
-        if self.config.messages:
-            v = nn.Dense(width, use_bias=False, name="send")(u) * active
-            total = jnp.einsum("...mf,...mw->...fw", vectors.moments, v)
-            parts.append(jnp.einsum("...mf,...fw->...mw", vectors.moments, total))
+        v = nn.Dense(width, use_bias=False, name="send")(u) * active
+        total = jnp.einsum("...mf,...mw->...fw", vectors.moments, v)
+        message = jnp.einsum("...mf,...fw->...mw", vectors.moments, total)
         number = jnp.maximum(active.sum(-2, keepdims=True), 1.0)
         mean = (u * active).sum(-2, keepdims=True) / number
-        inner = nn.Dense(2 * width, name="mix")(jnp.concatenate(parts, axis=-1))
+        inner = nn.Dense(2 * width, name="mix")(jnp.concatenate([u, message], axis=-1))
         pooled = nn.Dense(2 * width, use_bias=False, name="pool")(mean)
         out = nn.Dense(width, name="out")(nn.relu(inner + pooled))
         return h + out * active
@@ -57,10 +55,10 @@ class CompactNetwork(nn.Module):
     It sees the candidates only through inner products of whitened regressors, so no
     affine map of the commands and no order of the candidates can change the pick.
 
-    The last two choices are the look-ahead's (``endgame``): the best pair given what
-    was chosen before, then the largest gain. At K = n + 2 the choices before the pair
-    do not span the space and it is rated with the ridge of ``features`` beside them: it
-    may be second best where those choices nearly coincide (docs/policy.md).
+    The last two choices are the look-ahead's (``num_unlearned``): the best pair given
+    what was chosen before, then the largest gain. At K = n + 2 the choices before the
+    pair do not span the space and it is rated with the ridge of ``features`` beside
+    them: it may be second best where those choices nearly coincide (docs/policy.md).
     """
 
     config: NetworkConfig
@@ -85,7 +83,7 @@ class CompactNetwork(nn.Module):
     @property
     def num_unlearned(self) -> int:
         """Choices at the end of an episode that are made without the network."""
-        return min(self.config.lookahead, 2) if self.config.endgame else 0
+        return min(self.config.lookahead, 2)
 
     def candidate_features(
         self, candidates: jax.Array, usable: jax.Array

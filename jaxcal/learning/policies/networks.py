@@ -49,10 +49,6 @@ class NetworkConfig:
         1, "message rounds over what is left, for each decision"
     )
     lookahead: int = setting(12, "most greedy choices ahead that a feature shows")
-    messages: bool = setting(True, "second-moment messages sum_j v_j x_j x_j.T")
-    endgame: bool = setting(
-        True, "choose the last two by the look-ahead alone, without the network"
-    )
     close_up: bool = setting(False, "features that tell near-equal look-aheads apart")
     initial_trust: float = setting(
         0.0, "weight of the look-ahead before learning; 4 begins as the rule"

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers, one_of
 from jaxcal.models.sensors.pose import rotation_vector_rate
-from jaxcal.models.sensors.sensor import BASE, Reading, Sensor, Tip, hats
-
-if TYPE_CHECKING:
-    from jaxcal.models.serial.arm import Arm
+from jaxcal.models.sensors.sensor import BASE, Named, Reading, Sensor, Tip, hats
 
 __all__ = ["Board"]
 
@@ -75,7 +72,7 @@ class Board(Sensor):
     def usual_noise(self, length: float) -> ArrayLike:
         return [1e-3 * length] * 3 + [0.1] * 3
 
-    def unseen(self, arm: Arm) -> tuple[str, ...]:
+    def unseen(self, arm: Named) -> tuple[str, ...]:
         return BASE
 
     def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:

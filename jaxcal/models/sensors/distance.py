@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.models.sensors.sensor import BASE, Placed, Reading, Tip
-
-if TYPE_CHECKING:
-    from jaxcal.models.serial.arm import Arm
+from jaxcal.models.sensors.sensor import BASE, Named, Placed, Reading, Tip
 
 __all__ = ["Distance"]
 
@@ -41,7 +38,7 @@ class Distance(Placed):
     def usual_noise(self, length: float) -> ArrayLike:
         return 1e-4 * length
 
-    def unseen(self, arm: Arm) -> tuple[str, ...]:
+    def unseen(self, arm: Named) -> tuple[str, ...]:
         return BASE
 
     def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import in_words, numbers
-from jaxcal.models.sensors.sensor import Reading, Sensor, Tip, hats
-
-if TYPE_CHECKING:
-    from jaxcal.models.serial.arm import Arm
+from jaxcal.models.sensors.sensor import Named, Reading, Sensor, Tip, hats
 
 __all__ = ["Gravity"]
 
@@ -67,7 +63,7 @@ class Gravity(Sensor):
     def usual_noise(self, length: float) -> ArrayLike:
         return 1e-3 * self.magnitude
 
-    def unseen(self, arm: Arm) -> tuple[str, ...]:
+    def unseen(self, arm: Named) -> tuple[str, ...]:
         about = "xyz"[int(np.abs(self.up).argmax())]
         lengths = [
             name

@@ -4,22 +4,41 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers, whole_number
 
-if TYPE_CHECKING:
-    from jaxcal.models.serial.arm import Arm
-
-__all__ = ["BASE", "Placed", "Reading", "Sensor", "Tip", "across", "hats", "label"]
+__all__ = [
+    "BASE",
+    "Named",
+    "Placed",
+    "Reading",
+    "Sensor",
+    "Tip",
+    "across",
+    "hats",
+    "label",
+]
 
 Array = NDArray[np.float64]
 
 BASE = tuple(f"base {axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
+
+
+class Named(Protocol):
+    """An arm, by its parameters."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """p names."""
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """p units."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +120,7 @@ class Sensor:
         """() or (q,) standard deviation of a reading, for an arm of this length."""
         raise NotImplementedError
 
-    def unseen(self, arm: Arm) -> tuple[str, ...]:
+    def unseen(self, arm: Named) -> tuple[str, ...]:
         """Parameters that no posture shows; held unless a prior says otherwise."""
         return ()
 
@@ -149,7 +168,7 @@ class Sensor:
         return content
 
     @classmethod
-    def from_dict(cls, content: dict[str, Any]) -> Self:
+    def from_dict(cls, content: Mapping[str, Any]) -> Self:
         """The sensor that ``to_dict`` wrote."""
         return cls(**{key: content[key] for key in content if key != "kind"})
 

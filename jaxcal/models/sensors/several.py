@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Mapping
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from jaxcal.checks import numbers, table
-from jaxcal.models.sensors.sensor import Reading, Sensor, Tip, hats, label
-
-if TYPE_CHECKING:
-    from jaxcal.models.serial.arm import Arm
+from jaxcal.models.sensors.sensor import Named, Reading, Sensor, Tip, hats, label
 
 __all__ = ["Several"]
 
@@ -125,7 +123,7 @@ class Several(Sensor):
     def usual_noise(self, length: float) -> ArrayLike:
         return 1.0
 
-    def unseen(self, arm: Arm) -> tuple[str, ...]:
+    def unseen(self, arm: Named) -> tuple[str, ...]:
         """What none of them sees."""
         hidden = [set(one.unseen(arm)) for one in self.sensors]
         return tuple(name for name in arm.names if all(name in h for h in hidden))
@@ -137,7 +135,7 @@ class Several(Sensor):
         for i, one in enumerate(self.sensors):
             rows = np.flatnonzero(which == i)
             at = [columns.index(name) for name in one.inputs]
-            parts.append((rows, inputs[np.ix_(rows, at)]))
+            parts.append((rows, inputs[rows][:, at]))
         return parts
 
     def _tip(self, i: int, tip: Tip, rows: NDArray[np.intp], given: Array) -> Tip:
@@ -231,7 +229,7 @@ class Several(Sensor):
         return np.concatenate(offs), np.concatenate(rows)
 
     @classmethod
-    def from_dict(cls, content: dict[str, Any]) -> Self:
+    def from_dict(cls, content: Mapping[str, Any]) -> Self:
         from jaxcal.models.sensors import SENSORS  # which names this class
 
         sensors = [SENSORS[one["kind"]].from_dict(one) for one in content["sensors"]]

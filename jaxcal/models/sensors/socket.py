@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers
-from jaxcal.models.sensors.sensor import BASE, Placed, Reading, Tip, label
-
-if TYPE_CHECKING:
-    from jaxcal.models.serial.arm import Arm
+from jaxcal.models.sensors.sensor import BASE, Named, Placed, Reading, Tip, label
 
 __all__ = ["Socket"]
 
@@ -61,7 +58,7 @@ class Socket(Placed):
     def usual_noise(self, length: float) -> ArrayLike:
         return 2e-4 * length
 
-    def unseen(self, arm: Arm) -> tuple[str, ...]:
+    def unseen(self, arm: Named) -> tuple[str, ...]:
         return BASE
 
     def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
@@ -88,13 +85,13 @@ class Socket(Placed):
 
     def facts(self, own: Array) -> tuple[Array, Array]:
         places = own.reshape(-1, 3)
-        off, slopes = np.zeros(len(self.distances)), np.zeros((len(self.distances), 3))
+        off = np.zeros(len(self.distances))
         rows = np.zeros((len(self.distances), self.count, 3))
         for k, (first, second, distance, std) in enumerate(self.distances):
             i, j = int(first), int(second)
             apart = places[j] - places[i]
             far = float(np.linalg.norm(apart))
             off[k] = (distance - far) / std
-            slopes[k] = apart / (far or 1.0) / std
-            rows[k, j], rows[k, i] = slopes[k], -slopes[k]
-        return off, rows.reshape(len(off), -1)
+            rows[k, j] = apart / (far or 1.0) / std
+            rows[k, i] = -rows[k, j]
+        return off, rows.reshape(len(off), own.size)

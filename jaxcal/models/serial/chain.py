@@ -12,11 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import in_words, numbers, one_of
+from jaxcal.files import write_text
 from jaxcal.models.model import as_commands, as_parameters
 from jaxcal.models.sensors import SENSORS, Position, Sensor, Several
 from jaxcal.models.serial.arguments import (
     joint_numbers,
     load,
+    pose_matrix,
     require_degrees,
     transform,
     triple,
@@ -64,7 +66,7 @@ class SerialChain(Arm):
         joints: str | None = None,
         base: ArrayLike | None = None,
         tool: ArrayLike | None = None,
-        sensor: Sensor | None = None,
+        sensor: Sensor | Mapping[str, Any] | None = None,
         gears: Sequence[int] = (),
         compliance: Sequence[int] = (),
         loads: Sequence[tuple[int, float, ArrayLike]] = (),
@@ -84,8 +86,8 @@ class SerialChain(Arm):
             joints: a letter a joint, R or P; all revolute when not given.
             base: where the arm stands in the measuring frame: (3,) or (4, 4).
             tool: the measured point in the last link's frame: (3,) or (4, 4).
-            sensor: what the tip is measured with, of ``jaxcal.models``; Position() when
-                not given.
+            sensor: what the tip is measured with, of ``jaxcal.models``, or its
+                ``to_dict()``; Position() when not given.
             gears: joints, counted from 1, whose gear ratio is a parameter ("gear2"):
                 the joint moves by the ratio, nominally 1, times its command.
             compliance: revolute joints, counted from 1, that yield under the loads
@@ -129,6 +131,9 @@ class SerialChain(Arm):
         if at_zero.shape != (n,):
             raise ValueError(f"offset must have shape ({n},), got {at_zero.shape}")
         sensor = Position() if sensor is None else sensor
+        if isinstance(sensor, Mapping):
+            kind = one_of("kind of the sensor", sensor.get("kind"), tuple(SENSORS))
+            sensor = SENSORS[kind].from_dict(sensor)
         if not isinstance(sensor, Sensor):
             raise ValueError(
                 f"sensor must be of jaxcal.models, such as Position(), got {sensor!r}"
@@ -151,7 +156,7 @@ class SerialChain(Arm):
             number,
             tuple(load(each, n) for each in given),
             triple("gravity", gravity),
-            tuple(joint_names) or tuple(f"joint {i + 1}" for i in range(columns)),
+            tuple(joint_names) or _numbered(columns),
             moves,
             at_zero,
             _limits(limits, columns),
@@ -192,15 +197,107 @@ class SerialChain(Arm):
         arm = read_urdf(path, tip, base, locked or {})
         return cls.from_dh(**arm._asdict(), sensor=sensor, **options)
 
-    @classmethod
-    def from_dict(cls, content: Mapping[str, Any]) -> Self:
-        """The arm that ``to_dict`` wrote."""
-        given = {key: content[key] for key in content if key != "kind"}
-        return cls.from_dh(**given | {"sensor": _sensor(given["sensor"])})
-
     def measured_with(self, sensor: Sensor) -> Self:
         """The same arm with another sensor."""
         return dataclasses.replace(self, sensor=sensor)
+
+    def calibrated(self, parameters: ArrayLike, sensor: Sensor | None = None) -> Self:
+        """The arm whose nominal is this one with ``parameters``.
+
+        Args:
+            parameters: (p,) as ``identify`` found them.
+            sensor: of the new arm; Position() when not given.
+
+        Raises:
+            ValueError: a joint yields, which no nominal arm does.
+        """
+        theta = as_parameters(self, parameters)
+        ratios, compliance = self._drives(theta)
+        if compliance.any():
+            raise ValueError(
+                "a nominal arm has stiff joints, but compliance was found of joints "
+                f"{', '.join(map(str, self.compliance))}"
+            )
+        base, tool, _ = self._split(theta)
+        turned = pose_matrix(base)
+        turned[:3, :3] = turned[:3, :3] @ self.base[:3, :3]
+        end = pose_matrix(np.concatenate([tool[:3], np.zeros(3)]))
+        end[:3, :3] = self.tool[:3, :3] @ pose_matrix(tool)[:3, :3]
+        return dataclasses.replace(
+            self,
+            table=theta[: self.table.size].reshape(self.table.shape),
+            base=turned,
+            tool=end,
+            drive=ratios[:, None] * self.drive,
+            offset=ratios * self.offset,
+            sensor=sensor or Position(),
+        )
+
+    def to_urdf(
+        self,
+        path: str | os.PathLike[str],
+        parameters: ArrayLike,
+        *,
+        force: bool = False,
+    ) -> str:
+        """Write the URDF file that the arm came from, its origins corrected.
+
+        Meshes, comments and all else stay as they are; the tip goes where ``predict``
+        of positions puts it, the base in the measuring frame included.
+
+        Args:
+            path: the file to write.
+            parameters: (p,) as ``identify`` found them.
+            force: write over a file that is there.
+
+        Returns:
+            The tip link, a new one where no fixed joint before it could hold the tool.
+
+        Raises:
+            ValueError: the arm is of no URDF file; a gear ratio or a compliance was
+                found, which such a file cannot hold.
+            FileExistsError: there is a file and ``force`` is not given.
+        """
+        from jaxcal.models.serial.written import urdf_text
+
+        ratios = self._drives(as_parameters(self, parameters))[0]
+        for i in np.flatnonzero(ratios != 1.0):
+            raise ValueError(
+                f"gear{i + 1} is {ratios[i]:.6g}, which a URDF file cannot hold"
+            )
+        text, tip = urdf_text(self, self.calibrated(parameters))
+        _write_new(path, text, force)
+        return tip
+
+    def to_dh(
+        self,
+        path: str | os.PathLike[str],
+        parameters: ArrayLike,
+        *,
+        force: bool = False,
+    ) -> None:
+        """Write the calibrated DH table as CSV: joint, a, alpha, d, theta, beta.
+
+        theta has the joint's offset. Arguments and errors as of :meth:`to_urdf`.
+        """
+        from jaxcal.models.serial.written import dh_text
+
+        _write_new(path, dh_text(self.calibrated(parameters)), force)
+
+    def to_ur_kinematics(
+        self,
+        path: str | os.PathLike[str],
+        parameters: ArrayLike,
+        *,
+        force: bool = False,
+    ) -> None:
+        """Write the YAML file of Universal Robots' ROS description, for its six joints.
+
+        Base and tool are not in it. Arguments and errors as of :meth:`to_urdf`.
+        """
+        from jaxcal.models.serial.written import ur_text
+
+        _write_new(path, ur_text(self, self.calibrated(parameters)), force)
 
     def together(
         self, *tables: tuple[ArrayLike, ArrayLike | None]
@@ -235,7 +332,9 @@ class SerialChain(Arm):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """n names of the columns of the commands."""
+        """n names of the columns of the commands; () where the joints have none."""
+        if self.joint_names == _numbered(self.num_joints):
+            return ()
         return (*self.joint_names, *self.sensor.inputs)
 
     @property
@@ -366,10 +465,17 @@ class SerialChain(Arm):
         return {"kind": "serial_chain", **data, "limits": ends, "sensor": sensor}
 
 
-def _sensor(content: Mapping[str, Any]) -> Sensor:
-    """The sensor that ``to_dict`` wrote."""
-    kind = one_of("kind of the sensor", content.get("kind"), tuple(SENSORS))
-    return SENSORS[kind].from_dict(dict(content))
+def _write_new(path: str | os.PathLike[str], text: str, force: bool) -> None:
+    if not force and os.path.exists(path):
+        raise FileExistsError(
+            f"{os.fspath(path)} is there already; force=True writes over it"
+        )
+    write_text(path, text)
+
+
+def _numbered(columns: int) -> tuple[str, ...]:
+    """Names of joints that have none."""
+    return tuple(f"joint {i + 1}" for i in range(columns))
 
 
 def _limits(given: ArrayLike | None, columns: int) -> Array:

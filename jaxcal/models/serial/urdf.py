@@ -18,7 +18,16 @@ from scipy.spatial.transform import Rotation
 
 from jaxcal.checks import numbers
 
-__all__ = ["Chain", "Joint", "moved", "read_urdf", "walk"]
+__all__ = [
+    "Chain",
+    "Joint",
+    "joints_of",
+    "led",
+    "moved",
+    "read_urdf",
+    "row_matrix",
+    "walk",
+]
 
 Array = NDArray[np.float64]
 
@@ -74,7 +83,7 @@ def read_urdf(
         (first, down), (last, ends_down) = chain[0], chain[-1]
         source["base"] = first.parent if down else first.child
         source["tip"] = last.child if ends_down else last.parent
-        return _table(chain, _joints_of(text), locked, source)
+        return _table(chain, joints_of(text), locked, source)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
 
@@ -83,14 +92,14 @@ def walk(
     text: str, base: str | None, tip: str | None, locked: Mapping[str, float]
 ) -> Iterator[tuple[Joint, bool]]:
     """The joints from ``base`` to ``tip``, and whether each is passed downwards."""
-    joints = _joints_of(text)
-    for joint in locked:
-        if joint not in joints:
+    joints = joints_of(text)
+    for name, value in locked.items():
+        if name not in joints:
             raise ValueError(
                 f"locked must name joints of the file ({', '.join(joints)}), "
-                f"got {joint!r}"
+                f"got {name!r}"
             )
-        numbers(f"locked[{joint!r}]", locked[joint])
+        numbers(f"locked[{name!r}]", value)
     above: dict[str, Joint] = {}
     for joint in joints.values():
         if joint.child in above:
@@ -169,7 +178,8 @@ def _links_of(text: str) -> list[str]:
     return [_name(link, "link") for link in _robot(text).findall("link")]
 
 
-def _joints_of(text: str) -> dict[str, Joint]:
+def joints_of(text: str) -> dict[str, Joint]:
+    """The joints of a file by name."""
     links, joints = _links_of(text), {}
     for element in _robot(text).findall("joint"):
         joint = _read_joint(element)
@@ -257,7 +267,7 @@ def _numbers(
     return values
 
 
-def _led(
+def led(
     joint: Joint, joints: dict[str, Joint], locked: Mapping[str, float]
 ) -> tuple[str | None, float, float]:
     """The joint whose command moves this one, how far, and its value at zero.
@@ -303,7 +313,7 @@ def _table(
                 f"type of joint {joint.name} must be one of {', '.join(_KINDS)}, "
                 f"got {joint.kind!r}"
             )
-        leader, times, plus = _led(joint, joints, locked)
+        leader, times, plus = led(joint, joints, locked)
         if down:
             frame = frame @ joint.origin
         if leader is None:
@@ -333,7 +343,7 @@ def _table(
     for axis, point in lines[1:]:
         row = _row(reached, axis, point)
         rows.append(row)
-        reached = reached @ _transform(row)
+        reached = reached @ row_matrix(row)
     rows.append(np.zeros(5))
     return Chain(
         np.array(rows),
@@ -353,7 +363,7 @@ def _turn_of_z(axis: Array) -> Array:
     if axis[2] < -1.0 + 1e-12:
         return np.diag([1.0, -1.0, -1.0])
     vector = np.cross([0.0, 0.0, 1.0], axis)
-    hat = np.cross(np.eye(3), -vector)
+    hat = np.cross(np.eye(3), vector)
     return np.eye(3) + hat + hat @ hat / (1.0 + axis[2])
 
 
@@ -386,7 +396,8 @@ def _row(frame: Array, axis: Array, point: Array) -> Array:
     return np.where(np.abs(row) < 1e-13, 0.0, row)
 
 
-def _transform(row: Array) -> Array:
+def row_matrix(row: Array) -> Array:
+    """(4, 4) of a row a, alpha, d, theta, beta at a command of zero."""
     a, alpha, d, theta, beta = row
     matrix = np.eye(4)
     turn = Rotation.from_euler("ZXY", [theta, alpha, beta], degrees=True)

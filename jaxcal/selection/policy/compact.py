@@ -84,9 +84,8 @@ class CompactNetwork:
 
     def __init__(self, config: Mapping[str, Any], arrays: Mapping[str, Array32]):
         self._lookahead: int = config["lookahead"]
-        self._messages: bool = config["messages"]
         self._close_up: bool = config["close_up"]
-        self._unlearned = min(self._lookahead, _UNLEARNED) if config["endgame"] else 0
+        self._unlearned = min(self._lookahead, _UNLEARNED)
         self._encoder = [f"encoder_{i}" for i in range(config["encoder_rounds"])]
         self._decoder = [f"decoder_{i}" for i in range(config["decoder_rounds"])]
         self._weights = dict(arrays)
@@ -243,10 +242,9 @@ class CompactNetwork:
         mean = (u * seen.active[..., None]).sum(axis=1) / number
         shared = mean @ weights[f"{name}.pool.kernel"] + weights[f"{name}.mix.bias"]
         inner = _product(u, mix[:width])
-        if self._messages:
-            sent: Array32 = seen.moments @ _product(u, weights[f"{name}.send.kernel"])
-            sent = sent @ mix[width:]
-            inner += _product(np.matrix_transpose(seen.moments), sent)
+        sent: Array32 = seen.moments @ _product(u, weights[f"{name}.send.kernel"])
+        sent = sent @ mix[width:]
+        inner += _product(np.matrix_transpose(seen.moments), sent)
         inner += shared[:, None]
         np.maximum(inner, 0.0, out=inner)
         out = _product(inner, weights[f"{name}.out.kernel"])
