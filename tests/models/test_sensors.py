@@ -22,7 +22,7 @@ from jaxcal.models import (
     from_dict,
     identifiability,
 )
-from jaxcal.models.sensors import SENSORS
+from jaxcal.models.sensors import SENSORS, Reading
 
 from .arms import differences, ur5
 from .test_serial_chain import _matrix, tool_frame
@@ -301,8 +301,6 @@ class Height(Sensor):
         return 1e-4 * length
 
     def read(self, tip, inputs, own):
-        from jaxcal.models.sensors.sensor import Reading
-
         by_tip = np.zeros((len(tip.position), 1, 6))
         by_tip[:, 0, 2] = 1.0
         return Reading(tip.position[:, 2:], by_tip, np.zeros((len(by_tip), 1, 0)))

@@ -6,7 +6,7 @@ from jaxcal.models.sensors.gravity import Gravity
 from jaxcal.models.sensors.plane import Plane
 from jaxcal.models.sensors.pose import Pose
 from jaxcal.models.sensors.position import Position
-from jaxcal.models.sensors.sensor import Sensor, Tip
+from jaxcal.models.sensors.sensor import Placed, Reading, Sensor, Tip
 from jaxcal.models.sensors.several import Several
 from jaxcal.models.sensors.socket import Socket
 
@@ -15,9 +15,11 @@ __all__ = [
     "Board",
     "Distance",
     "Gravity",
+    "Placed",
     "Plane",
     "Pose",
     "Position",
+    "Reading",
     "Sensor",
     "Several",
     "Socket",

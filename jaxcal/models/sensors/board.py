@@ -37,6 +37,7 @@ class Board(Sensor):
     place: Array | None = None
 
     kind = "board"
+    zeros = True
     tool = ("x", "y", "z", "rx", "ry", "rz")
     _seen: ClassVar[tuple[str, ...]] = tuple(f"seen {axis}" for axis in tool)
 

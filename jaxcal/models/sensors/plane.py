@@ -26,6 +26,7 @@ class Plane(Placed):
     """
 
     kind = "plane"
+    zeros = True
     axes = ("tilt1", "tilt2", "offset")
     axis_units = ("deg", "deg", "length")
     width = 4

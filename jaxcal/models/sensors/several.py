@@ -8,7 +8,6 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from jaxcal.checks import numbers, table
 from jaxcal.models.sensors.sensor import Named, Reading, Sensor, Tip, hats, label
@@ -150,6 +149,8 @@ class Several(Sensor):
 
     def _mount(self, i: int, given: Array) -> tuple[Array, list[Array]]:
         """Shift (3,) and rotations after none, one, two turns, and after all (3, 3)."""
+        from scipy.spatial.transform import Rotation
+
         whole = dict.fromkeys(_MOUNTING, 0.0)
         whole |= dict(zip(self.sensors[i].tool, given, strict=True))
         turns = [np.eye(3)]

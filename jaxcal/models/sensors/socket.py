@@ -34,6 +34,7 @@ class Socket(Placed):
     distances: Sequence[Sequence[float]] = ()
 
     kind = "socket"
+    zeros = True
     axes = ("x", "y", "z")
     axis_units = ("length",) * 3
     width = 3

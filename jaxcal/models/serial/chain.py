@@ -338,6 +338,16 @@ class SerialChain(Arm):
         return (*self.joint_names, *self.sensor.inputs)
 
     @property
+    def command_units(self) -> tuple[str, ...]:
+        """J units of the joints' columns, "deg" or "length"."""
+        # A column drives itself by one; a leader that is not of the arm is an angle.
+        kinds = []
+        for column in self.drive.T:
+            own = np.flatnonzero(column == 1.0)
+            kinds.append(self.joints[own[0]] if own.size else "R")
+        return tuple("deg" if kind == "R" else "length" for kind in kinds)
+
+    @property
     def num_parameters(self) -> int:
         """p."""
         return len(self.names)

@@ -38,7 +38,7 @@ class _Part(NamedTuple):
     @property
     def matrix(self) -> Array:
         whole = self.joint.origin @ self.stands
-        return whole if self.down else np.linalg.inv(whole)
+        return np.asarray(whole if self.down else np.linalg.inv(whole))
 
     def origin_for(self, wanted: Array) -> Array:
         """The joint's origin that makes ``matrix`` be ``wanted``."""
