@@ -10,8 +10,6 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from jaxcal import xla
-
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration, identify
     from jaxcal.information.regression import (
@@ -47,8 +45,6 @@ __all__ = [
 ]
 
 __version__ = "0.1.0"
-
-xla.sidestep()  # before JAX computes anything
 
 _HOME = {
     "Calibration": "jaxcal.calibration",

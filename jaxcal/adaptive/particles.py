@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxcal import xla
 from jaxcal.adaptive.session import Options, Session
 from jaxcal.checks import in_words, numbers, whole_number
 
@@ -306,9 +305,7 @@ class ParticleTask:
         Raises:
             ValueError: naming the argument, the rule and the value; a model whose costs
                 are below 0, or whose probabilities do not sum to 1.
-            RuntimeError: XLA of this process compiles sums wrongly.
         """
-        xla.require_sums()
         budget = numbers("seconds", seconds, finite=False)
         if budget.ndim or not budget > 0.0:
             raise ValueError(f"seconds must be one number above 0, got {seconds}")
