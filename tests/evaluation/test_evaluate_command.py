@@ -18,7 +18,6 @@ from jaxcal.commands import evaluate as command
 from jaxcal.evaluation import stream
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import save_csv, save_npz
-from jaxcal.evaluation.tally import tally_of
 from jaxcal.information.regression import regression_matrix
 from jaxcal.paper.datasets.datasets import make_dataset
 from jaxcal.progress import Progress
@@ -272,7 +271,7 @@ def test_a_stopped_command_writes_nothing(
     assert list(tmp_path.iterdir()) == []
     folder = tmp_path / "parts"
     ones = np.ones(1_000)
-    row = tally_of(ones[:, None], ones, ones > 0, 3, 12, 0.1)
+    row = stream.tally_of(ones[:, None], ones, ones > 0, 3, 12, 0.1)
     block = (1_000, {"random": row, "greedy": row})
     monkeypatch.setattr(stream, "_solve_block", lambda *_: block)
     done = call(
