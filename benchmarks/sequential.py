@@ -31,17 +31,17 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from benchmarks.tasks.ces import ces
+from benchmarks.tasks.death import death_process
+from benchmarks.tasks.hyperbolic import hyperbolic
+from benchmarks.tasks.location import LocationFinding, location_finding
+from benchmarks.tasks.prey import prey
 from jaxcal.adaptive.bounds import sace
 from jaxcal.adaptive.episodes import Episodes
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.particles import ParticleTask
 from jaxcal.adaptive.rules import Gain
 from jaxcal.adaptive.session import Session
-from jaxcal.adaptive.tasks.ces import ces
-from jaxcal.adaptive.tasks.death import death_process
-from jaxcal.adaptive.tasks.hyperbolic import hyperbolic
-from jaxcal.adaptive.tasks.location import LocationFinding, location_finding
-from jaxcal.adaptive.tasks.prey import prey
 from jaxcal.files import write_text
 
 

@@ -10,14 +10,14 @@ import pytest
 from flax import struct
 from scipy import integrate, special, stats
 
+from benchmarks.tasks.ces import CES, ces
+from benchmarks.tasks.hyperbolic import Hyperbolic
+from benchmarks.tasks.location import LocationFinding
+from benchmarks.tasks.prey import make_prey
 from jaxcal.adaptive.bounds import sace, spce
 from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.particles import ParticleTask, systematic
 from jaxcal.adaptive.rules import Gain, GainRate, Random
-from jaxcal.adaptive.tasks.ces import CES, ces
-from jaxcal.adaptive.tasks.hyperbolic import Hyperbolic
-from jaxcal.adaptive.tasks.location import LocationFinding
-from jaxcal.adaptive.tasks.prey import make_prey
 
 
 @struct.dataclass

@@ -13,14 +13,16 @@ import pytest
 from flax import struct
 from scipy import integrate, stats
 
+from benchmarks.tasks.location import location_finding
 from jaxcal.adaptive.loop import next_measurement
 from jaxcal.adaptive.particles import ParticleTask
 from jaxcal.adaptive.tasks import registry
-from jaxcal.adaptive.tasks.location import location_finding
 from jaxcal.commands import evaluate as evaluate_command
 from jaxcal.commands import train as train_command
 
-DOCS = pathlib.Path(__file__).parents[2] / "docs"
+ROOT = pathlib.Path(__file__).parents[2]
+DOCS, TASKS = ROOT / "docs", ROOT / "benchmarks" / "tasks"
+LOCATION = str(TASKS / "location.py")
 
 
 @struct.dataclass
@@ -170,7 +172,7 @@ def test_the_documented_task_is_one_file(documented):
 @pytest.mark.slow
 def test_commands_run_a_task_of_particles(tmp_path, capsys):
     small = ["--with", "measurements=3", "particles=40", "candidates=5", "contrasts=10"]
-    arguments = ["--task", "location", *small, "--episodes", "8", "--quiet"]
+    arguments = ["--task", LOCATION, *small, "--episodes", "8", "--quiet"]
     document, report = tmp_path / "out.json", tmp_path / "report"
     more = ["--json", str(document), "--report", str(report)]
     methods = ["--methods", "random,gain,two_step,rollouts", "--rollouts", "2"]
@@ -181,10 +183,10 @@ def test_commands_run_a_task_of_particles(tmp_path, capsys):
     assert (
         evaluate_command.main([*arguments, "--methods", "static"], "evaluate.py") == 2
     )
-    assert "must not have static for location" in capsys.readouterr().err
+    assert "must not have static for " + LOCATION in capsys.readouterr().err
     out = str(tmp_path / "run")
     sizes = ["--num-minibatches", "2", "--num-epochs", "1", "--width", "8"]
-    start = ["--task", "location", *small, *sizes, "--updates", "1", "--out", out]
+    start = ["--task", LOCATION, *small, *sizes, "--updates", "1", "--out", out]
     assert train_command.main(start, "train.py") == 0
     policy = [*arguments, "--checkpoint", out, "--methods", "gain,policy"]
     assert evaluate_command.main(policy, "evaluate.py") == 0
@@ -211,8 +213,8 @@ def test_brax_plays_a_task_of_particles():
 
 
 @pytest.mark.parametrize("name", ["ces", "death", "hyperbolic", "location", "prey"])
-def test_public_tasks_are_registered(name):
-    entry = registry.load(name)
+def test_public_tasks_are_files_as_a_user_writes_them(name):
+    entry = registry.load(str(TASKS / f"{name}.py"))
     assert (
         entry.about
         and "gain" in entry.methods

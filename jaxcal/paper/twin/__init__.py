@@ -1,4 +1,4 @@
-"""The paper's robot, simulated: in closed form, in MuJoCo, and in pictures."""
+"""The paper's robot, simulated: in closed form and in MuJoCo."""
 
 from __future__ import annotations
 
@@ -7,11 +7,9 @@ from typing import Any
 
 _HOMES = {  # loaded when first used: the closed form needs no MuJoCo
     "RobotConfig": "robot",
-    "animate": "robot_pictures",
     "joint_angles": "robot",
     "measure": "robot",
     "read_out": "robot",
-    "render": "robot_pictures",
     "simulate": "robot_model",
     "trajectory": "robot_model",
 }

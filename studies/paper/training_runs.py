@@ -41,11 +41,12 @@ folder per run under --out.
 """
 _EPILOG = """\
 examples:
-  python -m jaxcal.paper.training_runs --preset compact --seeds 5 \\
-      --out studies/compact_seeds
-      trains seeds 0 to 4, a few minutes each, into studies/compact_seeds/seed_0 ...
-  python -m jaxcal.paper.training_runs --collect runs/paper --out studies/paper
-      a run of train.py, finished or still going, into studies/paper
+  python -m studies.paper.training_runs --preset compact --seeds 5 \\
+      --out studies/paper/kept/compact_seeds
+      trains seeds 0 to 4, a few minutes each, into seed_0 ... of that folder
+  python -m studies.paper.training_runs --collect runs/paper \\
+      --out studies/paper/kept/paper
+      keeps a run of train.py, finished or still going
 
 The same command again continues where it was stopped: finished seeds are skipped, an
 interrupted seed resumes from its last checkpoint, which is under --runs.
@@ -254,7 +255,7 @@ def _collect(run: pathlib.Path, out: pathlib.Path) -> None:
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = command.Parser(
-        "python -m jaxcal.paper.training_runs", _DESCRIPTION, _EPILOG
+        "python -m studies.paper.training_runs", _DESCRIPTION, _EPILOG
     )
     add = parser.add_argument
     number: dict[str, Any] = {"type": command.positive, "metavar": "N"}
