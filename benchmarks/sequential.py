@@ -67,7 +67,7 @@ class Row:
 ROWS = {
     "location": Row(
         location_finding,
-        "DAD 10.93, RL 11.73 (sPCE, capped at 13.1 to 13.8); ALINE, POLAR 13.5 (cap)",
+        "DAD 10.93, RL 11.73 (sPCE, capped at 13.1 to 13.8); ALINE 13.5 (cap)",
         256,
     ),
     "location-random": Row(
@@ -80,7 +80,7 @@ ROWS = {
         "DAD 7.33, RL 7.70, ALINE 8.91",
         128,
     ),
-    "ces": Row(ces, "DAD 10.77, ALINE 13.5, RL 14.60, POLAR 14.32 (cap 16.1)", 256),
+    "ces": Row(ces, "DAD 10.77, ALINE 13.5, RL 14.60 (cap 16.1)", 256),
     "ces-variance": Row(lambda: ces(log_u_sd=3.0**0.5), "none", 96),
     "ces-budget": Row(
         lambda: ces(budget=100.0),

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from jaxcal.adaptive.episodes import Episodes
 from jaxcal.adaptive.particles import ParticleBelief, ParticleTask, log_mean
+from jaxcal.checks import whole_number
 
 __all__ = ["Bounds", "sace", "spce"]
 
@@ -54,7 +55,7 @@ class Bounds:
 
 
 def spce(
-    task: ParticleTask, episodes: Episodes, key: jax.Array, contrasts: int = 100_000
+    task: ParticleTask, episodes: Episodes, key: jax.Array, contrasts: int = 24 * _CHUNK
 ) -> Bounds:
     """sPCE from below and sNMC from above, with contrasts from the prior.
 
@@ -63,12 +64,17 @@ def spce(
         episodes: B sessions.
         key: of the contrasts, which are drawn anew for each session.
         contrasts: L, a multiple of 4,096 or below it.
+
+    Raises:
+        ValueError: it is neither.
     """
-    chunk = min(_CHUNK, contrasts)
-    return _bounds(
-        _spce(task, episodes, key, chunk, -(-contrasts // chunk)),
-        float(np.log(-(-contrasts // chunk) * chunk + 1)),
-    )
+    chunk = min(_CHUNK, whole_number("contrasts", contrasts, 1))
+    if contrasts % chunk:
+        raise ValueError(
+            f"contrasts must be below {_CHUNK} or a multiple of it, got {contrasts}"
+        )
+    found = _spce(task, episodes, key, chunk, contrasts // chunk)
+    return _bounds(found, float(np.log(contrasts + 1)))
 
 
 def sace(

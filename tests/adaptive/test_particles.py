@@ -1,5 +1,6 @@
 """Particle beliefs, bounds and the public tasks, against exact and plain answers."""
 
+import inspect
 import math
 from typing import Any
 
@@ -203,6 +204,13 @@ def test_bounds_hold_the_closed_form_between_them(lines):
     assert (wide.lower <= wide.cap + 1e-5).all()
     gap = tight.lower - np.asarray(episodes.log_ratio)
     assert abs(gap.mean()) < 0.2
+
+
+def test_contrasts_that_are_not_drawn_whole_are_refused(lines):
+    task, episodes = lines
+    with pytest.raises(ValueError, match="below 4096 or a multiple of it, got 100000"):
+        spce(task, episodes, jax.random.key(0), 100_000)
+    assert inspect.signature(spce).parameters["contrasts"].default % 4096 == 0
 
 
 @pytest.mark.slow
