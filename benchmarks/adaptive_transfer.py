@@ -238,7 +238,11 @@ def wrong(policy: Any, episodes: int, seed: int) -> dict[str, Any]:
         deciders = arrays({"priced": PRICED, "state": STATE_RULE, "policy": policy})
         found = compare(task, deciders, episodes, seed, batch=512)
         found = type(found)(
-            found.names, found.log_ratio, found.told, found.log_ratio, found.choices
+            found.names,
+            found.log_ratio,
+            found.entropy_drop,
+            found.log_ratio,
+            found.choices,
         )
         rows[name] = {
             "options": options,

@@ -126,7 +126,7 @@ def session(task: Any, key: jax.Array) -> tuple[Episodes, jax.Array, jax.Array]:
         return carry, (design, outcome, gain, alive)
 
     (belief, end), (designs, outcomes, gains, alive) = jax.lax.scan(
-        step, (prior, begun), jax.random.split(key_steps, task.most)
+        step, (prior, begun), jax.random.split(key_steps, task.horizon)
     )
     told = prior.entropy() - belief.entropy()
     none: Any = None
@@ -148,9 +148,9 @@ def run(row: Row, episodes: int, seed: int) -> dict[str, Any]:
     gained = np.asarray(played.gain, np.float64)
     result = {
         "gains": [gained.mean(), gained.std(ddof=1) / np.sqrt(episodes)],
-        "measurements": task.most,
+        "measurements": task.horizon,
         "episodes": episodes,
-        "ms_a_step": 1e3 * float(np.median(taken)) / task.most,
+        "ms_a_step": 1e3 * float(np.median(taken)) / task.horizon,
         "least_left": float(np.min(left)),
         "published": row.published,
     }

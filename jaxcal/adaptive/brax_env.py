@@ -37,7 +37,7 @@ class SequentialEnv(EpisodeEnv):
     Observation: (C (F + 2),) features, log score and validity of the shortlist. Action:
     () int32, a place in the shortlist; an invalid one counts as the first. Reward: nats
     that the measurement is expected to tell. End: time or uses are spent, or
-    ``task.most`` measurements are made.
+    ``task.horizon`` measurements are made.
     """
 
     metric = "gain"
@@ -65,7 +65,7 @@ class SequentialEnv(EpisodeEnv):
         outcome = task.measure(now.truth, design, key_outcome)
         belief = now.belief.update(task, design, outcome, key_update)
         session = task.spend(now.session, design, outcome)
-        done = session.over | (session.made >= task.most)
+        done = session.over | (session.made >= task.horizon)
         return self._seen(now.truth, belief, session, key), gain, done, gain
 
     def _seen(self, truth: Any, belief: Any, session: Any, key: jax.Array) -> _Episode:

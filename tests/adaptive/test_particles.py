@@ -182,7 +182,7 @@ def test_gains_of_continuous_outcomes_are_those_of_the_closed_form():
 def test_three_estimators_and_the_closed_form_agree(lines):
     _, episodes = lines
     wanted = closed_form(episodes.designs)
-    for name in ("gain", "told", "log_ratio"):
+    for name in ("gain", "entropy_drop", "log_ratio"):
         gap = np.asarray(getattr(episodes, name), np.float64) - wanted
         assert abs(gap.mean()) < 4.0 * gap.std() / 8.0 + 0.1, name
 

@@ -201,7 +201,9 @@ def test_brax_plays_a_task_of_particles():
 
     task = counts()
     with jax.numpy_rank_promotion("allow"):
-        env = wrap_fresh(SequentialEnv(task, registry.FREE["state"], 3), task.most, 1)
+        env = wrap_fresh(
+            SequentialEnv(task, registry.FREE["state"], 3), task.horizon, 1
+        )
         assert env.action_size == 3
         state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(1), 4))
         step = jax.jit(env.step)
