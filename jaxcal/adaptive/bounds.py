@@ -7,7 +7,7 @@ the truth among the contrasts from below (Foster et al. 2020, 2021).
 
 ``spce`` draws contrasts from the prior (sPCE below, sNMC above): it cannot report more
 than ``log(L + 1)``. ``sace`` draws them from the posterior, fitted by particles to each
-history: its bounds meet. On a grid ``Episodes.entropy_drop`` is exact and needs neither.
+history: its bounds meet. On a grid ``Episodes.entropy_drop`` is exact, without either.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ class Episodes:
 
     @property
     def gain(self) -> jax.Array:
-        """(B,) nats: the sum of expected gains. Its mean is that of ``entropy_drop``."""
+        """(B,) nats: the sum of expected gains; its mean is the entropy's drop."""
         return (self.gains * self.alive).sum(axis=-1)
 
 
