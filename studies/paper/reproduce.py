@@ -9,6 +9,7 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from jaxcal.arguments import Parser
 from jaxcal.files import atomic_write, require_writable_folder
 from jaxcal.paper import command
 from jaxcal.progress import Progress
@@ -158,7 +159,9 @@ def _write(out: pathlib.Path, files: dict[str, bytes]) -> None:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = command.Parser("python -m studies.paper", _DESCRIPTION, _EPILOG)
+    parser = Parser(
+        prog="python -m studies.paper", description=_DESCRIPTION, epilog=_EPILOG
+    )
     add = parser.add_argument
     folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
     add("--quick", action="store_true", help="fewer episodes, draws and devices")

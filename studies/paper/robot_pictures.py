@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.arguments import Parser
 from jaxcal.files import atomic_write
 from jaxcal.paper import command
 from jaxcal.paper.twin.robot import RobotConfig, joint_angles, read_out
@@ -231,9 +232,9 @@ def _smooth(postures_deg: Array) -> Array:
 
 def main(arguments: list[str] | None = None) -> int:
     """Write both; the exit code."""
-    parser = command.Parser(
-        "python -m studies.paper.robot_pictures",
-        "Write robot.png and robot.gif, a picture and a film of the robot.",
+    parser = Parser(
+        prog="python -m studies.paper.robot_pictures",
+        description="Write robot.png and robot.gif, a picture and a film of the robot.",
     )
     parser.add_argument("folder", type=pathlib.Path, metavar="DIR")
     options = parser.parse_args(arguments)

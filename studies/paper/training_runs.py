@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.arguments import Parser
 from jaxcal.evaluation.csv_rows import csv_text
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.paper import command
@@ -254,8 +255,10 @@ def _collect(run: pathlib.Path, out: pathlib.Path) -> None:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = command.Parser(
-        "python -m studies.paper.training_runs", _DESCRIPTION, _EPILOG
+    parser = Parser(
+        prog="python -m studies.paper.training_runs",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
     )
     add = parser.add_argument
     number: dict[str, Any] = {"type": command.positive, "metavar": "N"}

@@ -117,4 +117,4 @@ def test_a_folder_that_is_a_file_is_refused(
 ) -> None:
     (tmp_path / "file").touch()
     assert main([str(tmp_path / "file")]) == 2
-    assert "robot_pictures: error:" in capsys.readouterr().err
+    assert "robot_pictures: " in capsys.readouterr().err
