@@ -1,15 +1,13 @@
 """Evaluation of any number of episodes: constant memory, resumable, shared.
 
-An endless dataset has a random stream for every block of episodes. What ``PART``
-episodes add to every count and sum is a file of its own, written when they are done. So
-a run that was stopped resumes, more episodes start from what is there, and several
-processes share a folder; none of that changes a digit, because the same parts are added
-up in the same order. Medians cannot be added: they are read off a histogram.
+An endless dataset is evaluated in parts; the rows of a part are a file of its own,
+written when it is done. So a run that was stopped resumes, more episodes start from
+what is there, and several processes share a folder; none of that changes a digit,
+because the same parts are averaged in the same order.
 """
 
 from __future__ import annotations
 
-import collections
 import contextlib
 import dataclasses
 import functools
@@ -26,9 +24,6 @@ from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context, parent_process
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.methods import (
     BASELINES,
@@ -36,24 +31,17 @@ from jaxcal.evaluation.methods import (
     DEFAULT_RANDOM_DRAWS,
     POLICIES,
     evaluate,
-    label_of,
     rows_of,
 )
-from jaxcal.evaluation.results import HIT_TOLERANCE, Row, Summary, versions
+from jaxcal.evaluation.results import Row, Summary, versions
 from jaxcal.files import write_text
 
-__all__ = ["PART", "Plan", "evaluate_stream", "open_folder", "summary", "tally_of"]
+__all__ = ["PART", "Plan", "evaluate_stream", "open_folder", "total"]
 
-Array = NDArray[np.float64]
 Cut = tuple[int, int]  # first episode, one after the last
-Tally = collections.Counter[str]
-"""Counts: episodes, selections (episodes times draws), hits (proven optima), singular
-(det S = 0; in no sum of logs), "bin i" of log det S. Sums: det, log_det, their squares,
-ratio (det S / det S*), efficiency (its p-th root), seconds. ``update`` adds another."""
+Numbers = dict[str, Any]  # of a row, see docs/evaluation.md
 
-BLOCK = 1_000  # episodes that share a random stream
-PART = 5_000  # episodes whose sums are one file
-BINS_PER_UNIT = 64  # of log det S: a median is within 1/64, 1.6 % of det S
+PART = 5_000  # episodes whose rows are one file; the draws' blocks of 1,000 divide it
 _POLL_SECONDS = 1.0  # between looks for the parts of other processes
 _ONE_THREAD = [f"{name}_NUM_THREADS" for name in ("OPENBLAS", "OMP", "MKL", "NUMBA")]
 
@@ -64,7 +52,7 @@ class Plan:
 
     dataset: str
     draw: Callable[[str, int, int, int], Dataset]
-    """(dataset, seed, begin, end) -> episodes; ``begin`` is a multiple of ``BLOCK``."""
+    """(dataset, seed, begin, end) -> episodes; ``begin`` is a multiple of 1,000."""
     seed: int = 0
     k: int = 4
     methods: tuple[str, ...] = BASELINES
@@ -160,65 +148,89 @@ def evaluate_stream(
     while not all(_path(folder, cut).exists() for cut in cuts):
         time.sleep(_POLL_SECONDS)
 
-    proven, totals = 0, collections.defaultdict[str, Tally](Tally)
-    for number, cut in enumerate(cuts):
-        progress("parts added up", number, len(cuts))
-        count, rows = _read_part(_path(folder, cut), cut)
-        proven += count
-        for name, row in rows.items():
-            totals[name].update(row)
-    shown = [
-        Row(
-            method,
-            checkpoint,
-            {"label": label_of(method, plan.num)}
-            | summary(totals[_key(method, checkpoint)], totals["random"]),
-        )
-        for method, checkpoint in rows_of(plan.methods, plan.checkpoints)
-    ]
+    parts = [_read_part(_path(folder, cut), cut) for cut in cuts]
+    counts = [end - begin for begin, end in cuts]
+    rows = {
+        row: total(counts, [part["rows"][_key(*row)] for part in parts])
+        for row in rows_of(_with_random(plan), plan.checkpoints)
+    }
+    random = rows["random", None]["det_s"]["mean"]
+    for numbers in rows.values():
+        mean = numbers["det_s"]["mean"]
+        numbers["ratio_to_random"] = mean / random if mean and random else None
     facts = plan.draw(plan.dataset, plan.seed, 0, 1).facts() | {"episodes": episodes}
-    note = (
-        "means and hit rates are of sums over all episodes; medians are read off a "
-        f"histogram of log det S with bins of 1/{BINS_PER_UNIT}"
+    return Summary(
+        facts,
+        plan.k,
+        plan.seed,
+        sum(part["proven"] for part in parts),
+        tuple(Row(*row, rows[row]) for row in rows_of(plan.methods, plan.checkpoints)),
+        notes=(f"medians are means of those of parts of {PART:,} episodes",),
     )
-    return Summary(facts, plan.k, plan.seed, proven, tuple(shown), notes=(note,))
+
+
+def total(counts: list[int], parts: list[Numbers]) -> Numbers:
+    """One row of all parts; a number that one of them lacks is lacking.
+
+    Args:
+        counts: episodes of each part.
+        parts: their rows: averages over their episodes, each with as many draws.
+    """
+
+    def mean(values: list[float | None]) -> float | None:
+        known = [value for value in values if value is not None]
+        if len(known) < len(values):
+            return None
+        pairs = zip(counts, known, strict=True)
+        return math.fsum(n * value for n, value in pairs) / sum(counts)
+
+    def moments(name: str) -> dict[str, float | None]:
+        held = [part[name] for part in parts]
+        found = {key: mean([one[key] for one in held]) for key in ("mean", "median")}
+        middle, std = found["mean"], None
+        if middle is not None and all(one["std"] is not None for one in held):
+            variance = mean(
+                [one["std"] ** 2 + (one["mean"] - middle) ** 2 for one in held]
+            )
+            std = None if variance is None else variance**0.5
+        return {"mean": middle, "std": std, "median": found["median"]}
+
+    averages = (
+        *("ratio_to_exact", "hit_rate", "d_efficiency"),
+        "seconds_per_selection",
+    )
+    return {
+        **parts[0],  # its label and number of draws are those of all
+        "det_s": moments("det_s"),
+        "log_det_s": moments("log_det_s"),
+        **{name: mean([part[name] for part in parts]) for name in averages},
+    }
 
 
 def _write_part(plan: Plan, folder: pathlib.Path, cut: Cut) -> None:
-    proven, totals = 0, collections.defaultdict[str, Tally](Tally)
-    for begin in range(*cut, BLOCK):
-        count, rows = _solve_block(plan, begin, min(begin + BLOCK, cut[1]))
-        proven += count
-        for name, row in rows.items():
-            totals[name].update(row)
-    part = {"episodes": cut, "proven": proven, "methods": totals}
+    part = {"episodes": cut} | _solved(plan, *cut)
     write_text(_path(folder, cut), json.dumps(part, separators=(",", ":")) + "\n")
 
 
-def _solve_block(plan: Plan, begin: int, end: int) -> tuple[int, dict[str, Tally]]:
-    """Proven optima among the episodes of one stream, and what every row adds."""
-    dataset = plan.draw(plan.dataset, plan.seed, begin, end)
+def _solved(plan: Plan, begin: int, end: int) -> dict[str, Any]:
+    """How many optima of some episodes are proven, and the rows."""
     found = evaluate(
-        dataset,
+        plan.draw(plan.dataset, plan.seed, begin, end),
         plan.k,
-        list(dict.fromkeys(["random", *plan.methods])),
+        _with_random(plan),
         plan.checkpoints,
         num=plan.num,
         random_draws=plan.draws,
         seed=plan.seed + begin,
-    )
-    m, n = dataset.num_outputs, dataset.num_inputs
-    return int(found.proven.sum()), {
-        _key(result.method, result.checkpoint): tally_of(
-            result.log_det,
-            found.reference,
-            found.proven,
-            m,
-            m * (n + 1),
-            result.seconds * dataset.num_episodes,
-        )
-        for result in found.results
-    }
+    ).summarise()
+    rows = {_key(row.method, row.checkpoint): row.numbers for row in found.rows}
+    for numbers in rows.values():
+        numbers.pop("parameter_variance", None)  # of all episodes at once only
+    return {"proven": found.num_proven, "rows": rows}
+
+
+def _with_random(plan: Plan) -> list[str]:
+    return list(dict.fromkeys(["random", *plan.methods]))
 
 
 def _key(method: str, checkpoint: str | None) -> str:
@@ -229,100 +241,16 @@ def _path(folder: pathlib.Path, cut: Cut) -> pathlib.Path:
     return folder / f"part-{cut[0]:012d}-{cut[1]:012d}.json"
 
 
-def _read_part(path: pathlib.Path, cut: Cut) -> tuple[int, dict[str, Tally]]:
+def _read_part(path: pathlib.Path, cut: Cut) -> dict[str, Any]:
     try:
         part = json.loads(path.read_text(encoding="utf-8"))
         if part["episodes"] != list(cut):
             raise ValueError(f"it says episodes {part['episodes']}")
-        rows = {name: Tally(row) for name, row in part["methods"].items()}
-        return int(part["proven"]), rows
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        return {"proven": int(part["proven"]), "rows": dict(part["rows"])}
+    except (ValueError, KeyError, TypeError) as error:
         raise ValueError(
             f"{path} is damaged ({error}); delete it, and it is computed again"
         ) from None
-
-
-def tally_of(
-    log_det: Array,
-    reference: Array,
-    proven: NDArray[np.bool_],
-    num_outputs: int,
-    num_parameters: int,
-    seconds: float,
-) -> Tally:
-    """What some selections add.
-
-    Args:
-        log_det: (E, R) natural log det S of what was chosen.
-        reference: (E,) that of the optimum, or a bound on it.
-        proven: (E,) which of them are proven.
-        num_outputs: m.
-        num_parameters: p.
-        seconds: spent choosing.
-    """
-    behind = log_det - reference[:, None]
-    hits = proven[:, None] & (behind >= -HIT_TOLERANCE * num_outputs)
-    behind = np.minimum(behind, 0.0)
-    finite = log_det[np.isfinite(log_det)]
-    det = np.exp(log_det)
-    sums = {
-        "det": det,
-        "det_squared": det * det,
-        "log_det": finite,
-        "log_det_squared": finite * finite,
-        "ratio": np.exp(behind),
-        "efficiency": np.exp(behind / num_parameters),
-    }
-    bins, counts = np.unique(np.floor(finite * BINS_PER_UNIT), return_counts=True)
-    numbers = {
-        "episodes": len(log_det),
-        "selections": log_det.size,
-        "hits": int(hits.sum()),
-        "singular": log_det.size - finite.size,
-        "seconds": seconds,
-        **{name: math.fsum(values.ravel()) for name, values in sums.items()},
-        **{f"bin {int(b)}": int(n) for b, n in zip(bins, counts, strict=True)},
-    }
-    return Tally(numbers)
-
-
-def summary(tally: Tally, random: Tally) -> dict[str, Any]:
-    """The numbers of one method against the baseline, see docs/evaluation.md."""
-    count, episodes = tally["selections"], tally["episodes"]
-    log_det: dict[str, float | None] = {"mean": None, "std": None}
-    if not tally["singular"]:
-        log_det = _moments(tally, "log_det")
-    middle = _median_log_det(tally)
-    mean, baseline = tally["det"] / count, random["det"] / random["selections"]
-    return {
-        "det_s": _moments(tally, "det") | {"median": math.exp(middle)},
-        "log_det_s": log_det | {"median": middle if middle > -math.inf else None},
-        "ratio_to_exact": tally["ratio"] / count,
-        "hit_rate": tally["hits"] / count,
-        "d_efficiency": tally["efficiency"] / count,
-        "ratio_to_random": mean / baseline if baseline else None,
-        "seconds_per_selection": tally["seconds"] / episodes,
-        "draws_per_episode": count // episodes,
-    }
-
-
-def _moments(tally: Tally, name: str) -> dict[str, float | None]:
-    mean = tally[name] / tally["selections"]
-    variance = tally[f"{name}_squared"] / tally["selections"] - mean * mean
-    return {"mean": mean, "std": math.sqrt(max(variance, 0.0))}  # 0: of equal values
-
-
-def _median_log_det(tally: Tally) -> float:
-    """Median of log det S, from the histogram; ``-inf`` where most are singular."""
-    half, below = tally["selections"] / 2, tally["singular"]
-    if below > half:
-        return -math.inf
-    bins = {int(n[4:]): v for n, v in tally.items() if n.startswith("bin ")}
-    for number, count in sorted(bins.items()):
-        if below + count >= half:
-            return (number + (half - below) / count) / BINS_PER_UNIT
-        below += count
-    raise ValueError("a tally of nothing has no median")
 
 
 @contextlib.contextmanager

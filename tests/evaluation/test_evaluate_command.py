@@ -270,10 +270,9 @@ def test_a_stopped_command_writes_nothing(
     assert done.stderr == f"evaluate.py: {says}, nothing was written\n"
     assert list(tmp_path.iterdir()) == []
     folder = tmp_path / "parts"
-    ones = np.ones(1_000)
-    row = stream.tally_of(ones[:, None], ones, ones > 0, 3, 12, 0.1)
-    block = (1_000, {"random": row, "greedy": row})
-    monkeypatch.setattr(stream, "_solve_block", lambda *_: block)
+    row = {"det_s": {}, "log_det_s": {}}
+    part = {"proven": 1_000, "rows": {"random": row, "greedy": row}}
+    monkeypatch.setattr(stream, "_solved", lambda *_: part)
     done = call(
         capsys,
         *("--stream", folder, "--episodes", 9_000, "--methods", "greedy"),
