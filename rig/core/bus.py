@@ -56,7 +56,8 @@ class Bus:
         self.silence_s = 0.0 if settings.transport == "tcp" else silence_s
         self.check: Callable[[], None] = lambda: None  # before each exchange; may raise
         self.silent: set[int] = set()  # units that did not answer the last time
-        self._emit = emit  # told of every write before it is sent
+        self._tell = emit  # told of every write before it is sent, of a stop's after
+        self._untold: list[dict[str, Any]] = []
         self._lock = threading.RLock()
         self._urgent = False
         self._timeout_s = settings.timeout_s
@@ -109,6 +110,7 @@ class Bus:
         """
         with self._lock:
             before = self._urgent, self._timeout_s
+            outermost = not self._urgent
             configured = self.settings.timeout_s
             self._urgent = True
             self._timeout_s = min(timeout_s or configured, configured)
@@ -116,6 +118,9 @@ class Bus:
                 yield
             finally:
                 self._urgent, self._timeout_s = before
+                untold, self._untold = (self._untold, []) if outermost else ([], [])
+        for fields in untold if outermost else ():
+            self._tell("write", **fields)
 
     def __enter__(self) -> Bus:
         return self.open()
@@ -158,7 +163,7 @@ class Bus:
             BusError: no valid reply; whether the drive obeyed is unknown.
             Rejected: the drive refused.
         """
-        self._emit("write", unit=unit, address=address, words=words)
+        self._emit(unit, address, words)
         try:
             if function == 6:
                 reply = self._exchange(6, unit, address, words[0])
@@ -174,11 +179,19 @@ class Bus:
 
     def broadcast(self, address: int, function: int, words: list[int]) -> None:
         """Write registers of every unit on a serial line; no unit answers."""
-        self._emit("write", unit=0, address=address, words=words)
+        self._emit(0, address, words)
         value = words[0] if function == 6 else words
         with self._lock:
             self._send(function, 0, address, value, no_response_expected=True)
             self._quiet_until += TURNAROUND_S
+
+    def _emit(self, unit: int, address: int, words: list[int]) -> None:
+        """Tell of a write. A journal on a disk that hangs must not hold up a stop."""
+        fields = {"unit": unit, "address": address, "words": words}
+        if self._urgent:
+            self._untold.append(fields | {"sent": round(time.time(), 4)})
+        else:
+            self._tell("write", **fields)
 
     def _exchange(
         self, function: int, unit: int, address: int, *args: Any, **more: Any
