@@ -41,6 +41,11 @@ def _stop(path: pathlib.Path | None) -> int:
     """Stop every drive; the session is asked before anything heavy is loaded."""
     from rig.stopping import stop_device
 
+    for name in ("pydantic", "pymodbus"):
+        if importlib.util.find_spec(name) is None:
+            text = f"rig: stop needs {name}: pip install 'jaxcal[rig]'"
+            print(text, file=sys.stderr)
+            return 2
     try:
         return stop_device(path or pathlib.Path("rig.toml"), path is not None)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
