@@ -8,9 +8,10 @@ jaxcal costs no more than numpy.
 from __future__ import annotations
 
 import importlib
+import pathlib
 from typing import TYPE_CHECKING, Any
 
-from jaxcal import xla
+from jaxcal import compiled
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration, identify
@@ -48,7 +49,9 @@ __all__ = [
 
 __version__ = "0.1.0"
 
-xla.sidestep()  # before JAX computes anything
+_PACKAGE = pathlib.Path(__file__).parent
+if (_PACKAGE.parent / "pyproject.toml").exists():
+    compiled.check(_PACKAGE)
 
 _HOME = {
     "Calibration": "jaxcal.calibration",
