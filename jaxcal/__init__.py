@@ -66,7 +66,12 @@ _HOME = {
 }
 
 
+_ROOMS = ("adaptive", "calibration", "candidates", "learning", "models", "selection")
+
+
 def __getattr__(name: str) -> Any:
+    if name in _ROOMS:
+        return importlib.import_module(f"jaxcal.{name}")
     if name not in __all__:
         raise AttributeError(f"module 'jaxcal' has no attribute {name!r}")
     value = getattr(
@@ -77,4 +82,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *__all__])
+    return sorted({*globals(), *__all__, *_ROOMS})

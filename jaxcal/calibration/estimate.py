@@ -96,7 +96,7 @@ def fit_model(
     if common_noise is None and _levels_differ(task, found):
         task = dataclasses.replace(task, per_output=True)
         found = solve(task, found)
-    fields = _fields(task, found, commands, measured, used)
+    fields = _fields(task, found, commands, measured, weights)
     return fields | {"model": model, "loss": loss}
 
 
@@ -158,9 +158,9 @@ def _fields(
     found: Solution,
     commands: Array,
     measured: Array,
-    used: NDArray[np.bool_],
+    weights: Array,
 ) -> dict[str, Any]:
-    information = found.weights
+    used, information = weights > 0.0, found.weights
     if task.student:
         _, mean, efficiency = student_constants(found.left)
         information = efficiency * np.minimum(1.0, found.weights / mean)
@@ -168,7 +168,7 @@ def _fields(
     rows = rows.reshape(-1, rows.shape[-1])
     covariance, null = _covariance(task, rows, found.precision[task.free], found.left)
     freedom = float(found.freedom.sum())
-    noise_std: Array | None = _noise(task, found)
+    noise_std: Array | None = _noise(task, found, weights[used])
     noise_dof = 0.0
     if not task.known:
         noise_dof = float(found.freedom.min()) if task.per_output else freedom
@@ -207,9 +207,9 @@ def _fields(
     }
 
 
-def _noise(task: Task, found: Solution) -> Array | None:
+def _noise(task: Task, found: Solution, weights: Array) -> Array:
     """(q,) of a reading of weight 1; root mean square where they were given apart."""
-    inverse = np.linalg.inv(task.white)
+    inverse = np.linalg.inv(task.white) * np.sqrt(weights)[:, None, None]
     each = inverse @ np.matrix_transpose(inverse)
     std = np.sqrt(np.diagonal(each, axis1=1, axis2=2).mean(axis=0))
     return np.asarray(std * found.level)

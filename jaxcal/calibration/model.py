@@ -16,7 +16,14 @@ from jaxcal.calibration.checked import derivative, predict
 from jaxcal.calibration.discrepancy import WithDiscrepancy
 from jaxcal.calibration.reach import Carry, reach
 from jaxcal.checks import in_words
-from jaxcal.models import Affine, Model, SerialChain, from_dict, identifiability
+from jaxcal.models import (
+    Affine,
+    Model,
+    Prior,
+    SerialChain,
+    from_dict,
+    identifiability,
+)
 from jaxcal.models.identifiability import Identifiability
 
 __all__ = ["ModelCalibration"]
@@ -121,8 +128,8 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
 
     def identifiability(self) -> Identifiability:
         """What the measurements alone say of the parameters, at the estimate."""
-        at = _At(self.model, self.parameters)
-        return identifiability(at, self.commands)  # type: ignore[arg-type]  # delegates
+        here = Prior(np.inf, mean=self.parameters)
+        return identifiability(self.model, self.commands, prior=here)
 
     @property
     def matrix(self) -> Array:
@@ -403,16 +410,3 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
         if (found["noise_std"] is None) != (found["joint_covariance"] is None):
             raise ValueError('"noise_std" and "joint_covariance" contradict each other')
         return found | {"model": model, "loss": content["loss"]}
-
-
-class _At:
-    """A model whose nominal parameters are those estimated."""
-
-    def __init__(self, model: Model, parameters: Array) -> None:
-        self._model, self.nominal = model, parameters
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._model, name)
-
-    def jacobian(self, commands: ArrayLike) -> Array:
-        return self._model.jacobian(commands, self.nominal)

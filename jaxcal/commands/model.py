@@ -29,9 +29,6 @@ def read_model(path: str | None) -> Model | None:
     if path.lower().endswith(".urdf"):
         return SerialChain.from_urdf(path)
     try:
-        document = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
-        if not isinstance(document, dict):
-            raise ValueError("a model must be a JSON object with a kind")
-        return from_dict(document)
+        return from_dict(json.loads(pathlib.Path(path).read_text(encoding="utf-8")))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error

@@ -70,31 +70,33 @@ def identifiability(
     prior: Prior | None = None,
     parameters: Sequence[str] | None = None,
 ) -> Identifiability:
-    """Every direction of the parameters that no candidate excites, near the nominal.
+    """Every direction of the parameters that no candidate excites.
 
     Args:
         model: with p parameters.
         candidates: (N, n) commands.
         noise: matters where commands are unknown in every measurement.
-        prior: counts as information where its std is finite; parameters that it fixes
-            are left out. Without one the measurements alone count.
+        prior: its mean is where the model is looked at, the nominal parameters without
+            one; it counts as information where its std is finite; parameters that it
+            fixes are left out. Without one the measurements alone count.
         parameters: names to ask about; the others are taken as known.
     """
     commands = table("candidates", candidates)
     if not len(commands):
         raise ValueError("candidates must hold at least one row, got none")
-    jacobian = model.jacobian(commands)
+    known = None if prior is None else prior.resolve(model)
+    mean = model.nominal if known is None else known.mean
+    jacobian = model.jacobian(commands, mean)
     if noise is not None:
         slopes = None
         if noise.command_std is not None:
-            slopes = model.command_jacobian(commands)
+            slopes = model.command_jacobian(commands, mean)
         jacobian = noise.whitening(len(commands), model.num_outputs, slopes) @ jacobian
     rows = jacobian.reshape(-1, model.num_parameters)
     asked = np.ones(model.num_parameters, dtype=np.bool_)
-    if prior is not None:
-        resolved = prior.resolve(model)
-        rows = np.vstack([rows, np.sqrt(resolved.precision)])
-        asked &= resolved.free
+    if known is not None:
+        rows = np.vstack([rows, np.sqrt(known.precision)])
+        asked &= known.free
     if parameters is not None:
         unknown = [name for name in parameters if name not in model.names]
         if unknown:

@@ -155,6 +155,15 @@ class Noise:
                     "the two are added in the readings' units"
                 )
 
+    def of(self, rows: NDArray[np.bool_]) -> Noise:
+        """The noise of some of the N candidates, ``rows`` (N,) True at each of them."""
+        std, covariance = self.std, self.covariance
+        if std is not None and np.ndim(std) == 2:
+            std = np.asarray(std)[rows]
+        if covariance is not None and np.ndim(covariance) == 3:
+            covariance = np.asarray(covariance)[rows]
+        return Noise(std, covariance, self.command_std)
+
     def whitening(
         self, count: int, num_outputs: int, command_jacobian: ArrayLike | None = None
     ) -> Array:

@@ -220,8 +220,6 @@ def _problem(
                     "model must be of jaxcal.models, or an object with the methods of "
                     f"jaxcal.models.Model, got {model!r}"
                 )
-            if given.get("noise") is None and hasattr(model, "default_noise"):
-                given["noise"] = model.default_noise()
         return make_problem(candidates, k, **given)
     if given.pop("model", None) is not None:
         raise ValueError("model must come with candidates, not with blocks")
@@ -261,7 +259,15 @@ def _selection(
         bound = min(bounds) if problem.criterion.larger_is_better else max(bounds)
         near = abs(value - optimum.bound) <= _PROVEN * max(1.0, abs(optimum.bound))
         proven = optimum.proven and near
-    subsets = found.alternatives or ((indices, value),)
+    subsets = [Subset(indices, value, log_det)]
+    if found.alternatives:
+        others = np.stack([each for each, _ in found.alternatives])
+        subsets = [
+            Subset(each, float(worth), float(of_all))
+            for each, worth, of_all in zip(
+                others, *values(problem, others), strict=True
+            )
+        ]
     return Selection(
         indices=indices,
         value=value,
@@ -274,7 +280,7 @@ def _selection(
         seed=found.seed,
         restarts=found.restarts,
         nodes=found.nodes,
-        alternatives=tuple(Subset(*each) for each in subsets),
+        alternatives=tuple(subsets),
         known_bound=bound,
         **labels,
     )

@@ -35,11 +35,7 @@ class Subset(NamedTuple):
 
     indices: Indices  # (k,)
     value: float  # of the criterion
-
-    @property
-    def log_det(self) -> float:
-        """``value`` under the name it has where the criterion is D."""
-        return self.value
+    log_det: float  # natural log det S, whatever the criterion
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)

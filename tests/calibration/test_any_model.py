@@ -616,3 +616,20 @@ def test_measurements_without_any_error_are_no_error(given):
     model = Polynomial(1, 1)
     found = identify([[0.0], [1.0], [2.0]], [[0.0]] * 3, model=model, **given)
     np.testing.assert_allclose(found.parameters, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("noise_std", [None, 0.1])
+def test_noise_is_that_of_a_measurement_of_weight_one(noise_std) -> None:
+    commands = np.random.default_rng(0).uniform(-1.0, 1.0, (12, 1))
+    measured = 2.0 * commands + np.random.default_rng(1).normal(0.0, 0.1, (12, 1))
+    about = {"weights": np.full(12, 4.0), "noise_std": noise_std}
+    plain = identify(commands, measured, **about)
+    found = identify(
+        commands, measured, model=Polynomial(1, 1), loss="gaussian", **about
+    )
+    np.testing.assert_allclose(found.noise_std, plain.noise_std, rtol=1e-3)
+    np.testing.assert_allclose(
+        found.predict_std([[0.5]], new_measurement=True),
+        plain.predict_std([[0.5]], new_measurement=True),
+        rtol=1e-3,
+    )

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import hypothesis
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxcal
 from jaxcal.models import (
     Affine,
+    FromJax,
     Linear,
     Noise,
     Polynomial,
@@ -144,3 +147,21 @@ def test_a_pose_shows_more_than_a_position():
     gantry = SerialChain.from_dh([(0, 0, 0, 0)] * 3, joints="PPP")
     unseen = identifiability(gantry, commands[:, :3]).directions
     assert "theta1" in [each.words for each in unseen]
+
+
+def test_a_prior_says_where_the_model_is_looked_at():
+    """The rate of a sine of no height shows only where a height is expected."""
+
+    def wave(u, theta):
+        return theta[0] * jnp.sin(theta[1] * u[0])
+
+    model = FromJax(wave, [0.0, 1.0], ["height", "rate"], num_inputs=1)
+    commands = np.linspace(-1.0, 1.0, 9)[:, None]
+    assert identifiability(model, commands).rank == 1
+    prior = Prior(np.inf, mean={"height": 2.0})
+    assert identifiability(model, commands, prior=prior).rank == 2
+    found = jaxcal.select(commands, 2, model=model, prior=prior, criterion="D")
+    heights = np.sin(commands[found.indices, 0])
+    rates = 2.0 * commands[found.indices, 0] * np.cos(commands[found.indices, 0])
+    expected = np.linalg.slogdet(np.c_[heights, rates])[1] * 2
+    assert found.log_det == pytest.approx(expected)

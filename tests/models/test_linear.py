@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxcal.extras import MissingExtraError
-from jaxcal.models import Affine, Linear, Model, Polynomial, from_dict
+from jaxcal.models import Affine, Linear, Model, Polynomial, SerialChain, from_dict
 
 from .arms import differences
 
@@ -174,12 +174,19 @@ def test_a_model_comes_back_from_json(model):
 
 def test_a_model_that_a_file_cannot_hold_is_refused():
     model = Linear(lambda u: u, inputs=1)
-    with pytest.raises(ValueError, match=r"kind linear holds a function.*model=\.\.\."):
+    with pytest.raises(ValueError, match=r"holds a function.*model=\.\.\."):
         from_dict(model.to_dict())
     with pytest.raises(ValueError, match="kind of the model must be one of affine"):
         from_dict({"kind": "cubic"})
     with pytest.raises(ValueError, match="kind polynomial must hold 'degree'"):
         from_dict({"kind": "polynomial"})
+    chain = SerialChain.from_dh([(1.0, 90, 0, 0), (2.0, 0, 0, 0)]).to_dict()
+    with pytest.raises(ValueError, match=r"serial_chain must hold no other .* 'tabel'"):
+        from_dict({**chain, "tabel": []})
+    with pytest.raises(ValueError, match="kind serial_chain must hold values as"):
+        from_dict({**chain, "joints": 5})
+    with pytest.raises(ValueError, match="a model must be a JSON object"):
+        from_dict([1])  # type: ignore[arg-type]  # the point
 
 
 def test_without_formulaic_the_command_is_named(monkeypatch):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import hypothesis
 import hypothesis.extra.numpy as hnp
 import hypothesis.strategies as st
@@ -9,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal.models import Affine, Noise, Prior
+from jaxcal.models import Affine, Noise, Polynomial, Prior
 
 MODEL = Affine(1, 2)  # a11 a21 b1 b2
 
@@ -126,3 +128,34 @@ def test_derivatives_of_another_shape_are_refused():
         noise.whitening(4, 2, np.ones((4, 2, 3)))
     with pytest.raises(ValueError, match=r"must have shape \(4, 2, n\)"):
         noise.whitening(4, 2, np.ones((3, 2, 2)))
+
+
+def test_noise_of_each_candidate_goes_with_the_available_ones():
+    rng = np.random.default_rng(0)
+    commands = rng.uniform(-1.0, 1.0, (12, 1))
+    available = np.arange(12) % 4 > 0
+    model, std = Polynomial(1, 1, 2), rng.uniform(0.1, 1.0, (12, 2))
+    rows = np.c_[np.ones(12), commands[:, 0]]
+    best = max(
+        sum(
+            np.linalg.slogdet((rows[at] / std[at, j, None] ** 2).T @ rows[at])[1]
+            for j in range(2)
+        )
+        for at in map(
+            list, itertools.combinations(np.flatnonzero(available).tolist(), 3)
+        )
+    )
+    for noise in (
+        Noise(std=std),
+        Noise(covariance=np.stack([np.diag(row**2) for row in std])),
+    ):
+        found = jaxcal.select(
+            commands, 3, "exact", model=model, noise=noise, criterion="D",
+            available=available,
+        )  # fmt: skip
+        assert found.log_det == pytest.approx(best)
+        with pytest.raises(ValueError, match="the same for all candidates where meas"):
+            jaxcal.select(
+                commands, 3, model=model, noise=noise, measured=commands[:2],
+                available=available,
+            )  # fmt: skip

@@ -224,3 +224,15 @@ def test_the_response_surface_of_algdesigns_vignette(name: str, theirs: float) -
     else:
         assert 15 * found.value <= theirs * (1 + 1e-6)
         assert 15 * found.bound >= 7.5  # "7.57" of the continuous design
+
+
+def test_alternatives_tell_their_log_det_under_every_criterion():
+    candidates = np.random.default_rng(3).random((12, 2))
+    rows = np.c_[candidates, np.ones(12)]
+    for criterion in ("A", "I", "E"):
+        found = select(candidates, 4, "exact", criterion=criterion, best=3)
+        assert found.alternatives[0].log_det == found.log_det
+        for each in found.alternatives:
+            chosen = rows[each.indices]
+            expected = 2 * np.linalg.slogdet(chosen.T @ chosen)[1]
+            assert each.log_det == pytest.approx(expected)

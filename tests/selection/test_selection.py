@@ -185,10 +185,11 @@ def test_a_mask_may_be_as_tight_as_the_selection():
         ({"candidates": np.full((9, 3), np.inf)}, "candidates must be finite, got inf"),
         (
             {"candidates": np.ones(9)},
-            r"candidates must have shape \(M, n\), got \(9,\)",
+            r"candidates must have shape \(M, n\), .* got \(9,\)",
         ),
         ({"candidates": np.ones((2, 9, 3))}, r"candidates must have shape \(M, n\)"),
         ({"candidates": np.ones((9, 0))}, r"candidates must have shape \(M, n\)"),
+        ({"candidates": np.ones((0, 3))}, r"candidates must have shape \(M, n\)"),
         ({"candidates": [["a", "b", "c"]]}, "candidates must be an array of numbers"),
         ({"candidates": [[1, 2, 3], [1, 2]]}, "candidates must be an array of numbers"),
         ({"k": 3}, "k must be at least 4, the number of regressors .* got 3"),
@@ -201,7 +202,7 @@ def test_a_mask_may_be_as_tight_as_the_selection():
         ({"num_outputs": 0}, "num_outputs must be at least 1, got 0"),
         ({"available": np.zeros(20, bool)}, "available must leave at least 4 .* none"),
         ({"available": np.ones(19, bool)}, r"available must have shape \(20,\), got"),
-        ({"available": np.ones(20)}, "available must be an array of bool .* float64"),
+        ({"available": np.full(20, 2)}, "available must hold True or 1 .* got 2"),
         ({"available": np.arange(20) < 3}, "k must not exceed .* 3 candidates, got 4"),
         ({"required": [20]}, r"required must lie in \[0, 20\), got 20"),
         ({"required": [-1]}, r"required must lie in \[0, 20\), got -1"),
@@ -226,6 +227,14 @@ def test_bad_input_is_one_clear_error(method, change, message):
     arguments = {"candidates": uniform(0), "k": 4, **change}
     with pytest.raises(ValueError, match=message):
         select(method=method, **arguments)
+
+
+def test_a_mask_of_noughts_and_ones_is_one_of_bool():
+    mask = np.arange(20) % 3 > 0
+    expected = select(uniform(0), 5, available=mask).indices
+    for kind in (int, float, np.uint8):
+        given = select(uniform(0), 5, available=mask.astype(kind))
+        np.testing.assert_array_equal(given.indices, expected)
 
 
 def test_unknown_methods_are_answered_with_the_list():
@@ -452,6 +461,14 @@ def test_to_frame_is_a_row_for_each_chosen():
     frame = found.to_frame()
     assert list(frame.columns) == ["index", "a", "b", "c"]
     np.testing.assert_array_equal(frame[["a", "b", "c"]], given.loc[frame.index])
+
+
+def test_rooms_are_there_after_the_import_alone():
+    code = "import jaxcal; print(jaxcal.models.Affine(1, 1).names, jaxcal.selection)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.startswith("('a11', 'b1')")
 
 
 def test_names_are_exported_lazily():

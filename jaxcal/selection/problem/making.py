@@ -9,7 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import axis_names, numbers, whole_number
-from jaxcal.information.blocks import missing_directions, prior_root, whiten
+from jaxcal.information.blocks import (
+    coarseness,
+    missing_directions,
+    prior_root,
+    whiten,
+)
 from jaxcal.information.excitation import directions_in_words, require_excited
 from jaxcal.models.affine import Affine
 from jaxcal.models.identifiability import identifiability
@@ -50,6 +55,7 @@ class _Rules(NamedTuple):
     required: ArrayLike | None
     max_replicates: int
     single: bool = True  # one set, given without its batch axis
+    coarse: float = 1.0  # how many times coarser than float64 the numbers given are
 
 
 def make_problem(
@@ -74,8 +80,10 @@ def make_problem(
         ValueError: naming the argument, the rule and the value.
     """
     array = numbers("candidates", candidates, finite=False)
-    if array.ndim != 2 or array.shape[1] < 1:
-        raise ValueError(f"candidates must have shape (M, n), got {array.shape}")
+    if array.ndim != 2 or 0 in array.shape:
+        raise ValueError(
+            f"candidates must have shape (M, n), neither of them 0, got {array.shape}"
+        )
     if model is None:
         m = array.shape[1] if num_outputs is None else num_outputs
         model = Affine(array.shape[1], whole_number("num_outputs", m, 1))
@@ -88,22 +96,25 @@ def make_problem(
         )
     mask = check_available(available, array.shape[:1], True)
     array = usable_numbers("candidates", array[None], mask, True)
-    rules = _Rules(k, mask, required, max_replicates)
+    rules = _Rules(k, mask, required, max_replicates, coarse=coarseness(candidates))
     plain = parameters is None and shares_regressor(model, prior, noise)
     if plain and isinstance(model, Affine):
         wanted = wanted_criterion(criterion, None, (), "D", region)
         std = None if noise is None else noise.std
         return _affine(model, array, rules, wanted, std, region, measured)[0]
+    if noise is None and hasattr(model, "default_noise"):
+        noise = model.default_noise()
     modelled = Modelled(model, prior, noise)
     default = "D" if isinstance(model, Affine) else "I"
     wanted = wanted_criterion(criterion, parameters, modelled.names, default, region)
     raw = modelled.blocks(array[0], mask[0])[None]
-    root = prior_root(modelled.precision)
-    if not np.diagonal(modelled.precision).all():
-        shown = [array[mask]] if measured is None else [array[mask], measured]
-        _require_identified(model, np.concatenate(shown), noise, prior)
+    root, shown = prior_root(modelled.precision), array[mask]
     if measured is not None:
         root = _with_measured(root, modelled.blocks_at("measured", measured, True))
+        shown = np.concatenate([shown, measured])
+    if not np.diagonal(modelled.precision).all():
+        known = None if noise is None else noise.of(mask[0])
+        _require_identified(model, shown, known, prior)
     if region is None and modelled.noise.command_std is not None:
         region = array[mask]  # predictions are for commands that are known
     if region is not None:
@@ -134,13 +145,16 @@ def make_problems(
         ValueError: naming the argument, the rule and the value.
     """
     array = numbers("candidates", candidates, finite=False)
-    if array.ndim != 3 or array.shape[2] < 1 or array.shape[0] < 1:
-        raise ValueError(f"candidates must have shape (B, M, n), got {array.shape}")
+    if array.ndim != 3 or 0 in array.shape:
+        raise ValueError(
+            f"candidates must have shape (B, M, n), none of them 0, got {array.shape}"
+        )
     mask = check_available(available, array.shape[:2], False)
     array = usable_numbers("candidates", array, mask, False)
     m = array.shape[2] if num_outputs is None else num_outputs
     model = Affine(array.shape[2], whole_number("num_outputs", m, 1))
-    rules = _Rules(k, mask, required, max_replicates, False)
+    coarse = coarseness(candidates)
+    rules = _Rules(k, mask, required, max_replicates, False, coarse)
     return _affine(model, array, rules, Wanted("D"))
 
 
@@ -202,7 +216,7 @@ def make_block_problem(
         wanted = wanted._replace(times=whole_number("num_outputs", num_outputs, 1))
     if region is not None:
         wanted = wanted._replace(region=_as_blocks("region", region, noise, q, p))
-    rules = _Rules(k, mask, required, max_replicates)
+    rules = _Rules(k, mask, required, max_replicates, coarse=coarseness(blocks))
     return _whitened(raw, root, rules, wanted, names)[0]
 
 
@@ -244,13 +258,16 @@ def _whitened(
     model: Model | None = None,
 ) -> list[Problem]:
     """The problems of blocks (S, M, q, p); ``names`` is None for blocks [u, 1]."""
-    k, mask, required, max_replicates, single = rules
+    k, mask, required, max_replicates, single, coarse = rules
     readings = mask.sum(axis=1) * raw.shape[2]
     if raw.shape[2] > raw.shape[3]:  # as much information in p rows, at q^3 less cost
         raw = np.asarray(np.linalg.qr(raw, mode="r"))
     k = check_k(k, raw, mask, root, regressors=names is None)
     cap, forced = check_counts(mask, k, required, max_replicates, single)
-    white = whiten(raw, mask, root)
+    computed = names is not None and candidates is not None
+    if computed:  # a derivative is as exact as its own numbers
+        coarse = 1.0
+    white = whiten(raw, mask, root, coarse=coarse, computed=computed)
     if white.singular.size:
         b = int(white.singular[0])
         if names is None and candidates is not None:
@@ -258,8 +275,8 @@ def _whitened(
             if not len(root):
                 which = "available ones" + in_set(b, single)
                 used = candidates[b][mask[b]]
-                require_excited(used, names[:-1], "candidates", which)
-        _refuse_blind(raw[b][mask[b]], root, names or ())
+                require_excited(used, names[:-1], "candidates", which, coarse)
+        _refuse_blind(raw[b][mask[b]], root, names or (), coarse)
     owned = [raw, root, *white[:3], mask, forced]
     for each in owned if candidates is None else [*owned, candidates]:
         each.flags.writeable = False
@@ -268,7 +285,7 @@ def _whitened(
             white.blocks[b], white.prior[b], k, mask[b], forced[b], cap,
             wanted.whitened(white, b, int(readings[b])), wanted.times,
             float(white.log_scale[b]), raw[b], white.basis[b], root,
-            None if candidates is None else candidates[b], model,
+            white.rounding[b], None if candidates is None else candidates[b], model,
         )
         for b in range(len(raw))
     ]  # fmt: skip
@@ -292,9 +309,11 @@ def _require_identified(
         )
 
 
-def _refuse_blind(blocks: Array, root: Array, names: tuple[str, ...]) -> None:
+def _refuse_blind(
+    blocks: Array, root: Array, names: tuple[str, ...], coarse: float
+) -> None:
     """Raise for the directions that neither blocks (N, q, p) nor ``root`` inform."""
-    null = missing_directions(blocks, root)
+    null = missing_directions(blocks, root, coarse)
     raise ValueError(
         "blocks must inform every parameter, but the available ones"
         + (" and what is known" if len(root) else "")

@@ -61,15 +61,16 @@ def check_available(
     if available is None:
         return np.ones(shape, dtype=np.bool_)
     mask = _leading_axis("available", available) if single else np.array(available)
-    if mask.dtype != np.bool_:
-        raise ValueError(
-            "available must be an array of bool (True = may be chosen), "
-            f"got dtype {mask.dtype}"
-        )
     if mask.shape != shape:
         want, got = (shape[1:], mask.shape[1:]) if single else (shape, mask.shape)
         raise ValueError(f"available must have shape {want}, got {got}")
-    return mask
+    if mask.dtype.kind not in "biuf" or not np.isin(mask, (0, 1)).all():
+        wrong = mask[~np.isin(mask, (0, 1))] if mask.dtype.kind in "iuf" else mask
+        raise ValueError(
+            "available must hold True or 1 where a candidate may be chosen, else False "
+            f"or 0, got {wrong.flat[0]}"
+        )
+    return mask.astype(np.bool_)
 
 
 def check_counts(
