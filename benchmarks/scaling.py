@@ -9,30 +9,29 @@ devices share the same cores, so this measures what sharding adds, not what it g
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import time
 
 import jax
+import jax.numpy as jnp
 
-from jaxcal.learning.policies.build import build
+from jaxcal.learning.core import ppo
 from jaxcal.learning.runtime import cache, devices
-from jaxcal.learning.training import optimiser, ppo, presets
+from jaxcal.learning.training import presets
 
 
 def measure(preset: str, number: int, num_updates: int) -> dict[str, float]:
     """Seconds an update on so many devices, compilation left out."""
-    config = presets.load(preset)
-    settings = dataclasses.replace(config.ppo, num_episodes=10**8)
-    network = build(config.network)
+    config = presets.with_values(presets.load(preset), {"num_episodes": 10**8})
+    learner = config.learners[0]
     mesh = devices.make_mesh(number)
-    devices.require_divisible(settings.sets_per_minibatch, mesh)
-    state = devices.replicate(optimiser.init(settings, config.tasks[0], network), mesh)
-    update = ppo.updater(settings, config.tasks[0], network, mesh)
+    devices.require_divisible(config.ppo.rows_per_minibatch, mesh)
+    begun = jax.jit(lambda key: ppo.begin(config.ppo, learner, key))(jax.random.key(0))
+    state = devices.replicate(begun, mesh)
+    update = ppo.updates(config.ppo, learner, mesh, num_updates)
     for warm in (True, False):
         wall, used = time.perf_counter(), time.process_time()
-        for _ in range(1 if warm else num_updates):
-            state, _ = update(state)
+        state, _ = update(state, jnp.int32(1 if warm else num_updates))
         jax.block_until_ready(state.num_updates)
         wall, used = time.perf_counter() - wall, time.process_time() - used
         if warm:
@@ -42,7 +41,7 @@ def measure(preset: str, number: int, num_updates: int) -> dict[str, float]:
         "compile_cpu_s": compiling,
         "wall_s": wall / num_updates,
         "cpu_s": used / num_updates,
-        "episodes_per_s": settings.episodes_per_update * num_updates / wall,
+        "episodes_per_s": config.ppo.episodes_per_update * num_updates / wall,
     }
 
 

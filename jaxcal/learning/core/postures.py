@@ -198,8 +198,10 @@ def play(
 
     states = jax.tree.map(of_every_episode, sets)
     # The rules are those of one episode.
-    advance, paid_of, outcome_of = (
-        jax.vmap(jax.vmap(rule)) for rule in (task.step, task.paid, task.outcome)
+    advance = jax.vmap(jax.vmap(task.step))
+    paid_of, outcome_of = (
+        jax.vmap(jax.vmap(task.paid)),
+        jax.vmap(jax.vmap(task.outcome)),
     )
     length = _start_lengths(task, (repeats, len(sets.available)), key_starts)
     learned = task.num_decisions - network.num_unlearned

@@ -53,7 +53,7 @@ Metrics = dict[str, jax.Array]
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig:
-    """Every number of the optimisation; ``postures`` and ``streams`` add their sizes."""
+    """Every number of the optimisation; what is played adds its sizes."""
 
     num_epochs: int = setting(2, "passes over what an update has played")
     num_minibatches: int = setting(4, "gradient steps per pass")
@@ -111,6 +111,9 @@ class Learner(Protocol):
     ``given`` are arrays that the caller passes through ``train`` or an update, such as
     a task's tables: arguments, so that other values compile nothing.
     """
+
+    def __hash__(self) -> int:
+        """Of its configuration."""
 
     def init(self, key: jax.Array, *given: Any) -> Any:
         """Parameters before training."""
@@ -174,7 +177,9 @@ def surrogate(
     value_loss = mean(squared_error(value - batch.target, config.value_error_limit))
     entropy = mean(-(jnp.exp(log_probs) * log_probs).sum(-1))
     progress = jnp.minimum(done / config.num_updates, 1.0)
-    bonus = config.entropy_start + progress * (config.entropy_end - config.entropy_start)
+    bonus = config.entropy_start + progress * (
+        config.entropy_end - config.entropy_start
+    )
     loss = policy_loss + config.value_coefficient * value_loss - bonus * entropy
     metrics = {
         "policy_loss": policy_loss,
@@ -188,8 +193,11 @@ def squared_error(error: jax.Array, limit: float) -> jax.Array:
     """The square of an error, beyond ``limit`` going on as a line: twice Huber's loss.
 
     Unlike the square of a clipped error it has a gradient however wrong a value is.
+    (``optax.losses.huber_loss`` cancels large numbers in its gradient.)
     """
-    return 2.0 * optax.losses.huber_loss(error, delta=limit)
+    size = jnp.abs(error)
+    near = jnp.minimum(size, limit)
+    return near * (2.0 * size - near)
 
 
 def advantages(
@@ -222,7 +230,7 @@ def advantages(
 def normalised(
     config: PPOConfig, advantage: jax.Array, counted: jax.Array, axes: tuple[int, ...]
 ) -> jax.Array:
-    """Advantages with mean 0 and scale 1 over ``axes``, of what counts; outliers clipped."""
+    """Advantages with mean 0 and scale 1 over ``axes`` of what counts, then clipped."""
     number = jnp.maximum(counted.sum(axes, keepdims=True), 1.0)
     mean = (advantage * counted).sum(axes, keepdims=True) / number
     centred = advantage - mean
@@ -369,7 +377,9 @@ Update = Callable[..., tuple[TrainState, Metrics]]
 """(state, *given) -> the next state and metrics."""
 
 
-def make_update(config: PPOConfig, learner: Learner, mesh: Mesh | None = None) -> Update:
+def make_update(
+    config: PPOConfig, learner: Learner, mesh: Mesh | None = None
+) -> Update:
     """One update: play, then learn from it; pure, not compiled.
 
     On a mesh the rows are spread over its devices while they are played, what was

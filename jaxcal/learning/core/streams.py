@@ -83,7 +83,7 @@ class Environment(Protocol):
 
 
 class Network(Protocol):
-    """A flax module: what was observed, leaves (..., ), -> (..., A) logits, (...) value."""
+    """A flax module: of what was observed (..., A) masked logits and (...,) values."""
 
     def __hash__(self) -> int:
         """It is static to ``jit``."""
@@ -132,9 +132,7 @@ class Streams:
         reward, value, ended = played["reward"], played["value"], played["ended"]
         goes_on = 1.0 - ended[:-1]
         following = played["chance"][:-1] * goes_on * value[1:] + played["others"][:-1]
-        advantage = advantages(
-            self.config, reward[:-1], value[:-1], following, goes_on
-        )
+        advantage = advantages(self.config, reward[:-1], value[:-1], following, goes_on)
         counted = jnp.ones_like(advantage)
 
         def by_stream(leaf: jax.Array) -> jax.Array:

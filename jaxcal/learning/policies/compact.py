@@ -18,6 +18,7 @@ from jaxcal.learning.policies.features import (
     remaining,
     vector_features,
 )
+from jaxcal.learning.policies.networks import NetworkConfig
 
 __all__ = ["CompactNetwork"]
 
@@ -196,7 +197,9 @@ class CompactNetwork(nn.Module):
         value = self.critic(nn.relu(self.critic_hidden(pooled)))[..., 0]
         return logits, decision.reached + value
 
-    def lookahead_logits(self, decision: DecisionFeatures) -> tuple[jax.Array, jax.Array]:
+    def lookahead_logits(
+        self, decision: DecisionFeatures
+    ) -> tuple[jax.Array, jax.Array]:
         """Logits and value of a choice that needs no parameters."""
         vectors = decision.vectors
         logits = mask_logits(_SHARP * vectors.ahead[..., 3], vectors.active)

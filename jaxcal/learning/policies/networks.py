@@ -10,14 +10,12 @@ as jaxcal's own pyproject.toml adds ``paper``:
 from __future__ import annotations
 
 import dataclasses
-from typing import cast
 
-from jaxcal.learning.core.network import Network
 from jaxcal.learning.settings import installed, require, setting
 
-__all__ = ["NetworkConfig", "build"]
+__all__ = ["GROUP", "NetworkConfig"]
 
-_GROUP = "jaxcal.networks"
+GROUP = "jaxcal.networks"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,22 +36,13 @@ class NetworkConfig:
     initial_actor: float = setting(0.1, "scale of the learned score before learning")
 
     def __post_init__(self) -> None:
-        if self.kind != "compact" and self.kind not in installed(_GROUP):
-            known = ", ".join(["compact", *installed(_GROUP)])
+        if self.kind != "compact" and self.kind not in installed(GROUP):
+            known = ", ".join(["compact", *installed(GROUP)])
             raise ValueError(
                 f"kind must be one of {known}, got "
                 f"{self.kind!r}; a package adds a kind by an entry point in the group "
-                f"{_GROUP}, when it is installed"
+                f"{GROUP}, when it is installed"
             )
         require(self, "at least 1", lambda v: v >= 1, "width", "lookahead")
         rounds = ("encoder_rounds", "decoder_rounds")
         require(self, "0 or more", lambda v: v >= 0, *rounds)
-
-
-def build(config: NetworkConfig) -> Network:
-    """The network that a configuration names, as a flax module."""
-    if config.kind == "compact":
-        from jaxcal.learning.policies.compact import CompactNetwork
-
-        return cast(Network, CompactNetwork(config))
-    return cast(Network, installed(_GROUP)[config.kind].load()(config))

@@ -23,9 +23,9 @@ from brax.training.agents.ppo import networks as brax_networks
 from brax.training.agents.ppo import train as brax_train
 from brax.training.networks import FeedForwardNetwork
 
+from jaxcal.learning.core.network import initial
 from jaxcal.learning.environments.brax_env import SelectionEnv, wrap_fresh
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.policies import networks
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.settings import settings_of
@@ -42,8 +42,7 @@ READ = (
     "gae_lambda",
     "clip_range",
     "max_grad_norm",
-    "seed",
-)  # fields of PPOConfig that brax is given; beside them the network's width
+)  # fields of EpisodesConfig that brax is given; beside them seed and network's width
 _WIDTH = 64  # of the network, where the preset has another kind
 _FASTEST = 1e-3  # learning rate; brax's updates diverge at the compact preset's 2e-3
 
@@ -61,7 +60,12 @@ def adapted(config: TrainConfig) -> TrainConfig:
 
 def require_read(given: Collection[str]) -> None:
     """Refuse values of fields, by name, that brax's trainer would not read."""
-    read = {*READ, "width", *(field.name for field in settings_of(SelectionConfig))}
+    read = {
+        *READ,
+        "seed",
+        "width",
+        *(field.name for field in settings_of(SelectionConfig)),
+    }
     unread = sorted(set(given) - read)
     if unread:
         flags = ", ".join("--" + name.replace("_", "-") for name in unread)
@@ -118,7 +122,7 @@ def _make_networks(
 
     def read(part: int) -> FeedForwardNetwork:
         return FeedForwardNetwork(
-            init=lambda key: networks.initial(network, key, m, n, env.num_selected),
+            init=lambda key: initial(network, key, m, n, env.num_selected),
             apply=lambda _, params, observation: network.apply(
                 {"params": params}, observation, m, n, method="from_observation"
             )[part],
@@ -181,7 +185,7 @@ def train(
         "clipping_epsilon": ppo.clip_range,
         "max_grad_norm": ppo.max_grad_norm,
         "normalize_observations": False,
-        "seed": ppo.seed,
+        "seed": config.seed,
         "num_evals": num_evals,
     }
     begun = time.perf_counter()
@@ -208,7 +212,6 @@ def train(
         "ppo": {name: getattr(ppo, name) for name in READ},
         "trainer": "brax",
         "brax": given,
-        "seed": ppo.seed,
         "progress": {
             "episodes": ppo.num_episodes,
             "seconds": time.perf_counter() - begun,

@@ -29,7 +29,8 @@ import orbax.checkpoint as ocp
 
 from jaxcal.learning.core.network import Network, initial
 from jaxcal.learning.core.ppo import TrainState
-from jaxcal.learning.policies.networks import NetworkConfig, build
+from jaxcal.learning.policies.build import build
+from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.weights import CheckpointError, Weights, locate
 
@@ -49,7 +50,6 @@ __all__ = [
 
 SCHEMA = "jaxcal-policy"
 VERSION = 2
-_REST = ("params", "opt_state", "key", "num_updates")  # of a state beside the policy
 _PACKAGES = ("jaxcal", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
 
 # orbax warns of every default it takes, on every load.
@@ -92,8 +92,9 @@ def _alone() -> Any:
 def save(
     folder: str | pathlib.Path,
     step: int,
-    state: TrainState,
+    policy: Any,
     meta: dict[str, Any],
+    state: TrainState | None = None,
     keep: int = 3,
 ) -> None:
     """Add a step to a checkpoint folder.
@@ -101,8 +102,10 @@ def save(
     Args:
         folder: made where missing.
         step: number of the step; a step that exists is left as it is.
-        state: of the run; its averaged weights are the policy.
+        policy: the averaged weights.
         meta: JSON values: ``schema``, and a configuration as that one says.
+        state: of the run, with that policy in it; None where there is nothing to go on
+            with.
         keep: older steps beyond these are deleted.
     """
     root = pathlib.Path(folder)
@@ -110,10 +113,11 @@ def save(
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     own: dict[str, Any] = {"schema": SCHEMA, "version": VERSION}
     meta = own | {"created": now, "versions": package_versions()} | meta
+    trees = {"policy": policy} | ({} if state is None else {"state": _rest(state)})
     # Arrays of the host, which know no device; nothing is written twice.
     items = {
         name: ocp.args.StandardSave(jax.tree.map(np.asarray, tree))
-        for name, tree in _parts(state).items()
+        for name, tree in trees.items()
     }
     options = ocp.CheckpointManagerOptions(
         max_to_keep=keep,
@@ -130,10 +134,10 @@ def save(
         )
 
 
-def _parts(state: TrainState) -> dict[str, Any]:
-    """The averaged weights, and what is left of a state."""
-    rest = {name: getattr(state, name) for name in _REST}
-    return {"policy": state.average, "state": rest}
+def _rest(state: TrainState) -> dict[str, Any]:
+    """What a state holds beside the averaged weights."""
+    names = ("params", "opt_state", "key", "num_updates")
+    return {name: getattr(state, name) for name in names}
 
 
 class _PatientLoop(asyncio.SelectorEventLoop):
@@ -323,7 +327,6 @@ def restore(
             f"checkpoint {path} holds a policy but no training state to resume from"
         )
     what = "resumed: its training state is damaged or of another configuration"
-    read = {
-        name: _read(path / name, tree, what) for name, tree in _parts(fresh).items()
-    }
-    return TrainState(average=read["policy"], **read["state"]), meta
+    average = _read(path / "policy", fresh.average, what)
+    rest = _read(path / "state", _rest(fresh), what)
+    return TrainState(average=average, **rest), meta

@@ -8,7 +8,8 @@ from typing import Any
 
 from jaxcal.learning.core.postures import EpisodesConfig, Postures
 from jaxcal.learning.environments.task import Task
-from jaxcal.learning.policies.networks import NetworkConfig, build
+from jaxcal.learning.policies.build import build
+from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.settings import require, setting
 
 __all__ = ["TrainConfig"]

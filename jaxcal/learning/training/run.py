@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
+import functools
 import os
 import pathlib
 import time
@@ -50,7 +51,9 @@ class Recipe:
     unit: str  # what an update plays: "episodes" or "decisions"
     per_update: int  # of them
     columns: tuple[str, ...]  # of metrics.csv, for every update
-    measured: tuple[str, ...]  # its columns of looks; by the first the best seed is known
+    measured: tuple[
+        str, ...
+    ]  # its columns of looks; by the first the best seed is known
     validate: Callable[[Any], dict[str, float]] | None  # averaged weights -> measured
     validate_every: float = 15.0  # seconds between looks
     save_every: float = 60.0  # seconds between checkpoints
@@ -148,7 +151,7 @@ def run(
             each = (time.perf_counter() - begun) / count
             # The first call also compiled: two updates then show how long one takes.
             count = 2 if first == 0 or count == 1 else int(_CALL_SECONDS / each)
-            count = devices.on_first(lambda count=count: max(count, 1))
+            count = devices.on_first(functools.partial(max, count, 1))
     if diary is not None:
         diary.save(state, done)
     return state
@@ -265,7 +268,7 @@ class _Diary:
             progress["seeds"] = self._each
         meta = recipe.meta | {"schema": recipe.schema, "progress": progress}
         state = devices.local(state)
-        checkpoint.save(self.root / "checkpoint", done, state, meta)
+        checkpoint.save(self.root / "checkpoint", done, state.average, meta, state)
 
     def close(self) -> None:
         """Bring the metrics to the disk."""
@@ -293,7 +296,10 @@ def _begin(
 def _of_each_seed(tree: Any, num_seeds: int) -> list[Any]:
     if num_seeds == 1:
         return [tree]
-    return [jax.tree.map(lambda leaf: leaf[i], tree) for i in range(num_seeds)]
+    return [
+        jax.tree.map(lambda leaf, seed=seed: leaf[seed], tree)
+        for seed in range(num_seeds)
+    ]
 
 
 def _table(path: pathlib.Path, done: int, columns: Sequence[str]) -> TextIO:
