@@ -20,6 +20,7 @@ PAPER = TrainConfig(
     ppo=EpisodesConfig(
         num_episodes=200_000,
         episodes_per_update=16,
+        slice_rows=16,
         episodes_per_set=1,
         num_epochs=10,
         num_minibatches=1,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import flax.linen as nn
@@ -252,6 +253,36 @@ def test_training_maps_over_seeds():
     np.testing.assert_allclose(several["slope"][1], alone["slope"], rtol=1e-4)
 
 
+def test_a_gradient_in_slices_is_that_of_the_whole():
+    """Also where slices count unequally; 8 rows in 7 become slices of 4."""
+    config = dataclasses.replace(TINY, episodes_per_update=32, num_minibatches=1)
+    task = Task(SelectionConfig(8, 5, 2, 2, reward_gain=True), random_starts=0.6)
+    learner = Postures(config, task, build(SMALL))
+    params = learner.init(jax.random.key(0))
+    key = jax.random.key(1)
+    played, _ = jax.jit(lambda p: learner.gather(p, learner.draw(key), key))(params)
+    counted = np.asarray(played.counted).sum((1, 2))
+    assert counted[:4].sum() != counted[4:].sum()
+
+    @functools.partial(jax.jit, static_argnums=1)
+    def found(params, size):
+        one = jax.grad(
+            lambda p, rows: learner.loss(p, rows, jnp.int32(0)), has_aux=True
+        )
+
+        def rows_of(index):
+            return jax.tree.map(lambda leaf: leaf[index], played)
+
+        return ppo.sliced(one, params, rows_of, jnp.arange(8), size)
+
+    whole = found(params, 8)
+    for size in (1, 7):
+        for a, b in zip(
+            *map(jax.tree.leaves, (whole, found(params, size))), strict=True
+        ):
+            np.testing.assert_allclose(a, b, atol=2e-5)
+
+
 def test_cutting_a_run_into_calls_changes_no_bit_and_a_seed_compiles_nothing():
     config, (learner,) = PROBE.ppo, PROBE.learners
     update = ppo.updates(config, learner, None, 8)
@@ -308,8 +339,10 @@ def test_the_averaged_weights_owe_nothing_to_the_initial_ones(rng):
             state,
             config,
             4,
-            lambda index: data[index],
-            lambda params, rows: (((params["w"][None] - rows) ** 2).sum(), {}),
+            jax.grad(
+                lambda params, index: (((params["w"] - data[index]) ** 2).sum(), {}),
+                has_aux=True,
+            ),
             jax.random.key(1),
         )
         seen.append(np.asarray(state.params["w"], np.float64))

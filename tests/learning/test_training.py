@@ -85,7 +85,7 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished, tmp_path):
 
 def test_updates_compile_once_and_change_every_weight(finished):
     for learner in CONFIG.learners:
-        assert ppo.updates(CONFIG.ppo, learner, None, 1)._cache_size() == 1
+        assert ppo.updates(CONFIG.ppo, learner, None, 1, 0)._cache_size() == 1
     begun = CONFIG.learners[0].init(ppo.streams_of(jax.random.key(3))[0])
     moved = jax.tree.map(lambda a, b: (a != b).any(), begun, finished[1].params)
     # The value reads every part of the network, the policy all but the critic.

@@ -42,6 +42,7 @@ __all__ = [
     "make_update",
     "normalised",
     "optimiser",
+    "sliced",
     "spread",
     "squared_error",
     "surrogate",
@@ -76,9 +77,13 @@ class PPOConfig:
     average_decay: float = setting(
         0.99, "for each gradient step, of the averaged weights, which are what is kept"
     )
+    slice_rows: int = setting(
+        8, "rows of a minibatch whose gradient is computed at once on a CPU: its cache"
+    )
 
     def __post_init__(self) -> None:
-        require(self, "at least 1", lambda v: v >= 1, "num_epochs", "num_minibatches")
+        counts = ("num_epochs", "num_minibatches", "slice_rows")
+        require(self, "at least 1", lambda v: v >= 1, *counts)
         positive = ("learning_rate", "clip_range", "max_grad_norm", "value_error_limit")
         require(self, "positive", lambda v: v > 0, *positive)
         require(self, "in [0, 1]", lambda v: 0.0 <= v <= 1.0, "discount", "gae_lambda")
@@ -124,7 +129,10 @@ class Learner(Protocol):
     def gather(
         self, params: Any, rows: Any, key: jax.Array, *given: Any
     ) -> tuple[Any, Metrics]:
-        """Play on each row: experience with as many leading rows, and metrics."""
+        """Play on each row: experience with as many leading rows, and metrics.
+
+        Experience has ``counted`` (rows, ...), of which ``loss`` is a mean.
+        """
 
     def loss(
         self, params: Any, experience: Any, done: jax.Array
@@ -321,8 +329,7 @@ def epochs(
     state: TrainState,
     config: PPOConfig,
     num_rows: int,
-    minibatch: Callable[[jax.Array], Any],
-    loss: Callable[[Any, Any], tuple[jax.Array, Metrics]],
+    gradient: Callable[[Any, jax.Array], tuple[Any, Metrics]],
     key: jax.Array,
 ) -> tuple[TrainState, Metrics]:
     """Epochs of minibatches over what an update has gathered.
@@ -331,8 +338,7 @@ def epochs(
         state: before the update.
         config: how to optimise.
         num_rows: gathered.
-        minibatch: (S,) indices of rows -> what was gathered of them.
-        loss: of parameters and a minibatch.
+        gradient: of parameters and the (S,) indices of a minibatch's rows.
         key: orders the minibatches.
 
     Returns:
@@ -343,7 +349,7 @@ def epochs(
 
     def step(carry: Any, index: jax.Array) -> tuple[Any, Metrics]:
         params, average, opt_state, count = carry
-        grads, metrics = jax.grad(loss, has_aux=True)(params, minibatch(index))
+        grads, metrics = gradient(params, index)
         changes, opt_state = optimise.update(grads, opt_state, params)
         params = optax.apply_updates(params, changes)
         # The share of the newest weights in a mean whose weights decay and add up to
@@ -369,6 +375,45 @@ def epochs(
         num_updates=state.num_updates + 1,
     )
     return state, {name: value.mean() for name, value in metrics.items()}
+
+
+def sliced(
+    gradient: Callable[[Any, Any], tuple[Any, Metrics]],
+    params: Any,
+    rows_of: Callable[[jax.Array], Any],
+    index: jax.Array,
+    size: int,
+) -> tuple[Any, Metrics]:
+    """The gradient of a minibatch's mean loss, and its metrics, slice by slice.
+
+    A slice's arrays stay in a core's cache: on a CPU that takes 0.6 of the time of all
+    rows at once.
+
+    Args:
+        gradient: of parameters and rows, of their mean loss over ``rows.counted``.
+        params: parameters.
+        rows_of: indices -> rows.
+        index: (S,) of the minibatch.
+        size: rows of a slice, at most.
+    """
+    size = max(part for part in range(1, size + 1) if len(index) % part == 0)
+    if size == len(index):
+        return gradient(params, rows_of(index))
+
+    def add(total: Any, index: jax.Array) -> tuple[Any, None]:
+        rows = rows_of(index)
+        number = rows.counted.sum()
+        found = gradient(params, rows), jnp.ones(())
+        return jax.tree.map(lambda t, f: t + number * f, total, found), None
+
+    parts = index.reshape(-1, size)
+    shapes = jax.eval_shape(lambda: gradient(params, rows_of(parts[0])))
+    zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), jnp.zeros(())
+    (total, number), _ = jax.lax.scan(add, zero, parts)
+    mean: tuple[Any, Metrics] = jax.tree.map(
+        lambda t: t / jnp.maximum(number, 1.0), total
+    )
+    return mean
 
 
 # -- an update, and training -----------------------------------------------------------
@@ -400,14 +445,20 @@ def make_update(
         experience, metrics = learner.gather(state.params, rows, key_gather, *given)
         experience = _everywhere(experience, mesh)
 
-        def minibatch(index: jax.Array) -> Any:
+        def rows_of(index: jax.Array) -> Any:
             return spread(jax.tree.map(lambda leaf: leaf[index], experience), mesh)
 
-        def loss(params: Any, rows: Any) -> tuple[jax.Array, Metrics]:
-            return learner.loss(params, rows, state.num_updates)
+        def gradient(params: Any, index: jax.Array) -> tuple[Any, Metrics]:
+            whole = mesh is not None or jax.default_backend() != "cpu"
+            size = len(index) if whole else min(config.slice_rows, len(index))
+            one = jax.grad(
+                lambda params, rows: learner.loss(params, rows, state.num_updates),
+                has_aux=True,
+            )
+            return sliced(one, params, rows_of, index, size)
 
-        num_rows = len(jax.tree.leaves(experience)[0])
-        after, losses = epochs(state, config, num_rows, minibatch, loss, key_epochs)
+        num_rows = len(experience.counted)
+        after, losses = epochs(state, config, num_rows, gradient, key_epochs)
         after = dataclasses.replace(after, key=jax.random.key_data(key))
         return _everywhere((after, metrics | losses), mesh)
 

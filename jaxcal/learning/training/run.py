@@ -142,7 +142,7 @@ def run(
                 most = 1  # the next update is of another program, or of other arrays
             count = min(count, most, last - done)
             update = ppo.updates(recipe.ppo, learner, mesh, most, seeds)
-            state, found = update(state, jnp.int32(count), *given)
+            state, found = update(state, np.int32(count), *given)
             # One transfer for all that these updates measured.
             rows = jax.device_get(devices.local(found))
             first, done = done, done + count
