@@ -105,7 +105,7 @@ def _train_postures(
 ) -> int:
     """Updates made."""
     from jaxcal.learning.runtime import devices
-    from jaxcal.learning.training import postures
+    from jaxcal.learning.training import checkpoint, postures
     from jaxcal.selection.teacher import fixed_validation, teacher
 
     mesh = devices.make_mesh(arguments.devices)
@@ -127,7 +127,7 @@ def _train_postures(
         teacher=teacher,
     )
     if devices.is_first():
-        _compare_seeds(out, config, postures.MEASURED)
+        _compare_seeds(out, config, postures.MEASURED, checkpoint.SCHEMA)
     return _updates_of(state)
 
 
@@ -154,7 +154,7 @@ def _train_task(
         num_devices=arguments.devices,
     )
     if devices.is_first():
-        _compare_seeds(out, config, run.MEASURED)
+        _compare_seeds(out, config, run.MEASURED, run.SCHEMA)
     return _updates_of(state)
 
 
@@ -212,11 +212,14 @@ def _for_brax(
     """A preset as brax trains it; what brax does not read is refused."""
     import jax
 
+    from jaxcal.commands.train_arguments import flag_of
+
     with needs("study", "--trainer brax"):
         from jaxcal.learning.training import brax_ppo
 
-    if arguments.resume:
-        raise ValueError("--resume works with --trainer jaxcal only")
+    for name in ("resume", "num_seeds"):
+        if getattr(arguments, name):
+            raise ValueError(f"{flag_of(name)} works with --trainer jaxcal only")
     if jax.process_count() > 1:
         raise ValueError("--trainer brax works in a single process only")
     if len(config.tasks) > 1:
@@ -347,18 +350,17 @@ def _show(report: Report, measured: tuple[str, ...]) -> None:
     )
 
 
-def _compare_seeds(out: pathlib.Path, config: Any, measured: tuple[str, ...]) -> None:
+def _compare_seeds(
+    out: pathlib.Path, config: Any, measured: tuple[str, ...], schema: str
+) -> None:
     """What every seed reached, where they were several."""
-    import json
-
     import numpy as np
 
-    from jaxcal.learning.runtime import weights
+    from jaxcal.learning.training import checkpoint
 
     if config.num_seeds == 1:
         return
-    meta = json.loads((weights.locate(out) / "meta" / "metadata").read_text())
-    progress = meta["progress"]
+    progress = checkpoint.read_meta(out, schema)[1]["progress"]
     values = np.array([[each[name] for name in measured] for each in progress["seeds"]])
     if not len(values):
         return

@@ -50,7 +50,7 @@ Ctrl-C saves and stops; --resume then continues bit for bit (on the same CPU).
 All devices of all processes share each update: docs/scaling.md."""
 
 TASK_PARTS: dict[str, type] = {"ppo": StreamsConfig, "policy": PolicyConfig}
-_ABOVE = ("num_episodes", "num_updates", "seed")  # flags above the groups
+_ABOVE = ("num_episodes", "num_updates", "seed", "num_seeds")  # flags above the groups
 _NAMES = {"num_episodes": "episodes", "num_updates": "updates", "num_seeds": "seeds"}
 
 
@@ -147,10 +147,10 @@ def values_of(arguments: argparse.Namespace, task: bool) -> dict[str, Any]:
     """
     own = {f.name for part in TASK_PARTS.values() for f in settings_of(part)}
     other = presets.field_names()
-    read = {*(own if task else other), "num_seeds"}
+    read = own if task else other
     given = {
         name: value
-        for name in {*own, *other, "num_seeds"}
+        for name in own | other
         if (value := getattr(arguments, name)) is not None
     }
     unread = {flag_of(name) for name in set(given) - read}

@@ -340,7 +340,10 @@ def test_the_averaged_weights_owe_nothing_to_the_initial_ones(rng):
             config,
             4,
             jax.grad(
-                lambda params, index: (((params["w"] - data[index]) ** 2).sum(), {}),
+                lambda params, index: (
+                    ((params["w"][None] - data[index]) ** 2).sum(),
+                    {},
+                ),
                 has_aux=True,
             ),
             jax.random.key(1),

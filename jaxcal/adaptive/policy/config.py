@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 from jaxcal.adaptive import rules
 from jaxcal.adaptive.policy.network import Network
 from jaxcal.adaptive.policy.sessions import Sessions
 from jaxcal.adaptive.rules import Scored
-from jaxcal.learning.core import streams
-from jaxcal.learning.core.streams import StreamsConfig
+from jaxcal.learning.core.streams import Streams, StreamsConfig
 from jaxcal.learning.settings import require, setting
 
 __all__ = ["PPO", "PolicyConfig"]
@@ -43,7 +42,7 @@ class PolicyConfig:
     width: int = setting(64, "of the network's layers")
     ppo: StreamsConfig = PPO
     seed: int = setting(0, "of everything random")
-    num_seeds: int = 1  # runs side by side: seed, seed + 1, ...
+    num_seeds: int = setting(1, "runs side by side: seed, seed + 1, ...")
     validate_every: float = 30.0  # seconds between validations
     save_every: float = 60.0  # seconds between checkpoints
 
@@ -57,10 +56,9 @@ class PolicyConfig:
             )
 
     @property
-    def learners(self) -> tuple[streams.Streams, ...]:
+    def learners(self) -> tuple[Streams, ...]:
         """One: other options are other arrays of the same program."""
-        network = cast(streams.Network, Network(self.width))
-        return (streams.Streams(self.ppo, Sessions(self.per_group), network),)
+        return (Streams(self.ppo, Sessions(self.per_group), Network(self.width)),)
 
     def as_meta(self) -> dict[str, Any]:
         """Plain JSON values; ``from_meta`` reads them back."""

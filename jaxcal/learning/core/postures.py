@@ -32,7 +32,7 @@ from jaxcal.learning.core.ppo import (
 )
 from jaxcal.learning.settings import require, setting
 
-__all__ = ["Episode", "EpisodesConfig", "Postures", "play"]
+__all__ = ["Episode", "EpisodesConfig", "Postures"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,9 +140,110 @@ class Postures:
         return jax.vmap(self.task.reset)(keys)
 
     def gather(self, params: Any, rows: Any, key: jax.Array) -> tuple[Batch, Metrics]:
-        """Play ``episodes_per_set`` episodes on every set."""
+        """Play ``episodes_per_set`` episodes on every set.
+
+        Returns:
+            What was played, rows (B,) of decisions (T, G); metrics: scalars, and
+            ``rewards`` (episodes_per_update,).
+        """
+        config, task, network = self.config, self.task, self.network
+        repeats = config.episodes_per_set
         _, key_actions, key_starts = jax.random.split(key, 3)
-        return play(self, params, rows, key_actions, key_starts)
+        features = network.candidate_features(rows.candidates, rows.available)
+        memory = encode(network, params, features)
+
+        def of_every_episode(leaf: jax.Array) -> jax.Array:
+            return jnp.broadcast_to(leaf[None], (repeats, *leaf.shape))
+
+        states = jax.tree.map(of_every_episode, rows)
+        # The rules are those of one episode.
+        advance = jax.vmap(jax.vmap(task.step))
+        paid_of, outcome_of = (
+            jax.vmap(jax.vmap(task.paid)),
+            jax.vmap(jax.vmap(task.outcome)),
+        )
+        length = _start_lengths(task, (repeats, len(rows.available)), key_starts)
+        learned = task.num_decisions - network.num_unlearned
+        seen: list[Any] = []
+        out: list[Metrics] = []
+        final = jnp.zeros(length.shape)
+        for step, key_step in enumerate(
+            jax.random.split(key_actions, task.num_decisions)
+        ):
+            key_policy, key_random = jax.random.split(key_step)
+
+            def view(states: Any, step: int = step) -> tuple[Any, jax.Array, jax.Array]:
+                decision = network.decision_features(
+                    features, states.chosen, states.available, step
+                )
+                if step < learned:
+                    return decision, *decode(network, params, memory, decision)
+                return decision, *network.lookahead_logits(decision)
+
+            if step == 0:  # one decision for all episodes of a set
+                decision, *scored = view(rows)
+                logits, value = (of_every_episode(leaf) for leaf in scored)
+            else:
+                decision, logits, value = jax.vmap(view)(states)
+            if step < learned:
+                seen.append(decision)
+            action = jax.random.categorical(key_policy, logits)
+            if task.random_starts > 0.0:
+                blind = mask_logits(jnp.zeros_like(logits), states.available)
+                action = jnp.where(
+                    step < length, jax.random.categorical(key_random, blind), action
+                )
+            # What was paid already is not to come: the value is of the rest.
+            paid = paid_of(states)
+            states, reward, _ = advance(states, action)
+            final = final + reward
+            log_probs = jax.nn.log_softmax(logits)
+            log_prob = jnp.take_along_axis(log_probs, action[..., None], axis=-1)[
+                ..., 0
+            ]
+            out.append(
+                {
+                    "action": action.astype(jnp.int32),
+                    "log_prob": log_prob,
+                    "value": value * task.value_scale - paid,
+                    "paid": paid,
+                    "reward": reward,
+                    "counted": (step >= length).astype(logits.dtype),
+                    "entropy": -(jnp.exp(log_probs) * log_probs).sum(-1),
+                }
+            )
+        played = {name: jnp.stack([each[name] for each in out]) for name in out[0]}
+        own = (length == 0).astype(final.dtype)
+        advantage, target = _advantages_and_targets(config, played, own)
+        # The last choices, made by the look-ahead alone, are not learned from.
+        counted, entropy = played["counted"][:learned], played["entropy"][:learned]
+        axes = (1, 2) if config.normalise_per_decision else (0, 1, 2)
+        advantage = normalised(config, advantage[:learned], counted, axes)
+
+        def by_set(leaf: jax.Array) -> jax.Array:
+            return jnp.moveaxis(leaf[:learned], 2, 0)  # (T, G, B) -> (B, T, G)
+
+        def stacked(*leaves: jax.Array) -> jax.Array:
+            return jnp.moveaxis(jnp.stack(leaves), 2, 0)
+
+        later = jax.tree.map(stacked, *seen[1:]) if learned > 1 else None
+        batch = Batch(
+            seen=Seen(features, seen[0], later),
+            action=by_set(played["action"]),
+            log_prob=by_set(played["log_prob"]),
+            advantage=by_set(advantage),
+            target=by_set(target),
+            counted=by_set(counted),
+        )
+        outcome = (outcome_of(states) * own).sum() / jnp.maximum(own.sum(), 1.0)
+        metrics = {
+            "rewards": final.reshape(-1),
+            "reward_mean": final.mean(),
+            "reward_std": final.std(),
+            "log_det_mean": outcome,
+            "entropy": (entropy * counted).sum() / jnp.maximum(counted.sum(), 1.0),
+        }
+        return batch, metrics
 
     def loss(
         self, params: Any, experience: Batch, done: jax.Array
@@ -166,121 +267,6 @@ class Postures:
             logits = jnp.concatenate([logits, more[0]], axis=1)
             value = jnp.concatenate([value, more[1]], axis=1)
         return logits, value * self.task.value_scale
-
-
-def play(
-    learner: Postures,
-    params: Any,
-    sets: Any,
-    key_actions: jax.Array,
-    key_starts: jax.Array,
-) -> tuple[Batch, Metrics]:
-    """Play ``episodes_per_set`` episodes on every set.
-
-    Args:
-        learner: what plays, and by which rules.
-        params: of its network.
-        sets: from ``Postures.draw``.
-        key_actions: spent by the policy's choices.
-        key_starts: by the lengths of random starts.
-
-    Returns:
-        What was played, rows (B,) of decisions (T, G); metrics: scalars, and
-        ``rewards`` (episodes_per_update,).
-    """
-    config, task, network = learner.config, learner.task, learner.network
-    repeats = config.episodes_per_set
-    features = network.candidate_features(sets.candidates, sets.available)
-    memory = encode(network, params, features)
-
-    def of_every_episode(leaf: jax.Array) -> jax.Array:
-        return jnp.broadcast_to(leaf[None], (repeats, *leaf.shape))
-
-    states = jax.tree.map(of_every_episode, sets)
-    # The rules are those of one episode.
-    advance = jax.vmap(jax.vmap(task.step))
-    paid_of, outcome_of = (
-        jax.vmap(jax.vmap(task.paid)),
-        jax.vmap(jax.vmap(task.outcome)),
-    )
-    length = _start_lengths(task, (repeats, len(sets.available)), key_starts)
-    learned = task.num_decisions - network.num_unlearned
-    seen: list[Any] = []
-    out: list[Metrics] = []
-    final = jnp.zeros(length.shape)
-    for step, key_step in enumerate(jax.random.split(key_actions, task.num_decisions)):
-        key_policy, key_random = jax.random.split(key_step)
-
-        def view(states: Any, step: int = step) -> tuple[Any, jax.Array, jax.Array]:
-            decision = network.decision_features(
-                features, states.chosen, states.available, step
-            )
-            if step < learned:
-                return decision, *decode(network, params, memory, decision)
-            return decision, *network.lookahead_logits(decision)
-
-        if step == 0:  # one decision for all episodes of a set
-            decision, *scored = view(sets)
-            logits, value = (of_every_episode(leaf) for leaf in scored)
-        else:
-            decision, logits, value = jax.vmap(view)(states)
-        if step < learned:
-            seen.append(decision)
-        action = jax.random.categorical(key_policy, logits)
-        if task.random_starts > 0.0:
-            blind = mask_logits(jnp.zeros_like(logits), states.available)
-            action = jnp.where(
-                step < length, jax.random.categorical(key_random, blind), action
-            )
-        # What was paid already is not to come: the value is of the rest.
-        paid = paid_of(states)
-        states, reward, _ = advance(states, action)
-        final = final + reward
-        log_probs = jax.nn.log_softmax(logits)
-        log_prob = jnp.take_along_axis(log_probs, action[..., None], axis=-1)[..., 0]
-        out.append(
-            {
-                "action": action.astype(jnp.int32),
-                "log_prob": log_prob,
-                "value": value * task.value_scale - paid,
-                "paid": paid,
-                "reward": reward,
-                "counted": (step >= length).astype(logits.dtype),
-                "entropy": -(jnp.exp(log_probs) * log_probs).sum(-1),
-            }
-        )
-    played = {name: jnp.stack([each[name] for each in out]) for name in out[0]}
-    own = (length == 0).astype(final.dtype)
-    advantage, target = _advantages_and_targets(config, played, own)
-    # What is not learned is dropped: the last choices, made by the look-ahead alone.
-    counted, entropy = played["counted"][:learned], played["entropy"][:learned]
-    axes = (1, 2) if config.normalise_per_decision else (0, 1, 2)
-    advantage = normalised(config, advantage[:learned], counted, axes)
-
-    def by_set(leaf: jax.Array) -> jax.Array:
-        return jnp.moveaxis(leaf[:learned], 2, 0)  # (T, G, B) -> (B, T, G)
-
-    def stacked(*leaves: jax.Array) -> jax.Array:
-        return jnp.moveaxis(jnp.stack(leaves), 2, 0)
-
-    later = jax.tree.map(stacked, *seen[1:]) if learned > 1 else None
-    batch = Batch(
-        seen=Seen(features, seen[0], later),
-        action=by_set(played["action"]),
-        log_prob=by_set(played["log_prob"]),
-        advantage=by_set(advantage),
-        target=by_set(target),
-        counted=by_set(counted),
-    )
-    outcome = (outcome_of(states) * own).sum() / jnp.maximum(own.sum(), 1.0)
-    metrics = {
-        "rewards": final.reshape(-1),
-        "reward_mean": final.mean(),
-        "reward_std": final.std(),
-        "log_det_mean": outcome,
-        "entropy": (entropy * counted).sum() / jnp.maximum(counted.sum(), 1.0),
-    }
-    return batch, metrics
 
 
 def _start_lengths(task: Episode, shape: tuple[int, int], key: jax.Array) -> jax.Array:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, Protocol
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -28,7 +29,7 @@ from jaxcal.learning.core.ppo import (
 )
 from jaxcal.learning.settings import require, setting
 
-__all__ = ["Environment", "Network", "Step", "Streams", "StreamsConfig"]
+__all__ = ["Environment", "Step", "Streams", "StreamsConfig"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,26 +83,13 @@ class Environment(Protocol):
         """Take an option: ``action`` () int32 of those in ``seen``."""
 
 
-class Network(Protocol):
-    """A flax module: of what was observed (..., A) masked logits and (...,) values."""
-
-    def __hash__(self) -> int:
-        """It is static to ``jit``."""
-
-    def init(self, *arguments: Any) -> Any:
-        """flax's: fresh parameters."""
-
-    def apply(self, *arguments: Any, **options: Any) -> Any:
-        """flax's: logits and value with given parameters."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Streams:
     """The learner of sessions; it is given one task, or a task for every stream."""
 
     config: StreamsConfig
     environment: Environment
-    network: Network
+    network: nn.Module  # of what is observed: masked logits (..., A), values (...)
     task_per_stream: bool = False  # the task's leaves have a leading axis of streams
 
     def init(self, key: jax.Array, task: Any) -> Any:
@@ -157,26 +145,28 @@ class Streams:
         self, params: Any, experience: Batch, done: jax.Array
     ) -> tuple[jax.Array, Metrics]:
         """PPO's."""
-        logits, value = self.network.apply(params, experience.seen)
+        logits, value = self._score(params, experience.seen)
         return surrogate(self.config, logits, value, experience, done)
+
+    def _score(self, params: Any, seen: Any) -> tuple[jax.Array, jax.Array]:
+        scored: Any = self.network.apply(params, seen)
+        return scored
 
     def _stream(self, params: Any, key: jax.Array, task: Any) -> dict[str, Any]:
         """Sessions one after another, leaves (T + 1, ...)."""
-        environment, network = self.environment, self.network
+        environment = self.environment
 
         def decide(state: Any, key: jax.Array) -> tuple[Any, dict[str, Any]]:
             key_seen, key_action, key_step, key_next = jax.random.split(key, 4)
             seen = environment.observe(task, state, key_seen)
-            logits, value = network.apply(params, seen)
+            logits, value = self._score(params, seen)
             action = jax.random.categorical(key_action, logits).astype(jnp.int32)
             log_probs = jax.nn.log_softmax(logits)
             step = environment.step(task, state, seen, action, key_step)
 
             def value_of(state: Any) -> jax.Array:
-                result: tuple[jax.Array, jax.Array] = network.apply(
-                    params, environment.observe(task, state, key_seen)
-                )
-                return result[1]
+                seen = environment.observe(task, state, key_seen)
+                return self._score(params, seen)[1]
 
             # The value of what happened is the next decision's.
             number = len(step.chance)

@@ -24,7 +24,7 @@ class TrainConfig:
     ppo: EpisodesConfig = field(default_factory=EpisodesConfig)
     tasks: tuple[Task, ...] = field(default=(Task(),))  # update u: tasks[u % len]
     seed: int = setting(0, "of everything random")
-    num_seeds: int = 1  # runs side by side: seed, seed + 1, ...
+    num_seeds: int = setting(1, "runs side by side: seed, seed + 1, ...")
     validate_every: float = 15.0  # seconds between looks at the validation set
     save_every: float = 60.0  # seconds between checkpoints
     about: str = ""  # one line for --help, of a preset

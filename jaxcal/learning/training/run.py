@@ -61,11 +61,6 @@ class Recipe:
     num_imitated: int = 0
     imitate: Callable[[int], tuple[Learner, Any]] | None = None
 
-    @property
-    def keys(self) -> jax.Array:
-        """The key of every run, (num_seeds,)."""
-        return jax.vmap(jax.random.key)(self.seed + jnp.arange(self.num_seeds))
-
     def init(self) -> TrainState:
         """The state before the first update, from the seeds alone."""
         learner, given = self.learners[0], self.given[0]
@@ -74,9 +69,10 @@ class Recipe:
             return ppo.begin(self.ppo, learner, key, *given)
 
         # One program: op by op it would be two hundred small ones, seconds to compile.
-        if self.num_seeds == 1:
-            return jax.jit(begin)(jax.random.key(self.seed))
-        return jax.jit(jax.vmap(begin))(self.keys)
+        keys = [jax.random.key(self.seed + i) for i in range(self.num_seeds)]
+        if len(keys) == 1:
+            return jax.jit(begin)(keys[0])
+        return jax.jit(jax.vmap(begin))(jnp.stack(keys))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,7 +120,7 @@ def run(
         state = devices.replicate(state, mesh)
     done = int(np.ravel(devices.local(state.num_updates))[0])
     seeds = recipe.num_seeds if recipe.num_seeds > 1 else 0
-    count = 1
+    count, timed = 1, False
     with contextlib.ExitStack() as stack:
         diary = None
         if devices.is_first():
@@ -149,9 +145,9 @@ def run(
             if diary is not None:
                 diary.note(state, first, count, rows)
             each = (time.perf_counter() - begun) / count
-            # The first call also compiled: two updates then show how long one takes.
-            count = 2 if first == 0 or count == 1 else int(_CALL_SECONDS / each)
-            count = devices.on_first(functools.partial(max, count, 1))
+            # The first call also compiled, so the second is of one update too.
+            fit = int(_CALL_SECONDS / each) if timed else 1
+            count, timed = devices.on_first(functools.partial(max, fit, 1)), True
     if diary is not None:
         diary.save(state, done)
     return state
