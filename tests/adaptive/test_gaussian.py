@@ -33,9 +33,8 @@ def test_one_at_a_time_gains_what_score_says(case):
     task = GaussianTask.make(model, COMMANDS, most=5, prior=prior, noise=noise)
 
     def log_det(indices):
-        return jaxcal.score(
-            COMMANDS, indices, model=model, prior=prior, noise=noise, criterion="D"
-        ).log_det
+        design = jaxcal.Design(COMMANDS, model, prior, noise)
+        return design.score(indices, "D").log_det
 
     history, chosen, total = [], [], 0.0
     for number in range(5):

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from jaxcal.information.linear_algebra import draw, factor
-from jaxcal.selection import exchange_batch, make_problem, select
+from jaxcal.selection import exchange_batch, select
 from jaxcal.selection.exchange.exchange import exchange_from, exchange_indices
+
+from .questions import make_problem
 
 
 def uniform(seed, m, n=3):
