@@ -115,11 +115,7 @@ def session(task: Any, key: jax.Array) -> tuple[Episodes, jax.Array, jax.Array]:
         options = task.options(belief, at, key_options)
         index = Gain()(task, belief, at, options, key_choice)
         design = jax.tree.map(lambda leaf: leaf[index], options.designs)
-        if isinstance(task, GridTask):
-            gain = belief.gains(task, options)[index]
-        else:  # again with other random numbers: the largest of many is too large
-            chosen = jax.tree.map(lambda leaf: leaf[index][None], options)
-            gain = belief.gains(task, chosen, key_gain)[0]
+        gain = belief.gain(task, design, key_gain)
         outcome = task.measure(truth, design, key_outcome)
         after = (
             belief.update(task, design, outcome, key_update),

@@ -24,12 +24,12 @@ import time
 
 from rig.config import RigConfig, parse_config
 from rig.config.files import EXAMPLES
-from rig.device.bus import Bus
-from rig.device.imu import Imu
-from rig.faults import Fault, StopRequested
-from rig.guard.signals import Signals
-from rig.session.device import Device
-from rig.session.motion import Motion
+from rig.core.bus import Bus
+from rig.core.device import Device
+from rig.core.faults import Fault, StopRequested
+from rig.core.motion import Motion
+from rig.core.phone import Imu
+from rig.signals import Signals
 from rig.simulator import Simulator, Truth, parse_fault
 
 SLOW = {

@@ -13,7 +13,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     args = make_parser().parse_args(argv)
     from jaxcal.extras import MissingExtraError, needs
-    from rig.outputs.journal import JournalError
+    from rig.journal import JournalError
 
     try:
         with needs("rig", "the rig"):

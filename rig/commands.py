@@ -9,10 +9,10 @@ from collections.abc import Callable
 
 from rig.config import example_text, load_config
 from rig.config.files import example_names
-from rig.device.bus import Bus, BusError
-from rig.device.drives import Drive
-from rig.device.lock import BusLock
-from rig.faults import EXIT_FAULT, EXIT_OK
+from rig.core.bus import Bus, BusError
+from rig.core.drive import Drive
+from rig.core.faults import EXIT_FAULT, EXIT_OK
+from rig.core.lock import BusLock
 from rig.sessions import FILE, journal_of, load, make_simulator, run_session
 
 COMMISSIONING = (

@@ -23,10 +23,10 @@ from rig.config import (
     load_config,
     parse_config,
 )
-from rig.device.lock import BusLock
-from rig.device.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
-from rig.faults import EXIT_FAULT, EXIT_OK, Refused
-from rig.session.folder import new_run_folder
+from rig.core.faults import EXIT_FAULT, EXIT_OK, Refused
+from rig.core.lock import BusLock
+from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
+from rig.journal import new_run_folder
 from rig.sessions import FILE, load, make_simulator
 
 if TYPE_CHECKING:

@@ -10,19 +10,19 @@ from typing import Any
 
 from jaxcal.files import write_text
 from rig.config import parse_config
-from rig.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault, Refused
+from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault, Refused
 from rig.sessions import recorded, records_of
 
 
 def refit(args: argparse.Namespace) -> int:
     """Identify a recorded calibration anew, into a folder of its own."""
     from rig.commission.toml import set_values
+    from rig.core.record import check_matrix
     from rig.identification.conclusion import conclude
     from rig.identification.refit import require_angles, reread
+    from rig.journal import RunFolder, new_run_folder
     from rig.outputs.console import recalibrate, summary_lines
     from rig.outputs.report import write_report
-    from rig.session.checks import check_matrix
-    from rig.session.folder import RunFolder, new_run_folder
 
     held = records_of(args.run)
     then, start = recorded(args)

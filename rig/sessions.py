@@ -17,12 +17,12 @@ from rig.config import (
     load_config,
     parse_config,
 )
-from rig.faults import Refused
+from rig.core.faults import Refused
 
 if TYPE_CHECKING:
-    from rig.device.record import DeviceRecord
-    from rig.session.reference import KeptZero
-    from rig.session.run import Run
+    from rig.core.record import DeviceRecord
+    from rig.core.session import Run
+    from rig.core.zero import KeptZero
     from rig.simulator import Simulator
 
 FILE = pathlib.Path("rig.toml")  # without --config
@@ -63,11 +63,12 @@ def make_simulator(
 
 def run_session(args: argparse.Namespace) -> int:
     """Run a session, new or resumed; returns the exit code."""
-    from rig.device.lock import BusLock
-    from rig.device.record import DeviceRecord
-    from rig.session.folder import new_run_folder
-    from rig.session.run import Run
-    from rig.session.runner import run_safely
+    from rig.core.lock import BusLock
+    from rig.core.record import DeviceRecord
+    from rig.core.session import Run, run_safely
+    from rig.journal import new_run_folder
+    from rig.outputs.console import listen
+    from rig.signals import Signals
 
     resumed = args.command == "resume"
     config, start = recorded(args) if resumed else _new(args)
@@ -108,7 +109,9 @@ def run_session(args: argparse.Namespace) -> int:
             zero_at=zero_at,
             kept_zero=kept_zero,
             dry_run=dry_run,
+            signals=Signals(),
         )
+        listen(session)
         if simulator is None:
             session.confirm = functools.partial(_confirm, args)
         else:
@@ -141,7 +144,7 @@ def _new(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
 
 def journal_of(run: pathlib.Path) -> pathlib.Path:
     """The journal in a run's folder; Refused where there is none."""
-    from rig.session.folder import JOURNAL
+    from rig.journal import JOURNAL
 
     if not (run / JOURNAL).is_file():
         raise Refused(f"{run} holds no run: there is no {JOURNAL} in it")
@@ -150,7 +153,7 @@ def journal_of(run: pathlib.Path) -> pathlib.Path:
 
 def records_of(run: pathlib.Path) -> list[dict[str, Any]]:
     """The journal of a run; Refused where its folder holds none, or a damaged one."""
-    from rig.outputs.journal import JournalError, read_journal
+    from rig.journal import JournalError, read_journal
 
     try:
         records = read_journal(journal_of(run))
@@ -181,7 +184,7 @@ def _procedure(
     """What a session does, and the zero posture that it must find."""
     import numpy as np
 
-    from rig.session import calibrate, checking
+    from rig.procedures import calibrate, checking
 
     if mode == "calibrate":
         return calibrate.calibrate, None
@@ -207,7 +210,7 @@ def _commission(config: RigConfig, record: DeviceRecord, simulator: Simulator) -
     """
     from rig.commission.operator import Operator
     from rig.commission.steps import Place, begin_simulated
-    from rig.device.record import SIGN_CHECKED
+    from rig.core.record import SIGN_CHECKED
 
     folder = record.path.parent / "axes"
     folder.mkdir(exist_ok=True)

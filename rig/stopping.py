@@ -15,12 +15,12 @@ from typing import Any
 from rig.config.salvage import Stoppable, read_for_stop
 from rig.config.schema import ConfigError
 from rig.config.settings import BusSettings
-from rig.device.bus import Bus, BusError
-from rig.device.drives import Drive
-from rig.device.lock import BusLock, held_by
-from rig.faults import EXIT_FAULT, EXIT_OK, Fault, Refused
-from rig.guard.signals import Signals
-from rig.guard.stop import UnitStop, stop_all
+from rig.core.bus import Bus, BusError
+from rig.core.drive import Drive
+from rig.core.faults import EXIT_FAULT, EXIT_OK, Fault, Refused
+from rig.core.lock import BusLock, held_by
+from rig.core.stop import UnitStop, stop_all
+from rig.signals import Signals
 
 HOLDER_S = 5.0  # for a session to see its drives stand, and to end
 HOLDER_WAITS = 6  # and so many times the bus's timeout, for units that do not answer
@@ -86,7 +86,7 @@ def _ask_holder(lock: BusLock, timeout_s: float) -> str:
 
 def _reported(holder: dict[str, Any], since: float) -> str:
     """The lines of the stop that a session journalled since it was asked."""
-    from rig.outputs.journal import JournalError, read_journal
+    from rig.journal import JournalError, read_journal
 
     if not holder.get("run"):
         return ""

@@ -1,8 +1,8 @@
 """The next measurement from the last: where information depends on what is measured.
 
-A task (``GridTask``, ``ParticleTask``, ``GaussianTask``) says what is unknown, what may
-be measured and what it costs; a belief is what is known; a decider picks what comes
-next. ``next_measurement`` answers at the bench, ``run`` closes the loop, ``play`` and
+A task (``GridTask``, ``ParticleTask``) says what is unknown, what may be measured and
+what it costs; a belief is what is known; a decider picks what comes next.
+``next_measurement`` answers at the bench, ``run`` closes the loop, ``play`` and
 ``compare`` try deciders on thousands of sessions. Names load on first use.
 """
 
@@ -13,13 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxcal.adaptive.episodes import compare, play
-    from jaxcal.adaptive.gaussian import GaussianTask
     from jaxcal.adaptive.grid import GridBelief, GridTask
     from jaxcal.adaptive.loop import next_measurement, run
     from jaxcal.adaptive.particles import ParticleBelief, ParticleTask
 
 __all__ = [
-    "GaussianTask",
     "GridBelief",
     "GridTask",
     "ParticleBelief",
@@ -31,7 +29,6 @@ __all__ = [
 ]
 
 _HOME = {
-    "GaussianTask": "gaussian",
     "GridBelief": "grid",
     "GridTask": "grid",
     "ParticleBelief": "particles",

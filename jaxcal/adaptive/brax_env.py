@@ -61,16 +61,17 @@ class SequentialEnv(Env):
     def step(self, state: State, action: jax.Array) -> State:
         """Make one measurement."""
         now, task = state.pipeline_state, self.task
-        key_outcome, key_update, key = jax.random.split(now.key, 3)
+        key_gain, key_outcome, key_update, key = jax.random.split(now.key, 4)
         place = jnp.where(now.seen.valid[action], action, 0)
         index = now.seen.index[place]
         design = jax.tree.map(lambda leaf: leaf[index], now.options.designs)
+        # By draws of its own: those of ``seen`` chose it, so theirs is too large.
+        gain = now.belief.gain(task, design, key_gain)
         outcome = task.measure(now.truth, design, key_outcome)
         belief = now.belief.update(task, design, outcome, key_update)
         session = task.spend(now.session, design, outcome)
         done = session.over | (session.made >= task.most)
         inside = self._inside(now.truth, belief, session, key)
-        gain = now.seen.gain[place]
         return state.replace(
             pipeline_state=inside,
             obs=_flat(inside.seen),

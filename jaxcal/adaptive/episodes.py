@@ -75,7 +75,7 @@ def _played(task: Task, decider: Decider, keys: jax.Array) -> Episodes:
         options = task.options(belief, session, key_options)
         index = decider(task, belief, session, options, key_choice)
         design = jax.tree.map(lambda leaf: leaf[index], options.designs)
-        gain = belief.gains(task, options, key_gain)[index]
+        gain = belief.gain(task, design, key_gain)
         outcome = task.measure(truth, design, key_outcome)
         after = (
             belief.update(task, design, outcome, key_update),

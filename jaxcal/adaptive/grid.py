@@ -41,13 +41,22 @@ class GridBelief:
         ]
 
     def gains(
-        self, task: GridTask, options: Options, key: jax.Array | None = None
+        self,
+        task: GridTask,
+        options: Options | None = None,
+        key: jax.Array | None = None,
     ) -> jax.Array:
         """(A,) nats: entropy of the outcome less its entropy if theta were known."""
         p = self.predictive(task)
         outcome = -(p * jnp.log(p + _SMALL)).sum(axis=-1)
         noise = [(part.p_log_p @ w).sum(axis=-1) for part, w in self._parts(task)]
         return jnp.maximum(outcome + task.by_design(noise), 0.0)
+
+    def gain(
+        self, task: GridTask, design: jax.Array, key: jax.Array | None = None
+    ) -> jax.Array:
+        """() nats of one design: exact, so it is that of ``gains``."""
+        return self.gains(task)[design]
 
     def entropies_after(self, task: GridTask) -> jax.Array:
         """(A, Y) nats after each outcome, of what its design depends on alone."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from jaxcal.checks import seconds as checked_seconds
 
 __all__ = [
     "History",
+    "StepKeys",
     "after",
     "begin",
     "checked",
@@ -69,14 +70,22 @@ def begin(
     return belief, session
 
 
-def step_keys(seed: int, number: int) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Keys of options, choice and update of measurement ``number``, from 0.
+class StepKeys(NamedTuple):
+    """What one measurement draws with."""
+
+    options: jax.Array
+    choice: jax.Array
+    update: jax.Array  # of the belief
+    gain: jax.Array  # of the design chosen: other draws than those that chose it
+
+
+def step_keys(seed: int, number: int) -> StepKeys:
+    """Keys of measurement ``number``, from 0.
 
     They depend on the number alone, so that a resumed session goes on as it would have.
     """
     key = jax.random.fold_in(jax.random.key(seed), number)
-    key_options, key_choice, key_update = jax.random.split(key, 3)
-    return key_options, key_choice, key_update
+    return StepKeys(*jax.random.split(key, 4))
 
 
 def replay(
@@ -103,7 +112,7 @@ def replay(
                 f"{where} was measured after the budget was spent: {_left(session)}"
             )
         entries.append(checked(task, belief, session, design, outcome, where))
-        _, _, key = step_keys(seed, number)
+        key = step_keys(seed, number).update
         belief, session = after(task, belief, session, *entries[-1], key)
         if any(np.isnan(leaf).any() for leaf in _floats(belief)):
             raise ValueError(

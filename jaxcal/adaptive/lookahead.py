@@ -34,16 +34,19 @@ class TwoStep:
         score = log_score(gains, prices)
         index, valid = shortlist(task, score, options, self.per_group)
 
+        # The same of every candidate and outcome, so that these are compared in pairs.
+        keys = jax.random.split(key_next, 4)
+
         def follow(index: jax.Array) -> tuple[jax.Array, jax.Array]:
             """Expected gain and price of the choice after a measurement."""
             design = jax.tree.map(lambda leaf: leaf[index], options.designs)
-            outcomes, p = belief.outcomes(task, design, key_next)
+            outcomes, p = belief.outcomes(task, design, keys[0])
 
             def after(outcome: Any) -> tuple[jax.Array, jax.Array]:
-                then = belief.update(task, design, outcome, key_next)
+                then = belief.update(task, design, outcome, keys[1])
                 left = task.spend(session, design, outcome)
-                follow = task.options(then, left, key_next)
-                gains, prices = self.base.judged(task, then, left, follow, key_next)
+                follow = task.options(then, left, keys[2])
+                gains, prices = self.base.judged(task, then, left, follow, keys[3])
                 chosen = best(log_score(gains, prices), follow)
                 going = ~(left.over | (left.made >= task.most))
                 # The price counts also where the session ends: an end is not cheap.

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxcal.adaptive.history import (
     History,
+    StepKeys,
     after,
     begin,
     checked,
@@ -130,7 +131,7 @@ def run(
             entry = checked(task, belief, session, proposal.design, outcome, where)
             if file is not None:
                 file.append(design=_leaves(entry[0]), outcome=_leaves(entry[1])[0])
-            _, _, key = step_keys(seed, proposal.number)
+            key = step_keys(seed, proposal.number).update
             belief, session = after(task, belief, session, *entry, key)
             entries.append(entry)
     finally:
@@ -148,10 +149,8 @@ def _proposal(
     number = int(session.made)
     if bool(session.over) or number >= task.most:
         return Proposal(None, None, 0.0, 0.0, 0.0, number, belief, session)
-    key_options, key_choice, _ = step_keys(seed, number)
-    design, gain, took, uses, any_left = _choose(
-        task, decider, belief, session, key_options, key_choice
-    )
+    keys = step_keys(seed, number)
+    design, gain, took, uses, any_left = _choose(task, decider, belief, session, keys)
     if not took >= 0.0:
         raise ValueError(f"a measurement must cost at least 0 s, got {float(took):g}")
     if not any_left:
@@ -171,16 +170,14 @@ def _choose(
     decider: Decider,
     belief: Any,
     session: Session,
-    key_options: jax.Array,
-    key_choice: jax.Array,
+    keys: StepKeys,
 ) -> tuple[Any, ...]:
-    options = task.options(belief, session, key_options)
-    index = decider(task, belief, session, options, key_choice)
-    gains = belief.gains(task, options, key_choice)
+    options = task.options(belief, session, keys.options)
+    index = decider(task, belief, session, options, keys.choice)
     seconds, uses = task.expected(belief, session, options)
     design = jax.tree.map(lambda leaf: leaf[index], options.designs)
-    left = options.allowed.any()
-    return design, gains[index], seconds[index], uses[index], left
+    gain = belief.gain(task, design, keys.gain)
+    return design, gain, seconds[index], uses[index], options.allowed.any()
 
 
 def _budget(seconds: float) -> float | str:

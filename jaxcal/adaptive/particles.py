@@ -141,6 +141,12 @@ class ParticleBelief:
             options.designs
         )
 
+    def gain(self, task: ParticleTask, design: Any, key: jax.Array) -> jax.Array:
+        """() nats of one design: ``gains`` of it alone, by draws of its own."""
+        alone = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], design)
+        only = Options(alone, jnp.zeros(1), jnp.ones(1, bool))
+        return self.gains(task, only, key)[0]
+
     def update(
         self, task: ParticleTask, design: Any, outcome: jax.Array, key: jax.Array
     ) -> ParticleBelief:

@@ -47,6 +47,13 @@ class Belief(Protocol):
     def gains(self, task: Any, options: Options, key: jax.Array) -> jax.Array:
         """(A,) nats that each measurement is expected to tell; at least 0."""
 
+    def gain(self, task: Any, design: Any, key: jax.Array) -> jax.Array:
+        """() nats that one measurement is expected to tell.
+
+        With a key of its own it is unbiased for a design that was chosen by ``gains``:
+        the largest of some noisy estimates is on average too large.
+        """
+
     def update(self, task: Any, design: Any, outcome: Any, key: jax.Array) -> Any:
         """The belief after a measurement."""
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 __all__ = [
     "Whitened",
+    "coarseness",
     "largest_rank",
     "log_det_blocks",
     "missing_directions",
@@ -193,9 +194,18 @@ def largest_rank(blocks: Array) -> int:
     return rank
 
 
-def missing_directions(blocks: Array, root: Array) -> list[Array]:
+def missing_directions(blocks: Array, root: Array, coarse: float = 1.0) -> list[Array]:
     """Directions (p,) that neither blocks (N, q, p) nor the prior say anything of."""
-    return null_directions(*_stack(blocks, None, root)[:2])
+    rows, largest, _ = _stack(blocks, None, root)
+    return null_directions(rows, coarse * largest)
+
+
+def coarseness(given: object) -> float:
+    """How many times coarser than float64 the numbers of an array are."""
+    kind = getattr(given, "dtype", np.asarray(given).dtype)
+    if isinstance(kind, np.dtype) and kind.kind == "f":
+        return max(1.0, float(np.finfo(kind).eps) / _EPS)
+    return 1.0
 
 
 class Whitened(NamedTuple):
@@ -206,9 +216,17 @@ class Whitened(NamedTuple):
     basis: Array  # (S, p, p): raw blocks times it are whitened
     log_scale: Array  # (S,) log det of unwhitened less whitened information
     singular: NDArray[np.int64]  # the sets whose information is; the rest is not theirs
+    rounding: Array  # (S, M) bound on the error of each whitened block, its norm
 
 
-def whiten(blocks: Array, usable: Mask, root: Array) -> Whitened:
+def whiten(
+    blocks: Array,
+    usable: Mask,
+    root: Array,
+    *,
+    coarse: float = 1.0,
+    computed: bool = False,
+) -> Whitened:
     """Blocks in coordinates where everything measured at once has information I.
 
     With T = prior + sum of the usable ``B_i.T @ B_i`` = R.T R the whitened block is
@@ -219,25 +237,34 @@ def whiten(blocks: Array, usable: Mask, root: Array) -> Whitened:
         blocks: (S, M, q, p) of S sets.
         usable: (S, M) which count.
         root: (r, p) of the prior precision.
+        coarse: how many times coarser than float64 the numbers are, for the rule of
+            what is singular.
+        computed: the blocks are rounded themselves, as a model's derivatives are.
     """
     num_sets, count, q, p = blocks.shape
     everything = bool(usable.all())
     rows, largest, shift = _stack(blocks, None if everything else usable, root)
+    coarsest = coarse * largest
     gram = np.matrix_transpose(rows) @ rows
     norms = np.sqrt(np.diagonal(gram, axis1=1, axis2=2))
     scale = np.where(norms == 0.0, 1.0, norms)
     triangle, inverse = _triangle(gram, rows, scale)
     pivots = np.abs(np.diagonal(triangle, axis1=1, axis2=2))
     # A cheap test first: only a set that looks nearly singular pays for the rule.
-    doubtful = (norms < 1e-6 * largest).any(axis=1) | (pivots < 1e-6).any(axis=1)
+    doubtful = (norms < 1e-6 * coarsest).any(axis=1) | (pivots < 1e-6).any(axis=1)
     at = np.flatnonzero(doubtful)
     if at.size:
-        at = at[np.isneginf(rank_rule(rows[at], largest[at], count)[1])]
+        at = at[np.isneginf(rank_rule(rows[at], coarsest[at], count)[1])]
         inverse[at] = np.eye(p)
     with np.errstate(divide="ignore"):
         log_scale = 2.0 * np.log(pivots * scale).sum(axis=1)
     basis = inverse / scale[:, :, None]
     white = rows @ basis
+    size = np.abs(rows[:, : count * q])
+    if computed:
+        size = size + largest[:, None]
+    error = (_EPS * p * (size @ np.abs(basis))).reshape(num_sets, count, q * p)
+    rounding = np.sqrt((error * error).sum(axis=2))
     of_prior = white[:, count * q :]
     return Whitened(
         white[:, : count * q].reshape(num_sets, count, q, p),
@@ -245,6 +272,7 @@ def whiten(blocks: Array, usable: Mask, root: Array) -> Whitened:
         basis - shift @ basis,
         log_scale,
         at,
+        rounding,
     )
 
 

@@ -8,8 +8,7 @@ kind      phi                          names   reported value               effi
 ========  ===========================  ======  ===========================  ==========
 ``det``   -log det V                   D, Ds   log det V^-1, larger better  e^((v-b)/s)
 ``trace`` -trace V                     A I As  trace V, smaller better      b / v
-``least`` smallest eigenvalue of       E       the same, larger better      v / b
-          ``C^-T M C^-1``
+``least`` 1 / largest eigenvalue of V  E       the same, larger better      v / b
 ========  ===========================  ======  ===========================  ==========
 
 v is the value of a selection, b that of the optimum or a bound on it, s the rows of C.
@@ -54,15 +53,11 @@ class Criterion:
         return self.kind != "trace"
 
     def value(self, information: Array) -> Array:
-        """phi (...,) of information matrices (..., p, p).
-
-        -inf where M is singular to rounding, for "least" its smallest eigenvalue then
-        too, which is zero to rounding.
-        """
-        if self.kind == "least":
-            return np.linalg.eigh(self._scaled(information))[0][..., 0]
+        """phi (...,) of information matrices (..., p, p); -inf where singular."""
         half, regular = self._half(information)
-        if self.kind == "trace":
+        if self.kind == "least":
+            phi = np.linalg.norm(half, 2, axis=(-2, -1)) ** -2.0
+        elif self.kind == "trace":
             phi = -(half * half).sum(axis=(-2, -1))
         else:
             phi = -np.linalg.slogdet(half @ np.matrix_transpose(half))[1]
@@ -70,16 +65,26 @@ class Criterion:
 
     def gradient(self, information: Array) -> Array:
         """G (..., p, p), a supergradient of phi at nonsingular M (..., p, p)."""
-        if self.kind == "least":
-            lowest = np.linalg.eigh(self._scaled(information))[1][..., :1]
-            lowest = np.linalg.inv(self.root) @ lowest
-            return lowest @ np.matrix_transpose(lowest)
         solved: NDArray[Any] = np.linalg.solve(information, self.root.T)
+        if self.kind == "least":
+            solved = self._weakest(solved)
+            return solved @ np.matrix_transpose(solved)
         inner = np.matrix_transpose(solved)
         if self.kind == "det":
             inner = np.linalg.solve(self.root @ solved, inner)
         gradient = solved @ inner
         return (gradient + np.matrix_transpose(gradient)) / 2.0
+
+    def _weakest(self, solved: Array) -> Array:
+        """(..., p, 1) y of the least ``y.T M y`` with ``|C y| = 1``, of ``M^-1 C.T``.
+
+        An eigenvector of the largest eigenvalue of V leads there. M in the coordinates
+        of the parameters, ``C^-T M C^-1``, is never made: where commands are far from
+        zero, double precision does not hold its smallest eigenvalue.
+        """
+        covariance = self.root @ solved
+        across = solved @ np.linalg.eigh(covariance)[1][..., -1:]
+        return across / np.linalg.norm(self.root @ across, axis=-2, keepdims=True)
 
     def reported(self, phi: Array | float) -> Array | float:
         """The value as the caller reads it."""
@@ -91,18 +96,21 @@ class Criterion:
         """Share in (0, 1] of the best possible, of reported values."""
         if self.kind == "det":
             return float(np.exp((value - bound) / (self.times * len(self.root))))
+        if value == bound:  # both may be zero: predictions that nothing depends on
+            return 1.0
         return float(bound / value if self.kind == "trace" else value / bound)
+
+    def bettered(self, value: float, share: float) -> float:
+        """A reported value where every variance is smaller by ``share`` of itself."""
+        if self.kind == "det":
+            return value + self.times * len(self.root) * float(np.log1p(share))
+        return value / (1.0 + share) if self.kind == "trace" else value * (1.0 + share)
 
     def enough(self, phi: float, efficiency: float) -> float:
         """The largest phi of a bound that proves ``efficiency`` of a selection."""
         if self.kind == "det":
             return phi - len(self.root) * float(np.log(efficiency))
         return phi * efficiency if self.kind == "trace" else phi / efficiency
-
-    def _scaled(self, information: Array) -> Array:
-        """``C^-T M C^-1``."""
-        inverse = np.linalg.inv(self.root)
-        return inverse.T @ information @ inverse
 
     def _half(self, information: Array) -> tuple[Array, NDArray[np.bool_]]:
         """H (..., s, p) with ``H @ H.T = V``, and where M is not singular."""

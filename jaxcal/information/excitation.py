@@ -17,6 +17,7 @@ def require_excited(
     names: tuple[str, ...],
     argument: str = "commands",
     which: str = "postures",
+    coarse: float = 1.0,
 ) -> None:
     """Refuse commands (N, n) that leave a direction unexcited, and name it.
 
@@ -25,10 +26,12 @@ def require_excited(
         names: n names of the axes.
         argument, which: what the message calls the commands: "candidates must vary in
             every direction, but the 5 available ones lie in one plane ...".
+        coarse: how many times coarser than float64 the numbers are.
     """
     count, n = commands.shape
     offset = commands - commands.mean(axis=0) if count else commands
-    null = null_directions(offset, np.abs(commands).max(axis=0, initial=0.0))
+    largest = np.abs(commands).max(axis=0, initial=0.0)
+    null = null_directions(offset, coarse * largest)
     if count >= n + 1 and not null:
         return
     never = directions_in_words("the direction{} never excited: ", null, names)

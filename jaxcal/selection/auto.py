@@ -61,7 +61,7 @@ def solve(
             f"the exact search ran out of time after {limit:g} s with a {name} "
             f"of at least {proven_share:.6f} proven; {least_efficiency:g} was asked for"
         )
-    stopped = not result.proven and close
+    stopped = not result.proven and close and not result.rounding
     return as_found(
         result,
         method="exchange" if stopped else "exact",

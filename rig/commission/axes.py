@@ -13,8 +13,8 @@ from rig.commission.proposals import Change, lines, proposals
 from rig.commission.stands import Stand, turn
 from rig.config import AXIS_NAMES
 from rig.config.axis import Pulses
-from rig.device.record import SIGN_CHECKED
-from rig.faults import MotionFault, Refused
+from rig.core.faults import MotionFault, Refused
+from rig.core.record import SIGN_CHECKED
 
 LOOK_DEG = 0.5  # the first move of an axis whose gearing is not proved
 REACH_DEG = 3.0  # each way

@@ -6,16 +6,17 @@ import pathlib
 from collections.abc import Callable
 from typing import Any
 
-from rig.attitude import Array, angle_between_deg
 from rig.config import RigConfig
 from rig.config.axis import Axis
-from rig.device.record import DeviceRecord
-from rig.faults import MotionFault
-from rig.session.checks import check_record
-from rig.session.device import Device
-from rig.session.folder import new_run_folder
-from rig.session.motion import Motion
-from rig.session.run import Run
+from rig.core.attitude import Array, angle_between_deg
+from rig.core.device import Device
+from rig.core.faults import MotionFault
+from rig.core.motion import Motion
+from rig.core.record import DeviceRecord, check_record
+from rig.core.session import Run
+from rig.journal import new_run_folder
+from rig.outputs.console import listen
+from rig.signals import Signals
 
 SLOW_DEG_S = 5.0
 # The phone may turn by this factor of what is commanded, and always by so much: a first
@@ -86,8 +87,9 @@ class Bench(Run):
         moved = moved.model_copy(update={"motion": motion})
         super().__init__(
             moved, folder, step, say,
-            record=record, start=start, reset_alarms=reset_alarms,
+            record=record, start=start, reset_alarms=reset_alarms, signals=Signals(),
         )  # fmt: skip
+        listen(self)
 
     def check_device(self, device: Device) -> None:
         """Homed drives are where they were left; the gearing is still to be checked."""

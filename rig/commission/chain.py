@@ -8,10 +8,10 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from rig.attitude import ORDERS, Array, euler_to_matrix, matrix_to_euler
 from rig.commission.stands import Stand, rates_of, turn
 from rig.config import AXIS_NAMES, RigConfig
-from rig.faults import MotionFault
+from rig.core.attitude import ORDERS, Array, euler_to_matrix, matrix_to_euler
+from rig.core.faults import MotionFault
 
 CLEAR = 4.0  # standard deviations that make a difference a finding
 

@@ -21,10 +21,10 @@ from jaxcal.adaptive.tasks.backlash import (
     dead_zone_bins,
 )
 from jaxcal.adaptive.tasks.breakaway import Cautious, breakaway
-from rig.attitude import mean_rotation
 from rig.commission.bench import Bench
 from rig.commission.probe import LEVEL, Probe, propose
-from rig.faults import MotionFault
+from rig.core.attitude import mean_rotation
+from rig.core.faults import MotionFault
 
 MOST_DEG = 1.5  # of play
 FAR_DEG = 1.5 * MOST_DEG  # of a move after which play and friction are taken up

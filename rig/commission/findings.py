@@ -19,11 +19,11 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rig.attitude import Array, euler_to_matrix
 from rig.commission.chain import chain
 from rig.commission.stands import Stand, rates_of, turn
 from rig.config import RigConfig
-from rig.faults import MotionFault
+from rig.core.attitude import Array, euler_to_matrix
+from rig.core.faults import MotionFault
 
 NEAREST = 0.7  # cosine: an axis within 45 degrees of where it is expected
 LETTERS = ("X", "Y", "Z")

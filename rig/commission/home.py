@@ -8,11 +8,11 @@ from collections.abc import Callable
 from rig.commission.bench import Bench
 from rig.config import RigConfig
 from rig.config.axis import HIGHEST, LOWEST
-from rig.device.bus import BusError
-from rig.device.drives import Drive
-from rig.device.record import HOMED, ZEROED
-from rig.faults import MotionFault, Refused
-from rig.session.run import ZERO_FACTOR
+from rig.core.bus import BusError
+from rig.core.drive import Drive
+from rig.core.faults import MotionFault, Refused
+from rig.core.record import HOMED, ZEROED
+from rig.core.session import ZERO_FACTOR
 
 HOME_S = 120.0  # for one axis on its own way home
 SET_S, SET_TRIES = 1.0, 3  # until a drive counts from its new zero

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
-from rig.faults import Refused
+from rig.core.faults import Refused
 
 
 class Operator:

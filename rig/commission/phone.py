@@ -8,10 +8,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rig.attitude import angle_between_deg, mean_rotation
 from rig.commission.ports import own_addresses
 from rig.config.settings import ImuSettings
-from rig.device.imu import Imu
+from rig.core.attitude import angle_between_deg, mean_rotation
+from rig.core.phone import Imu
 
 LOOK_S = 1.0
 

@@ -19,12 +19,12 @@ from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.loop import Proposal, next_measurement
 from jaxcal.adaptive.rules import Gain
 from jaxcal.adaptive.session import Decider
-from rig.attitude import Array
 from rig.commission.axes import ROOM_DEG, SEEN_DEG
 from rig.commission.bench import Bench
 from rig.commission.stands import Stand, turn
 from rig.config import AXIS_NAMES
-from rig.faults import MotionFault, Refused
+from rig.core.attitude import Array
+from rig.core.faults import MotionFault, Refused
 
 LEVEL = 0.95
 ENOUGH_DEG = 0.02  # width of an interval

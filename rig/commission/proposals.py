@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from rig.attitude import matrix_to_euler
 from rig.commission.findings import MOUNTING_DEG, Findings
 from rig.config import AXIS_NAMES, RigConfig
 from rig.config.axis import Axis, Scale
+from rig.core.attitude import matrix_to_euler
 
 # Measured against commanded: what A may take up, and what only a wrong gearing does.
 SOUND_RATIO = (0.4, 1.5)

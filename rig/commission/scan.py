@@ -11,7 +11,7 @@ from rig.config.maps import RegisterMap, available_maps, load_map
 from rig.config.registers import Read, decode
 from rig.config.schema import ConfigError, parse
 from rig.config.settings import BusSettings
-from rig.device.bus import Bus, BusError, Rejected
+from rig.core.bus import Bus, BusError, Rejected
 
 # For each absent unit, three times; a drive answers within 25 ms at 9600 baud.
 SCAN_TIMEOUT_S, RETRIES = 0.2, 2

@@ -17,9 +17,9 @@ from rig.commission.toml import edit, new_text, set_values
 from rig.config import AXIS_NAMES, RigConfig, parse_config
 from rig.config.axis import DEFAULT_ROTATES
 from rig.config.settings import BusSettings
-from rig.device.lock import BusLock
-from rig.device.record import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED
-from rig.faults import EXIT_OK, Refused
+from rig.core.faults import EXIT_OK, Refused
+from rig.core.lock import BusLock
+from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED
 
 FORMATS = ["hyperimu", "sensorlogger", "lines"]
 UNITS = 16

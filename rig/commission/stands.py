@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rig.attitude import Array
 from rig.config import AXIS_NAMES
+from rig.core.attitude import Array
 
 
 @dataclasses.dataclass(frozen=True)

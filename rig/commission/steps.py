@@ -18,21 +18,20 @@ from rig.commission.phone import Stream, addresses_text, watch
 from rig.commission.proposals import Change
 from rig.commission.toml import edit
 from rig.config import AXIS_NAMES, RigConfig
-from rig.device.bus import Bus
-from rig.device.drives import Drive
-from rig.device.imu import Imu
-from rig.device.lock import BusLock
-from rig.device.record import (
+from rig.core.bus import Bus
+from rig.core.drive import Drive
+from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault, Refused
+from rig.core.lock import BusLock
+from rig.core.phone import Imu
+from rig.core.record import (
     HOMED,
     IDENTIFIED,
     SIGN_CHECKED,
     STATES,
     DeviceRecord,
 )
-from rig.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault, Refused
-from rig.outputs.journal import Record
-from rig.session.run import STREAM_WAIT_S
-from rig.session.runner import run_safely
+from rig.core.session import STREAM_WAIT_S, run_safely
+from rig.journal import Record
 
 WATCH_S = 5.0
 # Below these a session's settle window would hardly ever fill.
@@ -170,7 +169,7 @@ def jog(place: Place, axis: int, way_deg: float | None) -> int:
 def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> int:
     """Measure play, dead zone and breakaway of an axis, into a calibration."""
     from rig.commission import characterise as measured  # loads JAX
-    from rig.session.checking import calibration_path, keep, load_calibration
+    from rig.procedures.checking import calibration_path, keep, load_calibration
 
     place.require(SIGN_CHECKED)
     path = None if into is None else calibration_path(into)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from rig.config import AXIS_NAMES, RigConfig
+from rig.core.attitude import angles, frame_at
 from rig.identification.drift import estimate_drift, without_drift
 from rig.identification.fit import fit, held_out_errors, pairs, uncertainty
 from rig.identification.noise import (
@@ -16,8 +17,7 @@ from rig.identification.noise import (
     effective_samples,
 )
 from rig.identification.orders import order_residuals
-from rig.outputs.journal import Record
-from rig.readings import angles, frame_at
+from rig.journal import Record
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,9 +13,9 @@ import dataclasses
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rig.attitude import Array, Frame
+from rig.core.attitude import Array, Frame
 from rig.identification.noise import mean_variance
-from rig.outputs.journal import Record
+from rig.journal import Record
 
 SIGNIFICANT = 3.0  # standard deviations
 LEAST = 0.1  # of the limit: less is left alone

@@ -9,10 +9,10 @@ import numpy as np
 from scipy import special
 from scipy.optimize import brentq
 
-from rig.attitude import Array
 from rig.config import AXIS_NAMES, RigConfig
+from rig.core.attitude import Array
 from rig.identification.noise import effective_samples, mean_variance
-from rig.outputs.journal import Record
+from rig.journal import Record
 
 
 def pairs(records: list[Record]) -> tuple[Array, Array]:

@@ -15,8 +15,8 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import brentq
 
-from rig.attitude import Array
-from rig.outputs.journal import Record
+from rig.core.attitude import Array
+from rig.journal import Record
 
 MOST = 0.999  # of phi; a thousand readings are then one
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from rig.attitude import ORDERS, Frame
 from rig.config import RigConfig
+from rig.core.attitude import ORDERS, Frame
 from rig.identification.fit import pairs
-from rig.outputs.journal import Record
+from rig.journal import Record
 
 
 def order_residuals(

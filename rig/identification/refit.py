@@ -12,13 +12,21 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rig.attitude import Array, Frame, euler_to_matrix, matrix_to_euler, mean_rotation
 from rig.config import RigConfig
 from rig.config.settings import ImuSettings
-from rig.faults import Refused
+from rig.core.attitude import (
+    DIGITS,
+    Array,
+    Frame,
+    attitudes,
+    euler_to_matrix,
+    frame_at,
+    matrix_to_euler,
+    mean_rotation,
+)
+from rig.core.faults import Refused
 from rig.identification.conclusion import Evidence
-from rig.outputs.journal import Record, measured_postures
-from rig.readings import DIGITS, attitudes, frame_at
+from rig.journal import Record, measured_postures
 
 
 def require_angles(imu: ImuSettings, changes: dict[str, Any]) -> None:

@@ -15,7 +15,7 @@ from fastapi import FastAPI, HTTPException
 from fastapi.responses import FileResponse, PlainTextResponse
 from nicegui import Client, ui
 
-from rig.faults import Refused
+from rig.core.faults import Refused
 from rig.live.guard import Guard
 from rig.live.page import make_page
 from rig.live.watcher import Watcher

@@ -11,10 +11,10 @@ import time
 from collections import deque
 from typing import Any
 
-from rig.faults import Refused
+from rig.core.faults import Refused
+from rig.journal import is_written
 from rig.live.state import RunState
 from rig.live.tail import Record, Tail
-from rig.outputs.journal import is_written
 from rig.outputs.telemetry import PERIOD_S, TELEMETRY
 
 JOURNAL = "journal.jsonl"

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from rig.config import AXIS_NAMES
-from rig.faults import EXIT_RECALIBRATE
-from rig.guard.stop import UnitStop
+from rig.core.faults import EXIT_RECALIBRATE
+from rig.core.stop import UnitStop
 from rig.live.state import ACTIVE, Degrees, Posture, Record, RunState
 from rig.live.worth import ellipsoid, prediction_std
 from rig.outputs.console import drift_text, error_text, noise_text

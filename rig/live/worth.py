@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rig.attitude import Array
+from rig.core.attitude import Array
 
 NUM_INPUTS = 3
 FLAT_DEG = 1e-6  # nearer to the flat than this is in it

@@ -6,15 +6,47 @@ from typing import Any
 
 import numpy as np
 
-from rig.attitude import Array
 from rig.config import AXIS_NAMES, RigConfig
-from rig.guard.stop import UnitStop
+from rig.core.attitude import Array
+from rig.core.device import Device
+from rig.core.session import Run
+from rig.core.stop import UnitStop
+from rig.outputs.telemetry import Telemetry
 
 
 def numbers(values: Any, width: int = 9, digits: int = 4) -> str:
     """Numbers side by side; what rounds to zero has no sign."""
     rounded = (round(float(value), digits) + 0.0 for value in values)
     return " ".join(f"{value:{width}.{digits}f}" for value in rounded)
+
+
+def listen(run: Run) -> None:
+    """Print what happens in a run, and append what phone and drives say to its files.
+
+    Both are listeners: a session neither waits for them nor needs them.
+    """
+    run.listeners.append(lambda record: run.say(*_lines(run, record)))
+    run.attachments.append(_telemetry)
+
+
+def _telemetry(run: Run, device: Device) -> Telemetry:
+    telemetry = Telemetry(
+        run.folder, run.config, device.imu, device.drives, lambda: device.frame
+    )
+    telemetry.start()
+    return telemetry
+
+
+def _lines(run: Run, record: dict[str, Any]) -> list[str]:
+    if record["event"] != "posture":
+        return event_lines(record)
+    visited, planned, seconds, left = run.progress
+    return [
+        f"  [{visited:>3}/{planned}] {record['name']:<12} "
+        f"u [{numbers(record['commanded_deg'], 8, 3)}]  "
+        f"y [{numbers(record['measured_deg'], 8, 3)}]  {seconds:5.2f} s, "
+        f"about {left:.0f} s left"
+    ]
 
 
 def event_lines(record: dict[str, Any]) -> list[str]:

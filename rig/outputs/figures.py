@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from jaxcal.pages import Figure, Text
-from rig.attitude import Array
 from rig.config import AXIS_NAMES
-from rig.outputs.journal import Record
+from rig.core.attitude import Array
+from rig.journal import Record
 
 MARKERS = {
     "select": "o", "before": "^", "after": "v", "reference": "s", "collect": ".",

@@ -15,6 +15,8 @@ import numpy as np
 
 from jaxcal.pages import Page, Section, Strong, Table, Text, write_page
 from rig.config import AXIS_NAMES
+from rig.core.attitude import angles, recorded_frame
+from rig.journal import Record, measured_postures
 from rig.outputs import figures
 from rig.outputs.console import (
     choice_text,
@@ -25,8 +27,6 @@ from rig.outputs.console import (
     recalibrate,
 )
 from rig.outputs.figures import drawn as _drawn
-from rig.outputs.journal import Record, measured_postures
-from rig.readings import angles, recorded_frame
 
 FOOTER = (
     "Research software, not a medical device. Calibrate with no patient attached; a "

@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from rig.attitude import Frame
 from rig.config import RigConfig
-from rig.device.drives import Drive
-from rig.device.imu import Imu
+from rig.core.attitude import Frame
+from rig.core.drive import Drive
+from rig.core.phone import Imu
 
 TELEMETRY = "telemetry.jsonl"
 OLDER = "telemetry.old.jsonl"  # takes what does not fit into TELEMETRY

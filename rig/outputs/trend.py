@@ -10,11 +10,11 @@ import pathlib
 import numpy as np
 
 from jaxcal.pages import Badge, Block, Page, Section, Table, Text, write_page
-from rig.attitude import Array
 from rig.config import AXIS_NAMES
+from rig.core.attitude import Array
+from rig.journal import JournalError, Record, read_journal
 from rig.outputs.console import recalibrate
 from rig.outputs.figures import drawn, parameters
-from rig.outputs.journal import JournalError, Record, read_journal
 
 NAMES = [f"A[{y}, {u}]" for y in AXIS_NAMES for u in AXIS_NAMES]
 NAMES = [*NAMES, *(f"b[{y}]" for y in AXIS_NAMES)]  # of the twelve parameters

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rig.attitude import Array, euler_to_matrix
 from rig.config.axis import AXIS_NAMES, Axis
 from rig.config.config import RigConfig
+from rig.core.attitude import Array, euler_to_matrix
 from rig.simulator.drive import SimDrive
 
 

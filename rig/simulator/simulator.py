@@ -5,8 +5,8 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-from rig.attitude import Array
 from rig.config.config import RigConfig
+from rig.core.attitude import Array
 from rig.simulator.drive import Habits, SimDrive
 from rig.simulator.faults import FaultInjector, FaultSpec
 from rig.simulator.phone import Phone

@@ -5,7 +5,7 @@ from commission import device, quick_text
 
 from rig.commission import bench, steps
 from rig.config import load_config
-from rig.device.record import (
+from rig.core.record import (
     HOMED,
     IDENTIFIED,
     SIGN_CHECKED,

@@ -34,8 +34,8 @@ from harness import (
 )
 
 from rig.config import parse_config
-from rig.outputs.journal import read_journal
-from rig.session.run import Run
+from rig.core.session import Run
+from rig.journal import read_journal
 from rig.simulator import Simulator, Truth, parse_fault
 
 PHASES = ("zeroing", "moving", "settling", "measuring", "saving")

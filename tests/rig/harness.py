@@ -17,13 +17,14 @@ from unittest import mock
 
 from rig.config import RigConfig, parse_config
 from rig.config.files import EXAMPLES
-from rig.device.lock import BusLock
-from rig.device.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
-from rig.guard import stop
+from rig.core import stop
+from rig.core.lock import BusLock
+from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
+from rig.core.session import Run, run_safely
 from rig.outputs import report
-from rig.session.calibrate import calibrate
-from rig.session.run import Run
-from rig.session.runner import run_safely
+from rig.outputs.console import listen
+from rig.procedures.calibrate import calibrate
+from rig.signals import Signals
 from rig.simulator import Simulator, Truth
 
 # A simulated drive stands within 0.1 s; for a dead one the whole time is waited.
@@ -100,6 +101,13 @@ def simulator(config: RigConfig, **options) -> Simulator:
     return Simulator(config, truth, **options)
 
 
+def make_run(*args, **more) -> Run:
+    """A run as the command line makes it: signals, console and telemetry listen."""
+    run = Run(*args, signals=Signals(), **more)
+    listen(run)
+    return run
+
+
 def session(
     config: RigConfig,
     folder: pathlib.Path,
@@ -115,7 +123,7 @@ def session(
     they are looked at.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    run = Run(
+    run = make_run(
         config,
         folder,
         "calibrate",

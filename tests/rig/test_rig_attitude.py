@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rig.attitude import (
+from rig.core.attitude import (
     ORDERS,
     Frame,
     angle_between_deg,

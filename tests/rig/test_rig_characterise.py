@@ -16,8 +16,8 @@ from test_rig_play import saved
 from rig.commission import bench, characterise, steps
 from rig.commission.operator import Operator
 from rig.commission.probe import ENOUGH_DEG
-from rig.outputs.journal import read_journal
-from rig.session.checking import load_calibration
+from rig.journal import read_journal
+from rig.procedures.checking import load_calibration
 from rig.simulator import Simulator, Truth
 
 pytestmark = pytest.mark.slow  # minutes together; test_rig_play.py is the quick part

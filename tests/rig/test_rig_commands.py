@@ -23,7 +23,7 @@ from harness import (
 import jaxcal
 from rig.__main__ import main
 from rig.arguments import make_parser
-from rig.outputs.journal import read_journal
+from rig.journal import read_journal
 from rig.simulator import Truth, parse_fault
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])

@@ -18,13 +18,13 @@ from rig.commission.jog import FIRST_S, REPEAT_S, Held, Released
 from rig.commission.operator import Operator
 from rig.commission.toml import edit
 from rig.config import load_config
-from rig.device.record import (
+from rig.core.faults import Refused
+from rig.core.record import (
     HOMED,
     SIGN_CHECKED,
     ZEROED,
     DeviceRecord,
 )
-from rig.faults import Refused
 from rig.simulator import Truth
 
 RIG = pathlib.Path(__file__).parents[2]

@@ -19,9 +19,9 @@ from recorder import Recorder, axis_with, rtu_over_tcp
 from rig.config import ConfigError, parse_config
 from rig.config.maps import available_maps, load_map
 from rig.config.settings import BusSettings
-from rig.device.bus import Bus, BusError, Rejected
-from rig.device.drives import Drive
-from rig.guard.stop import stop_all
+from rig.core.bus import Bus, BusError, Rejected
+from rig.core.drive import Drive
+from rig.core.stop import stop_all
 from rig.simulator import parse_fault
 from rig.simulator.server import crc16
 

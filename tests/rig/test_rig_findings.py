@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rig.attitude import ORDERS, angle_between_deg, euler_to_matrix
 from rig.commission.findings import find
 from rig.commission.proposals import proposals
 from rig.commission.stands import Stand
 from rig.config import AXIS_NAMES
-from rig.faults import MotionFault
+from rig.core.attitude import ORDERS, angle_between_deg, euler_to_matrix
+from rig.core.faults import MotionFault
 
 CONFIG = fast_config()
 START = (0, 0, 0)  # the zero posture: the axes are at right angles

@@ -16,8 +16,8 @@ from harness import changed, fast_config
 from scipy.spatial.transform import Rotation
 
 from rig.config.settings import BusSettings
-from rig.device.bus import Bus, BusError
-from rig.device.stream import MAX_LINE, LineSplitter, Parser, StreamFault
+from rig.core.bus import Bus, BusError
+from rig.core.stream import MAX_LINE, LineSplitter, Parser, StreamFault
 from rig.simulator.server import crc16
 
 IMU = changed(fast_config().imu, max_jump_deg=180.0)

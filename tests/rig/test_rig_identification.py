@@ -8,13 +8,20 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from rig.attitude import ORDERS, Frame, euler_to_matrix, mean_rotation
-from rig.device.stream import Reading
+from rig.core.attitude import (
+    ORDERS,
+    Frame,
+    Reading,
+    angles,
+    attitudes,
+    euler_to_matrix,
+    mean_rotation,
+    raw_fields,
+)
 from rig.identification import noise
 from rig.identification.drift import estimate_drift, without_drift
 from rig.identification.fit import uncertainty
 from rig.outputs.console import drift_text, recalibrate
-from rig.readings import angles, attitudes, raw_fields
 from rig.simulator import Truth
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])

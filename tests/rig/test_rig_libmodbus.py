@@ -23,9 +23,9 @@ from scipy.spatial.transform import Rotation
 from rig.__main__ import main
 from rig.config import parse_config
 from rig.config.settings import BusSettings
-from rig.device.bus import Bus, BusError
-from rig.device.drives import Drive
-from rig.guard.stop import stop_all
+from rig.core.bus import Bus, BusError
+from rig.core.drive import Drive
+from rig.core.stop import stop_all
 
 SOURCE = pathlib.Path(__file__).with_name("libmodbus_slave.c")
 MATRIX = np.array([[0.95, 0.03, -0.02], [0.01, 1.04, 0.02], [-0.015, 0.01, 0.9]])

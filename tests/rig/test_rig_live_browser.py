@@ -23,8 +23,8 @@ import pytest
 from harness import changed, fast_text, simulator
 
 from rig.config import parse_config
+from rig.journal import read_journal
 from rig.live.launch import TOKEN
-from rig.outputs.journal import read_journal
 
 pytest.importorskip("nicegui")
 webdriver = pytest.importorskip("selenium.webdriver")

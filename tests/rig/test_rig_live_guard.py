@@ -14,11 +14,11 @@ import urllib.request
 
 import pytest
 
-from rig.faults import Refused
+from rig.core.faults import Refused
+from rig.journal import Journal
 from rig.live import launch, words
 from rig.live.guard import Guard
 from rig.live.watcher import Watcher
-from rig.outputs.journal import Journal
 
 HOST = "192.0.2.7:8642"
 OWN = f"http://{HOST}"

@@ -13,12 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rig.config import parse_config
+from rig.journal import Journal, is_written, read_journal
 from rig.live import charts, words
 from rig.live.state import RunState
 from rig.live.tail import Tail
 from rig.live.watcher import Watcher
 from rig.live.worth import ellipsoid, prediction_std, reasons
-from rig.outputs.journal import Journal, is_written, read_journal
 
 PICTURE = charts.LIGHT
 

@@ -13,10 +13,10 @@ from test_rig_motion import bench
 from rig.config import ConfigError, parse_config
 from rig.config.maps import MAP_FOLDER, RegisterMap, available_maps
 from rig.config.schema import parse
-from rig.device.bus import Bus, BusError
-from rig.device.drives import Drive
-from rig.faults import MotionFault, StopRequested
-from rig.outputs.journal import read_journal
+from rig.core.bus import Bus, BusError
+from rig.core.drive import Drive
+from rig.core.faults import MotionFault, StopRequested
+from rig.journal import read_journal
 from rig.simulator import Simulator, Truth, parse_fault
 
 # Time enough for a busy computer: a reply that is late is one lost reply more.

@@ -8,8 +8,8 @@ shares nothing with the one that is tested.
 import pytest
 from recorder import Recorder, axis_with, rtu_over_tcp
 
-from rig.device.bus import Bus
-from rig.device.drives import Drive
+from rig.core.bus import Bus
+from rig.core.drive import Drive
 from rig.simulator.server import crc16
 
 

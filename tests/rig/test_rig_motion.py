@@ -11,20 +11,19 @@ import pytest
 from harness import HASTY, UNSETTLED, WATCHED, fast_config, fast_text, simulator
 
 from rig.config import parse_config
-from rig.device.bus import Bus
-from rig.device.imu import Imu
-from rig.faults import (
+from rig.core.bus import Bus
+from rig.core.device import Device, approach, check_plan
+from rig.core.faults import (
     LimitError,
     MotionFault,
     PauseRequested,
     StopRequested,
     Unreachable,
 )
-from rig.guard.limits import approach, check_plan
-from rig.guard.signals import Signals
-from rig.session.device import Device
-from rig.session.measuring import Observer
-from rig.session.motion import Motion
+from rig.core.measure import Observer
+from rig.core.motion import Motion
+from rig.core.phone import Imu
+from rig.signals import Signals
 from rig.simulator import parse_fault
 
 
@@ -304,7 +303,7 @@ def test_the_motion_and_stop_modules_never_load_jax():
     import sys
 
     program = (
-        "import sys, rig.session.motion, rig.session.measuring, rig.guard.stop\n"
+        "import sys, rig.core.motion, rig.core.measure, rig.core.stop\n"
         "heavy = {'jax', 'matplotlib', 'numba', 'flax', 'rig.outputs'}\n"
         "heavy &= set(sys.modules)\n"
         "sys.exit(f'loaded {heavy}' if heavy else 0)\n"

@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
-from harness import RATE_HZ, SPEEDUP, commissioned, fast_config
+from harness import RATE_HZ, SPEEDUP, commissioned, fast_config, make_run
 
 import jaxcal
-from rig.faults import Refused
-from rig.session.checking import goto, keep, load_calibration
-from rig.session.play import CHARACTERISED, Play
-from rig.session.run import Run
-from rig.session.runner import run_safely
+from rig.core.faults import Refused
+from rig.core.session import run_safely
+from rig.procedures.checking import goto, keep, load_calibration
+from rig.procedures.play import CHARACTERISED, Play
 from rig.simulator import Simulator, Truth
 
 WIDTH = 0.4
@@ -76,7 +75,7 @@ def test_goto_reaches_through_play(desired, below, tmp_path):
     with Simulator(config, truth, rate_hz=RATE_HZ, speedup=SPEEDUP) as sim:
         folder = tmp_path / "run"
         folder.mkdir()
-        run = Run(sim.start(), folder, "goto", said.append,
+        run = make_run(sim.start(), folder, "goto", said.append,
                   record=commissioned(config, folder))  # fmt: skip
         run.on_imu_port = sim.start_phone
         wanted = np.array(desired)
@@ -92,7 +91,7 @@ def test_a_target_within_the_play_of_a_limit_is_refused(tmp_path):
     config, said = fast_config(), []
     kept = load_calibration(path, config)
     edge = kept.calibration.predict([[19.9, 0.0, 0.0]])[0]
-    run = Run(config, tmp_path, "goto", said.append,
+    run = make_run(config, tmp_path, "goto", said.append,
               record=commissioned(config, tmp_path))  # fmt: skip
     with pytest.raises(Refused, match=r"less its play, 0\.200 deg"):
         goto(run, kept.calibration, edge, kept.play)

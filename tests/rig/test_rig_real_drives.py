@@ -10,9 +10,9 @@ from test_rig_motion import bench
 
 from rig.config import parse_config
 from rig.config.maps import MAP_FOLDER
-from rig.device.drives import Drive
-from rig.faults import MotionFault
-from rig.guard.stop import stop_all
+from rig.core.drive import Drive
+from rig.core.faults import MotionFault
+from rig.core.stop import stop_all
 from rig.simulator import Simulator, Truth, parse_fault
 
 

@@ -7,7 +7,8 @@ from harness import fast_config
 
 from rig.config import parse_config
 from rig.config.config import differences
-from rig.device.record import (
+from rig.core.faults import Refused
+from rig.core.record import (
     HOMED,
     IDENTIFIED,
     SIGN_CHECKED,
@@ -15,7 +16,6 @@ from rig.device.record import (
     ZEROED,
     DeviceRecord,
 )
-from rig.faults import Refused
 
 CONFIG = fast_config()
 

@@ -30,15 +30,14 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from rig.__main__ import main
-from rig.attitude import Frame
 from rig.config import AXIS_NAMES, parse_config
+from rig.core.attitude import Frame, attitudes
 from rig.identification.refit import reread
+from rig.journal import read_journal
 from rig.outputs import trend
 from rig.outputs.console import numbers
 from rig.outputs.export import LANGUAGES, load_inverse
-from rig.outputs.journal import read_journal
 from rig.outputs.report import write_report
-from rig.readings import attitudes
 from rig.simulator import Simulator, Truth
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])

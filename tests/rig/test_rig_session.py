@@ -18,6 +18,7 @@ from harness import (
     commissioned,
     fast_config,
     fast_text,
+    make_run,
     on_phase,
     session,
     simulator,
@@ -26,15 +27,14 @@ from harness import (
 import jaxcal
 from rig.__main__ import main
 from rig.config import parse_config
-from rig.faults import Refused
+from rig.core.faults import Refused
+from rig.core.plan import choose, draw_candidates
+from rig.core.session import run_safely
 from rig.identification.fit import uncertainty
 from rig.identification.orders import order_residuals
-from rig.outputs.journal import read_journal
-from rig.session.calibrate import calibrate
-from rig.session.checking import collect
-from rig.session.planning import choose, draw_candidates
-from rig.session.run import Run
-from rig.session.runner import run_safely
+from rig.journal import read_journal
+from rig.procedures.calibrate import calibrate
+from rig.procedures.checking import collect
 from rig.simulator import Truth
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
@@ -144,8 +144,8 @@ def test_a_finished_run_resumes_to_the_same_without_moving(finished, tmp_path):
 def test_resume_refuses_a_changed_configuration(finished):
     changed = parse_config(fast_text({"std_deg = 0.1": "std_deg = 0.2"}))
     named = r"configuration changed.*settle\.std_deg: 0\.1 then, 0\.2 now"
-    with pytest.raises(Refused, match=named):
-        Run(
+    with pytest.raises(ValueError, match=named):
+        make_run(
             changed, finished[0], "calibrate", [].append,
             record=commissioned(changed, finished[0]),
         )  # fmt: skip
@@ -156,10 +156,10 @@ def test_a_changed_verify_limit_does_not_keep_a_run_from_resuming(finished, tmp_
     table = '\n[session]\nmethod = "exact"\n' + limits
     judged = parse_config(fast_text({"stall_s = 0.3": "stall_s = 0.4"}, session=table))
     record = commissioned(judged, finished[0])
-    Run(judged, finished[0], "calibrate", [].append, record=record).close()
+    make_run(judged, finished[0], "calibrate", [].append, record=record).close()
     other = parse_config(fast_text({"samples = 5": "samples = 6"}, session=table))
-    with pytest.raises(Refused, match=r"settle.samples: 5 then, 6 now"):
-        Run(other, finished[0], "calibrate", [].append, record=record)
+    with pytest.raises(ValueError, match=r"settle.samples: 5 then, 6 now"):
+        make_run(other, finished[0], "calibrate", [].append, record=record)
 
 
 def test_a_resume_that_is_refused_before_it_moves_is_bad_input(tmp_path):
@@ -180,7 +180,7 @@ def test_a_resume_that_is_refused_before_it_moves_is_bad_input(tmp_path):
         assert events.count("pausing") == 1
         assert events.index("pausing") < events.index("paused")
         record = commissioned(served, tmp_path)
-        run = Run(served, tmp_path, "calibrate", said.append, record=record)
+        run = make_run(served, tmp_path, "calibrate", said.append, record=record)
         run.confirm = refuse
         moves = [list(ran) for ran in sim.executions()]
         assert run_safely(run, calibrate) == 2
@@ -258,9 +258,9 @@ def test_a_stop_that_is_lost_while_planning_opens_no_port(tmp_path, monkeypatch)
         runs[0].signals.request_stop("SIGTERM", 143)
         return choose(config, candidates)
 
-    monkeypatch.setattr("rig.session.calibrate.choose", lost)
+    monkeypatch.setattr("rig.procedures.calibrate.choose", lost)
     config = fast_config()
-    runs = [Run(config, tmp_path, "calibrate", said.append,
+    runs = [make_run(config, tmp_path, "calibrate", said.append,
                 record=commissioned(config, tmp_path))]  # fmt: skip
     assert run_safely(runs[0], calibrate) == 143
     assert said[0].startswith("planning: 4 of 50 candidates by exact")
@@ -287,7 +287,7 @@ def test_a_terminal_that_goes_away_stops_the_run_and_not_the_stop(tmp_path):
                 raise BrokenPipeError("Broken pipe")
 
         record = commissioned(served, folder)
-        run = Run(served, folder, "calibrate", broken, record=record)
+        run = make_run(served, folder, "calibrate", broken, record=record)
         run.on_imu_port = sim.start_phone
         assert run_safely(run, calibrate) == 3
         assert all(drive.stops for drive in sim.drives)
@@ -328,7 +328,7 @@ def test_collect_records_a_dataset_and_resumes(tmp_path):
 
         def once():
             record = commissioned(served, folder)
-            run = Run(served, folder, "collect", said.append, record=record)
+            run = make_run(served, folder, "collect", said.append, record=record)
             run.on_imu_port = sim.start_phone
 
             def press(phase):
@@ -355,7 +355,7 @@ def test_the_wrong_euler_order_is_named(finished):
                if r["event"] == "posture"]  # fmt: skip
     zero = next(r for r in read_journal(finished[0] / "journal.jsonl")
                 if r["event"] == "zero")  # fmt: skip
-    from rig.attitude import Frame
+    from rig.core.attitude import Frame
 
     config = fast_config()
     frame = Frame(np.array(zero["attitude"]), np.eye(3), "ZXY", config.letters)
@@ -433,13 +433,13 @@ def test_without_matplotlib_the_report_says_that_figures_are_missing(
 
 
 def test_run_folders_are_never_reused(tmp_path):
-    from rig.session.folder import new_run_folder
+    from rig.journal import new_run_folder
 
     folders = {new_run_folder(tmp_path, "calibrate") for _ in range(5)}
     assert len(folders) == 5
     blocked = tmp_path / "file"
     blocked.write_text("")
-    with pytest.raises(Refused, match="cannot make"):
+    with pytest.raises(ValueError, match="cannot make"):
         new_run_folder(pathlib.Path(blocked), "calibrate")
 
 
@@ -449,7 +449,7 @@ def test_a_plan_that_leaves_the_limits_is_refused_before_arming(tmp_path):
     folder.mkdir()
     said = []
     record = commissioned(config, folder)
-    run = Run(config, folder, "calibrate", said.append, record=record)
+    run = make_run(config, folder, "calibrate", said.append, record=record)
     wild = draw_candidates(config)
     wild[:, 0] = 99999
     choice = choose(config, config.to_deg(draw_candidates(config)))

@@ -16,14 +16,14 @@ from rig.commission import setup, steps
 from rig.commission.operator import Operator
 from rig.config import load_config, parse_config
 from rig.config.files import EXAMPLES
-from rig.device.record import (
+from rig.core.faults import Refused
+from rig.core.record import (
     HOMED,
     IDENTIFIED,
     SIGN_CHECKED,
     ZEROED,
     DeviceRecord,
 )
-from rig.faults import Refused
 from rig.simulator import Truth
 
 

@@ -7,8 +7,8 @@ import pytest
 from harness import fast_config, fast_text
 
 from rig.config import parse_config
-from rig.device.bus import Bus
-from rig.device.drives import Drive
+from rig.core.bus import Bus
+from rig.core.drive import Drive
 from rig.simulator import Simulator, Truth, truth_of
 from rig.simulator.drive import COMM_ALARM, Habits, SimDrive
 

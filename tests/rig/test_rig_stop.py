@@ -16,13 +16,13 @@ from rig import stopping
 from rig.__main__ import main
 from rig.config import load_config
 from rig.config.salvage import read_for_stop
-from rig.device import lock
-from rig.device.bus import Bus, BusError
-from rig.device.drives import Drive
-from rig.device.lock import BusLock
-from rig.faults import StopRequested
-from rig.guard.signals import Signals
-from rig.guard.stop import stop_all
+from rig.core import lock
+from rig.core.bus import Bus, BusError
+from rig.core.drive import Drive
+from rig.core.faults import StopRequested
+from rig.core.lock import BusLock
+from rig.core.stop import stop_all
+from rig.signals import Signals
 from rig.simulator import parse_fault
 
 GENERIC = {'map = "leadshine_pr"': 'map = "generic"', **HASTY}
@@ -339,7 +339,8 @@ def test_a_reader_that_went_away_does_not_keep_it_from_stopping(rig):
 
 def test_a_handler_only_sets_a_flag_and_the_loop_says_it():
     said = []
-    with Signals(said.append) as signals:
+    with Signals() as signals:
+        signals.report = said.append
         signals.armed = True
         signal.raise_signal(signal.SIGINT)
         assert signals.pause and not said

@@ -12,9 +12,9 @@ import pytest
 from harness import changed, fast_config
 from scipy.spatial.transform import Rotation
 
-from rig.attitude import angle_between_deg, euler_to_matrix, matrix_to_euler
-from rig.device.imu import Imu, ImuError
-from rig.device.stream import MAX_LINE, LineSplitter, Parser, StreamFault
+from rig.core.attitude import angle_between_deg, euler_to_matrix, matrix_to_euler
+from rig.core.phone import Imu, ImuError
+from rig.core.stream import MAX_LINE, LineSplitter, Parser, StreamFault
 
 HYPER = changed(fast_config().imu, max_jump_deg=180.0, host="127.0.0.1")
 PLAIN = changed(

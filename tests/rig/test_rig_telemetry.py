@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 from harness import fast_config, session, simulator
 
-from rig.attitude import euler_to_matrix
-from rig.device.drives import Status
-from rig.device.stream import Reading
+from rig.core.attitude import Reading, euler_to_matrix
+from rig.core.drive import Status
+from rig.core.measure import frame_at
+from rig.journal import read_journal
 from rig.outputs import telemetry
-from rig.outputs.journal import read_journal
-from rig.session.measuring import frame_at
 
 
 class Phone:

@@ -15,6 +15,7 @@ from harness import (
     fast_config,
     fast_text,
     in_the_middle,
+    make_run,
     session,
     simulator,
 )
@@ -22,17 +23,22 @@ from scipy.spatial.transform import Rotation
 
 import jaxcal
 from rig.__main__ import main
-from rig.attitude import euler_to_matrix
 from rig.config import example_text, parse_config
-from rig.device.imu import Imu
-from rig.device.record import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED, DeviceRecord
-from rig.faults import MotionFault, Refused
-from rig.outputs.journal import read_journal
-from rig.session.checking import collect, load_calibration, verify
-from rig.session.checks import check_matrix
-from rig.session.reference import KeptZero, check_zero, moved, unseen
-from rig.session.run import Run
-from rig.session.runner import run_safely
+from rig.core.attitude import euler_to_matrix
+from rig.core.faults import MotionFault, Refused
+from rig.core.phone import Imu
+from rig.core.record import (
+    HOMED,
+    IDENTIFIED,
+    SIGN_CHECKED,
+    ZEROED,
+    DeviceRecord,
+    check_matrix,
+)
+from rig.core.session import run_safely
+from rig.core.zero import KeptZero, check_zero, moved, unseen
+from rig.journal import read_journal
+from rig.procedures.checking import collect, load_calibration, verify
 from rig.simulator import Truth
 from rig.simulator.faults import FaultInjector
 from rig.simulator.phone import Phone
@@ -50,7 +56,7 @@ def run_verify(config, calibration, folder, sim, record=None, here=False):
     folder.mkdir()
     said = []
     saved = load_calibration(calibration, config)
-    run = Run(
+    run = make_run(
         config, folder, "verify", said.append,
         record=record or commissioned(config, folder),
         zero_at=None if here else saved.zero.pulses, kept_zero=saved.zero,
@@ -104,7 +110,7 @@ def test_a_fit_that_is_reversed_or_exchanged_is_refused_by_its_axis():
 
 def test_a_refused_fit_saves_nothing_and_voids_the_sign_check(tmp_path, monkeypatch):
     """Where the moves themselves showed nothing."""
-    from rig.session import measuring
+    from rig.core import measure as measuring
 
     monkeypatch.setattr(measuring.Observer, "_check_agreement", lambda *_: None)
     config, said = fast_config(), []
@@ -269,7 +275,9 @@ def test_a_zero_by_the_drives_is_compared_with_the_last_one(tmp_path):
         said = []
         for name in ("a", "b"):
             (tmp_path / name).mkdir()
-            run = Run(served, tmp_path / name, "collect", said.append, record=record)
+            run = make_run(
+                served, tmp_path / name, "collect", said.append, record=record
+            )
             run.on_imu_port = sim.start_phone
             assert run_safely(run, lambda r: collect(r, 1)) == 0
             record.left_at()
@@ -286,7 +294,9 @@ def test_a_zero_at_other_pulses_than_the_last_one_is_told(tmp_path):
         said = []
         for name, here in (("a", (0.0, 0.0, 0.0)), ("b", (2.0, 0.0, 0.0))):
             (tmp_path / name).mkdir()
-            run = Run(served, tmp_path / name, "collect", said.append, record=record)
+            run = make_run(
+                served, tmp_path / name, "collect", said.append, record=record
+            )
             run.on_imu_port = sim.start_phone
             run.zero_at = served.to_pulses(here)  # as if an operator had put it there
             assert run_safely(run, lambda r: collect(r, 1)) == 0
@@ -370,7 +380,7 @@ def test_a_drive_without_a_word_on_its_gearing_is_not_asked_for_it(tmp_path):
     with device(changed(config, axes=bare)) as sim:
         served = changed(sim.start(), axes=config.axes)
         record = commissioned(served, tmp_path)
-        run = Run(served, tmp_path, "collect", [].append, record=record)
+        run = make_run(served, tmp_path, "collect", [].append, record=record)
         run.on_imu_port = sim.start_phone
         assert run_safely(run, lambda r: collect(r, 1)) == 0
 
@@ -412,7 +422,7 @@ def test_another_drive_is_another_device(tmp_path):
         record = commissioned(served, tmp_path)
         record.reach(IDENTIFIED, served, identity=identity)
         (tmp_path / "b").mkdir()
-        run = Run(served, tmp_path / "b", "collect", said.append, record=record)
+        run = make_run(served, tmp_path / "b", "collect", said.append, record=record)
         record.reach(HOMED, served)
         record.reach(SIGN_CHECKED, served)
         assert run_safely(run, lambda r: collect(r, 1)) == 2
@@ -423,7 +433,7 @@ def test_another_drive_is_another_device(tmp_path):
 def test_after_a_lost_place_the_way_on_begins_with_home(tmp_path):
     config = fast_config()
     record = commissioned(config, tmp_path)
-    run = Run(config, tmp_path, "collect", [].append, record=record)
+    run = make_run(config, tmp_path, "collect", [].append, record=record)
     assert run.to_go_on == f"python -m rig resume {tmp_path}"
     record.void(HOMED, "yaw went into alarm")
     assert "`jaxcal-rig home`, then `jaxcal-rig axes`" in run.to_go_on

@@ -14,11 +14,11 @@ from test_rig_motion import bench
 from rig.config import ConfigError, load_config, parse_config
 from rig.config.files import EXAMPLES
 from rig.config.registers import decode
-from rig.faults import MotionFault
-from rig.guard import stop
-from rig.guard.watchdog import timeouts_left
-from rig.outputs.journal import read_journal
-from rig.session import runner
+from rig.core import stop
+from rig.core.device import timeouts_left
+from rig.core.faults import MotionFault
+from rig.core.session import Run
+from rig.journal import read_journal
 from rig.simulator import Simulator, Truth, parse_fault
 
 WATCHED = {'map = "leadshine_pr"': 'map = "generic"'}
@@ -242,7 +242,7 @@ def test_signals_during_the_stop_of_a_session_change_nothing(
         signal.raise_signal(after)
         return results
 
-    emit = runner.Run.emit
+    emit = Run.emit
 
     def noted(run, event, **fields):
         record = emit(run, event, **fields)
@@ -251,7 +251,7 @@ def test_signals_during_the_stop_of_a_session_change_nothing(
         return record
 
     monkeypatch.setattr(stop, "stop_all", stop_all)
-    monkeypatch.setattr(runner.Run, "emit", noted)
+    monkeypatch.setattr(Run, "emit", noted)
     config = fast_config(WATCHED)
     with watched_simulator(config) as sim:
 

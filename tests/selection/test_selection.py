@@ -330,7 +330,7 @@ def test_a_singular_subset_is_refused():
 def test_score_respects_the_mask_and_the_cap():
     with pytest.raises(ValueError, match="indices must be available, got 3"):
         score(uniform(0), [1, 2, 3, 4], available=np.arange(20) != 3)
-    with pytest.raises(ValueError, match="indices must repeat a candidate at most 1"):
+    with pytest.raises(ValueError, match="indices must repeat a candidate at most max"):
         score(uniform(0), [1, 2, 3, 4, 4])
     with pytest.raises(ValueError, match="reference must be one of bound, exact, got"):
         score(uniform(0), [1, 2, 3, 4], reference="best")

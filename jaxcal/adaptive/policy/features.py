@@ -24,7 +24,6 @@ class Seen:
     index: jax.Array  # (C,) int32 into the options
     features: jax.Array  # (C, NUM_FEATURES)
     log_score: jax.Array  # (C,) of the base rule, less its maximum
-    gain: jax.Array  # (C,) nats
     valid: jax.Array  # (C,) bool
 
 
@@ -85,7 +84,6 @@ def see(
         index=index,
         features=jnp.where(valid[:, None], features, 0.0),
         log_score=jnp.where(valid, below, -1e9),
-        gain=g,
         valid=valid,
     )
 

@@ -73,7 +73,6 @@ def initial(key: jax.Array, per_group: int, num_groups: int, width: int = 64) ->
         index=jnp.zeros(c, jnp.int32),
         features=jnp.zeros((c, NUM_FEATURES)),
         log_score=jnp.zeros(c),
-        gain=jnp.zeros(c),
         valid=jnp.ones(c, bool),
     )
     return Network(width).init(key, blank)

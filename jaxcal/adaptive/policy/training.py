@@ -139,13 +139,15 @@ def _stream(
 
     def step(carry: Any, key: jax.Array) -> tuple[Any, Any]:
         truth, belief, session = carry
-        keys = jax.random.split(key, 6)
+        keys = jax.random.split(key, 7)
         options = task.options(belief, session, keys[0])
         seen = see(task, belief, session, options, keys[1], base, per_group)
         logits, value = _apply(network, params, seen)
         action = jax.random.categorical(keys[2], logits).astype(jnp.int32)
         log_probs = jax.nn.log_softmax(logits)
         design = jax.tree.map(lambda leaf: leaf[seen.index[action]], options.designs)
+        # By draws of its own: those of ``seen`` chose it, so theirs is too large.
+        gain = belief.gain(task, design, keys[6])
         outcome = task.measure(truth, design, keys[3])
 
         def after(outcome: jax.Array) -> tuple[Any, Any, jax.Array]:
@@ -171,7 +173,7 @@ def _stream(
         )  # fmt: skip
         entropy = -(jnp.exp(log_probs) * log_probs).sum()
         return carry, (
-            seen, action, log_probs[action], value, seen.gain[action],
+            seen, action, log_probs[action], value, gain,
             ended.astype(jnp.float32), entropy, chance, elsewhere,
         )  # fmt: skip
 

@@ -27,7 +27,8 @@ _CHUNK = 16  # nodes between looks at the clock, where ``enough`` may stop the s
 _PACE = 0.01  # seconds between looks where not, at which an interrupt is seen too
 _MEMORY = 64 * 2**20  # bytes of open nodes up to which the best bound goes first
 _FREE = 3e6  # node x M q p^2 spent on a proof although ``enough`` is reached: 10 ms
-_SHARE = 0.05  # of its distance to the incumbent, how far a node is left from solved
+_SHARE = 0.05  # of its distance to the incumbent, how far a node is left from solved;
+# the root, whose bound may be all that is asked for, is solved
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -102,8 +103,8 @@ def branch_and_bound(
             )
         begun = time.perf_counter()
         size, more = search(
-            problem, TOLERANCE, _SHARE, nodes, bounds, size, counts, best_values,
-            max(256, _MEMORY // (24 * width)), chunk,
+            problem, TOLERANCE, _SHARE if done else 0.0, nodes, bounds, size, counts,
+            best_values, max(256, _MEMORY // (24 * width)), chunk,
         )  # fmt: skip
         if not done and size:
             # Incumbents may use what the root rules out as no better than they are.
@@ -152,8 +153,7 @@ def _relaxation(
         if criterion.kind == "trace":
             kind, root = TRACE, root / np.sqrt(scale)
         else:
-            kind, inverse = E, np.linalg.inv(root) / np.sqrt(scale)
-            blocks, prior = blocks @ inverse, inverse.T @ prior @ inverse
+            kind, root = E, root * np.sqrt(scale)
     blocks, prior, root = (np.array(each, order="C") for each in (blocks, prior, root))
     # Affine postures are enough for D at nearly every node: half as much to compile.
     plain = kind == D and blocks.shape[1] == 1 and not prior.any()

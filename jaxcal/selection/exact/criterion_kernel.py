@@ -52,7 +52,7 @@ class Relaxation(NamedTuple):
     kind: int
     blocks: NDArray[np.float64]  # (M, q, p)
     prior: NDArray[np.float64]  # (p, p)
-    root: NDArray[np.float64] | None  # (s, p) C of DS and TRACE; None: D, never RANK
+    root: NDArray[np.float64] | None  # (s, p) C of DS, TRACE and E; None: D, never RANK
     k: int  # selections in all
     rank: int  # of one block, at most
 
@@ -100,7 +100,10 @@ def evaluate(kind, root, local):
     if root is None:
         value = factor(local.gram, gradient)
         return value, value
-    if kind != E and kind != RANK:
+    if kind == E:
+        if not factor(local.gram, inverse) > -np.inf:
+            return -np.inf, -np.inf
+    elif kind != RANK:
         value = factor(local.gram, inverse)
         base = value
         if kind == D or not value > -np.inf:
@@ -114,7 +117,7 @@ def evaluate(kind, root, local):
         base = value
     if kind >= E:
         form = LEAST if kind == E else LOG_DET if kind == RANK else SHARES
-        other, bound = evaluate_spectrum(form, local)
+        other, bound = evaluate_spectrum(form, root, local)
         value, base = value + other, base + bound
         if kind == RANK_TRACE:
             for a in range(len(inverse)):

@@ -33,6 +33,8 @@ Indices = NDArray[np.int64]
 STARTING_RESTARTS = 30  # of the exchange: the search does the rest
 TIME_LIMIT = 10.0  # seconds of one search where none is given
 
+TOLERATED = 1e-9  # share by which rounding may change what is called proven
+
 _CHEAP = 3e7  # multiplications of an enumeration: about 20 ms
 _LARGEST_HULL_DIMENSION = 4  # qhull's facets grow as M^(n // 2)
 
@@ -46,6 +48,7 @@ class ExactResult:
     bound: float  # no selection has a better value; values[0] if proven
     nodes: int  # branch-and-bound nodes, or subsets enumerated
     proven: bool
+    rounding: float = 0.0  # share that keeps a finished search from being a proof
 
 
 def solve(
@@ -76,6 +79,11 @@ def solve_many(
 
 def as_found(result: ExactResult, **record: Any) -> Found:
     """What the protocol wants to know."""
+    if result.rounding:
+        record["reason"] = (
+            "not proven in double precision: the search is complete, but rounding may "
+            f"change the variances by a share of {result.rounding:.1g}"
+        )
     return Found(
         indices=result.subsets[0],
         value=float(result.values[0]),
@@ -258,7 +266,12 @@ def _result(
     bound = float(value[order[0]])
     if relaxed is not None:
         bound = better(bound, float(criterion.reported(relaxed)))
-    return ExactResult(chosen[order], value[order], bound, nodes, relaxed is None)
+    unsure = problem.uncertainty(chosen[order[0]])
+    if unsure <= TOLERATED:
+        return ExactResult(chosen[order], value[order], bound, nodes, relaxed is None)
+    bound = criterion.bettered(bound, unsure)
+    unsure = unsure if relaxed is None else 0.0
+    return ExactResult(chosen[order], value[order], bound, nodes, False, unsure)
 
 
 def _groups(problem: Problem, merge: bool) -> list[Indices]:

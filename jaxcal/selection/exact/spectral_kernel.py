@@ -1,7 +1,11 @@
 """Compiled bounds that go by eigenvalues: E, and D, A, I and As of few readings.
 
-E is smoothed, ``-log(trace exp(-b M)) / b``; its gradient is a Z >= 0 of trace 1 and
-so a bound trace(Z M) on the smallest eigenvalue, however good the smoothing is.
+E is 1 / the largest eigenvalue of V = C inverse(M) C.T, which double precision holds
+where it does not hold the smallest one of inverse(V): commands far from zero. With v an
+eigenvector of V, y = inverse(M) C.T v scaled to |C y| = 1 makes ``y.T M y`` its
+reciprocal at M, and at every other M a bound on E. E is smoothed over all reciprocals,
+``-log(sum of exp(-b l)) / b``; its gradient is a mean of such y y.T and so a bound too,
+however good the smoothing is.
 
 Where what is still to be chosen has fewer readings t than there are parameters: with
 P what is chosen for certain, the rest N = M - P of a selection has rank t at most. Of
@@ -202,12 +206,58 @@ def best_place(local):
 
 
 @njit(**FAST)
-def evaluate_spectrum(kind, local):
+def _reach(root, inverse, out):
+    """``out = C W`` (p, p)."""
+    p = len(inverse)
+    for a in range(p):
+        for b in range(p):
+            out[a, b] = 0.0
+        for c in range(p):
+            weight = root[a, c]
+            for b in range(p):
+                out[a, b] += weight * inverse[c, b]
+
+
+@njit(**FAST)
+def _weakest(root, inverse, values, vectors, rows):
+    """Eigenvalues of V become the l, smallest first, and ``rows`` their y."""
+    p = len(values)
+    largest = values[p - 1]
+    for a in range(p // 2):
+        x = values[a]
+        values[a] = values[p - 1 - a]
+        values[p - 1 - a] = x
+    for a in range(p):
+        values[a] = 1.0 / max(values[a], _EPS * largest)
+        row = rows[a]
+        for c in range(p):
+            row[c] = 0.0
+        for b in range(p):  # C.T v, then W times it
+            weight = 0.0
+            for c in range(p):
+                weight += vectors[p - 1 - a, c] * root[c, b]
+            for c in range(p):
+                row[c] += weight * inverse[b, c]
+        length = 0.0
+        for b in range(p):
+            across = 0.0
+            for c in range(p):
+                across += root[b, c] * row[c]
+            length += across * across
+        scale = 1.0 / np.sqrt(length) if length > 0.0 else 0.0
+        for c in range(p):
+            row[c] *= scale
+
+
+@njit(**FAST)
+def evaluate_spectrum(kind, root, local):
     """Fill the gradient, and the basis and bend of the Hessian.
 
     Args:
-        kind: LEAST: E at M. LOG_DET, SHARES: F at N in the metric of P, t and the
-            constant in ``local.settings``; the f of SHARES is ``-mu / (1 + l)``.
+        root: C (p, p) of LEAST.
+        kind: LEAST: E at M, W being there. LOG_DET, SHARES: F at N in the metric of P,
+            t and the constant in ``local.settings``; the f of SHARES is
+            ``-mu / (1 + l)``.
 
     Returns:
         The value, and the value to which the linear gain is added for a bound.
@@ -219,13 +269,19 @@ def evaluate_spectrum(kind, local):
     vectors, rows = np.empty((p, p)), np.empty((p, p))
     value, base = 0.0, 0.0
     if kind == LEAST:
+        _reach(root, local.inverse, rows)
         for a in range(p):
-            for c in range(p):
-                bend[a, c] = local.gram[a, c]
+            for c in range(a + 1):
+                total_ac = 0.0
+                for d in range(p):
+                    total_ac += rows[a, d] * root[c, d]
+                bend[a, c] = total_ac
+                bend[c, a] = total_ac
     else:
         _between(local.half, local.rest, bend)
     eigen(bend, values, vectors)
     if kind == LEAST:
+        _weakest(root, local.inverse, values, vectors, rows)
         b = settings[1]
         total = 0.0
         for a in range(p):
@@ -234,11 +290,14 @@ def evaluate_spectrum(kind, local):
             total += slopes[a]
         for a in range(p):
             slopes[a] /= total
-            base += slopes[a] * values[a]
             tail[a] = slopes[a]
             own[a] = -b * slopes[a]
-            for c in range(p):
-                rows[a, c] = vectors[a, c]
+            if slopes[a] > 0.0:
+                for c in range(p):
+                    across = 0.0
+                    for d in range(p):
+                        across += local.gram[c, d] * rows[a, d]
+                    base += slopes[a] * across * rows[a, c]
         value = values[0] - np.log(total) / b
         settings[0] = b
     else:

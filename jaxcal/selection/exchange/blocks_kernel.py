@@ -14,7 +14,8 @@ a subset of the parameters, log det of (C V C.T)^-1 is that of the information l
 of the nuisance parameters, whose inverse is X = V - V C.T (C V C.T)^-1 C V: the same
 formula twice. What does not depend on i (D_jj, H_jj, K, and the gain of j alone) is
 kept; a swap changes V and X by Woodbury's formula, and both are made anew where
-cancellation could show.
+cancellation could show, and before the climb ends. A swap is accepted only where phi of
+the sums made anew has risen, so no selection comes back.
 
 Candidates are held in groups of ``WIDE``, arrays (q, q, WIDE) or (q, p, WIDE), with
 innermost loops over a group: their length is known to the compiler, and what belongs to
@@ -34,7 +35,7 @@ DET, SUBSET, TRACE = 0, 1, 2  # log det of all, or of some parameters; a trace
 WIDE = 64  # candidates in a group
 
 _IMPROVES = 1e-11  # by which a swap must raise phi, relative above 1
-_SAME = 1e-9  # how far phi summed over swaps may be from phi computed at the end
+_MOST_SWAPS = 100  # of each place, where a few are usual
 _CANCELLED = 1e-3  # fall of the largest leverage that costs up to six digits of X
 _LEAST = 1e-14  # a determinant below it is that of a singular matrix
 _UNKNOWN = 1e13  # variance, in that of all candidates together, of mere rounding
@@ -477,36 +478,30 @@ def grow_and_climb(
     counts = np.zeros(num_groups * WIDE, dtype=np.int64)
     for i in chosen[:size]:
         counts[i] += 1
-    before = chosen.copy()
-    value, expected, peak = -np.inf, np.inf, 0.0
-    stale = True
-    since, position = 0, num_fixed
+    trial = np.empty((2, p, p))
+    value, peak = -np.inf, 0.0
+    stale, fresh = True, False
+    since, position, swaps = 0, num_fixed, 0
     while size < k or climbs:
         grows = size < k
         if not grows and since == k - num_fixed:
+            if fresh:
+                return value
             stale = True
         if stale:
             _sum(growing if grows else swapping, blocks, chosen[:size], gram)
             now = _value(kind, root, gram, matrices[0], matrices[1])
             if not grows:
-                if not now > value:  # rounding promised more than there is
-                    for r in range(k):
-                        chosen[r] = before[r]
-                    return value
-                value = now
-                same = abs(value - expected) <= _SAME * max(1.0, abs(value))
-                if k == num_fixed or (same and since == k - num_fixed):
-                    return value
-                for r in range(k):
-                    before[r] = chosen[r]
-                expected, since = value, 0
+                if k == num_fixed or not now > -np.inf:
+                    return now
+                value, since = now, 0
             for c in range(num_groups):
                 _fill(columns[c], matrices[0], part, grown[c, 0])
                 if kind != DET:
                     _fill(columns[c], matrices[1], part, grown[c, 1])
                 _keep(kind, grown[c], kept[c], alone[c], det)
             peak = _largest(grown)
-            stale = False
+            stale, fresh = False, True
         out = _NONE
         if grows:
             best = _best(alone, counts, upper)
@@ -542,10 +537,18 @@ def grow_and_climb(
             rise = gain[best // WIDE, best % WIDE]
             if kind != TRACE:
                 rise = np.log(rise)
-            if not rise > _IMPROVES * max(1.0, abs(expected)):
+            least = _IMPROVES * max(1.0, abs(value))
+            if not rise > least:
                 continue
-            expected += rise
-            since = 0
+            # Woodbury's formula may promise what is not there: sums made anew tell.
+            chosen[at] = best
+            _sum(swapping, blocks, chosen, gram)
+            now = _value(kind, root, gram, trial[0], trial[1])
+            if not now > value + least or swaps == _MOST_SWAPS * k:
+                chosen[at] = out
+                continue
+            value, since = now, 0
+            swaps += 1
             counts[out] -= 1
         counts[best] += 1
         chosen[at] = best
@@ -558,6 +561,7 @@ def grow_and_climb(
             kind, columns, changed[: q if grows else 2 * q], q, matrices, grown, kept,
             alone, cross, change[: q if grows else 2 * q], det,
         )  # fmt: skip
+        fresh = False
         largest = _largest(grown)
         stale = largest < _CANCELLED * peak
         peak = max(peak, largest)

@@ -1,7 +1,7 @@
 """Exchange for E, the smallest eigenvalue: exact values of the few that may be best.
 
-phi is concave, so with v the lowest eigenvector of what is left when a candidate goes
-out, adding B_j gives at most the eigenvalue there plus ``|B_j v|^2``; candidates are
+phi is concave, so with G its gradient at what is left when a candidate goes out, adding
+B_j gives at most phi there plus ``trace(B_j G B_j.T)``; candidates are
 evaluated in the order of that bound until it falls to the best found. Starts are local
 optima of A: the sum of the variances is at most p times the largest, and climbs from
 where the smallest eigenvalue stands still because two are equal.
@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.information.criterion import Criterion
 from jaxcal.selection.exchange.blocks import Blocks
 from jaxcal.selection.problem import Problem, values
 from jaxcal.selection.random import solve as random_selection
@@ -24,6 +25,7 @@ Indices = NDArray[np.int64]
 _CHUNK = 32  # candidates evaluated at once
 _WORK = 3e5  # k p^3 of the climbs of one call, about half a second
 _IMPROVES = 1e-9  # share by which a swap must raise the eigenvalue
+_RIDGE = 1e-10  # of the information of all candidates
 
 
 def exchange_eigenvalue(
@@ -64,22 +66,20 @@ def _required_first(problem: Problem, chosen: Indices) -> Indices:
 
 def climb_eigenvalue(problem: Problem, start: Indices) -> tuple[Indices, float]:
     """The local optimum that ``start`` (k,) climbs to, and its eigenvalue."""
-    inverse = np.linalg.inv(problem.criterion.root)
-    blocks = problem.blocks @ inverse
+    blocks, criterion = problem.blocks, problem.criterion
     grams = np.matrix_transpose(blocks) @ blocks
     chosen, fixed = start.copy(), len(problem.required)
-    total = inverse.T @ problem.prior @ inverse + grams[chosen].sum(axis=0)
-    value = float(np.linalg.eigvalsh(total)[0])
+    value = float(criterion.value(problem.prior + grams[chosen].sum(axis=0)))
     room = problem.upper - np.bincount(chosen, minlength=len(blocks))
     since, position = 0, fixed
     while since < len(chosen) - fixed:
         out = chosen[position]
-        rest = total - grams[out]
+        rest = problem.prior + grams[np.delete(chosen, position)].sum(axis=0)
         least = value * (1.0 + _IMPROVES)
-        best, found = _best(rest, blocks, grams, room > 0, least)
+        best, found = _best(rest, criterion, blocks, grams, room > 0, least)
         since += 1
         if best >= 0:
-            total, value, since = rest + grams[best], found, 0
+            value, since = found, 0
             room[out] += 1
             room[best] -= 1
             chosen[position] = best
@@ -88,15 +88,19 @@ def climb_eigenvalue(problem: Problem, start: Indices) -> tuple[Indices, float]:
 
 
 def _best(
-    rest: Array, blocks: Array, grams: Array, free: NDArray[np.bool_], least: float
+    rest: Array,
+    criterion: Criterion,
+    blocks: Array,
+    grams: Array,
+    free: NDArray[np.bool_],
+    least: float,
 ) -> tuple[int, float]:
     """The candidate, or -1, that gives the largest eigenvalue above ``least``."""
-    sizes, vectors = np.linalg.eigh(rest)
-    lift = (blocks @ vectors[:, 0]) ** 2
-    bound = np.where(free, sizes[0] + lift.sum(axis=1), -np.inf)
-    # A block of q readings lifts no eigenvalue above the q-th next of before.
-    if blocks.shape[1] < len(sizes):
-        bound = np.minimum(bound, sizes[blocks.shape[1]])
+    # A little more than there is keeps the bounds true where the rest is singular.
+    more = rest + _RIDGE * np.eye(len(rest))
+    lift = ((blocks @ criterion.gradient(more)) * blocks).sum(axis=(1, 2))
+    bound = float(criterion.value(more)) + lift
+    bound = np.where(free, bound, -np.inf)
     order = np.argsort(-bound)
     best = -1
     for first in range(0, len(order), _CHUNK):
@@ -104,7 +108,7 @@ def _best(
         some = some[bound[some] > least]
         if not some.size:
             break
-        values = np.linalg.eigvalsh(rest + grams[some])[:, 0]
+        values = criterion.value(rest + grams[some])
         if values.max() > least:
             least, best = float(values.max()), int(some[values.argmax()])
     return best, least

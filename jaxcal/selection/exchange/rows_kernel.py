@@ -21,6 +21,18 @@ from jaxcal.selection.exchange.starts import random_start, seeded
 __all__ = ["climb_rows", "exchange_rows"]
 
 _IMPROVES = 1.0 + 1e-11  # a swap must raise det by more than rounding
+_MOST_SWAPS = 100  # of each place, where a few are usual
+
+
+@njit(inline="always")
+def _log_det(blocks, chosen, prior, gram, inverse):
+    """log det of the chosen from sums made anew; gram and inverse are filled."""
+    for a in range(len(gram)):  # a slice assignment takes seconds to compile
+        for b in range(len(gram)):
+            gram[a, b] = prior[a, b]
+    for i in chosen:
+        add_block(gram, blocks, i, 1.0)
+    return factor(gram, inverse)
 
 
 @njit(inline="always")
@@ -59,18 +71,13 @@ def climb_rows(blocks, columns, upper, num_fixed, chosen, counts, prior, gram, i
         log det of the local optimum; -inf, and nothing changed, from a singular start.
     """
     k = len(chosen)
-    for a in range(len(gram)):  # a slice assignment takes seconds to compile
-        for b in range(len(gram)):
-            gram[a, b] = prior[a, b]
-    for r in range(k):
-        add_block(gram, blocks, chosen[r], 1.0)
-    log_det = factor(gram, inverse)
+    log_det = _log_det(blocks, chosen, prior, gram, inverse)
     if not log_det > -np.inf:
         return log_det
     leverage, inner = np.empty(len(blocks)), np.empty(len(blocks))
     rows, first = blocks[:, 0], columns[0]
     stale = True
-    since = 0
+    since = swaps = 0
     position = num_fixed
     while since < k - num_fixed:
         if stale:
@@ -81,19 +88,17 @@ def climb_rows(blocks, columns, upper, num_fixed, chosen, counts, prior, gram, i
         best = _best_row(leverage, inner, out, counts, upper)
         since += 1
         if best >= 0:
-            add_block(gram, blocks, out, -1.0)
-            add_block(gram, blocks, best, 1.0)
-            after = factor(gram, inverse)
-            if after > log_det:
+            chosen[position] = best
+            after = _log_det(blocks, chosen, prior, gram, inverse)
+            if after > log_det and swaps < _MOST_SWAPS * k:
                 counts[out] -= 1
                 counts[best] += 1
-                chosen[position] = best
                 log_det = after
                 since = 0
+                swaps += 1
             else:  # rounding promised more than there is
-                add_block(gram, blocks, best, -1.0)
-                add_block(gram, blocks, out, 1.0)
-                factor(gram, inverse)
+                chosen[position] = out
+                _log_det(blocks, chosen, prior, gram, inverse)
             stale = True
         position += 1
         if position == k:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers
+from jaxcal.information.blocks import coarseness
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, by_name
 from jaxcal.models.uncertainty import Noise, Prior
@@ -80,6 +81,7 @@ class Asked:
         self.candidates = usable_numbers("candidates", array[None], mask, True)[0]
         self.available = mask[0]
         self._blocks: Array | None = None
+        self._coarse = coarseness(candidates)
         if noise is None and hasattr(model, "default_noise"):
             noise = model.default_noise()  # type: ignore[union-attr]  # it has one
         self._set_rules(prior, noise, measured, required, max_replicates)
@@ -125,7 +127,7 @@ class Asked:
         asked.model, asked.candidates = None, None
         mask = check_available(available, array.shape[:1], True)
         asked._blocks = usable_numbers("blocks", array[None], mask, True)[0]
-        asked.available = mask[0]
+        asked.available, asked._coarse = mask[0], coarseness(blocks)
         if commands is not None:
             asked.candidates = numbers("commands", commands)
             if asked.candidates.ndim != 2 or len(asked.candidates) != len(array):
@@ -161,7 +163,10 @@ class Asked:
             where = source.used  # predictions are for commands that are known
         return whitened_problems(
             raw[None], root,
-            Rules(k, self.available[None], self._required, self.max_replicates),
+            Rules(
+                k, self.available[None], self._required, self.max_replicates,
+                coarse=self._coarse,
+            ),
             asked, names=source.names, times=source.times,
             region=None if where is None else source.at("region", where, False),
             candidates=None if self.candidates is None else self.candidates[None],

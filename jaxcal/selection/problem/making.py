@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import axis_names, numbers, whole_number
-from jaxcal.information.blocks import missing_directions, whiten
+from jaxcal.information.blocks import coarseness, missing_directions, whiten
 from jaxcal.information.excitation import directions_in_words, require_excited
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model
@@ -42,6 +42,7 @@ class Rules(NamedTuple):
     required: ArrayLike | None
     max_replicates: int
     single: bool = True  # one set, given without its batch axis
+    coarse: float = 1.0  # how many times coarser than float64 the numbers given are
 
 
 def make_problems(
@@ -76,9 +77,12 @@ def make_problems(
     m = array.shape[2] if num_outputs is None else num_outputs
     model = Affine(array.shape[2], whole_number("num_outputs", m, 1))
     root = np.zeros((0, model.num_inputs + 1))
+    rules = Rules(
+        k, mask, required, max_replicates, False, coarseness(candidates)
+    )  # fmt: skip
     return whitened_problems(
-        model.blocks(array), root, Rules(k, mask, required, max_replicates, False),
-        CRITERIA["D"](), times=m, candidates=array, model=model,
+        model.blocks(array), root, rules, CRITERIA["D"](), times=m, candidates=array,
+        model=model,
     )  # fmt: skip
 
 
@@ -107,13 +111,16 @@ def whitened_problems(
         candidates: (S, M, n), where there are any.
         model: what made blocks of them.
     """
-    k, mask, required, max_replicates, single = rules
+    k, mask, required, max_replicates, single, coarse = rules
     readings = mask.sum(axis=1) * raw.shape[2]
     if raw.shape[2] > raw.shape[3]:  # as much information in p rows, at q^3 less cost
         raw = np.asarray(np.linalg.qr(raw, mode="r"))
     k = check_k(k, raw, mask, root, regressors=not names)
     cap, forced = check_counts(mask, k, required, max_replicates, single)
-    white = whiten(raw, mask, root)
+    computed = bool(names) and model is not None
+    if computed:  # a derivative is as exact as its own numbers
+        coarse = 1.0
+    white = whiten(raw, mask, root, coarse=coarse, computed=computed)
     if white.singular.size:
         b = int(white.singular[0])
         if not names and candidates is not None:
@@ -121,8 +128,8 @@ def whitened_problems(
             if not len(root):
                 which = "available ones" + in_set(b, single)
                 used = candidates[b][mask[b]]
-                require_excited(used, names[:-1], "candidates", which)
-        _refuse_blind(raw[b][mask[b]], root, names)
+                require_excited(used, names[:-1], "candidates", which, coarse)
+        _refuse_blind(raw[b][mask[b]], root, names, coarse)
     owned = [raw, root, *white[:3], mask, forced]
     for each in owned if candidates is None else [*owned, candidates]:
         each.flags.writeable = False
@@ -136,7 +143,7 @@ def whitened_problems(
             Problem(
                 white.blocks[b], white.prior[b], k, mask[b], forced[b], cap,
                 wanted.criterion(at), times, at.log_scale, raw[b], white.basis[b], root,
-                None if candidates is None else candidates[b], model,
+                white.rounding[b], None if candidates is None else candidates[b], model,
             )
         )  # fmt: skip
     if forced.shape[1]:
@@ -145,9 +152,11 @@ def whitened_problems(
     return problems
 
 
-def _refuse_blind(blocks: Array, root: Array, names: tuple[str, ...]) -> None:
+def _refuse_blind(
+    blocks: Array, root: Array, names: tuple[str, ...], coarse: float
+) -> None:
     """Raise for the directions that neither blocks (N, q, p) nor ``root`` inform."""
-    null = missing_directions(blocks, root)
+    null = missing_directions(blocks, root, coarse)
     raise ValueError(
         "blocks must inform every parameter, but the available ones"
         + (" and what is known" if len(root) else "")

@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
+_EPS = float(np.finfo(np.float64).eps)
 _IN_PLANE = 1e-7  # of whitened rows of height one above the origin
 
 
@@ -46,6 +47,7 @@ class Problem:
     raw: Array  # (M, q, p) blocks in the caller's numbers
     basis: Array  # (p, p) raw blocks times it are whitened
     root: Array  # (r, p) root of the caller's prior precision, with what was measured
+    rounding: Array  # (M,) bound on the error of each whitened block, its norm
     candidates: Array | None = None  # (M, n) in the caller's unit, where there are any
     model: Model | None = None  # what made blocks of the candidates
 
@@ -108,6 +110,20 @@ class Problem:
             return False
         height = self.rows @ self.rows.sum(axis=0)
         return bool((np.abs(height - 1.0) <= _IN_PLANE)[self.available].all())
+
+    def uncertainty(self, indices: Indices) -> float:
+        """By how much rounding may change phi of a selection (k,), as a share.
+
+        Of "det" the share of every eigenvalue: phi itself changes by it times s. With
+        errors E_i of the blocks, M changes by 2 |E_i| / sqrt(least eigenvalue of M) of
+        itself each, beside what sums are rounded by.
+        """
+        rows = self.blocks[indices].reshape(-1, self.num_regressors)
+        least, largest = np.linalg.eigvalsh(rows.T @ rows + self.prior)[[0, -1]]
+        if not least > 0.0:
+            return np.inf
+        of_blocks = 2.0 * self.rounding[indices].sum() / np.sqrt(least)
+        return float(of_blocks + _EPS * len(rows) * largest / least)
 
     def log_det(self, indices: Indices) -> float:
         """log det S of a subset, natural, in the caller's units; -inf if singular."""

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from rig.config import AXIS_NAMES
-from rig.faults import Refused
+from rig.core.faults import Refused
+from rig.journal import Record
 from rig.outputs.console import recalibrate
-from rig.outputs.journal import Record
 
 
 @dataclasses.dataclass(frozen=True)

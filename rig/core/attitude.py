@@ -10,13 +10,27 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import time
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from rig.config.config import RigConfig
+
 Array = NDArray[np.float64]
 ORDERS = tuple("".join(order) for order in itertools.permutations("XYZ"))
+DIGITS = 8  # of a quaternion: 1e-6 degrees
+
+
+@dataclasses.dataclass(frozen=True)
+class Reading:
+    """One accepted attitude on the computer's clock."""
+
+    time: float  # monotonic seconds at which the phone measured, as far as known
+    matrix: Array  # (3, 3)
 
 
 def euler_to_matrix(angles_deg: ArrayLike, order: str) -> Array:
@@ -70,3 +84,45 @@ class Frame:
         sequence = np.asarray(angles_deg, dtype=np.float64)[..., places]
         turned = euler_to_matrix(sequence, self.order)
         return self.zero @ self.mounting.T @ turned @ self.mounting
+
+
+def raw_fields(readings: Sequence[Reading]) -> dict[str, Any]:
+    """``quaternions`` (samples, 4), x y z w, and ``stamps`` (samples,), Unix time."""
+    turns = Rotation.from_matrix([reading.matrix for reading in readings])
+    clock = time.time() - time.monotonic()
+    return {
+        "quaternions": turns.as_quat(canonical=True).round(DIGITS).tolist(),
+        "stamps": [round(reading.time + clock, 4) for reading in readings],
+    }
+
+
+def frame_at(config: RigConfig, zero: Array) -> Frame:
+    """The frame in which the (3, 3) attitude ``zero`` of the phone is the zero."""
+    mounting = euler_to_matrix(config.imu.mounting_deg, "ZYX")
+    return Frame(zero, mounting, config.mechanism.order, config.letters)
+
+
+def recorded_frame(described: dict[str, Any], zero: dict[str, Any]) -> Frame:
+    """The same from the journal: ``config`` of its start, and a zero record."""
+    mounting = euler_to_matrix(described["imu"]["mounting_deg"], "ZYX")
+    a, b, c = (axis["letter"] for axis in described["axes"])
+    attitude = np.array(zero["attitude"])
+    return Frame(attitude, mounting, described["mechanism_order"], (a, b, c))
+
+
+def attitudes(record: dict[str, Any], frame: Frame) -> Array:
+    """(samples, 3, 3) of the phone in its world, of a posture's or zero's readings.
+
+    Args:
+        record: of any version.
+        frame: in which it was measured; only version 1 needs it.
+    """
+    if "quaternions" in record:
+        return Rotation.from_quat(record["quaternions"]).as_matrix()
+    turned = frame.matrix(record["raw_deg"])  # right but for a fixed turn of the world
+    return np.array(record["attitude"]) @ mean_rotation(turned).T @ turned
+
+
+def angles(record: dict[str, Any], frame: Frame) -> Array:
+    """(samples, 3) pitch, yaw and roll in degrees of every reading."""
+    return frame.angles(attitudes(record, frame))

@@ -18,7 +18,7 @@ import time
 from typing import Any
 
 from rig.config.settings import BusSettings
-from rig.faults import Refused
+from rig.core.faults import Refused
 
 # The same for every login, service and TMPDIR of a user, or two sessions of one user
 # would not see each other's locks.

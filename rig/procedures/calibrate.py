@@ -7,23 +7,22 @@ from typing import Any
 
 import numpy as np
 
-from rig.attitude import Array
-from rig.device.record import SIGN_CHECKED
-from rig.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault
-from rig.guard.limits import check_plan
-from rig.identification.conclusion import Evidence, conclude
-from rig.identification.fit import fit, held_out_errors
-from rig.outputs.console import plan_lines, recalibrate, summary_lines
-from rig.outputs.journal import Record
-from rig.session.checks import check_matrix
-from rig.session.planning import (
+from rig.core.attitude import Array
+from rig.core.device import check_plan
+from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault
+from rig.core.plan import (
     Choice,
     choose,
     draw_candidates,
     draw_held_out,
     travel_order,
 )
-from rig.session.run import Run
+from rig.core.record import SIGN_CHECKED, check_matrix
+from rig.core.session import Run
+from rig.identification.conclusion import Evidence, conclude
+from rig.identification.fit import fit, held_out_errors
+from rig.journal import Record
+from rig.outputs.console import plan_lines, recalibrate, summary_lines
 
 MIDDLE, END = "reference:middle", "reference:end"  # visits of the zero posture
 

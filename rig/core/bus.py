@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from rig.config.settings import BusSettings
-from rig.faults import Fault
+from rig.core.faults import Fault
 
 METHODS = {3: "read_holding_registers", 6: "write_register", 16: "write_registers"}
 TURNAROUND_S = 0.05  # for the units to act on a broadcast, which none answers

@@ -7,7 +7,6 @@ backwards, no impossible jump. Everything else is counted and dropped.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
 import re
@@ -16,8 +15,8 @@ from typing import Any
 
 from scipy.spatial.transform import Rotation
 
-from rig.attitude import Array, angle_between_deg, euler_to_matrix
 from rig.config.settings import ImuSettings
+from rig.core.attitude import Array, Reading, angle_between_deg, euler_to_matrix
 
 MAX_LINE = 1024  # bytes; a phone's line has under 200
 MAX_BODY = 1 << 20  # bytes of one pushed message
@@ -38,14 +37,6 @@ class StreamFault(RuntimeError):
 
 class _Dropped(ValueError):
     """A record is not used; the text is the counter's name."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Reading:
-    """One accepted attitude on the computer's clock."""
-
-    time: float  # monotonic seconds at which the phone measured, as far as known
-    matrix: Array  # (3, 3)
 
 
 class LineSplitter:

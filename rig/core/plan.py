@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from jaxcal.selection.fastest import Motion, fastest_tour, travel_times
-from rig.attitude import Array
 from rig.config import RigConfig
 from rig.config.axis import Pulses
+from rig.core.attitude import Array
 
 EXACT_LIMIT_S = 20.0  # for the proof that the choice is (or is not) the optimum
 REPLAN_LIMIT_S = 5.0  # the same while the drives stand armed

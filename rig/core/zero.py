@@ -12,11 +12,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rig.attitude import Array, angle_between_deg
 from rig.config import AXIS_NAMES, RigConfig
 from rig.config.axis import Pulses
-from rig.faults import MotionFault
-from rig.readings import frame_at
+from rig.core.attitude import Array, angle_between_deg, frame_at
+from rig.core.faults import MotionFault
 
 UNSEEN_DEG = 15.0  # an axis this near to the vertical hardly changes the tilt
 TOLD_SHARE = 0.2  # of the largest: an axis that moved less is left out of the words

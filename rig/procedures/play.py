@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from rig.attitude import Array
 from rig.config import AXIS_NAMES
+from rig.core.attitude import Array
 
 CHARACTERISED = "characterised"  # the calibration's note of it
 MARGIN_DEG = 0.5  # by which the last move exceeds what it has to take up

@@ -8,17 +8,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxcal.files import atomic_write
-from rig.attitude import Array
 from rig.config import RigConfig
 from rig.config.config import differences
-from rig.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
+from rig.core.attitude import Array
+from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
+from rig.core.plan import draw, draw_held_out
+from rig.core.session import Run
+from rig.core.zero import KeptZero
 from rig.identification.fit import pairs
 from rig.outputs.console import error_text, numbers
-from rig.session.calibrate import visit_pairs
-from rig.session.planning import draw, draw_held_out
-from rig.session.play import CHARACTERISED, Play
-from rig.session.reference import KeptZero
-from rig.session.run import Run
+from rig.procedures.calibrate import visit_pairs
+from rig.procedures.play import CHARACTERISED, Play
 
 
 def collect(run: Run, count: int) -> int:

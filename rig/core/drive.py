@@ -8,8 +8,8 @@ from collections.abc import Callable
 
 from rig.config.axis import Axis
 from rig.config.registers import Read, Writes, decode, encode
-from rig.device.bus import Bus, BusError, Rejected
-from rig.faults import MotionFault
+from rig.core.bus import Bus, BusError, Rejected
+from rig.core.faults import MotionFault
 
 POLL_S = 0.05
 PASSING = (5, 6, 8, 10, 11)  # exceptions: acknowledge, busy, CRC; silence at a gateway

@@ -7,12 +7,11 @@ import time
 import numpy as np
 
 from rig.config.axis import Pulses
-from rig.device.bus import BusError, Rejected
-from rig.device.drives import Drive, Status, refusal
-from rig.faults import LimitError, MotionFault, Unreachable
-from rig.guard.limits import approach, check_plan, outside
-from rig.guard.stop import STILL_COUNTS
-from rig.session.device import Device
+from rig.core.bus import BusError, Rejected
+from rig.core.device import Device, approach, check_plan, outside
+from rig.core.drive import Drive, Status, refusal
+from rig.core.faults import LimitError, MotionFault, Unreachable
+from rig.core.stop import STILL_COUNTS
 
 
 class Motion:

@@ -7,13 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from rig.attitude import Array, Frame, mean_rotation
 from rig.config.axis import AXIS_NAMES, Pulses
-from rig.device.drives import Status
-from rig.device.stream import Reading
-from rig.faults import MotionFault, NotFollowing
-from rig.readings import frame_at, raw_fields
-from rig.session.device import Device
+from rig.core.attitude import Array, Frame, Reading, frame_at, mean_rotation, raw_fields
+from rig.core.device import Device
+from rig.core.drive import Status
+from rig.core.faults import MotionFault, NotFollowing
 
 FOLLOW_MIN_DEG = 3.0  # a commanded change this large must be seen by the IMU
 FOLLOW_SHARE = 0.1  # at least this share of it

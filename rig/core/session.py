@@ -9,40 +9,45 @@ from __future__ import annotations
 import pathlib
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from rig.attitude import Array, Frame
 from rig.config import RigConfig
 from rig.config.axis import Pulses
-from rig.device.bus import Bus
-from rig.device.imu import Imu
-from rig.device.record import ZEROED, DeviceRecord
-from rig.faults import (
+from rig.core.attitude import Array, Frame, frame_at
+from rig.core.bus import Bus
+from rig.core.device import Device, check_plan, timeouts_left
+from rig.core.faults import (
+    EXIT_BAD_INPUT,
     EXIT_FAULT,
+    EXIT_OK,
+    EXIT_PAUSED,
+    Fault,
     MotionFault,
     NotFollowing,
+    PauseRequested,
     PlanOnly,
     Refused,
+    StopRequested,
     Unreachable,
 )
-from rig.guard.limits import check_plan
-from rig.guard.signals import Signals
-from rig.guard.watchdog import timeouts_left
-from rig.outputs.console import event_lines, numbers
-from rig.outputs.journal import Record
-from rig.outputs.telemetry import Telemetry
-from rig.readings import frame_at
-from rig.session.checks import check_drives, leave
-from rig.session.device import Device
-from rig.session.folder import RunFolder
-from rig.session.measuring import Observer
-from rig.session.motion import Motion
-from rig.session.reference import KeptZero, axes_text
+from rig.core.measure import Observer
+from rig.core.motion import Motion
+from rig.core.phone import Imu
+from rig.core.record import ZEROED, DeviceRecord, check_drives, leave
+from rig.core.stop import Requests
+from rig.core.zero import KeptZero, axes_text
+from rig.journal import JournalError, Record, RunFolder
 
 STREAM_WAIT_S = 60.0  # time to start the app on the phone
 ZERO_FACTOR = 4  # readings of the zero posture, in those of a posture
+
+
+class Attached(Protocol):
+    """What runs beside a session while its ports are open."""
+
+    def close(self) -> None: ...
 
 
 class Run(RunFolder):
@@ -61,25 +66,28 @@ class Run(RunFolder):
         zero_at: Pulses | None = None,
         kept_zero: KeptZero | None = None,
         dry_run: bool = False,
+        signals: Requests | None = None,
     ) -> None:
         self._say = say
         self.confirm: Callable[[Run], None] = lambda run: None  # before ports open
         self.on_imu_port: Callable[[int], object] = lambda port: None
+        # Called with run and device once its ports are open; closed before they are.
+        self.attachments: list[Callable[[Run, Device], Attached]] = []
+        self._attached: list[Attached] = []
         self.device: Device | None = None
-        self.telemetry: Telemetry | None = None
         self.frame: Frame | None = None
         self.zero_pulses: Pulses | None = None
         self.record = record
         self.zero_at = zero_at
         self.kept_zero = kept_zero
         self.dry_run = dry_run
-        self.signals = Signals(self.emit)
+        self.signals = signals or Requests()
+        self.signals.report = self.emit
         self.planned = 0
         self._visited = 0
         self._visit_s: list[float] = []
         self._reset_alarms = reset_alarms
         super().__init__(config, folder, mode, start or {})
-        self.listeners.append(lambda record: self.say(*event_lines(record)))
         for zero in self.journal.events("zero")[-1:]:
             self._set_zero(zero)
 
@@ -135,10 +143,7 @@ class Run(RunFolder):
         self.on_imu_port(imu.port)
         bus.open()
         self.check_device(self.device)
-        self.telemetry = Telemetry(
-            self.folder, config, imu, device.drives, lambda: device.frame
-        )
-        self.telemetry.start()
+        self._attached = [attach(self, device) for attach in self.attachments]
         imu.wait_for_stream(STREAM_WAIT_S)
         self.signals.armed = True
         self.device.arm(self._reset_alarms)
@@ -230,22 +235,18 @@ class Run(RunFolder):
             self.emit("unreachable", sync=True, name=name, reason=str(reason))
             return None
         self.emit("phase", phase="saving")
-        record = self.emit("posture", sync=True, name=name, **measured, **fields)
         self._visited += 1
         self._visit_s.append(time.monotonic() - begun)
-        self._progress(record)
+        record = self.emit("posture", sync=True, name=name, **measured, **fields)
         self.signals.check_pause()
         return record
 
-    def _progress(self, record: Record) -> None:
+    @property
+    def progress(self) -> tuple[int, int, float, float]:
+        """Postures visited and planned, seconds of the last, and about those left."""
         left = max(0, self.planned - self._visited)
-        eta = left * float(np.mean(self._visit_s[-10:]))
-        self.say(
-            f"  [{self._visited:>3}/{self.planned}] {record['name']:<12} "
-            f"u [{numbers(record['commanded_deg'], 8, 3)}]  "
-            f"y [{numbers(record['measured_deg'], 8, 3)}]  {self._visit_s[-1]:5.2f} s, "
-            f"about {eta:.0f} s left"
-        )
+        last = self._visit_s[-10:] or [0.0]
+        return self._visited, self.planned, last[-1], left * float(np.mean(last))
 
     # The end
 
@@ -265,8 +266,9 @@ class Run(RunFolder):
 
     def disarm(self) -> None:
         """Nothing more will move: close the device, free the signals."""
-        if self.telemetry is not None:
-            self.telemetry.close()
+        for attached in self._attached:
+            attached.close()
+        self._attached = []
         if self.device is not None:
             if self.signals.armed:
                 try:
@@ -282,3 +284,50 @@ class Run(RunFolder):
         """Close device and journal."""
         self.disarm()
         self.journal.close()
+
+
+def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
+    """Run a procedure; whatever happens, the drives are told to stop and it is said.
+
+    Returns:
+        The exit code.
+    """
+    code, event, reason = EXIT_FAULT, "fault", ""
+    moved = len(run.journal.events("command"))
+    with run.signals:
+        try:
+            code = procedure(run)
+            event = "end"
+        except PlanOnly:
+            code, event = EXIT_OK, "end"
+            run.say("dry run: nothing was sent to the bus")
+        except PauseRequested as pause:
+            code, event, reason = EXIT_PAUSED, "paused", str(pause)
+        except StopRequested as stop:
+            code, event, reason = stop.exit_code, "stopped", str(stop)
+        except KeyboardInterrupt:
+            code, event, reason = 130, "stopped", "SIGINT"
+        except Refused as error:
+            reason = str(error)
+            if len(run.journal.events("command")) == moved:
+                code, event = EXIT_BAD_INPUT, "refused"
+        except (Fault, JournalError) as error:
+            reason = str(error)
+        except OSError as error:
+            reason = f"cannot write to {run.folder}: {error.strerror or error}"
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}"
+        finally:
+            run.signals.ending = True
+            run.stop(reason, latch=event not in ("end", "paused"))
+            run.disarm()
+        try:
+            run.emit(event, sync=True, code=code, reason=reason)
+        except JournalError as error:
+            run.say(f"the journal could not be closed with a last line: {error}")
+        if event != "end":
+            run.say(f"{event}: {reason}")
+            if event != "refused":
+                run.say(f"to go on: {run.to_go_on}")
+        run.close()
+    return code

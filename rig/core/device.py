@@ -1,0 +1,289 @@
+"""The device as one object: its drives, its phone, and the guards around them.
+
+The loops of moving and measuring read it and ask ``guard``; they look at the clock and
+do nothing else: no JAX, no files but the callback of events.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+from rig.config.axis import Pulses
+from rig.config.config import RigConfig
+from rig.config.registers import decode, registers_of
+from rig.core.attitude import Frame
+from rig.core.bus import Bus, BusError, Rejected
+from rig.core.drive import Drive, Status
+from rig.core.faults import LimitError, MotionFault, StopRequested
+from rig.core.phone import Imu, ImuError
+from rig.core.stop import Requests, Stopper
+
+
+def outside(config: RigConfig, target: Pulses) -> Iterator[str]:
+    """What of (3,) pulses leaves its limits, in words."""
+    for axis, pulses in zip(config.axes, target, strict=True):
+        angle = axis.to_deg(pulses)
+        rounding = 0.51 / abs(axis.pulses_per_deg)
+        if not (
+            axis.min_pulses <= pulses <= axis.max_pulses
+            and axis.min_deg - rounding <= angle <= axis.max_deg + rounding
+        ):
+            yield (
+                f"{axis.name} to {pulses} pulses ({angle:.3f} deg), limits "
+                f"{axis.min_pulses}..{axis.max_pulses} pulses and "
+                f"{axis.min_deg:g}..{axis.max_deg:g} deg"
+            )
+
+
+def approach(config: RigConfig, target: Pulses) -> list[Pulses]:
+    """The way to a target: from below it on every axis, or itself alone."""
+    overshoot = config.motion.approach_overshoot_deg
+    if not overshoot:
+        return [target]
+    return [config.to_pulses(config.to_deg(target) - overshoot), target]
+
+
+def check_plan(config: RigConfig, targets: Iterable[Pulses]) -> None:
+    """LimitError lists each target, or point it is approached from, that is outside."""
+    points = (point for target in targets for point in approach(config, target))
+    faults = [fault for point in points for fault in outside(config, point)]
+    if faults:
+        raise LimitError("the plan leaves the limits: " + "; ".join(faults))
+
+
+class Heartbeat(threading.Thread):
+    """A thread that stops the drives when the motion loop is silent for too long.
+
+    It also keeps the line alive for drives that watch their communication while the
+    plan computes or writes, when nothing moves.
+    """
+
+    def __init__(self, stopper: Stopper, silence_s: float, keep_alive_s: float) -> None:
+        super().__init__(name="heartbeat", daemon=True)
+        self._stopper = stopper
+        self._silence_s = silence_s
+        self._keep_alive_s = keep_alive_s
+        self._moving = False
+        self._fed = time.monotonic()
+        self._closing = threading.Event()
+
+    def feed(self, moving: bool | None = None) -> None:
+        """The motion loop is alive; ``moving``: it must be heard again soon."""
+        if moving is not None:
+            self._moving = moving
+        self._fed = time.monotonic()
+
+    def close(self) -> None:
+        self._closing.set()
+        if self.is_alive():
+            self.join(2.0)
+
+    def run(self) -> None:
+        while not self._closing.wait(0.05):
+            silence = time.monotonic() - self._fed
+            if self._moving and silence > self._silence_s:
+                self._stopper.stop(f"heartbeat lost for {silence:.2f} s while moving")
+                return
+            if not self._moving and self._keep_alive_s and silence > self._keep_alive_s:
+                for drive in self._stopper.drives:
+                    # The plan's own reads find what is wrong.
+                    with contextlib.suppress(BusError, StopRequested):
+                        drive.status(retries=0)
+                self._fed = time.monotonic()
+
+
+class LineWatch:
+    """The communication timeout of the drives that have one: lent, and given back.
+
+    What the register held is journalled before it is changed, so that a later process
+    can put it back for one that was killed.
+    """
+
+    def __init__(
+        self,
+        drives: list[Drive],
+        timeouts_s: Mapping[str, float],
+        emit: Callable[..., Any],
+        left: Mapping[str, Mapping[str, Any]],
+    ) -> None:
+        self._watched = [drive for drive in drives if drive.axis.name in timeouts_s]
+        self._timeouts_s = timeouts_s
+        self._emit = emit
+        self._left = left
+        self._before: dict[str, int] = {}
+
+    def apply(self) -> None:
+        """Set the timeouts.
+
+        Raises:
+            MotionFault: a register cannot be read, so it could not be put back.
+            BusError: no valid reply.
+        """
+        for drive in self._watched:
+            axis, watch = drive.axis, drive.axis.map.comm_timeout
+            assert watch is not None
+            address, kind = watch.place_of("timeout") or (watch.write[0].address, "u16")
+            order = axis.map.word_order
+            try:
+                words = drive.bus.read_words(axis.unit, address, registers_of(kind))
+            except Rejected as error:
+                raise MotionFault(
+                    f"{axis.name}: its communication timeout cannot be read, so it "
+                    f"could not be put back: {error}. Correct [comm_timeout] of the "
+                    f"map {axis.map.name}, or leave it out"
+                ) from None
+            before = decode(words, kind, order)
+            counts = max(1, math.ceil(self._timeouts_s[axis.name] * watch.per_s - 1e-9))
+            left = self._left.get(axis.name)
+            if left and before == left["counts"]:  # a killed session's, not the drive's
+                before = left["before"]
+            self._emit(
+                "comm_timeout", sync=True, axis=axis.name, before=before, counts=counts
+            )
+            self._before[axis.name] = before
+            drive.write(watch, timeout=counts)
+
+    def restore(self, standing: set[str]) -> None:
+        """Give back what was there, of the axes that stand; never raises.
+
+        A drive that was not seen to stand keeps its timeout: it stops itself.
+        """
+        for drive in self._watched:
+            name = drive.axis.name
+            if name not in self._before:
+                continue
+            error = "not seen standing"
+            if name in standing:
+                try:
+                    with drive.bus.urgent():
+                        drive.write(
+                            drive.axis.map.comm_timeout, timeout=self._before[name]
+                        )
+                    error = ""
+                except Exception as caught:
+                    error = str(caught)
+            counts = self._before.pop(name)
+            self._emit("comm_restored", axis=name, counts=counts, error=error)
+
+
+def timeouts_left(records: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """The ``comm_timeout`` records of a journal that no restoring has followed."""
+    left: dict[str, dict[str, Any]] = {}
+    for record in records:
+        if record["event"] == "comm_timeout":
+            left[record["axis"]] = record
+        elif record["event"] == "comm_restored" and not record["error"]:
+            left.pop(record["axis"], None)
+    return left
+
+
+class Device:
+    """Three drives and a phone: armed explicitly, and never moved once stopped."""
+
+    def __init__(
+        self,
+        config: RigConfig,
+        bus: Bus,
+        imu: Imu,
+        signals: Requests,
+        emit: Callable[..., Any],
+        timeouts_left: Mapping[str, Mapping[str, Any]] | None = None,
+    ) -> None:
+        self.config = config
+        self.bus = bus
+        self.imu = imu
+        self.emit = emit
+        self.drives = [Drive(bus, axis) for axis in config.axes]
+        self.stopper = Stopper(self.drives, emit)
+        self.armed = False
+        self.frame: Frame | None = None  # once the zero is taken
+        self._signals = signals
+        timeouts = config.comm_timeouts_s
+        self.line_watch = LineWatch(self.drives, timeouts, emit, timeouts_left or {})
+        self.heartbeat = Heartbeat(
+            self.stopper, config.heartbeat_s, min(timeouts.values(), default=0.0) / 4
+        )
+        bus.check = self._before_exchange
+
+    def arm(self, reset_alarms: bool = False) -> None:
+        """Check everything that must hold before anything may move.
+
+        Raises:
+            MotionFault: an alarm, a moving or disabled drive, a position outside the
+                limits, no fresh IMU reading.
+        """
+        self.stopper.check()
+        for drive in self.drives:
+            self._check_fit(drive, reset_alarms)
+            axis = drive.axis
+            if self.config.motion.mirror_limits:
+                drive.write(axis.map.limits, min=axis.min_pulses, max=axis.max_pulses)
+        try:
+            self.imu.latest()
+        except ImuError as error:
+            raise MotionFault(str(error)) from None
+        self.line_watch.apply()
+        self.armed = True
+        self.heartbeat.start()
+
+    def _check_fit(self, drive: Drive, reset_alarms: bool) -> None:
+        axis, status = drive.axis, drive.status()
+        if status.fault and reset_alarms and axis.map.alarm_reset:
+            status = drive.bring(axis.map.alarm_reset, lambda s: not s.fault)
+        if status.fault:
+            raise MotionFault(
+                f"{axis.name} is in alarm: {drive.alarm() or 'no code given'}. Find "
+                "the cause, then start again with --reset-alarms"
+            )
+        if status.moving:
+            raise MotionFault(
+                f"{axis.name} is already moving. Stop the other controller, then run "
+                "`stop`"
+            )
+        if not status.enabled:
+            if not drive.bring(axis.map.enable, lambda s: s.enabled).enabled:
+                raise MotionFault(
+                    f"{axis.name} does not enable its power stage. Check its "
+                    "supply and its enable and STO inputs"
+                )
+        slack = axis.pulses_within(self.config.motion.position_tolerance_deg)
+        if not axis.min_pulses - slack <= status.position <= axis.max_pulses + slack:
+            raise MotionFault(
+                f"{axis.name} stands at {status.position} pulses, outside its limits "
+                f"{axis.min_pulses}..{axis.max_pulses}. Home it first"
+            )
+
+    def guard(self, moving: bool = False) -> None:
+        """The loop is alive; raise StopRequested where a stop was asked for."""
+        self._signals.tell()
+        self._before_exchange()
+        self.heartbeat.feed(moving)
+
+    def _before_exchange(self) -> None:
+        """Before every frame: a stop is not kept waiting for the rest of a loop."""
+        self._signals.check_stop()
+        self.stopper.check()
+        self.heartbeat.feed()
+
+    def statuses(self) -> list[Status]:
+        """Of all drives; raises MotionFault on a fault bit."""
+        return [drive.sound() for drive in self.drives]
+
+    def positions(self) -> Pulses:
+        """Where the drives stand, in pulses."""
+        a, b, c = (drive.status().position for drive in self.drives)
+        return a, b, c
+
+    def close(self) -> None:
+        """Nothing more will move: close bus and phone."""
+        self.heartbeat.close()
+        self.armed = False
+        results = self.stopper.results
+        self.line_watch.restore({r.axis for r in results if r.standing})
+        self.bus.close()
+        self.imu.close()

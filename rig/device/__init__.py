@@ -1,1 +1,0 @@
-"""What is at the other end of the cables: drives over Modbus, a phone over a socket."""

@@ -1,1 +1,0 @@
-"""What keeps the device safe: limits, faults, the stop path, signals, the watchdog."""

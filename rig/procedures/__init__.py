@@ -1,0 +1,1 @@
+"""What a session is for: calibrate, collect, verify, goto."""
