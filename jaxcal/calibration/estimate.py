@@ -53,7 +53,7 @@ def fit_model(
     discrepancy: int | None,
     common_noise: bool | None,
 ) -> dict[str, Any]:
-    """The fields of a ``ModelCalibration`` but names, units and provenance."""
+    """The fields of a ``Calibration`` but names, units and provenance."""
     one_of("loss", loss, ("student", "gaussian"))
     if prior is not None and not isinstance(prior, Prior):
         raise ValueError(f"prior must be a jaxcal.Prior, got {type(prior).__name__}")
@@ -186,6 +186,7 @@ def _fields(
     return {
         "estimate": found.parameters,
         "joint_covariance": None if noise_std is None else covariance,
+        "centre": None,
         "unidentified": null,
         "prior_mean": task.mean,
         "prior_precision": found.precision,

@@ -18,8 +18,8 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.checked import derivative, predict
 from jaxcal.models import Model
+from jaxcal.models.checked import derivative, predict
 
 __all__ = ["NU", "Solution", "Task", "solve", "student_constants"]
 

@@ -102,7 +102,7 @@ def checked_options(method: str, given: Mapping[str, Any]) -> dict[str, Any]:
     Raises:
         ValueError: an option is unknown, has a bad value, or belongs to other methods.
     """
-    one_of("method", method, METHODS)
+    one_of("method", method, tuple(SOLVERS))
     reads = SOLVERS[method].options
     checked = {name: OPTIONS[name][0] for name in reads}
     for name, value in given.items():
@@ -112,7 +112,7 @@ def checked_options(method: str, given: Mapping[str, Any]) -> dict[str, Any]:
             continue
         value = check(value)
         if name not in reads:
-            others = [other for other in METHODS if name in SOLVERS[other].options]
+            others = [other for other in SOLVERS if name in SOLVERS[other].options]
             raise ValueError(
                 f'{name} is not an option of method "{method}" '
                 f"(it is of {', '.join(others)})"

@@ -13,11 +13,10 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from questions import of
 
 import jaxcal
 from jaxcal.selection.criteria import CRITERIA
-
-from .questions import of
 
 LIMIT = 20.0  # seconds of a call
 

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from questions import make_problem
 
 import jaxcal
 from jaxcal.selection.auto import solve
-
-from .questions import make_problem
 
 OPTIONS = {"seed": 0, "restarts": None, "time_limit": None}
 

@@ -7,12 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
+from questions import make_block_problem, make_problem, of
 
 from jaxcal.models import Affine
 from jaxcal.selection import select
 from jaxcal.selection.exchange.exchange import exchange_indices
-
-from .questions import make_block_problem, make_problem, of
 
 SOLVERS = ("random", "greedy", "exchange", "exact", "auto")
 laws = hypothesis_settings(max_examples=25, deadline=None)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from questions import make_block_problem, make_problem, of, score
 
 import jaxcal
 from jaxcal.models import Affine, FromJax, Linear
@@ -14,8 +15,6 @@ from jaxcal.selection import select
 from jaxcal.selection.criteria import CRITERIA
 from jaxcal.selection.exchange.exchange import exchange_from
 from jaxcal.selection.problem import values
-
-from .questions import make_block_problem, make_problem, of, score
 
 laws = settings(max_examples=20, deadline=None)
 NAMES = st.sampled_from(tuple(CRITERIA))
@@ -329,7 +328,7 @@ HELD = jaxcal.Prior(1.0, fixed=("a11", "a12", "a13", "b1"))
             {"region": np.ones((3, 4)), "criterion": "I"},
         ),
         (
-            "region, where .* must come with criterion I, got criterion D",
+            "region, where .* must come with criterion I, once, got criterion D",
             {"region": np.ones((3, 2, 4))},
         ),
         (r"measured must have shape \(N, 2, 4\)", {"measured": np.ones((3, 1, 4))}),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from questions import make_problem, score
 
 from jaxcal.models import Affine
 from jaxcal.selection import auto as auto_module
@@ -16,8 +17,6 @@ from jaxcal.selection.exact.branch_and_bound import branch_and_bound
 from jaxcal.selection.exact.exact import solve_exact, upper_bound
 from jaxcal.selection.exact.volume import largest_volumes
 from jaxcal.selection.exchange.exchange import exchange_indices
-
-from .questions import make_problem, score
 
 
 def full_log_dets(candidates, subsets, num_outputs=None):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from questions import make_block_problem, make_problem, of
 from scipy.linalg import hadamard
 from scipy.optimize import minimize
 
@@ -17,8 +18,6 @@ from jaxcal.selection import select
 from jaxcal.selection.criteria import CRITERIA
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
 from jaxcal.selection.exact.exact import upper_bound
-
-from .questions import make_block_problem, make_problem, of
 
 Array = np.ndarray
 NAMES = ("D", "Ds", "A", "As", "I", "E")

@@ -11,13 +11,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
+from questions import plan
 
 import jaxcal
 from jaxcal import plots
 from jaxcal.information.criteria import criteria
 from jaxcal.models import Affine, Noise, Polynomial, Prior, SerialChain
-
-from .questions import plan
 
 
 def value_of(candidates, indices, criterion, region=None):

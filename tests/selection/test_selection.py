@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from questions import make_problem, score
 
 import jaxcal
 from jaxcal.information.criteria import criteria
@@ -18,8 +19,6 @@ from jaxcal.selection import (
     random_batch,
     select,
 )
-
-from .questions import make_problem, score
 
 SOLVERS = ("random", "greedy", "exchange", "exact")
 BATCHES = (random_batch, greedy_batch, exchange_batch, exact_batch)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers, whole_number
+from jaxcal.checks import levels, numbers, whole_number
 from jaxcal.models.uncertainty import Noise
 from jaxcal.selection.criteria import positions
 from jaxcal.selection.greedy import greedy_indices
@@ -61,7 +61,7 @@ def make_request(
                 std = 1.0 if noise.std is None else noise.std
                 noise_std = std if np.ndim(std) < 2 else None
         if noise_std is not None:
-            noise_std = _level("noise_std", noise_std, model.num_outputs)
+            noise_std = levels("noise_std", noise_std, model.num_outputs)
             shared = not of_parameters and shares_regressor(model, asked.prior, None)
             # Where outputs share a regressor the noise is in the targets.
             asked = asked.with_noise(None if shared else Noise(noise_std))
@@ -75,7 +75,7 @@ def make_request(
     m = model.num_outputs if shared and model is not None else rows.shape[1]
     if not of_parameters:
         names = tuple(f"output {i + 1}" for i in range(m))
-    target = _level("accuracy", accuracy, m)
+    target = levels("accuracy", accuracy, m)
     scale = unit = target
     if noise_std is not None and shared:
         scale = (target / noise_std).min(keepdims=True)
@@ -107,18 +107,6 @@ def _region(
     where = problem.candidates[problem.available] if region is None else region
     source = asked.with_noise(None).source(not shared)
     return source.at("region", where, False), names
-
-
-def _level(name: str, value: ArrayLike, m: int) -> Array:
-    """(m,) positive numbers; a copy that cannot be written to."""
-    given = numbers(name, value)
-    if given.shape not in ((), (m,)):
-        raise ValueError(f"{name} must be one number or ({m},), got {given.shape}")
-    if (given <= 0.0).any():
-        raise ValueError(f"{name} must be positive, got {given.min():g}")
-    own = np.array(np.broadcast_to(given, (m,)))
-    own.flags.writeable = False
-    return own
 
 
 def fewest(problem: Problem) -> tuple[int, int]:

@@ -159,8 +159,8 @@ class Asked:
             root = _with_measured(root, seen)
         source.require_identified(self._measured)
         where = asked.region
-        if where is None and isinstance(source, Modelled) and source.of_known_commands:
-            where = source.used  # predictions are for commands that are known
+        if where is None and asked.name == "I":
+            where = source.predicted()
         return whitened_problems(
             raw[None], root,
             Rules(

@@ -13,7 +13,6 @@ A source answers, of candidates (M, n) of which some are available:
 from __future__ import annotations
 
 import dataclasses
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import numbers
 from jaxcal.information.blocks import prior_root
 from jaxcal.models.affine import Affine
+from jaxcal.models.checked import derivative
 from jaxcal.models.identifiability import identifiability
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
@@ -31,21 +31,25 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-class Source(Protocol):
-    """See the top of the module."""
+class Source:
+    """See the top of the module; what is the same in most."""
 
-    names: tuple[str, ...]
-    times: int
+    names: tuple[str, ...] = ()
+    times = 1
     root: Array
 
     def blocks(self) -> Array:
-        """(M, q, p)."""
+        raise NotImplementedError
 
     def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
-        """(N, q, p)."""
+        raise NotImplementedError
 
     def require_identified(self, measured: ArrayLike | None) -> None:
-        """Refuse candidates that leave parameters unknown, by the names of a model."""
+        """Refuse what candidates leave unknown, by the names of a model."""
+
+    def predicted(self) -> Array | None:
+        """Commands of predictions, where their blocks are not those of readings."""
+        return None
 
 
 def shares_regressor(model: Model, prior: Prior | None, noise: Noise | None) -> bool:
@@ -62,10 +66,8 @@ def shares_regressor(model: Model, prior: Prior | None, noise: Noise | None) -> 
     return bool(known.free.all() and not known.precision.any())
 
 
-class Shared:
+class Shared(Source):
     """The affine model where all outputs share one regressor [u, 1] / std."""
-
-    names: tuple[str, ...] = ()
 
     def __init__(self, model: Affine, candidates: Array, noise: Noise | None) -> None:
         self._model, self._candidates = model, candidates
@@ -80,14 +82,9 @@ class Shared:
         points = _commands(argument, values, self._model.num_inputs)
         return self._model.blocks(points) / self._std
 
-    def require_identified(self, measured: ArrayLike | None) -> None:
-        pass  # whitening finds it
 
-
-class Given:
+class Given(Source):
     """Blocks of the caller's own, and a prior precision (p, p)."""
-
-    times = 1
 
     def __init__(
         self, blocks: Array, prior: ArrayLike | None, noise: Noise | None
@@ -117,19 +114,14 @@ class Given:
             )
         return self._white(array)
 
-    def require_identified(self, measured: ArrayLike | None) -> None:
-        pass  # whitening finds it
-
     def _white(self, blocks: Array) -> Array:
         if self._noise is None:
             return blocks
         return self._noise.whitening(len(blocks), self._q) @ blocks
 
 
-class Modelled:
+class Modelled(Source):
     """A model at the mean of its prior, without the parameters that are held."""
-
-    times = 1
 
     def __init__(
         self,
@@ -158,7 +150,7 @@ class Modelled:
 
     def blocks(self) -> Array:
         count, mask = len(self._candidates), self._available
-        jacobian = self._jacobian("candidates", self.used)
+        jacobian = self._jacobian(self.used)
         q = jacobian.shape[1]
         slopes = None
         if self._noise.command_std is not None:
@@ -186,14 +178,12 @@ class Modelled:
             slopes = self._model.command_jacobian(points, self._mean)
         else:
             noise = dataclasses.replace(noise, command_std=None)
-        jacobian = self._jacobian(argument, points)
+        jacobian = self._jacobian(points)
         white = noise.whitening(len(points), jacobian.shape[1], slopes)
         return _weighted(white, jacobian)
 
-    @property
-    def of_known_commands(self) -> bool:
-        """Predictions and readings have blocks of their own: commands are noisy."""
-        return self._noise.command_std is not None
+    def predicted(self) -> Array | None:
+        return None if self._noise.command_std is None else self.used
 
     def require_identified(self, measured: ArrayLike | None) -> None:
         if np.diagonal(self._precision).all():
@@ -213,25 +203,9 @@ class Modelled:
                 "fixed=[name])"
             )
 
-    def _jacobian(self, argument: str, commands: Array) -> Array:
+    def _jacobian(self, commands: Array) -> Array:
         """(N, q, p) derivative by the free parameters, checked."""
-        model = self._model
-        jacobian = numbers(
-            "model.jacobian", model.jacobian(commands, self._mean), finite=False
-        )
-        shape = (len(commands), model.num_outputs, len(model.names))
-        if jacobian.shape != shape:
-            raise ValueError(
-                f"model.jacobian must return shape {shape}, got {jacobian.shape}"
-            )
-        finite = np.isfinite(jacobian)
-        if not finite.all():
-            i, output, at = np.argwhere(~finite)[0]
-            raise ValueError(
-                f"model.jacobian must be finite, got {jacobian[i, output, at]} for "
-                f"parameter {model.names[at]}, output {output + 1}, at {argument} "
-                f"{commands[i].tolist()}"
-            )
+        jacobian = derivative(self._model, commands, self._mean)
         return jacobian if self._free.all() else jacobian[..., self._free]
 
 
