@@ -111,11 +111,11 @@ def _simulate(args: argparse.Namespace) -> int:
 
 def _watch(args: argparse.Namespace) -> int:
     from jaxcal.extras import needs
-    from rig.live import launch
+    from rig.workbench.live import launch
 
     journal_of(args.run)
     with needs("live", "the live page"):
-        from rig.live.server import serve
+        from rig.workbench.live.server import serve
     sock, token, url = launch.listen(args.live_host)
     print(f"live page: {url}\nCtrl-C ends", flush=True)
     with contextlib.suppress(KeyboardInterrupt):

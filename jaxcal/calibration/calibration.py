@@ -19,6 +19,7 @@ from jaxcal.checks import in_words, numbers
 from jaxcal.models import (
     Affine,
     Model,
+    Pose,
     Prior,
     SerialChain,
     from_dict,
@@ -348,7 +349,7 @@ class Calibration:
     def _carry(self, wanted: Array, start: Array | None) -> Carry | None:
         """Of an arm's pose, whose orientations are relative to the commands."""
         arm = self.model
-        if not (isinstance(arm, SerialChain) and arm.output == "pose"):
+        if not (isinstance(arm, SerialChain) and isinstance(arm.sensor, Pose)):
             return None
         if start is None:
             raise ValueError(
@@ -381,6 +382,34 @@ class Calibration:
 
     def _rows(self, points: Array) -> Array:
         return points.reshape(-1, self.num_inputs)
+
+    # -- an arm, written back ----------------------------------------------------------
+
+    @property
+    def arm(self) -> SerialChain:
+        """The arm as calibrated, its parameters nominal, with Position()."""
+        return self._chain().calibrated(self.parameters)
+
+    def to_urdf(self, path: str | os.PathLike[str], *, force: bool = False) -> str:
+        """See :meth:`jaxcal.models.SerialChain.to_urdf`; returns the tip link."""
+        return self._chain().to_urdf(path, self.parameters, force=force)
+
+    def to_dh(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
+        """See :meth:`jaxcal.models.SerialChain.to_dh`."""
+        self._chain().to_dh(path, self.parameters, force=force)
+
+    def to_ur_kinematics(
+        self, path: str | os.PathLike[str], *, force: bool = False
+    ) -> None:
+        """See :meth:`jaxcal.models.SerialChain.to_ur_kinematics`."""
+        self._chain().to_ur_kinematics(path, self.parameters, force=force)
+
+    def _chain(self) -> SerialChain:
+        if not isinstance(self.model, SerialChain):
+            raise ValueError(
+                f"the model must be an arm, got {type(self.model).__name__}"
+            )
+        return self.model
 
     # -- printed, and as a file --------------------------------------------------------
 

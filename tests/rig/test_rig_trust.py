@@ -38,10 +38,10 @@ from rig.core.record import (
 from rig.core.session import run_safely
 from rig.core.zero import KeptZero, check_zero, moved, unseen
 from rig.journal import read_journal
-from rig.procedures.checking import collect, load_calibration, verify
 from rig.simulator import Truth
 from rig.simulator.faults import FaultInjector
 from rig.simulator.phone import Phone
+from rig.workbench.procedures.checking import collect, load_calibration, verify
 
 LOST = 1.4  # degrees, as was seen
 
