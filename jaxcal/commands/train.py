@@ -17,7 +17,7 @@ from jaxcal.arguments import refused
 from jaxcal.commands.runs import clock, stop_on_signals
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder
-from jaxcal.learning.runtime import processes
+from jaxcal.learning.runtime import cache, processes
 
 if TYPE_CHECKING:
     from jaxcal.adaptive.policy.config import PolicyConfig
@@ -43,6 +43,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
     given = list(sys.argv[1:] if argv is None else argv)
 
     def alone() -> int:  # this process may be one of several
+        cache.keep_compiled_programs()
         try:
             with needs("policy", prog):
                 from jaxcal.commands.train_arguments import parser
@@ -56,9 +57,8 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
 
 def _run(arguments: argparse.Namespace) -> int:
     """Train, say how it went; of several processes the first speaks for all."""
-    from jaxcal.learning.runtime import cache, devices
+    from jaxcal.learning.runtime import devices
 
-    cache.keep_compiled_programs()
     named = pathlib.Path(arguments.task or arguments.preset).stem
     out = pathlib.Path(arguments.out or f"runs/{named}")
     if arguments.export and not arguments.export.endswith(".npz"):
