@@ -130,26 +130,16 @@ def test_search_and_enumeration_agree(
     assert found.examined < slow.examined
 
 
-def test_the_search_resumes_where_it_stopped(monkeypatch: pytest.MonkeyPatch) -> None:
-    vectors = rows(sphere(3, 60, 4))
-    whole = searched(monkeypatch, vectors)
-    monkeypatch.setattr(volume, "_WORK", 1)  # one node per call
-    steps = searched(monkeypatch, vectors)
-    np.testing.assert_array_equal(steps.subsets, whole.subsets)
-    assert steps.examined == whole.examined
-
-
-@pytest.mark.parametrize("stop_after", [0, 1, 5, 40])
+@pytest.mark.parametrize("seconds", [0.0, 0.002, 0.02])
 def test_a_deadline_leaves_an_honest_bound(
-    monkeypatch: pytest.MonkeyPatch, stop_after: int
+    monkeypatch: pytest.MonkeyPatch, seconds: float
 ) -> None:
-    vectors = rows(sphere(4, 80))
+    vectors = rows(sphere(4, 200, 6))
     optimum = searched(monkeypatch, vectors).volumes[0]
-    clock = itertools.chain([0.0] * stop_after, itertools.repeat(2.0))
-    monkeypatch.setattr(volume, "_WORK", 1)
-    monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
-    found = searched(monkeypatch, vectors, deadline=1.0)
-    assert not found.complete and found.examined == stop_after
+    deadline = time.perf_counter() + seconds
+    found = searched(monkeypatch, vectors, deadline=deadline)
+    if seconds == 0.0:
+        assert not found.complete and found.examined == 0
     assert found.volumes[0] <= optimum * (1 + 1e-12) and optimum <= found.bound
     assert found.volumes[0] == pytest.approx(determinants(vectors, found.subsets)[0])
     assert found.volumes[0] > 0.9 * optimum

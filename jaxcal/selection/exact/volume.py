@@ -31,7 +31,6 @@ _MINORS = 200_000  # entries of the minors from which making them takes as long
 _STEPS = 5  # towards the D-optimal weights
 _STARTS = 4  # climbs to a known volume
 _UNTHREADED = 240_000  # multiplications up to which BLAS starts no threads, which stall
-_WORK = 4_000_000  # of the search between two looks at the clock, about 10 ms
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,21 +161,15 @@ def _search(
     h, q = len(kept), vectors.shape[1]
     points, index = np.empty((q - 1, h, q)), np.empty((q - 1, h), dtype=np.int64)
     points[0], index[0] = vectors[kept], kept
-    size, place = np.full(q - 1, h), np.zeros(q - 1, dtype=np.int64)
-    chosen, subset, volume = np.zeros(q, dtype=np.int64), known.copy(), np.ones(q - 1)
+    place, subset = np.zeros(q - 1, dtype=np.int64), known.copy()
     largest = np.array([abs(np.linalg.det(vectors[known]))])
-    depth = nodes = 0
-    while depth >= 0:
-        if deadline is not None and time.perf_counter() > deadline:
-            begun = max(0, int(place[0]) - 1)  # of the vectors that come first
-            bound = max(float(largest[0]), float(np.prod(lengths[begun : begun + q])))
-            found = np.sort(subset)[None]
-            return Volumes(found, unit * largest, nodes, False, unit * bound)
-        depth, done = descend(
-            points, index, size, place, volume, depth, chosen, subset, largest,
-            max(1, _WORK // (h * q)),
-        )  # fmt: skip
-        nodes += done
+    seconds = math.inf if deadline is None else deadline - time.perf_counter()
+    complete, nodes = descend(points, index, place, subset, largest, seconds)
+    if not complete:
+        begun = max(0, int(place[0]) - 1)  # of the vectors that come first
+        bound = max(float(largest[0]), float(np.prod(lengths[begun : begun + q])))
+        found = np.sort(subset)[None]
+        return Volumes(found, unit * largest, nodes, False, unit * bound)
     return _complete(subset[None], unit * largest, nodes)
 
 

@@ -10,130 +10,215 @@ two corners of the polygon around the points and their negatives.
 
 from __future__ import annotations
 
-import math
-
+import cython
 import numpy as np
-from numba import njit
+from cython.cimports.jaxcal.watch import Watch, begin, late
+from cython.cimports.libc.math import INFINITY, M_PI, copysign, cos, fabs, sin, sqrt
 
 __all__ = ["descend"]
 
-_TOLERANCE = 5e-11  # relative; a node must be able to improve the volume by more
-_SIDES = 16  # half the sides of the polygon, which is at most 1 % too large
-_FEW = 12  # points up to which all pairs are tried without the polygon
+# Relative; a node must be able to improve the volume by more.
+_TOLERANCE = cython.declare(cython.double, 5e-11)
+# Half the sides of the polygon, which is at most 1 % too large.
+_SIDES = cython.declare(cython.int, 16)
+# Points up to which all pairs are tried without the polygon.
+_FEW = cython.declare(cython.int, 12)
 
 
-@njit(cache=True, nogil=True)
-def descend(points, index, size, place, volume, depth, chosen, subset, largest, budget):
-    """Search until nothing is open or ``budget`` nodes are done; resumes where it was.
+def descend(
+    points: cython.double[:, :, ::1],
+    index: cython.Py_ssize_t[:, ::1],
+    place: cython.Py_ssize_t[::1],
+    subset: cython.Py_ssize_t[::1],
+    largest: cython.double[::1],
+    seconds: cython.double,
+):
+    """Search until nothing is open or the time is over.
 
     Args:
         points: (q - 1, h, q) coordinates of the vectors left at each depth, longest
-            first; only the first q - depth of them count.
-        index: (q - 1, h) which vectors these are.
-        size: (q - 1,) how many.
-        place: (q - 1,) the next to choose at each depth.
-        volume: (q - 1,) of the chosen.
-        depth: where to go on; 0 at first.
-        chosen: (q,) vectors chosen on the way to ``depth``.
-        subset, largest: (q,) vectors and (1,) volume of the incumbent; updated.
-        budget: nodes.
+            first; only the first q - depth of them count. The first depth is given.
+        index: (q - 1, h) int64 which vectors these are.
+        place: (q - 1,) int64 written: how many were chosen first at each depth.
+        subset, largest: (q,) int64 vectors and (1,) volume of the incumbent; updated.
+        seconds: time limit.
 
     Returns:
-        The depth to resume at, -1 where the search is complete, and the nodes done.
+        Whether the search is complete, and the nodes done.
     """
-    q = len(chosen)
-    nodes = 0
-    while depth >= 0 and nodes < budget:
-        if depth == q - 2:
-            _best_pair(points[depth], index, size, volume, chosen, subset, largest)
+    q, h = subset.shape[0], points.shape[1]
+    size: cython.Py_ssize_t[::1] = np.full(q - 1, h)
+    volume: cython.double[::1] = np.ones(q - 1)
+    chosen: cython.Py_ssize_t[::1] = np.zeros(q, np.int64)
+    room: cython.double[:, ::1] = np.empty((h, q + 1))
+    order: cython.Py_ssize_t[:, ::1] = np.empty((2, h), np.int64)
+    depth: cython.Py_ssize_t = 0
+    nodes: cython.Py_ssize_t = 0
+    watch: Watch = begin(seconds)
+    place[:] = 0
+    with cython.nogil:
+        while depth >= 0:
+            if late(cython.address(watch)):
+                break
+            if depth == q - 2:
+                _best_pair(points[depth], index, size, volume, chosen, subset, largest)
+                nodes += 1
+                depth -= 1
+                continue
+            c = place[depth]
+            needed = (1.0 + _TOLERANCE) * largest[0] / volume[depth]
+            if _too_short(points[depth], c, size[depth], q - depth, needed):
+                depth -= 1
+                continue
+            place[depth] = c + 1
+            chosen[depth] = index[depth, c]
+            _open(points, index, size, volume, depth, c, largest[0], room, order)
+            depth += 1
+            place[depth] = 0
             nodes += 1
-            depth -= 1
-            continue
-        c = place[depth]
-        needed = (1.0 + _TOLERANCE) * largest[0] / volume[depth]
-        if _too_short(points[depth], c, size[depth], q - depth, needed):
-            depth -= 1
-            continue
-        place[depth] = c + 1
-        chosen[depth] = index[depth, c]
-        _open(points, index, size, volume, depth, c, largest[0])
-        depth += 1
-        place[depth] = 0
-        nodes += 1
-    return depth, nodes
+    return depth < 0, nodes
 
 
-@njit(cache=True, nogil=True)
-def _length(point, dimension):
-    total = 0.0
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _length(
+    points: cython.double[:, ::1], c: cython.Py_ssize_t, dimension: cython.Py_ssize_t
+) -> cython.double:
+    total: cython.double = 0.0
     for a in range(dimension):
-        total += point[a] * point[a]
-    return math.sqrt(total)
+        total += points[c, a] * points[c, a]
+    return sqrt(total)
 
 
-@njit(cache=True, nogil=True)
-def _too_short(points, first, size, dimension, needed):
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _too_short(
+    points: cython.double[:, ::1],
+    first: cython.Py_ssize_t,
+    size: cython.Py_ssize_t,
+    dimension: cython.Py_ssize_t,
+    needed: cython.double,
+) -> cython.bint:
     """Do all subsets of the points from ``first`` on stay below the volume needed?"""
     if first + dimension > size:
         return True
-    bound = 1.0
+    bound: cython.double = 1.0
     for c in range(first, first + dimension):  # the longest of them
-        bound *= _length(points[c], dimension)
+        bound *= _length(points, c, dimension)
     return bound < needed
 
 
-@njit(cache=True, nogil=True)
-def _open(points, index, size, volume, depth, c, reached):
-    """Fill depth + 1 with what comes after c, without what is too short to matter."""
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _open(
+    points: cython.double[:, :, ::1],
+    index: cython.Py_ssize_t[:, ::1],
+    size: cython.Py_ssize_t[::1],
+    volume: cython.double[::1],
+    depth: cython.Py_ssize_t,
+    c: cython.Py_ssize_t,
+    reached: cython.double,
+    room: cython.double[:, ::1],
+    order: cython.Py_ssize_t[:, ::1],
+) -> cython.void:
+    """Fill depth + 1 with what comes after c, without what is too short to matter.
+
+    Args:
+        room: (h, q + 1) to work in: a vector and its length each.
+        order: (2, h) likewise.
+    """
     q = points.shape[2]
     left = q - depth - 1  # dimensions after the choice
-    chosen, below, names = points[depth, c], points[depth + 1], index[depth + 1]
-    length = _length(chosen, left + 1)
+    below, names = points[depth + 1], index[depth + 1]
+    length = _length(points[depth], c, left + 1)
     volume[depth + 1] = volume[depth] * length
     # The reflection that takes the chosen onto the first axis, which is then dropped.
-    mirror = chosen[: left + 1].copy()
-    mirror[0] += math.copysign(length, mirror[0])
-    factor = 1.0 / (length * (length + abs(chosen[0])))
+    first = points[depth, c, 0]
+    factor = 1.0 / (length * (length + fabs(first)))
     count = size[depth] - c - 1
-    lengths = np.empty(count)
-    longest = 0.0
+    longest: cython.double = 0.0
     for k in range(count):
-        point = points[depth, c + 1 + k]
-        along = 0.0
+        i = c + 1 + k
+        along: cython.double = copysign(length, first) * points[depth, i, 0]
         for a in range(left + 1):
-            along += mirror[a] * point[a]
+            along += points[depth, c, a] * points[depth, i, a]
         along *= factor
-        square = 0.0
+        square: cython.double = 0.0
         for a in range(left):
-            value = point[a + 1] - along * mirror[a + 1]
-            below[k, a] = value
+            value = points[depth, i, a + 1] - along * points[depth, c, a + 1]
+            room[k, a] = value
             square += value * value
-        lengths[k] = math.sqrt(square)
-        longest = max(longest, lengths[k])
-    needed = (1.0 + _TOLERANCE) * reached / volume[depth + 1]
-    least = needed / longest ** (left - 1) if longest > 0.0 else np.inf
-    kept = 0
+        room[k, q] = sqrt(square)
+        longest = max(longest, room[k, q])
+    least = INFINITY
+    if longest > 0.0:
+        least = (1.0 + _TOLERANCE) * reached / volume[depth + 1]
+        for _ in range(left - 1):
+            least /= longest
+    kept: cython.Py_ssize_t = 0
     for k in range(count):
-        if lengths[k] >= least:
-            for a in range(left):
-                below[kept, a] = below[k, a]
-            names[kept] = index[depth, c + 1 + k]
-            lengths[kept] = -lengths[k]
+        if room[k, q] >= least:
+            order[0, kept] = k
             kept += 1
     size[depth + 1] = kept
-    if left > 2:  # longest first; loops, since slices take seconds to compile
-        order = np.argsort(lengths[:kept])
-        unsorted, unsorted_names = below[:kept].copy(), names[:kept].copy()
-        for k in range(kept):
-            names[k] = unsorted_names[order[k]]
-            for a in range(left):
-                below[k, a] = unsorted[order[k], a]
+    if left > 2:
+        _longest_first(room, order, kept)
+    for k in range(kept):
+        i = order[0, k]
+        names[k] = index[depth, c + 1 + i]
+        for a in range(left):
+            below[k, a] = room[i, a]
 
 
-@njit(cache=True, nogil=True)
-def _best_pair(plane, index, size, volume, chosen, subset, largest):
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _longest_first(
+    room: cython.double[:, ::1],
+    order: cython.Py_ssize_t[:, ::1],
+    count: cython.Py_ssize_t,
+) -> cython.void:
+    """Sort the first ``count`` of ``order[0]`` by length, by merging runs."""
+    key = room.shape[1] - 1
+    width: cython.Py_ssize_t = 1
+    while width < count:
+        begin_of: cython.Py_ssize_t = 0
+        while begin_of < count:
+            middle = min(begin_of + width, count)
+            end = min(begin_of + 2 * width, count)
+            i: cython.Py_ssize_t = begin_of
+            j: cython.Py_ssize_t = middle
+            for k in range(begin_of, end):
+                if j >= end or (
+                    i < middle and room[order[0, i], key] >= room[order[0, j], key]
+                ):
+                    order[1, k] = order[0, i]
+                    i += 1
+                else:
+                    order[1, k] = order[0, j]
+                    j += 1
+            begin_of = end
+        order[0, :count] = order[1, :count]
+        width *= 2
+
+
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _best_pair(
+    plane: cython.double[:, ::1],
+    index: cython.Py_ssize_t[:, ::1],
+    size: cython.Py_ssize_t[::1],
+    volume: cython.double[::1],
+    chosen: cython.Py_ssize_t[::1],
+    subset: cython.Py_ssize_t[::1],
+    largest: cython.double[::1],
+) -> cython.void:
     """The two of the planar points with the largest cross product, if it is enough."""
-    last = len(chosen) - 2
+    last = chosen.shape[0] - 2
     count = size[last]
     needed = (1.0 + _TOLERANCE) * largest[0] / volume[last]
     if count > _FEW and _polygon_bound(plane, count) < needed:
@@ -141,35 +226,42 @@ def _best_pair(plane, index, size, volume, chosen, subset, largest):
     for i in range(count - 1):
         x, y = plane[i, 0], plane[i, 1]
         for j in range(i + 1, count):
-            found = volume[last] * abs(x * plane[j, 1] - y * plane[j, 0])
+            found = volume[last] * fabs(x * plane[j, 1] - y * plane[j, 0])
             if found > largest[0]:
                 largest[0] = found
-                for a in range(last):
-                    subset[a] = chosen[a]
-                subset[last], subset[last + 1] = index[last, i], index[last, j]
+                subset[:last] = chosen[:last]
+                subset[last] = index[last, i]
+                subset[last + 1] = index[last, j]
 
 
-@njit(cache=True, nogil=True)
-def _polygon_bound(plane, count):
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _polygon_bound(
+    plane: cython.double[:, ::1], count: cython.Py_ssize_t
+) -> cython.double:
     """Largest cross product of two points of the polygon that holds the points.
 
     Its sides are at equal angles and touch the points or their negatives.
     """
-    step = math.pi / _SIDES
-    reach = np.zeros(_SIDES + 1)
+    reach = cython.declare(cython.double[17])
+    x = cython.declare(cython.double[16])
+    y = cython.declare(cython.double[16])
+    step = M_PI / _SIDES
+    d: cython.Py_ssize_t
     for d in range(_SIDES):
-        c, s = math.cos(d * step), math.sin(d * step)
+        c, s = cos(d * step), sin(d * step)
+        reach[d] = 0.0
         for k in range(count):
-            reach[d] = max(reach[d], abs(c * plane[k, 0] + s * plane[k, 1]))
+            reach[d] = max(reach[d], fabs(c * plane[k, 0] + s * plane[k, 1]))
     reach[_SIDES] = reach[0]
-    x, y = np.empty(_SIDES), np.empty(_SIDES)
     for d in range(_SIDES):  # the corner between sides d and d + 1
-        c, s = math.cos(d * step), math.sin(d * step)
-        along = (reach[d + 1] - reach[d] * math.cos(step)) / math.sin(step)
+        c, s = cos(d * step), sin(d * step)
+        along = (reach[d + 1] - reach[d] * cos(step)) / sin(step)
         x[d] = reach[d] * c - along * s
         y[d] = reach[d] * s + along * c
-    bound = 0.0
+    bound: cython.double = 0.0
     for d in range(_SIDES):
         for e in range(d):
-            bound = max(bound, abs(x[d] * y[e] - y[d] * x[e]))
+            bound = max(bound, fabs(x[d] * y[e] - y[d] * x[e]))
     return bound
