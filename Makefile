@@ -7,6 +7,7 @@ BENCH ?= .venv-bench
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 DOCS := $(VENV)/.docs
+KERNELS := hatch_build.py $(shell find jaxcal -name '*kernel.py' -o -name '*.pxd')
 
 .DEFAULT_GOAL := help
 .PHONY: help train checkpoint evaluate reproduce test test-all lint format benchmark docs docs-serve release-check clean
@@ -14,7 +15,7 @@ DOCS := $(VENV)/.docs
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
 
-$(READY): pyproject.toml constraints.txt
+$(READY): pyproject.toml constraints.txt $(KERNELS)
 	@test -n "$(PYTHON)" || { echo "jaxcal needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[all,dev]'
@@ -27,14 +28,14 @@ $(DOCS): $(READY)
 train: $(READY) ## set everything up and train the compact policy on this machine (a few minutes)
 	$(BIN)/python train.py $(ARGS)
 
-checkpoint: $(READY) ## train the policy that ships and put it in checkpoints/default (about 10 minutes)
-	$(BIN)/python train.py --preset general --export checkpoints/default $(ARGS)
+checkpoint: $(READY) ## train the policy that ships and put it in checkpoints/default.npz (about 10 minutes)
+	$(BIN)/python train.py --preset general --export checkpoints/default.npz $(ARGS)
 
 evaluate: $(READY) ## compare every method with the proven optimum on 1,000 unseen candidate sets
 	$(BIN)/python evaluate.py $(ARGS)
 
 reproduce: $(READY) ## the paper's figures, tables and claims from our own runs, in report/index.html
-	$(BIN)/python -m jaxcal.paper $(ARGS)
+	$(BIN)/python -m studies.paper $(ARGS)
 
 # Most of a first run is XLA compiling: without its optimiser that takes a third of the
 # time. `make test-all` compiles as users do.
@@ -74,4 +75,4 @@ release-check: $(READY) ## wheel and sdist in fresh environments of Python 3.11,
 	$(BIN)/python tests/release_check.py $(ARGS)
 
 clean: ## remove the virtual environment and caches
-	rm -rf $(VENV) $(BENCH) site .cache .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(BENCH) build site .cache .mypy_cache .ruff_cache .pytest_cache

@@ -31,7 +31,6 @@ def run(args: argparse.Namespace) -> int:
         return EXIT_OK
     commands: dict[str, Callable[[argparse.Namespace], int]] = {
         "identify": _identify,
-        "stop": _stop,
         "simulate": _simulate,
         "example": _example,
         "check": _check,
@@ -83,12 +82,6 @@ def _described(drive: Drive) -> list[str]:
     ]
 
 
-def _stop(args: argparse.Namespace) -> int:
-    from rig.stopping import stop_device
-
-    return stop_device(args.config or FILE)
-
-
 def _simulate(args: argparse.Namespace) -> int:
     config = load(args)
     port = config.bus.port if args.bus_port is None else args.bus_port
@@ -111,11 +104,11 @@ def _simulate(args: argparse.Namespace) -> int:
 
 def _watch(args: argparse.Namespace) -> int:
     from jaxcal.extras import needs
-    from rig.live import launch
+    from rig.workbench.live import launch
 
     journal_of(args.run)
     with needs("live", "the live page"):
-        from rig.live.server import serve
+        from rig.workbench.live.server import serve
     sock, token, url = launch.listen(args.live_host)
     print(f"live page: {url}\nCtrl-C ends", flush=True)
     with contextlib.suppress(KeyboardInterrupt):

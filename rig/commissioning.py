@@ -12,10 +12,6 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from jaxcal.extras import needs
-from rig.commission import setup, steps
-from rig.commission.operator import Operator
-from rig.commission.ports import MODBUS_PORT, serial_lines, tcp_line
-from rig.commission.scan import Found, parse_bus, scan
 from rig.config import (
     AXIS_NAMES,
     RigConfig,
@@ -28,6 +24,10 @@ from rig.core.lock import BusLock
 from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
 from rig.journal import new_run_folder
 from rig.sessions import FILE, load, make_simulator
+from rig.workbench.commission import setup, steps
+from rig.workbench.commission.operator import Operator
+from rig.workbench.commission.ports import MODBUS_PORT, serial_lines, tcp_line
+from rig.workbench.commission.scan import Found, parse_bus, scan
 
 if TYPE_CHECKING:
     from rig.simulator import Simulator
@@ -143,7 +143,7 @@ def _setup(args: argparse.Namespace) -> int:
             simulator = stack.enter_context(_simulator(args))
             given = _given(simulator, given)
             path = args.config or _own_folder(simulator.config) / "rig.toml"
-        operator.confirm(setup.SAFETY)
+        operator.confirm(setup.SAFETY, "setup")
         if path.exists() and args.set:
             raise Refused(f"{path} exists: edit it, or leave out --set")
         if path.exists():

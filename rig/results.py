@@ -16,13 +16,13 @@ from rig.sessions import recorded, records_of
 
 def refit(args: argparse.Namespace) -> int:
     """Identify a recorded calibration anew, into a folder of its own."""
-    from rig.commission.toml import set_values
     from rig.core.record import check_matrix
-    from rig.identification.conclusion import conclude
-    from rig.identification.refit import require_angles, reread
     from rig.journal import RunFolder, new_run_folder
-    from rig.outputs.console import recalibrate, summary_lines
-    from rig.outputs.report import write_report
+    from rig.workbench.commission.toml import set_values
+    from rig.workbench.identification.conclusion import conclude
+    from rig.workbench.identification.refit import require_angles, reread
+    from rig.workbench.outputs.console import recalibrate, summary_lines
+    from rig.workbench.outputs.report import write_report
 
     held = records_of(args.run)
     then, start = recorded(args)
@@ -46,7 +46,11 @@ def refit(args: argparse.Namespace) -> int:
     now = parse_config(text, pathlib.Path(start["maps_from"]), str(args.run))
     changed = {key: [old[key], value] for key, value in new.items()}
     records, evidence = reread(held, then, now)
-    calibration, summary = conclude(now, evidence, {"refit_of": args.run.name})
+    calibration, summary = conclude(
+        now,
+        evidence,
+        {"refit_of": args.run.name, "simulated": start["simulated"] is not None},
+    )
     try:
         warnings = check_matrix(calibration.matrix)
     except MotionFault as fault:
@@ -95,7 +99,7 @@ def _saved(path: pathlib.Path, *keys: str) -> dict[str, Any] | None:
 
 def report(args: argparse.Namespace) -> int:
     """Write report.html of a run of any kind, also of an unfinished one."""
-    from rig.outputs.report import write_report
+    from rig.workbench.outputs.report import write_report
 
     print(write_report(args.run, records_of(args.run)))
     return EXIT_OK
@@ -103,7 +107,7 @@ def report(args: argparse.Namespace) -> int:
 
 def export(args: argparse.Namespace) -> int:
     """Print or write the inverse map of a run's calibration."""
-    from rig.outputs.export import LANGUAGES, load_inverse
+    from rig.workbench.outputs.export import LANGUAGES, load_inverse
 
     inverse = load_inverse(args.run, records_of(args.run))
     for text in inverse.warnings:
@@ -119,7 +123,7 @@ def export(args: argparse.Namespace) -> int:
 
 def trend(args: argparse.Namespace) -> int:
     """Compare the calibrations in a folder, device by device; also as trend.html."""
-    from rig.outputs.trend import read_runs, trend_lines, write_trend
+    from rig.workbench.outputs.trend import read_runs, trend_lines, write_trend
 
     if not args.folder.is_dir():
         raise Refused(f"{args.folder} is no folder")

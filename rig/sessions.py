@@ -67,13 +67,14 @@ def run_session(args: argparse.Namespace) -> int:
     from rig.core.record import DeviceRecord
     from rig.core.session import Run, run_safely
     from rig.journal import new_run_folder
-    from rig.outputs.console import listen
     from rig.signals import Signals
+    from rig.workbench.outputs.console import listen
 
     resumed = args.command == "resume"
     config, start = recorded(args) if resumed else _new(args)
     mode = start["mode"]
-    procedure, kept_zero = _procedure(mode, start["inputs"], config)
+    simulated = start["simulated"] is not None
+    procedure, kept_zero = _procedure(mode, start["inputs"], config, simulated)
     # With --zero the operator put the device into its zero posture.
     zero_at = kept_zero.pulses if kept_zero and not args.zero else None
     dry_run = getattr(args, "dry_run", False)
@@ -118,7 +119,7 @@ def run_session(args: argparse.Namespace) -> int:
             session.on_imu_port = simulator.start_phone
             session.listeners.append(simulator.hear)
         if args.live or args.live_host:
-            from rig.live import launch
+            from rig.workbench.live import launch
 
             session.say(launch.start(folder, args.live_host))
         return run_safely(session, procedure)
@@ -179,19 +180,21 @@ def recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
 
 
 def _procedure(
-    mode: str, inputs: dict[str, Any], config: RigConfig
+    mode: str, inputs: dict[str, Any], config: RigConfig, simulated: bool
 ) -> tuple[Callable[[Run], int], KeptZero | None]:
     """What a session does, and the zero posture that it must find."""
     import numpy as np
 
-    from rig.procedures import calibrate, checking
+    from rig.workbench.procedures import calibrate, checking
 
     if mode == "calibrate":
         return calibrate.calibrate, None
     count = inputs["count"]
     if mode == "collect":
         return lambda run: checking.collect(run, count), None
-    saved = checking.load_calibration(pathlib.Path(inputs["calibration"]), config)
+    saved = checking.load_calibration(
+        pathlib.Path(inputs["calibration"]), config, simulated
+    )
     if saved.note:
         print(saved.note, flush=True)
     calibration = saved.calibration
@@ -208,9 +211,9 @@ def _commission(config: RigConfig, record: DeviceRecord, simulator: Simulator) -
     Raises:
         MotionFault: its axes are not as configured.
     """
-    from rig.commission.operator import Operator
-    from rig.commission.steps import Place, begin_simulated
     from rig.core.record import SIGN_CHECKED
+    from rig.workbench.commission.operator import Operator
+    from rig.workbench.commission.steps import Place, begin_simulated
 
     folder = record.path.parent / "axes"
     folder.mkdir(exist_ok=True)

@@ -259,6 +259,11 @@ class RigConfig(Section):
             yield f"session.k: must be under candidates ({session.candidates})"
         for axis, (low, high) in zip(self.axes, self.ranges, strict=True):
             at, span = f"axes.{axis.name}", f"session.{axis.name}_range_deg"
+            if axis.speed_deg_s > motion.max_speed_deg_s:
+                yield (
+                    f"{at}.speed_deg_s: must be at most motion.max_speed_deg_s = "
+                    f"{motion.max_speed_deg_s:g}, got {axis.speed_deg_s:g}"
+                )
             if abs(1.0 / axis.pulses_per_deg) > motion.position_tolerance_deg:
                 yield f"{at}: one pulse is coarser than motion.position_tolerance_deg"
             if axis.comm_timeout_s is not None and axis.comm_timeout_s <= slowest:

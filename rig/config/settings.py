@@ -136,6 +136,10 @@ class MechanismSettings(Section):
 class MotionSettings(Section):
     """How the device is moved."""
 
+    max_speed_deg_s: float = key(
+        "ceiling of speed_deg_s of the axes; raise it only with a reason",
+        120.0, 1e-3, 5000,
+    )  # fmt: skip
     max_step_deg: float = key("longer moves are split", 15.0, 0.1, 360)
     approach_overshoot_deg: float = key(
         "> 0: come to every posture from below; play becomes pure bias", 0.0, 0, 20

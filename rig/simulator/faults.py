@@ -29,6 +29,7 @@ KINDS = {
     "imu_nan": "the phone sends NaN",
     "imu_frozen": "the phone repeats one attitude under new stamps",
     "imu_wrong_order": "the phone's angles are in another Euler order",
+    "imu_radians": "the phone sends radians",
     "imu_columns": "the phone's lines get one column more",
     "imu_second_sender": "in a gap another computer sends other angles",
     "imu_reorder": "the phone's lines come out of order",

@@ -145,6 +145,8 @@ class Phone:
         if not faults.take("imu_frozen"):
             self._frozen = matrix
         matrix = self._frozen
+        if faults.take("imu_radians"):
+            s = s.model_copy(update={"unit": "rad"})
         text = format_line(s, matrix, time.time(), order)
         if faults.take("imu_nan"):
             fields = text.split(s.separator)

@@ -7,15 +7,15 @@ from harness import SPEEDUP, fast_config
 
 from rig import commissioning
 from rig.__main__ import main
-from rig.commission.scan import parse_bus
-from rig.commission.toml import set_values
 from rig.config import AXIS_NAMES
 from rig.simulator import Simulator, Truth
+from rig.workbench.commission.scan import parse_bus
+from rig.workbench.commission.toml import set_values
 
 QUICK = (  # of the new rig.toml: short windows, quick axes
     "settle.window_s=0.04", "settle.min_samples=5", "settle.samples=5",
     "settle.slope_deg_s=0.5", "motion.poll_s=0.005", "imu.stale_s=1.0",
-    "session.method=exact", "session.verify_postures=1",
+    "motion.max_speed_deg_s=400", "session.method=exact", "session.verify_postures=1",
     *(f"axes.{name}.{key}" for name in AXIS_NAMES
       for key in ("speed_deg_s=400", "accel_deg_s2=8000", "reduction=10")),
 )  # fmt: skip
@@ -51,7 +51,7 @@ def set_up(bus: str, port: int, *more: str, values=QUICK) -> int:
 
 
 def quick_text(bus, port):
-    from rig.commission.toml import new_text
+    from rig.workbench.commission.toml import new_text
 
     axes = [
         {"name": name, "letter": letter, "unit": unit, "family": "leadshine_pr",

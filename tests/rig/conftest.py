@@ -3,7 +3,6 @@
 import pytest
 from commission import device, quick_text
 
-from rig.commission import bench, steps
 from rig.config import load_config
 from rig.core.record import (
     HOMED,
@@ -11,6 +10,7 @@ from rig.core.record import (
     SIGN_CHECKED,
     DeviceRecord,
 )
+from rig.workbench.commission import steps, unproved
 
 
 @pytest.fixture
@@ -18,7 +18,8 @@ def at(tmp_path, monkeypatch):
     """An empty folder to work in, and axes that need not be watched by a person."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(steps, "WATCH_S", 0.3)
-    monkeypatch.setattr(bench, "SLOW_DEG_S", 400.0)
+    monkeypatch.setattr(unproved, "SLOW_DEG_S", 400.0)
+    monkeypatch.setattr(unproved, "LOOK_S", 0.01)
     return tmp_path
 
 

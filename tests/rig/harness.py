@@ -21,11 +21,11 @@ from rig.core import stop
 from rig.core.lock import BusLock
 from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
 from rig.core.session import Run, run_safely
-from rig.outputs import report
-from rig.outputs.console import listen
-from rig.procedures.calibrate import calibrate
 from rig.signals import Signals
 from rig.simulator import Simulator, Truth
+from rig.workbench.outputs import report
+from rig.workbench.outputs.console import listen
+from rig.workbench.procedures.calibrate import calibrate
 
 # A simulated drive stands within 0.1 s; for a dead one the whole time is waited.
 stop.VERIFY_S = 0.6
@@ -42,7 +42,7 @@ WATCHED = {  # drives that stop themselves when the line is silent
 FAST = {  # quick axes and short windows; a busy computer may still answer late
     "speed_deg_s = 120": "speed_deg_s = 400",
     "accel_deg_s2 = 1200": "accel_deg_s2 = 8000",
-    "poll_s = 0.01": "poll_s = 0.005\nstall_s = 0.3",
+    "poll_s = 0.01": "poll_s = 0.005\nstall_s = 0.3\nmax_speed_deg_s = 400",
     "window_s = 0.2": "window_s = 0.04",
     "min_samples = 10": "min_samples = 5",
     "samples = 25": "samples = 5",
@@ -129,7 +129,7 @@ def session(
         "calibrate",
         (said if said is not None else []).append,
         record=commissioned(config, folder, sim),
-        start={"simulated": {"noise": 0.0}, "inputs": {}, "maps_from": "."},
+        start={"simulated": None, "inputs": {}, "maps_from": "."},
         reset_alarms=True,
     )
     if on_imu_port or sim:

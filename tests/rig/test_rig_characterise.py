@@ -13,12 +13,12 @@ from fault_matrix import _free_port
 from harness import SPEEDUP, commissioned, fast_config, fast_text, simulator
 from test_rig_play import saved
 
-from rig.commission import bench, characterise, steps
-from rig.commission.operator import Operator
-from rig.commission.probe import ENOUGH_DEG
 from rig.journal import read_journal
-from rig.procedures.checking import load_calibration
 from rig.simulator import Simulator, Truth
+from rig.workbench.commission import bench, characterise, steps
+from rig.workbench.commission.operator import Operator
+from rig.workbench.commission.probe import ENOUGH_DEG
+from rig.workbench.procedures.checking import load_calibration
 
 pytestmark = pytest.mark.slow  # minutes together; test_rig_play.py is the quick part
 

@@ -18,11 +18,11 @@ from rig.core.attitude import (
     mean_rotation,
     raw_fields,
 )
-from rig.identification import noise
-from rig.identification.drift import estimate_drift, without_drift
-from rig.identification.fit import uncertainty
-from rig.outputs.console import drift_text, recalibrate
 from rig.simulator import Truth
+from rig.workbench.identification import noise
+from rig.workbench.identification.drift import estimate_drift, without_drift
+from rig.workbench.identification.fit import uncertainty
+from rig.workbench.outputs.console import drift_text, recalibrate
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 LETTERS = ("X", "Z", "Y")

@@ -24,7 +24,7 @@ from harness import changed, fast_text, simulator
 
 from rig.config import parse_config
 from rig.journal import read_journal
-from rig.live.launch import TOKEN
+from rig.workbench.live.launch import TOKEN
 
 pytest.importorskip("nicegui")
 webdriver = pytest.importorskip("selenium.webdriver")
@@ -69,7 +69,7 @@ class Rig:
         sock = socket.create_server(("127.0.0.1", 0))
         self.port = sock.getsockname()[1]
         with sock:
-            command = [sys.executable, "-m", "rig.live", str(self.folder)]
+            command = [sys.executable, "-m", "rig.workbench.live", str(self.folder)]
             self.page = subprocess.Popen(
                 [*command, "--fd", str(sock.fileno())],
                 pass_fds=[sock.fileno()],
@@ -380,6 +380,6 @@ def _pages(folder):
     for path in pathlib.Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):
             words = path.read_bytes().decode(errors="replace")
-            if "rig.live" in words and str(folder) in words:
+            if "rig.workbench.live" in words and str(folder) in words:
                 found.append(int(path.parent.name))
     return found

@@ -16,9 +16,9 @@ import pytest
 
 from rig.core.faults import Refused
 from rig.journal import Journal
-from rig.live import launch, words
-from rig.live.guard import Guard
-from rig.live.watcher import Watcher
+from rig.workbench.live import launch, words
+from rig.workbench.live.guard import Guard
+from rig.workbench.live.watcher import Watcher
 
 HOST = "192.0.2.7:8642"
 OWN = f"http://{HOST}"
@@ -246,7 +246,7 @@ def served(tmp_path_factory):
     command = [
         sys.executable,
         "-m",
-        "rig.live",
+        "rig.workbench.live",
         str(folder),
         "--fd",
         str(sock.fileno()),
@@ -332,7 +332,7 @@ def test_the_token_is_not_on_the_command_line(served):
     shown = subprocess.run(
         ["ps", "-o", "args=", "-p", str(page.pid)], capture_output=True, text=True
     ).stdout
-    assert "rig.live" in shown and token not in shown
+    assert "rig.workbench.live" in shown and token not in shown
 
 
 def test_watch_shows_a_run_until_it_is_interrupted(tmp_path):
@@ -351,7 +351,7 @@ def test_a_page_that_nobody_looks_at_ends_by_itself(tmp_path):
     pytest.importorskip("nicegui")
     _journal(tmp_path, os.getpid()).close()
     code = (
-        "import pathlib, socket; from rig.live.server import serve;"
+        "import pathlib, socket; from rig.workbench.live.server import serve;"
         "sock = socket.create_server(('127.0.0.1', 0));"
         f"serve(pathlib.Path({str(tmp_path)!r}), sock, None, linger_s=0.2)"
     )

@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 
 from rig.config import parse_config
 from rig.journal import Journal, is_written, read_journal
-from rig.live import charts, words
-from rig.live.state import RunState
-from rig.live.tail import Tail
-from rig.live.watcher import Watcher
-from rig.live.worth import ellipsoid, prediction_std, reasons
+from rig.workbench.live import charts, words
+from rig.workbench.live.state import RunState
+from rig.workbench.live.tail import Tail
+from rig.workbench.live.watcher import Watcher
+from rig.workbench.live.worth import ellipsoid, prediction_std, reasons
 
 PICTURE = charts.LIGHT
 

@@ -7,9 +7,9 @@ from harness import RATE_HZ, SPEEDUP, commissioned, fast_config, make_run
 import jaxcal
 from rig.core.faults import Refused
 from rig.core.session import run_safely
-from rig.procedures.checking import goto, keep, load_calibration
-from rig.procedures.play import CHARACTERISED, Play
 from rig.simulator import Simulator, Truth
+from rig.workbench.procedures.checking import goto, keep, load_calibration
+from rig.workbench.procedures.play import CHARACTERISED, Play
 
 WIDTH = 0.4
 

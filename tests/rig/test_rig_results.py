@@ -32,13 +32,13 @@ import jaxcal
 from rig.__main__ import main
 from rig.config import AXIS_NAMES, parse_config
 from rig.core.attitude import Frame, attitudes
-from rig.identification.refit import reread
 from rig.journal import read_journal
-from rig.outputs import trend
-from rig.outputs.console import numbers
-from rig.outputs.export import LANGUAGES, load_inverse
-from rig.outputs.report import write_report
 from rig.simulator import Simulator, Truth
+from rig.workbench.identification.refit import reread
+from rig.workbench.outputs import trend
+from rig.workbench.outputs.console import numbers
+from rig.workbench.outputs.export import LANGUAGES, load_inverse
+from rig.workbench.outputs.report import write_report
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 SESSION = '\n[session]\nmethod = "exact"\nverify_postures = 2\n'
@@ -513,7 +513,7 @@ def test_trend_tells_what_moved_and_separates_devices(run, capsys):
 def test_parameters_are_drawn_over_time(finished):
     from matplotlib.figure import Figure
 
-    from rig.outputs.figures import parameters
+    from rig.workbench.outputs.figures import parameters
 
     summary = json.loads((finished / "summary.json").read_text())
     runs = [summary | {"time": 0.0}, summary | {"time": 86400.0}]

@@ -8,11 +8,11 @@ from commission import device, free_port
 from harness import fast_text
 
 from rig.__main__ import main
-from rig.commission.scan import parse_bus
-from rig.commission.toml import edit, set_values
 from rig.config import ConfigError, parse_config
 from rig.config.files import EXAMPLES
 from rig.simulator.drive import DriveException
+from rig.workbench.commission.scan import parse_bus
+from rig.workbench.commission.toml import edit, set_values
 
 
 @pytest.mark.slow

@@ -12,8 +12,6 @@ from harness import no_figures
 
 from rig import commissioning
 from rig.__main__ import main
-from rig.commission import setup, steps
-from rig.commission.operator import Operator
 from rig.config import load_config, parse_config
 from rig.config.files import EXAMPLES
 from rig.core.faults import Refused
@@ -25,6 +23,8 @@ from rig.core.record import (
     DeviceRecord,
 )
 from rig.simulator import Truth
+from rig.workbench.commission import setup, steps
+from rig.workbench.commission.operator import Operator
 
 
 @pytest.mark.parametrize(
@@ -120,7 +120,8 @@ def test_setup_asks_with_defaults_and_moves_nothing_without_a_yes(at):
 
     def read(question):
         asked.append(question)
-        return "no" if told[-1].startswith("axes: ") else ""
+        word = re.search(r"Type (\w+) to go on", question)
+        return word[1] if word and word[1] != "axes" else ""
 
     with device() as (sim, bus, port):
         operator = Operator(say=told.append, read=read)
@@ -133,7 +134,7 @@ def test_setup_asks_with_defaults_and_moves_nothing_without_a_yes(at):
             setup.go(place, given)
         assert sim.executions() == [[], [], []]
     assert record.state(HOMED) and not record.state(SIGN_CHECKED)
-    assert all(re.search(r"\[.+\]: $", question) for question in asked)
+    assert all(re.search(r"(\[.+\]|go on): $", question) for question in asked)
 
 
 @pytest.mark.parametrize("simulated", [False, True])

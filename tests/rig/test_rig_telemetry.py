@@ -12,7 +12,7 @@ from rig.core.attitude import Reading, euler_to_matrix
 from rig.core.drive import Status
 from rig.core.measure import frame_at
 from rig.journal import read_journal
-from rig.outputs import telemetry
+from rig.workbench.outputs import telemetry
 
 
 class Phone:

@@ -114,7 +114,8 @@ def _search(
     if criterion.kind == "det" and len(root) == p:
         kind, shift = D, -2.0 * float(np.linalg.slogdet(root)[1])
     elif criterion.kind == "det":
-        kind = DS
+        kind, lengths = DS, np.linalg.norm(root, axis=1)
+        root, shift = root / lengths[:, None], -2.0 * float(np.log(lengths).sum())
     else:
         chosen = np.repeat(blocks, start, axis=0).reshape(-1, p)
         phi = abs(float(criterion.value(prior + chosen.T @ chosen)))
@@ -122,5 +123,6 @@ def _search(
         trace = criterion.kind == "trace"
         kind = TRACE if trace else E
         root = root / np.sqrt(scale) if trace else root * np.sqrt(scale)
-    arrays = (np.array(each, order="C") for each in (blocks, prior, root))
-    return Search(kind, *arrays, k, rank), scale, shift
+    arrays = [np.array(each, order="C") for each in (blocks, prior, root)]
+    search: Any = Search
+    return search(kind, *arrays, k, rank), scale, shift

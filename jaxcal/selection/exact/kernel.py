@@ -1,15 +1,15 @@
 """Compiled branch and bound on the concave relaxation; the front is branch_and_bound.
 
 A node bounds the count of every candidate, ``low_i <= c_i <= high_i``, sum k. Its
-relaxation lets counts be real numbers: the criterion phi is concave, so at any counts c,
-with G the gradient at the information M and leverages ``d_i = trace(B_i G B_i.T)``,
+relaxation lets counts be real numbers: the criterion phi is concave, so at any counts
+c, with G the gradient at the information M and leverages ``d_i = trace(B_i G B_i.T)``,
 
     phi(any c') <= phi(c) + max over c' of sum of (c'_i - c_i) d_i
 
-within the bounds: true wherever the climb stops, tight at the relaxed optimum. The climb
-is Newton's, on the fractional counts and those the leverages ask to move; its quadratic
-programme is solved by an active set. The Hessian over the counts is, with W = inverse(M)
-and <.,.> the entrywise product,
+within the bounds: true wherever the climb stops, tight at the relaxed optimum. The
+climb is Newton's, on the fractional counts and those the leverages ask to move; its
+quadratic programme is solved by an active set. With W = inverse(M) and <.,.> the
+entrywise product, the Hessian over the counts is
 
     D       -|X|^2           X = B_i W B_j.T
     Ds      |X|^2 - 2 <X, Y> X = B_i G B_j.T, Y = B_i W B_j.T
@@ -23,9 +23,9 @@ all reciprocals l, ``-log(sum of exp(-b l)) / b``; its gradient is a mean of suc
 and so a bound too, however good the smoothing is.
 
 D, A, I and As where what is still to be chosen has fewer readings t than there are
-parameters: with P what is chosen for certain, the rest N = M - P of a selection has rank
-t at most. Of the eigenvalues l of N in the metric of P (of H N H.T, H P H.T = I) the
-smallest are replaced by their total in equal shares among what is left of the t,
+parameters: with P what is chosen for certain, the rest N = M - P of a selection has
+rank t at most. Of the eigenvalues l of N in the metric of P (of H N H.T, H P H.T = I)
+the smallest are replaced by their total in equal shares among what is left of the t,
 
     F(N) = sum over the i largest of f(l) + (t - i) f(rest / (t - i)),
 
@@ -52,18 +52,17 @@ import numpy as np
 from cython.cimports.jaxcal.information.linear_algebra import (
     cholesky,
     factor,
-    invert_lower,
     multiply,
 )
-from cython.cimports.jaxcal.watch import Watch, begin, late
+from cython.cimports.jaxcal.watch import begin, late
 from cython.cimports.libc.math import INFINITY, exp, fabs, floor, log, log1p, sqrt
 from cython.cimports.scipy.linalg.cython_lapack import dsyevd
 
 __all__ = ["DS", "TRACE", "D", "E", "Search"]
 
 D, DS, TRACE, E = range(4)
-# Compiled functions read C variables, which Python does not see. RANK and RANK_TRACE are
-# D and TRACE in their sharper forms.
+# Compiled functions read C variables, which Python does not see. RANK and RANK_TRACE
+# are D and TRACE in their sharper forms.
 _D = cython.declare(cython.int, 0)
 _DS = cython.declare(cython.int, 1)
 _TRACE = cython.declare(cython.int, 2)
@@ -80,20 +79,24 @@ _FRACTIONAL = cython.declare(cython.int, 400)  # counts that a Newton step moves
 _RIDGE = cython.declare(cython.double, 1e-10)  # share of the largest curvature
 _ROUNDING = cython.declare(cython.double, 1e-12)  # of a count that is whole
 _TUNES = cython.declare(cython.int, 2)  # of mu of RANK_TRACE in one node
-_SMOOTHING = cython.declare(cython.double, 30.0)  # b of E at first, where phi is about 1
+_SMOOTHING = cython.declare(
+    cython.double, 30.0
+)  # b of E at first, where phi is about 1
 _SHARPEST = cython.declare(cython.double, 1e5)
 _TAKEN = cython.declare(cython.double, 1e-6)  # of a reading, in what eigenvectors take
 _WHOLE = cython.declare(cython.double, 1e-9)  # a count this near a whole number is it
 _SAME = cython.declare(cython.double, 1e-7)  # apart in value, selections are two
 
 
-
 class Search:
-    """A problem, where the relaxation of a node is, and the work space of both."""
+    """A problem, where the relaxation of a node is, and the work space of both.
 
+    ``kernel.pxd`` says what each attribute is.
+    """
 
     def __init__(self, kind, blocks, prior, root, k, rank):
-        """See the attributes; arrays are C-contiguous float64."""
+        # Arrays are C-contiguous float64. (A docstring here would be a global symbol of
+        # C, of which a module that holds its code twice has two.)
         num_blocks, q, p = blocks.shape
         self.kind, self.k, self.rank = kind, k, rank
         self.blocks, self.prior, self.root = blocks, prior, root
@@ -412,7 +415,8 @@ class Search:
         q: cython.int = self.blocks.shape[1]
         p: cython.int = self.blocks.shape[2]
         multiply(False, turn, m * q, p, p, cython.address(self.picked[0, 0]),
-                  cython.address(matrix[0, 0]), cython.address(self.turned[0, 0]))  # fmt: skip
+                  cython.address(matrix[0, 0]),
+                  cython.address(self.turned[0, 0]))  # fmt: skip
 
     def _hessian(self, kind, m):
         """Fill ``curvature`` (m, m): minus the Hessian over the counts of ``which``."""
@@ -937,7 +941,8 @@ class Search:
         return left, done, not ended
 
     def _run(
-        self, nodes, bounds, size, done, best_counts, best_values, slack, widest, tries, slope, shift,
+        self, nodes, bounds, size, done, best_counts, best_values, slack, widest, tries,
+        slope, shift,
     ):  # fmt: skip
         last = best_values.shape[0] - 1
         low, high, c = self.node[0], self.node[1], self.node[2]

@@ -78,7 +78,7 @@ def default_restarts(problem: Problem) -> int:
     most = 200 if problem.max_replicates == 1 else 400
     if problem.rank_one:
         return most
-    if problem.criterion.name == "E":  # not compiled, and from local optima of A
+    if problem.criterion.kind == "least":  # not compiled, and from local optima of A
         most = 20
     count, q, p = problem.blocks.shape
     work = _WORK["D" if problem.criterion.name == "D" else "other"]
@@ -99,8 +99,11 @@ class Climbs:
         self._required = np.searchsorted(self._usable, problem.required)
         self._deadline = deadline
         criterion, q, p = problem.criterion, blocks.shape[1], blocks.shape[2]
-        kind = TRACE
+        kind, root = TRACE, criterion.root
         if criterion.kind == "det":
+            root = root / np.linalg.norm(
+                root, axis=1, keepdims=True
+            )  # variances near 1
             kind = DET if criterion.name == "D" else SUBSET
         span = np.zeros((0, p))
         if len(problem.root):
@@ -108,7 +111,7 @@ class Climbs:
             span = np.ascontiguousarray(vectors.T[values > 1e-6])
         self._share = _SHARE * min(1.0, problem.k * q / p) ** 6
         self._climber = Climber(
-            kind, blocks, problem.prior, criterion.root, problem.upper[self._usable],
+            kind, blocks, problem.prior, root, problem.upper[self._usable],
             self._required, span, largest_rank(blocks), problem.k, seed,
         )  # fmt: skip
 
@@ -172,7 +175,7 @@ def exchange_indices(
     if restarts is None:
         restarts = default_restarts(problem)
     climbs = Climbs(problem, seed, deadline)
-    if problem.criterion.name == "E":
+    if problem.criterion.kind == "least":
         chosen, phi = _best_eigenvalue(problem, climbs, restarts)
     else:
         chosen, phi = climbs.best_of(restarts)
@@ -204,7 +207,7 @@ def exchange_from(problem: Problem, indices: ArrayLike) -> Indices:
             f"{given.tolist()} is singular"
         )
     start = _required_first(problem, given)
-    if problem.criterion.name == "E":
+    if problem.criterion.kind == "least":
         return _climb_eigenvalue(problem, start)[0]
     return Climbs(problem, 0, None).climbed(start)[0]
 

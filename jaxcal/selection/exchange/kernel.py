@@ -178,7 +178,7 @@ def _invert(
 
 
 class Climber:
-    """The candidates of a problem, and the work space; ``kernel.pxd`` says what is where.
+    """The candidates of a problem, and the work space that ``kernel.pxd`` describes.
 
     Args:
         kind: DET, SUBSET or TRACE.
@@ -326,7 +326,7 @@ class Climber:
             self._keep(c)
 
     def _keep(self, c):
-        """K, and what the group's candidates alone gain: a factor, or fall of a trace."""
+        """K, and the gain of each alone: a factor, or the fall of a trace."""
         q = self.q
         alone, det = cython.address(self.alone[c, 0]), cython.address(self.det[0])
         for m in range(2 if self.kind == _SUBSET else 1):

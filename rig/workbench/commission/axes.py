@@ -1,0 +1,195 @@
+"""Small moves of each axis that show what unit turns what, which way and how far."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from rig.config import AXIS_NAMES
+from rig.config.axis import Axis, Pulses
+from rig.core.faults import MotionFault, Refused
+from rig.core.record import SIGN_CHECKED
+from rig.workbench.commission.bench import Bench
+from rig.workbench.commission.chain import CLEAR
+from rig.workbench.commission.findings import Findings, find
+from rig.workbench.commission.proposals import (
+    Change,
+    lines,
+    proposals,
+    ratios_of,
+    require_unit,
+)
+from rig.workbench.commission.stands import Stand, turn
+from rig.workbench.commission.unproved import FIRST_MOTOR_DEG, Reach, unit_proved
+
+REACH_DEG = 3.0  # each way
+FAR_ENOUGH = 1.1  # a move that would be no longer than that is not made
+SURE_SIGMA = 3.0
+PAIR_DEG = 6.0  # commanded at most, so that the phone turns about REACH_DEG
+PAIR_STD_DEG = 0.03  # two rotations of REACH_DEG in either order are 0.16 deg apart
+ROOM_DEG = 0.2  # left to a limit
+SEEN_DEG = 0.03  # the phone must turn at least this much in a whole move
+SEEN_SIGMA = 6.0
+
+
+def check_axes(run: Bench, names_known: bool) -> tuple[Findings, list[Change]]:
+    """Move, measure and say what is found; the corrections that follow from it.
+
+    Where nothing is to be corrected the device is SIGN_CHECKED.
+    """
+    stands = measure(run)
+    found = find(run.config, stands, names_known)
+    device = run.arm()
+    told = [drive.pulses_per_rev() for drive in device.drives]
+    ratios = ratios_of(run.config, found)
+    if run.config.imu.unit == "rad":
+        require_unit(run.config, ratios, proved=True)
+    changes = proposals(run.config, found, told)
+    evidence = {
+        "ratio": dict(zip(AXIS_NAMES, np.round(ratios, 4).tolist(), strict=True)),
+        "off_deg": found.off_deg.round(2).tolist(),
+        "backlash_deg": found.backlash_deg.round(4).tolist(),
+        "phone_turned_deg": round(found.turned_deg, 2),
+        "run": run.folder.name,
+    }
+    run.emit("axes", sync=True, **evidence, changes=[str(change) for change in changes])
+    run.say(*lines(run.config, found))
+    if not changes:
+        run.record.reach(SIGN_CHECKED, run.plain, **evidence)
+        run.say("each unit turns its own joint, the right way and about as far as told")
+    return found, changes
+
+
+def measure(run: Bench) -> dict[str, Stand]:
+    """Visit the places that ``findings.find`` reads from, and come back.
+
+    Raises:
+        Refused: an axis stands too near to a limit.
+        MotionFault: an axis does not turn the phone, or turns it too far, or the unit
+            of the phone's angles is not the one that is configured.
+    """
+    device = run.arm()
+    config, start = run.config, device.positions()
+    _check_room(run, start)
+    stands: dict[str, Stand] = {}
+    run.planned = 1 + 8 * 3 + 2 * 3
+
+    def visit(name: str, offset: dict[int, int], samples: int = 0) -> Stand:
+        """Stand at pulses away from the start, and measure."""
+        target = list(start)
+        for axis, way in offset.items():
+            target[axis] += way
+        pitch, yaw, roll = target
+        run.signals.check_pause()
+        run.small.move_to((pitch, yaw, roll), name)
+        measured = run.observer.measure((pitch, yaw, roll), name, samples or None)
+        run.emit("stand", sync=True, name=name, **measured)
+        stands[name] = Stand.of(measured)
+        return stands[name]
+
+    run.say(
+        f"axes: about {run.planned} places; each axis first by {FIRST_MOTOR_DEG:g} deg "
+        f"of its motor, then as far as the phone's turn allows, {REACH_DEG:g} deg at "
+        "most either way"
+    )
+    base = visit("start", {}, 4 * config.settle.samples)
+    run.small.stay_near(base.attitude)
+    noise = SURE_SIGMA * base.std_deg * (2.0 / config.settle.samples) ** 0.5
+    wanted = [axis.to_pulses(REACH_DEG) for axis in config.axes]
+
+    def turned(stand: Stand) -> float:
+        return float(np.linalg.norm(turn(base.attitude, stand.attitude)))
+
+    def grow(j: int, reach: Reach, samples: int = 0) -> tuple[int, ...]:
+        """Move an axis further and further; pulses of the last two places."""
+        way, counts = int(np.sign(wanted[j])), [0]
+        while True:
+            count = reach.pulses(wanted[j], REACH_DEG)
+            if count <= FAR_ENOUGH * counts[-1]:
+                return way * counts[-2], way * counts[-1]
+            _pace(run, j, reach.paced(count))
+            look = visit(f"{AXIS_NAMES[j]}:plus", {j: way * count}, samples)
+            reach.saw(count, turned(look), noise)
+            counts.append(count)
+
+    proved = unit_proved(config.imu, base.attitude)
+    if not proved:
+        run.say(
+            "  no angle of the phone is over 6.3, so degrees are not told from "
+            "radians: shorter moves show first which they are"
+        )
+        ratios = []
+        for j, axis in enumerate(config.axes):
+            _, far = grow(j, Reach(axis, False), 4 * config.settle.samples)
+            seen = turned(stands[f"{AXIS_NAMES[j]}:plus"])
+            told = device.drives[j].pulses_per_rev() or axis.pulses_per_rev
+            geared = told / axis.pulses_per_rev
+            ratios.append(geared * seen / abs(axis.to_deg(far)))
+            visit(f"{AXIS_NAMES[j]}:back", {j: 0})
+        require_unit(config, ratios)
+    pair = [0, 0, 0]
+    for j, name in enumerate(AXIS_NAMES):
+        axis, reach = config.axes[j], Reach(config.axes[j])
+        look, far = grow(j, reach)
+        plus = stands[f"{name}:plus"]
+        way = turned(plus)
+        if way < max(SEEN_DEG, SEEN_SIGMA * base.std_deg / plus.samples**0.5):
+            raise MotionFault(
+                f"unit {axis.unit} turned its motor by {abs(axis.to_deg(far)):g} deg "
+                f"of {name}, and the phone turned {way:.3f}. Look for a loose "
+                "coupling, a stream that does not change, or a reduction that is far "
+                "too small"
+            )
+        # Once more on the way up, where its play is taken up.
+        run.small.move_to(_moved(start, j, -far), name)
+        visit(f"{name}:look", {j: look if 2 * abs(look) <= abs(far) else far // 4})
+        visit(f"{name}:plus", {j: far})
+        visit(f"{name}:back", {j: 0})
+        visit(f"{name}:minus", {j: -far})
+        visit(f"{name}:up", {j: 0})
+        most = min(PAIR_DEG, _room(run, start, j))
+        pair[j] = round(far * min(REACH_DEG / way, most / abs(axis.to_deg(far))))
+        run.say(
+            f"  {name}: {abs(axis.to_deg(far)):.2f} deg commanded, the phone turned "
+            f"{way:.3f}"
+        )
+    clear = int(np.ceil(2.0 * (CLEAR * base.std_deg / PAIR_STD_DEG) ** 2))
+    samples = min(max(clear, config.settle.samples), 8 * config.settle.samples)
+    for a, b in itertools.combinations(range(3), 2):
+        for sign in "-+":
+            way_a = pair[a] if sign == "+" else -pair[a]
+            label = f"{AXIS_NAMES[a]}{sign}{AXIS_NAMES[b]}+"
+            visit(label, {a: way_a, b: pair[b]}, samples)
+    run.small.move_to(start, "back")
+    return stands
+
+
+def _pace(run: Bench, index: int, axis: Axis) -> None:
+    """At a speed that what is known allows; a simulated device need not be slow."""
+    if not run.full_speed:
+        run.small.pace(index, axis)
+
+
+def _moved(start: Pulses, axis: int, way: int) -> Pulses:
+    target = list(start)
+    target[axis] += way
+    a, b, c = target
+    return a, b, c
+
+
+def _room(run: Bench, start: Pulses, axis: int) -> float:
+    """Degrees from the start to the nearer limit of an axis."""
+    each = run.config.axes[axis]
+    here = each.to_deg(start[axis])
+    return min(here - each.min_deg, each.max_deg - here) - ROOM_DEG
+
+
+def _check_room(run: Bench, start: Pulses) -> None:
+    for j, name in enumerate(AXIS_NAMES):
+        if (room := _room(run, start, j)) < REACH_DEG:
+            raise Refused(
+                f"{name} stands {room + ROOM_DEG:.1f} deg from a limit; the check "
+                f"moves it {REACH_DEG:g} deg either way. Move it inwards: jaxcal-rig "
+                f"jog {name}"
+            )

@@ -1,0 +1,87 @@
+"""What the phone sends: rate, gaps, what is dropped, and how it lies."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from rig.config.settings import ImuSettings
+from rig.core.attitude import angle_between_deg, mean_rotation
+from rig.core.phone import Imu
+from rig.workbench.commission.ports import own_addresses
+
+LOOK_S = 1.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Stream:
+    """A phone's stream over some seconds."""
+
+    rate_hz: float
+    longest_gap_s: float
+    scatter_deg: float  # about the mean attitude
+    tilt_deg: float  # of the screen's normal from the vertical
+    accepted: int
+    dropped: dict[str, int]  # records that were not used, by reason
+    sender: str  # address
+
+    def __str__(self) -> str:
+        dropped = ", ".join(f"{n} {reason}" for reason, n in self.dropped.items())
+        return (
+            f"{self.rate_hz:.0f} readings per s, longest gap "
+            f"{self.longest_gap_s:.2f} s, scatter {self.scatter_deg:.3f} deg, tilt "
+            f"{self.tilt_deg:.1f} deg, dropped: {dropped or 'none'}"
+        )
+
+
+def addresses_text(settings: ImuSettings, port: int) -> str:
+    """What to type into the phone's app."""
+    if settings.transport == "connect":
+        return f"connecting to the phone at {settings.host}:{port}"
+    if settings.host in ("0.0.0.0", "::"):
+        hosts = own_addresses() or ["(this computer has no network address)"]
+    else:
+        hosts = [settings.host]
+    each = " or ".join(f"{host} port {port}" for host in hosts)
+    return f"type into the phone's app ({settings.format}): {each}"
+
+
+def watch(
+    imu: Imu, seconds: float, wait_s: float, say: Callable[[str], None]
+) -> Stream:
+    """Wait for an open stream and look at it for so long, telling each second.
+
+    Raises:
+        ImuError: nothing came, or the stream is not to be trusted.
+    """
+    imu.wait_for_stream(wait_s)
+    start = time.monotonic()
+    end = start + seconds
+    told: Stream | None = None
+    while time.monotonic() < end:
+        time.sleep(min(LOOK_S, max(0.0, end - time.monotonic())))
+        imu.latest()
+        told = _stream(imu, start)
+        say(f"  {told}")
+    return told or _stream(imu, start)
+
+
+def _stream(imu: Imu, start: float) -> Stream:
+    readings = imu.since(start)
+    spent = max(time.monotonic() - start, 1e-3)
+    times = np.array([reading.time for reading in readings])
+    mean = mean_rotation([reading.matrix for reading in readings[-500:]])
+    apart = [angle_between_deg(mean, reading.matrix) for reading in readings[-500:]]
+    counts = dict(imu.counts)
+    return Stream(
+        rate_hz=len(readings) / spent,
+        longest_gap_s=float(np.diff(times).max()) if len(times) > 1 else spent,
+        scatter_deg=float(np.sqrt(np.mean(np.square(apart)) / 3.0)),
+        tilt_deg=float(np.degrees(np.arccos(np.clip(mean[2, 2], -1.0, 1.0)))),
+        accepted=counts.pop("accepted", 0),
+        dropped=counts,
+        sender=imu.sender,
+    )

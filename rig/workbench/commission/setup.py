@@ -1,0 +1,192 @@
+"""From cables to a device that may be calibrated, one question at a time."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import pathlib
+from typing import Any
+
+from jaxcal.files import write_text
+from rig.config import AXIS_NAMES, RigConfig, parse_config
+from rig.config.axis import DEFAULT_ROTATES
+from rig.config.settings import BusSettings
+from rig.core.faults import EXIT_OK, Refused
+from rig.core.lock import BusLock
+from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED
+from rig.workbench.commission import steps
+from rig.workbench.commission.home import can_home
+from rig.workbench.commission.operator import Operator
+from rig.workbench.commission.ports import serial_lines
+from rig.workbench.commission.scan import Found, parse_bus, scan
+from rig.workbench.commission.toml import edit, new_text, set_values
+
+FORMATS = ["hyperimu", "sensorlogger", "lines"]
+UNITS = 16
+SAFETY = (
+    "Research software, not a medical device. No patient is attached, nobody is within "
+    "the device's reach, a hardware emergency stop is at hand."
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Given:
+    """What the command line says, so that it is not asked."""
+
+    bus: str = ""
+    imu: str = ""  # FORMAT or FORMAT:PORT
+    units: int = UNITS
+    values: dict[str, Any] = dataclasses.field(default_factory=dict)  # of rig.toml
+    home: str = "here"
+    names_known: bool = False
+
+
+def write_config(path: pathlib.Path, given: Given, operator: Operator) -> RigConfig:
+    """Ask for bus, axes and phone, and write a new rig.toml."""
+    say = operator.say
+    say("1 ports")
+    lines = serial_lines()
+    for line in lines or ["no serial port on this computer"]:
+        say(f"  {line}")
+    bus = _ask_bus(given, operator, lines)
+    say(f"2 scan: units 1 to {given.units} on {bus.where}; reads only")
+    with BusLock(bus).acquire("setup"):
+        found = scan(bus, given.units, lambda text: say(f"  {text}"))
+    say("3 axes: which unit drives which joint. `axes` checks it by moving them")
+    axes = _ask_axes(found, given, operator)
+    say("4 phone")
+    form, _, port = (given.imu or "").partition(":")
+    form = form or operator.choose(
+        f"app of the phone ({', '.join(FORMATS)})", FORMATS, FORMATS[0]
+    )
+    port = port or operator.ask("TCP port that the phone sends to", "2055")
+    values = dict(given.values)
+    for name in AXIS_NAMES:
+        key = f"axes.{name}.reduction"
+        if key not in values:
+            question = f"{name}: motor turns for one turn of the joint (gearbox)"
+            values[key] = operator.number(question, 1.0)
+    text = set_values(new_text(bus, axes, form, int(port)), values)
+    config = parse_config(text, path.parent, str(path))
+    operator.confirm(f"setup writes {path}", "write")
+    write_text(path, text)
+    return config
+
+
+def _ask_bus(given: Given, operator: Operator, lines: list[str]) -> BusSettings:
+    default = ""
+    if lines:
+        default = f"rtu:{lines[0].partition(':')[0]},115200,N,8,1"
+    question = "bus, as rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT"
+    return parse_bus(given.bus or operator.ask(question, default))
+
+
+def _ask_axes(
+    found: list[Found], given: Given, operator: Operator
+) -> list[dict[str, Any]]:
+    usable = {each.unit: each for each in found if each.families}
+    if len(usable) < 3:
+        unknown = [each.unit for each in found if not each.families]
+        raise Refused(
+            f"three drives of a known family are needed, found {len(usable)}"
+            + (f"; units {unknown} answer, of no known family" if unknown else "")
+            + ". Check power, wiring, termination, the line format, and that every "
+            "drive has a unit id of its own; another family needs a map (docs/rig.md)"
+        )
+    left, axes = sorted(usable), []
+    for name in AXIS_NAMES:
+        choices = [str(unit) for unit in left]
+        unit = int(operator.choose(f"unit of {name}", choices, choices[0]))
+        left.remove(unit)
+        each = usable[unit]
+        family = each.families[0]
+        if len(each.families) > 1:
+            question = f"unit {unit} could be {' or '.join(each.families)}: which"
+            family = operator.choose(question, list(each.families), family)
+        pulses = each.pulses_per_rev or int(
+            operator.number(f"{name}: pulses for one motor turn", 10000)
+        )
+        axes.append(
+            {
+                "name": name,
+                "letter": DEFAULT_ROTATES[name],
+                "unit": unit,
+                "family": family,
+                "pulses": pulses,
+            }
+        )
+    return axes
+
+
+def go(place: steps.Place, given: Given) -> int:
+    """All steps from IDENTIFIED on; those that stand already are left out."""
+    operator, say, record = place.operator, place.say, place.record
+    assert place.path is not None
+    say(f"device record: {record.path}")
+    if record.missing(place.config, IDENTIFIED):
+        steps.identify(place)
+    say("5 imu")
+    stream = steps.look_at_phone(place)
+    pin(place, stream.sender)
+    if record.missing(place.config, HOMED):
+        say("6 jog and home")
+        if not operator.yes:
+            _offer_jog(place)
+        here = _ask_home(place, given)
+        if code := steps.go_home(place, here):
+            return code
+        say("7 limits")
+        _ask_limits(place)
+    if record.missing(place.config, SIGN_CHECKED):
+        say("8 axes")
+        if code := steps.axes(place, given.names_known):
+            return code
+    if record.missing(place.config, ZEROED):
+        say("9 zero")
+        if code := steps.take_zero(place):
+            return code
+    say(f"the device is commissioned: {record.path}")
+    # A simulated device is gone with this command; another is made as rig.toml says.
+    again = " --simulate" * place.full_speed
+    say(f"next: jaxcal-rig calibrate{again} --config {os.path.relpath(place.path)}")
+    return EXIT_OK
+
+
+def pin(place: steps.Place, sender: str) -> None:
+    """Only this phone is listened to from now on."""
+    if place.path is None or not sender or sender in place.config.imu.allow:
+        return
+    place.operator.confirm(
+        f"imu: listen to {sender} only, and to no other sender", "listen"
+    )
+    place.take(edit(place.path, {"imu.allow": [sender]}))
+
+
+def _offer_jog(place: steps.Place) -> None:
+    choices = [*AXIS_NAMES, "no"]
+    question = f"move an axis to the zero posture by hand ({', '.join(choices)})"
+    while (name := place.operator.choose(question, choices, "no")) != "no":
+        steps.jog(place, AXIS_NAMES.index(name), None)
+
+
+def _ask_home(place: steps.Place, given: Given) -> bool:
+    if not can_home(place.config):
+        return True
+    question = (
+        "home here (the device stands in its zero posture), or drive (each drive runs "
+        "its own homing)"
+    )
+    return place.operator.choose(question, ["here", "drive"], given.home) == "here"
+
+
+def _ask_limits(place: steps.Place) -> None:
+    assert place.path is not None
+    values: dict[str, float] = {}
+    for axis in place.config.axes:
+        for end, name in (("lowest", "min_deg"), ("highest", "max_deg")):
+            now = getattr(axis, name)
+            question = f"{axis.name}: {end} angle that is safe, deg from home"
+            if (number := place.operator.number(question, now)) != now:
+                values[f"axes.{axis.name}.{name}"] = number
+    if values:
+        place.take(edit(place.path, values))

@@ -1,0 +1,274 @@
+"""The steps of commissioning, each a run with a folder of its own, or reads alone."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import pathlib
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from rig.config import AXIS_NAMES, RigConfig
+from rig.core.bus import Bus
+from rig.core.drive import Drive
+from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault, Refused
+from rig.core.lock import BusLock
+from rig.core.phone import Imu
+from rig.core.record import (
+    HOMED,
+    IDENTIFIED,
+    SIGN_CHECKED,
+    STATES,
+    DeviceRecord,
+)
+from rig.core.session import STREAM_WAIT_S, run_safely
+from rig.journal import Record
+from rig.workbench.commission.axes import check_axes
+from rig.workbench.commission.bench import Bench
+from rig.workbench.commission.home import home, identity, unlimited, zero
+from rig.workbench.commission.jog import MOST_STEP_DEG, by_keyboard, step, unproved
+from rig.workbench.commission.operator import Operator
+from rig.workbench.commission.phone import Stream, addresses_text, watch
+from rig.workbench.commission.proposals import Change
+from rig.workbench.commission.toml import edit
+
+WATCH_S = 5.0
+# Below these a session's settle window would hardly ever fill.
+SLOW_HZ, LONG_GAP_S = 5.0, 0.3
+
+
+@dataclasses.dataclass
+class Place:
+    """A device, its files, and who stands at it."""
+
+    config: RigConfig  # with the addresses that are really used
+    record: DeviceRecord
+    operator: Operator
+    path: pathlib.Path | None = None  # rig.toml, where there is one to correct
+    folder: pathlib.Path | None = None  # of the run; a new one where not given
+    full_speed: bool = False  # of a simulated device
+    locked: bool = False  # the caller holds the bus
+    reset_alarms: bool = False
+    on_imu_port: Callable[[int], object] = lambda port: None
+    listeners: tuple[Callable[[Record], None], ...] = ()
+
+    def say(self, text: str) -> None:
+        self.operator.say(text)
+
+    def take(self, written: RigConfig) -> None:
+        """A configuration that was edited, reached as the one before."""
+        where = {name: getattr(self.config.imu, name) for name in ("host", "port")}
+        imu = written.imu.model_copy(update=where)
+        update = {"bus": self.config.bus, "imu": imu}
+        self.config = written.model_copy(update=update)
+
+    def require(self, through: str) -> None:
+        """Refused where the device has not reached a state; says what to do."""
+        if text := self.record.missing(self.config, through):
+            raise Refused(text)
+
+    def _lock(self, what: str) -> BusLock:
+        lock = BusLock(self.config.bus)
+        return lock if self.locked else lock.acquire(what)
+
+    @contextlib.contextmanager
+    def bus(self, what: str) -> Iterator[list[Drive]]:
+        """The drives, to be read; nobody else writes meanwhile."""
+        config = self.config
+        with self._lock(what), Bus(config.bus, config.silence_s) as bus:
+            yield [Drive(bus, axis) for axis in config.axes]
+
+    def run(
+        self,
+        name: str,
+        procedure: Callable[[Bench], object],
+        limits: bool = True,
+        again: str = "",
+    ) -> int:
+        """Run a step that moves or writes; returns the exit code."""
+        config = self.config if limits else unlimited(self.config)
+        with self._lock(name) as lock:
+            bench = Bench(
+                config, name, self.record, self.say,
+                folder=self.folder, plain=self.config, homed=limits,
+                full_speed=self.full_speed,
+                again=f"jaxcal-rig {again or name}", reset_alarms=self.reset_alarms,
+                start={"simulated": None, "inputs": {}, "maps_from": ""},
+            )  # fmt: skip
+            lock.tell(run=str(bench.folder.resolve()))
+            bench.on_imu_port = self.on_imu_port
+            bench.listeners += self.listeners
+
+            def whole(run: Any) -> int:
+                result = procedure(run)
+                return result if isinstance(result, int) else EXIT_OK
+
+            return run_safely(bench, whole)
+
+
+def identify(place: Place) -> None:
+    """The configured units answer as the configured families: IDENTIFIED."""
+    with place.bus("scan") as drives:
+        found = identity(drives)
+    place.record.reach(IDENTIFIED, place.config, identity=found)
+    each = [f"{axis.name} is unit {axis.unit}" for axis in place.config.axes]
+    place.say(f"IDENTIFIED: {', '.join(each)}")
+
+
+def look_at_phone(place: Place, seconds: float | None = None) -> Stream:
+    """Wait for the phone, tell what it sends, and say what of it is too little."""
+    settings = place.config.imu
+    with Imu(settings) as imu:
+        place.say(f"imu: {addresses_text(settings, imu.port)}; then start its stream")
+        place.on_imu_port(imu.port)
+        stream = watch(imu, seconds or WATCH_S, STREAM_WAIT_S, place.say)
+    if stream.rate_hz < SLOW_HZ or stream.longest_gap_s > LONG_GAP_S:
+        place.say(
+            f"  note: sessions want {SLOW_HZ:g} readings per s without gaps over "
+            f"{LONG_GAP_S:g} s. Raise the app's rate, keep the phone awake and near "
+            "the Wi-Fi; or raise imu.stale_s and settle.window_s"
+        )
+    return stream
+
+
+def go_home(place: Place, here: bool) -> int:
+    """Make the counts mean a place: HOMED."""
+    place.require(IDENTIFIED)
+    place.say(
+        "the drives are armed; keep out of the device's reach, hand on the emergency "
+        "stop"
+    )
+    confirm = place.operator.confirm
+    return place.run("home", lambda run: home(run, here, confirm), limits=False)
+
+
+def jog(place: Place, axis: int, way_deg: float | None) -> int:
+    """Move one axis by a step, or as long as a key is held."""
+    place.require(IDENTIFIED)
+    name = AXIS_NAMES[axis]
+    if way_deg is None and (place.operator.yes or not sys.stdin.isatty()):
+        raise Refused(f"jog {name}: holding a key needs a terminal; give a step in deg")
+    if way_deg is not None and abs(way_deg) > MOST_STEP_DEG:
+        raise Refused(f"STEP must be at most {MOST_STEP_DEG:g} deg, got {way_deg:g}")
+    homed = place.record.missing(place.config, HOMED) is None
+    if not homed:
+        place.say("the device is not HOMED: the soft limits are not in force")
+    move = "while a key is held" if way_deg is None else f"by {way_deg:g} deg"
+    place.operator.confirm(f"jog: {name} will move {move}, slowly", "jog")
+
+    def procedure(run: Bench) -> None:
+        if way_deg is None:
+            by_keyboard(run, axis)
+        else:
+            step(run, axis, way_deg, unproved(run, axis))
+
+    return place.run("jog", procedure, limits=homed)
+
+
+def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> int:
+    """Measure play, dead zone and breakaway of an axis, into a calibration."""
+    from rig.workbench.commission import characterise as measured  # loads JAX
+    from rig.workbench.procedures.checking import (
+        calibration_path,
+        keep,
+        load_calibration,
+    )
+
+    place.require(SIGN_CHECKED)
+    path = None if into is None else calibration_path(into)
+    if path is not None:
+        # Of this device; simulated ones alone are moved at full speed.
+        load_calibration(path, place.config, simulated=place.full_speed)
+    name, most = AXIS_NAMES[axis], measured.BASE_DEG + measured.FAR_DEG
+    place.operator.confirm(
+        f"characterise: {name} will move up to {most:.2f} deg from where it stands, "
+        "many times. Keep out of the device's reach",
+        "characterise",
+    )
+
+    def procedure(run: Bench) -> None:
+        found = measured.characterise(run, axis)
+        if path is not None:
+            keep(path, name, found | {"run": run.folder.name})
+            run.say(f"kept in {path}: `goto` puts the play back")
+
+    return place.run("characterise", procedure, again=f"characterise {name}")
+
+
+def axes(place: Place, names_known: bool = False) -> int:
+    """Check each axis, correct rig.toml after a yes, and check again: SIGN_CHECKED."""
+    place.require(HOMED)
+    place.operator.confirm(
+        "axes: the device stands in its zero posture. Each axis in turn will move a "
+        "little, then up to 3 deg either way; then two at a time. Watch that the joint "
+        "that moves is the one that is named, and keep out of the device's reach",
+        "axes",
+    )
+    for again in (False, True):
+        changes: list[Change] = []
+
+        def procedure(run: Bench, changes: list[Change] = changes) -> None:
+            changes += check_axes(run, names_known)[1]
+
+        if code := place.run("axes", procedure):
+            return code
+        if not changes:
+            return EXIT_OK
+        place.say("rig.toml does not say what the device does:")
+        for change in changes:
+            place.say(f"  {change}")
+        if again or place.path is None:
+            place.say("the device is NOT sign-checked")
+            return EXIT_RECALIBRATE
+        place.operator.confirm(
+            f"axes: write this to {place.path}, then move the axes again", "correct"
+        )
+        _correct(place, changes)
+    raise AssertionError("unreachable")
+
+
+def _correct(place: Place, changes: list[Change]) -> None:
+    """Write corrections; what was proved of the drives goes with their cables."""
+    assert place.path is not None
+    place.take(edit(place.path, {change.key: change.new for change in changes}))
+    place.say(f"  written; the old file is kept beside {place.path}")
+    homed = place.record.state(HOMED) or {}
+    identify(place)
+    place.record.reach(HOMED, place.config, **homed)
+    place.record.left_at()  # where each named axis stands is not what it was
+
+
+def take_zero(place: Place) -> int:
+    """Measure the zero posture: ZEROED."""
+    place.require(SIGN_CHECKED)
+    confirm = place.operator.confirm
+    return place.run("zero", lambda run: zero(run, confirm))
+
+
+def begin_simulated(place: Place, through: str) -> None:
+    """Take a simulated device through the states up to one, as a real one is taken.
+
+    Its drives keep their counts: they are homed as they stand.
+
+    Raises:
+        MotionFault: its axes are not as configured.
+    """
+    states = STATES[: STATES.index(through) + 1] if through else ()
+    if IDENTIFIED in states:
+        identify(place)
+    if HOMED in states:
+        with place.bus("home") as drives:
+            pulses = [drive.status().position for drive in drives]
+        place.record.reach(HOMED, place.config, how="as they stand", pulses=pulses)
+    if SIGN_CHECKED not in states:
+        return
+    wrong: list[Change] = []
+    code = place.run("axes", lambda run: wrong.extend(check_axes(run, False)[1]))
+    if wrong:
+        raise MotionFault(
+            "the configuration does not say what the device does: "
+            + "; ".join(map(str, wrong))
+        )
+    if code:
+        raise MotionFault("the axis check of the simulated device did not end well")

@@ -1,0 +1,217 @@
+"""What a session prints, as lines of text."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rig.config import AXIS_NAMES, RigConfig
+from rig.core.attitude import Array
+from rig.core.device import Device
+from rig.core.session import Run
+from rig.core.stop import UnitStop
+from rig.workbench.outputs.telemetry import Telemetry
+
+
+def numbers(values: Any, width: int = 9, digits: int = 4) -> str:
+    """Numbers side by side; what rounds to zero has no sign."""
+    rounded = (round(float(value), digits) + 0.0 for value in values)
+    return " ".join(f"{value:{width}.{digits}f}" for value in rounded)
+
+
+def listen(run: Run) -> None:
+    """Print what happens in a run, and append what phone and drives say to its files.
+
+    Both are listeners: a session neither waits for them nor needs them.
+    """
+    run.listeners.append(lambda record: run.say(*_lines(run, record)))
+    run.attachments.append(_telemetry)
+
+
+def _telemetry(run: Run, device: Device) -> Telemetry:
+    telemetry = Telemetry(
+        run.folder, run.config, device.imu, device.drives, lambda: device.frame
+    )
+    telemetry.start()
+    return telemetry
+
+
+def _lines(run: Run, record: dict[str, Any]) -> list[str]:
+    if record["event"] != "posture":
+        return event_lines(record)
+    visited, planned, seconds, left = run.progress
+    return [
+        f"  [{visited:>3}/{planned}] {record['name']:<12} "
+        f"u [{numbers(record['commanded_deg'], 8, 3)}]  "
+        f"y [{numbers(record['measured_deg'], 8, 3)}]  {seconds:5.2f} s, "
+        f"about {left:.0f} s left"
+    ]
+
+
+def event_lines(record: dict[str, Any]) -> list[str]:
+    """What an event of the run comes to on the console; most are silent."""
+    match record["event"]:
+        case "zero":
+            return [f"zero taken at pulses {record['pulses']}"]
+        case "void":
+            return [f"  withdrawn, to be measured again: {', '.join(record['names'])}"]
+        case "pausing":
+            return ["pausing after this posture; another Ctrl-C stops at once"]
+        case "lost_reply":
+            found = {
+                "obeyed": "the drive obeys",
+                "not taken": "the drive did not take it, so it is sent again",
+                "unknown": "whether the drive took it is unknown, so all stop",
+            }[record["outcome"]]
+            return [f"  the reply to a move of {record['axis']} was lost: {found}"]
+        case "sender_refused":
+            return [f"WARNING: {record['reason']}"]
+        case "unreachable":
+            return [f"  {record['name']} is out of reach: {record['reason']}"]
+        case "comm_restored" if record["error"]:
+            return [
+                f"{record['axis']}: its communication timeout was not put back to "
+                f"{record['counts']} ({record['error']}); `resume` does it"
+            ]
+        case "stop":
+            units = [f"  {UnitStop(**unit)}" for unit in record["units"]]
+            return [f"stop: {record['reason'] or 'end of run'}", *units]
+    return []
+
+
+def plan_lines(
+    config: RigConfig, choice: Any, pulses: Array, start_deg: Array
+) -> list[str]:
+    """What will be done: a choice, in the order of visits, of (M, 3) ``pulses``."""
+    session, settle = config.session, config.settle
+    text = choice_text(vars(choice))
+    lines = [f"{session.k} of {session.candidates} candidates by {text}"]
+    if choice.note:
+        lines.append(f"  note: {choice.note}")
+    lines.append("  order   candidate   degrees (pitch yaw roll)        pulses")
+    visited = pulses[list(choice.indices)]
+    degrees = config.to_deg(visited)
+    for number, index in enumerate(choice.indices):
+        angles, sent = numbers(degrees[number]), visited[number].tolist()
+        lines.append(f"  {number + 1:>5}   {index:>9}   {angles}   {sent}")
+    ways = np.abs(np.diff(np.vstack([start_deg, degrees]), axis=0))
+    speeds = np.array([axis.speed_deg_s for axis in config.axes])
+    seconds = (ways / speeds).max(axis=1).sum() / session.k
+    seconds += settle.window_s + 0.02 * settle.samples + 0.1
+    total = seconds * (session.k + 2 * session.verify_postures + 2)
+    pitch, yaw, roll = ways.sum(axis=0)
+    lines.append(
+        f"  travel pitch {pitch:.1f}, yaw {yaw:.1f}, roll {roll:.1f} deg; with "
+        f"{session.verify_postures} held-out postures, before and after, about "
+        f"{total:.0f} s"
+    )
+    return lines
+
+
+def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
+    """A and b with their intervals, the errors and any warning."""
+    lines = ["y = A u + b in degrees, +- 95 % confidence for all twelve at once:"]
+    for row, name in enumerate(AXIS_NAMES):
+        a, b, wide = summary["A"][row], summary["b"][row], summary["ci95"][row]
+        values = "  ".join(f"{a[i]:8.5f} +- {wide[i]:.5f}" for i in range(3))
+        lines.append(f"  {name:<5} [{values}]   {b:8.4f} +- {wide[3]:.4f}")
+    lines.append(f"  {noise_text(summary)}")
+    if "after" in summary:
+        lines.append(f"held-out {error_text(summary)}")
+    elif "prediction_max" in summary:  # a refit: nothing was compensated by it
+        lines.append(
+            f"held-out postures predicted to {summary['prediction_rms']:.4f} deg rms "
+            f"(max {summary['prediction_max']:.4f})"
+        )
+    if summary.get("drift"):
+        lines.append(f"drift: {drift_text(summary['drift'])}")
+    elif summary["drift_deg"] is not None:  # of version 1
+        lines.append(
+            f"zero posture at the end: {summary['drift_deg']:.4f} deg from zero"
+        )
+    if summary["orders"]["warning"]:
+        lines.append(f"WARNING: {summary['orders']['warning']}")
+    if reasons := recalibrate(summary, limit_deg):
+        lines.append(
+            f"RECALIBRATE: {' and '.join(reasons)}. Do not use this calibration before "
+            "the cause is known"
+        )
+    return lines
+
+
+def recalibrate(summary: dict[str, Any], limit_deg: float) -> list[str]:
+    """Why a calibration is not to be used; nothing where all is well."""
+    reasons = []
+    what, worst = "after compensation", summary.get("after", {}).get("max", 0.0)
+    if "after" not in summary:
+        what, worst = "of the prediction", summary.get("prediction_max", 0.0)
+    if worst > limit_deg:
+        limit = f"session.verify_limit_deg ({limit_deg:g})"
+        reasons.append(f"the error {what} exceeds {limit}")
+    if summary.get("drift") and summary["drift"]["over"]:
+        limit = f"session.drift_limit_deg ({summary['drift']['limit_deg']:g})"
+        reasons.append(f"the drift of the zero that is left exceeds {limit}")
+    return reasons
+
+
+def drift_text(drift: dict[str, Any]) -> str:
+    """How far the zero drifted, and what was done about it."""
+    worst = int(np.argmax(np.abs(drift["angles_deg"]).max(axis=0)))
+    text = (
+        f"the zero posture read up to {drift['size_deg']:.4f} deg from zero "
+        f"({AXIS_NAMES[worst]}) on later visits (limit {drift['limit_deg']:g})"
+    )
+    if drift["corrected"]:
+        rate = drift["rate_deg_per_min"][worst]
+        text += (
+            f"; linear, {rate:+.4f} deg/min, and taken out: {drift['left_deg']:.4f} "
+            "deg are left"
+        )
+    if drift["over"]:
+        kind = "" if drift["bend_deg"] is None else "It is not linear. "
+        text += (
+            f". {kind}Look for a loose phone, play, or a magnetic heading near the "
+            "motors"
+        )
+    return text
+
+
+def noise_text(summary: dict[str, Any]) -> str:
+    """How large the noise is, axis by axis, and where it was taken from."""
+    noise = (f"{name} {value:.4f}" for name, value in _named(summary["noise_std_deg"]))
+    text = (
+        f"noise of one posture {', '.join(noise)} deg, from {summary['basis']} "
+        f"({summary['dof']} degrees of freedom"
+    )
+    if "effective_samples" not in summary:  # of version 1
+        return f"{text})"
+    as_good = (f"{value:.1f}" for value in summary["effective_samples"])
+    return (
+        f"{text} each); {summary['samples']} readings are correlated and count as "
+        f"{', '.join(as_good)}"
+    )
+
+
+def _named(values: Any) -> Any:
+    return zip(AXIS_NAMES, values, strict=True)
+
+
+def choice_text(choice: dict[str, Any]) -> str:
+    """How the postures were chosen, and how good they are."""
+    rank = "proven optimum" if choice["proven"] else "best known"
+    gap = choice["best_log_det"] - choice["log_det"]
+    return (
+        f"{choice['method']}: log det {choice['log_det']:.4f} (commands in degrees), "
+        f"{rank} {choice['best_log_det']:.4f}, gap {gap:.4f}, D-efficiency "
+        f"{np.exp(-gap / 12.0):.4f}"
+    )
+
+
+def error_text(found: dict[str, Any]) -> str:
+    """Errors at held-out postures, raw and compensated."""
+    before, after = found["before"], found["after"]
+    return (
+        f"error before {before['rms']:.4f} deg rms (max {before['max']:.4f}), after "
+        f"compensation {after['rms']:.4f} (max {after['max']:.4f})"
+    )

@@ -1,0 +1,235 @@
+"""collect, verify and goto: the sessions besides calibrate."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxcal.files import atomic_write
+from rig.config import RigConfig
+from rig.config.config import differences
+from rig.core.attitude import Array
+from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
+from rig.core.plan import draw, draw_held_out
+from rig.core.session import Run
+from rig.core.zero import KeptZero
+from rig.workbench.identification.fit import pairs
+from rig.workbench.outputs.console import error_text, numbers
+from rig.workbench.procedures.calibrate import END, visit_pairs
+from rig.workbench.procedures.play import CHARACTERISED, Play
+
+
+def collect(run: Run, count: int) -> int:
+    """Record ``count`` random postures: the paper's Datasets 4 and 5.
+
+    Writes pairs.csv and dataset.npz with ``candidates`` and ``measured`` of shape
+    (episodes, M, 3), M as configured; the last, unfinished episode is in the CSV only.
+    """
+    config = run.config
+    targets = run.remember(
+        "collection", lambda: {"pulses": draw(config, count, 2).tolist()}
+    )["pulses"]
+    if run.dry_run:
+        for number, target in enumerate(targets):
+            run.say(f"  {number:>5}   {numbers(config.to_deg(target))}   {target}")
+    run.planned = len(targets) + 1
+    for number, target in enumerate(targets):
+        run.visit(f"collect:{number}", target, role="collect")
+    closing = run.visit(END, run.zero_pulses, role="reference")
+    run.emit("phase", phase="saving")
+    collected = [r for r in run.postures().values() if r["role"] == "collect"]
+    commands, measured = pairs(collected)
+    size = min(config.session.candidates, len(commands))
+    episodes = len(commands) // max(1, size)
+    run.save_pairs()
+    with atomic_write(run.folder / "dataset.npz") as file:
+        np.savez(
+            file,
+            candidates=commands[: episodes * size].reshape(episodes, size, 3),
+            measured=measured[: episodes * size].reshape(episodes, size, 3),
+        )
+    run.say(
+        f"saved: {run.folder}/pairs.csv ({len(commands)} postures), dataset.npz "
+        f"({episodes} x {size})"
+    )
+    drift = np.abs(closing["measured_deg"]).max() if closing else 0.0
+    limit = config.session.drift_limit_deg
+    if drift > limit:
+        run.say(
+            f"RECALIBRATE: the zero posture reads {drift:.3f} deg at the end (limit "
+            f"session.drift_limit_deg = {limit:g}). Fix the phone, and collect again"
+        )
+        return EXIT_RECALIBRATE
+    return EXIT_OK
+
+
+class Saved(NamedTuple):
+    """A calibration that this device can use, and what is known of its zero posture."""
+
+    calibration: Any
+    zero: KeptZero
+    play: Play
+    note: str  # for the operator; empty where all is well
+
+
+def load_calibration(
+    path: pathlib.Path, config: RigConfig, simulated: bool = False
+) -> Saved:
+    """A calibration that was made with a device configured as this one.
+
+    Args:
+        path: of the file, or of its run's folder.
+        config: of the device.
+        simulated: so is the device that is to be moved.
+
+    Raises:
+        Refused: not a calibration, or of another device, or a simulated one of a real
+            device; names the keys.
+    """
+    import jaxcal
+
+    path = calibration_path(path)
+    try:
+        calibration = jaxcal.Calibration.load(path)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise Refused(f"{path}: not a calibration: {error}") from None
+    notes = calibration.provenance.get("notes", {})
+    if notes.get("simulated") and not simulated:
+        raise Refused(
+            f"{path}: made with a simulated device: it says nothing of the real one. "
+            "Calibrate the device, or use it with --simulate"
+        )
+    note = _check_device(path, notes, config)
+    zero, attitude = notes.get("zero_pulses"), notes.get("zero_attitude")
+    kept = KeptZero(
+        f"calibration {notes.get('run', path)}",
+        None if zero is None else (int(zero[0]), int(zero[1]), int(zero[2])),
+        None if attitude is None else np.array(attitude, dtype=np.float64),
+    )
+    return Saved(calibration, kept, Play.of(notes), note)
+
+
+def calibration_path(path: pathlib.Path) -> pathlib.Path:
+    """The file of a calibration that is given by itself or by its run's folder."""
+    return path / "calibration.json" if path.is_dir() else path
+
+
+def keep(path: pathlib.Path, axis: str, found: dict[str, Any]) -> None:
+    """Write what was found of an axis into the notes of a calibration's file."""
+    from jaxcal.calibration import file
+
+    content = file.read(path)
+    notes = content["provenance"].setdefault("notes", {})
+    notes[CHARACTERISED] = notes.get(CHARACTERISED, {}) | {axis: found}
+    file.write(path, content)
+
+
+def _check_device(path: pathlib.Path, notes: dict[str, Any], config: RigConfig) -> str:
+    """What to tell of a calibration's device; Refused where it is another one."""
+    if "device" in notes:
+        if changed := differences(notes["device"], config.device_fingerprint()):
+            raise Refused(
+                f"{path}: made with another device: {'; '.join(changed)}. Correct "
+                "rig.toml, or calibrate this device"
+            )
+        return ""
+    if notes.get("fingerprint") != config.fingerprint():
+        raise Refused(
+            f"{path}: does not say with which device it was made, and this "
+            "configuration is not that of its run. Calibrate again"
+        )
+    return (
+        f"WARNING: {path} is of version 1: the configuration is that of its run, but "
+        "it keeps no attitude of the zero posture, so that lost origins cannot be "
+        "seen. Calibrate again"
+    )
+
+
+def verify(run: Run, calibration: Any, count: int) -> int:
+    """Fresh held-out postures against a saved calibration: is it still true?"""
+    config = run.config
+    held = run.remember(
+        "held_out", lambda: {"pairs": draw_held_out(config, calibration, count)}
+    )["pairs"]
+    if not held:
+        raise Refused("no target in the ranges can be reached through this calibration")
+    run.planned = 2 * len(held)
+    if run.dry_run:
+        for raw, command in held:
+            run.say(f"  target {numbers(config.to_deg(raw))}  command {list(command)}")
+    records, found = visit_pairs(run, held)
+    if not found:
+        raise Refused("no held-out posture could be reached")
+    commands, measured = pairs(records)
+    off = measured - calibration.predict(commands)
+    limit = config.session.verify_limit_deg
+    again = found["after"]["max"] > limit
+    run.emit("phase", phase="saving")
+    run.save_pairs()
+    run.save_summary(
+        {
+            **found,
+            "prediction_rms": float(np.sqrt((off**2).mean())),
+            "limit_deg": limit,
+            "recalibrate": again,
+        }
+    )
+    run.say(f"{error_text(found)}, limit {limit:g}")
+    run.say("RECALIBRATE: over the limit" if again else "the calibration still holds")
+    return EXIT_RECALIBRATE if again else EXIT_OK
+
+
+def goto(run: Run, calibration: Any, desired: Array, play: Play) -> int:
+    """Move the end-effector to (3,) desired degrees through a calibration.
+
+    Args:
+        run, calibration, desired: what moves, by what, and where to.
+        play: of the axes, put back by the direction in which each arrives.
+    """
+    config = run.config
+    command = np.asarray(calibration.command_for(desired), dtype=np.float64)
+    for axis, value, most in zip(config.axes, command, play.most, strict=True):
+        if not axis.min_deg + most <= value <= axis.max_deg - most:
+            raise LimitError(
+                f"{desired.tolist()} deg needs {axis.name} commanded to {value:.3f} "
+                f"deg, outside [{axis.min_deg:g}, {axis.max_deg:g}]"
+                + f" less its play, {most:.3f} deg"
+                * bool(most)
+            )
+    if play.known and "goto" not in run.postures() and not run.dry_run:
+        command = _with_play(run, command, play)
+    pulses = config.to_pulses(command)
+    run.say(
+        f"desired {desired.tolist()} deg: command {command.round(4).tolist()} deg, "
+        f"pulses {list(pulses)}"
+    )
+    run.planned = 1
+    record = run.visit("goto", pulses, role="goto")
+    if record is None:
+        return EXIT_RECALIBRATE
+    reached = np.array(record["measured_deg"])
+    run.say(
+        f"reached {reached.round(4).tolist()} deg, off by "
+        f"{(reached - desired).round(4).tolist()}"
+    )
+    return EXIT_OK
+
+
+def _with_play(run: Run, command: Array, play: Play) -> Array:
+    """(3,) the command with the play put back, once what is too near has run up."""
+    config, one_way = run.config, run.config.motion.approach_overshoot_deg > 0.0
+    here = config.to_deg(run.ready().positions())
+    direction = np.ones(3) if one_way else np.where(command < here, -1.0, 1.0)
+    near = np.abs(command - here) < play.run_up
+    if near.any() and not one_way:  # so that the last move takes the play up
+        begin = np.where(near, command - direction * play.run_up, here)
+        low = [axis.min_deg for axis in config.axes]
+        high = [axis.max_deg for axis in config.axes]
+        turned = near & ((begin < low) | (begin > high))
+        direction = np.where(turned, -direction, direction)
+        begin = np.where(near, command - direction * play.run_up, here)
+        run.motion.move_to(config.to_pulses(begin), "goto")
+    run.say(*play.lines(command, direction))
+    return command + play.shift(direction)
