@@ -71,9 +71,9 @@ def choose(rule: str, name: str, place: Place, k: int, rng) -> Array:
     if rule == "all":
         return np.arange(len(commands))
     if rule == "random":
-        return rng.choice(len(commands), k, replace=False)
+        return rng.choice(len(commands), min(k, len(commands)), replace=False)
     return jaxcal.select(
-        commands, k, "exchange", model=arm(name), criterion=rule
+        commands, min(k, len(commands)), "exchange", model=arm(name), criterion=rule
     ).indices
 
 
