@@ -1,8 +1,10 @@
-"""The calibration of any model ``y = f(u; theta)``, with a prior and either loss."""
+"""``Calibration``: the identified map, its uncertainty, its inverse and its file."""
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import importlib
 import os
 from collections.abc import Mapping
 from typing import Any
@@ -10,13 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration import file, table
-from jaxcal.calibration.affine_inverse import limits_of
-from jaxcal.calibration.base import Calibration
-from jaxcal.calibration.checked import derivative, predict
+from jaxcal.calibration import file
 from jaxcal.calibration.discrepancy import WithDiscrepancy
-from jaxcal.calibration.reach import Carry, reach
-from jaxcal.checks import in_words
+from jaxcal.calibration.inverse import Carry, limits_of, reach, solve_affine
+from jaxcal.checks import in_words, numbers
 from jaxcal.models import (
     Affine,
     Model,
@@ -26,17 +25,18 @@ from jaxcal.models import (
     from_dict,
     identifiability,
 )
+from jaxcal.models.checked import derivative, predict
 from jaxcal.models.identifiability import Identifiability
 
-__all__ = ["ModelCalibration"]
+__all__ = ["Calibration"]
 
 Array = NDArray[np.float64]
 
 _SCHEMA = file.Schema(
-    version=2,
     shapes={
         "estimate": "P",
         "joint_covariance": "PP",
+        "centre": "n",
         "unidentified": "zP",
         "prior_mean": "P",
         "prior_precision": "P",
@@ -56,8 +56,8 @@ _SCHEMA = file.Schema(
     counts={"num_measurements": 1, "num_readings": 1},
     switches=("noise_known",),
     may_be_null=(
-        *("joint_covariance", "unidentified", "estimated_commands", "noise_std"),
-        *("frequencies", "phases"),
+        *("joint_covariance", "centre", "unidentified", "estimated_commands"),
+        *("noise_std", "frequencies", "phases"),
     ),
     not_negative=(
         *("prior_precision", "free", "loss_weights", "distance", "noise_std"),
@@ -68,13 +68,29 @@ _SCHEMA = file.Schema(
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
-class ModelCalibration(Calibration, version=_SCHEMA.version):
-    """The most probable parameters; P of them with those of the discrepancy, if any."""
+class Calibration:
+    """The identified map from commands u (n inputs) to outputs y (m of them).
 
+    ``y = f(u; theta)`` with the most probable p parameters; P of them with those of the
+    discrepancy, if any. ``identify`` fills it, in closed form where the model is affine
+    and nothing else is asked for. Arrays are copied and frozen on entry.
+    """
+
+    residuals: Array  # (N, m) measured less predicted, measured unit
+    noise_std: Array | None  # (m,) at weight 1, behind every uncertainty
+    noise_known: bool  # True: noise_std was given; False: it comes from the residuals
+    noise_dof: float  # degrees of freedom of the noise estimated, 0 where known
+    num_measurements: int  # of positive weight
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    command_unit: str  # "" where not stated
+    measured_unit: str
+    provenance: Mapping[str, Any]  # created, packages, data_sha256, notes
     model: Model
     loss: str  # "student" or "gaussian"
     estimate: Array  # (P,)
     joint_covariance: Array | None  # (P, P); None where the noise is unknown
+    centre: Array | None  # (n,) of the affine closed form: with b the outputs there
     unidentified: Array | None  # (z, P) directions that nothing determines
     prior_mean: Array  # (P,)
     prior_precision: Array  # (P,) 0 where nothing was known
@@ -89,31 +105,63 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
     frequencies: Array | None  # (n, D) of the discrepancy
     phases: Array | None  # (D,)
 
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                value = np.array(value)
+                value.setflags(write=False)
+                object.__setattr__(self, field.name, value)
+        object.__setattr__(self, "provenance", copy.deepcopy(self.provenance))
+
+    def __repr__(self) -> str:
+        return self.summary()
+
     # -- parameters --------------------------------------------------------------------
+
+    @property
+    def num_inputs(self) -> int:
+        """n."""
+        return len(self.input_names)
+
+    @property
+    def num_outputs(self) -> int:
+        """m."""
+        return len(self.output_names)
 
     @property
     def parameters(self) -> Array:
         """(p,) of the model."""
-        return self.estimate[: len(self.names)]
+        return self.estimate[: len(self.model.names)]
 
     @property
-    def parameter_names(self) -> tuple[str, ...]:
-        """p names."""
+    def names(self) -> tuple[str, ...]:
+        """p names of the parameters."""
         return self.model.names
 
     @property
     def covariance(self) -> Array | None:
-        """(p, p) of ``parameters``, directions that nothing determines held fixed."""
-        p = len(self.names)
-        return None if self.joint_covariance is None else self.joint_covariance[:p, :p]
+        """(p, p) of ``parameters``, directions that nothing determines held fixed.
+
+        None where the noise is unknown.
+        """
+        if self.joint_covariance is None:
+            return None
+        p, n, m = len(self.names), self.num_inputs, self.num_outputs
+        if self.centre is None:
+            return self.joint_covariance[:p, :p]
+        # b = (the outputs at the centre) - A centre
+        to_bias = np.eye(p)
+        to_bias[m * n :, : m * n] = -np.kron(np.eye(m), self.centre)
+        return to_bias @ self.joint_covariance @ to_bias.T
 
     @property
     def standard_errors(self) -> Array | None:
-        """(p,); infinite where nothing determines the parameter by itself."""
-        errors = super().standard_errors
-        if errors is None or self.unidentified is None:
-            return errors
-        return np.where(self._undetermined, np.inf, errors)
+        """(p,); infinite where nothing determines the parameter; None as above."""
+        covariance = self.covariance
+        if covariance is None:
+            return None
+        return np.where(self._undetermined, np.inf, np.sqrt(np.diag(covariance)))
 
     @property
     def from_data(self) -> Array | None:
@@ -136,16 +184,43 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
     @property
     def matrix(self) -> Array:
         """(m, n) A of an affine model."""
-        if not isinstance(self.model, Affine):
-            raise AttributeError("matrix")  # the base class says what it means
+        self._require_affine("matrix")
         return self.parameters[: -self.num_outputs].reshape(self.num_outputs, -1)
 
     @property
     def bias(self) -> Array:
         """(m,) b of an affine model."""
-        if not isinstance(self.model, Affine):
-            raise AttributeError("bias")
+        self._require_affine("bias")
         return self.parameters[-self.num_outputs :]
+
+    def confidence_intervals(self, confidence: float = 0.95) -> Array:
+        """(p, 2) lower and upper end for each parameter, one at a time.
+
+        Student's t where the noise was estimated, the normal where it was given.
+
+        Args:
+            confidence: probability in (0, 1).
+
+        Raises:
+            ValueError: the noise is unknown, or ``confidence`` is not in (0, 1).
+        """
+        self._require_noise("confidence intervals")
+        half = self._quantile(confidence) * np.asarray(self.standard_errors)
+        return np.stack([self.parameters - half, self.parameters + half], axis=-1)
+
+    def predict_interval(
+        self,
+        commands: ArrayLike,
+        confidence: float = 0.95,
+        *,
+        new_measurement: bool = False,
+    ) -> tuple[Array, Array]:
+        """Lower and upper end, (..., m) each; arguments as for ``predict_std``."""
+        centre = self.predict(commands)
+        half = self._quantile(confidence) * self.predict_std(
+            commands, new_measurement=new_measurement
+        )
+        return centre - half, centre + half
 
     # -- the fit -----------------------------------------------------------------------
 
@@ -196,7 +271,10 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
         """
         points = self._points("commands", commands, self.num_inputs)
         noise = self._require_noise("prediction uncertainty")
-        slopes = derivative(self._whole, self._rows(points), self.estimate)
+        rows = self._rows(points)
+        if self.centre is not None:
+            rows = rows - self.centre
+        slopes = derivative(self._whole, rows, self.estimate)
         covariance = np.asarray(self.joint_covariance)
         variance = ((slopes @ covariance) * slopes).sum(axis=-1)
         std = np.sqrt(np.maximum(variance, 0.0) + float(new_measurement) * noise**2)
@@ -206,7 +284,7 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
             std = np.where((np.abs(moved) > 1e-7 * size).any(axis=-1), np.inf, std)
         return std.reshape(*points.shape[:-1], self.num_outputs)
 
-    # -- inside ------------------------------------------------------------------------
+    # -- the inverse -------------------------------------------------------------------
 
     def command_for(
         self,
@@ -217,7 +295,10 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
         clip: bool = False,
         max_condition: float = 1e6,
     ) -> Array:
-        """Commands that reach desired outputs, by Newton's method from several starts.
+        """Commands that reach desired outputs.
+
+        Of a square affine map its inverse, else Newton's method from several starts;
+        within limits the nearest output.
 
         Args:
             desired: (..., m) in the measured unit; m at most n. Where m is less than n
@@ -246,7 +327,9 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
                 f"command_for needs at most as many outputs as inputs, got {m} and {n}"
             )
         begin = None
-        if start is not None:
+        if isinstance(self.model, Affine) and m == n and self.phases is None:
+            begin = solve_affine(self, wanted.reshape(-1, m), max_condition)
+        elif start is not None:
             points = self._points("start", start, n)
             begin = np.broadcast_to(points, (*wanted.shape[:-1], n)).reshape(-1, n)
         commands = reach(
@@ -300,13 +383,6 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
     def _rows(self, points: Array) -> Array:
         return points.reshape(-1, self.num_inputs)
 
-    def _no_noise(self, what: str) -> str:
-        return (
-            f"no {what}: {self.num_measurements} measurements leave {self.dof:.2g} "
-            "residual degrees of freedom beside the prior, so the noise is unknown; "
-            "measure more or give noise"
-        )
-
     # -- an arm, written back ----------------------------------------------------------
 
     @property
@@ -340,9 +416,11 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
     def summary(self) -> str:
         """The parameters with their 95 % intervals, the noise and the fit, as text."""
         columns = self._columns()
+        affine = isinstance(self.model, Affine)
+        what = "y = A u + b" if affine else f"of {type(self.model).__name__}"
         fixed = int((self.free[: len(self.parameters)] == 0).sum())
         lines = [
-            f"Calibration of {type(self.model).__name__}: {self.num_inputs} inputs "
+            f"Calibration {what}: {self.num_inputs} inputs "
             f"({', '.join(self.input_names)}), {self.num_outputs} outputs "
             f"({', '.join(self.output_names)}), {self.num_measurements} measurements, "
             f"{len(self.parameters)} parameters"
@@ -350,8 +428,10 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
             + (", with discrepancy" if self.phases is not None else "")
             + f", {self.loss} loss"
         ]
-        cells = {
-            "": columns["parameter"],
+        cells = {"": columns["parameter"]}
+        if affine:
+            cells["meaning"] = columns["meaning"]
+        cells |= {
             "value": [f"{value: .6g}" for value in columns["value"]],
         }
         if "low" in columns:
@@ -360,10 +440,11 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
                 f"[{low: .6g}, {high: .6g}]"
                 for low, high in zip(columns["low"], columns["high"], strict=True)
             ]
-            cells["from data"] = [f"{share:.0%}" for share in columns["from_data"]]
+            if self.prior_precision.any() or self.unidentified is not None:
+                cells["from data"] = [f"{share:.0%}" for share in columns["from_data"]]
         if any(columns["unit"]):
             cells["unit"] = columns["unit"]
-        lines += table.in_lines(cells)
+        lines += _in_lines(cells)
         unit = f" {self.measured_unit}" if self.measured_unit else ""
         size = np.sqrt(np.mean(self.residuals**2, axis=0))
         fit = self.lack_of_fit()
@@ -377,6 +458,8 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
         else:
             source = "as given" if self.noise_known else "from the residuals"
             lines.append(f"noise std {in_words(self.noise_std)}{unit}, {source}")
+            if self.dof < 0.5:
+                lines.append("no residual degree of freedom: the noise is not checked")
         if self.unidentified is not None:
             named = [
                 name
@@ -395,16 +478,35 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
         return "\n".join(lines)
 
     def _columns(self) -> dict[str, list[Any]]:
-        columns: dict[str, list[Any]] = {
-            "parameter": list(self.names),
-            "value": self.parameters.tolist(),
-            "unit": list(getattr(self.model, "units", [""] * len(self.parameters))),
-        }
+        columns: dict[str, list[Any]] = {"parameter": list(self.names)}
+        if isinstance(self.model, Affine):
+            columns["meaning"] = [
+                *(f"{y} per {u}" for y in self.output_names for u in self.input_names),
+                *(f"{y} at u = 0" for y in self.output_names),
+            ]
+        columns |= {"value": self.parameters.tolist(), "unit": self._units}
         if self.standard_errors is not None and self.from_data is not None:
             columns["std_error"] = self.standard_errors.tolist()
             columns["low"], columns["high"] = self.confidence_intervals().T.tolist()
             columns["from_data"] = self.from_data.tolist()
         return columns
+
+    def to_frame(self) -> Any:
+        """One row per parameter: value, unit, std_error, low and high (95 %), ...
+
+        Returns:
+            A ``pandas.DataFrame``; the last three only where the noise is known.
+
+        Raises:
+            ImportError: pandas is not installed.
+        """
+        try:
+            pandas = importlib.import_module("pandas")
+        except ModuleNotFoundError:
+            raise ImportError(
+                "to_frame needs pandas, which is not installed: pip install pandas"
+            ) from None
+        return pandas.DataFrame(self._columns()).set_index("parameter")
 
     def to_dict(self) -> dict[str, Any]:
         """The content of the file: names, numbers and lists, as JSON has them."""
@@ -416,10 +518,48 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
             "parameters": self.parameters.tolist(),
             "covariance": None if covariance is None else covariance.tolist(),
         }
+        if isinstance(self.model, Affine):
+            content["derived"]["matrix"] = self.matrix.tolist()
+            content["derived"]["bias"] = self.bias.tolist()
         return content
 
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write a versioned JSON file atomically; see ``docs/calibration.md``.
+
+        Raises:
+            OSError: the folder is missing, not writable or full; the old file stays.
+        """
+        file.write(path, self.to_dict())
+
     @classmethod
-    def _fields(cls, content: Mapping[str, Any], model: Model | None) -> dict[str, Any]:
+    def load(
+        cls, path: str | os.PathLike[str], *, model: Model | None = None
+    ) -> Calibration:
+        """Read a file that ``save`` wrote.
+
+        Args:
+            path: the file.
+            model: the model, where it holds a function, which no file can.
+
+        Raises:
+            OSError: it cannot be read.
+            ValueError: as of ``from_dict``; the message names the file too.
+        """
+        content = file.read(path)
+        try:
+            return cls.from_dict(content, model=model)
+        except ValueError as error:
+            raise ValueError(f"{os.fspath(path)}: {error}") from None
+
+    @classmethod
+    def from_dict(cls, content: Any, *, model: Model | None = None) -> Calibration:
+        """The inverse of ``to_dict``.
+
+        Raises:
+            ValueError: it is not a calibration, of another version, or damaged; the
+                message names the key.
+        """
+        file.require_version(content)
         found = file.fields(content, _SCHEMA)
         for key, kind in (("model", dict), ("loss", str), ("derived", dict)):
             if not isinstance(content.get(key), kind):
@@ -439,4 +579,62 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
             raise ValueError(f'"estimate" must have shape ({expected},)')
         if (found["noise_std"] is None) != (found["joint_covariance"] is None):
             raise ValueError('"noise_std" and "joint_covariance" contradict each other')
-        return found | {"model": model, "loss": content["loss"]}
+        return cls(**found, model=model, loss=content["loss"])
+
+    # -- inside ------------------------------------------------------------------------
+
+    def _points(self, name: str, values: ArrayLike, width: int) -> Array:
+        points = numbers(name, values)
+        if points.ndim < 1 or points.shape[-1] != width:
+            raise ValueError(
+                f"{name} must have shape (..., {width}), got {points.shape}"
+            )
+        return points
+
+    def _require_noise(self, what: str) -> Array:
+        if self.noise_std is None:
+            raise ValueError(self._no_noise(what))
+        return self.noise_std
+
+    def _quantile(self, confidence: float) -> float:
+        """Half-width of an interval in standard errors."""
+        if not 0.0 < confidence < 1.0:
+            raise ValueError(f"confidence must be in (0, 1), got {confidence}")
+        from scipy import special  # loads in half the time of scipy.stats
+
+        upper = 0.5 + 0.5 * confidence
+        if self.noise_known:
+            return float(special.ndtri(upper))
+        return float(special.stdtrit(self.noise_dof, upper))
+
+    def _no_noise(self, what: str) -> str:
+        left = f"only {self.dof:.2g}" if self.dof >= 0.5 else "no"
+        return (
+            f"no {what}: {self.num_measurements} measurements leave {left} residual "
+            f"degree of freedom for {int(self.free.sum())} free parameters, so the "
+            "noise is unknown; measure more or give noise_std"
+        )
+
+    @property
+    def _units(self) -> list[str]:
+        """p units of the parameters, "" where not known."""
+        if not isinstance(self.model, Affine):
+            return list(getattr(self.model, "units", [""] * len(self.names)))
+        per = f"/{self.command_unit}" if self.command_unit else ""
+        slope = (self.measured_unit or "1") + per if per else self.measured_unit
+        m = self.num_outputs
+        return [slope] * (m * self.num_inputs) + [self.measured_unit] * m
+
+    def _require_affine(self, name: str) -> None:
+        if not isinstance(self.model, Affine):
+            raise AttributeError(f"{name}: only an affine model y = A u + b has one")
+
+
+def _in_lines(columns: dict[str, list[str]]) -> list[str]:
+    """A header and a line for each row, columns padded to the same width."""
+    widths = [max(map(len, [name, *column])) for name, column in columns.items()]
+    lines = []
+    for row in [list(columns), *zip(*columns.values(), strict=True)]:
+        padded = [f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)]
+        lines.append(("  " + "  ".join(padded)).rstrip())
+    return lines

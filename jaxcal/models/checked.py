@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.checks import in_words
-from jaxcal.models import Model
+from jaxcal.models.model import Model
 
 __all__ = ["derivative", "facts", "predict"]
 

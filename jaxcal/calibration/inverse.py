@@ -1,24 +1,87 @@
-"""Commands that reach desired outputs of any model, or why there are none."""
+"""The inverse map: commands that reach desired outputs, or why there are none."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration.checked import derivative, predict
-from jaxcal.checks import in_words
+from jaxcal.checks import in_words, numbers
 from jaxcal.information.excitation import direction_in_words
-from jaxcal.models import Model
+from jaxcal.models import Affine, Model
+from jaxcal.models.checked import derivative, predict
 
-__all__ = ["reach"]
+__all__ = ["Carry", "limits_of", "reach", "solve_affine"]
 
 Array = NDArray[np.float64]
 
 _STARTS, _STEPS, _REACHED = 6, 60, 1e-9  # of the outputs' spread over the measurements
 
 Carry = Callable[[Array, NDArray[np.intp]], Array]
+_ROUNDING = 1e-12  # a response below this share of the output is rounding
+
+
+def limits_of(limits: ArrayLike, names: tuple[str, ...]) -> Array:
+    """(n, 2), least below greatest, with at least one finite command between them."""
+    bounds = numbers("limits", limits, finite=False)
+    if bounds.shape != (len(names), 2):
+        raise ValueError(
+            f"limits must have shape ({len(names)}, 2), got {bounds.shape}"
+        )
+    low, high = bounds.T
+    bad = np.flatnonzero(~((low <= high) & (low < np.inf) & (high > -np.inf)))
+    if bad.size:
+        raise ValueError(
+            f"limits of {names[bad[0]]} must be a least and a greatest value, "
+            f"got {in_words(bounds[bad[0]])}"
+        )
+    return bounds
+
+
+def solve_affine(fit: Any, wanted: Array, max_condition: float) -> Array:
+    """(P, n) the inverse of a square affine ``Calibration`` at outputs (P, n).
+
+    Raises:
+        ValueError: A is singular, or cannot be told from singular within its own
+            uncertainty; or no finite command reaches an output.
+    """
+    centre = fit.commands.mean(axis=0)
+    scale = np.where(np.ptp(fit.commands, axis=0) > 0.0, fit.commands.std(axis=0), 1.0)
+    at_centre = fit.matrix @ centre + fit.bias
+    effect = fit.matrix * scale  # (n, n) of one spread of each command
+    rows = np.linalg.norm(effect, axis=1)
+    silent = np.flatnonzero(rows <= _ROUNDING * np.abs(at_centre))
+    if silent.size:
+        name = fit.output_names[int(silent[0])]
+        raise ValueError(f"matrix A is singular: {name} does not respond to any input")
+    left, singular, right = np.linalg.svd(effect / rows[:, None])
+    unseen = direction_in_words(right[-1] * scale, fit.input_names)
+    insensitive = f"no output responds to the direction {unseen} of the commands"
+    if singular[-1] * max_condition < singular[0]:
+        ratio = singular[0] / singular[-1] if singular[-1] > 0 else np.inf
+        raise ValueError(
+            f"matrix A is near singular (condition number {ratio:.3g}, at most "
+            f"{max_condition:.3g} is inverted): {insensitive}"
+        )
+    if fit.joint_covariance is not None:
+        # Standard deviation of left . B right, whose value is the smallest one.
+        along = np.kron(left[:, -1] / rows, right[-1] * scale)
+        of_slopes = fit.joint_covariance[: along.size, : along.size]
+        spread = float(np.sqrt(along @ of_slopes @ along))
+        if singular[-1] < 3.0 * spread:
+            raise ValueError(
+                "matrix A cannot be told from a singular one: its smallest singular "
+                f"value is {singular[-1] / spread:.2g} standard deviations from zero, "
+                f"so within the noise {insensitive}"
+            )
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = ((wanted - at_centre) / rows).T
+        command = centre + scale * np.linalg.solve(effect / rows[:, None], off).T
+    if not np.isfinite(command).all():
+        raise ValueError("desired must be within reach of finite commands, got larger")
+    return command
 
 
 def reach(
@@ -43,7 +106,7 @@ def reach(
         names: n names of the inputs, for errors.
         begin: (P, n) where the first search begins; the nearest when None.
         bounds: (n, 2) limits of the commands, or None.
-        clip, max_condition: as for :meth:`ModelCalibration.command_for`.
+        clip, max_condition: as for :meth:`Calibration.command_for`.
         carry: what the model would answer at commands (R, n) if points ``rows`` (R,)
             were reached there; ``wanted[rows]`` where outputs are absolute.
     """
@@ -153,23 +216,36 @@ class _Search:
         def off(command: Array) -> Array:
             return -self.gap(command[None], np.array([i]))[0]
 
-        best = None
-        for begin in (free, *self.nearest[i]):
-            found = optimize.least_squares(
-                off,
-                np.clip(begin, low, high),
-                lambda command: self.slopes(command[None])[0] / self.spread,
-                (low, high),
-                x_scale=self.spread,
-                **{key: 1e-15 for key in ("ftol", "xtol", "gtol")},
-            )
-            if best is None or found.cost < best.cost:
-                best = found
-            if self._arrived(found.fun[None])[0]:
-                return np.asarray(found.x)
-        assert best is not None  # there is a start
+        def solutions() -> Iterator[Array]:
+            if isinstance(self.model, Affine):  # to the last digit, limits of any size
+                slope = self.slopes(free[None])[0]
+                there = slope @ (free / self.spread) - off(free)
+                ends = (low / self.spread, high / self.spread)
+                found = optimize.lsq_linear(
+                    slope, there, ends, method="bvls", tol=1e-15
+                )
+                yield np.clip(found.x * self.spread, low, high)
+                return
+            for begin in (free, *self.nearest[i]):
+                found = optimize.least_squares(
+                    off,
+                    np.clip(begin, low, high),
+                    lambda command: self.slopes(command[None])[0] / self.spread,
+                    (low, high),
+                    x_scale=self.spread,
+                    **{key: 1e-15 for key in ("ftol", "xtol", "gtol")},
+                )
+                yield np.asarray(found.x)
+
+        nearest, least = free, np.inf
+        for command in solutions():
+            gap = off(command)
+            if self._arrived(gap[None])[0]:
+                return command
+            if gap @ gap < least:
+                nearest, least = command, float(gap @ gap)
         if clip:
-            return np.asarray(best.x)
+            return nearest
         beyond = np.maximum(low - free, free - high) / self.spread
         if reached:
             axis = int(beyond.argmax())
@@ -177,11 +253,11 @@ class _Search:
                 f"desired {in_words(wanted)} needs {names[axis]} = {free[axis]:.6g}, "
                 f"outside its limits [{bounds[axis, 0]:.6g}, {bounds[axis, 1]:.6g}]"
             )
-        gap = np.minimum(best.x - low, high - best.x) < 1e-4 * self.spread
-        active = [name for name, at in zip(names, gap, strict=True) if at]
+        close = np.minimum(nearest - low, high - nearest) < 1e-4 * self.spread
+        active = [name for name, at in zip(names, close, strict=True) if at]
         raise ValueError(
             f"desired {in_words(wanted)} is out of reach; the nearest output found is "
-            f"{in_words(self.outputs(best.x[None])[0])}"
+            f"{in_words(self.outputs(nearest[None])[0])}"
             + (f", at the limit of {', '.join(active)}" if active else "")
         )
 
