@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.calibration.fitted import Fitted
 from jaxcal.checks import table, whole_number
 from jaxcal.models import SerialChain
-
-if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration
 
 __all__ = ["Check", "check", "verification"]
 
@@ -48,7 +45,7 @@ class Check:
 
 
 def check(
-    calibration: Calibration,
+    calibration: Fitted,
     commands: ArrayLike,
     measured: ArrayLike,
     tolerance: float | None,
@@ -138,15 +135,15 @@ def _noncentrality(freedom: int) -> float:
 
 
 def verification(
-    calibration: Calibration,
+    calibration: Fitted,
     candidates: ArrayLike,
     k: int,
     region: ArrayLike | None,
 ) -> NDArray[np.int64]:
     """See :meth:`jaxcal.calibration.Calibration.verification`.
 
-    Greedy, then swaps, for the sum over parameters of the log of how well their drift
-    is seen: it falls most where one of them is hardly seen at all.
+    Greedy, then swaps, for the smallest sum over parameters of the squared drift that
+    is seen, as a move of the outputs.
     """
     points = table("candidates", candidates)
     if not 1 <= whole_number("k", k, 1) <= len(points):
@@ -169,7 +166,8 @@ def verification(
 
     def value(rows: list[int]) -> Array:
         """(M,) of the rows and each candidate."""
-        return np.asarray(np.log(seen[rows].sum(axis=0) + seen + least).sum(axis=1))
+        together = seen[rows].sum(axis=0) + seen + least
+        return np.asarray(-(1.0 / together).sum(axis=1))
 
     chosen: list[int] = []
     for _ in range(k):

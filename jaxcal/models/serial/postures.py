@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,13 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import numbers, whole_number
 from jaxcal.models.sensors import Board, Placed, Plane, Several, Socket
 
-if TYPE_CHECKING:
-    from jaxcal.models.serial.chain import SerialChain
-
 __all__ = ["postures"]
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+Chain = Any  # a SerialChain, whose module imports this one
 
 _ROUNDS, _STEPS = 40, 80  # batches of starts; steps of the inverse kinematics
 _REACHED = 1e-7  # of the arm's length
@@ -27,7 +25,7 @@ _VIEW = np.cos(np.radians(25.0))  # of the board from the camera's axis, and its
 
 
 def postures(
-    arm: SerialChain,
+    arm: Chain,
     count: int,
     seed: int,
     near: ArrayLike | None,
@@ -79,9 +77,7 @@ def postures(
     )
 
 
-def _aimed(
-    arm: SerialChain, near: ArrayLike | None
-) -> tuple[SerialChain, Array | None]:
+def _aimed(arm: Chain, near: ArrayLike | None) -> tuple[Chain, Array | None]:
     """The arm with its sensor at ``near``, or points that the tip should be near."""
     sensor = arm.sensor
     places = None if near is None else np.atleast_2d(numbers("near", near))
@@ -93,8 +89,8 @@ def _aimed(
                 "arm.located(commands)"
             )
         if places is not None:
-            given = {"count": len(places), "places": places}
-            arm = arm.measured_with(type(sensor)(**given))
+            aimed = dataclasses.replace(sensor, count=len(places), places=places)
+            arm = arm.measured_with(aimed)
         return arm, None
     if isinstance(sensor, Board):
         if sensor.place is None:
@@ -112,7 +108,7 @@ def _aimed(
 
 
 def _reach(
-    arm: SerialChain, commands: Array, low: Array, high: Array, targets: Array | None
+    arm: Chain, commands: Array, low: Array, high: Array, targets: Array | None
 ) -> tuple[Array, list[str]]:
     """Commands moved to where the sensor reads, and why not ("" where it does)."""
     if isinstance(arm.sensor, Board):
@@ -132,7 +128,7 @@ def _reach(
 
 
 def _touching(
-    arm: SerialChain, commands: Array, low: Array, high: Array
+    arm: Chain, commands: Array, low: Array, high: Array
 ) -> tuple[Array, list[str]]:
     """Damped steps of least length until the readings are zero, within the limits."""
     commands, j = commands.copy(), arm.num_joints
@@ -163,7 +159,7 @@ def _touching(
     return commands, ["" if one else why for one in reached]
 
 
-def _in_view(arm: SerialChain, commands: Array) -> tuple[Array, list[str]]:
+def _in_view(arm: Chain, commands: Array) -> tuple[Array, list[str]]:
     """The board before the camera and turned to it; ``seen`` as it is predicted."""
     commands = commands.copy()
     j = arm.num_joints
