@@ -25,9 +25,9 @@ Place = tuple[Array, Array]  # joints (N, n) in degrees, sockets (N,)
 
 ARMS = {"panda_1": "panda", "kuka_14": "iiwa14", "dinova_1": "gen3lite"}
 APART = [(0, 1, 0.05, 1e-4)]  # the sockets are printed 50 mm apart, to 0.1 mm
-COUNTS = (8, 12, 16, 24)
-RULES = ("random", "D", "I")
-DRAWS = 15
+COUNTS = (8, 12, 16)
+RULES = ("random", "I")
+DRAWS = 5
 
 
 def arm(name: str) -> SerialChain:

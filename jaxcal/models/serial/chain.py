@@ -475,7 +475,8 @@ class SerialChain(Arm):
     def default_prior(self) -> Prior:
         """Loose knowledge of any arm, by the length of its links; see the constants.
 
-        What the sensor cannot see is held.
+        What the sensor cannot see is held; where contacts are few, the scales of
+        lengths and angles are taken from them (:meth:`Prior.sized`).
         """
         length = self.length or np.inf  # axes of unknown stroke alone
         joint = [_LENGTH * length, _ANGLE, _LENGTH * length, _ANGLE, _ANGLE]
@@ -491,6 +492,7 @@ class SerialChain(Arm):
                 *self.sensor.prior_std(length),
             ],
             fixed=self.sensor.unseen(self),
+            by_data=self.sensor.sizes_prior,
         )
 
     def to_dict(self) -> dict[str, Any]:
