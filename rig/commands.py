@@ -31,7 +31,6 @@ def run(args: argparse.Namespace) -> int:
         return EXIT_OK
     commands: dict[str, Callable[[argparse.Namespace], int]] = {
         "identify": _identify,
-        "stop": _stop,
         "simulate": _simulate,
         "example": _example,
         "check": _check,
@@ -81,12 +80,6 @@ def _described(drive: Drive) -> list[str]:
         f"{axis.to_deg(status.position):.4f} deg" + (alarm and f", {alarm}"),
         *identity,
     ]
-
-
-def _stop(args: argparse.Namespace) -> int:
-    from rig.stopping import stop_device
-
-    return stop_device(args.config or FILE)
 
 
 def _simulate(args: argparse.Namespace) -> int:

@@ -46,7 +46,11 @@ def refit(args: argparse.Namespace) -> int:
     now = parse_config(text, pathlib.Path(start["maps_from"]), str(args.run))
     changed = {key: [old[key], value] for key, value in new.items()}
     records, evidence = reread(held, then, now)
-    calibration, summary = conclude(now, evidence, {"refit_of": args.run.name})
+    calibration, summary = conclude(
+        now,
+        evidence,
+        {"refit_of": args.run.name, "simulated": start["simulated"] is not None},
+    )
     try:
         warnings = check_matrix(calibration.matrix)
     except MotionFault as fault:

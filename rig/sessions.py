@@ -73,7 +73,8 @@ def run_session(args: argparse.Namespace) -> int:
     resumed = args.command == "resume"
     config, start = recorded(args) if resumed else _new(args)
     mode = start["mode"]
-    procedure, kept_zero = _procedure(mode, start["inputs"], config)
+    simulated = start["simulated"] is not None
+    procedure, kept_zero = _procedure(mode, start["inputs"], config, simulated)
     # With --zero the operator put the device into its zero posture.
     zero_at = kept_zero.pulses if kept_zero and not args.zero else None
     dry_run = getattr(args, "dry_run", False)
@@ -179,7 +180,7 @@ def recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
 
 
 def _procedure(
-    mode: str, inputs: dict[str, Any], config: RigConfig
+    mode: str, inputs: dict[str, Any], config: RigConfig, simulated: bool
 ) -> tuple[Callable[[Run], int], KeptZero | None]:
     """What a session does, and the zero posture that it must find."""
     import numpy as np
@@ -191,7 +192,9 @@ def _procedure(
     count = inputs["count"]
     if mode == "collect":
         return lambda run: checking.collect(run, count), None
-    saved = checking.load_calibration(pathlib.Path(inputs["calibration"]), config)
+    saved = checking.load_calibration(
+        pathlib.Path(inputs["calibration"]), config, simulated
+    )
     if saved.note:
         print(saved.note, flush=True)
     calibration = saved.calibration

@@ -50,7 +50,8 @@ class Wanted:
     kind: ClassVar[str]  # "det", "trace" or "least"
     says: ClassVar[str]  # what a table prints before the value; V is a covariance
     per_output: ClassVar[bool] = False  # the value is one output's, not their sum
-    region: ArrayLike | None = None  # commands or blocks of predictions, if it has any
+    of_region: ClassVar[bool] = False  # it is about predictions, see ``region``
+    region: ArrayLike | None = None  # commands or blocks where; the candidates if None
     parameters: Sequence[str | int] | None = None  # of interest; all when None
 
     def root(self, at: Coordinates) -> Array:
@@ -94,6 +95,7 @@ class I(Wanted):  # noqa: E742 - the criterion's own name in the literature
     """
 
     name, kind, says, per_output = "I", "trace", "mean variance", True
+    of_region = True
 
     def __init__(self, region: ArrayLike | None = None) -> None:
         self.region = region
@@ -167,7 +169,7 @@ def wanted(criterion: Any, region: Any, default: str) -> Wanted:
             ) from None
     if region is None:
         return asked
-    if asked.name != "I" or asked.region is not None:
+    if not asked.of_region or asked.region is not None:
         raise ValueError(
             "region, where predictions are wanted, must come with criterion I, once, "
             f"got criterion {asked.name}"

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxcal.paper.datasets import BIAS_DEG, SCALE, make_dataset
 from jaxcal.paper.datasets.__main__ import write_datasets
-from jaxcal.paper.reproduce import main
+from studies.paper.reproduce import main
 
 ROOT = pathlib.Path(__file__).parents[2]
 
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.slow  # one report for all; its parts are tested quickl
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "jaxcal.paper", *map(str, arguments)],
+        [sys.executable, "-m", "studies.paper", *map(str, arguments)],
         capture_output=True,
         text=True,
         cwd=ROOT,

@@ -314,7 +314,7 @@ def test_blocks_are_planned_as_by_brute_force(criterion, known):
     for row in found.rows:
         share = shares(row.indices)
         np.testing.assert_allclose(
-            row.standard_error / found.target_accuracy,
+            row.standard_error / found.accuracy,
             share / best[4] / 1.0001,
             rtol=1e-8,
         )

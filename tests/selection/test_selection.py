@@ -475,6 +475,15 @@ def test_rooms_are_there_after_the_import_alone():
     assert done.stdout.startswith("('a11', 'b1')")
 
 
+def test_the_import_changes_no_environment_variable():
+    code = (
+        "import os; before = dict(os.environ)\n"
+        "import jaxcal; jaxcal.select, jaxcal.models\n"
+        "assert dict(os.environ) == before, set(os.environ) ^ set(before)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_names_are_exported_lazily():
     assert jaxcal.select is select
     code = (
@@ -491,3 +500,19 @@ def test_names_are_exported_lazily():
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert done.stdout.splitlines() == ["[]", "['numba']"]
+
+
+def test_a_design_keeps_its_own_numbers_between_questions():
+    candidates, measured = uniform(0), uniform(1, m=2)
+    available, required = np.arange(20) != 4, np.array([3])
+    design = jaxcal.Design(
+        candidates, measured=measured, available=available, required=required
+    )
+    first = design.select(5)
+    for array in (candidates, measured, available, required):
+        array[:] = 0
+    again = design.select(5)
+    np.testing.assert_array_equal(first.indices, again.indices)
+    assert first.log_det == again.log_det
+    assert design.score(first.indices).log_det == pytest.approx(first.log_det)
+    assert {c: design.select(5, c).criterion for c in "DAIE"} == {c: c for c in "DAIE"}

@@ -68,7 +68,7 @@ class Plan:
     k: int
     indices: Indices  # (k,) sorted, into the candidates
     standard_error: Array  # (m,) predicted by the criterion, measured unit
-    target_accuracy: Array  # (m,) measured unit
+    accuracy: Array  # (m,) measured unit
     noise_std: Array | None  # one an output, measured unit; None where Noise says more
     names: tuple[str, ...]  # (m,) of the parameters, or output 1, ...
     criterion: str  # "G", "I" or "parameters"
@@ -84,15 +84,15 @@ class Plan:
     @property
     def hardest_output(self) -> int:
         """The output, or parameter, that is furthest from its target."""
-        return int((self.standard_error / self.target_accuracy).argmax())
+        return int((self.standard_error / self.accuracy).argmax())
 
     def worst(self, errors: Array) -> float:
         """Largest of (m,) errors over their targets, times that of the hardest output.
 
         Where the targets are equal, the largest error.
         """
-        share = (errors / self.target_accuracy).max()
-        return float(share * self.target_accuracy[self.hardest_output])
+        share = (errors / self.accuracy).max()
+        return float(share * self.accuracy[self.hardest_output])
 
     def __str__(self) -> str:
         return self.table()
@@ -106,7 +106,7 @@ class Plan:
         elif self.noise_std is not None:
             what += f", noise {self.noise_std[worst]:g}"
         lines = [
-            f"{what}, target {self.target_accuracy[worst]:g}",
+            f"{what}, target {self.accuracy[worst]:g}",
             "   K  distinct  standard error  no design below  D-optimal     design",
         ]
         for row in self.rows:
@@ -205,7 +205,7 @@ def make_plan(
         k=chosen.k,
         indices=chosen.indices,
         standard_error=chosen.standard_error,
-        target_accuracy=target,
+        accuracy=target,
         noise_std=level,
         names=names,
         criterion=criterion,

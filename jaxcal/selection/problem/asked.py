@@ -159,7 +159,7 @@ class Asked:
             root = _with_measured(root, seen)
         source.require_identified(self._measured)
         where = asked.region
-        if where is None and asked.name == "I":
+        if where is None and asked.of_region:
             where = source.predicted()
         return whitened_problems(
             raw[None], root,
@@ -200,7 +200,9 @@ class Asked:
     ) -> None:
         _require_kind("noise", noise, Noise)
         self.prior, self.noise = prior, noise
-        self._measured, self._required = measured, required
+        # Copies: the caller's arrays may change before the next question.
+        self._measured = None if measured is None else numbers("measured", measured)
+        self._required = copy.copy(required)
         self.max_replicates = max_replicates
 
 

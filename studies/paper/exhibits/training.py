@@ -1,0 +1,285 @@
+"""Figure 2: training curves of the compact preset over seeds, and of a ``paper`` run.
+
+Nothing is trained here: the runs are kept in ``kept/`` by
+``studies.paper.training_runs`` and read from there; what is not there is said to be
+missing.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import pathlib
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from jaxcal.evaluation.training_figure import (
+    last_rewards,
+    read_metrics,
+    training_curves,
+)
+from jaxcal.plots.style import COLOURS, GREY, band, boxes, panels
+from studies.paper.exhibits.exhibit import Exhibit, Verdict, judge
+from studies.paper.exhibits.intervals import mean_interval
+from studies.paper.exhibits.material import Material
+
+__all__ = ["Run", "exhibits", "kept_runs", "plateau"]
+
+Array = NDArray[np.float64]
+
+CLAIMED = 200_000  # episodes within which the paper's training converges
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A kept training run."""
+
+    folder: pathlib.Path
+    metrics: dict[str, Array]
+    summary: dict[str, Any]
+    rewards: Array  # of the last episodes
+    rewards_are: str  # in words
+
+    @property
+    def finished(self) -> bool:
+        """Whether it ran as many episodes as were planned."""
+        return self.summary["episodes"] >= (self.summary["planned_episodes"] or CLAIMED)
+
+
+def exhibits(material: Material) -> list[Exhibit]:
+    """The seeds of the compact preset, and the paper's network."""
+    studies = material.settings.studies
+    seeds, paper = kept_runs(studies / "compact_seeds"), kept_runs(studies, "paper")
+    return [_seeds(seeds, paper), _paper(paper)]
+
+
+def kept_runs(folder: pathlib.Path, pattern: str = "seed_*") -> list[Run]:
+    """Runs in the folders that match, in the order of their seeds.
+
+    Raises:
+        ValueError: a file of one cannot be understood.
+    """
+    found = []
+    for path in sorted(folder.glob(f"{pattern}/metrics.csv")):
+        metrics = read_metrics(path)
+        rewards, what = last_rewards(path.parent, metrics)
+        summary = _summary(path.with_name("summary.json"), metrics)
+        found.append(Run(path.parent, metrics, summary, rewards, what))
+    return sorted(found, key=lambda run: run.summary["seed"])
+
+
+def _summary(path: pathlib.Path, metrics: dict[str, Array]) -> dict[str, Any]:
+    """The summary of a run; what metrics.csv tells where there is none."""
+    known: dict[str, Any] = {
+        "seed": 0,
+        "episodes": int(metrics["episodes"][-1]),
+        "planned_episodes": None,
+        "finished": None,
+        "seconds": float(metrics["seconds"][-1]) if "seconds" in metrics else None,
+        "parameters": None,
+        "dataset2": None,
+    }
+    if path.is_file():
+        try:
+            held = json.loads(path.read_text(encoding="utf-8"))
+            return {name: held[name] for name in known}
+        except (ValueError, KeyError, TypeError):
+            raise ValueError(f"{path} is not the summary of a training run") from None
+    return known
+
+
+def plateau(run: Run) -> dict[str, float]:
+    """Where a reward curve became flat, and how much it still rises.
+
+    ``episode``: from where on the moving average (5 % of the run) stays within 5 % of
+    the whole rise from the final level. ``last_tenth``: rise from the tenth before the
+    last to the last, as a share of the whole.
+    """
+    reward, episodes = run.metrics["reward_mean"], run.metrics["episodes"]
+    count = len(reward)
+    part, window = max(count // 10, 1), max(count // 20, 1)
+    final = float(reward[-part:].mean())
+    rise = final - float(reward[0])
+    smooth = np.convolve(reward, np.ones(window) / window, mode="valid")
+    outside = np.flatnonzero(np.abs(smooth - final) > 0.05 * abs(rise))
+    first = min(int(outside[-1]) + 1 if outside.size else 0, len(smooth) - 1)
+    before = float(reward[-2 * part : -part].mean()) if count > 2 * part else final
+    return {
+        "episode": float(episodes[first + window - 1]),
+        "final_reward": final,
+        "rise": rise,
+        "last_tenth": (final - before) / rise if rise else 0.0,
+    }
+
+
+def _converges(runs: list[Run], flat: list[dict[str, float]]) -> Verdict:
+    """Whether every run rose and became flat within the paper's episodes."""
+    if not all(run.finished and run.summary["episodes"] >= CLAIMED for run in runs):
+        return "not comparable"
+    rose = all(state["rise"] > 0 for state in flat)
+    settled = all(abs(state["last_tenth"]) < 0.02 for state in flat)
+    in_time = all(state["episode"] <= CLAIMED for state in flat)
+    return judge(rose and settled and in_time, rose and not settled)
+
+
+def _seeds(runs: list[Run], paper: list[Run]) -> Exhibit:
+    if len(runs) < 2:
+        return Exhibit.missing("figure_2", seeds=len(runs))
+    grid = np.linspace(
+        max(run.metrics["episodes"][0] for run in runs),
+        min(run.metrics["episodes"][-1] for run in runs),
+        100,
+    )
+    columns: dict[str, Any] = {"episodes": grid}
+    for run in runs:
+        curve = np.interp(grid, run.metrics["episodes"], run.metrics["reward_mean"])
+        columns[f"reward_seed_{run.summary['seed']}"] = curve
+    bands = [
+        mean_interval(row) for row in zip(*list(columns.values())[1:], strict=True)
+    ]
+    for name, field in (("mean", "value"), ("low", "low"), ("high", "high")):
+        columns[f"reward_{name}"] = [getattr(found, field) for found in bands]
+    flat = [plateau(run) for run in runs]
+    lengths = [run.summary["episodes"] for run in runs]
+    numbers: dict[str, Any] = {
+        "seeds": len(runs),
+        "episodes": lengths,
+        "plateau_episode": mean_interval([f["episode"] for f in flat]),
+        "last_tenth_of_rise": [f["last_tenth"] for f in flat],
+        "last_1000_reward_mean": mean_interval([r.rewards.mean() for r in runs]),
+        "last_1000_reward_std": mean_interval([r.rewards.std() for r in runs]),
+        "seconds": [run.summary["seconds"] for run in runs],
+    }
+    measured = [run.summary["dataset2"] for run in runs]
+    text = ""
+    if all(measured):
+        for name in ("ratio_to_exact", "hit_rate"):
+            numbers[name] = mean_interval([m[name] for m in measured], most=1.0)
+        text = (
+            f" On 1,000 unseen sets det S / det S* is {numbers['ratio_to_exact']:.4f} "
+            f"and the optimum is hit in {numbers['hit_rate']:.3f}."
+        )
+    rewards = {f"seed {run.summary['seed']}": run.rewards for run in runs}
+    if paper:
+        rewards["paper's network"] = paper[0].rewards
+    ends = dict.fromkeys((min(lengths), max(lengths)))
+    return Exhibit.from_texts(
+        "figure_2",
+        {
+            "range": " to ".join(f"{end:,}" for end in ends),
+            "caution": _caution(runs),
+            "measured": text,
+        },
+        verdict=_converges(runs, flat),
+        figures={"figure_2_seeds": _curves(runs, columns, rewards, paper)},
+        data={
+            "reward": columns,
+            "last_rewards": {
+                "run": [name for name, values in rewards.items() for _ in values],
+                "reward": np.concatenate(list(rewards.values())),
+            },
+        },
+        numbers=numbers,
+    )
+
+
+def _caution(runs: list[Run]) -> str:
+    """Where the runs are shorter than the claim or cut off; else nothing."""
+    parts = []
+    short = [run for run in runs if run.summary["episodes"] < CLAIMED]
+    if short:
+        parts.append(f"{len(short)} of {len(runs)} runs are shorter than {CLAIMED:,}")
+    cut = [run for run in runs if not run.finished]
+    if cut:
+        parts.append(f"{len(cut)} not finished")
+    return ", ".join(parts) + ". " if parts else ""
+
+
+def _curves(
+    runs: list[Run],
+    columns: dict[str, Any],
+    rewards: dict[str, Array],
+    paper: list[Run],
+) -> Figure:
+    """Reward with its band, last rewards by seed, and the share of the optimum."""
+    title = "Training of the compact preset"
+    figure, (left, middle, right) = panels((12.0, 3.8), title, (1, 3))
+    thin = {"color": GREY, "linewidth": 0.6, "alpha": 0.7}
+    for i, run in enumerate(runs):
+        x, y = run.metrics["episodes"] / 1e3, run.metrics["reward_mean"]
+        left.plot(x, y, label="one seed" if i == 0 else None, **thin)
+    ends = (columns[f"reward_{name}"] for name in ("mean", "low", "high"))
+    text = "mean; band: its 95 % interval"
+    band(left, columns["episodes"] / 1e3, *ends, color=COLOURS[0], label=text)
+    left.set_title(f"(a) reward, {len(runs)} seeds", fontsize=10)
+
+    colours = [COLOURS[0 if name.startswith("seed") else 1] for name in rewards]
+    boxes(middle, list(rewards.values()), colours, (5, 95))
+    short = [n.removeprefix("seed ").removesuffix("'s network") for n in rewards]
+    middle.set_xticks(range(1, len(rewards) + 1), short)
+    middle.set_xlabel("seed; box: quartiles, whiskers: 5 to 95 %")
+    middle.set_title("(b) reward, last 1,000 episodes", fontsize=10)
+
+    seed: dict[str, Any] = {"color": GREY, "linewidth": 1.0, "linestyle": "-"}
+    other: dict[str, Any] = {"color": COLOURS[1], "linewidth": 1.6, "linestyle": "--"}
+    labels = {"compact, one seed": (runs, seed), "paper's network": (paper, other)}
+    for label, (shown, look) in labels.items():
+        for i, run in enumerate(shown):
+            x = run.metrics["episodes"]
+            ratio = run.metrics.get("ratio_to_exact", np.full(len(x), np.nan))
+            known = np.isfinite(ratio)
+            name = None if i else label
+            right.plot(x[known] / 1e3, ratio[known], label=name, **look)
+    right.set_ylim(0.0, 1.02)
+    right.set_title("(c) share of the optimum, validation", fontsize=10)
+    right.set_ylabel("mean det S / det S*")
+    for axes in (left, middle):
+        axes.set_ylabel("reward (log det S / 10)")
+    for axes in (left, right):
+        axes.set_xlabel("training episodes (thousands)")
+        axes.legend(fontsize=8, frameon=False, loc="lower right")
+    return figure
+
+
+def _paper(runs: list[Run]) -> Exhibit:
+    if not runs:
+        return Exhibit.missing("figure_2_paper", present=False)
+    run = runs[0]
+    held, flat = run.summary, plateau(run)
+    took = "" if held["seconds"] is None else f" in {held['seconds'] / 3600:.2f} h"
+    took += "." if run.finished else ": not finished, so this is how far it went."
+    good, measured = held["dataset2"], ""
+    ratio = run.metrics.get("ratio_to_exact", np.array([np.nan]))
+    known = ratio[np.isfinite(ratio)]
+    if good is not None:
+        measured = (
+            f" det S / det S* {good['ratio_to_exact']:.4f}, optimum hit in "
+            f"{good['hit_rate']:.3f} of {good['episodes']:,} unseen sets."
+        )
+    elif known.size:
+        measured = f" det S / det S* {known[-1]:.4f} on the validation sets."
+    size = held["parameters"]
+    figure = training_curves(run.folder)
+    figure.suptitle("Training of the paper's network", fontsize=10)
+    return Exhibit.from_texts(
+        "figure_2_paper",
+        {
+            **{"took": took, "measured": measured, "rewards_are": run.rewards_are},
+            "planned": held["planned_episodes"] or CLAIMED,
+            "weights": "" if size is None else f", {size:,} weights",
+        },
+        verdict=_converges([run], [flat]),
+        figures={"figure_2_paper": figure},
+        data={"metrics": run.metrics, "last_rewards": {"reward": run.rewards}},
+        numbers={
+            "present": True,
+            "finished": run.finished,
+            **held,
+            **flat,
+            "last_reward_mean": float(run.rewards.mean()),
+            "last_reward_std": float(run.rewards.std()),
+        },
+    )

@@ -1,0 +1,130 @@
+"""Figures 5 and 9: variance over the episodes of the twelve identified parameters."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.evaluation import figures
+from jaxcal.evaluation.parameters import parameter_names
+from jaxcal.plots.style import BLACK, COLOURS, GREY
+from studies.paper.exhibits.exhibit import Exhibit, judge
+from studies.paper.exhibits.material import METHODS, Material
+from studies.paper.exhibits.selection import STREAM, words_of
+
+__all__ = ["exhibits", "variance_table"]
+
+Array = NDArray[np.float64]
+
+
+def exhibits(material: Material) -> list[Exhibit]:
+    """Figures 5 and 9."""
+    return [
+        _variance(material, "dataset3", "figure_5", "Figure 5"),
+        _variance(material, "dataset4", "figure_9", "Figure 9"),
+    ]
+
+
+def variance_table(
+    parameters: dict[str, Array], rng: np.random.Generator, resamples: int
+) -> dict[str, tuple[Array, Array, Array]]:
+    """Variance over episodes of each parameter, with an interval.
+
+    Of several draws per episode: the median variance, between 5 and 95 % of the draws.
+    Else the variance and its bootstrap interval, the same episodes for every method.
+
+    Args:
+        parameters: (E, R, P) by method, the policy among them.
+        rng: of the bootstrap.
+        resamples: of it.
+
+    Returns:
+        By method: (P,) variance, lower and upper end; and under ``method/policy`` each
+        method's variance over the policy's: paired, or, of several draws, between the
+        5 % draw over the policy's upper end and the 95 % draw over its lower.
+    """
+    count = len(parameters["policy"])
+    weight = rng.multinomial(count, np.full(count, 1.0 / count), resamples) / count
+    out: dict[str, tuple[Array, Array, Array]] = {}
+    again = {}  # (resamples, P) of the methods with one draw
+    for method, sample in parameters.items():
+        value = sample.var(axis=0)  # (R, P)
+        if len(value) > 1:
+            low, middle, high = np.quantile(value, [0.05, 0.5, 0.95], axis=0)
+            out[method] = (middle, low, high)
+            continue
+        one = sample[:, 0] - sample[:, 0].mean(axis=0)
+        again[method] = weight @ one**2 - (weight @ one) ** 2
+        low, high = np.quantile(again[method], [0.025, 0.975], axis=0)
+        out[method] = (value[0], low, high)
+    policy, policy_low, policy_high = out["policy"]
+    for method in [m for m in parameters if m != "policy"]:
+        value, low, high = out[method]
+        if method in again:
+            ratio = again[method] / again["policy"]
+            low, high = np.quantile(ratio, [0.025, 0.975], axis=0)
+        else:
+            low, high = low / policy_high, high / policy_low
+        out[f"{method}/policy"] = (value / policy, low, high)
+    return out
+
+
+def _variance(material: Material, name: str, key: str, title: str) -> Exhibit:
+    settings = material.settings
+    parameters = {m: material.parameters(name, m) for m in (*METHODS, "all 50")}
+    table = variance_table(
+        parameters, settings.rng(STREAM[name], 1), settings.size("resamples")
+    )
+    names = parameter_names(3, 3)
+    columns: dict[str, Any] = {"parameter": list(names)}
+    for method, (value, low, high) in table.items():
+        plain = method.replace(" ", "_").replace("/", "_over_")
+        columns |= {plain: value, f"{plain}_low": low, f"{plain}_high": high}
+    rows = [
+        (label, table[m][0], table[m][1:], {"color": colour, "marker": marker})
+        for m, label, colour, marker in (
+            ("random", "random", GREY, "x"),
+            ("greedy", "greedy", COLOURS[1], "s"),
+            ("policy", "policy", COLOURS[0], "o"),
+            ("exact", "exact", BLACK, "*"),
+            ("all 50", "all 50 postures", COLOURS[2], "^"),
+        )
+    ]
+    figure = figures.variances(rows, names, "A: no unit, b: deg²")
+    text = f"Cross-episode variance of the identified parameters: {name}"
+    figure.axes[0].set_title(text, fontsize=10)
+    (ratio, low, _), fifty = table["random/policy"], table["all 50/policy"]
+    lower = int((low > 1.0).sum())
+    words = {"middle": np.median(ratio), "least": ratio.min(), "most": ratio.max()}
+    words |= {"lower": lower, "fifty": np.median(fifty[0])}
+    return Exhibit.from_texts(
+        "variance",
+        words_of(material, name, title) | words,
+        key=key,
+        verdict=judge(lower and (fifty[1] > 1.0).all(), lower),
+        figures={f"{key}_parameter_variance": figure},
+        data={
+            "variance": columns,
+            "parameters": _parameter_columns(parameters, names),
+        },
+        numbers={
+            method: dict(zip(("value", "low", "high"), values, strict=True))
+            for method, values in table.items()
+        },
+    )
+
+
+def _parameter_columns(
+    parameters: dict[str, Array], names: tuple[str, ...]
+) -> dict[str, Any]:
+    """Every identified parameter, a row per episode and draw of each method."""
+    places = [
+        (method, episode + 1, draw + 1)
+        for method, sample in parameters.items()
+        for episode, draw in np.ndindex(sample.shape[:2])
+    ]
+    values = np.concatenate([p.reshape(-1, len(names)) for p in parameters.values()])
+    heads = zip(("method", "episode", "draw"), zip(*places, strict=True), strict=True)
+    return dict(heads) | dict(zip(names, values.T, strict=True))

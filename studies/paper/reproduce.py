@@ -1,0 +1,174 @@
+"""The report on the paper: compute every exhibit, judge the claims, write the files."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import pathlib
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from jaxcal.arguments import Parser
+from jaxcal.files import atomic_write, require_writable_folder
+from jaxcal.paper import command
+from jaxcal.progress import Progress
+
+if TYPE_CHECKING:
+    from studies.paper.exhibits.exhibit import Claim, Exhibit
+    from studies.paper.exhibits.material import Settings
+
+__all__ = ["main"]
+
+_DESCRIPTION = """\
+Make every figure and table of the paper from our own runs, each beside what the paper
+states, and judge its claims one by one. Writes into --out:
+
+  index.html            the report: one file, opens offline, prints
+  reproduction.json     every number in it
+  figures/*.png, *.svg  each figure; robot.png and robot.gif, the robot moving
+  data/*.csv            what each figure is drawn from
+
+The policy is the one that ships (checkpoints/default). Training curves are read from
+--studies, where python -m studies.paper.training_runs puts them; without them the
+report says so. The same seed gives the same numbers on the same machine.
+"""
+_EPILOG = """\
+examples:
+  make reproduce
+      the whole report, in report/index.html
+  python -m studies.paper --quick
+      fewer episodes and draws, to see whether everything works
+  python -m studies.paper --data recordings
+      Datasets 4 and 5 from a rig: dataset4.csv and dataset5.csv in that folder, each
+      the pairs.csv that python -m rig collect writes (docs/datasets.md)
+  python -m studies.paper --seed 1 --out report_1
+      other candidate sets, draws and devices: how much of it is luck?
+"""
+_PARTS = (  # modules of exhibits, in the order in which they are computed
+    *("training", "calibration", "selection", "variance", "pictures", "tables"),
+    *("accuracy", "ellipsoids", "recalibration", "recorded"),
+)
+_ORDER = (  # of the exhibits, that of the paper
+    *("robot", "table_1", "figure_1", "table_2", "table_3", "rank", "reward_range"),
+    *("figure_2_paper", "figure_2", "figure_3", "gap_to_optimum", "figure_4"),
+    *("figure_5", "ellipsoids", "figure_6", "figure_7", "figure_8", "figure_9"),
+    *("four_or_fifty", "number_of_postures", "figure_10", "figure_10_recorded"),
+    "euler_orders",
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Compute, write, say where; the exit code."""
+    options = _parse(arguments)
+    progress = Progress(quiet=options.quiet)
+
+    def make() -> None:
+        try:
+            _run(options, progress)
+        finally:
+            progress.clear()
+
+    return command.run(make, "reproduce", "nothing was written")
+
+
+def _run(options: argparse.Namespace, progress: Progress) -> None:
+    if options.data is not None and not options.data.is_dir():
+        raise ValueError(f"--data must be a folder, got {options.data}")
+    require_writable_folder(options.out)
+    begun = time.perf_counter()
+
+    from jaxcal.learning.runtime import cache
+    from studies.paper.exhibits.claims import claims
+    from studies.paper.exhibits.material import STUDIES, Settings
+
+    cache.keep_compiled_programs()
+    studies = options.studies or STUDIES
+    settings = Settings(options.seed, options.quick, options.data, studies)
+    exhibits = _exhibits(settings, progress)
+    judged = claims(exhibits, settings.recorded)
+    _write(options.out, _files(settings, exhibits, judged, progress))
+    progress.clear()
+    for claim in judged:
+        print(f"{claim.verdict:>15}  {claim.claim}: {claim.ours}")
+    for exhibit in exhibits:
+        if exhibit.notice:
+            print(f"note: {exhibit.notice}")
+    print(
+        f"saved: {options.out}/index.html, reproduction.json, "
+        f"{sum(len(e.figures) for e in exhibits)} figures, "
+        f"{sum(len(e.pictures) for e in exhibits)} pictures and "
+        f"{sum(len(e.data) for e in exhibits)} tables in "
+        f"{time.perf_counter() - begun:.0f} s"
+    )
+
+
+def _exhibits(settings: Settings, progress: Progress) -> list[Exhibit]:
+    """All of them, in the order of the paper."""
+    from studies.paper.exhibits.material import Material
+
+    material = Material(settings, progress)
+    # Small inputs that may be wrong come first: a bad file is refused at once.
+    for name in ("dataset5", "dataset4"):
+        material.dataset(name)
+    found: list[Exhibit] = []
+    for number, name in enumerate(_PARTS):
+        material.stage = f"part {number + 1} of {len(_PARTS)}, "
+        part = importlib.import_module(f"studies.paper.exhibits.{name}")
+        found += part.exhibits(material)
+    return sorted(found, key=lambda exhibit: _ORDER.index(exhibit.key))
+
+
+def _files(
+    settings: Settings,
+    exhibits: Sequence[Exhibit],
+    judged: Sequence[Claim],
+    progress: Progress,
+) -> dict[str, bytes]:
+    """Everything to write, by path below the folder; the page last."""
+    from jaxcal.evaluation.csv_rows import csv_text
+    from jaxcal.plots.style import as_files
+    from studies.paper.exhibits.page import json_document, page
+
+    figures = {name: f for e in exhibits for name, f in e.figures.items()}
+    files: dict[str, bytes] = {}
+    for number, (name, figure) in enumerate(figures.items()):
+        progress("drawing", number, len(figures))
+        svg, png = as_files(figure, "svg", "png")
+        files |= {f"figures/{name}.svg": svg, f"figures/{name}.png": png}
+    for exhibit in exhibits:
+        files |= {f"figures/{name}": p for name, p in exhibit.pictures.items()}
+        for name, columns in exhibit.tables.items():
+            files[f"data/{name}"] = csv_text(columns).encode()
+    images = {name: files[f"figures/{name}.svg"] for name in figures}
+    files["reproduction.json"] = json_document(exhibits, judged, settings).encode()
+    files["index.html"] = page(exhibits, judged, images, settings).encode()
+    return files
+
+
+def _write(out: pathlib.Path, files: dict[str, bytes]) -> None:
+    """Each atomically; figures and tables left from an earlier report are removed."""
+    for name, data in files.items():
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(out / name) as file:
+            file.write(data)
+    for folder, kinds in (("figures", (".png", ".svg", ".gif")), ("data", (".csv",))):
+        for path in (out / folder).iterdir():
+            if path.suffix in kinds and f"{folder}/{path.name}" not in files:
+                path.unlink()
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    parser = Parser(
+        prog="python -m studies.paper", description=_DESCRIPTION, epilog=_EPILOG
+    )
+    add = parser.add_argument
+    folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
+    add("--quick", action="store_true", help="fewer episodes, draws and devices")
+    seed: dict[str, Any] = {"type": command.seed, "metavar": "S"}
+    add("--seed", default=0, help="of everything random; 0", **seed)
+    add("--data", help="real recordings for Datasets 4 and 5", **folder)
+    add("--studies", help="kept runs; the repository's studies", **folder)
+    add("--out", default=pathlib.Path("report"), help="of the report; report", **folder)
+    add("--quiet", action="store_true", help="no progress")
+    return parser.parse_args(arguments)
