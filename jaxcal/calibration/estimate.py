@@ -79,7 +79,8 @@ def fit_model(
     if isinstance(model, SerialChain):
         _require_postures(model, commands[used], measured[used])
         model = model.located(commands[used], measured[used])
-    resolved = (prior or model.default_prior()).resolve(model)
+    prior = prior or model.default_prior()
+    resolved = prior.resolve(model)
     whole, extra = model, np.zeros(0)
     if discrepancy is not None:
         features = whole_number("discrepancy", discrepancy, 1)
@@ -100,7 +101,7 @@ def fit_model(
         student=loss == "student",
     )
     found = solve(task)
-    if prior is not None and prior.by_data:
+    if prior.by_data:
         if not isinstance(model, SerialChain) or extra.size or spread.any():
             raise ValueError(
                 "Prior.sized() is of arms, without discrepancy and command_std"

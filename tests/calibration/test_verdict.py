@@ -20,11 +20,9 @@ PLACE = contacts.load("panda_1")["front"]
 
 
 def _fit(name, joints, sockets):
-    return jaxcal.identify(
-        np.column_stack([joints, sockets]),
-        np.zeros((len(sockets), 3)),
-        model=contacts.arm(name),
-    )
+    commands = np.column_stack([joints, sockets])
+    zeros = np.zeros((len(sockets), 3))
+    return jaxcal.identify(commands, zeros, model=contacts.arm(name))
 
 
 def test_good_contacts_get_a_good_verdict():
