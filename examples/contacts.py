@@ -1,7 +1,7 @@
 """My arm is 1 cm off: calibrate real arms from a ball put into two printed sockets.
 
-    python examples/contacts.py           # one arm, trained at one place
-    python examples/contacts.py --full    # three arms, every place, and contacts.md
+    python examples/contacts.py           # one arm
+    python examples/contacts.py --full    # three arms, and contacts.md
 
 Some of the contacts of one place are chosen, the arm is identified from them alone, and
 judged at the other places: how far the predicted ball is from the mean of its socket.
@@ -29,6 +29,7 @@ APART = [(0, 1, 0.05, 1e-4)]  # the sockets are printed 50 mm apart, to 0.1 mm
 COUNTS = (8, 12, 16)
 RULES = ("random", "I")
 DRAWS = 5
+TRAINED = "front"  # place of the contacts that are fitted
 
 
 def arm(name: str) -> SerialChain:
@@ -81,7 +82,7 @@ def choose(rule: str, name: str, place: Place, k: int, rng) -> Array:
 
 
 def study(full: bool) -> dict[tuple[str, str, int], list[float]]:
-    """(arm, rule, K) to the mean error elsewhere, mm, of each training place."""
+    """(arm, rule, K) to the errors at the other places, mm."""
     names = list(ARMS) if full else ["panda_1"]
     cells = [("nominal", 0), ("all", 0)]
     cells += [(rule, k) for k in (COUNTS if full else (12,)) for rule in RULES]
@@ -90,26 +91,25 @@ def study(full: bool) -> dict[tuple[str, str, int], list[float]]:
     for i, name in enumerate(names):
         progress("arms", i, len(names))
         places = load(name)
-        for trained in places if full else ["front"]:
-            elsewhere = [place for other, place in places.items() if other != trained]
-            for rule, k in cells:
-                errors = []
-                for draw in range(DRAWS if rule == "random" else 1):
-                    model = arm(name).calibrated(arm(name).nominal)
-                    if rule != "nominal":
-                        rng = np.random.default_rng(draw)
-                        chosen = choose(rule, name, places[trained], k, rng)
-                        model = identify(name, places[trained], chosen).arm
-                    errors += [consistency(model, place) for place in elsewhere]
-                found.setdefault((name, rule, k), []).append(float(np.mean(errors)))
+        elsewhere = [place for other, place in places.items() if other != TRAINED]
+        for rule, k in cells:
+            errors = []
+            for draw in range(DRAWS if rule == "random" else 1):
+                model = arm(name).calibrated(arm(name).nominal)
+                if rule != "nominal":
+                    rng = np.random.default_rng(draw)
+                    chosen = choose(rule, name, places[TRAINED], k, rng)
+                    model = identify(name, places[TRAINED], chosen).arm
+                errors += [consistency(model, place) for place in elsewhere]
+            found[name, rule, k] = errors
     progress.clear()
     return found
 
 
 def rows(found: dict[tuple[str, str, int], list[float]]) -> common.Rows:
-    """Mean over the places of training."""
+    """Mean over the other places, and over the draws of random ones."""
     return [
-        common.row({"arm": name, "rule": rule, "k": k or "", "places": len(errors)},
+        common.row({"arm": name, "rule": rule, "k": k or ""},
                    ["error_mm"], [np.mean(errors)], ".3f")
         for (name, rule, k), errors in found.items()
     ]  # fmt: skip
