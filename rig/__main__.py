@@ -1,12 +1,18 @@
-"""``python -m rig`` and ``jaxcal-rig``: the command line."""
+"""``jaxcal-rig`` and ``python -m rig``: the command line."""
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import sys
 from collections.abc import Sequence
 
 from rig.arguments import make_parser
+
+# Looked for before any port opens; finding is quicker than importing.
+NEEDED = ("pydantic", "pymodbus")
+REPORTS = ("jinja2",)  # the report is written last
+CORRECTS = {"setup": ("tomlkit",), "imu": ("tomlkit",), "axes": ("tomlkit",)}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -15,31 +21,26 @@ def main(argv: Sequence[str] | None = None) -> int:
     from jaxcal.extras import MissingExtraError, needs
     from rig.journal import JournalError
 
+    command = args.command
+    names = NEEDED + REPORTS * (command != "stop") + CORRECTS.get(command, ())
+    module, _, function = args.function.partition(":")
     try:
         with needs("rig", "the rig"):
-            _check_packages("pydantic", "pymodbus")
-            if args.command != "stop":
-                _check_packages("jinja2")  # of the report, which is written last
-            if args.command in ("setup", "imu", "axes"):
-                _check_packages("tomlkit")  # of the corrections to rig.toml
-            from rig import commands
-        return commands.run(args)
+            for name in names:
+                if importlib.util.find_spec(name) is None:
+                    raise ModuleNotFoundError(name, name=name)
+            run = getattr(importlib.import_module(module), function)
+        code: int = run(args)
+        return code
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
         return 141  # the reader of our output went away, as `| head` does
     except (ValueError, OSError, RuntimeError, MissingExtraError) as error:
-        print(f"rig: {error}", file=sys.stderr)
+        print(f"jaxcal-rig: {error}", file=sys.stderr)
         if isinstance(error, JournalError):
-            return 2 if args.command == "resume" else 3
+            return 2 if command == "resume" else 3
         return 3 if isinstance(error, RuntimeError) else 2
-
-
-def _check_packages(*names: str) -> None:
-    """Before any port opens; finding is quicker than importing."""
-    for name in names:
-        if importlib.util.find_spec(name) is None:
-            raise ModuleNotFoundError(name, name=name)
 
 
 if __name__ == "__main__":

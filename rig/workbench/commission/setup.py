@@ -19,7 +19,7 @@ from rig.workbench.commission.home import can_home
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.ports import serial_lines
 from rig.workbench.commission.scan import Found, parse_bus, scan
-from rig.workbench.commission.toml import edit, new_text, set_values
+from rig.workbench.toml import edit, new_text, set_values
 
 FORMATS = ["hyperimu", "sensorlogger", "lines"]
 UNITS = 16

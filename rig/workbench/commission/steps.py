@@ -7,7 +7,7 @@ import dataclasses
 import pathlib
 import sys
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rig.config import AXIS_NAMES, RigConfig
 from rig.core.bus import Bus
@@ -31,7 +31,10 @@ from rig.workbench.commission.jog import MOST_STEP_DEG, by_keyboard, step, unpro
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.phone import Stream, addresses_text, watch
 from rig.workbench.commission.proposals import Change
-from rig.workbench.commission.toml import edit
+from rig.workbench.toml import edit
+
+if TYPE_CHECKING:
+    from rig.simulator import Simulator
 
 WATCH_S = 5.0
 # Below these a session's settle window would hardly ever fill.
@@ -243,6 +246,20 @@ def take_zero(place: Place) -> int:
     place.require(SIGN_CHECKED)
     confirm = place.operator.confirm
     return place.run("zero", lambda run: zero(run, confirm))
+
+
+def simulated(
+    simulator: Simulator,
+    served: RigConfig,
+    record: DeviceRecord,
+    say: Callable[[str], None],
+    path: pathlib.Path | None = None,
+) -> Place:
+    """A simulated device, at which nobody needs to stand."""
+    return Place(
+        served, record, Operator(yes=True, say=say), path, full_speed=True,
+        on_imu_port=simulator.start_phone, listeners=(simulator.hear,),
+    )  # fmt: skip
 
 
 def begin_simulated(place: Place, through: str) -> None:

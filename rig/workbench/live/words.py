@@ -249,8 +249,6 @@ def verdict(state: RunState, summary: dict[str, Any], report: bool) -> str:
         lines.append(sentence(noise_text(summary)))
     if summary.get("drift"):
         lines.append(sentence(drift_text(summary["drift"])))
-    elif summary.get("drift_deg") is not None:  # of version 1
-        lines.append(f"Zero posture at the end: {summary['drift_deg']:.4f} deg off")
     if warning := summary.get("orders", {}).get("warning"):
         lines.append(f"Warning: {warning}")
     if state.mode == "goto" and state.done:
