@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
 import pathlib
 import sys
 from collections.abc import Callable, Iterator
@@ -66,6 +67,11 @@ class Place:
         update = {"bus": self.config.bus, "imu": imu}
         self.config = written.model_copy(update=update)
 
+    def command(self, words: str) -> str:
+        """A command about this device, to be typed."""
+        where = "" if self.path is None else f" --config {os.path.relpath(self.path)}"
+        return f"jaxcal-rig {words}{where}"
+
     def require(self, through: str) -> None:
         """Refused where the device has not reached a state; says what to do."""
         if text := self.record.missing(self.config, through):
@@ -96,7 +102,7 @@ class Place:
                 config, name, self.record, self.say,
                 folder=self.folder, plain=self.config, homed=limits,
                 full_speed=self.full_speed,
-                again=f"jaxcal-rig {again or name}", reset_alarms=self.reset_alarms,
+                again=self.command(again or name), reset_alarms=self.reset_alarms,
                 start={"simulated": None, "inputs": {}, "maps_from": ""},
             )  # fmt: skip
             lock.tell(run=str(bench.folder.resolve()))
@@ -166,7 +172,8 @@ def jog(place: Place, axis: int, way_deg: float | None) -> int:
         else:
             step(run, axis, way_deg, unproved(run, axis))
 
-    return place.run("jog", procedure, limits=homed)
+    way = "" if way_deg is None else f" {way_deg:g}"
+    return place.run("jog", procedure, limits=homed, again=f"jog {name}{way}")
 
 
 def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> int:

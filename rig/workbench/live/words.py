@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import math
+import shlex
 from typing import Any
 
 import numpy as np
@@ -81,7 +82,10 @@ def headline(state: RunState, running: bool) -> tuple[str, str]:
 
 
 def _go_on(state: RunState, folder: str) -> str:
-    return f"To go on: jaxcal-rig {f'resume {folder}' if state.session else state.mode}"
+    if state.session:
+        return f"To go on: jaxcal-rig resume {folder}"
+    typed = state.start.get("arguments") or [state.mode]
+    return f"To go on: jaxcal-rig {shlex.join(typed)}"
 
 
 def trouble(state: RunState, running: bool, folder: str) -> str:
