@@ -7,6 +7,7 @@ BENCH ?= .venv-bench
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 DOCS := $(VENV)/.docs
+KERNELS := hatch_build.py $(shell find jaxcal -name '*kernel.py' -o -name '*.pxd')
 
 .DEFAULT_GOAL := help
 .PHONY: help train checkpoint evaluate reproduce test test-all lint format benchmark docs docs-serve release-check clean
@@ -14,7 +15,7 @@ DOCS := $(VENV)/.docs
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | awk -F':.*## ' '{printf "  make %-13s %s\n", $$1, $$2}'
 
-$(READY): pyproject.toml constraints.txt
+$(READY): pyproject.toml constraints.txt $(KERNELS)
 	@test -n "$(PYTHON)" || { echo "jaxcal needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[all,dev]'
@@ -74,4 +75,4 @@ release-check: $(READY) ## wheel and sdist in fresh environments of Python 3.11,
 	$(BIN)/python tests/release_check.py $(ARGS)
 
 clean: ## remove the virtual environment and caches
-	rm -rf $(VENV) $(BENCH) site .cache .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(BENCH) build site .cache .mypy_cache .ruff_cache .pytest_cache

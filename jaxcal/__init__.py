@@ -8,9 +8,10 @@ jaxcal costs no more than numpy.
 from __future__ import annotations
 
 import importlib
+import pathlib
 from typing import TYPE_CHECKING, Any
 
-from jaxcal import xla
+from jaxcal import compiled, xla
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration, identify
@@ -47,6 +48,10 @@ __all__ = [
 ]
 
 __version__ = "0.1.0"
+
+_PACKAGE = pathlib.Path(__file__).parent
+if (_PACKAGE.parent / "pyproject.toml").exists():
+    compiled.check(_PACKAGE)
 
 xla.sidestep()  # before JAX computes anything
 

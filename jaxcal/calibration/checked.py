@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from jaxcal.checks import in_words
 from jaxcal.models import Model
 
-__all__ = ["derivative", "predict"]
+__all__ = ["derivative", "facts", "predict"]
 
 Array = NDArray[np.float64]
 
@@ -56,6 +56,14 @@ def derivative(
             f"{names[column]} for the command {in_words(commands[row])}"
         )
     return found
+
+
+def facts(model: Model, parameters: Array) -> tuple[Array, Array]:
+    """What a model knows besides the prior: (F,) off, (F, P) derivative, whitened."""
+    if not hasattr(model, "facts"):
+        return np.zeros(0), np.zeros((0, len(parameters)))
+    off, rows = model.facts(parameters)
+    return np.asarray(off), np.asarray(rows)
 
 
 def _require_shape(method: str, found: Array, shape: tuple[int, ...]) -> None:

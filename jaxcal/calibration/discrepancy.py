@@ -13,6 +13,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.calibration.checked import facts
 from jaxcal.models import Model
 
 __all__ = ["WithDiscrepancy"]
@@ -68,6 +69,11 @@ class WithDiscrepancy:
         slopes = -self._scale * np.sin(phase)
         extra = np.einsum("nd,qd,id->nqi", slopes, size, self.frequencies)
         return self.model.command_jacobian(commands, own) + extra
+
+    def facts(self, parameters: Array) -> tuple[Array, Array]:
+        own, size = self._split(parameters)
+        off, rows = facts(self.model, own)
+        return off, np.hstack([rows, np.zeros((len(off), size.size))])
 
     @property
     def _scale(self) -> float:

@@ -8,15 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.calibration.checked import facts
 from jaxcal.calibration.discrepancy import WithDiscrepancy
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
-from jaxcal.checks import one_of, whole_number
-from jaxcal.models import Model, Noise, Prior, SerialChain
+from jaxcal.checks import in_words, one_of, whole_number
+from jaxcal.models import Model, Noise, Pose, Position, Prior, SerialChain
 
 __all__ = ["fit_model", "require_model"]
 
 Array = NDArray[np.float64]
 
+_BEYOND = 45.0  # degrees beyond a limit: files are often too narrow, never so much
 _NULL = 1e-10  # of the largest singular value: not determined
 
 
@@ -67,11 +69,15 @@ def fit_model(
             "give one of them"
         )
     _require_unit(model, commands[used], measured[used])
-    if spread.any() and isinstance(model, SerialChain) and model.num_outputs == 6:
+    pose = isinstance(model, SerialChain) and isinstance(model.sensor, Pose)
+    if spread.any() and pose:
         raise ValueError(
-            "command_std must not be given with output='pose': the orientations are "
+            "command_std must not be given with a Pose: the orientations are "
             "compared with those of the commands given; raise the std of the noise"
         )
+    if isinstance(model, SerialChain):
+        _require_postures(model, commands[used], measured[used])
+        model = model.located(commands[used], measured[used])
     resolved = (prior or model.default_prior()).resolve(model)
     whole, extra = model, np.zeros(0)
     if discrepancy is not None:
@@ -104,6 +110,8 @@ def _require_unit(model: Any, commands: Array, measured: Array) -> None:
     """Refuse millimetres for metres, radians for degrees: an arm is not off tenfold."""
     if not isinstance(model, SerialChain):
         return
+    if not isinstance(model.sensor, Position | Pose):
+        return
     spread = []
     for points in (measured[:, :3], model.predict(commands)[:, :3]):
         apart = np.linalg.norm(points - np.median(points, axis=0), axis=1)
@@ -113,6 +121,28 @@ def _require_unit(model: Any, commands: Array, measured: Array) -> None:
             "measured must be in the unit of the model's lengths and commands in "
             f"degrees: measured positions spread over {spread[0]:g}, those predicted "
             f"over {spread[1]:g}"
+        )
+
+
+def _require_postures(arm: SerialChain, commands: Array, measured: Array) -> None:
+    """Refuse radians for degrees, and joints far beyond their limits."""
+    low, high = arm.limits.T
+    units = np.array(arm.command_units)
+    slack = np.where(units == "deg", _BEYOND, 0.5 * (high - low))
+    joints = commands[:, : arm.num_joints]
+    far = np.argwhere((joints < low - slack) | (joints > high + slack))
+    for row, joint in far[:1]:
+        raise ValueError(
+            f"{arm.joint_names[joint]} must be within its limits "
+            f"{in_words(arm.limits[joint])}, to {slack[joint]:g}, got "
+            f"{joints[row, joint]:g} in row {row}; are the columns in this order: "
+            f"{', '.join(arm.joint_names)}?"
+        )
+    largest = np.abs(joints[:, units == "deg"]).max(initial=0.0)
+    if arm.sensor.zeros and arm.num_joints > 2 and 1.0 < largest < 7.0:
+        raise ValueError(
+            f"commands must be in degrees, got angles of at most {largest:.3g}, which "
+            "look like radians: np.degrees(commands), --radians"
         )
 
 
@@ -166,6 +196,8 @@ def _fields(
         information = efficiency * np.minimum(1.0, found.weights / mean)
     rows = np.sqrt(information)[:, None, None] * found.rows
     rows = rows.reshape(-1, rows.shape[-1])
+    known = facts(task.model, found.parameters)[1][:, task.free]
+    rows = np.concatenate([rows, known])
     covariance, null = _covariance(task, rows, found.precision[task.free], found.left)
     freedom = float(found.freedom.sum())
     noise_std: Array | None = _noise(task, found, weights[used])

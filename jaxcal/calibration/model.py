@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,6 +20,7 @@ from jaxcal.checks import in_words
 from jaxcal.models import (
     Affine,
     Model,
+    Pose,
     Prior,
     SerialChain,
     from_dict,
@@ -264,7 +266,7 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
     def _carry(self, wanted: Array, start: Array | None) -> Carry | None:
         """Of an arm's pose, whose orientations are relative to the commands."""
         arm = self.model
-        if not (isinstance(arm, SerialChain) and arm.output == "pose"):
+        if not (isinstance(arm, SerialChain) and isinstance(arm.sensor, Pose)):
             return None
         if start is None:
             raise ValueError(
@@ -304,6 +306,34 @@ class ModelCalibration(Calibration, version=_SCHEMA.version):
             "residual degrees of freedom beside the prior, so the noise is unknown; "
             "measure more or give noise"
         )
+
+    # -- an arm, written back ----------------------------------------------------------
+
+    @property
+    def arm(self) -> SerialChain:
+        """The arm as calibrated, its parameters nominal, with Position()."""
+        return self._chain().calibrated(self.parameters)
+
+    def to_urdf(self, path: str | os.PathLike[str], *, force: bool = False) -> str:
+        """See :meth:`jaxcal.models.SerialChain.to_urdf`; returns the tip link."""
+        return self._chain().to_urdf(path, self.parameters, force=force)
+
+    def to_dh(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
+        """See :meth:`jaxcal.models.SerialChain.to_dh`."""
+        self._chain().to_dh(path, self.parameters, force=force)
+
+    def to_ur_kinematics(
+        self, path: str | os.PathLike[str], *, force: bool = False
+    ) -> None:
+        """See :meth:`jaxcal.models.SerialChain.to_ur_kinematics`."""
+        self._chain().to_ur_kinematics(path, self.parameters, force=force)
+
+    def _chain(self) -> SerialChain:
+        if not isinstance(self.model, SerialChain):
+            raise ValueError(
+                f"the model must be an arm, got {type(self.model).__name__}"
+            )
+        return self.model
 
     # -- printed, and as a file --------------------------------------------------------
 

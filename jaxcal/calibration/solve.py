@@ -18,7 +18,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.checked import derivative, predict
+from jaxcal.calibration.checked import derivative, facts, predict
 from jaxcal.models import Model
 
 __all__ = ["NU", "Solution", "Task", "solve", "student_constants"]
@@ -191,6 +191,7 @@ class _Search:
 
     def _cost(self, residuals: Array, theta: Array, commands: Array) -> float:
         off = (theta - self.task.mean) ** 2 @ self._precision()
+        off += (facts(self.task.model, theta)[0] ** 2).sum()
         return float(self.weights @ self._distance(residuals, commands) + off)
 
     def _reduce(self, damping: float) -> tuple[Array, Array]:
@@ -224,17 +225,22 @@ class _Search:
         return commands
 
     def _system(self, damping: float) -> tuple[Array, Array, Array]:
-        """Weighted rows (R, F) of readings and prior, residuals (R,), scale (F,)."""
+        """Weighted rows (R, F), residuals (R,), scale (F,): readings, prior, facts."""
         free = self.task.free
         root = np.sqrt(self._precision()[free])
         weight = np.sqrt(self.weights)[:, None]
         rows, right = self._reduce(damping)
         rows = (weight[..., None] * rows).reshape(-1, len(root))
-        scale = np.sqrt((rows**2).sum(axis=0) + root**2)
+        known, more = facts(self.task.model, self.theta)
+        rows = np.concatenate([rows, np.diag(root), more[:, free]])
+        scale = np.sqrt((rows**2).sum(axis=0))
         scale = np.where(scale > 0.0, scale, 1.0)
-        rows = np.concatenate([rows, np.diag(root)]) / scale
         off = root * (self.task.mean - self.theta)[free]
-        return rows, np.concatenate([(weight * right).ravel(), off]), scale
+        return (
+            rows / scale,
+            np.concatenate([(weight * right).ravel(), off, known]),
+            scale,
+        )
 
     def step(self) -> bool:
         """Move the parameters to a lower cost; True where they need not move."""
@@ -319,7 +325,9 @@ class _Search:
         triangle, _ = _triangle(rows, right, _LEAST_DAMPING)
         root = np.asarray(np.linalg.solve(triangle.T, rows.T).T, dtype=np.float64)
         width, count = rows.shape[1], len(self.weights)
-        return root[:-width].reshape(count, -1, width), root[-width:]
+        readings = len(root) - width - len(facts(self.task.model, self.theta)[0])
+        prior = root[readings : readings + width]
+        return root[:readings].reshape(count, -1, width), prior
 
     def _freedom(self, readings: Array) -> Array:
         """(q,) residual degrees of freedom of each output."""
@@ -327,7 +335,10 @@ class _Search:
         used = (readings**2).sum(axis=-1)
         if len(self.command_root):
             return np.full(q, (count * self.left - used.sum()) / q)
-        return np.asarray(count - used.sum(axis=0))
+        # A reading that nothing moves and that is met is none, as where the sensors of
+        # one arm have different numbers of readings.
+        none = (self.residuals == 0.0) & (self.by_theta == 0.0).all(axis=-1)
+        return np.asarray(count - none.sum(axis=0) - used.sum(axis=0))
 
     def solution(self) -> Solution:
         readings, _ = self._leverage()

@@ -7,21 +7,41 @@ from jaxcal.models.kinds import from_dict
 from jaxcal.models.linear import Linear
 from jaxcal.models.model import Model
 from jaxcal.models.polynomial import Polynomial
+from jaxcal.models.sensors import (
+    Board,
+    Distance,
+    Gravity,
+    Plane,
+    Pose,
+    Position,
+    Sensor,
+    Several,
+    Socket,
+)
 from jaxcal.models.serial import SerialChain
 from jaxcal.models.uncertainty import Noise, Prior, ResolvedPrior
 
 __all__ = [
     "Affine",
+    "Board",
     "Direction",
+    "Distance",
     "FromJax",
+    "Gravity",
     "Identifiability",
     "Linear",
     "Model",
     "Noise",
+    "Plane",
     "Polynomial",
+    "Pose",
+    "Position",
     "Prior",
     "ResolvedPrior",
+    "Sensor",
     "SerialChain",
+    "Several",
+    "Socket",
     "from_dict",
     "identifiability",
 ]

@@ -39,6 +39,7 @@ class Identifiability:
     directions: tuple[Direction, ...]  # the rest, p - rank vectors in all
     condition: float  # of the identified part, every column scaled to length one
     num_candidates: int
+    held: tuple[str, ...] = ()  # not asked about: the model's default prior fixes them
 
     @property
     def identifiable(self) -> tuple[str, ...]:
@@ -59,6 +60,8 @@ class Identifiability:
             lines.append(f"Not seen at all: {', '.join(alone)}")
         if self.identifiable:
             lines.append(f"Identified by themselves: {', '.join(self.identifiable)}")
+        if self.held:
+            lines.append(f"Held, as it is not shown: {', '.join(self.held)}")
         return "\n".join(lines)
 
 
@@ -78,7 +81,8 @@ def identifiability(
         noise: matters where commands are unknown in every measurement.
         prior: its mean is where the model is looked at, the nominal parameters without
             one; it counts as information where its std is finite; parameters that it
-            fixes are left out. Without one the measurements alone count.
+            fixes are left out. Without one the measurements alone count, and what the
+            model's default prior fixes is held.
         parameters: names to ask about; the others are taken as known.
     """
     commands = table("candidates", candidates)
@@ -94,9 +98,15 @@ def identifiability(
         jacobian = noise.whitening(len(commands), model.num_outputs, slopes) @ jacobian
     rows = jacobian.reshape(-1, model.num_parameters)
     asked = np.ones(model.num_parameters, dtype=np.bool_)
+    held: Sequence[str] = ()
     if known is not None:
         rows = np.vstack([rows, np.sqrt(known.precision)])
         asked &= known.free
+    elif parameters is None:
+        held = model.default_prior().fixed
+        asked &= ~np.isin(model.names, list(held))
+    if hasattr(model, "facts"):
+        rows = np.vstack([rows, model.facts(mean)[1]])
     if parameters is not None:
         unknown = [name for name in parameters if name not in model.names]
         if unknown:
@@ -136,7 +146,9 @@ def identifiability(
     condition = float(size[0] / size[rank - 1]) if rank else np.inf
     order = {name: i for i, name in enumerate(names)}
     directions.sort(key=lambda direction: order[direction.names[0]])
-    return Identifiability(names, rank, tuple(directions), condition, len(commands))
+    return Identifiability(
+        names, rank, tuple(directions), condition, len(commands), tuple(held)
+    )
 
 
 def _in_words(names: tuple[str, ...], same: bool) -> str:

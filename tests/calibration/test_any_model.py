@@ -17,6 +17,7 @@ from jaxcal.models import (
     Linear,
     Noise,
     Polynomial,
+    Pose,
     Prior,
     SerialChain,
 )
@@ -412,7 +413,7 @@ def test_command_for_reaches_a_pose() -> None:
     """Absolute poses, asked for as turns from nominal at a rough start."""
     table = [(0, 90, 89, 0), (-425, 0, 0, 0), (-392, 0, 0, 0),
              (0, 90, 109, 0), (0, -90, 95, 0), (0, 0, 82, 0)]  # fmt: skip
-    arm = SerialChain.from_dh(table, output="pose")
+    arm = SerialChain.from_dh(table, sensor=Pose())
     rng = np.random.default_rng(0)
     joints = rng.uniform(-120, 120, (30, 6))
     truth = arm.nominal + 0.2 * rng.normal(size=arm.num_parameters)

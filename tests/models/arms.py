@@ -33,3 +33,20 @@ def differences(function, at, step=1e-4):
     for entry in np.eye(len(at)) * step:
         columns.append((function(at + entry) - function(at - entry)) / (2.0 * step))
     return np.stack(columns, axis=-1)
+
+
+CONTACTS = UR5.parent / "contacts"
+
+
+def contacts_of_a_panda(place):
+    """URDF file, joints (N, 7) in radians and sockets (N,) of a real arm at a place."""
+    rows = np.genfromtxt(
+        CONTACTS / "panda_1.csv",
+        delimiter=",",
+        names=True,
+        dtype=None,
+        encoding="utf-8",
+    )
+    rows = rows[rows["place"] == place]
+    joints = np.stack([rows[f"panda_joint{i + 1}"] for i in range(7)], axis=1)
+    return CONTACTS / "panda.urdf", joints, rows["socket"]

@@ -14,6 +14,7 @@ from jaxcal.models import (
     Linear,
     Noise,
     Polynomial,
+    Pose,
     Prior,
     SerialChain,
     identifiability,
@@ -142,7 +143,7 @@ def test_a_pose_shows_more_than_a_position():
     rng = np.random.default_rng(0)
     commands = rng.uniform(-150.0, 150.0, (40, 6))
     position = identifiability(ur5(), commands)
-    pose = identifiability(ur5(output="pose"), commands)
+    pose = identifiability(ur5(sensor=Pose()), commands)
     assert pose.rank > position.rank
     gantry = SerialChain.from_dh([(0, 0, 0, 0)] * 3, joints="PPP")
     unseen = identifiability(gantry, commands[:, :3]).directions

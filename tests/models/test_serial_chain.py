@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxcal.models import SerialChain, from_dict
+from jaxcal.models import Pose, Position, SerialChain, from_dict
 
 from .arms import UR5_TABLE, differences, ur5, ur5_data
 
@@ -53,7 +53,7 @@ def tool_frame(model, command, values):
         product += joint + link if model.convention == "standard" else link + joint
     product.append(_matrix(None, [values[f"tool {axis}"] for axis in "xyz"]))
     product.append(_matrix(Rotation.from_matrix(model.tool[:3, :3])))
-    if model.output == "pose":
+    if isinstance(model.sensor, Pose):
         product += [_turn(axis, values[f"tool r{axis}"]) for axis in "xyz"]
     return functools.reduce(np.matmul, product)
 
@@ -80,7 +80,7 @@ def arms(draw, compliance=False):
         joints=joints,
         base=mountings[0],
         tool=mountings[1],
-        output=draw(st.sampled_from(["position", "pose"])),
+        sensor=draw(st.sampled_from([Position(), Pose()])),
         gears=[i + 1 for i in range(n) if rng.random() < 0.5],
         compliance=revolute[:2] if compliance else (),
         loads=loads if compliance else (),
@@ -95,7 +95,7 @@ def arms(draw, compliance=False):
 def _outputs(model, command, parameters):
     values = dict(zip(model.names, parameters, strict=True))
     frame = tool_frame(model, command, values)
-    if model.output == "position":
+    if isinstance(model.sensor, Position):
         return frame[:3, 3]
     nominal = tool_frame(
         model, command, dict(zip(model.names, model.nominal, strict=True))
@@ -152,7 +152,7 @@ def test_a_model_comes_back_from_json(arm):
 
 
 def test_a_command_turns_a_pose_against_the_orientation_it_is_compared_with():
-    model = ur5(output="pose")
+    model = ur5(sensor=Pose())
     commands = ur5_data("ur5_random_20.csv")[0][:3]
     values = dict(zip(model.names, model.nominal, strict=True))
     frames = []
@@ -192,7 +192,7 @@ def test_the_names_of_a_six_axis_arm():
         *("tool x", "tool y", "tool z"),
     )
     assert len(ur5().names) == 39 == ur5().num_parameters
-    assert len(ur5(output="pose").names) == 42
+    assert len(ur5(sensor=Pose()).names) == 42
 
 
 def test_the_default_prior_follows_the_size_of_the_arm():
@@ -235,7 +235,7 @@ def test_a_weight_bends_a_compliant_joint_by_its_torque():
         ({"table": [(0, 90, 1)]}, r"table must have shape \(n, 4\)"),
         ({"joints": "RX"}, "joints must be 6 letters R"),
         ({"convention": "craig"}, "convention must be one of standard, modified"),
-        ({"output": "angle"}, "output must be one of position, pose"),
+        ({"sensor": "angle"}, r"sensor must be of jaxcal.models, .* got 'angle'"),
         ({"gears": [7]}, "gears must hold joints of 1 to 6 once"),
         ({"compliance": [0]}, "compliance must be at least 1"),
         ({"joints": "PRRRRR", "compliance": [1]}, "joint 1 is prismatic"),

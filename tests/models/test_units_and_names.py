@@ -7,15 +7,15 @@ import pytest
 
 import jaxcal
 from jaxcal import Noise
-from jaxcal.models import Linear, SerialChain
+from jaxcal.models import Linear, Pose, Sensor, SerialChain
 
 TABLE = np.array([[0, 90, 400, 0], [500, 0, 0, 0], [0, 90, 0, 0], [0, 0, 450, 0.0]])
 JOINTS = np.random.default_rng(0).uniform(-120, 120, (60, 4))
 
 
-def arm(unit: float, output: str = "position") -> SerialChain:
+def arm(unit: float, sensor: Sensor | None = None) -> SerialChain:
     table = TABLE * [unit, 1, unit, 1]
-    return SerialChain.from_dh(table, tool=(30 * unit, 0, 80 * unit), output=output)
+    return SerialChain.from_dh(table, tool=(30 * unit, 0, 80 * unit), sensor=sensor)
 
 
 def test_without_noise_given_metres_select_what_millimetres_do() -> None:
@@ -36,7 +36,7 @@ def test_measurements_in_another_unit_are_refused() -> None:
 
 
 def test_a_pose_with_uncertain_commands_is_refused() -> None:
-    model = arm(1.0, "pose")
+    model = arm(1.0, Pose())
     noise = Noise(std=0.1, command_std=0.01)
     with pytest.raises(ValueError, match="command_std must not be given"):
         jaxcal.identify(JOINTS, model.predict(JOINTS), model=model, noise=noise)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import json
+
 import hypothesis
 import hypothesis.strategies as st
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxcal.models import SerialChain
+from jaxcal.models import Pose, SerialChain, from_dict
+from jaxcal.models.model import by_name
 
 from .test_serial_chain import _matrix, _slide
 
@@ -45,10 +48,10 @@ def _tip(joints, command):
     return frame
 
 
-def _read(tmp_path, text, *args, **options):
+def _read(tmp_path, text, **options):
     path = tmp_path / "arm.urdf"
     path.write_text(text)
-    return SerialChain.from_urdf(path, *args, **options)
+    return SerialChain.from_urdf(path, **options)
 
 
 right = st.sampled_from([0.0, np.pi / 2, -np.pi / 2, np.pi, 1.5708, 0.3, -2.0])
@@ -63,11 +66,14 @@ lengths = st.sampled_from([0.0, 0.1, -0.4, 0.75])
         min_size=1,
         max_size=6,
     ),
+    axes,
     st.integers(0, 1000),
 )
-def test_a_file_and_the_model_agree_at_every_posture(tmp_path_factory, joints, seed):
-    joints = [("revolute", (0, 0, 0.2), (0, 0, 0), (0, 0, 1)), *joints]
-    model = _read(tmp_path_factory.mktemp("urdf"), _urdf(joints), output="pose")
+def test_a_file_and_the_model_agree_at_every_posture(
+    tmp_path_factory, joints, first, seed
+):
+    joints = [("revolute", (0, 0, 0.2), (0, 0, 0), first), *joints]
+    model = _read(tmp_path_factory.mktemp("urdf"), _urdf(joints), sensor=Pose())
     command = np.random.default_rng(seed).uniform(-180.0, 180.0, model.num_inputs)
     frame = _tip(joints, command)
     outputs = model.predict(command[None])
@@ -111,7 +117,7 @@ def test_a_chain_between_two_links_of_a_tree(tmp_path):
     )
     with pytest.raises(ValueError, match=r"tip must be given: .* \(link3, camera"):
         _read(tmp_path, _urdf(joints, finger))
-    model = _read(tmp_path, _urdf(joints, finger), "link3", "link1")
+    model = _read(tmp_path, _urdf(joints, finger), tip="link3", base="link1")
     assert model.joints == "RP"
     expected = (np.linalg.inv(_slide("x", 1.0)) @ _tip(joints, (30.0, 0.2)))[:3, 3]
     np.testing.assert_allclose(model.predict([[30.0, 0.2]])[0], expected, atol=1e-12)
@@ -135,8 +141,13 @@ ONE = [("revolute", (0, 0, 1), (0, 0, 0), (0, 0, 1))]
         (_urdf(ONE).replace('child link="link1"', 'child link="x"'), "the link 'x'"),
         (
             _urdf(ONE).replace("</joint>", '<mimic joint="j0"/></joint>'),
-            "joint j1 mimics another one",
+            "joint j1 must mimic another joint of the file, got 'j0'",
         ),
+        (
+            _urdf(ONE).replace("</joint>", '<limit lower="a"/></joint>'),
+            "lower of <limit> of joint j1 must be a number, got 'a'",
+        ),
+        (_urdf(ONE, "<xacro:arm/>"), "xacro file: expand it first, xacro arm.xacro"),
         (
             _urdf(
                 ONE,
@@ -153,15 +164,114 @@ def test_a_file_that_is_no_chain_is_refused(tmp_path, text, message):
         _read(tmp_path, text)
 
 
+TREE = """
+<robot name="tree">
+  <link name="body"/><link name="left"/><link name="palm"/><link name="finger"/>
+  <link name="right"/><link name="camera"/>
+  <joint name="shoulder" type="revolute">
+    <parent link="body"/><child link="left"/><axis xyz="0 1 0"/>
+    <origin xyz="0 0.2 0.5" rpy="0.1 0 0"/>
+    <limit lower="-1.5707963267948966" upper="1"/>
+  </joint>
+  <joint name="slide" type="prismatic">
+    <parent link="left"/><child link="palm"/><axis xyz="0 0 1"/>
+    <origin xyz="0.3 0 0" rpy="0 1 0"/><limit lower="0" upper="0.1"/>
+  </joint>
+  <joint name="curl" type="revolute">
+    <parent link="palm"/><child link="finger"/><axis xyz="1 0 0"/>
+    <origin xyz="0 0 0.1"/><mimic joint="slide" multiplier="5" offset="0.2"/>
+  </joint>
+  <joint name="neck" type="continuous">
+    <parent link="body"/><child link="right"/><axis xyz="0 0 1"/>
+    <origin xyz="0 -0.2 0.5"/>
+  </joint>
+  <joint name="eye" type="fixed">
+    <parent link="right"/><child link="camera"/><origin xyz="0.1 0 0.1" rpy="0 0 2"/>
+  </joint>
+</robot>
+"""
+
+
+def _transform(xyz, rpy=(0, 0, 0)):
+    return _matrix(Rotation.from_euler("xyz", rpy), xyz)
+
+
+def _finger(shoulder, slide):
+    """The finger in the body's frame, radians and metres."""
+    return (
+        _transform((0, 0.2, 0.5), (0.1, 0, 0))
+        @ _transform((0, 0, 0), (0, shoulder, 0))
+        @ _transform((0.3, 0, 0), (0, 1, 0))
+        @ _transform((0, 0, slide))
+        @ _transform((0, 0, 0.1))
+        @ _transform((0, 0, 0), (0.2 + 5 * slide, 0, 0))
+    )
+
+
+def _camera(neck):
+    turned = _transform((0, -0.2, 0.5)) @ _transform((0, 0, 0), (0, 0, neck))
+    return turned @ _transform((0.1, 0, 0.1), (0, 0, 2))
+
+
+def test_any_two_links_of_a_tree_with_a_joint_that_mimics(tmp_path):
+    model = _read(tmp_path, TREE, base="camera", tip="finger", sensor=Pose())
+    assert model.joint_names == model.inputs == ("neck", "shoulder", "slide")
+    for neck, shoulder, slide in ((0.0, 0.0, 0.0), (1.0, -0.7, 0.05)):
+        frame = np.linalg.inv(_camera(neck)) @ _finger(shoulder, slide)
+        command = [[np.degrees(neck), np.degrees(shoulder), slide]]
+        found = model.predict(command)
+        np.testing.assert_allclose(found[0, :3], frame[:3, 3], atol=1e-12)
+        turn = model.rotation_vectors(command, frame[None, :3, :3])
+        np.testing.assert_allclose(turn, 0.0, atol=1e-9)
+    back = _read(tmp_path, TREE, base="finger", tip="camera")
+    frame = np.linalg.inv(_finger(-0.7, 0.05)) @ _camera(1.0)
+    at = dict(zip(model.joint_names, command[0], strict=True))
+    found = back.predict([[at[name] for name in back.joint_names]])
+    np.testing.assert_allclose(found[0], frame[:3, 3], atol=1e-12)
+    slope = model.predict(np.add(command, [0, 0, 1e-6])) - model.predict(command)
+    np.testing.assert_allclose(
+        model.command_jacobian(command)[0, :3, 2], slope[0, :3] / 1e-6, atol=1e-5
+    )
+
+
+def test_limits_are_read_and_joints_are_locked(tmp_path):
+    model = _read(tmp_path, TREE, tip="finger")
+    np.testing.assert_allclose(model.limits, [[-90.0, np.degrees(1.0)], [0.0, 0.1]])
+    neck = _read(tmp_path, TREE, tip="camera")
+    assert np.isinf(neck.limits).all()
+    locked = _read(tmp_path, TREE, tip="finger", locked={"slide": 0.05})
+    assert locked.joint_names == ("shoulder",)
+    np.testing.assert_allclose(
+        locked.predict([[20.0]])[0], _finger(np.radians(20.0), 0.05)[:3, 3], atol=1e-12
+    )
+    again = from_dict(json.loads(json.dumps(locked.to_dict())))
+    np.testing.assert_array_equal(again.predict([[20.0]]), locked.predict([[20.0]]))
+    np.testing.assert_array_equal(again.limits, locked.limits)
+
+
+def test_columns_of_a_table_are_taken_by_the_names_of_the_joints(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    model = _read(tmp_path, TREE, base="camera", tip="finger")
+    frame = pandas.DataFrame({"slide": [0.01], "neck": [10.0], "shoulder": [5.0]})
+    picked = by_name(model, frame).to_numpy()
+    np.testing.assert_array_equal(picked, [[10.0, 5.0, 0.01]])
+    with pytest.raises(ValueError, match="'neck' is missing"):
+        by_name(model, frame.drop(columns="neck"))
+
+
 def test_links_that_do_not_fit_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"tip must be a link of .* got 'flange'"):
-        _read(tmp_path, _urdf(ONE), "flange")
-    with pytest.raises(ValueError, match="base 'link1' is not above tip 'link0'"):
-        _read(tmp_path, _urdf(ONE), "link0", "link1")
+        _read(tmp_path, _urdf(ONE), tip="flange")
+    with pytest.raises(ValueError, match="no joint moves between base 'link0' and"):
+        _read(tmp_path, _urdf(ONE), tip="link0", base="link0")
+    with pytest.raises(ValueError, match="base 'b' and tip 'link1' hang on different"):
+        _read(tmp_path, _urdf(ONE, '<link name="b"/>'), tip="link1", base="b")
+    with pytest.raises(ValueError, match=r"locked must name joints .*\(j1\), got 'j9'"):
+        _read(tmp_path, _urdf(ONE), locked={"j9": 0.0})
     ring = _urdf(
         ONE,
         '<joint name="back" type="fixed"><parent link="link1"/>'
         '<child link="link0"/></joint>',
     )
     with pytest.raises(ValueError, match="the joints back, j1 form a loop"):
-        _read(tmp_path, ring, "link1")
+        _read(tmp_path, ring, tip="link1")

@@ -9,7 +9,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import in_words, numbers, whole_number
 
-__all__ = ["joint_numbers", "load", "require_degrees", "transform", "triple"]
+__all__ = [
+    "joint_numbers",
+    "load",
+    "pose_matrix",
+    "require_degrees",
+    "transform",
+    "triple",
+]
 
 Array = NDArray[np.float64]
 
@@ -43,6 +50,16 @@ def transform(argument: str, given: ArrayLike | None) -> Array:
     if error > 1e-6 or np.linalg.det(array[:3, :3]) < 0.0:
         raise ValueError(f"the rotation of {argument} must be a rotation matrix")
     return array
+
+
+def pose_matrix(pose: Array) -> Array:
+    """(4, 4) of x, y, z and then turns about x, y, z in degrees (6,)."""
+    from scipy.spatial.transform import Rotation
+
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_euler("XYZ", pose[3:], degrees=True).as_matrix()
+    matrix[:3, 3] = pose[:3]
+    return matrix
 
 
 def triple(argument: str, given: ArrayLike) -> tuple[float, float, float]:

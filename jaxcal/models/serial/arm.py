@@ -1,23 +1,19 @@
-"""The kinematics of a serial arm and their derivative."""
+"""The kinematics of a serial arm, what its sensor reads, and their derivatives."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers
 from jaxcal.models.model import as_commands
-from jaxcal.models.serial.kinematics import (
-    OF_BASE,
-    OF_ROW,
-    Step,
-    cross,
-    forward,
-    rotation_vector_rate,
-)
+from jaxcal.models.sensors import Sensor, Tip
+from jaxcal.models.serial.kinematics import OF_BASE, OF_ROW, Step, cross, forward
 from jaxcal.models.serial.torque import Load, torque
 
 __all__ = ["Arm"]
@@ -37,24 +33,41 @@ class Arm:
     joints: str  # "RRPRRR": revolute or prismatic
     base: Array  # (4, 4) from the measuring frame to the first joint's
     tool: Array  # (4, 4) from the last link to the measured point
-    output: str  # "position": x, y, z; "pose": and the turn from nominal, in degrees
+    sensor: Sensor  # what its tip is measured with
     gears: tuple[int, ...]  # joints, from 1, whose gear ratio is a parameter
     compliance: tuple[int, ...]  # joints, from 1, whose compliance is one
     loads: tuple[Load, ...]  # link, weight, its centre
     gravity: tuple[float, float, float]  # direction in the measuring frame
-    joint_names: tuple[str, ...]
+    joint_names: tuple[str, ...]  # J of them, the first columns of the commands
+    drive: Array  # (n, J) how far each joint moves with each column
+    offset: Array  # (n,) where each joint is at commands of zero
+    limits: Array  # (J, 2) least and greatest command, infinite where not known
+    source: Mapping[str, Any] | None  # the URDF file: text, base, tip, locked
+
+    @property
+    def num_joints(self) -> int:
+        """J, columns of the commands that move the arm."""
+        return len(self.joint_names)
 
     @property
     def num_inputs(self) -> int:
-        return len(self.table)
+        """n, the joints and what the sensor asks for."""
+        return self.num_joints + len(self.sensor.inputs)
 
     @property
     def num_outputs(self) -> int:
-        return 3 if self.output == "position" else 6
+        """q."""
+        return len(self.sensor.outputs)
+
+    @functools.cached_property
+    def length(self) -> float:
+        """Of the links and the tool together; 0 where the table holds no length."""
+        links = np.hypot(self.table[:, 0], self.table[:, 2]).sum()
+        return float(links + np.linalg.norm(self.tool[:3, 3]))
 
     @property
     def nominal(self) -> Array:
-        """(p,) the table, gear ratios of 1, stiff joints, base and tool as given."""
+        """(p,) table, gear ratios of 1, stiff joints, base, tool, the sensor's own."""
         return np.concatenate(
             [
                 self.table.ravel(),
@@ -62,8 +75,8 @@ class Arm:
                 np.zeros(len(self.compliance)),
                 self.base[:3, 3],
                 np.zeros(3),
-                self.tool[:3, 3],
-                np.zeros(self.num_outputs - 3),
+                np.concatenate([self.tool[:3, 3], np.zeros(3)])[self._tool],
+                self.sensor.nominal,
             ]
         )
 
@@ -106,17 +119,22 @@ class Arm:
         steps = self._steps(commands, self.nominal)
         return forward(len(commands), steps)[0][:3].transpose(2, 1, 0)
 
+    @functools.cached_property
+    def _tool(self) -> list[int]:
+        """Which of the tool's shifts and turns are parameters."""
+        return ["x y z rx ry rz".split().index(axis) for axis in self.sensor.tool]
+
     @property
     def _steps_of_joints(self) -> NDArray[np.int64]:
-        """(n,) the step that each joint's command moves."""
+        """(n,) the step that moves each joint."""
         order = _ORDER[self.convention]
         moved = [order[3 if kind == "R" else 2] for kind in self.joints]
-        return OF_BASE + OF_ROW * np.arange(self.num_inputs) + moved
+        return OF_BASE + OF_ROW * np.arange(len(self.joints)) + moved
 
     @functools.cached_property
     def _steps_of_parameters(self) -> NDArray[np.int64]:
-        """(p,) the step that each parameter moves."""
-        n = self.num_inputs
+        """The step that each parameter moves; the sensor's own move none."""
+        n = len(self.joints)
         moved = self._steps_of_joints
         first = OF_BASE + OF_ROW * np.arange(n)
         tool = OF_BASE + OF_ROW * n
@@ -125,28 +143,40 @@ class Arm:
                 (first[:, None] + _ORDER[self.convention]).ravel(),
                 moved[[i - 1 for i in (*self.gears, *self.compliance)]],
                 np.arange(6),
-                (tool + np.array([0, 1, 2, 4, 5, 6]))[: self.num_outputs],
+                tool + np.array([0, 1, 2, 4, 5, 6])[self._tool],
             ]
         )
 
+    def _split(self, parameters: Array) -> tuple[Array, Array, Array]:
+        """Base (6,), tool (6,) and the sensor's own (s,)."""
+        last = len(parameters) - len(self.sensor.names)
+        first = last - len(self._tool)
+        tool = np.concatenate([self.tool[:3, 3], np.zeros(3)])
+        tool[self._tool] = parameters[first:last]
+        return parameters[first - 6 : first], tool, parameters[last:]
+
     def _drives(self, parameters: Array) -> tuple[Array, Array]:
         """Gear ratio (n,) of all joints, and compliance of those that have one."""
-        first = 5 * self.num_inputs
+        first = 5 * len(self.joints)
         last = first + len(self.gears)
-        ratios = np.ones(self.num_inputs)
+        ratios = np.ones(len(self.joints))
         ratios[[i - 1 for i in self.gears]] = parameters[first:last]
         return ratios, parameters[last : last + len(self.compliance)]
 
+    def _moves(self, commands: Array) -> Array:
+        """(N, n) how far each joint moves, before its gear."""
+        return commands[:, : self.num_joints] @ self.drive.T + self.offset
+
     def _steps(self, commands: Array, parameters: Array) -> list[Step]:
         """The whole chain, from the measuring frame to the tool."""
-        n = self.num_inputs
+        n = len(self.joints)
         gears, compliance = self._drives(parameters)
-        moves = gears[:, None] * commands.T
+        moves = gears[:, None] * self._moves(commands).T
         if compliance.any():
             at = [i - 1 for i in self.compliance]
             moves[at] += compliance[:, None] * self._torque(commands)[0]
-        mounting = parameters[-6 - self.num_outputs :]
-        steps = [Step(k > 2, k % 3, mounting[k]) for k in range(6)]
+        base, tool, _ = self._split(parameters)
+        steps = [Step(k > 2, k % 3, base[k]) for k in range(6)]
         steps.append(Step(True, None, self.base[:3, :3]))
         for row, move, kind in zip(
             parameters[: 5 * n].reshape(n, 5), moves, self.joints, strict=True
@@ -159,43 +189,37 @@ class Arm:
                 steps += [turn, slide, *link]
             else:
                 steps += [*link, turn, slide]
-        tool = [Step(k > 2, k % 3, mounting[6 + k]) for k in range(self.num_outputs)]
-        steps += [*tool[:3], Step(True, None, self.tool[:3, :3]), *tool[3:]]
+        mounting = [Step(k > 2, k % 3, tool[k]) for k in range(6)]
+        steps += [*mounting[:3], Step(True, None, self.tool[:3, :3]), *mounting[3:]]
         return steps
+
+    def _tip_at(self, commands: Array, frame: Array) -> Tip:
+        return Tip(frame, lambda: self._nominal_rotations(commands), self.length)
 
     def _motion(
         self, commands: Array, parameters: Array, at: NDArray[np.int64]
-    ) -> Array:
-        """(N, q, S) derivative of the outputs by the steps ``at`` (S,)."""
+    ) -> tuple[Array, Array]:
+        """Derivative (N, q, S) of the readings by the steps ``at`` (S,), and (N, q, s).
+
+        The second is by the sensor's own parameters.
+        """
         steps = self._steps(commands, parameters)
         frame, axes, origins = forward(len(commands), steps)
-        motion = np.empty((len(at), 3, len(commands)))
+        motion = np.zeros((len(at), 6, len(commands)))  # shift and turn of the tip
         for k, i in enumerate(at):
             if steps[i].turns:
-                cross(axes[i], np.radians(frame[3] - origins[i]), motion[k])
+                cross(axes[i], np.radians(frame[3] - origins[i]), motion[k, :3])
+                motion[k, 3:] = np.radians(axes[i])
             else:
-                motion[k] = axes[i]
-        position = np.ascontiguousarray(motion.transpose(2, 1, 0))
-        if self.output == "position":
-            return position
-        vector = np.radians(self._outputs(commands, frame)[:, 3:])
-        turn = np.zeros_like(position)
-        for k, i in enumerate(at):
-            if steps[i].turns:
-                turn[..., k] = axes[i].T
-        return np.concatenate([position, rotation_vector_rate(vector) @ turn], axis=1)
-
-    def _outputs(self, commands: Array, frame: Array) -> Array:
-        position = np.ascontiguousarray(frame[3].T)
-        if self.output == "position":
-            return position
-        rotations = frame[:3].transpose(2, 1, 0)
-        return np.hstack([position, self.rotation_vectors(commands, rotations)])
+                motion[k, :3] = axes[i]
+        tip, inputs = self._tip_at(commands, frame), commands[:, self.num_joints :]
+        found = self.sensor.read(tip, inputs, self._split(parameters)[2])
+        return found.by_tip @ motion.transpose(2, 1, 0), found.by_own
 
     def _torque(self, commands: Array) -> tuple[Array, Array]:
         """Of the compliant joints of the nominal arm (C, N), and its rate (C, n, N)."""
         return torque(
-            commands,
+            len(commands),
             self._steps(commands, self.nominal),
             self._steps_of_joints,
             np.array([kind == "R" for kind in self.joints]),

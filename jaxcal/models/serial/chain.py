@@ -5,17 +5,20 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers, one_of
+from jaxcal.checks import in_words, numbers, one_of
+from jaxcal.files import write_text
 from jaxcal.models.model import as_commands, as_parameters
+from jaxcal.models.sensors import SENSORS, Position, Sensor, Several
 from jaxcal.models.serial.arguments import (
     joint_numbers,
     load,
+    pose_matrix,
     require_degrees,
     transform,
     triple,
@@ -33,7 +36,6 @@ _COLUMNS = ("a", "alpha", "d", "theta", "beta")
 # 0.5 degrees a joint, 0.12 m and 1.7 degrees of the base and the tool.
 _LENGTH, _ANGLE, _GEAR = 2.5e-3, 0.5, 5e-3  # share of the links' length; degrees; ratio
 _MOUNTING, _MOUNTING_ANGLE = 0.1, 1.7
-_NOISE = 1e-4  # of the links' length, radians: 0.12 mm on a UR5
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -48,8 +50,9 @@ class SerialChain(Arm):
 
     Parameters, in this order: ``a1 alpha1 d1 theta1 beta1 a2 ...``; ``gear1 ...`` and
     ``compliance1 ...`` of the joints asked for; ``base x``, ``y``, ``z``, ``rx``,
-    ``ry``, ``rz``; ``tool x``, ``y``, ``z`` and, where the output is a pose, ``rx``,
-    ``ry``, ``rz``. The turns of base and tool are relative to their nominal rotation.
+    ``ry``, ``rz``; what the sensor sees of ``tool x``, ``y``, ``z``, ``rx``, ``ry``,
+    ``rz``; the sensor's own. The turns of base and tool are relative to their nominal
+    rotation. Commands are the joints, then the columns that the sensor asks for.
 
     Made by :meth:`from_dh` and :meth:`from_urdf`.
     """
@@ -63,12 +66,16 @@ class SerialChain(Arm):
         joints: str | None = None,
         base: ArrayLike | None = None,
         tool: ArrayLike | None = None,
-        output: str = "position",
+        sensor: Sensor | Mapping[str, Any] | None = None,
         gears: Sequence[int] = (),
         compliance: Sequence[int] = (),
         loads: Sequence[tuple[int, float, ArrayLike]] = (),
         gravity: Sequence[float] = (0.0, 0.0, -1.0),
         joint_names: Sequence[str] = (),
+        drive: ArrayLike | None = None,
+        offset: ArrayLike | None = None,
+        limits: ArrayLike | None = None,
+        source: Mapping[str, Any] | None = None,
     ) -> Self:
         """The arm of a DH table.
 
@@ -79,7 +86,8 @@ class SerialChain(Arm):
             joints: a letter a joint, R or P; all revolute when not given.
             base: where the arm stands in the measuring frame: (3,) or (4, 4).
             tool: the measured point in the last link's frame: (3,) or (4, 4).
-            output: "position" of the tool's point, q = 3, or "pose", q = 6.
+            sensor: what the tip is measured with, of ``jaxcal.models``, or its
+                ``to_dict()``; Position() when not given.
             gears: joints, counted from 1, whose gear ratio is a parameter ("gear2"):
                 the joint moves by the ratio, nominally 1, times its command.
             compliance: revolute joints, counted from 1, that yield under the loads
@@ -88,7 +96,13 @@ class SerialChain(Arm):
                 of one at the tool. The torques are those of the nominal arm.
             gravity: direction of weight in the measuring frame; times 9.81 where
                 loads are masses.
-            joint_names: what the joints are called, for the reader.
+            joint_names: what the columns of the commands are called.
+            drive: (n, J) how far each joint moves with each of J columns, where they
+                are not the same (a joint that mimics another).
+            offset: (n,) where each joint is at commands of zero.
+            limits: (J, 2) least and greatest command of each column.
+            source: the URDF file that the arm comes from: its text, the base and tip
+                links and the locked joints.
         """
         rows = numbers("table", table)
         if rows.ndim != 2 or rows.shape[1] not in (4, 5) or not len(rows):
@@ -105,8 +119,25 @@ class SerialChain(Arm):
                 f"joints must be {n} letters R (revolute) or P (prismatic), "
                 f"got {joints!r}"
             )
-        if joint_names and len(joint_names) != n:
-            raise ValueError(f"joint_names must hold {n} names, got {joint_names!r}")
+        moves = np.eye(n) if drive is None else numbers("drive", drive)
+        if moves.ndim != 2 or len(moves) != n:
+            raise ValueError(f"drive must have shape ({n}, J), got {moves.shape}")
+        columns = moves.shape[1]
+        if joint_names and len(joint_names) != columns:
+            raise ValueError(
+                f"joint_names must hold {columns} names, got {joint_names!r}"
+            )
+        at_zero = np.zeros(n) if offset is None else numbers("offset", offset)
+        if at_zero.shape != (n,):
+            raise ValueError(f"offset must have shape ({n},), got {at_zero.shape}")
+        sensor = Position() if sensor is None else sensor
+        if isinstance(sensor, Mapping):
+            kind = one_of("kind of the sensor", sensor.get("kind"), tuple(SENSORS))
+            sensor = SENSORS[kind].from_dict(sensor)
+        if not isinstance(sensor, Sensor):
+            raise ValueError(
+                f"sensor must be of jaxcal.models, such as Position(), got {sensor!r}"
+            )
         end = transform("tool", tool)
         for joint in (number := joint_numbers("compliance", compliance, n)):
             if joints[joint - 1] == "P":
@@ -120,46 +151,201 @@ class SerialChain(Arm):
             joints,
             transform("base", base),
             end,
-            one_of("output", output, ("position", "pose")),
+            sensor,
             joint_numbers("gears", gears, n),
             number,
             tuple(load(each, n) for each in given),
             triple("gravity", gravity),
-            tuple(joint_names) or tuple(f"joint {i + 1}" for i in range(n)),
+            tuple(joint_names) or _numbered(columns),
+            moves,
+            at_zero,
+            _limits(limits, columns),
+            None if source is None else dict(source),
         )
 
     @classmethod
     def from_urdf(
         cls,
         path: str | os.PathLike[str],
-        tip: str | None = None,
+        *,
         base: str | None = None,
+        tip: str | None = None,
+        sensor: Sensor | None = None,
+        locked: Mapping[str, float] | None = None,
         **options: Any,
     ) -> Self:
         """The arm between two links of a URDF file, as a standard table with beta.
 
         Lengths are in metres as in the file, angles in degrees; the tip goes where the
-        file puts it at every posture.
+        file puts it at every posture. A joint that mimics another moves with its
+        leader's column; limits are read.
 
         Args:
             path: a URDF file; xacro files must be expanded first.
-            tip: link whose origin is the measured point; the only last one by default.
-            base: link that the outputs are relative to; the root by default.
-            options: ``output``, ``gears``, ``compliance``, ``loads``, ``gravity`` of
+            base: link that the outputs are relative to, anywhere in the tree; the root
+                by default.
+            tip: link whose origin is the measured point, anywhere in the tree; the only
+                last one by default.
+            sensor: what the tip is measured with; Position() when not given.
+            locked: joints that stand still, by name, and where: degrees, metres.
+            options: ``gears``, ``compliance``, ``loads``, ``gravity`` of
                 :meth:`from_dh`.
         """
         # scipy.spatial and the XML parser take half a second to load.
         from jaxcal.models.serial.urdf import read_urdf
 
-        arm = read_urdf(path, tip, base)
-        return cls.from_dh(
-            arm.table,
-            joints=arm.joints,
-            base=arm.base,
-            tool=arm.tool,
-            joint_names=arm.names,
-            **options,
+        arm = read_urdf(path, tip, base, locked or {})
+        return cls.from_dh(**arm._asdict(), sensor=sensor, **options)
+
+    def measured_with(self, sensor: Sensor) -> Self:
+        """The same arm with another sensor."""
+        return dataclasses.replace(self, sensor=sensor)
+
+    def calibrated(self, parameters: ArrayLike, sensor: Sensor | None = None) -> Self:
+        """The arm whose nominal is this one with ``parameters``.
+
+        Args:
+            parameters: (p,) as ``identify`` found them.
+            sensor: of the new arm; Position() when not given.
+
+        Raises:
+            ValueError: a joint yields, which no nominal arm does.
+        """
+        theta = as_parameters(self, parameters)
+        ratios, compliance = self._drives(theta)
+        if compliance.any():
+            raise ValueError(
+                "a nominal arm has stiff joints, but compliance was found of joints "
+                f"{', '.join(map(str, self.compliance))}"
+            )
+        base, tool, _ = self._split(theta)
+        turned = pose_matrix(base)
+        turned[:3, :3] = turned[:3, :3] @ self.base[:3, :3]
+        end = pose_matrix(np.concatenate([tool[:3], np.zeros(3)]))
+        end[:3, :3] = self.tool[:3, :3] @ pose_matrix(tool)[:3, :3]
+        return dataclasses.replace(
+            self,
+            table=theta[: self.table.size].reshape(self.table.shape),
+            base=turned,
+            tool=end,
+            drive=ratios[:, None] * self.drive,
+            offset=ratios * self.offset,
+            sensor=sensor or Position(),
         )
+
+    def to_urdf(
+        self,
+        path: str | os.PathLike[str],
+        parameters: ArrayLike,
+        *,
+        force: bool = False,
+    ) -> str:
+        """Write the URDF file that the arm came from, its origins corrected.
+
+        Meshes, comments and all else stay as they are; the tip goes where ``predict``
+        of positions puts it, the base in the measuring frame included.
+
+        Args:
+            path: the file to write.
+            parameters: (p,) as ``identify`` found them.
+            force: write over a file that is there.
+
+        Returns:
+            The tip link, a new one where no fixed joint before it could hold the tool.
+
+        Raises:
+            ValueError: the arm is of no URDF file; a gear ratio or a compliance was
+                found, which such a file cannot hold.
+            FileExistsError: there is a file and ``force`` is not given.
+        """
+        from jaxcal.models.serial.written import urdf_text
+
+        ratios = self._drives(as_parameters(self, parameters))[0]
+        for i in np.flatnonzero(ratios != 1.0):
+            raise ValueError(
+                f"gear{i + 1} is {ratios[i]:.6g}, which a URDF file cannot hold"
+            )
+        text, tip = urdf_text(self, self.calibrated(parameters))
+        _write_new(path, text, force)
+        return tip
+
+    def to_dh(
+        self,
+        path: str | os.PathLike[str],
+        parameters: ArrayLike,
+        *,
+        force: bool = False,
+    ) -> None:
+        """Write the calibrated DH table as CSV: joint, a, alpha, d, theta, beta.
+
+        theta has the joint's offset. Arguments and errors as of :meth:`to_urdf`.
+        """
+        from jaxcal.models.serial.written import dh_text
+
+        _write_new(path, dh_text(self.calibrated(parameters)), force)
+
+    def to_ur_kinematics(
+        self,
+        path: str | os.PathLike[str],
+        parameters: ArrayLike,
+        *,
+        force: bool = False,
+    ) -> None:
+        """Write the YAML file of Universal Robots' ROS description, for its six joints.
+
+        Base and tool are not in it. Arguments and errors as of :meth:`to_urdf`.
+        """
+        from jaxcal.models.serial.written import ur_text
+
+        _write_new(path, ur_text(self, self.calibrated(parameters)), force)
+
+    def together(
+        self, *tables: tuple[ArrayLike, ArrayLike | None]
+    ) -> tuple[Array, Array]:
+        """Commands and readings of several sensors as the tables that a fit takes.
+
+        Args:
+            tables: for each sensor of ``Several`` a pair: commands (N, n) with the
+                columns that it asks for, and what it measured (N, q), or None for
+                zeros (contacts) and for candidates.
+
+        Returns:
+            Commands (N, n) and readings (N, q), each in units of its sensor's noise.
+        """
+        if not isinstance(self.sensor, Several):
+            raise ValueError("together needs an arm with sensor=Several(...)")
+        return self.sensor.rows(self.length, *tables)
+
+    def located(self, commands: ArrayLike, measured: ArrayLike | None = None) -> Self:
+        """This arm with its sensor where nominal postures and readings put it.
+
+        Nothing is changed that was given: sockets, planes, anchors, boards and their
+        cameras have no place of their own until the first readings.
+        """
+        commands = as_commands(commands, self.num_inputs)
+        read = None if measured is None else numbers("measured", measured)
+        frame = forward(len(commands), self._steps(commands, self.nominal))[0]
+        inputs = commands[:, self.num_joints :]
+        sensor, new = self.sensor.located(self._tip_at(commands, frame), inputs, read)
+        tool = self.tool if new is None else self.tool @ new
+        return dataclasses.replace(self, sensor=sensor, tool=tool)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """n names of the columns of the commands; () where the joints have none."""
+        if self.joint_names == _numbered(self.num_joints):
+            return ()
+        return (*self.joint_names, *self.sensor.inputs)
+
+    @property
+    def command_units(self) -> tuple[str, ...]:
+        """J units of the joints' columns, "deg" or "length"."""
+        # A column drives itself by one; a leader that is not of the arm is an angle.
+        kinds = []
+        for column in self.drive.T:
+            own = np.flatnonzero(column == 1.0)
+            kinds.append(self.joints[own[0]] if own.size else "R")
+        return tuple("deg" if kind == "R" else "length" for kind in kinds)
 
     @property
     def num_parameters(self) -> int:
@@ -168,36 +354,39 @@ class SerialChain(Arm):
 
     @functools.cached_property
     def names(self) -> tuple[str, ...]:
-        n = self.num_inputs
+        n = len(self.joints)
         mounting = ("x", "y", "z", "rx", "ry", "rz")
         return (
             *(f"{column}{i + 1}" for i in range(n) for column in _COLUMNS),
             *(f"gear{i}" for i in self.gears),
             *(f"compliance{i}" for i in self.compliance),
             *(f"base {axis}" for axis in mounting),
-            *(f"tool {axis}" for axis in mounting[: self.num_outputs]),
+            *(f"tool {axis}" for axis in self.sensor.tool),
+            *self.sensor.names,
         )
 
     @property
     def units(self) -> tuple[str, ...]:
-        """p units: "length" (the table's), "deg", "ratio", "deg per torque"."""
+        """p units: "length" (the table's), "deg", "ratio", "deg per torque", ..."""
         mounting = ["length"] * 3 + ["deg"] * 3
         return (
-            *["length", "deg", "length", "deg", "deg"] * self.num_inputs,
+            *["length", "deg", "length", "deg", "deg"] * len(self.joints),
             *["ratio"] * len(self.gears),
             *["deg per torque"] * len(self.compliance),
             *mounting,
-            *mounting[: self.num_outputs],
+            *(mounting[i] for i in self._tool),
+            *self.sensor.units,
         )
 
     def predict(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
-        """Outputs (N, 3), or (N, 6) with the turn from nominal in degrees."""
+        """Readings (N, q)."""
         commands = as_commands(commands, self.num_inputs)
         parameters = as_parameters(self, parameters)
         frame = forward(len(commands), self._steps(commands, parameters))[0]
-        return self._outputs(commands, frame)
+        tip, inputs = self._tip_at(commands, frame), commands[:, self.num_joints :]
+        return self.sensor.read(tip, inputs, self._split(parameters)[2]).values
 
     def jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
@@ -205,61 +394,113 @@ class SerialChain(Arm):
         """(N, q, p)."""
         commands = as_commands(commands, self.num_inputs)
         parameters = as_parameters(self, parameters)
-        columns = self._motion(commands, parameters, self._steps_of_parameters)
-        first = 5 * self.num_inputs
+        columns, own = self._motion(commands, parameters, self._steps_of_parameters)
+        first = 5 * len(self.joints)
         last = first + len(self.gears)
-        columns[..., first:last] *= commands[:, None, [i - 1 for i in self.gears]]
+        moves = self._moves(commands)[:, [i - 1 for i in self.gears]]
+        columns[..., first:last] *= moves[:, None]
         if self.compliance:
             torque = self._torque(commands)[0].T
             columns[..., last : last + len(self.compliance)] *= torque[:, None]
-        return columns
+        return np.concatenate([columns, own], axis=-1)
 
     def command_jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
-        """(N, q, n); of a pose, with the orientation it is compared with held."""
+        """(N, q, n), zero by the sensor's columns.
+
+        Of a pose, with the orientation that it is compared with held.
+        """
         commands = as_commands(commands, self.num_inputs)
         parameters = as_parameters(self, parameters)
-        columns = self._motion(commands, parameters, self._steps_of_joints)
+        columns, _ = self._motion(commands, parameters, self._steps_of_joints)
         gears, compliance = self._drives(parameters)
         result = columns * gears
         if self.compliance:
             at = [i - 1 for i in self.compliance]
             rate = compliance[:, None, None] * self._torque(commands)[1]
             result += np.einsum("nqc,cjn->nqj", columns[..., at], rate)
-        return result
+        own = np.zeros((*result.shape[:2], len(self.sensor.inputs)))
+        return np.concatenate([result @ self.drive, own], axis=-1)
 
-    @functools.cached_property
-    def length(self) -> float:
-        """Of the links and the tool together; 0 where the table holds no length."""
-        links = np.hypot(self.table[:, 0], self.table[:, 2]).sum()
-        return float(links + np.linalg.norm(self.tool[:3, 3]))
+    def facts(self, parameters: ArrayLike | None = None) -> tuple[Array, Array]:
+        """What is known besides the prior, as readings that need no posture.
+
+        Returns:
+            (F,) how far off it is and (F, p) its derivative, in standard deviations.
+        """
+        parameters = as_parameters(self, parameters)
+        own = self._split(parameters)[2]
+        off, rows = self.sensor.facts(own)
+        before = np.zeros((len(off), len(parameters) - len(own)))
+        return off, np.hstack([before, rows])
 
     def default_noise(self) -> Noise:
-        """What ``select`` takes where no noise is given, in the unit of the arm."""
-        angle = np.degrees(_NOISE)
-        std = [_NOISE * (self.length or 1.0)] * 3 + [angle] * 3
-        return Noise(std=std[: self.num_outputs])
+        """What ``select`` takes where no noise is given: the sensor's."""
+        return Noise(std=self.sensor.stds(self.length or 1.0))
 
     def default_prior(self) -> Prior:
-        """Loose knowledge of any arm, by the length of its links; see the constants."""
+        """Loose knowledge of any arm, by the length of its links; see the constants.
+
+        What the sensor cannot see is held.
+        """
         length = self.length or np.inf  # axes of unknown stroke alone
         joint = [_LENGTH * length, _ANGLE, _LENGTH * length, _ANGLE, _ANGLE]
         mounting = [_MOUNTING * length] * 3 + [_MOUNTING_ANGLE] * 3
         torque = length * sum(abs(weight) for _, weight, _ in self.loads)
         return Prior(
             [
-                *joint * self.num_inputs,
+                *joint * len(self.joints),
                 *[_GEAR] * len(self.gears),
                 *[_ANGLE / torque if torque else np.inf] * len(self.compliance),
                 *mounting,
-                *mounting[: self.num_outputs],
-            ]
+                *(mounting[i] for i in self._tool),
+                *self.sensor.prior_std(length),
+            ],
+            fixed=self.sensor.unseen(self),
         )
 
     def to_dict(self) -> dict[str, Any]:
         """What a file holds of the model."""
-        data = dataclasses.asdict(self)
-        for name in ("table", "base", "tool"):
-            data[name] = data[name].tolist()
-        return {"kind": "serial_chain", **data}
+        fields = (field.name for field in dataclasses.fields(self))
+        data = {name: getattr(self, name) for name in fields if name != "sensor"}
+        for name, value in data.items():
+            if isinstance(value, np.ndarray):
+                data[name] = value.tolist()
+        # JSON knows no infinity: null is a limit that is not known.
+        ends = [
+            [end if np.isfinite(end) else None for end in row] for row in self.limits
+        ]
+        sensor = self.sensor.to_dict()
+        return {"kind": "serial_chain", **data, "limits": ends, "sensor": sensor}
+
+
+def _write_new(path: str | os.PathLike[str], text: str, force: bool) -> None:
+    if not force and os.path.exists(path):
+        raise FileExistsError(
+            f"{os.fspath(path)} is there already; force=True writes over it"
+        )
+    write_text(path, text)
+
+
+def _numbered(columns: int) -> tuple[str, ...]:
+    """Names of joints that have none."""
+    return tuple(f"joint {i + 1}" for i in range(columns))
+
+
+def _limits(given: ArrayLike | None, columns: int) -> Array:
+    """(J, 2) least and greatest; None of a pair is not known."""
+    open_ended = np.tile([-np.inf, np.inf], (columns, 1))
+    if given is None:
+        return open_ended
+    limits = np.array(given, dtype=np.float64)  # None becomes NaN
+    if limits.shape != (columns, 2):
+        raise ValueError(f"limits must have shape ({columns}, 2), got {limits.shape}")
+    limits = np.where(np.isnan(limits), open_ended, limits)
+    bad = np.flatnonzero(limits[:, 0] > limits[:, 1])
+    if bad.size:
+        raise ValueError(
+            "limits must be a least and a greatest command, got "
+            f"{in_words(limits[bad[0]])}"
+        )
+    return limits

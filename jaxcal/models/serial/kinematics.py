@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["OF_BASE", "OF_ROW", "Step", "cross", "forward", "rotation_vector_rate"]
+__all__ = ["OF_BASE", "OF_ROW", "Step", "cross", "forward"]
 
 Array = NDArray[np.float64]
 
@@ -71,19 +71,3 @@ def forward(
             frame[j] = cosine * first + sine * second
             frame[k] = cosine * second - sine * first
     return np.stack([*frame, origin]), axes, origins
-
-
-def rotation_vector_rate(vector: Array) -> Array:
-    """(N, 3, 3) derivative of rotation vectors r (N, 3), radians, by a turn w.
-
-    ``exp(r + dr) = exp(w) exp(r)`` to first order, dr this matrix times w.
-    """
-    angle = np.linalg.norm(vector, axis=-1)
-    small = angle < 1e-4
-    safe = np.where(small, 1.0, angle)
-    factor = 1.0 / safe**2 - 1.0 / (2.0 * safe * np.tan(safe / 2.0))
-    factor = np.where(small, 1.0 / 12.0, factor)[:, None, None]
-    hat = np.zeros((len(vector), 3, 3))
-    hat[:, [2, 0, 1], [1, 2, 0]] = vector
-    hat = hat - np.matrix_transpose(hat)
-    return np.eye(3) - 0.5 * hat + factor * (hat @ hat)

@@ -16,7 +16,7 @@ Load = tuple[int, float, tuple[float, float, float]]  # link from 1, weight, its
 
 
 def torque(
-    commands: Array,
+    count: int,
     steps: Sequence[Step],
     moved: NDArray[np.int64],
     revolute: NDArray[np.bool_],
@@ -30,7 +30,7 @@ def torque(
     joint is a second derivative of their positions: ``w_i x J_j``, i before j.
 
     Args:
-        commands: (N, n).
+        count: N postures.
         steps: the chain; the rows of its table are five steps each, ending at the tool.
         moved: (n,) the step of each joint.
         revolute: (n,) else prismatic.
@@ -41,7 +41,7 @@ def torque(
     Returns:
         (C, N) and (C, n, N), the latter per degree or unit of length.
     """
-    count, n = commands.shape
+    n = len(moved)
     _, all_axes, all_origins = forward(count, steps)
     axes = np.stack([all_axes[i] for i in moved])
     origins = np.stack([all_origins[i] for i in moved])

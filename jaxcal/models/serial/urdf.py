@@ -7,6 +7,8 @@ arm gets the same five parameters a joint, whatever frames its file uses.
 from __future__ import annotations
 
 import os
+import pathlib
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 from xml.etree import ElementTree
 
@@ -14,7 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-__all__ = ["Chain", "read_urdf"]
+from jaxcal.checks import numbers
+
+__all__ = [
+    "Chain",
+    "Joint",
+    "joints_of",
+    "led",
+    "moved",
+    "read_urdf",
+    "row_matrix",
+    "walk",
+]
 
 Array = NDArray[np.float64]
 
@@ -22,119 +35,221 @@ _PARALLEL = 1e-3  # sine; below it the common normal of two axes is ill defined
 
 
 class Chain(NamedTuple):
-    """A standard table with beta; angles in degrees, lengths in metres."""
+    """Arguments of ``SerialChain.from_dh``; angles in degrees, lengths in metres."""
 
     table: Array  # (n, 5)
     joints: str
-    names: tuple[str, ...]
+    joint_names: tuple[str, ...]  # J columns of the commands
     base: Array  # (4, 4)
     tool: Array  # (4, 4)
+    drive: Array  # (n, J)
+    offset: Array  # (n,)
+    limits: Array  # (J, 2)
+    source: dict[str, object]  # text, base, tip, locked: what ``walk`` asks for
 
 
-class _Joint(NamedTuple):
+class Joint(NamedTuple):
+    """A joint of the file."""
+
     name: str
     kind: str  # "R", "P" or "" for fixed
     parent: str
     child: str
     origin: Array  # (4, 4)
     axis: Array  # (3,) unit
-    mimics: bool
+    mimic: tuple[str, float, float] | None  # leader, multiplier, offset as in the file
+    limits: tuple[float, float]  # as in the file, infinite where not known
 
 
 _KINDS = {"revolute": "R", "continuous": "R", "prismatic": "P", "fixed": ""}
 
 
 def read_urdf(
-    path: str | os.PathLike[str], tip: str | None = None, base: str | None = None
+    path: str | os.PathLike[str],
+    tip: str | None,
+    base: str | None,
+    locked: Mapping[str, float],
 ) -> Chain:
     """Raises:
-    ValueError: the file is malformed, a joint is of another type or mimics another,
-        the links form a loop, or ``tip`` and ``base`` are not links one above the
-        other; the message names the link or joint.
+    ValueError: the file is malformed or a xacro file, a joint of the chain is of
+        another type, the links form a loop, or ``tip``, ``base`` and ``locked`` are not
+        in it; the message names the link or joint.
     """
+    name = os.fspath(path)
+    text = pathlib.Path(path).read_text(encoding="utf-8")
     try:
-        robot = ElementTree.parse(path).getroot()
-    except ElementTree.ParseError as error:
-        raise ValueError(f"{path} is not a URDF file: {error}") from error
-    if robot.tag != "robot":
-        raise ValueError(f"{path} must hold a <robot>, got <{robot.tag}>")
-    links = [_name(link, "link", path) for link in robot.findall("link")]
-    above: dict[str, _Joint] = {}
-    for element in robot.findall("joint"):
-        joint = _read_joint(element, path)
-        for link in (joint.parent, joint.child):
-            if link not in links:
-                raise ValueError(
-                    f"{path}: joint {joint.name} names the link {link!r}, which the "
-                    "file does not hold"
-                )
+        chain = list(walk(text, base, tip, locked))
+        source: dict[str, object] = {"text": text, "locked": dict(locked)}
+        (first, down), (last, ends_down) = chain[0], chain[-1]
+        source["base"] = first.parent if down else first.child
+        source["tip"] = last.child if ends_down else last.parent
+        return _table(chain, joints_of(text), locked, source)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
+
+
+def walk(
+    text: str, base: str | None, tip: str | None, locked: Mapping[str, float]
+) -> Iterator[tuple[Joint, bool]]:
+    """The joints from ``base`` to ``tip``, and whether each is passed downwards."""
+    joints = joints_of(text)
+    for name, value in locked.items():
+        if name not in joints:
+            raise ValueError(
+                f"locked must name joints of the file ({', '.join(joints)}), "
+                f"got {name!r}"
+            )
+        numbers(f"locked[{name!r}]", value)
+    above: dict[str, Joint] = {}
+    for joint in joints.values():
         if joint.child in above:
             raise ValueError(
-                f"{path}: link {joint.child} is the child of the joints "
+                f"link {joint.child} is the child of the joints "
                 f"{above[joint.child].name} and {joint.name}; a chain cannot hold loops"
             )
         above[joint.child] = joint
-    chain = _chain(above, links, tip, base, path)
-    moving = [joint for joint in chain if joint.kind]
-    if not moving:
-        raise ValueError(f"{path}: no joint moves between the base and {tip!r}")
-    for joint in moving:
-        if joint.mimics:
+    links = _links_of(text)
+    for argument, link in (("tip", tip), ("base", base)):
+        if link is not None and link not in links:
             raise ValueError(
-                f"{path}: joint {joint.name} mimics another one, which SerialChain "
-                "does not do; name a tip before it, or use FromJax"
+                f"{argument} must be a link of it ({', '.join(links)}), got {link!r}"
             )
-    return _table(chain, moving)
+    if tip is None:
+        parents = {joint.parent for joint in above.values()}
+        leaves = [link for link in links if link not in parents]
+        if len(leaves) != 1:
+            raise ValueError(
+                f"tip must be given: the file has {len(leaves)} links without a joint "
+                f"after them ({', '.join(leaves) or 'a loop'})"
+            )
+        tip = leaves[0]
+    down = _up(tip, above)
+    up = [] if base is None else _up(base, above)
+    while up and down and up[-1].name == down[-1].name:
+        up.pop()
+        down.pop()
+    top = {up[-1].parent if up else base, down[-1].parent if down else tip}
+    if base is not None and len(top) > 1:
+        raise ValueError(f"base {base!r} and tip {tip!r} hang on different roots")
+    if not up and not down:
+        raise ValueError(f"no joint moves between base {base!r} and tip {tip!r}")
+    yield from ((joint, False) for joint in up)
+    yield from ((joint, True) for joint in reversed(down))
 
 
-def _name(element: ElementTree.Element, what: str, path: object) -> str:
+def moved(joint: Joint, value: float) -> Array:
+    """(4, 4) of a joint at a value in degrees or metres; fixed ones do not move."""
+    matrix = np.eye(4)
+    if joint.kind == "R":
+        turn = Rotation.from_rotvec(value * joint.axis, degrees=True)
+        matrix[:3, :3] = turn.as_matrix()
+    elif joint.kind == "P":
+        matrix[:3, 3] = value * joint.axis
+    return matrix
+
+
+def _up(link: str, above: dict[str, Joint]) -> list[Joint]:
+    """Joints from a link up to its root."""
+    found: list[Joint] = []
+    while link in above:
+        if len(found) == len(above):
+            names = ", ".join(dict.fromkeys(joint.name for joint in reversed(found)))
+            raise ValueError(f"the joints {names} form a loop")
+        found.append(above[link])
+        link = above[link].parent
+    return found
+
+
+def _robot(text: str) -> ElementTree.Element:
+    if "xacro:" in text or "${" in text:
+        raise ValueError(
+            "it is a xacro file: expand it first, xacro arm.xacro > arm.urdf"
+        )
+    try:
+        robot = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"is not a URDF file: {error}") from error
+    if robot.tag != "robot":
+        raise ValueError(f"it must hold a <robot>, got <{robot.tag}>")
+    return robot
+
+
+def _links_of(text: str) -> list[str]:
+    return [_name(link, "link") for link in _robot(text).findall("link")]
+
+
+def joints_of(text: str) -> dict[str, Joint]:
+    """The joints of a file by name."""
+    links, joints = _links_of(text), {}
+    for element in _robot(text).findall("joint"):
+        joint = _read_joint(element)
+        for link in (joint.parent, joint.child):
+            if link not in links:
+                raise ValueError(
+                    f"joint {joint.name} names the link {link!r}, which the file does "
+                    "not hold"
+                )
+        if joint.name in joints:
+            raise ValueError(f"two joints are named {joint.name}")
+        joints[joint.name] = joint
+    return joints
+
+
+def _name(element: ElementTree.Element, what: str) -> str:
     name = element.get("name")
     if not name:
-        raise ValueError(f"{path}: a <{what}> has no name")
+        raise ValueError(f"a <{what}> has no name")
     return name
 
 
-def _read_joint(element: ElementTree.Element, path: object) -> _Joint:
-    name = _name(element, "joint", path)
-    kind = element.get("type")
-    if kind not in _KINDS:
-        raise ValueError(
-            f"{path}: type of joint {name} must be one of {', '.join(_KINDS)}, "
-            f"got {kind!r}"
-        )
+def _read_joint(element: ElementTree.Element) -> Joint:
+    name = _name(element, "joint")
+    kind = element.get("type", "none")
     ends = {}
     for end in ("parent", "child"):
         found = element.find(end)
         link = None if found is None else found.get("link")
         if not link:
-            raise ValueError(f"{path}: joint {name} has no <{end} link=...>")
+            raise ValueError(f"joint {name} has no <{end} link=...>")
         ends[end] = link
     origin = np.eye(4)
-    origin[:3, 3] = _triple(element, "origin", "xyz", (0.0, 0.0, 0.0), name, path)
-    turn = _triple(element, "origin", "rpy", (0.0, 0.0, 0.0), name, path)
+    origin[:3, 3] = _numbers(element, "origin", "xyz", (0.0, 0.0, 0.0), name)
+    turn = _numbers(element, "origin", "rpy", (0.0, 0.0, 0.0), name)
     origin[:3, :3] = Rotation.from_euler("xyz", turn).as_matrix()
-    axis = _triple(element, "axis", "xyz", (1.0, 0.0, 0.0), name, path)
+    axis = _numbers(element, "axis", "xyz", (1.0, 0.0, 0.0), name)
     length = np.linalg.norm(axis)
-    if _KINDS[kind] and not length > 0.0:
-        raise ValueError(f"{path}: the axis of joint {name} must not be zero")
-    return _Joint(
+    if _KINDS.get(kind) and not length > 0.0:
+        raise ValueError(f"the axis of joint {name} must not be zero")
+    mimic = None
+    follows = element.find("mimic")
+    if follows is not None:
+        leader = follows.get("joint")
+        if not leader:
+            raise ValueError(f"joint {name} has no <mimic joint=...>")
+        (times,) = _numbers(element, "mimic", "multiplier", (1.0,), name)
+        (plus,) = _numbers(element, "mimic", "offset", (0.0,), name)
+        mimic = (leader, float(times), float(plus))
+    (low,) = _numbers(element, "limit", "lower", (0.0,), name)
+    (high,) = _numbers(element, "limit", "upper", (0.0,), name)
+    known = kind in ("revolute", "prismatic") and low < high
+    return Joint(
         name,
-        _KINDS[kind],
+        _KINDS.get(kind, kind),
         ends["parent"],
         ends["child"],
         origin,
         axis / (length or 1.0),
-        element.find("mimic") is not None,
+        mimic,
+        (float(low), float(high)) if known else (-np.inf, np.inf),
     )
 
 
-def _triple(
+def _numbers(
     joint: ElementTree.Element,
     tag: str,
     attribute: str,
-    default: tuple[float, float, float],
+    default: tuple[float, ...],
     name: str,
-    path: object,
 ) -> Array:
     element = joint.find(tag)
     text = None if element is None else element.get(attribute)
@@ -142,59 +257,84 @@ def _triple(
         return np.array(default)
     try:
         values = np.array([float(word) for word in text.split()])
-        if values.shape != (3,) or not np.isfinite(values).all():
+        if values.shape != (len(default),) or not np.isfinite(values).all():
             raise ValueError
     except ValueError:
+        count = {1: "a number", 3: "three numbers"}[len(default)]
         raise ValueError(
-            f"{path}: {attribute} of <{tag}> of joint {name} must be three numbers, "
-            f"got {text!r}"
+            f"{attribute} of <{tag}> of joint {name} must be {count}, got {text!r}"
         ) from None
     return values
 
 
-def _chain(
-    above: dict[str, _Joint],
-    links: list[str],
-    tip: str | None,
-    base: str | None,
-    path: object,
-) -> list[_Joint]:
-    """Joints from ``base`` to ``tip``."""
-    for argument, link in (("tip", tip), ("base", base)):
-        if link is not None and link not in links:
+def led(
+    joint: Joint, joints: dict[str, Joint], locked: Mapping[str, float]
+) -> tuple[str | None, float, float]:
+    """The joint whose command moves this one, how far, and its value at zero.
+
+    None where it stands still. In degrees and metres.
+    """
+    times, plus, unit = 1.0, 0.0, _unit(joint)
+    seen = [joint.name]
+    while joint.name not in locked:
+        if not joint.kind:
+            return None, 0.0, plus / unit
+        if joint.mimic is None:
+            return joint.name, times * _unit(joint) / unit, plus / unit
+        leader, by, more = joint.mimic
+        if leader not in joints or leader in seen:
             raise ValueError(
-                f"{argument} must be a link of {path} ({', '.join(links)}), "
-                f"got {link!r}"
+                f"joint {joint.name} must mimic another joint of the file, "
+                f"got {leader!r}"
             )
-    if tip is None:
-        parents = {joint.parent for joint in above.values()}
-        leaves = [link for link in links if link not in parents]
-        if len(leaves) != 1:
-            raise ValueError(
-                f"tip must be given: {path} has {len(leaves)} links without a joint "
-                f"after them ({', '.join(leaves) or 'a loop'})"
-            )
-        tip = leaves[0]
-    chain: list[_Joint] = []
-    link = tip
-    while link != base and link in above:
-        if len(chain) == len(above):
-            names = ", ".join(dict.fromkeys(joint.name for joint in chain))
-            raise ValueError(f"{path}: the joints {names} form a loop")
-        chain.insert(0, above[link])
-        link = above[link].parent
-    if base is not None and link != base:
-        raise ValueError(f"base {base!r} is not above tip {tip!r} in {path}")
-    return chain
+        plus += times * more
+        times *= by
+        joint = joints[leader]
+        seen.append(leader)
+    return None, 0.0, (plus + times * locked[joint.name] * _unit(joint)) / unit
 
 
-def _table(chain: list[_Joint], moving: list[_Joint]) -> Chain:
+def _unit(joint: Joint) -> float:
+    """Ours in the file's: degrees in radians, metres in metres."""
+    return float(np.radians(1.0)) if joint.kind == "R" else 1.0
+
+
+def _table(
+    chain: list[tuple[Joint, bool]],
+    joints: dict[str, Joint],
+    locked: Mapping[str, float],
+    source: dict[str, object],
+) -> Chain:
     frame = np.eye(4)
-    lines = []
-    for joint in chain:
-        frame = frame @ joint.origin
-        if joint.kind:
-            lines.append((frame[:3, :3] @ joint.axis, frame[:3, 3]))
+    lines, kinds, leads = [], [], []
+    for joint, down in chain:
+        if joint.kind not in ("R", "P", ""):
+            raise ValueError(
+                f"type of joint {joint.name} must be one of {', '.join(_KINDS)}, "
+                f"got {joint.kind!r}"
+            )
+        leader, times, plus = led(joint, joints, locked)
+        if down:
+            frame = frame @ joint.origin
+        if leader is None:
+            stands = moved(joint, plus)
+            frame = frame @ (stands if down else np.linalg.inv(stands))
+        else:
+            axis = frame[:3, :3] @ joint.axis
+            lines.append((axis if down else -axis, frame[:3, 3]))
+            kinds.append(joint.kind)
+            leads.append((leader, times, plus))
+        if not down:
+            frame = frame @ np.linalg.inv(joint.origin)
+    if not lines:
+        raise ValueError(
+            f"no joint moves between base {source['base']!r} and tip {source['tip']!r}"
+        )
+    columns = list(dict.fromkeys(leader for leader, _, _ in leads))
+    drive = np.zeros((len(leads), len(columns)))
+    for row, (leader, times, _) in zip(drive, leads, strict=True):
+        row[columns.index(leader)] = times
+    limits = [np.array(joints[c].limits) / _unit(joints[c]) for c in columns]
     base = np.eye(4)
     base[:3, :3] = _turn_of_z(lines[0][0])
     base[:3, 3] = lines[0][1]
@@ -203,14 +343,18 @@ def _table(chain: list[_Joint], moving: list[_Joint]) -> Chain:
     for axis, point in lines[1:]:
         row = _row(reached, axis, point)
         rows.append(row)
-        reached = reached @ _transform(row)
+        reached = reached @ row_matrix(row)
     rows.append(np.zeros(5))
     return Chain(
         np.array(rows),
-        "".join(joint.kind for joint in moving),
-        tuple(joint.name for joint in moving),
+        "".join(kinds),
+        tuple(columns),
         base,
         np.linalg.inv(reached) @ frame,
+        drive,
+        np.array([plus for _, _, plus in leads]),
+        np.array(limits),
+        source,
     )
 
 
@@ -219,7 +363,7 @@ def _turn_of_z(axis: Array) -> Array:
     if axis[2] < -1.0 + 1e-12:
         return np.diag([1.0, -1.0, -1.0])
     vector = np.cross([0.0, 0.0, 1.0], axis)
-    hat = np.cross(np.eye(3), -vector)
+    hat = np.cross(np.eye(3), vector)
     return np.eye(3) + hat + hat @ hat / (1.0 + axis[2])
 
 
@@ -252,7 +396,8 @@ def _row(frame: Array, axis: Array, point: Array) -> Array:
     return np.where(np.abs(row) < 1e-13, 0.0, row)
 
 
-def _transform(row: Array) -> Array:
+def row_matrix(row: Array) -> Array:
+    """(4, 4) of a row a, alpha, d, theta, beta at a command of zero."""
     a, alpha, d, theta, beta = row
     matrix = np.eye(4)
     turn = Rotation.from_euler("ZXY", [theta, alpha, beta], degrees=True)

@@ -12,7 +12,6 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from jaxcal.selection.fastest.refill import refills
@@ -121,7 +120,6 @@ def complete(task: Task, runs: Indices, wanted: float) -> Indices | None:
     return best
 
 
-@njit(cache=True, nogil=True)
 def _runs(x, times, start, prices, fixed, k, num):
     """(W num, k) int64 runs: for each price the best ``num`` first postures, completed.
 
@@ -159,7 +157,6 @@ def _runs(x, times, start, prices, fixed, k, num):
     return runs
 
 
-@njit(cache=True, nogil=True)
 def _ends(x, tolls, factors, start, free, chosen, k):
     """(M,) log gain less tolls to the end of the run, by the candidate chosen next."""
     values = np.empty((4, len(free)))

@@ -1,4 +1,4 @@
-"""Selection by a trained policy: the shipped one in numpy and numba, others by JAX."""
+"""Selection by a trained policy: the shipped one in numpy, others by JAX."""
 
 from jaxcal.selection.policy.api import DECODINGS, load_policy, select_batch
 

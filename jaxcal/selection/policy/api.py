@@ -1,8 +1,8 @@
 """Choosing by a checkpoint: its weights read once, its kind of network looked up.
 
-The compact network is inferred in numpy and numba and needs no JAX; any other kind goes
-through JAX, which the extra ``policy`` installs. Both read whitened or rescaled
-candidates, so pulses and degrees give the same pick.
+The compact network is inferred in numpy and a compiled kernel and needs no JAX; any
+other kind goes through JAX, which the extra ``policy`` installs. Both read whitened or
+rescaled candidates, so pulses and degrees give the same pick.
 """
 
 from __future__ import annotations

@@ -1,114 +1,157 @@
-"""What the compact network reads of a decision, compiled once for sets of every size.
+"""What the compact network reads of a decision, compiled: CONTRIBUTING.md says how.
 
 Letters: E episodes, M candidates, p regressors, c choices made, F = 13 or 16 features.
 Everything is float64; docs/policy.md describes every part.
 """
 
+# Sums in any order.
+
 from __future__ import annotations
 
-import math
-from typing import Any
-
+import cython
 import numpy as np
-from numba import njit
-from numpy.typing import NDArray
+from cython.cimports.jaxcal.watch import Watch, begin, late
+from cython.cimports.libc.math import INFINITY, exp, log, sqrt
 
 __all__ = ["CLOSE", "conditional", "describe", "look_ahead"]
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-
 CLOSE = (32.0, 256.0, 2048.0)  # scales at which near-equal look-aheads differ
-_LOWEST = -30.0  # log-volume of a candidate that is not active or not looked ahead from
-_FLOOR = -8.0  # least log-volume, relative to the best, that a feature shows
-_RIDGE = 0.01  # of the metric of fewer choices than regressors
-_LEAST_RIDGE = 1e-6  # of the metric of more
-_LEAST_GAIN = 1e-5  # as in training, where float32 shows the rounding of zero below it
-_ALL_START = 1024  # candidates up to which every one is looked ahead from
-_STARTS = 512  # of more candidates, those of largest gain that are
 
-# Sums may be taken in any order, and no number is NaN.
-_FAST = {"nnan", "nsz", "contract", "reassoc"}
-_compiled = njit(cache=True, nogil=True, fastmath=_FAST)
+# Compiled functions read C variables, which Python does not see.
+_close = cython.declare(cython.double[3], [32.0, 256.0, 2048.0])
+_LOWEST = cython.declare(cython.double, -30.0)  # log-volume where none is computed
+_FLOOR = cython.declare(cython.double, -8.0)  # least, behind the best, a feature shows
+_RIDGE = cython.declare(cython.double, 0.01)  # of the metric of c < p choices
+_LEAST_RIDGE = cython.declare(cython.double, 1e-6)  # of the metric of more
+# As in training, where float32 shows the rounding of zero below it:
+_LEAST_GAIN = cython.declare(cython.double, 1e-5)
+_ALL_START = cython.declare(cython.int, 1024)  # M up to which all are looked ahead from
+_STARTS = cython.declare(cython.int, 512)  # of more, those of largest gain that are
 
 
-@_compiled
-def describe(
-    x: Array,
-    chosen: Indices,
-    active: Mask,
-    k: int,
-    depth: int,
-    best_only: bool,
-    features: Array32,
-    moments: Array32,
-    ahead: Array,
-) -> Any:
+def describe(x, chosen, active, k, depth, best_only, features, moments, ahead):
     """Geometry of E decisions.
 
     Args:
         x: (E, p, M) whitened regressors with mean square 1, 0 where masked.
-        chosen: (E, c) choices made.
+        chosen: (E, c) int64 choices made.
         active: (E, M) True where a candidate counts.
         k: choices in all.
         depth: choices to look ahead, the next included; at least 1.
         best_only: write ``ahead`` alone, and that as ``look_ahead`` says.
-        features: (E, M, F) written, 0 where not active; the close-ups if F = 16.
-        moments: (E, p (p + 1) / 2, M) written: second moments of what is left of the
-            candidates, scaled so that messages keep their size.
+        features: (E, M, F) float32 written, 0 where not active; close-ups if F = 16.
+        moments: (E, p (p + 1) / 2, M) float32 written: second moments of what is left
+            of the candidates, scaled so that messages keep their size.
         ahead: (E, M) written: log-volume at the end of the look-ahead, behind the best.
     """
-    episodes, p, m = x.shape
-    values = np.empty((4, m))
-    for b in range(episodes):
-        y = conditional(x[b], chosen[b], active[b], k)
-        look_ahead(y, active[b], k > p, depth, best_only, None, values)
-        for d in range(4):
-            best = _LOWEST
+    p, m = x.shape[1:]
+    _describe(
+        np.ascontiguousarray(x),
+        chosen,
+        np.ascontiguousarray(active).view(np.uint8),
+        k,
+        depth,
+        best_only,
+        features,
+        moments,
+        ahead,
+        np.empty((p, m)),
+        np.empty((4, m)),
+        np.empty((depth + 3, m)),
+    )
+
+
+@cython.cfunc
+def _describe(
+    x: cython.double[:, :, ::1],
+    chosen: cython.Py_ssize_t[:, :],
+    active: cython.uchar[:, ::1],
+    k: cython.Py_ssize_t,
+    depth: cython.Py_ssize_t,
+    best_only: cython.bint,
+    features: cython.float[:, :, ::1],
+    moments: cython.float[:, :, ::1],
+    ahead: cython.double[:, ::1],
+    y: cython.double[:, ::1],
+    values: cython.double[:, ::1],
+    work: cython.double[:, ::1],
+):
+    b: cython.Py_ssize_t
+    with cython.nogil:
+        for b in range(x.shape[0]):
+            _conditional(x[b], chosen[b], active[b], k, y, work[0])
+            _look_ahead(
+                y, active[b], k > x.shape[1], depth, best_only, None, values, work
+            )
+            _behind_best(values)
+            ahead[b] = values[3]
+            if not best_only:
+                _features(y, active[b], values, features[b], moments[b])
+
+
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _behind_best(values: cython.double[:, ::1]) -> cython.void:
+    """Values less the largest of their row, at least ``_LOWEST``."""
+    for d in range(values.shape[0]):
+        best: cython.double = _LOWEST
+        for j in range(values.shape[1]):
+            best = max(best, values[d, j])
+        for j in range(values.shape[1]):
+            values[d, j] = max(values[d, j] - best, _LOWEST)
+
+
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _features(
+    y: cython.double[:, ::1],
+    active: cython.uchar[::1],
+    values: cython.double[:, ::1],
+    features: cython.float[:, ::1],
+    moments: cython.float[:, ::1],
+) -> cython.void:
+    """What ``describe`` writes of one decision."""
+    p, m = y.shape[0], y.shape[1]
+    number: cython.Py_ssize_t = 0
+    f: cython.Py_ssize_t = 0
+    total: cython.double = 0.0
+    for c in range(p):
+        for j in range(m):
+            total += y[c, j] * y[c, j]
+    for j in range(m):
+        number += active[j]
+    mean_square = max(total / max(number, 1), 1e-8)
+    scale = 1.0 / (mean_square * sqrt(max(number, 1)))
+    for c in range(p):
+        for e in range(c, p):
+            # Their inner product for x and y is (x . y)^2.
+            factor = scale if c == e else sqrt(2.0) * scale
             for j in range(m):
-                best = max(best, values[d, j])
-            for j in range(m):
-                values[d, j] = max(values[d, j] - best, _LOWEST)
-        ahead[b] = values[3]
-        if best_only:
+                moments[f, j] = y[c, j] * y[e, j] * factor
+            f += 1
+    for j in range(m):
+        if not active[j]:
+            features[j, :] = 0.0
             continue
-        number, total = 0, 0.0
-        for j in range(m):
-            number += active[b, j]
-            for c in range(p):
-                total += y[c, j] * y[c, j]
-        mean_square = max(total / max(number, 1), 1e-8)
-        scale = 1.0 / (mean_square * math.sqrt(max(number, 1)))
-        for j in range(m):
-            square, f = 0.0, 0
-            for c in range(p):
-                square += y[c, j] * y[c, j]
-                for e in range(c, p):
-                    # Their inner product for x and y is (x . y)^2.
-                    factor = 1.0 if c == e else math.sqrt(2.0)
-                    moments[b, f, j] = y[c, j] * y[e, j] * factor * scale
-                    f += 1
-            if not active[b, j]:
-                features[b, j] = 0.0
-                continue
-            for d in range(4):
-                short = max(values[d, j], _FLOOR)
-                grown = math.exp(short)
-                features[b, j, d] = short / 2.0
-                features[b, j, 4 + d] = grown
-                features[b, j, 8 + d] = grown * grown * grown * grown
-            level = math.log(max(square, 1e-6) / mean_square)
-            features[b, j, 12] = min(max(level, _FLOOR), 4.0) / 2.0
-            for d in range(13, features.shape[2]):
-                # Float32 below exp(-80) would be subnormal, with which sums are slow.
-                near = max(CLOSE[d - 13] * values[3, j], -80.0)
-                features[b, j, d] = math.exp(near)
+        square: cython.double = 0.0
+        for c in range(p):
+            square += y[c, j] * y[c, j]
+        for d in range(4):
+            short = max(values[d, j], _FLOOR)
+            grown = exp(short)
+            features[j, d] = short / 2.0
+            features[j, 4 + d] = grown
+            features[j, 8 + d] = grown * grown * grown * grown
+        level = log(max(square, 1e-6) / mean_square)
+        features[j, 12] = min(max(level, _FLOOR), 4.0) / 2.0
+        for d in range(13, features.shape[1]):
+            # Float32 below exp(-80) would be subnormal, with which sums are slow.
+            features[j, d] = exp(max(_close[d - 13] * values[3, j], -80.0))
 
 
-@_compiled
-def conditional(x: Array, chosen: Indices, active: Mask, k: int) -> Any:
+def conditional(x, chosen, active, k):
     """(p, M) what is left of every active candidate once some are chosen, 0 elsewhere.
 
     With k = p every choice is a new direction, which leaves the other candidates. With
@@ -117,52 +160,58 @@ def conditional(x: Array, chosen: Indices, active: Mask, k: int) -> Any:
 
     Args:
         x: (p, M).
-        chosen: (c,).
-        active: (M,).
+        chosen: (c,) int64.
+        active: (M,) bool.
         k: choices in all.
     """
-    p, m = x.shape
-    y = x.copy()
-    if k > p:
-        ridge = _RIDGE if len(chosen) < p else _LEAST_RIDGE
+    y = np.empty_like(x)
+    _conditional(x, chosen, active.view(np.uint8), k, y, np.empty(x.shape[1]))
+    return y
+
+
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _conditional(
+    x: cython.double[:, ::1],
+    chosen: cython.Py_ssize_t[:],
+    active: cython.uchar[::1],
+    k: cython.Py_ssize_t,
+    y: cython.double[:, ::1],
+    inner: cython.double[::1],
+) -> cython.void:
+    """``conditional`` into y, with M numbers of work."""
+    p, m = x.shape[0], x.shape[1]
+    least = _RIDGE if chosen.shape[0] < p else _LEAST_RIDGE
+    shrink = 1.0 / sqrt(least) if k > p else 1.0
+    for c in range(p):
+        for j in range(m):
+            y[c, j] = x[c, j] * shrink
+    for i in range(chosen.shape[0]):
+        newest = chosen[i]
+        size: cython.double = 0.0
+        whole: cython.double = 0.0
         for c in range(p):
-            for j in range(m):
-                y[c, j] /= math.sqrt(ridge)
-    inner = np.empty(m)
-    unit = np.empty(p)
-    for newest in chosen:
-        size, whole = 0.0, 0.0
-        for c in range(p):
-            unit[c] = y[c, newest]
-            size += unit[c] * unit[c]
+            size += y[c, newest] * y[c, newest]
             whole += x[c, newest] * x[c, newest]
         if size <= 1e-9 * whole:
             continue
-        keep = 1.0 / math.sqrt(1.0 + size) if k > p else 0.0
+        keep = 1.0 / sqrt(1.0 + size) if k > p else 0.0
         inner[:] = 0.0
         for c in range(p):
+            unit = y[c, newest]
             for j in range(m):
-                inner[j] += unit[c] * y[c, j]
+                inner[j] += unit * y[c, j]
         for c in range(p):
-            along = (1.0 - keep) / size * unit[c]
+            along = (1.0 - keep) / size * y[c, newest]
             for j in range(m):
                 y[c, j] -= along * inner[j]
     for c in range(p):
         for j in range(m):
             y[c, j] *= active[j]
-    return y
 
 
-@_compiled
-def look_ahead(
-    y: Array,
-    active: Mask,
-    spanned: bool,
-    depth: int,
-    best_only: bool,
-    factors: Array | None,
-    values: Array,
-) -> Any:
+def look_ahead(y, active, spanned, depth, best_only, factors, values):
     """Log of the factor by which the determinant grows over 1, 2, 3 and all choices,
     the first of them a given candidate and the others greedy.
 
@@ -172,7 +221,7 @@ def look_ahead(
 
     Args:
         y: (p, M) vectors of the candidates given what was chosen, 0 where not active.
-        active: (M,).
+        active: (M,) bool.
         spanned: True where choosing i multiplies the determinant by ``1 + |y_i|^2``,
             False where by ``|y_i|^2``.
         depth: choices to look at, the start included; at least 1.
@@ -183,34 +232,65 @@ def look_ahead(
             ``depth``; -30 (with factors ``-inf``) where not active, and after the first
             where skipped.
     """
-    p, m = y.shape
+    vectors: cython.double[:, ::1] = y
+    seen: cython.uchar[::1] = active.view(np.uint8)
+    tolls: cython.double[:, ::1] = factors
+    to: cython.double[:, ::1] = values
+    work: cython.double[:, ::1] = np.empty((depth + 3, len(active)))
+    grows: cython.bint = spanned
+    ahead: cython.Py_ssize_t = depth
+    only: cython.bint = best_only
+    with cython.nogil:
+        _look_ahead(vectors, seen, grows, ahead, only, tolls, to, work)
+
+
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(-1)
+def _look_ahead(
+    y: cython.double[:, ::1],
+    active: cython.uchar[::1],
+    spanned: cython.bint,
+    depth: cython.Py_ssize_t,
+    best_only: cython.bint,
+    factors: cython.double[:, ::1] | None,
+    values: cython.double[:, ::1],
+    work: cython.double[:, ::1],
+) -> cython.int:
+    """``look_ahead`` with (depth + 3, M) numbers of work; raises KeyboardInterrupt."""
+    p, m = y.shape[0], y.shape[1]
+    priced: cython.bint = factors is not None
     base = 1.0 if spanned else 0.0
-    square = np.zeros(m)
-    gains = np.empty(m)  # of every candidate, after the choices made from a start
-    rows = np.empty((depth, m))  # of the factor, one a choice
-    row = np.empty(m)
+    square = work[depth]
+    gains = work[depth + 1]  # of every candidate, after the choices made from a start
+    row = work[depth + 2]  # of the factor; those of choices past are work[1:depth]
+    square[:] = 0.0
     for c in range(p):
         for j in range(m):
             square[j] += y[c, j] * y[c, j]
-    values[:] = _LOWEST if factors is None else -np.inf
+    values[:, :] = -INFINITY if priced else _LOWEST
+    largest: cython.double = 0.0
     for j in range(m):
         if active[j]:
-            values[0, j] = math.log(max(base + square[j], _LEAST_GAIN))
+            values[0, j] = log(max(base + square[j], _LEAST_GAIN))
         else:
             square[j] = -1.0
-    least = _least_start(square) if m > _ALL_START else 0.0
-    best, each = _LOWEST, 0.0
-    if best_only:
-        each = math.log(max(base + square.max(), _LEAST_GAIN))
+        largest = max(largest, square[j])
+    least = _least_start(square, largest) if m > _ALL_START else 0.0
+    each = log(max(base + largest, _LEAST_GAIN))
+    best: cython.double = _LOWEST
+    watch: Watch = begin(INFINITY)
     for i in range(m):
+        late(cython.address(watch))
         if square[i] < least or (
             best_only and values[0, i] + (depth - 1) * each < best
         ):
             continue
         gains[:] = square
-        reached, newest = values[0, i], i
+        reached: cython.double = values[0, i]
+        newest: cython.Py_ssize_t = i
         for d in range(1, depth):
-            factor = 1.0 / math.sqrt(max(base + gains[newest], _LEAST_GAIN))
+            factor = 1.0 / sqrt(max(base + gains[newest], _LEAST_GAIN))
             gains[newest] = -1.0
             row[:] = 0.0
             for c in range(p):
@@ -218,43 +298,48 @@ def look_ahead(
                 for j in range(m):
                     row[j] += weight * y[c, j]
             for e in range(1, d):
-                weight = factor * rows[e, newest]
+                weight = factor * work[e, newest]
                 for j in range(m):
-                    row[j] -= weight * rows[e, j]
-            gain = 0.0
+                    row[j] -= weight * work[e, j]
+            gain: cython.double = 0.0
             for j in range(m):
-                rows[d, j] = row[j]
+                work[d, j] = row[j]
                 gains[j] -= row[j] * row[j]
                 gain = max(gain, gains[j])
-            if factors is None:
+            if not priced:
                 newest = 0
                 while newest < m - 1 and gains[newest] != gain:
                     newest += 1
-                reached += math.log(max(base + gain, _LEAST_GAIN))
+                reached += log(max(base + gain, _LEAST_GAIN))
             else:
-                here, most = newest, -1.0
+                here = newest
+                most: cython.double = -1.0
                 for j in range(m):
                     grown = max(base + gains[j], _LEAST_GAIN) * factors[here, j]
                     if gains[j] > -0.5 and grown > most:  # -1 where taken
-                        most, newest = grown, j
-                reached += math.log(most)
+                        most = grown
+                        newest = j
+                reached += log(most)
             if d < 3:
                 values[d, i] = reached
         for d in range(min(depth, 3), 4):
             values[d, i] = reached
         best = max(best, reached)
+    return 0
 
 
-@_compiled
-def _least_start(square: Array) -> Any:
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _least_start(square: cython.double[::1], largest: cython.double) -> cython.double:
     """The least squared length of a start, among (M,) of them, by bisection."""
-    low, high = 0.0, 0.0
-    for value in square:
-        high = max(high, value)
+    low: cython.double = 0.0
+    high = largest
     for _ in range(60):
-        middle, count = 0.5 * (low + high), 0
-        for value in square:
-            count += value >= middle
+        middle = 0.5 * (low + high)
+        count: cython.Py_ssize_t = 0
+        for j in range(square.shape[0]):
+            count += square[j] >= middle
         if count > _STARTS:
             low = middle
         else:

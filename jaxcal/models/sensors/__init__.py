@@ -1,0 +1,39 @@
+"""What an arm is measured with: sensors that turn the tip's pose into readings."""
+
+from jaxcal.models.sensors.board import Board
+from jaxcal.models.sensors.distance import Distance
+from jaxcal.models.sensors.gravity import Gravity
+from jaxcal.models.sensors.plane import Plane
+from jaxcal.models.sensors.pose import Pose
+from jaxcal.models.sensors.position import Position
+from jaxcal.models.sensors.sensor import Placed, Reading, Sensor, Tip
+from jaxcal.models.sensors.several import Several
+from jaxcal.models.sensors.socket import Socket
+
+__all__ = [
+    "SENSORS",
+    "Board",
+    "Distance",
+    "Gravity",
+    "Placed",
+    "Plane",
+    "Pose",
+    "Position",
+    "Reading",
+    "Sensor",
+    "Several",
+    "Socket",
+    "Tip",
+]
+
+# By their names in files and on the command line; a sensor of one's own is added here.
+SENSORS: dict[str, type[Sensor]] = {
+    "position": Position,
+    "pose": Pose,
+    "socket": Socket,
+    "plane": Plane,
+    "distance": Distance,
+    "gravity": Gravity,
+    "board": Board,
+    "several": Several,
+}

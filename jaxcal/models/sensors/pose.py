@@ -1,0 +1,58 @@
+"""Motion capture: position and orientation of the tool."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.models.sensors.sensor import Reading, Sensor, Tip, hats
+
+__all__ = ["Pose", "rotation_vector_rate"]
+
+Array = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Pose(Sensor):
+    """Position, and the turn from the nominal orientation as a vector in degrees.
+
+    The vector is in the measuring frame; ``SerialChain.rotation_vectors`` makes it
+    from measured rotation matrices. Noise 0.01 % of the arm's length, 0.006 degrees.
+    """
+
+    kind = "pose"
+    tool = ("x", "y", "z", "rx", "ry", "rz")
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return self.tool
+
+    def usual_noise(self, length: float) -> ArrayLike:
+        return [1e-4 * length] * 3 + [float(np.degrees(1e-4))] * 3
+
+    def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
+        from scipy.spatial.transform import Rotation
+
+        turn = tip.rotation @ np.matrix_transpose(tip.nominal())
+        vector = np.asarray(Rotation.from_matrix(turn).as_rotvec())
+        by_tip = np.zeros((len(vector), 6, 6))
+        by_tip[:, :3, :3] = np.eye(3)
+        by_tip[:, 3:, 3:] = np.degrees(rotation_vector_rate(vector))
+        values = np.hstack([tip.position, np.degrees(vector)])
+        return Reading(values, by_tip, np.zeros((len(vector), 6, 0)))
+
+
+def rotation_vector_rate(vector: Array) -> Array:
+    """(N, 3, 3) derivative of rotation vectors r (N, 3), radians, by a turn w.
+
+    ``exp(r + dr) = exp(w) exp(r)`` to first order, dr this matrix times w.
+    """
+    angle = np.linalg.norm(vector, axis=-1)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    factor = 1.0 / safe**2 - 1.0 / (2.0 * safe * np.tan(safe / 2.0))
+    factor = np.where(small, 1.0 / 12.0, factor)[:, None, None]
+    hat = hats(vector)
+    return np.eye(3) - 0.5 * hat + factor * (hat @ hat)

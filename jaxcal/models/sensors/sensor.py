@@ -1,0 +1,260 @@
+"""What every sensor answers: readings of the tip's pose, and their derivatives."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple, Protocol, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import numbers, whole_number
+
+__all__ = [
+    "BASE",
+    "Named",
+    "Placed",
+    "Reading",
+    "Sensor",
+    "Tip",
+    "across",
+    "hats",
+    "label",
+]
+
+Array = NDArray[np.float64]
+
+BASE = tuple(f"base {axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
+
+
+class Named(Protocol):
+    """An arm, by its parameters."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """p names."""
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """p units."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Tip:
+    """The tip of the arm at N postures, in the measuring frame."""
+
+    frame: Array  # (4, 3, N) its axes x, y, z and its origin
+    nominal: Callable[[], Array]  # () -> (N, 3, 3), the nominal arm's rotation there
+    length: float  # of the arm
+
+    @functools.cached_property
+    def position(self) -> Array:
+        """(N, 3)."""
+        return np.ascontiguousarray(self.frame[3].T)
+
+    @functools.cached_property
+    def rotation(self) -> Array:
+        """(N, 3, 3) from the tip to the measuring frame."""
+        return np.ascontiguousarray(self.frame[:3].transpose(2, 1, 0))
+
+
+class Reading(NamedTuple):
+    """What a sensor reads at N postures."""
+
+    values: Array  # (N, q)
+    by_tip: Array  # (N, q, 6) by a shift of the tip, and by its turn in radians
+    by_own: Array  # (N, q, s) by the sensor's own parameters
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sensor:
+    """A sensor of an arm; this one has no parameters and no column of its own.
+
+    A sensor of one's own is a frozen dataclass of this kind: ``read`` says what it
+    reads, the rest names what it has. Lengths are in the arm's unit.
+
+    Attributes:
+        noise: standard deviation of a reading: one number or (q,); the sensor's usual
+            one when not given.
+    """
+
+    noise: float | tuple[float, ...] | None = dataclasses.field(
+        default=None, kw_only=True
+    )
+
+    kind: ClassVar[str]  # in files and for the command line
+    tool: ClassVar[tuple[str, ...]] = ("x", "y", "z")  # what of the tool it sees
+    zeros: ClassVar[bool] = False  # what is measured is always zero
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Columns of the commands after the joints."""
+        return ()
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """q names of the readings."""
+        raise NotImplementedError
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """s names of its own parameters."""
+        return ()
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """s units: "length", "deg" and the like."""
+        return ()
+
+    @property
+    def nominal(self) -> Array:
+        """(s,) its own parameters as far as they are known."""
+        return np.zeros(len(self.names))
+
+    def prior_std(self, length: float) -> Array:
+        """(s,) of its own parameters, for an arm of this length; nothing is known."""
+        return np.full(len(self.names), np.inf)
+
+    def usual_noise(self, length: float) -> ArrayLike:
+        """() or (q,) standard deviation of a reading, for an arm of this length."""
+        raise NotImplementedError
+
+    def unseen(self, arm: Named) -> tuple[str, ...]:
+        """Parameters that no posture shows; held unless a prior says otherwise."""
+        return ()
+
+    def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
+        """Readings at N postures, with columns ``inputs`` (N, e) and parameters."""
+        raise NotImplementedError
+
+    def located(
+        self, tip: Tip, inputs: Array, measured: Array | None
+    ) -> tuple[Self, Array | None]:
+        """This sensor where nominal postures (and readings) say that it stands.
+
+        Returns:
+            It, and where its tool is seen from the nominal one (4, 4), if that is new.
+        """
+        return self, None
+
+    def facts(self, own: Array) -> tuple[Array, Array]:
+        """What is known of its own parameters besides: (F,) off, (F, s) derivative.
+
+        Both in standard deviations: a fact is a reading that needs no posture.
+        """
+        return np.zeros(0), np.zeros((0, len(own)))
+
+    def stds(self, length: float) -> Array:
+        """(q,) standard deviations of the readings."""
+        given = self.usual_noise(length) if self.noise is None else self.noise
+        std = numbers("noise of the sensor", given)
+        q = len(self.outputs)
+        if std.shape not in ((), (q,)) or not (std > 0.0).all():
+            raise ValueError(
+                f"noise of the sensor must be one positive number or ({q},), "
+                f"got {given!r}"
+            )
+        return np.broadcast_to(std, (q,)).copy()
+
+    def to_dict(self) -> dict[str, Any]:
+        """JSON with its kind."""
+        content: dict[str, Any] = {"kind": self.kind}
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            content[field.name] = (
+                value.tolist() if isinstance(value, np.ndarray) else value
+            )
+        return content
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> Self:
+        """The sensor that ``to_dict`` wrote."""
+        return cls(**{key: content[key] for key in content if key != "kind"})
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Placed(Sensor):
+    """A sensor with things that stand around the arm: sockets, planes, anchors.
+
+    Attributes:
+        count: how many there are. From two on the commands have one more column,
+            named as the sensor, which says of each row which one it is, from 0.
+        places: (count, width) where they stand, roughly; found from the first readings
+            when not given.
+    """
+
+    count: int = 1
+    places: Array | None = None
+
+    axes: ClassVar[tuple[str, ...]]  # w names of the parameters of one of them
+    axis_units: ClassVar[tuple[str, ...]]
+    width: ClassVar[int]  # numbers that say where one stands
+
+    def __post_init__(self) -> None:
+        whole_number("count", self.count, 1)
+        if self.places is not None:
+            places = numbers("places", self.places)
+            shape = (self.count, self.width)
+            if places.shape != shape:
+                raise ValueError(f"places must have shape {shape}, got {places.shape}")
+            object.__setattr__(self, "places", places)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return (self.kind,) if self.count > 1 else ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        numbered = [f"{self.kind}{i}" for i in range(self.count)]
+        each = numbered if self.count > 1 else [self.kind]
+        return tuple(f"{name} {axis}" for name in each for axis in self.axes)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return self.axis_units * self.count
+
+    @property
+    def nominal(self) -> Array:
+        return np.zeros(len(self.names)) if self.places is None else self.places.ravel()
+
+    def of_rows(self, inputs: Array) -> NDArray[np.int64]:
+        """(N,) which one each row is of."""
+        if self.count == 1:
+            return np.zeros(len(inputs), dtype=np.int64)
+        return label(self.kind, inputs[:, 0], self.count)
+
+    def spread(self, which: NDArray[np.int64], by_one: Array) -> Array:
+        """(N, q, s) derivative by all parameters, of (N, q, w) by those of a row's."""
+        count, q, w = by_one.shape
+        full = np.zeros((count, q, self.count, w))
+        full[np.arange(count), :, which] = by_one
+        return full.reshape(count, q, self.count * w)
+
+
+def hats(vectors: Array) -> Array:
+    """(..., 3, 3) with ``hats(v) @ w = v x w``."""
+    matrix = np.zeros((*vectors.shape[:-1], 3, 3))
+    matrix[..., [2, 0, 1], [1, 2, 0]] = vectors
+    return matrix - np.matrix_transpose(matrix)
+
+
+def across(normals: Array) -> tuple[Array, Array]:
+    """Two unit vectors (..., 3) across unit vectors and each other."""
+    least = np.eye(3)[np.abs(normals).argmin(axis=-1)]
+    first = np.cross(normals, least)
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    return first, np.cross(normals, first)
+
+
+def label(what: str, column: Array, count: int) -> NDArray[np.int64]:
+    """(N,) which of ``count`` things each row is of, checked."""
+    whole = column.astype(np.int64)
+    bad = np.flatnonzero((whole != column) | (whole < 0) | (whole >= count))
+    if bad.size:
+        raise ValueError(
+            f"column {what} of commands must be a whole number in [0, {count}), got "
+            f"{column[bad[0]]:g} in row {bad[0]}"
+        )
+    return whole

@@ -1,0 +1,276 @@
+"""Several sensors on one arm, in one fit."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import numbers, table
+from jaxcal.models.sensors.sensor import Named, Reading, Sensor, Tip, hats, label
+
+__all__ = ["Several"]
+
+Array = NDArray[np.float64]
+
+_MOUNTING = ("x", "y", "z", "rx", "ry", "rz")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Several(Sensor):
+    """Readings of some sensors, each in units of its own noise.
+
+    Commands have the column ``sensor``, which says of each row which one read it, and
+    then the columns of all of them (0 where they are another's); :meth:`rows` makes
+    such tables. The first is at the tool; where the others are on it are parameters of
+    their own, known as a tool is.
+
+    Attributes:
+        sensors: two or more.
+        mounts: (S - 1, 4, 4) where the others are, seen from the tool; there with it
+            when not given.
+    """
+
+    sensors: tuple[Sensor, ...] = ()
+    mounts: ArrayLike | None = None
+
+    kind = "several"
+
+    def __post_init__(self) -> None:
+        given = tuple(self.sensors)
+        if len(given) < 2 or not all(isinstance(one, Sensor) for one in given):
+            raise ValueError(f"sensors must hold two sensors or more, got {given!r}")
+        object.__setattr__(self, "sensors", given)
+        frames = np.tile(np.eye(4), (len(given) - 1, 1, 1))
+        if self.mounts is not None:
+            frames = numbers("mounts", self.mounts)
+        if frames.shape != (len(given) - 1, 4, 4):
+            raise ValueError(
+                f"mounts must have shape ({len(given) - 1}, 4, 4), got {frames.shape}"
+            )
+        object.__setattr__(self, "mounts", frames)
+
+    @property
+    def tool(self) -> tuple[str, ...]:  # type: ignore[override]  # the first one's
+        return self.sensors[0].tool
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        columns = [name for one in self.sensors for name in one.inputs]
+        return ("sensor", *dict.fromkeys(columns))
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        most = max(len(one.outputs) for one in self.sensors)
+        return tuple(f"reading {i + 1}" for i in range(most))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(name for name, _ in self._named())
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return tuple(unit for _, unit in self._named())
+
+    def _named(self) -> list[tuple[str, str]]:
+        """Own parameters and their units: mounting, then own, sensor after sensor."""
+        kinds = [one.kind for one in self.sensors]
+        found = []
+        for i, one in enumerate(self.sensors):
+            title = one.kind if kinds.count(one.kind) == 1 else f"{one.kind} {i}"
+            for axis in one.tool if i else ():
+                found.append(
+                    (f"{title} tool {axis}", "deg" if "r" in axis else "length")
+                )
+            for name, unit in zip(one.names, one.units, strict=True):
+                alone = title == one.kind
+                found.append((name if alone else f"{title}: {name}", unit))
+        return found
+
+    @property
+    def nominal(self) -> Array:
+        parts = [
+            np.concatenate([self._mounting(i), one.nominal])
+            for i, one in enumerate(self.sensors)
+        ]
+        return np.concatenate(parts)
+
+    def _mounting(self, i: int) -> Array:
+        """Nominal shifts, and turns of zero, of where sensor ``i`` is on the tool."""
+        if not i:
+            return np.zeros(0)
+        shift = np.asarray(self.mounts)[i - 1, :3, 3]
+        whole = dict(zip(_MOUNTING, [*shift, 0.0, 0.0, 0.0], strict=True))
+        return np.array([whole[axis] for axis in self.sensors[i].tool])
+
+    def prior_std(self, length: float) -> Array:
+        mounting = {"r": 1.7, "": 0.1 * length}  # as the tool's
+        parts = [
+            np.concatenate(
+                [
+                    [mounting[axis[:-1]] for axis in (one.tool if i else ())],
+                    one.prior_std(length),
+                ]
+            )
+            for i, one in enumerate(self.sensors)
+        ]
+        return np.concatenate(parts)
+
+    def usual_noise(self, length: float) -> ArrayLike:
+        return 1.0
+
+    def unseen(self, arm: Named) -> tuple[str, ...]:
+        """What none of them sees."""
+        hidden = [set(one.unseen(arm)) for one in self.sensors]
+        return tuple(name for name in arm.names if all(name in h for h in hidden))
+
+    def _parts(self, inputs: Array) -> list[tuple[NDArray[np.intp], Array]]:
+        """Of each sensor its rows, and its columns there."""
+        which = label("sensor", inputs[:, 0], len(self.sensors))
+        columns, parts = self.inputs, []
+        for i, one in enumerate(self.sensors):
+            rows = np.flatnonzero(which == i)
+            at = [columns.index(name) for name in one.inputs]
+            parts.append((rows, inputs[rows][:, at]))
+        return parts
+
+    def _tip(self, i: int, tip: Tip, rows: NDArray[np.intp], given: Array) -> Tip:
+        """The place of sensor ``i`` at its rows, its mounting as ``given``."""
+        frame, nominal = tip.frame[:, :, rows], lambda: tip.nominal()[rows]
+        if i:
+            shift, turn = self._mount(i, given)
+            turned = np.einsum("jcn,jk->kcn", frame[:3], turn[-1])
+            origin = frame[3] + np.einsum("jcn,j->cn", frame[:3], shift)
+            frame = np.concatenate([turned, origin[None]])
+        return Tip(frame, nominal, tip.length)
+
+    def _mount(self, i: int, given: Array) -> tuple[Array, list[Array]]:
+        """Shift (3,) and rotations after none, one, two turns, and after all (3, 3)."""
+        from scipy.spatial.transform import Rotation
+
+        whole = dict.fromkeys(_MOUNTING, 0.0)
+        whole |= dict(zip(self.sensors[i].tool, given, strict=True))
+        turns = [np.eye(3)]
+        for axis in "xyz":
+            one = Rotation.from_euler(axis, whole[f"r{axis}"], degrees=True)
+            turns.append(turns[-1] @ one.as_matrix())
+        turns.append(turns[-1] @ np.asarray(self.mounts)[i - 1, :3, :3])
+        return np.array([whole[axis] for axis in "xyz"]), turns
+
+    def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
+        count, q, first = len(inputs), len(self.outputs), 0
+        values = np.zeros((count, q))
+        by_tip, by_own = np.zeros((count, q, 6)), np.zeros((count, q, len(own)))
+        parts = self._parts(inputs)
+        for i, (one, (rows, columns)) in enumerate(
+            zip(self.sensors, parts, strict=True)
+        ):
+            size = len(one.tool) if i else 0
+            last = first + size + len(one.names)
+            mount, width = own[first : first + size], len(one.outputs)
+            found = one.read(
+                self._tip(i, tip, rows, mount), columns, own[first + size : last]
+            )
+            scale = one.stds(tip.length)[:, None]
+            values[rows, :width] = found.values / scale[:, 0]
+            seen = found.by_tip / scale
+            by_own[rows, :width, first + size : last] = found.by_own / scale
+            if i:
+                shift, turns = self._mount(i, mount)
+                rotation = tip.rotation[rows]
+                moves, turned = seen[..., :3] @ rotation, seen[..., 3:] @ rotation
+                slopes = {axis: moves[..., k] for k, axis in enumerate("xyz")}
+                for k, axis in enumerate("xyz"):
+                    slopes[f"r{axis}"] = np.radians(turned @ turns[k][:, k])
+                for k, axis in enumerate(one.tool):
+                    by_own[rows, :width, first + k] = slopes[axis]
+                seen = seen.copy()
+                seen[..., 3:] -= seen[..., :3] @ hats(rotation @ shift)
+            by_tip[rows, :width] = seen
+            first = last
+        return Reading(values, by_tip, by_own)
+
+    def located(
+        self, tip: Tip, inputs: Array, measured: Array | None
+    ) -> tuple[Self, Array | None]:
+        """Each of them, and where those that find it are on the tool."""
+        parts = self._parts(inputs)
+        sensors, mounts = [], np.array(self.mounts)
+        tool = None
+        for i, (one, (rows, columns)) in enumerate(
+            zip(self.sensors, parts, strict=True)
+        ):
+            read = None
+            if measured is not None:
+                read = measured[rows, : len(one.outputs)] * one.stds(tip.length)
+            placed, new = one, None
+            if len(rows):
+                at = self._tip(i, tip, rows, self._mounting(i))
+                placed, new = one.located(at, columns, read)
+            sensors.append(placed)
+            if new is not None and i:
+                mounts[i - 1] = mounts[i - 1] @ new
+            elif new is not None:  # the others stay where they are
+                tool, mounts = new, np.linalg.inv(new) @ mounts
+        return dataclasses.replace(self, sensors=tuple(sensors), mounts=mounts), tool
+
+    def facts(self, own: Array) -> tuple[Array, Array]:
+        first, offs, rows = 0, [], []
+        for i, one in enumerate(self.sensors):
+            first += len(one.tool) if i else 0
+            last = first + len(one.names)
+            off, slopes = one.facts(own[first:last])
+            offs.append(off)
+            rows.append(np.zeros((len(off), len(own))))
+            rows[-1][:, first:last] = slopes
+            first = last
+        return np.concatenate(offs), np.concatenate(rows)
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any]) -> Self:
+        from jaxcal.models.sensors import SENSORS  # which names this class
+
+        sensors = [SENSORS[one["kind"]].from_dict(one) for one in content["sensors"]]
+        return cls(tuple(sensors), content["mounts"])
+
+    def to_dict(self) -> dict[str, Any]:
+        content = super().to_dict()
+        return content | {"sensors": [one.to_dict() for one in self.sensors]}
+
+    def rows(
+        self, length: float, *tables: tuple[ArrayLike, ArrayLike | None]
+    ) -> tuple[Array, Array]:
+        """Commands and readings of all as one table; see ``SerialChain.together``."""
+        if len(tables) != len(self.sensors):
+            raise ValueError(
+                f"one pair (commands, measured) is needed for each of the "
+                f"{len(self.sensors)} sensors, got {len(tables)}"
+            )
+        columns, q = self.inputs, len(self.outputs)
+        all_commands, all_measured = [], []
+        for i, (one, (given, read)) in enumerate(
+            zip(self.sensors, tables, strict=True)
+        ):
+            commands = table(f"commands of {one.kind}", given)
+            joints = commands.shape[1] - len(one.inputs)
+            own = np.zeros((len(commands), len(columns)))
+            own[:, 0] = i
+            own[:, [columns.index(name) for name in one.inputs]] = commands[:, joints:]
+            measured = np.zeros((len(commands), q))
+            width = len(one.outputs)
+            if read is not None:
+                values = table("measured", read)
+                if values.shape != (len(commands), width):
+                    raise ValueError(
+                        f"measured of {one.kind} must have shape "
+                        f"({len(commands)}, {width}), got {values.shape}"
+                    )
+                measured[:, :width] = values / one.stds(length)
+            all_commands.append(np.hstack([commands[:, :joints], own]))
+            all_measured.append(measured)
+        if len({rows.shape[1] for rows in all_commands}) > 1:
+            raise ValueError("commands of all sensors must have the same joints")
+        return np.vstack(all_commands), np.vstack(all_measured)

@@ -1,0 +1,98 @@
+"""A ball at the tip, put by hand into sockets that stand still."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import numbers
+from jaxcal.models.sensors.sensor import BASE, Named, Placed, Reading, Tip, label
+
+__all__ = ["Socket"]
+
+Array = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Socket(Placed):
+    """Three zeros a contact: the ball's centre less that of its socket.
+
+    What is measured is zero. Contacts do not show where the arm stands, so ``base`` is
+    held; without a known distance they do not show its scale, which is the prior's.
+    ``places`` are the centres (S, 3); noise, the play of the ball, 0.02 % of the arm's
+    length.
+
+    Attributes:
+        distances: rows (first, second, distance, std) of two sockets and how far apart
+            their centres are.
+    """
+
+    distances: Sequence[Sequence[float]] = ()
+
+    kind = "socket"
+    zeros = True
+    axes = ("x", "y", "z")
+    axis_units = ("length",) * 3
+    width = 3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        rows = numbers("distances", self.distances or np.zeros((0, 4)))
+        if rows.ndim != 2 or rows.shape[1] != 4 or not (rows[:, 2:] > 0.0).all():
+            raise ValueError(
+                "distances must be rows (first socket, second, distance, std), the "
+                f"last two positive, got {self.distances!r}"
+            )
+        pairs = [label("of distances", column, self.count) for column in rows[:, :2].T]
+        if (pairs[0] == pairs[1]).any():
+            raise ValueError(f"distances must name two sockets, got {self.distances!r}")
+        object.__setattr__(self, "distances", tuple(map(tuple, rows.tolist())))
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        return ("off x", "off y", "off z")
+
+    def usual_noise(self, length: float) -> ArrayLike:
+        return 2e-4 * length
+
+    def unseen(self, arm: Named) -> tuple[str, ...]:
+        return BASE
+
+    def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
+        which = self.of_rows(inputs)
+        count = len(which)
+        by_tip = np.broadcast_to(np.eye(3, 6), (count, 3, 6))
+        by_one = np.broadcast_to(-np.eye(3), (count, 3, 3))
+        values = tip.position - own.reshape(-1, 3)[which]
+        return Reading(values, by_tip, self.spread(which, by_one))
+
+    def located(
+        self, tip: Tip, inputs: Array, measured: Array | None
+    ) -> tuple[Self, Array | None]:
+        """Sockets in the middle of the nominal contacts."""
+        if self.places is not None:
+            return self, None
+        which, points = self.of_rows(inputs), tip.position
+        middle = points.mean(axis=0)
+        places = [
+            points[which == i].mean(axis=0) if (which == i).any() else middle
+            for i in range(self.count)
+        ]
+        return dataclasses.replace(self, places=np.array(places)), None
+
+    def facts(self, own: Array) -> tuple[Array, Array]:
+        places = own.reshape(-1, 3)
+        off = np.zeros(len(self.distances))
+        rows = np.zeros((len(self.distances), self.count, 3))
+        for k, (first, second, distance, std) in enumerate(self.distances):
+            i, j = int(first), int(second)
+            apart = places[j] - places[i]
+            far = float(np.linalg.norm(apart))
+            off[k] = (distance - far) / std
+            rows[k, j] = apart / (far or 1.0) / std
+            rows[k, i] = -rows[k, j]
+        return off, rows.reshape(len(off), own.size)

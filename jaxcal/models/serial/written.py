@@ -1,0 +1,262 @@
+"""A calibrated arm as robots read it: the user's URDF file, a DH table, UR's YAML.
+
+A joint of the file moves by ``M(v) = C^-1 Rz(v) C`` with a constant C, so the
+constants between its joints follow from the table: ``K = C^-1 D C'``, D a row of it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+from xml.parsers import expat
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.models.serial.urdf import Joint, joints_of, led, moved, row_matrix, walk
+
+if TYPE_CHECKING:
+    from jaxcal.models.serial.arm import Arm
+
+__all__ = ["dh_text", "ur_text", "urdf_text"]
+
+Array = NDArray[np.float64]
+
+_UR = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+_SAME = 1e-13  # metres and radians: no correction
+
+
+class _Part(NamedTuple):
+    """A transform on the way that does not move."""
+
+    joint: Joint
+    down: bool
+    stands: Array  # (4, 4) of a joint that is held somewhere
+    drives: bool  # the origin of a joint that moves
+
+    @property
+    def matrix(self) -> Array:
+        whole = self.joint.origin @ self.stands
+        return np.asarray(whole if self.down else np.linalg.inv(whole))
+
+    def origin_for(self, wanted: Array) -> Array:
+        """The joint's origin that makes ``matrix`` be ``wanted``."""
+        whole = wanted if self.down else np.linalg.inv(wanted)
+        return np.asarray(whole @ np.linalg.inv(self.stands))
+
+
+def urdf_text(nominal: Arm, calibrated: Arm) -> tuple[str, str]:
+    """The file of ``nominal`` with the origins of ``calibrated``, and its tip link.
+
+    The tip is a new link where the file has no fixed joint that could hold the tool.
+
+    Raises:
+        ValueError: the arm is of no URDF file, or what was found cannot be in one.
+    """
+    source = nominal.source
+    if source is None:
+        raise ValueError("the arm must come from a URDF file: SerialChain.from_urdf")
+    text, tip = source["text"], source["tip"]
+    origins, extra = _origins(nominal, calibrated)
+    written = _with_origins(text, origins)
+    if extra is None:
+        return written, tip
+    name = f"{tip}_calibrated"
+    numbers = _pose(extra)
+    more = (
+        f'  <link name="{name}"/>\n  <joint name="{name}_joint" type="fixed">\n'
+        f'    <parent link="{tip}"/>\n    <child link="{name}"/>\n'
+        f'    <origin xyz="{numbers["xyz"]}" rpy="{numbers["rpy"]}"/>\n  </joint>\n'
+    )
+    at = written.rindex("</robot")
+    return written[:at] + more + written[at:], name
+
+
+def dh_text(calibrated: Arm) -> str:
+    """The table as CSV: joint, a, alpha, d, theta (with the offset), beta."""
+    lines = ["joint,a,alpha,d,theta,beta"]
+    numbers = [f"joint {i + 1}" for i in range(len(calibrated.table))]
+    names = calibrated.joint_names
+    for name, row in zip(
+        names if len(names) == len(numbers) else numbers, calibrated.table, strict=True
+    ):
+        lines.append(",".join([name, *(repr(float(value)) for value in row)]))
+    return "\n".join(lines) + "\n"
+
+
+def ur_text(nominal: Arm, calibrated: Arm) -> str:
+    """The kinematics file of Universal Robots' ROS description, in metres.
+
+    Raises:
+        ValueError: the arm is not of six revolute joints, or its table has lengths that
+            are no metres.
+    """
+    if nominal.joints != "RRRRRR" or nominal.convention != "standard":
+        raise ValueError(
+            "the arm must have six revolute joints and a standard table, got "
+            f"{nominal.joints} and {nominal.convention}"
+        )
+    if nominal.length > 20.0:
+        raise ValueError(
+            "the table must be in metres for this file, got links of "
+            f"{nominal.length:g} in all"
+        )
+    if nominal.source is not None:
+        found, _ = _origins(nominal, calibrated)
+        joints = joints_of(nominal.source["text"])
+        frames = [found.get(n, joints[n].origin) for n in nominal.joint_names]
+    else:
+        frames, before = [], np.eye(4)
+        for row in calibrated.table:
+            _, _, d, theta, _ = row
+            frames.append(before @ row_matrix(np.array([0.0, 0.0, d, theta, 0.0])))
+            before = row_matrix(row * [1.0, 1.0, 0.0, 0.0, 1.0])
+    lines = ["kinematics:"]
+    for name, frame in zip(_UR, frames, strict=True):
+        pose = _pose(frame)
+        values = [*pose["xyz"].split(), *pose["rpy"].split()]
+        lines.append(f"  {name}:")
+        for key, value in zip(
+            ("x", "y", "z", "roll", "pitch", "yaw"), values, strict=True
+        ):
+            lines.append(f"    {key}: {value}")
+    lines.append("  hash: calibrated_by_jaxcal")
+    return "\n".join(lines) + "\n"
+
+
+def _origins(nominal: Arm, calibrated: Arm) -> tuple[dict[str, Array], Array | None]:
+    """New origins by joint, and what no joint before the tip can hold, if anything."""
+    assert nominal.source is not None  # the caller has looked
+    gaps = _gaps(nominal.source)
+    rows = [row_matrix(row) for row in nominal.table]
+    new = [row_matrix(row) for row in calibrated.table]
+    turns = [np.linalg.inv(nominal.base) @ _product(gaps[0])]
+    for row, gap in zip(rows[:-1], gaps[1:-1], strict=True):
+        turns.append(np.linalg.inv(row) @ turns[-1] @ _product(gap))
+    wanted = [calibrated.base @ turns[0]]
+    for turn, row, after in zip(turns, new, turns[1:], strict=False):
+        wanted.append(np.linalg.inv(turn) @ row @ after)
+    wanted.append(np.linalg.inv(turns[-1]) @ new[-1] @ calibrated.tool)
+    found: dict[str, Array] = {}
+    extra = None
+    for i, (gap, matrix) in enumerate(zip(gaps, wanted, strict=True)):
+        if np.abs(matrix - _product(gap)).max() < _SAME:
+            continue
+        if not gap and i:
+            extra = matrix
+            continue
+        if not gap:
+            raise ValueError(
+                f"base {nominal.source['base']!r} moves with its joint and cannot hold "
+                "a correction: name the link before it as base"
+            )
+        driving = [k for k, part in enumerate(gap) if part.drives]
+        at = driving[-1] if driving else len(gap) - 1
+        before, after = _product(gap[:at]), _product(gap[at + 1 :])
+        held = np.linalg.inv(before) @ matrix @ np.linalg.inv(after)
+        found[gap[at].joint.name] = gap[at].origin_for(held)
+    return found, extra
+
+
+def _gaps(source: Mapping[str, Any]) -> list[list[_Part]]:
+    """What stands still before the first moving joint, between them, after the last."""
+    joints, locked = joints_of(source["text"]), source["locked"]
+    gaps: list[list[_Part]] = [[]]
+    for joint, down in walk(source["text"], source["base"], source["tip"], locked):
+        leader, _, plus = led(joint, joints, locked)
+        stands = np.eye(4) if leader else moved(joint, plus)
+        part = _Part(joint, down, stands, leader is not None)
+        if leader is None:
+            gaps[-1].append(part)
+        elif down:
+            gaps[-1].append(part)
+            gaps.append([])
+        else:
+            gaps.append([part])
+    return gaps
+
+
+def _product(gap: list[_Part]) -> Array:
+    matrix = np.eye(4)
+    for part in gap:
+        matrix = matrix @ part.matrix
+    return matrix
+
+
+def _pose(matrix: Array) -> dict[str, str]:
+    """xyz and rpy as URDF files have them; exact near the poles of the angles too."""
+    turn = matrix[:3, :3]
+    yaw = np.arctan2(turn[1, 0], turn[0, 0])
+    pitch = np.arctan2(-turn[2, 0], np.hypot(turn[0, 0], turn[1, 0]))
+    c, s = np.cos(yaw), np.sin(yaw)
+    across = np.array([-s, c, 0.0])  # the y axis before the roll
+    roll = np.arctan2(-(across @ turn[:, 2]), across @ turn[:, 1])
+    words = [
+        " ".join(repr(float(value)) for value in values)
+        for values in (matrix[:3, 3], (roll, pitch, yaw))
+    ]
+    return {"xyz": words[0], "rpy": words[1]}
+
+
+def _with_origins(text: str, origins: Mapping[str, Array]) -> str:
+    """``text`` with other origins of some joints, every other character kept."""
+    data = text.encode("utf-8")
+    places = _places(data)
+    edits = []
+    for name, matrix in origins.items():
+        pose = _pose(matrix)
+        joint, origin = places[name]
+        if origin is None:
+            new = f'\n    <origin xyz="{pose["xyz"]}" rpy="{pose["rpy"]}"/>'
+            end = _end_of_tag(data, joint)
+            edits.append((end, end, new))
+            continue
+        end = _end_of_tag(data, origin)
+        tag = data[origin:end].decode("utf-8")
+        for key, words in pose.items():
+            there = re.compile(rf"""(\s{key}\s*=\s*)(["'])[^"']*\2""")
+            if there.search(tag):
+                tag = there.sub(rf'\g<1>"{words}"', tag)
+            else:
+                tag = tag.replace("<origin", f'<origin {key}="{words}"', 1)
+        edits.append((origin, end, tag))
+    for start, end, new in sorted(edits, reverse=True):
+        data = data[:start] + new.encode("utf-8") + data[end:]
+    return data.decode("utf-8")
+
+
+def _places(data: bytes) -> dict[str, tuple[int, int | None]]:
+    """Of each joint where its tag begins, and where that of its origin, in bytes."""
+    parser = expat.ParserCreate("utf-8")
+    path: list[str] = []
+    found: dict[str, tuple[int, int | None]] = {}
+    name = ""
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal name
+        path.append(tag)
+        if path == ["robot", "joint"]:
+            name = attributes["name"]
+            found[name] = (parser.CurrentByteIndex, None)
+        elif path == ["robot", "joint", "origin"]:
+            found[name] = (found[name][0], parser.CurrentByteIndex)
+
+    parser.StartElementHandler = start
+    parser.EndElementHandler = lambda tag: path.pop()
+    parser.Parse(data, True)
+    return found
+
+
+def _end_of_tag(data: bytes, start: int) -> int:
+    """One after the > of the tag that begins at ``start``."""
+    quote = None
+    for i in range(start, len(data)):
+        letter = data[i : i + 1]
+        if quote is not None:
+            quote = None if letter == quote else quote
+        elif letter in (b'"', b"'"):
+            quote = letter
+        elif letter == b">":
+            return i + 1
+    raise ValueError("a tag does not end")

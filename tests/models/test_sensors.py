@@ -1,0 +1,338 @@
+"""Sensors against what they mean, written out a posture at a time, and differences."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxcal.models import (
+    Board,
+    Distance,
+    Gravity,
+    Plane,
+    Pose,
+    Position,
+    Sensor,
+    SerialChain,
+    Several,
+    Socket,
+    from_dict,
+    identifiability,
+)
+from jaxcal.models.sensors import SENSORS, Reading
+
+from .arms import differences, ur5
+from .test_serial_chain import _matrix, tool_frame
+
+RNG = np.random.default_rng(0)
+JOINTS = RNG.uniform(-120.0, 120.0, (6, 6))
+WHICH = np.array([0.0, 1.0, 0.0, 1.0, 1.0, 0.0])[:, None]
+SEEN = np.hstack([RNG.normal(size=(6, 3)) * 300.0, RNG.normal(size=(6, 3)) * 60.0])
+PLACE = _matrix(Rotation.random(rng=RNG), RNG.normal(size=3) * 500.0)
+SOCKETS = np.array([[400.0, 100.0, 0.0], [400.0, 150.0, 0.0]])
+PLANES = np.array([[0.0, 0.0, 1.0, 20.0], [1.0, 2.0, 2.0, 300.0]])
+ANCHORS = np.array([[900.0, 0.0, 0.0, 5.0], [0.0, 900.0, 100.0, 0.0]])
+MOUNT = _matrix(Rotation.random(rng=RNG), [30.0, -20.0, 50.0])
+
+
+def _board(moves, tip, row, own):
+    stand = _matrix(None, own[:3])
+    for axis, angle in zip("xyz", own[3:], strict=True):
+        stand = stand @ _matrix(Rotation.from_euler(axis, angle, degrees=True))
+    stand = stand @ _matrix(Rotation.from_matrix(PLACE[:3, :3]))
+    first, second = (tip, stand) if moves == "camera" else (stand, tip)
+    board = np.linalg.inv(first) @ second
+    seen = Rotation.from_rotvec(row[3:], degrees=True).as_matrix()
+    turn = Rotation.from_matrix(board[:3, :3] @ seen.T).as_rotvec(degrees=True)
+    return [*(board[:3, 3] - row[:3]), *turn]
+
+
+def _plane(tip, row, own):
+    normal = PLANES[int(row[0]), :3] / np.linalg.norm(PLANES[int(row[0]), :3])
+    tilt1, tilt2, offset = own.reshape(2, 3)[int(row[0])]
+    least = np.eye(3)[np.abs(normal).argmin()]
+    first = np.cross(normal, least) / np.linalg.norm(np.cross(normal, least))
+    second = np.cross(normal, first)
+    leaning = normal + np.radians(tilt1) * first + np.radians(tilt2) * second
+    return [leaning / np.linalg.norm(leaning) @ tip[:3, 3] - offset]
+
+
+def _distance(tip, row, own):
+    x, y, z, zero = own.reshape(2, 4)[int(row[0])]
+    return [np.linalg.norm(tip[:3, 3] - [x, y, z]) - zero]
+
+
+# Sensor, columns of the commands after the joints, readings (tip, columns, own).
+CASES = {
+    "position": (Position(), np.zeros((6, 0)), lambda tip, row, own: tip[:3, 3]),
+    "socket": (
+        Socket(2, SOCKETS),
+        WHICH,
+        lambda tip, row, own: tip[:3, 3] - own.reshape(2, 3)[int(row[0])],
+    ),
+    "plane": (Plane(2, PLANES), WHICH, _plane),
+    "distance": (Distance(2, ANCHORS), WHICH, _distance),
+    "gravity": (
+        Gravity(up=(0.1, 0.0, 1.0)),
+        np.zeros((6, 0)),
+        lambda tip, row, own: (
+            own[0] * 9.81 * tip[:3, :3].T @ [0.1, 0.0, 1.0] / np.sqrt(1.01) + own[1:]
+        ),
+    ),
+    "camera on the tip": (
+        Board("camera", PLACE),
+        SEEN,
+        lambda tip, row, own: _board("camera", tip, row, own),
+    ),
+    "board on the tip": (
+        Board("board", PLACE),
+        SEEN,
+        lambda tip, row, own: _board("board", tip, row, own),
+    ),
+}
+
+
+def _case(name):
+    sensor, columns, readings = CASES[name]
+    model = ur5(sensor=sensor)
+    parameters = model.nominal + np.random.default_rng(1).normal(size=len(model.names))
+    return model, np.hstack([JOINTS, columns]), parameters, readings
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_readings_are_what_the_sensor_means(name):
+    model, commands, parameters, readings = _case(name)
+    values = dict.fromkeys(
+        [f"tool {a}" for a in ("x", "y", "z", "rx", "ry", "rz")], 0.0
+    )
+    values["tool z"] = 31.0
+    values |= dict(zip(model.names, parameters, strict=True))
+    posed = ur5(sensor=Pose())  # so that all turns of the tool are there
+    own = parameters[len(parameters) - len(model.sensor.names) :]
+    expected = [
+        readings(tool_frame(posed, command, values), command[6:], own)
+        for command in commands
+    ]
+    np.testing.assert_allclose(
+        model.predict(commands, parameters), expected, atol=1e-9, rtol=1e-12
+    )
+
+
+@pytest.mark.parametrize("name", [*CASES, "several"])
+def test_derivatives_are_those_of_central_differences(name):
+    if name == "several":
+        model, commands, parameters = _several()
+    else:
+        model, commands, parameters, _ = _case(name)
+    numeric = differences(lambda at: model.predict(commands, at), parameters)
+    size = np.abs(numeric).max(axis=(0, 1)) + 1e-9
+    slopes = model.jacobian(commands, parameters)
+    np.testing.assert_allclose(slopes / size, numeric / size, atol=1e-6)
+    assert model.jacobian(commands).shape == (*numeric.shape[:2], len(model.names))
+    by_command = np.stack(
+        [
+            (
+                model.predict(commands + step, parameters)
+                - model.predict(commands - step, parameters)
+            )
+            / 2e-4
+            for step in np.eye(model.num_inputs)[:6] * 1e-4
+        ],
+        axis=-1,
+    )
+    found = model.command_jacobian(commands, parameters)[..., :6]
+    np.testing.assert_allclose(found, by_command, atol=1e-5 * np.abs(by_command).max())
+
+
+def _several():
+    sensors = (Position(), Socket(2, SOCKETS), Gravity(), Board("camera", PLACE))
+    mounts = [MOUNT, np.linalg.inv(MOUNT), MOUNT @ MOUNT]
+    model = ur5(sensor=Several(sensors, mounts))
+    tables = [(JOINTS, JOINTS[:, :3]), (np.hstack([JOINTS, WHICH]), None)]
+    tables += [(JOINTS, JOINTS[:, :3]), (np.hstack([JOINTS, SEEN]), None)]
+    commands, _ = model.together(*tables)
+    parameters = model.nominal + np.random.default_rng(1).normal(size=len(model.names))
+    return model, commands, parameters
+
+
+def test_several_sensors_read_what_each_reads_where_it_is_mounted():
+    model, commands, parameters = _several()
+    values = dict(zip(model.names, parameters, strict=True))
+    length, inputs = model.length, (*model.joint_names, *model.sensor.inputs)
+    found = model.predict(commands, parameters)
+    for i, one in enumerate(model.sensor.sensors):
+        rows = commands[:, 6] == i
+        tool = _matrix(None, [values[f"tool {axis}"] for axis in "xyz"])
+        if i:
+            shift = np.array(model.sensor.mounts)[i - 1][:3, 3]
+            given = dict(zip(["x", "y", "z"], shift, strict=True))
+            title = f"{one.kind} tool "
+            given |= {n[len(title) :]: values[n] for n in values if n.startswith(title)}
+            tool = tool @ _matrix(None, [given[axis] for axis in "xyz"])
+            for axis in "xyz":
+                turn = Rotation.from_euler(
+                    axis, given.get(f"r{axis}", 0.0), degrees=True
+                )
+                tool = tool @ _matrix(turn)
+            turn = Rotation.from_matrix(np.array(model.sensor.mounts)[i - 1][:3, :3])
+            tool = tool @ _matrix(turn)
+        alone = SerialChain.from_dh(model.table[:, :4], tool=tool, sensor=one)
+        theta = alone.nominal.copy()
+        for k, name in enumerate(alone.names):
+            if not name.startswith("tool"):
+                theta[k] = values[name]
+        columns = [inputs.index(name) for name in (*alone.joint_names, *one.inputs)]
+        expected = alone.predict(commands[np.ix_(rows, columns)], theta)
+        width = len(one.outputs)
+        np.testing.assert_allclose(
+            found[rows, :width], expected / one.stds(length), atol=1e-7, rtol=1e-9
+        )
+        assert (found[rows, width:] == 0.0).all()
+
+
+@pytest.mark.parametrize("name", [*CASES, "several"])
+def test_a_sensor_comes_back_from_json(name):
+    model, commands, parameters = (_several() if name == "several" else _case(name))[:3]
+    again = from_dict(model.to_dict())
+    assert again.to_dict() == model.to_dict() and again.units == model.units
+    np.testing.assert_array_equal(
+        again.predict(commands, parameters), model.predict(commands, parameters)
+    )
+    assert set(SENSORS) >= {"position", "pose", "socket", "plane", "distance"}
+
+
+@pytest.mark.parametrize("moves", ["camera", "board"])
+def test_hand_and_eye_are_found_without_a_guess(moves):
+    """A tool turned by 180 degrees and a place anywhere, from poses without noise."""
+    turned = _matrix(Rotation.from_euler("x", 180.0, degrees=True), [20.0, -30.0, 40.0])
+    tool = _matrix(Rotation.from_euler("z", 100.0, degrees=True)) @ turned
+    true = SerialChain.from_dh(ur5().table[:, :4], tool=tool, sensor=Pose())
+    frames = [
+        tool_frame(true, q, dict(zip(true.names, true.nominal, strict=True)))
+        for q in JOINTS
+    ]
+    seen = []
+    for tip in frames:
+        first, second = (tip, PLACE) if moves == "camera" else (PLACE, tip)
+        board = np.linalg.inv(first) @ second
+        turn = Rotation.from_matrix(board[:3, :3]).as_rotvec(degrees=True)
+        seen.append([*board[:3, 3], *turn])
+    model = ur5(sensor=Board(moves))
+    commands = np.hstack([JOINTS, seen])
+    found = model.located(commands)
+    np.testing.assert_allclose(found.tool, tool, atol=1e-8)
+    np.testing.assert_allclose(found.sensor.place, PLACE, atol=1e-8)
+    np.testing.assert_allclose(found.predict(commands), 0.0, atol=1e-8)
+    with pytest.raises(ValueError, match="about two axes at least"):
+        still = np.repeat(commands[:1], 5, axis=0)
+        model.located(still)
+
+
+def test_sockets_planes_and_anchors_are_found_from_nominal_postures():
+    commands = np.hstack([JOINTS, WHICH])
+    points = ur5().predict(JOINTS)
+    model = ur5(sensor=Socket(2)).located(commands)
+    middle = [points[WHICH[:, 0] == i].mean(axis=0) for i in range(2)]
+    np.testing.assert_allclose(model.sensor.places, middle)
+    assert model.located(commands[:1]).sensor.places is model.sensor.places
+    many = np.random.default_rng(2).uniform(-120.0, 120.0, (20, 6))
+    wire = ur5(sensor=Distance(1))
+    far = np.linalg.norm(ur5().predict(many) - ANCHORS[0, :3], axis=1, keepdims=True)
+    found = wire.located(many, far).sensor.places
+    np.testing.assert_allclose(found, [[*ANCHORS[0, :3], 0.0]], atol=1e-8)
+    with pytest.raises(ValueError, match="anchor 0 has 3 lengths, and four are needed"):
+        wire.located(many[:3], far[:3])
+    plane = ur5(sensor=Plane()).located(many)
+    offs = plane.predict(many)
+    rng = np.random.default_rng(3)
+    for _ in range(50):  # no other plane is nearer
+        normal = rng.normal(size=3)
+        heights = ur5().predict(many) @ normal / np.linalg.norm(normal)
+        assert offs.std() <= heights.std() and abs(offs.mean()) < 1e-9
+
+
+def test_distances_between_sockets_are_facts():
+    model = ur5(sensor=Socket(2, SOCKETS, distances=[(0, 1, 49.0, 0.1)]))
+    off, rows = model.facts()
+    np.testing.assert_allclose(off, [-10.0])
+    numeric = differences(lambda at: -model.facts(at)[0], model.nominal)
+    np.testing.assert_allclose(rows, numeric, atol=1e-6)
+    both = ur5(sensor=Several((Position(), model.sensor)))
+    off, rows = both.facts()
+    assert off[0] == pytest.approx(-10.0)
+    assert [n for n, r in zip(both.names, rows[0], strict=True) if r] == [
+        "socket0 y",
+        "socket1 y",
+    ]
+    assert ur5().facts()[1].shape == (0, 39)
+
+
+def test_what_a_sensor_cannot_see_is_held_and_named():
+    base = [f"base {axis}" for axis in ("x", "y", "z", "rx", "ry", "rz")]
+    for sensor in (Socket(), Plane(), Distance(), Board()):
+        assert list(ur5(sensor=sensor).default_prior().fixed) == base
+    held = ur5(sensor=Gravity()).default_prior().fixed
+    assert {"a2", "d1", "base x", "base rz"} <= set(held) and "theta2" not in held
+    both = ur5(sensor=Several((Socket(), Gravity())))
+    assert both.default_prior().fixed == ("base x", "base y", "base z", "base rz")
+    assert not ur5(sensor=Several((Position(), Socket()))).default_prior().fixed
+    many = np.random.default_rng(2).uniform(-120.0, 120.0, (60, 6))
+    report = identifiability(ur5(sensor=Socket()), many)
+    assert report.held == tuple(base)
+    assert (
+        str(report).splitlines()[-1] == f"Held, as it is not shown: {', '.join(base)}"
+    )
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Height(Sensor):
+    """A stranger's: the height of the tip above the measuring frame."""
+
+    kind = "height"
+
+    @property
+    def outputs(self):
+        return ("height",)
+
+    def usual_noise(self, length):
+        return 1e-4 * length
+
+    def read(self, tip, inputs, own):
+        by_tip = np.zeros((len(tip.position), 1, 6))
+        by_tip[:, 0, 2] = 1.0
+        return Reading(tip.position[:, 2:], by_tip, np.zeros((len(by_tip), 1, 0)))
+
+
+def test_a_sensor_of_ones_own_needs_no_more_than_a_class():
+    model = ur5(sensor=Height())
+    np.testing.assert_array_equal(model.predict(JOINTS), ur5().predict(JOINTS)[:, 2:])
+    np.testing.assert_array_equal(model.jacobian(JOINTS), ur5().jacobian(JOINTS)[:, 2:])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Socket(0), "count must be at least 1"),
+        (lambda: Socket(2, np.zeros((3, 3))), r"places must have shape \(2, 3\)"),
+        (lambda: Socket(2, distances=[(0, 1, 50.0)]), "distances must be rows"),
+        (lambda: Socket(2, distances=[(0, 2, 50.0, 0.1)]), r"in \[0, 2\), got 2"),
+        (lambda: Socket(2, distances=[(1, 1, 50.0, 0.1)]), "must name two sockets"),
+        (lambda: Plane(1, [[0, 0, 0, 1]]), "must have normals other than zero"),
+        (lambda: Gravity(up=(0, 0, 0)), "up must be a direction"),
+        (lambda: Gravity(0.0), "magnitude must be positive"),
+        (lambda: Board("hand"), "moves must be one of camera, board"),
+        (lambda: Several((Position(),)), "sensors must hold two sensors or more"),
+        (lambda: ur5(sensor=Socket(noise=-1.0)).default_noise(), "noise of the sensor"),
+        (
+            lambda: ur5(sensor=Socket(2)).predict(np.full((1, 7), 2.0)),
+            r"column socket of commands must be a whole number in \[0, 2\), got 2 in",
+        ),
+        (lambda: ur5().together((JOINTS, None)), "needs an arm with sensor=Several"),
+    ],
+)
+def test_what_cannot_be_a_sensor_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()

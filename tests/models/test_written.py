@@ -1,0 +1,199 @@
+"""Calibrated arms written back: read again they go where the calibration says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from jaxcal.models import Pose, Position, SerialChain, Socket
+
+from .arms import UR5_TABLE, ur5
+from .test_serial_chain import _matrix
+from .test_urdf import TREE, _transform, _urdf
+
+ARM = """<?xml version="1.0" encoding="utf-8"?>
+<!-- a comment before: µ -->
+<robot name="arm">
+  <link name="base">
+    <visual><geometry><mesh filename="a.stl"/></geometry></visual>
+  </link>
+  <link name="upper"/> <link name="fore"/> <link name="hand"/> <link name="ball"/>
+  <joint name="shoulder" type="revolute">
+    <!-- <origin xyz="9 9 9"/> is a comment -->
+    <origin  rpy='1.5707963267948966 0 0'   xyz="0 0 0.3" other="kept"/>
+    <parent link="base"/><child link="upper"/><axis xyz="0 0 1"/>
+  </joint>
+  <joint name="elbow" type="revolute">
+    <parent link="upper"/><child link="fore"/><axis xyz="0 1 0"/>
+    <origin xyz="0.4 0 0" rpy="0 1.5707963267948966 0"></origin>
+  </joint>
+  <joint name="wrist" type="continuous">
+    <parent link="fore"/><child link="hand"/><axis xyz="1 1 0"/>
+  </joint>
+  <joint name="ball_joint" type="fixed">
+    <parent link="hand"/><child link="ball"/><origin xyz="0 0 0.1"/>
+  </joint>
+</robot>
+"""
+
+
+def _round_trip(tmp_path, text, size=1.0, **ends):
+    """The model, parameters that are off, the text written, and the model of that."""
+    path, out = tmp_path / "arm.urdf", tmp_path / "calibrated.urdf"
+    path.write_text(text, encoding="utf-8")
+    model = SerialChain.from_urdf(path, sensor=Pose(), **ends)
+    rng = np.random.default_rng(0)
+    off = np.where(np.array(model.units) == "length", 0.01, 1.0) * size
+    parameters = model.nominal + off * rng.normal(size=model.num_parameters)
+    tip = model.to_urdf(out, parameters)
+    again = SerialChain.from_urdf(out, sensor=Pose(), **{**ends, "tip": tip})
+    return model, parameters, out.read_text(encoding="utf-8"), again
+
+
+@pytest.mark.parametrize(
+    ("text", "ends"),
+    [
+        (ARM, {}),
+        (ARM, {"tip": "hand"}),
+        (ARM, {"base": "ball", "tip": "base"}),
+        (ARM, {"locked": {"elbow": 30.0}}),
+        (TREE, {"base": "camera", "tip": "finger"}),
+        (TREE, {"base": "camera", "tip": "palm"}),
+        (TREE, {"tip": "finger", "locked": {"slide": 0.03}}),
+    ],
+)
+def test_the_file_written_goes_where_the_prediction_is(tmp_path, text, ends):
+    model, parameters, _, again = _round_trip(tmp_path, text, **ends)
+    commands = np.random.default_rng(1).uniform(-90.0, 90.0, (20, model.num_inputs))
+    commands[:, [name == "slide" for name in model.joint_names]] /= 1000.0
+    turns = model.predict(commands, parameters)
+    found = again.predict(commands)
+    np.testing.assert_allclose(found[:, :3], turns[:, :3], atol=1e-9)
+    frames = model.rotations(commands, turns[:, 3:])
+    vectors = again.rotation_vectors(commands, frames)
+    np.testing.assert_allclose(vectors, 0.0, atol=1e-7)
+    assert again.joint_names == model.joint_names
+
+
+def test_all_but_the_origins_is_kept(tmp_path):
+    model, _parameters, text, _ = _round_trip(tmp_path, ARM)
+    before, after = ARM.splitlines(), text.splitlines()
+    changed = [line for line in before if line not in after]
+    assert len(changed) == 3 and all("<origin" in line for line in changed)
+    assert "<!-- a comment before: µ -->" in text and 'other="kept"' in text
+    assert '<mesh filename="a.stl"/>' in text
+    assert text.count("<origin") == ARM.count("<origin") + 1  # the wrist had none
+    unchanged = tmp_path / "same.urdf"
+    model.to_urdf(unchanged, model.nominal)
+    assert unchanged.read_text(encoding="utf-8") == ARM
+
+
+def test_nothing_is_written_over_a_file_without_force(tmp_path):
+    model, _parameters, text, _ = _round_trip(tmp_path, ARM)
+    out = tmp_path / "calibrated.urdf"
+    with pytest.raises(FileExistsError, match="is there already; force=True"):
+        model.to_urdf(out, model.nominal)
+    assert out.read_text(encoding="utf-8") == text
+    model.to_urdf(out, model.nominal, force=True)
+    assert out.read_text(encoding="utf-8") == ARM
+
+
+def test_what_no_file_can_hold_is_refused(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(ARM, encoding="utf-8")
+    model = SerialChain.from_urdf(path, gears=[2])
+    parameters = model.nominal.copy()
+    parameters[model.names.index("gear2")] = 1.01
+    with pytest.raises(ValueError, match=r"gear2 is 1\.01, which a URDF file cannot"):
+        model.to_urdf(tmp_path / "out.urdf", parameters)
+    model = SerialChain.from_urdf(path, compliance=[2])
+    parameters = model.nominal.copy()
+    parameters[model.names.index("compliance2")] = 0.1
+    with pytest.raises(ValueError, match="compliance was found of joints 2"):
+        model.to_urdf(tmp_path / "out.urdf", parameters)
+    with pytest.raises(ValueError, match="must come from a URDF file"):
+        ur5().to_urdf(tmp_path / "out.urdf", ur5().nominal)
+    model = SerialChain.from_urdf(path, base="hand", tip="upper")
+    with pytest.raises(ValueError, match="base 'hand' moves with its joint"):
+        model.to_urdf(tmp_path / "out.urdf", model.nominal + 0.01)
+    assert not (tmp_path / "out.urdf").exists()
+
+
+def test_a_calibrated_arm_is_nominal_where_it_was_found(tmp_path):
+    model = ur5(sensor=Socket(), gears=[2])
+    parameters = model.nominal + 0.1 * np.random.default_rng(0).normal(size=43)
+    commands = np.random.default_rng(1).uniform(-90.0, 90.0, (20, 6))
+    points = model.measured_with(Position()).predict(commands, parameters[:-3])
+    found = model.calibrated(parameters)
+    np.testing.assert_allclose(found.predict(commands), points, atol=1e-9)
+
+
+def _ur_frames(text):
+    """Transforms of the six joints in UR's file, by their names."""
+    frames, name = {}, ""
+    for line in text.splitlines()[1:-1]:
+        key, value = line.strip().split(":")
+        if value:
+            frames[name][key] = float(value)
+        else:
+            name = key
+            frames[name] = {}
+    assert list(frames) == "shoulder upper_arm forearm wrist_1 wrist_2 wrist_3".split()
+    return [
+        _transform([f["x"], f["y"], f["z"]], [f["roll"], f["pitch"], f["yaw"]])
+        for f in frames.values()
+    ]
+
+
+def _along(frames, command):
+    frame = np.eye(4)
+    for step, angle in zip(frames, command, strict=True):
+        turn = Rotation.from_euler("z", angle, degrees=True)
+        frame = frame @ step @ _matrix(turn)
+    return frame
+
+
+def test_the_kinematics_file_of_universal_robots(tmp_path):
+    metres = np.array(UR5_TABLE) / [1000.0, 1.0, 1000.0, 1.0]
+    arm = SerialChain.from_dh(metres, sensor=Pose())
+    rng = np.random.default_rng(0)
+    off = np.where(np.array(arm.units) == "length", 0.001, 0.3)
+    parameters = arm.nominal + off * rng.normal(size=arm.num_parameters)
+    parameters[30:] = 0.0  # base and tool are not in the file
+    path = tmp_path / "kinematics.yaml"
+    arm.to_ur_kinematics(path, parameters)
+    last = parameters[25:30].copy()
+    wrist = _matrix(Rotation.from_euler("x", last[1], degrees=True), [last[0], 0, 0])
+    wrist = wrist @ _matrix(Rotation.from_euler("y", last[4], degrees=True))
+    for command in rng.uniform(-180.0, 180.0, (5, 6)):
+        frame = _along(_ur_frames(path.read_text()), command) @ wrist
+        expected = arm.predict(command[None], parameters)[0]
+        np.testing.assert_allclose(frame[:3, 3], expected[:3], atol=1e-9)
+    # The nominal file is that of the ROS description.
+    arm.to_ur_kinematics(path, arm.nominal, force=True)
+    frames = _ur_frames(path.read_text())
+    np.testing.assert_allclose(frames[2][:3, 3], [-0.425, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(frames[4][:3, 3], [0.0, -0.09456, 0.0], atol=2e-4)
+    with pytest.raises(ValueError, match="must be in metres"):
+        ur5().to_ur_kinematics(path, ur5().nominal)
+
+
+def test_the_table_as_csv(tmp_path):
+    path = tmp_path / "dh.csv"
+    parameters = ur5().nominal + 0.1
+    ur5().to_dh(path, parameters)
+    rows = np.genfromtxt(path, delimiter=",", names=True)
+    np.testing.assert_array_equal(rows["theta"], parameters[3:30:5])
+    np.testing.assert_array_equal(rows["beta"], 0.1)
+    assert path.read_text().splitlines()[1].startswith("joint 1,")
+
+
+def test_a_file_of_one_joint(tmp_path):
+    text = _urdf([("revolute", (0, 0, 1), (0, 0, 0), (0, 0, 1))])
+    model, parameters, written, again = _round_trip(tmp_path, text)
+    assert '<link name="link1_calibrated"/>' in written
+    commands = [[10.0], [50.0]]
+    np.testing.assert_allclose(
+        again.predict(commands)[:, :3], model.predict(commands, parameters)[:, :3]
+    )
