@@ -23,7 +23,7 @@ from rig.core.attitude import Array
 from rig.core.faults import MotionFault, Refused
 from rig.workbench.commission.axes import ROOM_DEG, SEEN_DEG
 from rig.workbench.commission.bench import ALLOWED_DEG, Bench
-from rig.workbench.commission.stands import Stand, turn
+from rig.workbench.commission.findings import Stand, turn
 
 LEVEL = 0.95
 ENOUGH_DEG = 0.02  # width of an interval
