@@ -35,7 +35,7 @@ evaluate: $(READY) ## compare every method with the proven optimum on 1,000 unse
 	$(BIN)/python evaluate.py $(ARGS)
 
 reproduce: $(READY) ## the paper's figures, tables and claims from our own runs, in report/index.html
-	$(BIN)/python -m jaxcal.paper $(ARGS)
+	$(BIN)/python -m studies.paper $(ARGS)
 
 # Most of a first run is XLA compiling: without its optimiser that takes a third of the
 # time. `make test-all` compiles as users do.

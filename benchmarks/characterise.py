@@ -97,7 +97,7 @@ def fixed(number: int, weights: Any, gains: Any, keys: Any) -> Any:
 
 def planned(task: GridTask, seed: int) -> Chooser:
     """A sequence whose entries were exchanged."""
-    length = min(task.most, 24)  # nearly all sessions are over by then
+    length = min(task.horizon, 24)  # nearly all sessions are over by then
     plan = optimise(task, length=length, episodes=256, sweeps=1, seed=seed).sequence
     return lambda number, weights, gains, keys: jnp.full(
         len(gains), plan[number % length]
@@ -111,16 +111,16 @@ def sessions(
     key_truth, key = jax.random.split(jax.random.key(seed))
     truth = jax.vmap(task.draw)(jax.random.split(key_truth, count))
     weights = jnp.tile(task.prior, (count, 1))
-    needed, over = np.full(count, task.most + 1), np.zeros(count)
+    needed, over = np.full(count, task.horizon + 1), np.zeros(count)
     unknown = np.asarray(task.theta)[np.asarray(truth), 0]
-    for number in range(task.most):
+    for number in range(task.horizon):
         key, key_choice, key_outcome = jax.random.split(key, 3)
         designs = choose(
             number, weights, weighed(task, weights), jax.random.split(key_choice, count)
         )
         keys = jax.random.split(key_outcome, count)
         weights = measured(task, truth, weights, designs, keys)
-        left = needed > task.most
+        left = needed > task.horizon
         step = np.asarray(task.designs)[np.asarray(designs), 0]
         over = np.where(left, np.maximum(over, step - unknown), over)
         table = np.asarray(weights)
@@ -128,7 +128,7 @@ def sessions(
             found = estimates(task, GridBelief(table[i]))[task.theta_names[0]]
             if found.width <= ENOUGH_DEG:
                 needed[i] = number + 1
-        if (needed <= task.most).all():
+        if (needed <= task.horizon).all():
             break
     return needed, over
 
@@ -159,12 +159,12 @@ def main() -> int:
             found = [sessions(task, by, given.sessions, given.seed) for by in tried]
             needed, over = min(found, key=lambda pair: pair[0].mean())
             median, ninety = np.quantile(needed, [0.5, 0.9], method="higher")
-            shown = [f"{n}" if n <= task.most else f"over {task.most}"
+            shown = [f"{n}" if n <= task.horizon else f"over {task.horizon}"
                      for n in (median, ninety)]  # fmt: skip
             mean = (
                 f"{needed.mean():.1f} +- {needed.std(ddof=1) / len(needed) ** 0.5:.1f}"
             )
-            if (needed > task.most).any():
+            if (needed > task.horizon).any():
                 mean = f"at least {mean}"
             far = ""
             if name == "breakaway":

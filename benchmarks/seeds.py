@@ -22,9 +22,9 @@ import numpy as np
 from jaxcal.information.regression import log_det_information
 from jaxcal.learning.runtime import cache
 from jaxcal.learning.training import presets
-from jaxcal.paper.training_runs import train_seed
 from jaxcal.selection import exact_batch
 from jaxcal.selection.policy import select_batch
+from studies.paper.training_runs import train_seed
 
 HIT = 1e-8
 NAMES = ("ratio", "hit_rate", "ratio of 8", "hits of 8")

@@ -31,17 +31,17 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from benchmarks.tasks.ces import ces
+from benchmarks.tasks.death import death_process
+from benchmarks.tasks.hyperbolic import hyperbolic
+from benchmarks.tasks.location import LocationFinding, location_finding
+from benchmarks.tasks.prey import prey
 from jaxcal.adaptive.bounds import sace
 from jaxcal.adaptive.episodes import Episodes
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.particles import ParticleTask
 from jaxcal.adaptive.rules import Gain
 from jaxcal.adaptive.session import Session
-from jaxcal.adaptive.tasks.ces import ces
-from jaxcal.adaptive.tasks.death import death_process
-from jaxcal.adaptive.tasks.hyperbolic import hyperbolic
-from jaxcal.adaptive.tasks.location import LocationFinding, location_finding
-from jaxcal.adaptive.tasks.prey import prey
 from jaxcal.files import write_text
 
 
@@ -67,7 +67,7 @@ class Row:
 ROWS = {
     "location": Row(
         location_finding,
-        "DAD 10.93, RL 11.73 (sPCE, capped at 13.1 to 13.8); ALINE, POLAR 13.5 (cap)",
+        "DAD 10.93, RL 11.73 (sPCE, capped at 13.1 to 13.8); ALINE 13.5 (cap)",
         256,
     ),
     "location-random": Row(
@@ -80,7 +80,7 @@ ROWS = {
         "DAD 7.33, RL 7.70, ALINE 8.91",
         128,
     ),
-    "ces": Row(ces, "DAD 10.77, ALINE 13.5, RL 14.60, POLAR 14.32 (cap 16.1)", 256),
+    "ces": Row(ces, "DAD 10.77, ALINE 13.5, RL 14.60 (cap 16.1)", 256),
     "ces-variance": Row(lambda: ces(log_u_sd=3.0**0.5), "none", 96),
     "ces-budget": Row(
         lambda: ces(budget=100.0),
@@ -126,7 +126,7 @@ def session(task: Any, key: jax.Array) -> tuple[Episodes, jax.Array, jax.Array]:
         return carry, (design, outcome, gain, alive)
 
     (belief, end), (designs, outcomes, gains, alive) = jax.lax.scan(
-        step, (prior, begun), jax.random.split(key_steps, task.most)
+        step, (prior, begun), jax.random.split(key_steps, task.horizon)
     )
     told = prior.entropy() - belief.entropy()
     none: Any = None
@@ -148,9 +148,9 @@ def run(row: Row, episodes: int, seed: int) -> dict[str, Any]:
     gained = np.asarray(played.gain, np.float64)
     result = {
         "gains": [gained.mean(), gained.std(ddof=1) / np.sqrt(episodes)],
-        "measurements": task.most,
+        "measurements": task.horizon,
         "episodes": episodes,
-        "ms_a_step": 1e3 * float(np.median(taken)) / task.most,
+        "ms_a_step": 1e3 * float(np.median(taken)) / task.horizon,
         "least_left": float(np.min(left)),
         "published": row.published,
     }

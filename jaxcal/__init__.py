@@ -11,7 +11,7 @@ import importlib
 import pathlib
 from typing import TYPE_CHECKING, Any
 
-from jaxcal import compiled, xla
+from jaxcal import compiled
 
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration, identify
@@ -52,8 +52,6 @@ __version__ = "0.1.0"
 _PACKAGE = pathlib.Path(__file__).parent
 if (_PACKAGE.parent / "pyproject.toml").exists():
     compiled.check(_PACKAGE)
-
-xla.sidestep()  # before JAX computes anything
 
 _HOME = {
     "Calibration": "jaxcal.calibration",

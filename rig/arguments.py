@@ -252,7 +252,7 @@ COMMANDS: list[Row] = [
     ("identify", "read identity and status of every drive; write nothing",
      f"{RECORDED}:identify", CONFIG, True),
     ("stop", "quick-stop every drive now, and verify",
-     f"{RECORDED}:stop", CONFIG, False),
+     "rig.__main__:stop", CONFIG, False),
     ("check", "check a configuration and list every fault",
      f"{RECORDED}:check", FILE | CONFIG, False),
     ("example", "print a commented example configuration",

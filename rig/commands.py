@@ -16,13 +16,6 @@ if TYPE_CHECKING:
     from rig.core.drive import Drive
 
 
-def stop(args: argparse.Namespace) -> int:
-    """Quick-stop every drive."""
-    from rig.stopping import stop_device
-
-    return stop_device(args.config or FILE)
-
-
 def identify(args: argparse.Namespace) -> int:
     """Print what every drive says of itself."""
     from rig.core.bus import Bus, BusError

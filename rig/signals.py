@@ -1,36 +1,73 @@
-"""Ctrl-C, SIGTERM and SIGHUP as requests to pause or to stop a session."""
+"""Signals of the operating system as requests to pause or to stop a session."""
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
+import time
 from types import FrameType
 from typing import Any
 
 from rig.core.stop import Requests
 
+# What ends or suspends a program: a session that moves stops its drives first.
+STOPS = (
+    signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP,
+)  # fmt: skip
+IGNORED = (signal.SIGTTOU,)  # output from the background must not suspend it
+HANDLED_S = 0.2  # until the main thread has run a handler, unless it hangs
+
 
 class Signals(Requests):
-    """Ctrl-C once: finish the posture and pause; twice, SIGTERM or SIGHUP: stop now.
+    """Ctrl-C once: finish the posture and pause. Twice, or any other signal: stop now.
 
     While armed, a signal only sets a flag, so that no frame on the bus and no line of
     the journal is cut in two. While nothing can move, it ends the program at once, but
     not a run that is ending. Nothing is written here.
+
+    Python runs handlers on the main thread. Where that hangs, on a disk that does not
+    answer, a second thread sets the flag, and the heartbeat stops the drives.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self._previous: dict[int, Any] = {}
+        self._pipe: tuple[int, int] | None = None
 
     def __enter__(self) -> Signals:
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            self._pipe = os.pipe()
+            os.set_blocking(self._pipe[1], False)
+            signal.set_wakeup_fd(self._pipe[1], warn_on_full_buffer=False)
+            listener = threading.Thread(target=self._listen, args=[self._pipe[0]])
+            listener.daemon = True
+            listener.start()
+            for number in STOPS:
                 self._previous[number] = signal.signal(number, self._handle)
+            for number in IGNORED:
+                self._previous[number] = signal.signal(number, signal.SIG_IGN)
         return self
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
+        self._previous = {}
+        if self._pipe is not None:
+            signal.set_wakeup_fd(-1)
+            os.close(self._pipe[1])  # which ends the listener
+            self._pipe = None
+
+    def _listen(self, pipe: int) -> None:
+        interrupts = 0
+        while numbers := os.read(pipe, 64):
+            time.sleep(HANDLED_S)
+            for number in numbers:
+                interrupts += number == signal.SIGINT
+                once = number == signal.SIGINT and interrupts < 2  # a pause
+                if number in STOPS and self.armed and not once:
+                    self.request_stop(signal.Signals(number).name, 128 + number)
+        os.close(pipe)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if number == signal.SIGINT and not self.pause and self.armed:

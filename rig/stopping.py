@@ -1,62 +1,175 @@
-"""The command ``stop``: ask who moves the device to stop, then stop every unit itself.
+"""The command ``stop``: ask who moves the device, end them, stop every drive itself.
 
-It works with a configuration file that no session accepts, and no signal ends it before
-the drives were told.
+The holder of a bus is asked first, before anything heavy is loaded. One that has not
+told its drives to stop ASK_S later, because it hangs or is suspended, is killed: the
+kernel frees the lock and the port. Then each drive is stopped and looked at from here.
+What a session left beside the lock when it armed is enough for that; a configuration
+file is read where nothing is armed. No signal ends this before the drives were told.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import pathlib
 import signal
 import time
-from typing import Any
+import tomllib
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
-from rig.config.salvage import Stoppable, read_for_stop
-from rig.config.schema import ConfigError
-from rig.config.settings import BusSettings
-from rig.core.bus import Bus, BusError
-from rig.core.drive import Drive
 from rig.core.faults import EXIT_FAULT, EXIT_OK, Fault, Refused
-from rig.core.lock import BusLock, held_by
-from rig.core.stop import UnitStop, stop_all
-from rig.signals import Signals
+from rig.core.lock import BusLock, armed_files, held_by, read_armed
 
-HOLDER_S = 5.0  # for a session to see its drives stand, and to end
-HOLDER_WAITS = 6  # and so many times the bus's timeout, for units that do not answer
+if TYPE_CHECKING:
+    from rig.core.stop import UnitStop
+
+ASK_S = 0.5  # for the holder to have told its drives
+END_S = 2.0  # more for one that has, to write its last lines and end
+KILLED_S = 0.5  # for the kernel to end a process that was killed
 NOTHING = "NOTHING WAS STOPPED BY THIS COMMAND"
 LAST_RESORT = "Use the emergency stop"
 
 
-def stop_device(path: pathlib.Path) -> int:
-    """Stop the drives of a configuration file; the exit code is 0 if all stand.
+class Target:
+    """One bus: its lock, and what of it was armed last."""
+
+    def __init__(self, lock: BusLock, armed: dict[str, Any] | None) -> None:
+        self.lock = lock
+        self.armed = armed
+        self.asked = time.time()
+        self.since = time.monotonic()
+        self.holder: dict[str, Any] | None = None
+
+    @classmethod
+    def of(cls, bus: dict[str, Any]) -> Target:
+        """The bus of these settings."""
+        known = {"transport": "", "host": "", "port": 502, "device": ""} | bus
+        where = known["device"] or f"{known['host']}:{known['port']}"
+        lock = BusLock(SimpleNamespace(**known, where=where))  # type: ignore[arg-type] # light
+        return cls(lock, read_armed(lock.armed_path))
+
+    def ask(self) -> None:
+        """Tell the holder to stop."""
+        try:
+            self.holder = self.lock.signal_holder(signal.SIGTERM)
+        except (OSError, Refused) as error:  # the lock is a help, not a condition
+            _say(f"cannot ask who holds {self.lock.where}: {error}")
+        if self.holder is not None:
+            _say(f"{self.lock.where} is {held_by(self.holder)}: told to stop now")
+
+    def end(self) -> None:
+        """Wait for the holder; kill one that has not stopped its drives in time."""
+        if self.holder is None:
+            return
+        freed = self.lock.freed(ASK_S - (time.monotonic() - self.since))
+        reported = self._reported()
+        if not freed and reported:
+            freed = self.lock.freed(END_S)
+        if not freed:
+            _say("it has not answered: it is ended now")
+            with contextlib.suppress(OSError, Refused):
+                self.lock.signal_holder(signal.SIGKILL)
+            if not self.lock.freed(KILLED_S):
+                _say("it still holds the bus")
+        _say(self._reported() or "it has reported no stop")
+
+    def _reported(self) -> str:
+        """The lines of the stop that a session journalled since it was asked."""
+        if not self.holder or not self.holder.get("run"):
+            return ""
+        lines = []
+        for record in _last_records(pathlib.Path(self.holder["run"])):
+            if record["event"] == "stop" and record["time"] >= self.asked:
+                from rig.core.stop import UnitStop
+
+                lines += [f"  {UnitStop(**unit)}" for unit in record["units"]]
+        return "\n".join(["the session reported:", *lines]) if lines else ""
+
+
+def _last_records(run: pathlib.Path) -> Iterator[dict[str, Any]]:
+    """Whole records at the end of a journal that somebody may be writing."""
+    with contextlib.suppress(OSError):
+        with (run / "journal.jsonl").open("rb") as file:
+            file.seek(max(0, file.seek(0, 2) - 65536))
+            for line in file.read().split(b"\n"):
+                with contextlib.suppress(ValueError, TypeError, KeyError):
+                    record = json.loads(line)
+                    if record["time"] and record["event"]:
+                        yield record
+
+
+def stop_device(path: pathlib.Path, given: bool = True) -> int:
+    """Stop what is armed on the bus of a configuration file; 0 if all drives stand.
+
+    Without a file of use, everything that sessions of this user have armed.
+
+    Args:
+        path: of rig.toml.
+        given: an operator named it.
 
     Raises:
         Fault: no drive was told to stop.
     """
+    from rig.signals import Signals
+
     with Signals() as signals:
         signals.armed = True  # it takes seconds at most: a signal does not cut it short
-        try:
-            found = read_for_stop(path)
-        except ConfigError as error:
-            raise Fault(f"{NOTHING}: {error}. {LAST_RESORT}") from None
-        for fault in found.ignored:
-            _say(f"ignored in {path}: {fault}")
-        if found.bus is None or not found.axes:
-            lack = "no bus" if found.bus is None else "no drive"
-            lost = "".join(f"\n  NOT STOPPED: {text}" for text in found.lost)
+        found, lack = _targets(path, given)
+        if not found:
             raise Fault(
-                f"{NOTHING}: {path} names {lack} that can be reached. {LAST_RESORT}"
-                f"{lost}"
+                f"{NOTHING}: {lack}, and no session of this user has armed a device. "
+                f"{LAST_RESORT}"
             )
-        lock = BusLock(found.bus)
-        reported = _ask_holder(lock, found.bus.timeout_s)
-        try:
-            lock.acquire("stop")
-        except (OSError, Refused) as error:  # a stop waits for nobody
-            _say(str(error))
-        with lock:
-            return _stop_units(found, found.bus, reported)
+        if lack:
+            _say(f"{lack}: stopping all that sessions of this user have armed")
+        for target in found:
+            target.ask()
+        with ThreadPoolExecutor(len(found)) as pool:
+            codes = list(pool.map(lambda target: _stop(target, path), found))
+        faults = [code for code in codes if isinstance(code, Fault)]
+        if len(faults) == len(codes):
+            raise faults[0]
+        for fault in faults:
+            _say(str(fault))
+        return EXIT_FAULT if faults or EXIT_FAULT in codes else EXIT_OK
+
+
+def stop_run(run: pathlib.Path) -> list[UnitStop]:
+    """Stop the device that a session of this computer moves; what the drives say.
+
+    Args:
+        run: folder of the session's run.
+
+    Raises:
+        Fault: no drive was told to stop.
+    """
+    for path in armed_files():
+        armed = read_armed(path)
+        target = armed and Target.of(armed["bus"])
+        if target:
+            holder = target.lock.holder()
+            if holder and holder.get("run") == str(run.resolve()):
+                target.ask()
+                target.end()
+                return _stop_units(target, None)
+    raise Fault(f"{NOTHING}: no session of this computer moves {run.name}")
+
+
+def _targets(path: pathlib.Path, given: bool) -> tuple[list[Target], str]:
+    """The buses to stop, and what is wrong with the file."""
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        return [Target.of(data["bus"])], ""
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        fault = f"{path} names no bus: {' '.join(str(error).split())}"
+        if isinstance(error, FileNotFoundError):
+            fault = f"there is no {path}" + " here" * (not given)
+    left = [armed for each in armed_files() if (armed := read_armed(each))]
+    moving = [armed for armed in left if not armed["standing"]]
+    return [Target.of(armed["bus"]) for armed in moving or left], fault
 
 
 def _say(text: str) -> None:
@@ -65,53 +178,67 @@ def _say(text: str) -> None:
         print(text, flush=True)
 
 
-def _ask_holder(lock: BusLock, timeout_s: float) -> str:
-    """Tell the holder to stop, and wait for it; what it reported."""
-    asked = time.time()
+def _stop(target: Target, path: pathlib.Path) -> int | Fault:
+    target.end()
     try:
-        holder = lock.signal_holder(signal.SIGTERM)
-    except (OSError, Refused) as error:  # the lock is a help, not a condition
-        _say(f"cannot ask who holds {lock.where}: {error}")
-        return ""
-    if holder is None:
-        return ""
-    print(f"{lock.where} is {held_by(holder)}: told to stop now")
-    ended = lock.freed(HOLDER_S + HOLDER_WAITS * timeout_s)
-    reported = _reported(holder, asked)
-    _say(reported or "it has reported no stop")
-    if not ended:
-        _say("it still holds the bus")
-    return reported
-
-
-def _reported(holder: dict[str, Any], since: float) -> str:
-    """The lines of the stop that a session journalled since it was asked."""
-    from rig.journal import JournalError, read_journal
-
-    if not holder.get("run"):
-        return ""
-    try:
-        records = read_journal(pathlib.Path(holder["run"]) / "journal.jsonl")
-    except JournalError:
-        return ""
-    stops = [r for r in records if r["event"] == "stop" and r["time"] >= since]
-    lines = [f"  {UnitStop(**unit)}" for stop in stops[:1] for unit in stop["units"]]
-    return "\n".join(["the session reported:", *lines]) if lines else ""
-
-
-def _stop_units(found: Stoppable, settings: BusSettings, reported: str) -> int:
-    silence = max(axis.map.inter_frame_s for axis in found.axes)
-    bus = Bus(settings, silence)
-    try:
-        bus.open()
-    except BusError as error:
-        what = f"\n{reported}" if reported else f" {LAST_RESORT}"
-        raise BusError(f"{NOTHING}: {error}.{what}") from None
-    with bus:
-        results = stop_all([Drive(bus, axis) for axis in found.axes])
+        results = _stop_units(target, path)
+    except Fault as fault:
+        return fault
     for result in results:
         _say(str(result))
-    for text in found.lost:
-        _say(f"NOT STOPPED: {text}. {LAST_RESORT}")
     stopped = all(r.acknowledged and r.standing for r in results)
-    return EXIT_OK if stopped and not found.lost else EXIT_FAULT
+    return EXIT_OK if stopped else EXIT_FAULT
+
+
+def _stop_units(target: Target, path: pathlib.Path | None) -> list[UnitStop]:
+    """Stop the drives that were armed last, else those of the configuration file."""
+    from rig.core.bus import Bus, BusError
+    from rig.core.drive import Drive
+    from rig.core.stop import stop_all
+
+    settings, silence_s, axes = _drives(target.armed, path)
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(target.lock.acquire("stop"))
+        except (OSError, Refused) as error:  # a stop waits for nobody
+            _say(str(error))
+        bus = Bus(settings, silence_s)
+        try:
+            bus.open()
+        except BusError as error:
+            raise BusError(f"{NOTHING}: {error}. {LAST_RESORT}") from None
+        with bus:
+            results = stop_all([Drive(bus, axis) for axis in axes])
+        if all(result.standing for result in results):
+            target.lock.stood()
+        return results
+
+
+def _drives(
+    armed: dict[str, Any] | None, path: pathlib.Path | None
+) -> tuple[Any, float, list[Any]]:
+    """Bus, silence and axes: of what is armed, else of the file, else as armed last."""
+    from rig.config.axis import Axis
+    from rig.config.files import load_config
+    from rig.config.maps import RegisterMap
+    from rig.config.schema import ConfigError, parse
+    from rig.config.settings import BusSettings
+
+    if path is not None and (armed is None or armed["standing"]):
+        try:
+            config = load_config(path)
+            return config.bus, config.silence_s, [*config.axes]
+        except ConfigError as error:
+            if armed is None:
+                raise Fault(f"{NOTHING}: {error}. {LAST_RESORT}") from None
+            _say(f"{error}\nstopping the drives that were armed last instead")
+    assert armed is not None
+    axes = [
+        Axis.model_construct(
+            name=each["name"], unit=each["unit"],
+            map=parse(RegisterMap, each["map"], each["name"]),
+            rotates="X", min_pulses=0, max_pulses=0,  # of no use to a stop
+        )
+        for each in armed["drives"]
+    ]  # fmt: skip
+    return BusSettings.model_validate(armed["bus"]), armed["silence_s"], axes

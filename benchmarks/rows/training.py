@@ -121,4 +121,5 @@ def run(budget: Budget) -> Row:
         "peers the paper's 210 numbers: the row compares what a user gets from each; "
         "the line 'the observation only' is jaxcal's trainer with the peers' sight"
     )
+    row.notes.append("MaskablePPO runs with its defaults; nothing was tuned for it")
     return row

@@ -7,7 +7,7 @@ the truth among the contrasts from below (Foster et al. 2020, 2021).
 
 ``spce`` draws contrasts from the prior (sPCE below, sNMC above): it cannot report more
 than ``log(L + 1)``. ``sace`` draws them from the posterior, fitted by particles to each
-history: its bounds meet. On a grid ``Episodes.told`` is exact and needs neither.
+history: its bounds meet. On a grid ``Episodes.entropy_drop`` is exact, without either.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from jaxcal.adaptive.episodes import Episodes
 from jaxcal.adaptive.particles import ParticleBelief, ParticleTask, log_mean
+from jaxcal.checks import whole_number
 
 __all__ = ["Bounds", "sace", "spce"]
 
@@ -54,7 +55,7 @@ class Bounds:
 
 
 def spce(
-    task: ParticleTask, episodes: Episodes, key: jax.Array, contrasts: int = 100_000
+    task: ParticleTask, episodes: Episodes, key: jax.Array, contrasts: int = 24 * _CHUNK
 ) -> Bounds:
     """sPCE from below and sNMC from above, with contrasts from the prior.
 
@@ -63,12 +64,17 @@ def spce(
         episodes: B sessions.
         key: of the contrasts, which are drawn anew for each session.
         contrasts: L, a multiple of 4,096 or below it.
+
+    Raises:
+        ValueError: it is neither.
     """
-    chunk = min(_CHUNK, contrasts)
-    return _bounds(
-        _spce(task, episodes, key, chunk, -(-contrasts // chunk)),
-        float(np.log(-(-contrasts // chunk) * chunk + 1)),
-    )
+    chunk = min(_CHUNK, whole_number("contrasts", contrasts, 1))
+    if contrasts % chunk:
+        raise ValueError(
+            f"contrasts must be below {_CHUNK} or a multiple of it, got {contrasts}"
+        )
+    found = _spce(task, episodes, key, chunk, contrasts // chunk)
+    return _bounds(found, float(np.log(contrasts + 1)))
 
 
 def sace(
@@ -99,7 +105,7 @@ def _bounds(found: tuple[jax.Array, jax.Array], cap: float) -> Bounds:
     return Bounds(lower, upper, cap)
 
 
-def _told(task: ParticleTask, episode: Episodes) -> ParticleBelief:
+def _observed(task: ParticleTask, episode: Episodes) -> ParticleBelief:
     """A belief of no particles with the history of one session."""
     belief, _ = jax.eval_shape(task.begin, jax.random.key(0))
     empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), belief)
@@ -118,12 +124,12 @@ def _spce(
 ) -> tuple[jax.Array, jax.Array]:
     def one(given: Any) -> tuple[jax.Array, jax.Array]:
         episode, key = given
-        told = _told(task, episode)
-        own = told._history(episode.truth[None])[0]
+        observed = _observed(task, episode)
+        own = observed._history(episode.truth[None])[0]
 
         def add(total: jax.Array, key: jax.Array) -> tuple[jax.Array, None]:
             z = jax.random.normal(key, (chunk, task.model.dim))
-            return jnp.logaddexp(total, jax.nn.logsumexp(told._history(z))), None
+            return jnp.logaddexp(total, jax.nn.logsumexp(observed._history(z))), None
 
         total, _ = jax.lax.scan(
             add, jnp.asarray(-jnp.inf), jax.random.split(key, chunks)
@@ -143,7 +149,7 @@ def _sace(
     def one(given: Any) -> tuple[jax.Array, jax.Array]:
         episode, key = given
         key_begin, key_fit, key_draws = jax.random.split(key, 3)
-        told = _told(task, episode)
+        observed = _observed(task, episode)
         begun, _ = task.begin(key_begin)
 
         def measured(belief: ParticleBelief, now: Any) -> tuple[ParticleBelief, None]:
@@ -163,9 +169,9 @@ def _sace(
 
         def joint(z: jax.Array) -> jax.Array:
             prior = -0.5 * (z * z).sum(axis=-1)  # without its constant, as below
-            return told._history(z) + prior - _log_proposal(z, centres, roots)
+            return observed._history(z) + prior - _log_proposal(z, centres, roots)
 
-        own = told._history(episode.truth[None])[0]
+        own = observed._history(episode.truth[None])[0]
         truth, others = joint(episode.truth[None])[0], joint(z)
         lower = own - log_mean(jnp.append(others, truth))
         return lower, own - log_mean(others)

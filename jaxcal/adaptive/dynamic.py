@@ -13,12 +13,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numba as nb
 import numpy as np
 from flax import struct
 from numpy.typing import NDArray
 
 from jaxcal.adaptive.grid import GridBelief, GridTask
+from jaxcal.adaptive.kernel import backwards
 from jaxcal.adaptive.session import Options, Session
 from jaxcal.checks import seconds as checked_seconds
 
@@ -126,7 +126,7 @@ def solve(task: GridTask, tick: float) -> Optimum:
             f"task must have at most {_MOST_STATES:,} states for dynamic programming, "
             f"got {size:,}: use fewer cells or a longer tick"
         )
-    values, chosen = _backwards(
+    values, chosen = backwards(
         after, chance, travel, extra,
         np.asarray(task.place_after, np.int64), np.asarray(task.uses, np.int64),
         ticks, uses,
@@ -181,44 +181,3 @@ def _beliefs(
         chance.append(p)
         done += 1
     return np.stack(sets), np.stack(after), np.stack(chance)
-
-
-@nb.njit(cache=True)
-def _backwards(after, chance, travel, extra, place_after, taken, ticks, uses):
-    """(ticks + 1, uses + 1, P, B) nats still to gain, and the best measurement."""
-    num_beliefs, num_designs, num_outcomes = after.shape
-    places = len(travel)
-    values = np.zeros((ticks + 1, uses + 1, places, num_beliefs), np.float32)
-    chosen = np.zeros(values.shape, np.int16)
-    gains = np.zeros((num_beliefs, num_designs))
-    for b in range(num_beliefs):
-        for a in range(num_designs):
-            for y in range(num_outcomes):
-                p = chance[b, a, y]
-                if p > 0.0:
-                    gains[b, a] -= p * np.log(p)
-    for t in range(1, ticks + 1):
-        for e in range(1, uses + 1):
-            for place in range(places):
-                for b in range(num_beliefs):
-                    best = 0.0
-                    for a in range(num_designs):
-                        if gains[b, a] <= 0.0:
-                            continue
-                        total = gains[b, a]
-                        for y in range(num_outcomes):
-                            p = chance[b, a, y]
-                            if p > 0.0:
-                                left = t - travel[place, a] - extra[a, y]
-                                more = e - taken[a, y]
-                                if left > 0 and more > 0:
-                                    follow = after[b, a, y]
-                                    total += (
-                                        p
-                                        * values[left, more, place_after[a, y], follow]
-                                    )
-                        if total > best:
-                            best = total
-                            chosen[t, e, place, b] = a
-                    values[t, e, place, b] = best
-    return values, chosen

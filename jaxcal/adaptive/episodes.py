@@ -26,12 +26,12 @@ class Episodes:
     outcomes: Any  # leaves (B, T, ...)
     gains: jax.Array  # (B, T) nats expected of each measurement when it was chosen
     alive: jax.Array  # (B, T) bool
-    told: jax.Array  # (B,) nats: entropy of the prior less the posterior's
+    entropy_drop: jax.Array  # (B,) nats: of the prior, less the posterior's
     log_ratio: jax.Array  # (B,) log posterior less log prior, at the truth
 
     @property
     def gain(self) -> jax.Array:
-        """(B,) nats: the sum of expected gains. Its mean is that of ``told``."""
+        """(B,) nats: the sum of expected gains; its mean is the entropy's drop."""
         return (self.gains * self.alive).sum(axis=-1)
 
 
@@ -64,7 +64,7 @@ def _played(task: Task, decider: Decider, keys: jax.Array) -> Episodes:
     )(keys)
     truth = jax.vmap(task.draw)(key_truth)
     prior, begun = jax.vmap(task.begin)(key_begin)
-    steps = jax.vmap(lambda key: jax.random.split(key, task.most), out_axes=1)(
+    steps = jax.vmap(lambda key: jax.random.split(key, task.horizon), out_axes=1)(
         key_steps
     )
 
@@ -113,7 +113,7 @@ def _played(task: Task, decider: Decider, keys: jax.Array) -> Episodes:
         outcomes=outcomes,
         gains=gains,
         alive=alive,
-        told=jax.vmap(lambda a, b: a.entropy() - b.entropy())(prior, belief),
+        entropy_drop=jax.vmap(lambda a, b: a.entropy() - b.entropy())(prior, belief),
         log_ratio=jax.vmap(lambda a, b, t: b.log_density(t) - a.log_density(t))(
             prior, belief, truth
         ),
@@ -126,7 +126,7 @@ class Comparison:
 
     names: tuple[str, ...]
     gain: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) sum of expected gains
-    told: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) drop of entropy
+    entropy_drop: np.ndarray[Any, np.dtype[np.float64]]  # (D, B)
     log_ratio: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) at the truth
     choices: np.ndarray[Any, np.dtype[np.float64]]  # (D, B) measurements made
 
@@ -165,7 +165,7 @@ def compare(
             progress(at)
             played = play(task, decider, keys[at : at + batch])
             made = played.alive.sum(axis=1)
-            part = played.gain, played.told, played.log_ratio, made
+            part = played.gain, played.entropy_drop, played.log_ratio, made
             parts.append([np.asarray(values, np.float64) for values in part])
         found.append([np.concatenate(values) for values in zip(*parts, strict=True)])
     whole = (np.stack(values) for values in zip(*found, strict=True))

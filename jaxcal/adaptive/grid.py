@@ -63,8 +63,8 @@ class GridBelief:
 
         def of(part: Part, w: jax.Array) -> jax.Array:
             p = part.likelihood @ w + _SMALL
-            told = part.likelihood @ (w * jnp.log(w + _SMALL)) + part.p_log_p @ w
-            return jnp.maximum(jnp.log(p) - told / p, 0.0)
+            known = part.likelihood @ (w * jnp.log(w + _SMALL)) + part.p_log_p @ w
+            return jnp.maximum(jnp.log(p) - known / p, 0.0)
 
         return task.by_design([of(part, w) for part, w in self._parts(task)])
 
@@ -138,7 +138,7 @@ class GridTask:
     groups: jax.Array  # (A,) int32 of alike designs, such as those of one joint
     num_groups: int = struct.field(pytree_node=False)
     shape: tuple[int, ...] = struct.field(pytree_node=False)  # of theta as a grid
-    most: int = struct.field(pytree_node=False)
+    horizon: int = struct.field(pytree_node=False)
     theta_names: tuple[str, ...] = struct.field(pytree_node=False)
     design_names: tuple[str, ...] = struct.field(pytree_node=False)
 
@@ -157,7 +157,7 @@ class GridTask:
         uses: ArrayLike = 0,
         seconds: float | tuple[float, float] = np.inf,
         num_uses: int | Sequence[int] = 1,
-        most: int,
+        horizon: int,
         theta_names: Sequence[str] = (),
         design_names: Sequence[str] = (),
     ) -> GridTask:
@@ -180,7 +180,7 @@ class GridTask:
             uses: (A, Y), or what broadcasts to it, of a countable resource.
             seconds: budget of a session, or (least, most) to draw it from.
             num_uses: uses that end a session, or the list it is drawn from.
-            most: measurements after which a session ends in any case.
+            horizon: measurements after which a session ends in any case.
 
         Raises:
             ValueError: naming the table, the rule and the value.
@@ -274,7 +274,7 @@ class GridTask:
             groups=jnp.asarray(alike, whole),
             num_groups=int(alike.max()) + 1,
             shape=lengths,
-            most=whole_number("most", most, 1),
+            horizon=whole_number("horizon", horizon, 1),
             theta_names=_names("theta_names", theta_names, "theta", grid.shape[1]),
             design_names=_names("design_names", design_names, "u", at.shape[1]),
         )

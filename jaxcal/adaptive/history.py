@@ -158,8 +158,8 @@ def checked(
                 f"{where}: outcome must be a whole number in [0, {count}), "
                 f"got {outcome!r}"
             )
-        told = np.asarray(task.likelihood[design, found], np.float64)
-        if not (told * np.asarray(belief.weights, np.float64)).sum() > 0.0:
+        likelihood = np.asarray(task.likelihood[design, found], np.float64)
+        if not (likelihood * np.asarray(belief.weights, np.float64)).sum() > 0.0:
             raise ValueError(
                 f"{where}: outcome {found} of design "
                 f"{in_words(np.asarray(task.designs[design], np.float64))} cannot "

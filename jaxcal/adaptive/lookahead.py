@@ -48,7 +48,7 @@ class TwoStep:
                 follow = task.options(then, left, keys[2])
                 gains, prices = self.base.judged(task, then, left, follow, keys[3])
                 chosen = best(log_score(gains, prices), follow)
-                going = ~(left.over | (left.made >= task.most))
+                going = ~(left.over | (left.made >= task.horizon))
                 # The price counts also where the session ends: an end is not cheap.
                 return going * gains[chosen], prices[chosen]
 
@@ -122,7 +122,7 @@ class Rollouts:
 
         def going(carry: Any) -> jax.Array:
             _, session, _, number = carry
-            over = session.over | (session.made >= task.most)
+            over = session.over | (session.made >= task.horizon)
             return ~over & (number < self.depth)
 
         def step(carry: Any) -> Any:

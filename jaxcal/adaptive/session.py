@@ -74,7 +74,7 @@ class Task(Protocol):
     """What is measured. ``GridTask`` and ``ParticleTask`` are the two kinds."""
 
     @property
-    def most(self) -> int:
+    def horizon(self) -> int:
         """Measurements after which a session ends in any case."""
 
     def draw(self, key: jax.Array) -> Any:

@@ -51,13 +51,13 @@ def optimise(
 
     Args:
         task: of finitely many designs.
-        length: entries; ``task.most`` by default.
+        length: entries; ``task.horizon`` by default.
         episodes: sessions that judge a sequence.
         starts, sweeps: so many, at most so many.
         seed: of the sessions and starts.
         report: called after each entry with how many are done, of how many, and nats.
     """
-    length = whole_number("length", task.most if length is None else length, 1)
+    length = whole_number("length", task.horizon if length is None else length, 1)
     for name, value in (("episodes", episodes), ("starts", starts)):
         whole_number(name, value, 1)
     keys = jax.random.split(jax.random.key(seed), episodes)

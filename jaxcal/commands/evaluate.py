@@ -129,12 +129,12 @@ def _whole(
 ) -> Iterator[tuple[Summary, Evaluation]]:
     """Every dataset, read or made before the first is evaluated."""
     from jaxcal.evaluation.methods import evaluate
-    from jaxcal.paper.datasets.catalogue import CATALOGUE
+    from jaxcal.paper.datasets import catalogue
 
     if _process()[1] > 1:
         raise ValueError("several processes can share an evaluation with --stream only")
     datasets = [
-        CATALOGUE.load(
+        catalogue.load(
             name,
             options.seed,
             options.episodes,
@@ -163,7 +163,7 @@ def _streamed(
 ) -> Iterator[tuple[Summary, None]]:
     """One dataset in parts; of several processes the first has the totals."""
     from jaxcal.evaluation.stream import Plan, evaluate_stream, open_folder
-    from jaxcal.paper.datasets.catalogue import CATALOGUE
+    from jaxcal.paper.datasets.datasets import drawn
 
     whole = {
         "--report": options.report is not None,
@@ -179,8 +179,8 @@ def _streamed(
     if options.episodes is None:
         raise ValueError("--stream needs --episodes")
     plan = Plan(
-        CATALOGUE,
         options.dataset[0],
+        drawn,
         seed=options.seed,
         k=options.k,
         methods=options.methods,

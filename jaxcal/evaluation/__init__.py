@@ -6,7 +6,6 @@ import importlib
 from typing import Any
 
 _HOMES = {  # loaded when first used: methods load numba, figures matplotlib
-    "Catalogue": "catalogue",
     "Dataset": "dataset",
     "Evaluation": "results",
     "Summary": "results",

@@ -105,7 +105,7 @@ def evaluate(
         if method == "static":
             decider: Any = static.optimise(
                 task,
-                length=min(task.most, _STATIC),
+                length=min(task.horizon, _STATIC),
                 sweeps=1,
                 seed=seed + 1,
                 report=lambda done, of, nats: progress("optimising static", done, of),
@@ -130,7 +130,7 @@ def evaluate(
         tuple(methods),
         *(
             np.concatenate([getattr(one, field) for one in found])
-            for field in ("gain", "told", "log_ratio", "choices")
+            for field in ("gain", "entropy_drop", "log_ratio", "choices")
         ),
     )
     rivals = [m for m in ("state", "priced", "rate", "gain") if m in methods]

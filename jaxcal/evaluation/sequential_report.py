@@ -73,11 +73,11 @@ def json_document(result: Result, *, command: Sequence[str]) -> str:
     found = result.found
     methods = {}
     for row, name in enumerate(found.names):
-        told, ratio = found.told[row], found.log_ratio[row]
+        drop, ratio = found.entropy_drop[row], found.log_ratio[row]
         methods[name] = {
             "label": METHODS[name],
             "nats": _moments(found.gain[row]),
-            "entropy_drop": _moments(told),
+            "entropy_drop": _moments(drop),
             "log_ratio_at_truth": _moments(ratio),
             "choices": float(found.choices[row].mean()),
             "seconds_per_choice": float(result.seconds[row]),

@@ -1,58 +1,58 @@
 """Evaluation of any number of episodes: constant memory, resumable, shared.
 
-An endless dataset has a random stream for every block of episodes. It is evaluated in
-parts of whole blocks; what a part adds to every mean is a file of its own, written when
-the part is complete (``jaxcal.evaluation.tally``). So a run that was stopped resumes,
-several processes share a folder, and the totals are the same to the last digit however
-the parts were cut.
+An endless dataset is evaluated in parts; the rows of a part are a file of its own,
+written when it is done. So a run that was stopped resumes, more episodes start from
+what is there, and several processes share a folder; none of that changes a digit,
+because the same parts are averaged in the same order.
 """
 
 from __future__ import annotations
 
-import collections
+import contextlib
 import dataclasses
-import itertools
+import functools
 import json
+import math
+import os
 import pathlib
+import signal
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context, parent_process
 from typing import Any
 
-from jaxcal.evaluation import tally
-from jaxcal.evaluation.catalogue import Catalogue
+from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.methods import (
     BASELINES,
     DEFAULT_METHODS,
     DEFAULT_RANDOM_DRAWS,
     POLICIES,
     evaluate,
-    label_of,
     rows_of,
 )
 from jaxcal.evaluation.results import Row, Summary, versions
-from jaxcal.evaluation.tally import BINS_PER_UNIT, Tally
-from jaxcal.evaluation.workers import num_cores, worker_pool
 from jaxcal.files import write_text
 
-__all__ = ["PART", "Plan", "evaluate_stream", "open_folder"]
+__all__ = ["PART", "Plan", "evaluate_stream", "open_folder", "total"]
 
-Progress = Callable[[str, int, int], None]
 Cut = tuple[int, int]  # first episode, one after the last
+Numbers = dict[str, Any]  # of a row, see docs/evaluation.md
 
-PART = 5_000  # episodes whose sums are one file
-FORMAT = "jaxcal-evaluation-stream"
-VERSION = 2
+PART = 5_000  # episodes whose rows are one file; the draws' blocks of 1,000 divide it
 _POLL_SECONDS = 1.0  # between looks for the parts of other processes
+_ONE_THREAD = [f"{name}_NUM_THREADS" for name in ("OPENBLAS", "OMP", "MKL", "NUMBA")]
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
     """What is evaluated: parts of equal plans add up."""
 
-    source: Catalogue
     dataset: str
+    draw: Callable[[str, int, int, int], Dataset]
+    """(dataset, seed, begin, end) -> episodes; ``begin`` is a multiple of 1,000."""
     seed: int = 0
     k: int = 4
     methods: tuple[str, ...] = BASELINES
@@ -61,17 +61,12 @@ class Plan:
     draws: int = DEFAULT_RANDOM_DRAWS
 
     def __post_init__(self) -> None:
-        if self.dataset not in self.source.endless:
-            raise ValueError(
-                f"a streamed dataset must be one of {', '.join(self.source.endless)}, "
-                f"which are drawn from a seed without end, got {self.dataset!r}"
-            )
         for method in set(self.methods) - set(DEFAULT_METHODS):
-            known = ", ".join(DEFAULT_METHODS)
             raise ValueError(
-                f"a streamed method must be one of {known}, got {method!r}"
+                f"a streamed method must be one of {', '.join(DEFAULT_METHODS)}, "
+                f"got {method!r}"
             )
-        first = self.source.draw(self.dataset, self.seed, 0, 1)
+        first = self.draw(self.dataset, self.seed, 0, 1)
         if not first.num_inputs < self.k < first.num_candidates:
             raise ValueError(
                 f"k must be in [{first.num_inputs + 1}, {first.num_candidates}), "
@@ -81,14 +76,14 @@ class Plan:
     def description(self) -> dict[str, Any]:
         """What ``stream.json`` says: equal for folders whose parts add up."""
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        del values["source"]
+        del values["draw"]
         weights = {}
         if any(method in POLICIES for method in self.methods):
             from jaxcal.learning.training.checkpoint import fingerprint
 
             weights = {c or "default": fingerprint(c) for c in self.checkpoints}
-        known = {"format": FORMAT, "version": VERSION, **values}
-        return known | {"weights": weights, "versions": versions()}
+        known = {"format": "jaxcal-evaluation-stream", "version": 3, "part": PART}
+        return known | values | {"weights": weights, "versions": versions()}
 
 
 def open_folder(plan: Plan, folder: pathlib.Path) -> None:
@@ -103,19 +98,12 @@ def open_folder(plan: Plan, folder: pathlib.Path) -> None:
     path = folder / "stream.json"
     if not path.exists():
         write_text(path, json.dumps(wanted, indent=1) + "\n")
-        return
     try:
         held = json.loads(path.read_text(encoding="utf-8"))
         differing = [name for name in wanted if held.get(name) != wanted[name]]
     except (ValueError, AttributeError):
         raise ValueError(f"{path} is damaged: it is not a JSON object") from None
-    if held.get("format") == FORMAT and held.get("version") != VERSION:
-        raise ValueError(
-            f"{folder} was written by another version of jaxcal (stream format "
-            f"{held.get('version')}, this one uses {VERSION}): name another folder"
-        )
-    if differing:
-        name = differing[0]
+    for name in differing:
         raise ValueError(
             f"{folder} holds parts of another evaluation: its {name} is "
             f"{held.get(name)!r}, not {wanted[name]!r}; name another folder"
@@ -129,8 +117,7 @@ def evaluate_stream(
     *,
     workers: int | None = None,
     process: tuple[int, int] = (0, 1),
-    part: int = PART,
-    progress: Progress | None = None,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> Summary:
     """Evaluate the first episodes of a plan, resuming from the parts in a folder.
 
@@ -141,99 +128,109 @@ def evaluate_stream(
         workers: processes on this machine that solve; its cores when None, none beside
             this one where 1.
         process: (i, n), this is the i-th of n; each takes every n-th part.
-        part: episodes of a file, a multiple of the block that shares a stream.
         progress: called as parts are completed.
 
     Raises:
         ValueError: a part is damaged, or a policy returned what it must not.
         OSError: the folder cannot be read or written, or a worker died.
     """
-    size = plan.source.block
-    if part < 1 or part % size:
-        raise ValueError(f"part must be a multiple of {size} episodes, got {part}")
-    report = progress or (lambda *_: None)
-    workers = num_cores() if workers is None else workers
-    cuts = [(begin, min(begin + part, episodes)) for begin in range(0, episodes, part)]
+    cuts = [(begin, min(begin + PART, episodes)) for begin in range(0, episodes, PART)]
     own = cuts[process[0] :: process[1]]
     own = [cut for cut in own if not _path(folder, cut).exists()]
     todo, done = sum(end - begin for begin, end in own), 0
-    report("episodes", 0, todo)
-    with worker_pool(workers) as executor:
-        begun = (
-            executor.submit(_solve_block, plan, begin, min(begin + size, end))
-            for first, end in own
-            for begin in range(first, end, size)
-        )
-        blocks = _ahead(begun, part // size + 2 * workers)
-        for cut in own:
-            parts = itertools.islice(blocks, len(range(*cut, size)))
-            added = {"episodes": list(cut)} | _as_json(*_added(parts))
-            text = json.dumps(added, separators=(",", ":"))
-            write_text(_path(folder, cut), text + "\n")
-            done += cut[1] - cut[0]
-            report("episodes", done, todo)
+    progress("episodes", 0, todo)
+    cores = len(os.sched_getaffinity(0)) if workers is None else workers
+    with _workers(cores) as run:
+        written = run(functools.partial(_write_part, plan, folder), own)
+        for (begin, end), _ in zip(own, written, strict=True):
+            done += end - begin
+            progress("episodes", done, todo)
     while not all(_path(folder, cut).exists() for cut in cuts):
         time.sleep(_POLL_SECONDS)
-    return _total(plan, episodes, folder, cuts, report)
 
-
-Block = tuple[int, dict[str, Tally]]  # proven optima, and the tally of every row
-
-
-def _solve_block(plan: Plan, begin: int, end: int) -> Block:
-    """What the episodes of one stream add."""
-    dataset = plan.source.draw(plan.dataset, plan.seed, begin, end)
-    found = evaluate(
-        dataset,
+    parts = [_read_part(_path(folder, cut), cut) for cut in cuts]
+    counts = [end - begin for begin, end in cuts]
+    rows = {
+        row: total(counts, [part["rows"][_key(*row)] for part in parts])
+        for row in rows_of(_with_random(plan), plan.checkpoints)
+    }
+    random = rows["random", None]["det_s"]["mean"]
+    for numbers in rows.values():
+        mean = numbers["det_s"]["mean"]
+        numbers["ratio_to_random"] = mean / random if mean and random else None
+    facts = plan.draw(plan.dataset, plan.seed, 0, 1).facts() | {"episodes": episodes}
+    return Summary(
+        facts,
         plan.k,
-        list(dict.fromkeys(["random", *plan.methods])),
+        plan.seed,
+        sum(part["proven"] for part in parts),
+        tuple(Row(*row, rows[row]) for row in rows_of(plan.methods, plan.checkpoints)),
+        notes=(f"medians are means of those of parts of {PART:,} episodes",),
+    )
+
+
+def total(counts: list[int], parts: list[Numbers]) -> Numbers:
+    """One row of all parts; a number that one of them lacks is lacking.
+
+    Args:
+        counts: episodes of each part.
+        parts: their rows: averages over their episodes, each with as many draws.
+    """
+
+    def mean(values: list[float | None]) -> float | None:
+        known = [value for value in values if value is not None]
+        if len(known) < len(values):
+            return None
+        pairs = zip(counts, known, strict=True)
+        return math.fsum(n * value for n, value in pairs) / sum(counts)
+
+    def moments(name: str) -> dict[str, float | None]:
+        held = [part[name] for part in parts]
+        found = {key: mean([one[key] for one in held]) for key in ("mean", "median")}
+        middle, std = found["mean"], None
+        if middle is not None and all(one["std"] is not None for one in held):
+            variance = mean(
+                [one["std"] ** 2 + (one["mean"] - middle) ** 2 for one in held]
+            )
+            std = None if variance is None else variance**0.5
+        return {"mean": middle, "std": std, "median": found["median"]}
+
+    averages = (
+        *("ratio_to_exact", "hit_rate", "d_efficiency"),
+        "seconds_per_selection",
+    )
+    return {
+        **parts[0],  # its label and number of draws are those of all
+        "det_s": moments("det_s"),
+        "log_det_s": moments("log_det_s"),
+        **{name: mean([part[name] for part in parts]) for name in averages},
+    }
+
+
+def _write_part(plan: Plan, folder: pathlib.Path, cut: Cut) -> None:
+    part = {"episodes": cut} | _solved(plan, *cut)
+    write_text(_path(folder, cut), json.dumps(part, separators=(",", ":")) + "\n")
+
+
+def _solved(plan: Plan, begin: int, end: int) -> dict[str, Any]:
+    """How many optima of some episodes are proven, and the rows."""
+    found = evaluate(
+        plan.draw(plan.dataset, plan.seed, begin, end),
+        plan.k,
+        _with_random(plan),
         plan.checkpoints,
         num=plan.num,
         random_draws=plan.draws,
         seed=plan.seed + begin,
-    )
-    m = dataset.num_outputs
-    tallies = {
-        _key(result.method, result.checkpoint): tally.tally_of(
-            result.log_det,
-            found.reference,
-            found.proven,
-            m,
-            m * (dataset.num_inputs + 1),
-            result.seconds * dataset.num_episodes,
-        )
-        for result in found.results
-    }
-    return int(found.proven.sum()), tallies
+    ).summarise()
+    rows = {_key(row.method, row.checkpoint): row.numbers for row in found.rows}
+    for numbers in rows.values():
+        numbers.pop("parameter_variance", None)  # of all episodes at once only
+    return {"proven": found.num_proven, "rows": rows}
 
 
-def _ahead(begun: Iterator[Future[Block]], most: int) -> Iterator[Block]:
-    """The results in their order, at most so many begun before they are taken."""
-    try:
-        waiting = collections.deque(itertools.islice(begun, most))
-        while waiting:
-            yield waiting.popleft().result()
-            waiting.extend(itertools.islice(begun, 1))
-    except BrokenProcessPool:
-        raise OSError(
-            "a worker process died, perhaps because memory ran out: use fewer "
-            "(--workers)"
-        ) from None
-
-
-def _added(parts: Iterable[Block]) -> Block:
-    """All of them added up."""
-    proven, totals = 0, collections.defaultdict[str, Tally](dict)
-    for count, tallies in parts:
-        proven += count
-        for name, row in tallies.items():
-            tally.add(totals[name], row)
-    return proven, totals
-
-
-def _as_json(proven: int, tallies: dict[str, Tally]) -> dict[str, Any]:
-    rows = {name: tally.as_json(row) for name, row in tallies.items()}
-    return {"proven": proven, "methods": rows}
+def _with_random(plan: Plan) -> list[str]:
+    return list(dict.fromkeys(["random", *plan.methods]))
 
 
 def _key(method: str, checkpoint: str | None) -> str:
@@ -244,43 +241,55 @@ def _path(folder: pathlib.Path, cut: Cut) -> pathlib.Path:
     return folder / f"part-{cut[0]:012d}-{cut[1]:012d}.json"
 
 
-def _read_part(path: pathlib.Path, cut: Cut) -> Block:
+def _read_part(path: pathlib.Path, cut: Cut) -> dict[str, Any]:
     try:
         part = json.loads(path.read_text(encoding="utf-8"))
         if part["episodes"] != list(cut):
             raise ValueError(f"it says episodes {part['episodes']}")
-        rows = part["methods"].items()
-        return int(part["proven"]), {name: tally.from_json(row) for name, row in rows}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        return {"proven": int(part["proven"]), "rows": dict(part["rows"])}
+    except (ValueError, KeyError, TypeError) as error:
         raise ValueError(
             f"{path} is damaged ({error}); delete it, and it is computed again"
         ) from None
 
 
-def _total(
-    plan: Plan,
-    episodes: int,
-    folder: pathlib.Path,
-    cuts: list[Cut],
-    report: Progress,
-) -> Summary:
-    """All parts of a folder added up."""
+@contextlib.contextmanager
+def _workers(number: int) -> Iterator[Callable[..., Iterable[None]]]:
+    """``map`` over so many processes of one thread each; in this one where it is 1.
 
-    def read(number: int) -> Block:
-        report("parts added up", number, len(cuts))
-        return _read_part(_path(folder, cuts[number]), cuts[number])
+    What has not begun when the block is left, is cancelled.
+    """
+    if number < 1:
+        raise ValueError(f"workers must be at least 1, got {number}")
+    if number == 1:
+        yield map
+        return
+    before = {name: os.environ.get(name) for name in _ONE_THREAD}
+    # Read when a worker starts, before it imports numpy.
+    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
+    pool = ProcessPoolExecutor(number, get_context("spawn"), _begin_worker)
+    try:
+        yield pool.map
+    except BrokenProcessPool:
+        raise OSError(
+            "a worker process died, perhaps because memory ran out: use fewer "
+            "(--workers)"
+        ) from None
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            os.environ.update({} if value is None else {name: value})
 
-    proven, totals = _added(map(read, range(len(cuts))))
-    facts = plan.source.draw(plan.dataset, plan.seed, 0, 1).facts()
-    rows = []
-    for method, checkpoint in rows_of(plan.methods, plan.checkpoints):
-        own = totals[_key(method, checkpoint)]
-        numbers = {"label": label_of(method, plan.num)}
-        numbers |= tally.summary(own, totals["random"])
-        rows.append(Row(method, checkpoint, numbers))
-    note = (
-        "means and hit rates are of exact sums over all episodes; medians are read off "
-        f"a histogram of log det S with bins of 1/{BINS_PER_UNIT}"
-    )
-    facts |= {"episodes": episodes}
-    return Summary(facts, plan.k, plan.seed, proven, tuple(rows), notes=(note,))
+
+def _begin_worker() -> None:
+    """An interrupt is the parent's; where the parent is killed, its workers end too."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_the_parent, daemon=True).start()
+
+
+def _end_with_the_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

@@ -1,5 +1,4 @@
-"""The paper alone: its robot, datasets, exhibits and training runs.
+"""What a user of jaxcal has of the paper: its network and preset, robot and datasets.
 
-``python -m jaxcal.paper`` (``make reproduce``) makes its figures, tables and claims
-from our own runs. Nothing in the rest of jaxcal imports this package.
+Its figures, tables and claims are a study of the repository: ``make reproduce``.
 """

@@ -1,36 +1,17 @@
-"""What the paper's commands share: errors of one line, exit codes, common arguments."""
+"""What the paper's commands share: exit codes and types of arguments."""
 
 from __future__ import annotations
 
 import argparse
 import sys
 from collections.abc import Callable, Iterable
-from typing import NoReturn
 
-from jaxcal.arguments import at_least
+from jaxcal.arguments import at_least, refused
 
-__all__ = ["Parser", "one_of", "positive", "run", "seed"]
+__all__ = ["one_of", "positive", "run", "seed"]
 
 seed = at_least(0)  # for ``type=``
 positive = at_least(1)
-
-
-class Parser(argparse.ArgumentParser):
-    """Reports a bad argument in one line and keeps the layout of its texts."""
-
-    def __init__(self, prog: str, description: str, epilog: str = "") -> None:
-        layout = argparse.RawDescriptionHelpFormatter
-        super().__init__(
-            prog,
-            description=description,
-            epilog=epilog,
-            formatter_class=layout,
-            allow_abbrev=False,
-        )
-
-    def error(self, message: str) -> NoReturn:
-        print(f"{self.prog}: error: {message}; see --help", file=sys.stderr)
-        sys.exit(2)
 
 
 def one_of(names: Iterable[str]) -> Callable[[str], str]:
@@ -63,9 +44,6 @@ def run(command: Callable[[], None], name: str, interrupted: str) -> int:
         print(f"{name}: interrupted; {interrupted}", file=sys.stderr)
         return 130
     except (ValueError, OSError, RuntimeError) as error:
-        text = " ".join(str(error).split())
-        if isinstance(error, OSError) and error.strerror and error.filename:
-            text = f"{error.filename}: {error.strerror}"
-        print(f"{name}: error: {text}", file=sys.stderr)
-        return 3 if isinstance(error, RuntimeError) else 2
+        code = refused(name, error)
+        return 3 if isinstance(error, RuntimeError) else code
     return 0

@@ -3,8 +3,10 @@
 pymodbus does the framing. What it leaves to its caller is done here: exception replies
 are errors, replies are checked against their request, the silence between frames is
 kept, reads are retried, and a motion write is sent exactly once. After any failed
-exchange the line is emptied (or the connection opened again), so that a late reply can
-never be taken for the answer to a later request.
+exchange the line is emptied (or the connection opened again). RTU frames bear no
+number, so a reply that comes later still could be taken for the answer to the next
+request: a unit that owes one is asked for another number of registers first, until what
+it answers can only be the answer to that.
 """
 
 from __future__ import annotations
@@ -28,6 +30,8 @@ EXCEPTIONS = {
     10: "no gateway path", 11: "gateway target silent",
 }  # fmt: skip
 GATEWAY_CODES = (10, 11)  # the unit behind the gateway is silent
+PROBES = 6  # questions of another length to a unit whose replies come late
+LATEST_S = 10.0  # no gateway keeps a reply for so long
 
 
 class BusError(Fault):
@@ -56,11 +60,16 @@ class Bus:
         self.silence_s = 0.0 if settings.transport == "tcp" else silence_s
         self.check: Callable[[], None] = lambda: None  # before each exchange; may raise
         self.silent: set[int] = set()  # units that did not answer the last time
-        self._emit = emit  # told of every write before it is sent
+        self._tell = emit  # told of every write before it is sent, of a stop's after
+        self._untold: list[dict[str, Any]] = []
         self._lock = threading.RLock()
         self._urgent = False
         self._timeout_s = settings.timeout_s
         self._quiet_until = 0.0
+        # Of a unit: registers in each reply that may still come, 0 of a write, and
+        # when it was asked; and an address that was read well.
+        self._owed: dict[int, list[tuple[int, float]]] = {}
+        self._readable: dict[int, int] = {}
         self._client: Any = None
 
     def _make_client(self) -> Any:
@@ -109,6 +118,7 @@ class Bus:
         """
         with self._lock:
             before = self._urgent, self._timeout_s
+            outermost = not self._urgent
             configured = self.settings.timeout_s
             self._urgent = True
             self._timeout_s = min(timeout_s or configured, configured)
@@ -116,6 +126,9 @@ class Bus:
                 yield
             finally:
                 self._urgent, self._timeout_s = before
+                untold, self._untold = (self._untold, []) if outermost else ([], [])
+        for fields in untold if outermost else ():
+            self._tell("write", **fields)
 
     def __enter__(self) -> Bus:
         return self.open()
@@ -137,16 +150,16 @@ class Bus:
         while True:
             left -= 1
             try:
-                reply = self._exchange(3, unit, address, count=count)
-                words = list(getattr(reply, "registers", []))
+                self._catch_up(unit, address)
+                words = self._read(unit, address, count)
                 if len(words) != count:
                     raise BusError(
                         f"unit {unit}: asked for {count} registers at 0x{address:04X}, "
                         f"got {len(words)}"
                     )
+                self._readable[unit] = address
                 return words
             except BusError as error:
-                self._resynchronise(error)
                 if not left:
                     error.args = (f"{error} (tried {tries} times)",)
                     raise
@@ -158,7 +171,9 @@ class Bus:
             BusError: no valid reply; whether the drive obeyed is unknown.
             Rejected: the drive refused.
         """
-        self._emit("write", unit=unit, address=address, words=words)
+        self._emit(unit, address, words)
+        if not self._urgent:  # an acknowledgement of a stop tells of a stop, also late
+            self._catch_up(unit, self._readable.get(unit))
         try:
             if function == 6:
                 reply = self._exchange(6, unit, address, words[0])
@@ -169,16 +184,68 @@ class Bus:
             if not echoed or getattr(reply, "address", None) != address:
                 raise BusError(f"unit {unit}: the reply to a write does not echo it")
         except BusError as error:
-            self._resynchronise(error)
+            self._resynchronise(error, unit, 0)
             raise
+
+    def _read(self, unit: int, address: int, count: int) -> list[int]:
+        """The registers of one reply, of any number."""
+        try:
+            words = list(
+                getattr(self._exchange(3, unit, address, count=count), "registers", [])
+            )
+        except BusError as error:
+            self._resynchronise(error, unit, count)
+            raise
+        if len(words) != count:  # of an earlier question: this one's may still come
+            self._resynchronise(BusError(), unit, count)
+        return words
+
+    def _catch_up(self, unit: int, address: int | None) -> None:
+        """Be sure that no earlier reply of a unit on an RTU line is still to come.
+
+        A unit answers in order: once it has answered a question whose reply has a
+        length that it owes nowhere, all before it has come, or is lost.
+
+        Raises:
+            BusError: it is silent, or what it says is always the answer to another.
+        """
+        address = self._readable.get(unit, address)
+        for _ in range(PROBES if address is not None else 0):
+            recent = time.monotonic() - LATEST_S
+            owed = [one for one in self._owed.get(unit, []) if one[1] > recent]
+            self._owed[unit] = owed
+            if not owed:
+                return
+            lengths = [length for length, _ in owed]
+            count = next(n for n in range(1, 99) if n not in lengths)
+            try:
+                found = len(self._read(unit, int(address or 0), count))
+            except Rejected:  # or the oldest was answered like this
+                del owed[0]
+                owed.append((count, time.monotonic()))
+                continue
+            if found == count:
+                owed.clear()
+            elif found in lengths:
+                del owed[: lengths.index(found) + 1]
+        if self._owed.get(unit) and address is not None:
+            raise BusError(f"unit {unit}: its replies come too late to be told apart")
 
     def broadcast(self, address: int, function: int, words: list[int]) -> None:
         """Write registers of every unit on a serial line; no unit answers."""
-        self._emit("write", unit=0, address=address, words=words)
+        self._emit(0, address, words)
         value = words[0] if function == 6 else words
         with self._lock:
             self._send(function, 0, address, value, no_response_expected=True)
             self._quiet_until += TURNAROUND_S
+
+    def _emit(self, unit: int, address: int, words: list[int]) -> None:
+        """Tell of a write. A journal on a disk that hangs must not hold up a stop."""
+        fields = {"unit": unit, "address": address, "words": words}
+        if self._urgent:
+            self._untold.append(fields | {"sent": round(time.time(), 4)})
+        else:
+            self._tell("write", **fields)
 
     def _exchange(
         self, function: int, unit: int, address: int, *args: Any, **more: Any
@@ -224,11 +291,14 @@ class Bus:
         finally:
             self._quiet_until = time.monotonic() + self.silence_s
 
-    def _resynchronise(self, error: BusError) -> None:
-        """Empty the line, so that a late reply is not taken for the next one's."""
+    def _resynchronise(self, error: BusError, unit: int, owed: int) -> None:
+        """Empty the line; a reply of ``owed`` registers of the unit may still come."""
         with self._lock:
             if self._client is None or isinstance(error, Rejected):
                 return  # a refusal is a whole reply
+            if self.settings.transport != "tcp":
+                known = self._owed.setdefault(unit, [])
+                known.append((owed, time.monotonic()))
             if self.settings.transport != "rtu":
                 self._client.close()  # the next request connects again
                 return

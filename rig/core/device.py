@@ -56,15 +56,26 @@ def check_plan(config: RigConfig, targets: Iterable[Pulses]) -> None:
         raise LimitError("the plan leaves the limits: " + "; ".join(faults))
 
 
+OVERDUE_S = 0.3  # of a stop that was asked for and that no loop has answered
+
+
 class Heartbeat(threading.Thread):
-    """A thread that stops the drives when the motion loop is silent for too long.
+    """A thread that stops the drives when the motion loop is silent for too long, or
+    does not answer to a stop.
 
     It also keeps the line alive for drives that watch their communication while the
     plan computes or writes, when nothing moves.
     """
 
-    def __init__(self, stopper: Stopper, silence_s: float, keep_alive_s: float) -> None:
+    def __init__(
+        self,
+        stopper: Stopper,
+        requests: Requests,
+        silence_s: float,
+        keep_alive_s: float,
+    ) -> None:
         super().__init__(name="heartbeat", daemon=True)
+        self._requests = requests
         self._stopper = stopper
         self._silence_s = silence_s
         self._keep_alive_s = keep_alive_s
@@ -86,6 +97,9 @@ class Heartbeat(threading.Thread):
     def run(self) -> None:
         while not self._closing.wait(0.05):
             silence = time.monotonic() - self._fed
+            if not self._stopper.reason and (late := self._requests.overdue(OVERDUE_S)):
+                self._stopper.stop(f"{late}, which the session did not answer")
+                return
             if self._moving and silence > self._silence_s:
                 self._stopper.stop(f"heartbeat lost for {silence:.2f} s while moving")
                 return
@@ -206,7 +220,10 @@ class Device:
         timeouts = config.comm_timeouts_s
         self.line_watch = LineWatch(self.drives, timeouts, emit, timeouts_left or {})
         self.heartbeat = Heartbeat(
-            self.stopper, config.heartbeat_s, min(timeouts.values(), default=0.0) / 4
+            self.stopper,
+            signals,
+            config.heartbeat_s,
+            min(timeouts.values(), default=0.0) / 4,
         )
         bus.check = self._before_exchange
 

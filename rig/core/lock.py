@@ -1,7 +1,11 @@
-"""One lock for each bus: who moves the device now, and how to ask them to stop.
+"""One lock for each bus: who moves the device now, and how to stop it without them.
 
 The lock is an flock on a file in a folder of this user, so the kernel frees it however
 its holder ends. The file says who holds it; what it says without the flock is stale.
+Beside it lies what a stop needs, written before the drives are armed: bus, units and
+register maps. So a stop needs no configuration file.
+
+Nothing heavy is imported here: ``stop`` asks the holder before it loads anything.
 """
 
 from __future__ import annotations
@@ -15,14 +19,19 @@ import re
 import signal
 import socket
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rig.config.settings import BusSettings
 from rig.core.faults import Refused
+
+if TYPE_CHECKING:
+    from rig.config.config import RigConfig
+    from rig.config.settings import BusSettings
 
 # The same for every login, service and TMPDIR of a user, or two sessions of one user
 # would not see each other's locks.
-FOLDER = pathlib.Path(f"/var/tmp/jaxcal-rig-{os.getuid()}")
+FOLDER = pathlib.Path(
+    os.environ.get("JAXCAL_RIG_LOCKS", f"/var/tmp/jaxcal-rig-{os.getuid()}")
+)
 PATIENCE_S = 0.2  # a `holder` of another process keeps the flock for an instant
 LOOK_S = 0.02
 
@@ -36,7 +45,8 @@ class BusLock:
 
     def __init__(self, settings: BusSettings) -> None:
         self.where = settings.where
-        self.path = FOLDER / (re.sub(r"[^\w.-]+", "_", _identity(settings)) + ".lock")
+        name = re.sub(r"[^\w.-]+", "_", _identity(settings))
+        self.path, self.armed_path = FOLDER / f"{name}.lock", FOLDER / f"{name}.armed"
         self._fd: int | None = None
         self._told: dict[str, Any] = {}
 
@@ -118,6 +128,46 @@ class BusLock:
                 os.kill(told["pid"], signal.Signals(number))
         return told
 
+    def leave(self, config: RigConfig) -> None:
+        """Write what a stop of these drives needs; before they are armed.
+
+        Raises:
+            Refused: the folder cannot be written.
+        """
+        told = {
+            "bus": config.bus.model_dump(),
+            "silence_s": config.silence_s,
+            "standing": False,
+            "drives": [
+                {"name": axis.name, "unit": axis.unit, "map": axis.map.text}
+                for axis in config.axes
+            ],
+        }
+        self._write_armed(told)
+
+    def stood(self, forget: bool = False) -> None:
+        """All drives were seen standing: nothing has to be stopped any more.
+
+        ``forget``: they are gone as well, as simulated ones are.
+        """
+        with contextlib.suppress(Refused, OSError):  # they stand, whatever is written
+            if forget:
+                self.armed_path.unlink(missing_ok=True)
+            elif told := read_armed(self.armed_path):
+                self._write_armed(told | {"standing": True})
+
+    def _write_armed(self, told: dict[str, Any]) -> None:
+        new = self.armed_path.with_suffix(f".{os.getpid()}")
+        try:
+            _folder()
+            new.write_text(json.dumps(told), encoding="utf-8")
+            new.replace(self.armed_path)
+        except OSError as error:
+            reason = error.strerror or error
+            raise Refused(
+                f"cannot write {self.armed_path}, which `stop` needs: {reason}"
+            ) from None
+
     def freed(self, seconds: float) -> bool:
         """Wait so long for the holder to let go; whether it did."""
         end = time.monotonic() + seconds
@@ -128,19 +178,43 @@ class BusLock:
         return True
 
     def _open(self, flags: int) -> int:
-        if flags & os.O_CREAT:
-            with contextlib.suppress(FileExistsError):
-                FOLDER.mkdir(mode=0o700)
         try:
-            owner = FOLDER.lstat().st_uid
-            if owner != os.getuid():
-                raise Refused(f"{FOLDER} belongs to user {owner}: remove it")
+            _folder(make=bool(flags & os.O_CREAT))
             return os.open(self.path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         except FileNotFoundError:
             raise
         except OSError as error:
             reason = error.strerror or error
             raise Refused(f"cannot lock {self.where}: {self.path}: {reason}") from None
+
+
+def _folder(make: bool = True) -> None:
+    """The folder is there, and this user's."""
+    if make:
+        with contextlib.suppress(FileExistsError):
+            FOLDER.mkdir(mode=0o700)
+    owner = FOLDER.lstat().st_uid
+    if owner != os.getuid():
+        raise Refused(f"{FOLDER} belongs to user {owner}: remove it")
+
+
+def armed_files() -> list[pathlib.Path]:
+    """What sessions of this user have left for a stop, the newest first."""
+    try:
+        _folder(make=False)
+        found = {path: path.stat().st_mtime for path in FOLDER.glob("*.armed")}
+    except (OSError, Refused):
+        return []
+    return sorted(found, key=lambda path: -found[path])
+
+
+def read_armed(path: pathlib.Path) -> dict[str, Any] | None:
+    """What was left for a stop; None where there is nothing, or nothing of use."""
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        return told if told["bus"] and told["drives"] else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def held_by(told: dict[str, Any]) -> str:

@@ -32,7 +32,7 @@ class Motion:
         """
         if not self.device.armed:
             raise MotionFault("not armed")
-        self.device.stopper.check()
+        self.device.guard()
         check_plan(self.config, [target])
         self.device.emit("phase", phase="moving")
         for point in approach(self.config, target):

@@ -32,6 +32,7 @@ from rig.core.faults import (
     StopRequested,
     Unreachable,
 )
+from rig.core.lock import BusLock
 from rig.core.measure import Observer
 from rig.core.motion import Motion
 from rig.core.phone import Imu
@@ -145,6 +146,7 @@ class Run(RunFolder):
         self.check_device(self.device)
         self._attached = [attach(self, device) for attach in self.attachments]
         imu.wait_for_stream(STREAM_WAIT_S)
+        BusLock(config.bus).leave(config)
         self.signals.armed = True
         self.device.arm(self._reset_alarms)
         self.record.left_at()  # not known until they stand again
@@ -276,6 +278,10 @@ class Run(RunFolder):
                         leave(self.device.drives, self.record)
                 except OSError as error:
                     self.say(f"{self.record.path} cannot be written: {error}")
+            results = self.device.stopper.results
+            if results and all(result.standing for result in results):
+                simulated = self.journal.records[0].get("simulated") is not None
+                BusLock(self.config.bus).stood(forget=simulated)
             self.device.close()
         self.device = None
         self.signals.armed = False

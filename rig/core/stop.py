@@ -181,6 +181,7 @@ class Requests:
         self.pause = False
         self.report: Callable[[str], object] = lambda event: None
         self._stop: StopRequested | None = None
+        self._asked = 0.0
         self._told = False
 
     def __enter__(self) -> Requests:
@@ -191,7 +192,14 @@ class Requests:
 
     def request_stop(self, reason: str, exit_code: int) -> None:
         """Ask for a stop; the first request is the one that is kept."""
-        self._stop = self._stop or StopRequested(reason, exit_code)
+        if self._stop is None:
+            self._asked = time.monotonic()
+            self._stop = StopRequested(reason, exit_code)
+
+    def overdue(self, seconds: float) -> str:
+        """The reason of a stop that was asked for so long ago; empty where none was."""
+        late = self._stop is not None and time.monotonic() - self._asked > seconds
+        return str(self._stop) if late else ""
 
     def tell(self) -> None:
         """Report "pausing" from a loop, once, where a pause was asked for."""

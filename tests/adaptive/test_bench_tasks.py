@@ -137,7 +137,7 @@ def test_intervals_hold_as_often_as_they_say():
 )
 def test_three_estimators_agree(task):
     found = compare(task, {"gain": Gain(), "random": Random()}, 768, batch=768)
-    for other in (found.told, found.log_ratio):
+    for other in (found.entropy_drop, found.log_ratio):
         difference = other - found.gain
         error = difference.std(axis=1, ddof=1) / np.sqrt(768)
         assert (np.abs(difference.mean(axis=1)) < 4.0 * error).all()

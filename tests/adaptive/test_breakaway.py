@@ -74,7 +74,7 @@ def test_a_cautious_step_hardly_ever_goes_far_past_the_threshold():
         played = play(task, decider, keys)
         truth[name] = np.asarray(task.theta)[np.asarray(played.truth), 0]
         steps[name] = np.asarray(task.designs)[np.asarray(played.designs), 0]
-        found[name] = float(played.told.mean())
+        found[name] = float(played.entropy_drop.mean())
     far = {n: steps[n] - truth[n][:, None] > 0.1 for n in steps}
     assert far["cautious"].mean() <= 0.05 < far["free"].any(axis=1).mean()
     assert found["cautious"] > 0.95 * found["free"]  # nearly all of log 32 nats

@@ -33,7 +33,7 @@ def three_joints():
         travel=rng.uniform(0.5, 3, (7, 6)),
         extra=[0.0, 2.0, 0.3],
         seconds=(4.0, 9.0),
-        most=12,
+        horizon=12,
     )
 
 
@@ -49,7 +49,7 @@ def no_clock():
         place_after=np.full((4, 3), 5),
         uses=[0, 1, 2],
         num_uses=4,
-        most=6,
+        horizon=6,
     )
 
 

@@ -156,7 +156,7 @@ def test_two_steps_draw_candidates_and_judge_them_by_different_draws(task):
             spent.append(("options", key))
             return self.belief.draws(count, key)
 
-    long = task.replace(most=3)
+    long = task.replace(horizon=3)
     belief, session = long.begin(jax.random.key(0))
     options = long.options(belief, session, jax.random.key(1))
     decider = TwoStep(Priced(1.0, 0.0, 0.0), per_group=2)

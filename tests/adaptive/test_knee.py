@@ -79,7 +79,7 @@ def test_sessions_are_those_of_the_second_implementation(rule):
     for number in range(24):
         belief, total = replay(task, episodes, number, 6, 0.05)
         told = stats.entropy(prior.ravel()) - stats.entropy(belief.ravel())
-        assert float(episodes.told[number]) == pytest.approx(told, abs=1e-4)
+        assert float(episodes.entropy_drop[number]) == pytest.approx(told, abs=1e-4)
         assert float(episodes.gain[number]) == pytest.approx(total, abs=1e-5)
         truth = int(episodes.truth[number])
         ratio = math.log(belief.ravel()[truth] / prior.ravel()[truth])
@@ -102,7 +102,7 @@ def test_outcomes_come_as_often_as_the_likelihood_says():
 def test_three_estimators_of_the_information_agree():
     found = compare(knee(**SMALL), {"state": STATE_RULE, "random": Random()}, 2048)
     for row in range(2):
-        for other in (found.told, found.log_ratio):
+        for other in (found.entropy_drop, found.log_ratio):
             gap = found.gain[row] - other[row]
             assert abs(gap.mean()) < 4.5 * gap.std() / math.sqrt(len(gap))
 
@@ -175,7 +175,7 @@ def made(**change):
         "theta": [0.0, 1.0],
         "designs": [0.0, 1.0, 2.0],
         "likelihood": np.full((3, 2, 2), 0.5),
-        "most": 3,
+        "horizon": 3,
     }
     return GridTask.make(**base | change)
 

@@ -278,7 +278,7 @@ def test_a_likelihood_that_is_known_to_float32_bears_a_long_history():
     theta = np.linspace(0.0, 1.0, 11)
     yes = np.clip(theta, 1e-6, 1 - 1e-6)[None]
     table = np.stack([1 - yes, yes], axis=1)
-    coin = GridTask.make(theta, [0.0], table, num_uses=1, most=400)
+    coin = GridTask.make(theta, [0.0], table, num_uses=1, horizon=400)
     history = [(0, 0), (0, 1)] * 150
     proposal = next_measurement(coin, history)
     np.testing.assert_allclose(

@@ -1,5 +1,6 @@
 """Particle beliefs, bounds and the public tasks, against exact and plain answers."""
 
+import inspect
 import math
 from typing import Any
 
@@ -10,14 +11,14 @@ import pytest
 from flax import struct
 from scipy import integrate, special, stats
 
+from benchmarks.tasks.ces import CES, ces
+from benchmarks.tasks.hyperbolic import Hyperbolic
+from benchmarks.tasks.location import LocationFinding
+from benchmarks.tasks.prey import make_prey
 from jaxcal.adaptive.bounds import sace, spce
 from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.particles import ParticleTask, systematic
 from jaxcal.adaptive.rules import Gain, GainRate, Random
-from jaxcal.adaptive.tasks.ces import CES, ces
-from jaxcal.adaptive.tasks.hyperbolic import Hyperbolic
-from jaxcal.adaptive.tasks.location import LocationFinding
-from jaxcal.adaptive.tasks.prey import make_prey
 
 
 @struct.dataclass
@@ -181,7 +182,7 @@ def test_gains_of_continuous_outcomes_are_those_of_the_closed_form():
 def test_three_estimators_and_the_closed_form_agree(lines):
     _, episodes = lines
     wanted = closed_form(episodes.designs)
-    for name in ("gain", "told", "log_ratio"):
+    for name in ("gain", "entropy_drop", "log_ratio"):
         gap = np.asarray(getattr(episodes, name), np.float64) - wanted
         assert abs(gap.mean()) < 4.0 * gap.std() / 8.0 + 0.1, name
 
@@ -203,6 +204,13 @@ def test_bounds_hold_the_closed_form_between_them(lines):
     assert (wide.lower <= wide.cap + 1e-5).all()
     gap = tight.lower - np.asarray(episodes.log_ratio)
     assert abs(gap.mean()) < 0.2
+
+
+def test_contrasts_that_are_not_drawn_whole_are_refused(lines):
+    task, episodes = lines
+    with pytest.raises(ValueError, match="below 4096 or a multiple of it, got 100000"):
+        spce(task, episodes, jax.random.key(0), 100_000)
+    assert inspect.signature(spce).parameters["contrasts"].default % 4096 == 0
 
 
 @pytest.mark.slow

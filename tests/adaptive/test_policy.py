@@ -133,7 +133,7 @@ def sides(sides=5, noise=0.1):
     hit = np.full((sides, sides), noise) + (1 - 2 * noise) * np.eye(sides)
     return GridTask.make(
         np.arange(sides), np.arange(sides), np.stack([1 - hit, hit], axis=1),
-        travel=1.0, seconds=(2.0, 4.0), most=4,
+        travel=1.0, seconds=(2.0, 4.0), horizon=4,
     )
 
 ENTRY = Entry(sides, about="a heavy side")

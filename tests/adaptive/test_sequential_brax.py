@@ -17,7 +17,7 @@ SMALL = {"cells": 4, "sigma": 0.05, "seconds": (5.0, 9.0)}
 def test_the_adapter_plays_sessions_and_draws_new_ones():
     task = knee(**SMALL)
     with jax.numpy_rank_promotion("allow"):
-        env = wrap_fresh(SequentialEnv(task, STATE_RULE, 2), task.most, 1)
+        env = wrap_fresh(SequentialEnv(task, STATE_RULE, 2), task.horizon, 1)
         state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(1), 8))
         assert state.obs.shape == (8, env.observation_size)
         step = jax.jit(env.step)

@@ -18,7 +18,6 @@ from jaxcal.commands import evaluate as command
 from jaxcal.evaluation import stream
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import save_csv, save_npz
-from jaxcal.evaluation.tally import tally_of
 from jaxcal.information.regression import regression_matrix
 from jaxcal.paper.datasets.datasets import make_dataset
 from jaxcal.progress import Progress
@@ -271,10 +270,9 @@ def test_a_stopped_command_writes_nothing(
     assert done.stderr == f"evaluate.py: {says}, nothing was written\n"
     assert list(tmp_path.iterdir()) == []
     folder = tmp_path / "parts"
-    ones = np.ones(1_000)
-    row = tally_of(ones[:, None], ones, ones > 0, 3, 12, 0.1)
-    block = (1_000, {"random": row, "greedy": row})
-    monkeypatch.setattr(stream, "_solve_block", lambda *_: block)
+    row = {"det_s": {}, "log_det_s": {}}
+    part = {"proven": 1_000, "rows": {"random": row, "greedy": row}}
+    monkeypatch.setattr(stream, "_solved", lambda *_: part)
     done = call(
         capsys,
         *("--stream", folder, "--episodes", 9_000, "--methods", "greedy"),

@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxcal.paper.datasets import BIAS_DEG, SCALE, make_dataset
 from jaxcal.paper.datasets.__main__ import write_datasets
-from jaxcal.paper.reproduce import main
+from studies.paper.reproduce import main
 
 ROOT = pathlib.Path(__file__).parents[2]
 

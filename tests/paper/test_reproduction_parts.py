@@ -6,7 +6,6 @@ import functools
 import json
 import pathlib
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,22 +17,21 @@ from jaxcal.calibration.identify import identify
 from jaxcal.evaluation.csv_rows import csv_text
 from jaxcal.evaluation.parameters import least_squares, predict
 from jaxcal.paper.datasets import make_dataset
-from jaxcal.paper.exhibits import pictures
-from jaxcal.paper.exhibits.devices import Device
-from jaxcal.paper.exhibits.intervals import (
+from jaxcal.plots import as_bytes
+from studies.paper import robot_pictures
+from studies.paper.exhibits import pictures
+from studies.paper.exhibits.devices import Device
+from studies.paper.exhibits.intervals import (
     bootstrap_interval,
     mean_interval,
     median_interval,
     paired,
     share_interval,
 )
-from jaxcal.paper.exhibits.material import Material, Settings
-from jaxcal.paper.exhibits.training import exhibits, kept_runs, plateau
-from jaxcal.paper.exhibits.variance import variance_table
-from jaxcal.paper.training_runs import FORMAT
-from jaxcal.paper.twin import robot_pictures
-from jaxcal.paper.twin.robot import RobotConfig
-from jaxcal.plots import as_bytes
+from studies.paper.exhibits.material import Material, Settings
+from studies.paper.exhibits.training import exhibits, kept_runs, plateau
+from studies.paper.exhibits.variance import variance_table
+from studies.paper.training_runs import FORMAT
 
 Array = NDArray[np.float64]
 
@@ -164,22 +162,13 @@ def test_recordings_can_be_given(tmp_path: pathlib.Path) -> None:
     assert "500 postures" in Material(Settings()).about_overlap("dataset4")
 
 
-def test_the_robot_is_drawn_where_mujoco_cannot(
+def test_a_report_without_opengl_says_why_it_has_no_picture(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def fail(*_: object) -> None:
         raise ImportError("no EGL here")
 
     monkeypatch.setattr(robot_pictures, "_renderer", fail)
-    render = functools.partial(robot_pictures.render, size=(120, 90))
-    monkeypatch.setattr(pictures, "render", render)
-
-    def animate(
-        config: RobotConfig, path: pathlib.Path, way: Array, **rest: Any
-    ) -> str:
-        return robot_pictures.animate(config, path, way[:1], size=(120, 90), **rest)
-
-    monkeypatch.setattr(pictures, "animate", animate)
     chosen = SimpleNamespace(indices=np.arange(4).reshape(1, 1, 4))
     material = SimpleNamespace(
         settings=Settings(quick=True),
@@ -188,11 +177,9 @@ def test_the_robot_is_drawn_where_mujoco_cannot(
         progress=lambda *_: None,
     )
     (found,) = pictures.exhibits(material)
-    assert found.notice.startswith("MuJoCo cannot draw here: ")
-    assert found.notice.endswith("drawn by matplotlib from the same parts and angles.")
+    assert found.notice.startswith("MuJoCo cannot draw here: no EGL here; ")
     assert "\n" not in found.notice and found.notice in found.caption
-    assert found.pictures["robot.png"].startswith(b"\x89PNG")
-    assert found.pictures["robot.gif"].startswith(b"GIF89a")
+    assert found.pictures == {}
 
 
 # -- training --------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxcal.evaluation.training_figure import read_metrics
-from jaxcal.paper.training_runs import main, thinned
+from studies.paper.training_runs import main, thinned
 
 ROOT = pathlib.Path(__file__).parents[2]
 
@@ -89,7 +89,7 @@ def test_a_kept_run_of_another_budget_is_not_overwritten(
 def test_the_command_trains_keeps_and_does_not_train_again(
     tmp_path: pathlib.Path,
 ) -> None:
-    command = [sys.executable, "-m", "jaxcal.paper.training_runs"]
+    command = [sys.executable, "-m", "studies.paper.training_runs"]
     folders = ["--out", str(tmp_path / "kept"), "--runs", str(tmp_path / "runs")]
     given = [*command, "--preset", "compact", "--seeds", "3,3", "--episodes", "4096"]
     done = subprocess.run([*given, *folders], capture_output=True, text=True, cwd=ROOT)

@@ -471,6 +471,15 @@ def test_rooms_are_there_after_the_import_alone():
     assert done.stdout.startswith("('a11', 'b1')")
 
 
+def test_the_import_changes_no_environment_variable():
+    code = (
+        "import os; before = dict(os.environ)\n"
+        "import jaxcal; jaxcal.select, jaxcal.models\n"
+        "assert dict(os.environ) == before, set(os.environ) ^ set(before)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_names_are_exported_lazily():
     assert jaxcal.select is select
     code = (

@@ -153,7 +153,7 @@ def _stream(
         def after(outcome: jax.Array) -> tuple[Any, Any, jax.Array]:
             then = belief.update(task, design, outcome, keys[4])
             left = task.spend(session, design, outcome)
-            return then, left, left.over | (left.made >= task.most)
+            return then, left, left.over | (left.made >= task.horizon)
 
         def value_after(outcome: jax.Array) -> jax.Array:
             then, left, ended = after(outcome)

@@ -118,7 +118,7 @@ def backlash(
         travel=measure_s + way / speed,
         uses=1,
         num_uses=measurements,
-        most=measurements,
+        horizon=measurements,
         theta_names=["width", "offset"],
         design_names=["posture", "direction"],
     )
@@ -190,7 +190,7 @@ def dead_zone(
         bins.likelihood(mean, sigma, outliers),
         uses=1,
         num_uses=measurements,
-        most=measurements,
+        horizon=measurements,
         theta_names=["width", "centre"],
         design_names=["command"],
     )

@@ -66,7 +66,7 @@ def breakaway(
         groups=side,
         uses=1,
         num_uses=measurements,
-        most=measurements,
+        horizon=measurements,
         theta_names=["up", "down"][:directions],
         design_names=["step", "direction"],
     )

@@ -80,13 +80,13 @@ def knee(
         uses=[0, 1],
         seconds=seconds,
         num_uses=trips,
-        most=_most(seconds, test_s),
+        horizon=_horizon(seconds, test_s),
         theta_names=[f"tau{i + 1}" for i in range(joints)],
         design_names=["joint", "u"],
     )
 
 
-def _most(seconds: float | tuple[float, float], test_s: float) -> int:
+def _horizon(seconds: float | tuple[float, float], test_s: float) -> int:
     return int(np.ceil(np.max(seconds) / test_s))
 
 

@@ -12,6 +12,7 @@ import importlib.metadata
 import importlib.util
 import inspect
 import pathlib
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -24,13 +25,8 @@ _GROUP = "jaxcal.tasks"  # entry points
 _OWN = {
     "backlash": "jaxcal.adaptive.tasks.backlash:ENTRY",
     "breakaway": "jaxcal.adaptive.tasks.breakaway:ENTRY",
-    "ces": "jaxcal.adaptive.tasks.ces:ENTRY",
     "dead_zone": "jaxcal.adaptive.tasks.backlash:DEAD_ZONE",
-    "death": "jaxcal.adaptive.tasks.death:ENTRY",
-    "hyperbolic": "jaxcal.adaptive.tasks.hyperbolic:ENTRY",
     "knee": "jaxcal.adaptive.tasks.knee:ENTRY",
-    "location": "jaxcal.adaptive.tasks.location:ENTRY",
-    "prey": "jaxcal.adaptive.tasks.prey:ENTRY",
     "transmission": "jaxcal.adaptive.tasks.transmission:ENTRY",
 }
 
@@ -87,9 +83,10 @@ def load(name: str) -> Entry:
 def _of_file(path: pathlib.Path) -> Any:
     if not path.is_file():
         raise ValueError(f"task file {path} does not exist")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
+    spec = importlib.util.spec_from_file_location(f"{_GROUP} {path}", path)
     assert spec is not None and spec.loader is not None  # it is a Python file
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses of the file look themselves up there
     spec.loader.exec_module(module)
     if not hasattr(module, "ENTRY"):
         raise ValueError(f"task file {path} must define ENTRY = Entry(...)")

@@ -70,7 +70,7 @@ def transmission_error(
         travel=measure_s + travel_s * np.abs(here[:, None] - at),
         uses=1,
         num_uses=measurements,
-        most=measurements,
+        horizon=measurements,
         theta_names=["frequency", "amplitude", "phase"],
         design_names=["posture"],
     )

@@ -1,19 +1,14 @@
-"""The selection environment as a ``brax.envs.base.Env``; importing this loads brax.
+"""Episodes as ``brax.envs.base.Env``; importing this loads brax.
 
-| | |
-|---|---|
-| observation | (n M + M + 2 n + 4,): ``environment.observe``, the paper's 210 |
-| action | () int32, an available candidate |
-| reward, end | as ``jaxcal.learning.environments.selection`` |
-
-``done`` is 1 on the last choice: an episode ends, it is never cut off, so brax's
-``truncation`` stays 0. brax's own ``AutoResetWrapper`` replays the first candidate set
-for ever; ``wrap_fresh`` draws a new one for every episode.
+``done`` is 1 on the last step: an episode ends, it is never cut off, so brax's
+``truncation`` stays 0. brax's own ``AutoResetWrapper`` replays the first episode for
+ever; ``wrap_fresh`` draws a new one every time.
 """
 
 from __future__ import annotations
 
-from typing import Any
+import abc
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -23,11 +18,65 @@ from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 from jaxcal.learning.environments import selection as environment
 from jaxcal.learning.environments.selection import Candidates, SelectionConfig
 
-__all__ = ["SelectionEnv", "wrap_fresh"]
+__all__ = ["EpisodeEnv", "SelectionEnv", "wrap_fresh"]
 
 
-class SelectionEnv(Env):
-    """One episode; brax's wrappers make the batch."""
+class EpisodeEnv(Env, abc.ABC):
+    """One episode of what jaxcal plays; brax's wrappers make the batch."""
+
+    metric: ClassVar[str]  # what ``advance`` reports beside the reward
+    backend = "jaxcal"
+
+    @abc.abstractmethod
+    def begin(self, key: jax.Array) -> Any:
+        """A new episode, which carries a ``key`` of its own."""
+
+    @abc.abstractmethod
+    def observe(self, episode: Any) -> jax.Array:
+        """(observation_size,) what a policy sees."""
+
+    @abc.abstractmethod
+    def advance(self, episode: Any, action: jax.Array) -> tuple[Any, ...]:
+        """The next episode, reward, () bool whether it was the last step, metric."""
+
+    def reset(self, rng: jax.Array) -> State:
+        """A new episode; ``rng`` is a legacy uint32 key, which brax's wrappers need."""
+        episode, zero = self.begin(rng), jnp.zeros(())
+        return State(
+            pipeline_state=episode,
+            obs=self.observe(episode),
+            reward=zero,
+            done=zero,
+            metrics={self.metric: zero},
+            info={},
+        )
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Take one step."""
+        after, reward, done, metric = self.advance(state.pipeline_state, action)
+        return state.replace(
+            pipeline_state=after,
+            obs=self.observe(after),
+            reward=reward,
+            done=done.astype(jnp.float32),
+            metrics=state.metrics | {self.metric: metric},
+        )
+
+    @property
+    def observation_size(self) -> int:
+        key = jax.random.PRNGKey(0)  # brax's own kind
+        return int(jax.eval_shape(self.reset, key).obs.shape[-1])
+
+
+class SelectionEnv(EpisodeEnv):
+    """Postures.
+
+    Observation: (n M + M + 2 n + 4,) of ``environment.observe``, the paper's 210.
+    Action: () int32, an available candidate. Reward and end: as
+    ``jaxcal.learning.environments.selection``; ``log_det`` is paid with the reward.
+    """
+
+    metric = "log_det"
 
     def __init__(
         self, config: SelectionConfig | None = None, draw: Candidates | None = None
@@ -35,43 +84,19 @@ class SelectionEnv(Env):
         self.config = SelectionConfig() if config is None else config
         self._draw = draw
 
-    def reset(self, rng: jax.Array) -> State:
-        """A new episode; ``rng`` is a legacy uint32 key, which brax's wrappers need."""
-        state = environment.reset(rng, self.config, self._draw)
-        return State(
-            pipeline_state=state,
-            obs=environment.observe(state, self.config),
-            reward=jnp.zeros(()),
-            done=jnp.zeros(()),
-            metrics={"log_det": jnp.zeros(())},
-            info={},
-        )
+    def begin(self, key: jax.Array) -> Any:
+        return environment.reset(key, self.config, self._draw)
 
-    def step(self, state: State, action: jax.Array) -> State:
-        """Choose one posture; the metric ``log_det`` is paid with the reward."""
-        after, reward, done = environment.step(
-            state.pipeline_state, action, self.config
-        )
-        paid = {"log_det": reward / self.config.reward_scale}
-        return state.replace(
-            pipeline_state=after,
-            obs=environment.observe(after, self.config),
-            reward=reward,
-            done=done.astype(jnp.float32),
-            metrics=state.metrics | paid,
-        )
+    def observe(self, episode: Any) -> jax.Array:
+        return environment.observe(episode, self.config)
 
-    @property
-    def observation_size(self) -> int:
-        return self.config.observation_size
+    def advance(self, episode: Any, action: jax.Array) -> tuple[Any, ...]:
+        after, reward, done = environment.step(episode, action, self.config)
+        return after, reward, done, reward / self.config.reward_scale
 
     @property
     def action_size(self) -> int:
         return self.config.num_candidates
-
-    @property
-    def backend(self) -> str:
-        return "jaxcal"
 
 
 class _FreshReset(Wrapper):

@@ -22,6 +22,9 @@ def keep_compiled_programs() -> None:
         "jax_persistent_cache_min_compile_time_secs": 0.0,
         "jax_persistent_cache_min_entry_size_bytes": 0,
     }
+    # jaxlib 0.10.1 logs an error for each program from the cache where the processor
+    # has hints that XLA does not list as features; the programs are right.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     for name, value in settings.items():
         os.environ.setdefault(name.upper(), str(value))  # read when JAX is loaded
         jax = sys.modules.get("jax")

@@ -1,10 +1,7 @@
 """The same environment trained by brax's own PPO: ``python train.py --trainer brax``.
 
-brax 0.14.2 calls ``jax.device_put_replicated``, which jax 0.10 removed; its main branch
-is mended, its newest release is not. ``_replicated`` puts the function back while brax
-trains and takes it away again. The policy is the paper's architecture, because brax's
-trainer gives a network the observation and nothing else; it is masked by the
-availability in that observation.
+The policy is the paper's architecture, because brax's trainer gives a network the
+observation and nothing else; it is masked by the availability in that observation.
 """
 
 from __future__ import annotations
@@ -34,16 +31,25 @@ from jaxcal.learning.training.config import TrainConfig
 
 __all__ = ["READ", "MaskedCategorical", "adapted", "require_read", "train"]
 
-READ = (
-    "num_episodes",
-    "learning_rate",
-    "entropy_start",
-    "discount",
-    "gae_lambda",
-    "clip_range",
-    "max_grad_norm",
-    "seed",
-)  # fields of PPOConfig that brax is given; beside them the network's width
+READ = {
+    "learning_rate": "learning_rate",
+    "entropy_start": "entropy_cost",
+    "discount": "discounting",
+    "gae_lambda": "gae_lambda",
+    "clip_range": "clipping_epsilon",
+    "max_grad_norm": "max_grad_norm",
+    "seed": "seed",
+}
+"""Fields of PPOConfig that brax is given, and its names of them; beside them the number
+of episodes, the environment and the network's width."""
+_FIXED = {
+    "num_envs": 256,
+    "num_eval_envs": 256,
+    "batch_size": 64,
+    "num_minibatches": 16,
+    "num_updates_per_batch": 4,
+    "normalize_observations": False,
+}
 _WIDTH = 64  # of the network, where the preset has another kind
 _FASTEST = 1e-3  # learning rate; brax's updates diverge at the compact preset's 2e-3
 
@@ -61,9 +67,9 @@ def adapted(config: TrainConfig) -> TrainConfig:
 
 def require_read(given: Collection[str]) -> None:
     """Refuse values of fields, by name, that brax's trainer would not read."""
-    read = {*READ, "width", *(field.name for field in settings_of(SelectionConfig))}
-    unread = sorted(set(given) - read)
-    if unread:
+    read = {*READ, "num_episodes", "width"}
+    read |= {field.name for field in settings_of(SelectionConfig)}
+    if unread := sorted(set(given) - read):
         flags = ", ".join("--" + name.replace("_", "-") for name in unread)
         raise ValueError(f"--trainer brax does not read {flags}: leave it out")
 
@@ -72,46 +78,37 @@ class _Categorical:
     """One batch of categorical distributions over candidates."""
 
     def __init__(self, logits: jax.Array) -> None:
-        self.logits = logits
+        self.log_probs = jax.nn.log_softmax(logits)
         # brax's loss logs ``loc`` and ``scale`` of every distribution; a categorical
         # one has neither, so it is given its largest probability and its entropy.
-        self.loc = jax.nn.softmax(logits).max(-1)
-        self.scale = self.entropy()
+        self.loc, self.scale = jnp.exp(self.log_probs).max(-1), self.entropy()
 
     def sample(self, seed: jax.Array) -> jax.Array:
-        return jax.random.categorical(seed, self.logits)
+        return jax.random.categorical(seed, self.log_probs)
 
     def mode(self) -> jax.Array:
-        return jnp.argmax(self.logits, axis=-1)
+        return jnp.argmax(self.log_probs, axis=-1)
 
     def log_prob(self, x: jax.Array) -> jax.Array:
         index = x.astype(jnp.int32)[..., None]
-        log_probs = jax.nn.log_softmax(self.logits)
-        return jnp.take_along_axis(log_probs, index, axis=-1)[..., 0]
+        return jnp.take_along_axis(self.log_probs, index, axis=-1)[..., 0]
 
     def entropy(self) -> jax.Array:
-        log_probs = jax.nn.log_softmax(self.logits)
-        return -(jnp.exp(log_probs) * log_probs).sum(-1)
+        return -(jnp.exp(self.log_probs) * self.log_probs).sum(-1)
 
 
 class MaskedCategorical(distribution.ParametricDistribution):
     """brax's distribution interface over logits that the network has masked."""
 
     def __init__(self, num_actions: int) -> None:
-        super().__init__(
-            param_size=num_actions,
-            postprocessor=distribution.IdentityPostprocessor(),
-            event_ndims=0,
-            reparametrizable=False,
-        )
+        identity = distribution.IdentityPostprocessor()
+        super().__init__(num_actions, identity, event_ndims=0, reparametrizable=False)
 
     def create_dist(self, parameters: jax.Array) -> _Categorical:
         return _Categorical(parameters)
 
 
-def _make_networks(
-    env: SelectionConfig, config: NetworkConfig
-) -> Callable[..., brax_networks.PPONetworks]:
+def _networks(env: SelectionConfig, config: NetworkConfig) -> brax_networks.PPONetworks:
     """A network read from the observation, for the policy and the value."""
     network = build(config)
     m, n = env.num_candidates, env.num_inputs
@@ -124,25 +121,27 @@ def _make_networks(
             )[part],
         )
 
-    made = brax_networks.PPONetworks(read(0), read(1), MaskedCategorical(m))
-    return lambda *sizes, **options: made
+    return brax_networks.PPONetworks(read(0), read(1), MaskedCategorical(m))
 
 
 @contextlib.contextmanager
-def _replicated() -> Iterator[None]:
-    """``jax.device_put_replicated`` for as long as brax 0.14.2 needs it."""
-    if hasattr(jax, "device_put_replicated"):
-        yield
-        return
+def _repaired() -> Iterator[None]:
+    """brax 0.14.2 on jax 0.10, for as long as it trains.
 
-    def device_put_replicated(tree: Any, devices: Any) -> Any:
-        return jax.tree.map(lambda leaf: jnp.stack([leaf] * len(devices)), tree)
-
-    vars(jax)["device_put_replicated"] = device_put_replicated
+    It calls ``jax.device_put_replicated``, which jax removed (google/brax issue 671;
+    its main branch is mended, its newest release is not), and promotes ranks.
+    """
+    missing = not hasattr(jax, "device_put_replicated")
+    if missing:
+        vars(jax)["device_put_replicated"] = lambda tree, devices: jax.tree.map(
+            lambda leaf: jnp.stack([leaf] * len(devices)), tree
+        )
     try:
-        yield
+        with jax.numpy_rank_promotion("allow"):
+            yield
     finally:
-        del vars(jax)["device_put_replicated"]
+        if missing:
+            del vars(jax)["device_put_replicated"]
 
 
 def train(
@@ -157,55 +156,39 @@ def train(
     The checkpoint's configuration holds what brax was given and nothing else.
 
     Args:
-        config: from ``adapted``; of ``ppo`` the fields ``READ`` are used.
+        config: from ``adapted``.
         folder: of the run.
         say: takes a line of progress.
         num_evals: how often brax reports.
         watch: called with the step and the policy's parameters at every report.
     """
     task, ppo = config.tasks[0], config.ppo
-    env = task.environment
-    given = {
-        "num_timesteps": ppo.num_episodes * env.num_selected,
-        "num_envs": 256,
-        "num_eval_envs": 256,
-        "episode_length": env.num_selected,
-        "unroll_length": env.num_selected,
-        "batch_size": 64,
-        "num_minibatches": 16,
-        "num_updates_per_batch": 4,
-        "learning_rate": ppo.learning_rate,
-        "entropy_cost": ppo.entropy_start,
-        "discounting": ppo.discount,
-        "gae_lambda": ppo.gae_lambda,
-        "clipping_epsilon": ppo.clip_range,
-        "max_grad_norm": ppo.max_grad_norm,
-        "normalize_observations": False,
-        "seed": ppo.seed,
-        "num_evals": num_evals,
-    }
+    env, length = task.environment, task.environment.num_selected
+    read = {name: getattr(ppo, name) for name in READ}
+    given = _FIXED | {READ[name]: value for name, value in read.items()}
+    given |= {"num_timesteps": ppo.num_episodes * length, "num_evals": num_evals}
+    given |= {"episode_length": length, "unroll_length": length}
     begun = time.perf_counter()
 
     def progress(steps: int, metrics: dict[str, Any]) -> None:
-        seconds = time.perf_counter() - begun
         say(
-            f"{steps:10,d} decisions  {seconds:7.1f} s  "
+            f"{steps:10,d} decisions  {time.perf_counter() - begun:7.1f} s  "
             f"mean log det S {metrics['eval/episode_log_det']:.3f}"
         )
 
     say("brax is compiling (about half a minute) ...")
-    with _replicated(), jax.numpy_rank_promotion("allow"):
+    with _repaired():
         _, params, _ = brax_train.train(
             environment=SelectionEnv(env, task.draw),
             wrap_env_fn=wrap_fresh,
-            network_factory=_make_networks(env, config.network),
+            network_factory=lambda *_, **__: _networks(env, config.network),
             progress_fn=progress,
             policy_params_fn=lambda step, _, params: watch(step, params[1]),
             **given,
         )
     meta = config.as_meta() | {
         "network": {"kind": config.network.kind, "width": config.network.width},
-        "ppo": {name: getattr(ppo, name) for name in READ},
+        "ppo": read | {"num_episodes": ppo.num_episodes},
         "trainer": "brax",
         "brax": given,
         "seed": ppo.seed,
@@ -215,5 +198,6 @@ def train(
             "device": jax.devices()[0].device_kind,
         },
     }
-    root = pathlib.Path(folder) / "checkpoint"
-    checkpoint.save(root, ppo.num_episodes, params[1], meta)
+    checkpoint.save(
+        pathlib.Path(folder) / "checkpoint", ppo.num_episodes, params[1], meta
+    )

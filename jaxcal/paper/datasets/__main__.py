@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from jaxcal.arguments import Parser
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import save_csv_parts, save_npz
 from jaxcal.files import require_writable_folder, write_text
@@ -107,7 +108,7 @@ def _formats(text: str) -> list[str]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = command.Parser("python -m jaxcal.paper.datasets", _DESCRIPTION)
+    parser = Parser(prog="python -m jaxcal.paper.datasets", description=_DESCRIPTION)
     add = parser.add_argument
     folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
     name = command.one_of(NAMES)

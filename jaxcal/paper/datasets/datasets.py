@@ -136,7 +136,15 @@ def drawn(name: str, seed: int, begin: int, end: int) -> Dataset:
         seed: of the streams, 0 or greater.
         begin: the first episode, a multiple of ``BLOCK``.
         end: one after the last.
+
+    Raises:
+        ValueError: it is of another kind, which ends.
     """
+    if name not in DRAWN:
+        raise ValueError(
+            f"a streamed dataset must be one of {', '.join(DRAWN)}, which are drawn "
+            f"from a seed without end, got {name!r}"
+        )
     parts = []
     for first in range(begin, end, BLOCK):
         draw, noise = _streams(name, seed, first // BLOCK)

@@ -19,6 +19,7 @@ import sys
 import tempfile
 import time
 
+from jaxcal.arguments import Parser
 from jaxcal.files import atomic_write, require_writable_folder, write_text
 from jaxcal.paper import command
 from jaxcal.paper.constants import RANGES
@@ -102,10 +103,10 @@ def _rig(*arguments: str, capture: bool = False) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Record; the exit code."""
-    parser = command.Parser(
-        "python -m jaxcal.paper.datasets.record",
-        "Record Datasets 4 and 5 through the rig against its simulator (550 postures, "
-        "about three and a half minutes).",
+    parser = Parser(
+        prog="python -m jaxcal.paper.datasets.record",
+        description="Record Datasets 4 and 5 through the rig against its simulator "
+        "(550 postures, about three and a half minutes).",
     )
     name = command.one_of(SESSIONS)
     about = "dataset4, dataset5"

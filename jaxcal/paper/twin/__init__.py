@@ -1,25 +1,13 @@
-"""The paper's robot, simulated: in closed form, in MuJoCo, and in pictures."""
+"""The paper's robot, simulated: in closed form and in MuJoCo, which loads on use."""
 
-from __future__ import annotations
+from jaxcal.paper.twin.robot import RobotConfig, joint_angles, measure, read_out
+from jaxcal.paper.twin.robot_model import simulate, trajectory
 
-import importlib
-from typing import Any
-
-_HOMES = {  # loaded when first used: the closed form needs no MuJoCo
-    "RobotConfig": "robot",
-    "animate": "robot_pictures",
-    "joint_angles": "robot",
-    "measure": "robot",
-    "read_out": "robot",
-    "render": "robot_pictures",
-    "simulate": "robot_model",
-    "trajectory": "robot_model",
-}
-
-__all__ = list(_HOMES)  # the names above
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+__all__ = [
+    "RobotConfig",
+    "joint_angles",
+    "measure",
+    "read_out",
+    "simulate",
+    "trajectory",
+]

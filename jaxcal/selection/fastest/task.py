@@ -93,7 +93,7 @@ class Task:
 
     def tour(self, chosen: Indices) -> tuple[Indices, float]:
         """``chosen`` (k,) in the best order found, and its seconds of travel."""
-        from jaxcal.selection.fastest.tour_kernel import best_order
+        from jaxcal.selection.fastest.kernel import best_order
 
         order, seconds = best_order(
             self.times[np.ix_(chosen, chosen)], self.start[chosen]

@@ -44,7 +44,7 @@ def fastest_tour(
     begin = np.zeros(k) if start is None else numbers("start", start)
     if begin.shape != (k,):
         raise ValueError(f"start must have shape ({k},), got {begin.shape}")
-    from jaxcal.selection.fastest.tour_kernel import best_order
+    from jaxcal.selection.fastest.kernel import best_order
 
     order, seconds = best_order(between, begin)
     return order, float(seconds)

@@ -12,6 +12,10 @@ const live = {
     const answer = document.getElementById("answer");
     answer.className = "";
     answer.textContent = "Asking the session to " + what + " …";
+    const late = setTimeout(() => {
+      answer.textContent = "NO ANSWER: use the emergency stop";
+      answer.className = "bad";
+    }, 1000);
     try {
       const reply = await fetch("/" + what, { method: "POST" });
       answer.textContent = await reply.text();
@@ -21,6 +25,8 @@ const live = {
         "NOT SENT: the page has lost its server. Press Ctrl-C twice in the terminal, " +
         "run jaxcal-rig stop, or use the emergency stop.";
       answer.className = "bad";
+    } finally {
+      clearTimeout(late);
     }
   },
 };

@@ -15,7 +15,7 @@ from fastapi import FastAPI, HTTPException
 from fastapi.responses import FileResponse, PlainTextResponse
 from nicegui import Client, ui
 
-from rig.core.faults import Refused
+from rig.core.faults import Fault, Refused
 from rig.workbench.live.guard import Guard
 from rig.workbench.live.page import make_page
 from rig.workbench.live.watcher import Watcher
@@ -49,7 +49,19 @@ def make_app(watcher: Watcher, linger_s: float | None = None) -> FastAPI:
 
     @app.post("/stop")
     async def stop() -> PlainTextResponse:
-        return ask(signal.SIGTERM)
+        since = time.time()
+        asked = ask(signal.SIGTERM)
+        if asked.status_code != 200:
+            return asked
+        try:
+            units = await asyncio.to_thread(watcher.stopped, since)
+        except Fault as fault:
+            return PlainTextResponse(str(fault), status_code=503)
+        lines = "; ".join(map(str, units)) or "nothing was armed"
+        if all(unit.acknowledged and unit.standing for unit in units):
+            return PlainTextResponse(f"STOPPED: {lines}")
+        text = f"NOT ALL DRIVES STAND: use the emergency stop. {lines}"
+        return PlainTextResponse(text, status_code=503)
 
     @app.post("/pause")
     async def pause() -> PlainTextResponse:

@@ -12,7 +12,9 @@ from collections import deque
 from typing import Any
 
 from rig.core.faults import Refused
+from rig.core.stop import UnitStop
 from rig.journal import is_written
+from rig.stopping import stop_run
 from rig.workbench.live.state import RunState
 from rig.workbench.outputs.telemetry import PERIOD_S, TELEMETRY
 
@@ -145,3 +147,22 @@ class Watcher:
         if number == signal.SIGINT:
             return "pause asked for: the session finishes this posture first"
         return f"STOP sent to process {pid}"
+
+    def stopped(self, since: float) -> list[UnitStop]:
+        """What became of a stop that was asked for at ``since`` (Unix time).
+
+        It is waited for what the session says of its drives; where it says nothing,
+        the session is ended and the drives are stopped from here.
+
+        Raises:
+            Fault: no drive was told to stop.
+        """
+        end = time.monotonic() + ASK_S
+        while time.monotonic() < end:
+            stop = self.state.stop
+            if stop is not None and stop["time"] >= since:
+                return [UnitStop(**unit) for unit in stop["units"]]
+            if not is_written(self.folder / JOURNAL):
+                return []  # it had armed nothing
+            time.sleep(0.02)
+        return stop_run(self.folder)

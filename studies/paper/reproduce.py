@@ -9,13 +9,14 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from jaxcal.arguments import Parser
 from jaxcal.files import atomic_write, require_writable_folder
 from jaxcal.paper import command
 from jaxcal.progress import Progress
 
 if TYPE_CHECKING:
-    from jaxcal.paper.exhibits.exhibit import Claim, Exhibit
-    from jaxcal.paper.exhibits.material import Settings
+    from studies.paper.exhibits.exhibit import Claim, Exhibit
+    from studies.paper.exhibits.material import Settings
 
 __all__ = ["main"]
 
@@ -29,19 +30,19 @@ states, and judge its claims one by one. Writes into --out:
   data/*.csv            what each figure is drawn from
 
 The policy is the one that ships (checkpoints/default). Training curves are read from
---studies, where python -m jaxcal.paper.training_runs puts them; without them the report
-says so. The same seed gives the same numbers on the same machine.
+--studies, where python -m studies.paper.training_runs puts them; without them the
+report says so. The same seed gives the same numbers on the same machine.
 """
 _EPILOG = """\
 examples:
   make reproduce
       the whole report, in report/index.html
-  python -m jaxcal.paper --quick
+  python -m studies.paper --quick
       fewer episodes and draws, to see whether everything works
-  python -m jaxcal.paper --data recordings
+  python -m studies.paper --data recordings
       Datasets 4 and 5 from a rig: dataset4.csv and dataset5.csv in that folder, each
       the pairs.csv that jaxcal-rig collect writes (docs/datasets.md)
-  python -m jaxcal.paper --seed 1 --out report_1
+  python -m studies.paper --seed 1 --out report_1
       other candidate sets, draws and devices: how much of it is luck?
 """
 _PARTS = (  # modules of exhibits, in the order in which they are computed
@@ -78,8 +79,8 @@ def _run(options: argparse.Namespace, progress: Progress) -> None:
     begun = time.perf_counter()
 
     from jaxcal.learning.runtime import cache
-    from jaxcal.paper.exhibits.claims import claims
-    from jaxcal.paper.exhibits.material import STUDIES, Settings
+    from studies.paper.exhibits.claims import claims
+    from studies.paper.exhibits.material import STUDIES, Settings
 
     cache.keep_compiled_programs()
     studies = options.studies or STUDIES
@@ -104,7 +105,7 @@ def _run(options: argparse.Namespace, progress: Progress) -> None:
 
 def _exhibits(settings: Settings, progress: Progress) -> list[Exhibit]:
     """All of them, in the order of the paper."""
-    from jaxcal.paper.exhibits.material import Material
+    from studies.paper.exhibits.material import Material
 
     material = Material(settings, progress)
     # Small inputs that may be wrong come first: a bad file is refused at once.
@@ -113,7 +114,7 @@ def _exhibits(settings: Settings, progress: Progress) -> list[Exhibit]:
     found: list[Exhibit] = []
     for number, name in enumerate(_PARTS):
         material.stage = f"part {number + 1} of {len(_PARTS)}, "
-        part = importlib.import_module(f"jaxcal.paper.exhibits.{name}")
+        part = importlib.import_module(f"studies.paper.exhibits.{name}")
         found += part.exhibits(material)
     return sorted(found, key=lambda exhibit: _ORDER.index(exhibit.key))
 
@@ -126,8 +127,8 @@ def _files(
 ) -> dict[str, bytes]:
     """Everything to write, by path below the folder; the page last."""
     from jaxcal.evaluation.csv_rows import csv_text
-    from jaxcal.paper.exhibits.page import json_document, page
     from jaxcal.plots.style import as_files
+    from studies.paper.exhibits.page import json_document, page
 
     figures = {name: f for e in exhibits for name, f in e.figures.items()}
     files: dict[str, bytes] = {}
@@ -158,7 +159,9 @@ def _write(out: pathlib.Path, files: dict[str, bytes]) -> None:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = command.Parser("python -m jaxcal.paper", _DESCRIPTION, _EPILOG)
+    parser = Parser(
+        prog="python -m studies.paper", description=_DESCRIPTION, epilog=_EPILOG
+    )
     add = parser.add_argument
     folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
     add("--quick", action="store_true", help="fewer episodes, draws and devices")

@@ -19,7 +19,7 @@ __all__ = ["STUDIES", "Material", "Settings", "commands_deg"]
 Array = NDArray[np.float64]
 
 METHODS = ("policy", "random", "greedy", "exact")
-STUDIES = pathlib.Path(__file__).resolve().parents[3] / "studies"
+STUDIES = pathlib.Path(__file__).resolve().parents[1] / "kept"
 """Where the repository keeps training runs"""
 
 
@@ -54,7 +54,7 @@ class Settings:
     @property
     def command(self) -> str:
         """What makes the same report again."""
-        words = ["python -m jaxcal.paper"]
+        words = ["python -m studies.paper"]
         words += [f"--seed {self.seed}"] if self.seed else []
         words += ["--quick"] if self.quick else []
         words += [f"--data {self.data}"] if self.data is not None else []

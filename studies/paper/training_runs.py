@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.arguments import Parser
 from jaxcal.evaluation.csv_rows import csv_text
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.paper import command
@@ -41,11 +42,12 @@ folder per run under --out.
 """
 _EPILOG = """\
 examples:
-  python -m jaxcal.paper.training_runs --preset compact --seeds 5 \\
-      --out studies/compact_seeds
-      trains seeds 0 to 4, a few minutes each, into studies/compact_seeds/seed_0 ...
-  python -m jaxcal.paper.training_runs --collect runs/paper --out studies/paper
-      a run of train.py, finished or still going, into studies/paper
+  python -m studies.paper.training_runs --preset compact --seeds 5 \\
+      --out studies/paper/kept/compact_seeds
+      trains seeds 0 to 4, a few minutes each, into seed_0 ... of that folder
+  python -m studies.paper.training_runs --collect runs/paper \\
+      --out studies/paper/kept/paper
+      keeps a run of train.py, finished or still going
 
 The same command again continues where it was stopped: finished seeds are skipped, an
 interrupted seed resumes from its last checkpoint, which is under --runs.
@@ -253,8 +255,10 @@ def _collect(run: pathlib.Path, out: pathlib.Path) -> None:
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = command.Parser(
-        "python -m jaxcal.paper.training_runs", _DESCRIPTION, _EPILOG
+    parser = Parser(
+        prog="python -m studies.paper.training_runs",
+        description=_DESCRIPTION,
+        epilog=_EPILOG,
     )
     add = parser.add_argument
     number: dict[str, Any] = {"type": command.positive, "metavar": "N"}

@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from jaxcal.evaluation import figures
 from jaxcal.evaluation.results import HIT_TOLERANCE, Evaluation
-from jaxcal.paper.exhibits.exhibit import Columns, Exhibit, judge
-from jaxcal.paper.exhibits.intervals import (
+from jaxcal.plots.style import BLACK, COLOURS, legend_right, panels
+from studies.paper.exhibits.exhibit import Columns, Exhibit, judge
+from studies.paper.exhibits.intervals import (
     bootstrap_interval,
     mean_interval,
     share_interval,
 )
-from jaxcal.paper.exhibits.material import Material, Settings
-from jaxcal.plots.style import BLACK, COLOURS, legend_right, panels
+from studies.paper.exhibits.material import Material, Settings
 
 __all__ = ["STREAM", "exhibits", "words_of"]
 

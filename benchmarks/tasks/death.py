@@ -47,7 +47,7 @@ def death_process(
         xi,
         likelihood,
         prior=prior,
-        most=measurements,
+        horizon=measurements,
         theta_names=["rate"],
         design_names=["time"],
     )

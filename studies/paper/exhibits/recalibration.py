@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from jaxcal.candidates import uniform_candidates
 from jaxcal.evaluation.parameters import least_squares, predict
 from jaxcal.paper.constants import NOISE_STD_DEG, RANGES
-from jaxcal.paper.exhibits.devices import Device, pick, rms
-from jaxcal.paper.exhibits.exhibit import Exhibit, from_rows, judge
-from jaxcal.paper.exhibits.intervals import median_interval, paired
-from jaxcal.paper.exhibits.material import Material
-from jaxcal.paper.exhibits.traces import POINTS, TRACED, trace_columns, traces
 from jaxcal.plots.style import COLOURS, GREY, MARKERS, band, legend_right, panels
 from jaxcal.selection import exact_batch
+from studies.paper.exhibits.devices import Device, pick, rms
+from studies.paper.exhibits.exhibit import Exhibit, from_rows, judge
+from studies.paper.exhibits.intervals import median_interval, paired
+from studies.paper.exhibits.material import Material
+from studies.paper.exhibits.traces import POINTS, TRACED, trace_columns, traces
 
 __all__ = ["exhibits"]
 

@@ -13,12 +13,12 @@ from scipy import stats
 from jaxcal.evaluation.parameters import least_squares, parameter_names
 from jaxcal.information.regression import regressors
 from jaxcal.paper.constants import BIAS_DEG, NOISE_STD_DEG, SCALE
-from jaxcal.paper.exhibits.devices import Device
-from jaxcal.paper.exhibits.exhibit import Exhibit, from_rows
-from jaxcal.paper.exhibits.intervals import share_interval
-from jaxcal.paper.exhibits.material import Material, commands_deg
 from jaxcal.plots import ellipsoid
 from jaxcal.plots.style import BLACK, COLOURS, GREY, legend_below, panels
+from studies.paper.exhibits.devices import Device
+from studies.paper.exhibits.exhibit import Exhibit, from_rows
+from studies.paper.exhibits.intervals import share_interval
+from studies.paper.exhibits.material import Material, commands_deg
 
 __all__ = ["exhibits"]
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from jaxcal import pages
 from jaxcal.evaluation.results import versions
-from jaxcal.paper.exhibits.exhibit import Claim, Exhibit, Verdict
-from jaxcal.paper.exhibits.material import Settings
+from studies.paper.exhibits.exhibit import Claim, Exhibit, Verdict
+from studies.paper.exhibits.material import Settings
 
 __all__ = ["json_document", "page"]
 

@@ -8,11 +8,11 @@ import tempfile
 import numpy as np
 
 from jaxcal.paper.datasets import dataset0_robot
-from jaxcal.paper.exhibits.exhibit import Exhibit
-from jaxcal.paper.exhibits.material import Material, commands_deg
 from jaxcal.paper.twin.robot import read_out
 from jaxcal.paper.twin.robot_model import simulate
-from jaxcal.paper.twin.robot_pictures import TOUR_DEG, animate, render
+from studies.paper.exhibits.exhibit import Exhibit
+from studies.paper.exhibits.material import Material, commands_deg
+from studies.paper.robot_pictures import TOUR_DEG, animate, render
 
 __all__ = ["exhibits"]
 
@@ -26,17 +26,15 @@ def exhibits(material: Material) -> list[Exhibit]:
     if not material.settings.quick:
         way = f"each axis alone, then {way}"
         postures = np.concatenate([TOUR_DEG[:6], four])  # to either side of each axis
-    said, notice, backend = "Drawn by MuJoCo, without a screen.", "", "mujoco"
+    said, notice, files = "Drawn by MuJoCo, without a screen.", "", {}
     with tempfile.TemporaryDirectory() as place:
         still, film = (pathlib.Path(place) / n for n in ("robot.png", "robot.gif"))
         try:
-            render(robot, still, four[0], backend=backend)
+            render(robot, still, four[0])
+            animate(robot, film, postures, progress=material.progress)
+            files = {path.name: path.read_bytes() for path in (still, film)}
         except RuntimeError as error:
-            notice = f"{error}; drawn by matplotlib from the same parts and angles."
-            said, backend = notice, "matplotlib"
-            render(robot, still, four[0], backend=backend)
-        animate(robot, film, postures, backend=backend, progress=material.progress)
-        files = {path.name: path.read_bytes() for path in (still, film)}
+            said = notice = f"{error}; the report has no picture of the robot."
     apart = np.abs(simulate(robot, postures) - np.asarray(read_out(robot, postures)))
     return [
         Exhibit.from_texts(

@@ -1,7 +1,7 @@
 """Figure 2: training curves of the compact preset over seeds, and of a ``paper`` run.
 
-Nothing is trained here: the runs are kept in ``studies/`` by
-``jaxcal.paper.training_runs`` and read from there; what is not there is said to be
+Nothing is trained here: the runs are kept in ``kept/`` by
+``studies.paper.training_runs`` and read from there; what is not there is said to be
 missing.
 """
 
@@ -21,10 +21,10 @@ from jaxcal.evaluation.training_figure import (
     read_metrics,
     training_curves,
 )
-from jaxcal.paper.exhibits.exhibit import Exhibit, Verdict, judge
-from jaxcal.paper.exhibits.intervals import mean_interval
-from jaxcal.paper.exhibits.material import Material
 from jaxcal.plots.style import COLOURS, GREY, band, boxes, panels
+from studies.paper.exhibits.exhibit import Exhibit, Verdict, judge
+from studies.paper.exhibits.intervals import mean_interval
+from studies.paper.exhibits.material import Material
 
 __all__ = ["Run", "exhibits", "kept_runs", "plateau"]
 

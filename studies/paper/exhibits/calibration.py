@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from jaxcal.calibration.identify import identify
 from jaxcal.evaluation.parameters import least_squares, parameter_names, predict
 from jaxcal.paper.constants import AXES, BIAS_DEG, NOISE_STD_DEG, RANGES, SCALE
-from jaxcal.paper.exhibits.exhibit import Exhibit, by_axis, judge
-from jaxcal.paper.exhibits.intervals import mean_interval, share_interval
-from jaxcal.paper.exhibits.material import Material
 from jaxcal.paper.twin.robot import ORDERS, RobotConfig, read_out
 from jaxcal.plots.style import BLACK, COLOURS, boxes, legend_right, panels
+from studies.paper.exhibits.exhibit import Exhibit, by_axis, judge
+from studies.paper.exhibits.intervals import mean_interval, share_interval
+from studies.paper.exhibits.material import Material
 
 __all__ = ["exhibits"]
 

@@ -18,17 +18,17 @@ from numpy.typing import NDArray
 from jaxcal.evaluation.parameters import least_squares, predict
 from jaxcal.information.regression import regressors
 from jaxcal.paper.constants import NOISE_STD_DEG
-from jaxcal.paper.exhibits.devices import Device, pick, rms
-from jaxcal.paper.exhibits.exhibit import Exhibit, from_rows, judge
-from jaxcal.paper.exhibits.intervals import (
+from jaxcal.plots.style import BLACK, band, numbered, panels, plain_log
+from jaxcal.selection import exchange_batch
+from studies.paper.exhibits.devices import Device, pick, rms
+from studies.paper.exhibits.exhibit import Exhibit, from_rows, judge
+from studies.paper.exhibits.intervals import (
     mean_interval,
     median_interval,
     paired,
     share_interval,
 )
-from jaxcal.paper.exhibits.material import Material, commands_deg
-from jaxcal.plots.style import BLACK, band, numbered, panels, plain_log
-from jaxcal.selection import exchange_batch
+from studies.paper.exhibits.material import Material, commands_deg
 
 __all__ = ["exhibits"]
 

@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from jaxcal.evaluation.parameters import least_squares, predict
 from jaxcal.paper.constants import AXES
-from jaxcal.paper.exhibits.devices import pick, rms
-from jaxcal.paper.exhibits.exhibit import Exhibit, judge
-from jaxcal.paper.exhibits.intervals import median_interval, paired, share_interval
-from jaxcal.paper.exhibits.material import Material
-from jaxcal.paper.exhibits.traces import POINTS, TRACED, trace_columns, traces
+from studies.paper.exhibits.devices import pick, rms
+from studies.paper.exhibits.exhibit import Exhibit, judge
+from studies.paper.exhibits.intervals import median_interval, paired, share_interval
+from studies.paper.exhibits.material import Material
+from studies.paper.exhibits.traces import POINTS, TRACED, trace_columns, traces
 
 __all__ = ["exhibits"]
 

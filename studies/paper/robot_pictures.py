@@ -1,10 +1,9 @@
-"""A picture and a short film of the robot, by MuJoCo or, without OpenGL, by matplotlib.
+"""A picture and a short film of the robot.
 
-``mujoco.Renderer`` draws where there is EGL or OSMesa, which need no screen. Where
-there is neither, matplotlib draws the same scene; what drew is returned and printed.
-Files are written by pillow, so no encoder is needed.
+``mujoco.Renderer`` draws where there is EGL or OSMesa, which need no screen. Files are
+written by pillow, so no encoder is needed.
 
-``python -m jaxcal.paper.twin.robot_pictures DIR`` writes robot.png and robot.gif.
+``python -m studies.paper.robot_pictures DIR`` writes robot.png and robot.gif.
 """
 
 from __future__ import annotations
@@ -22,22 +21,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import one_of
+from jaxcal.arguments import Parser
 from jaxcal.files import atomic_write
 from jaxcal.paper import command
 from jaxcal.paper.twin.robot import RobotConfig, joint_angles, read_out
-from jaxcal.paper.twin.robot_drawing import Drawing
 from jaxcal.paper.twin.robot_model import load_model, pose, trajectory
 from jaxcal.paper.twin.robot_parts import AXIS_COLOURS
 
-__all__ = ["BACKENDS", "animate", "draw", "main", "render"]
+__all__ = ["animate", "draw", "main", "render"]
 
 Array = NDArray[np.float64]
 Report = Callable[[str, int, int], None]
 Image = NDArray[np.uint8]
 """(height, width, 3)"""
 
-BACKENDS = ("auto", "mujoco", "matplotlib")
 POSTURE_DEG = (18.0, 14.0, -12.0)  # what the picture shows
 TOUR_DEG = (  # what the film goes through: each axis alone, then all of them
     (18.0, 0.0, 0.0),
@@ -60,27 +57,24 @@ def render(
     commands_deg: ArrayLike = POSTURE_DEG,
     *,
     size: tuple[int, int] = (960, 720),
-    backend: str = "auto",
-) -> str:
-    """Write a picture of the robot at one command; what drew it, as in ``draw``.
+) -> None:
+    """Write a picture of the robot at one command.
 
     Args:
         config: the robot.
         path: of the PNG.
         commands_deg: (3,) pitch, yaw, roll in degrees.
         size: width and height in pixels, at most 1280 x 960.
-        backend: mujoco, matplotlib, or auto: the first that works.
 
     Raises:
         OSError: the file cannot be written.
-        RuntimeError: mujoco was asked for and cannot draw here.
+        RuntimeError: MuJoCo cannot draw here.
     """
     command_deg = np.asarray(commands_deg, dtype=np.float64).reshape(1, 3)
-    with draw(config, size, backend) as (name, picture):
+    with draw(config, size) as picture:
         image = picture(np.asarray(joint_angles(config, command_deg))[0])
     read = np.asarray(read_out(config, command_deg))
     _save(path, [_captioned(image, command_deg[0], read[0])], 0)
-    return name
 
 
 def animate(
@@ -89,17 +83,15 @@ def animate(
     commands_deg: ArrayLike = TOUR_DEG,
     *,
     size: tuple[int, int] = (480, 360),
-    backend: str = "auto",
     progress: Report | None = None,
-) -> str:
+) -> None:
     """Write a film of the robot moving through postures, simulated by MuJoCo.
 
     Args:
         config: the robot.
         path: of the GIF.
         commands_deg: (N, 3) pitch, yaw, roll in degrees, one second each.
-        size: as ``backend``, what is returned and what is raised, see ``render``.
-        backend: mujoco, matplotlib or auto.
+        size: as in ``render``, and so is what is raised.
         progress: told how many frames of how many are drawn.
     """
     way = _smooth(np.asarray(commands_deg, dtype=np.float64).reshape(-1, 3))
@@ -107,47 +99,44 @@ def animate(
         config, way, hold_s=1.0 / _FRAMES_PER_S, frames_per_s=_FRAMES_PER_S
     )[1:]
     read = np.asarray(read_out(config, way))
-    with draw(config, size, backend) as (name, picture):
+    with draw(config, size) as picture:
         frames: list[Any] = []
         for angles, *told in zip(links, way, read, strict=True):
             if progress is not None:
                 progress("draw the film", len(frames), len(way))
             frames.append(_captioned(picture(angles), *told))
     _save(path, frames, round(1000.0 / _FRAMES_PER_S))
-    return name
 
 
 @contextlib.contextmanager
 def draw(
-    config: RobotConfig, size: tuple[int, int], backend: str = "auto"
-) -> Iterator[tuple[str, Callable[[ArrayLike], Image]]]:
-    """What draws, and a function from joint angles (3,) in degrees to an image."""
+    config: RobotConfig, size: tuple[int, int]
+) -> Iterator[Callable[[ArrayLike], Image]]:
+    """A function from joint angles (3,) in degrees to an image.
+
+    Raises:
+        RuntimeError: MuJoCo cannot draw here.
+    """
     import mujoco
 
-    one_of("backend", backend, BACKENDS)
     width, height = size
     if not (1 <= width <= 1280 and 1 <= height <= 960):
         raise ValueError(f"size must be within 1280 x 960 pixels, got {size}")
     model = load_model(config)
     data = mujoco.MjData(model)
-    canvas, name = None, "mujoco"
-    if backend != "matplotlib":
-        try:
-            canvas = _renderer(model, width, height)
-        except Exception as error:  # drivers fail in many ways
-            if backend == "mujoco":
-                why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-                raise RuntimeError(f"MuJoCo cannot draw here: {why}") from None
-    if canvas is None:
-        canvas, name = Drawing(model, width, height), "matplotlib"
+    try:
+        canvas = _renderer(model, width, height)
+    except Exception as error:  # drivers fail in many ways
+        why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
+        raise RuntimeError(f"MuJoCo cannot draw here: {why}") from None
 
     def picture(joints_deg: ArrayLike) -> Image:
         pose(model, data, joints_deg)
         canvas.update_scene(data, "view")
-        return canvas.render()
+        return np.asarray(canvas.render())
 
     with contextlib.closing(canvas):
-        yield name, picture
+        yield picture
 
 
 def _renderer(model: Any, width: int, height: int) -> Any:
@@ -243,22 +232,19 @@ def _smooth(postures_deg: Array) -> Array:
 
 def main(arguments: list[str] | None = None) -> int:
     """Write both; the exit code."""
-    parser = command.Parser(
-        "python -m jaxcal.paper.twin.robot_pictures",
-        "Write robot.png and robot.gif, a picture and a film of the robot.",
+    parser = Parser(
+        prog="python -m studies.paper.robot_pictures",
+        description="Write robot.png and robot.gif, a picture and a film of the robot.",
     )
     parser.add_argument("folder", type=pathlib.Path, metavar="DIR")
-    parser.add_argument("--backend", choices=BACKENDS, default="auto")
     options = parser.parse_args(arguments)
 
     def write() -> None:
         config = RobotConfig(mechanism_order="YXZ", read_out_order="YXZ")
         options.folder.mkdir(parents=True, exist_ok=True)
         for make, file in ((render, "robot.png"), (animate, "robot.gif")):
-            path = options.folder / file
-            print(
-                f"saved: {path}, drawn by {make(config, path, backend=options.backend)}"
-            )
+            make(config, options.folder / file)
+            print(f"saved: {options.folder / file}")
 
     return command.run(write, "robot_pictures", "files already named are complete")
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from jaxcal.evaluation.parameters import predict
 from jaxcal.paper.constants import AXES
-from jaxcal.paper.exhibits.exhibit import by_axis
 from jaxcal.plots.style import BLACK, COLOURS, GREY, legend_below, panels
+from studies.paper.exhibits.exhibit import by_axis
 
 __all__ = ["POINTS", "TRACED", "trace_columns", "traces"]
 

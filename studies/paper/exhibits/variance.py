@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from jaxcal.evaluation import figures
 from jaxcal.evaluation.parameters import parameter_names
-from jaxcal.paper.exhibits.exhibit import Exhibit, judge
-from jaxcal.paper.exhibits.material import METHODS, Material
-from jaxcal.paper.exhibits.selection import STREAM, words_of
 from jaxcal.plots.style import BLACK, COLOURS, GREY
+from studies.paper.exhibits.exhibit import Exhibit, judge
+from studies.paper.exhibits.material import METHODS, Material
+from studies.paper.exhibits.selection import STREAM, words_of
 
 __all__ = ["exhibits", "variance_table"]
 

@@ -9,9 +9,9 @@ import numpy as np
 
 from jaxcal.information.regression import log_det_information, regression_matrix
 from jaxcal.paper.constants import EPISODES, NUM_CANDIDATES, RANGES
-from jaxcal.paper.exhibits.exhibit import Exhibit, from_rows, judge
-from jaxcal.paper.exhibits.intervals import mean_interval
-from jaxcal.paper.exhibits.material import Material
+from studies.paper.exhibits.exhibit import Exhibit, from_rows, judge
+from studies.paper.exhibits.intervals import mean_interval
+from studies.paper.exhibits.material import Material
 
 __all__ = ["exhibits"]
 

@@ -1,0 +1,377 @@
+"""Compiled searches: the order of least time, and the fastest subset with its proof."""
+
+from __future__ import annotations
+
+import cython
+import numpy as np
+from cython.cimports.jaxcal.watch import Watch, begin, late
+from cython.cimports.libc.math import INFINITY, log
+from cython.cimports.scipy.linalg.cython_lapack import dpotrf, dpotri
+
+__all__ = ["MOST_EXACT", "best_order", "fastest_subset"]
+
+MOST_EXACT = 12  # postures up to which the order is optimal (Held and Karp 1962)
+
+_IMPROVED = 20  # shortest nearest-neighbour tours that are improved beyond that
+_SHORTER = cython.declare(cython.double, 1e-10)  # seconds that a change must save
+_SINGULAR = cython.declare(cython.double, 1e-14)  # pivot, relative to its diagonal
+
+
+def best_order(times, start):
+    """Order of least time, ending anywhere: exact for few postures, else improved.
+
+    Args:
+        times: (K, K) float64 seconds, symmetric.
+        start: (K,) float64 seconds from the start.
+
+    Returns:
+        (K,) int64 order, and its seconds.
+    """
+    k = len(start)
+    if k <= MOST_EXACT:
+        return _exact_order(times, start)
+    tours = np.empty((k, k), np.int64)
+    seconds = np.empty(k)
+    for first in range(k):
+        seconds[first] = _nearest_neighbours(times, start, first, tours[first])
+    best, least = tours[0], np.inf
+    for first in np.argsort(seconds)[:_IMPROVED]:
+        reached = _improve(times, start, tours[first], seconds[first])
+        if reached < least:
+            best, least = tours[first], reached
+    return best, least
+
+
+def _exact_order(times, start):
+    k = len(start)
+    every = np.arange(k)
+    tours = np.full((1 << k, k), np.inf)
+    least = 0.0
+    for depth in range(k):
+        least = _extend(tours, times, start, every, depth)
+    order = np.empty(k, np.int64)
+    mask = (1 << k) - 1
+    last = int(tours[mask].argmin())
+    for place in range(k - 1, -1, -1):
+        order[place] = last
+        mask &= ~(1 << last)
+        last = int((tours[mask] + times[:, last]).argmin())
+    return order, least
+
+
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _extend(
+    tours: cython.double[:, ::1],
+    times: cython.double[:, ::1],
+    start: cython.double[::1],
+    chosen: cython.Py_ssize_t[::1],
+    depth: cython.Py_ssize_t,
+) -> cython.double:
+    """Add a posture to the table of best open tours (Held and Karp).
+
+    Args:
+        tours: (2^K, K); ``tours[mask, last]`` is the least time over the postures in
+            ``mask`` that ends in ``last``, known below ``2^depth``.
+        times: (M, M) seconds from each posture to each, symmetric.
+        start: (M,) seconds to each from the start.
+        chosen: (K,) into ``times``; bit c of a mask stands for ``chosen[c]``.
+        depth: the posture to add is ``chosen[depth]``.
+
+    Returns:
+        Seconds of the best tour through the first ``depth + 1`` chosen.
+    """
+    one: cython.Py_ssize_t = 1
+    bit = one << depth
+    new = chosen[depth]
+    for last in range(depth + 1):
+        tours[bit, last] = INFINITY
+    tours[bit, depth] = start[new]
+    rest: cython.Py_ssize_t
+    for rest in range(1, bit):
+        mask = rest | bit
+        best: cython.double = INFINITY
+        for before in range(depth):
+            if rest >> before & 1:
+                best = min(best, tours[rest, before] + times[chosen[before], new])
+        tours[mask, depth] = best
+        for last in range(depth):
+            best = INFINITY
+            if rest >> last & 1:
+                end = chosen[last]
+                without = mask & ~(one << last)
+                for before in range(depth + 1):
+                    if without >> before & 1:
+                        best = min(
+                            best, tours[without, before] + times[chosen[before], end]
+                        )
+            tours[mask, last] = best
+    least: cython.double = INFINITY
+    for last in range(depth + 1):
+        least = min(least, tours[2 * bit - 1, last])
+    return least
+
+
+def _nearest_neighbours(
+    times: cython.double[:, ::1],
+    start: cython.double[::1],
+    first: cython.Py_ssize_t,
+    order: cython.Py_ssize_t[::1],
+):
+    """Fill ``order`` (K,) from posture ``first`` on; returns its seconds."""
+    k = start.shape[0]
+    free: cython.uchar[::1] = np.ones(k, np.uint8)
+    here: cython.Py_ssize_t = first
+    seconds: cython.double = start[first]
+    for place in range(k):
+        if place:
+            nearest: cython.Py_ssize_t = -1
+            for j in range(k):
+                if free[j] and (nearest < 0 or times[here, j] < times[here, nearest]):
+                    nearest = j
+            seconds += times[here, nearest]
+            here = nearest
+        order[place] = here
+        free[here] = 0
+    return seconds
+
+
+def _improve(
+    times: cython.double[:, ::1],
+    start: cython.double[::1],
+    order: cython.Py_ssize_t[::1],
+    seconds: cython.double,
+):
+    """Reverse pieces and move single postures until neither shortens ``order`` (K,)."""
+    with cython.nogil:
+        while True:
+            saved = _pass(times, start, order)
+            if saved == 0.0:
+                break
+            seconds -= saved
+    return seconds
+
+
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(-1.0)
+def _pass(
+    times: cython.double[:, ::1],
+    start: cython.double[::1],
+    order: cython.Py_ssize_t[::1],
+) -> cython.double:
+    """Seconds that one pass of ``_improve`` saves; 0 at the end."""
+    k = order.shape[0]
+    saved: cython.double = 0.0
+    watch: Watch = begin(INFINITY)
+    for i in range(k - 1):
+        late(cython.address(watch))
+        for j in range(i + 1, k):
+            a, b, after = order[i], order[j], order[i + 1]
+            into_a = times[order[i - 1], a] if i else start[a]
+            into_b = times[order[i - 1], b] if i else start[b]
+            into_after = times[order[i - 1], after] if i else start[after]
+            a_out = times[a, order[j + 1]] if j + 1 < k else 0.0
+            b_out = times[b, order[j + 1]] if j + 1 < k else 0.0
+            reverse = into_b - into_a + a_out - b_out
+            moved = into_after - into_a - times[a, after] + times[b, a]
+            later = moved + a_out - b_out
+            if reverse < -_SHORTER and reverse <= later:
+                for step in range((j - i + 1) // 2):
+                    order[i + step], order[j - step] = order[j - step], order[i + step]
+                saved -= reverse
+            elif later < -_SHORTER:
+                for step in range(i, j):
+                    order[step] = order[step + 1]
+                order[j] = a
+                saved -= later
+    return saved
+
+
+def fastest_subset(
+    blocks: cython.const[cython.double][:, :, ::1],
+    prior: cython.const[cython.double][:, ::1],
+    times: cython.double[:, ::1],
+    start: cython.double[::1],
+    fixed: cython.Py_ssize_t,
+    relaxed: cython.const[cython.double][:, ::1],
+    wanted: cython.double,
+    same: cython.double,
+    chosen: cython.Py_ssize_t[::1],
+    best: cython.double[::1],
+    seconds: cython.double,
+):
+    """Depth-first search for the fastest subset with a determinant.
+
+    Args:
+        blocks: (M, q, p) float64 whitened.
+        prior: (p, p) float64 information beforehand.
+        times: (M, M) float64 seconds, a metric.
+        start: (M,) float64 seconds to each from the start, zero where there is none.
+        fixed: postures in every subset, the first of ``blocks``; fewer than k.
+        relaxed: (p, p) information of a good selection of k, without the prior; any
+            leaves the bound true.
+        wanted: log det a subset must have.
+        same: seconds within which two runs take as long; of these the one with the
+            larger determinant wins.
+        chosen: (k,) int64 the incumbent, written.
+        best: (2,) float64 its seconds and log det, written.
+        seconds: time limit.
+
+    Returns:
+        Whether the search is complete, and its nodes.
+    """
+    m, k, p = blocks.shape[0], chosen.shape[0], blocks.shape[2]
+    tours: cython.double[:, ::1] = np.full((1 << k, k), np.inf)
+    held: cython.Py_ssize_t[::1] = np.zeros(k + 1, np.int64)
+    gram: cython.double[:, ::1] = np.empty((p, p))
+    inverse: cython.double[:, ::1] = np.empty((p, p))
+    gains: cython.double[::1] = np.empty(k)
+    depth: cython.Py_ssize_t
+    nodes: cython.Py_ssize_t = 0
+    watch: Watch = begin(seconds)
+    with cython.nogil:
+        for depth in range(fixed):
+            held[depth] = depth
+            _extend(tours, times, start, held, depth)
+        depth = fixed
+        held[depth] = fixed - 1  # the next one tried is one further
+        while depth >= fixed:
+            held[depth] += 1
+            if held[depth] + (k - depth) > m:
+                depth -= 1
+                continue
+            if late(cython.address(watch)):
+                break
+            nodes += 1
+            least = _extend(tours, times, start, held, depth)
+            if least > best[0] + same:
+                continue
+            _sum(blocks, prior, held, depth + 1, gram)
+            if depth == k - 1:
+                log_det = _factor(gram, inverse)
+                if log_det >= wanted and (
+                    least < best[0] - same or log_det > best[1] + 1e-12
+                ):
+                    best[0] = min(least, best[0])
+                    best[1] = log_det
+                    chosen[:] = held[:k]
+                continue
+            bound = _bound(
+                blocks, held[depth] + 1, k - depth - 1, k, relaxed, gram, inverse, gains
+            )
+            if bound < wanted or (least > best[0] - same and bound <= best[1]):
+                continue
+            depth += 1
+            held[depth] = held[depth - 1]
+    return depth < fixed, nodes
+
+
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _sum(
+    blocks: cython.const[cython.double][:, :, ::1],
+    prior: cython.const[cython.double][:, ::1],
+    held: cython.Py_ssize_t[::1],
+    count: cython.Py_ssize_t,
+    gram: cython.double[:, ::1],
+) -> cython.void:
+    """``gram`` (p, p): prior and the first ``count`` of the held."""
+    p = gram.shape[0]
+    gram[:, :] = prior
+    for c in range(count):
+        i = held[c]
+        for r in range(blocks.shape[1]):
+            for a in range(p):
+                for b in range(p):
+                    gram[a, b] += blocks[i, r, a] * blocks[i, r, b]
+
+
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _factor(
+    gram: cython.double[:, ::1], inverse: cython.double[:, ::1]
+) -> cython.double:
+    """Log det of a positive definite matrix, and its inverse; -inf where singular."""
+    p: cython.int = gram.shape[0]
+    info: cython.int = 0
+    triangle: cython.char = b"L"
+    log_det: cython.double = 0.0
+    inverse[:, :] = gram
+    matrix = cython.address(inverse[0, 0])
+    size = cython.address(p)
+    done = cython.address(info)
+    dpotrf(cython.address(triangle), size, matrix, size, done)
+    if info:
+        return -INFINITY
+    for a in range(p):
+        square = inverse[a, a] * inverse[a, a]
+        if not square > _SINGULAR * gram[a, a]:
+            return -INFINITY
+        log_det += log(square)
+    dpotri(cython.address(triangle), size, matrix, size, done)
+    for a in range(p):  # LAPACK's lower triangle is the upper one of rows
+        for b in range(a):
+            inverse[a, b] = inverse[b, a]
+    return log_det
+
+
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _bound(
+    blocks: cython.const[cython.double][:, :, ::1],
+    first: cython.Py_ssize_t,
+    more: cython.Py_ssize_t,
+    k: cython.Py_ssize_t,
+    relaxed: cython.const[cython.double][:, ::1],
+    gram: cython.double[:, ::1],
+    inverse: cython.double[:, ::1],
+    gains: cython.double[::1],
+) -> cython.double:
+    """Upper bound on log det of the held with ``more`` from ``first`` on.
+
+    Args:
+        blocks: (M, q, p).
+        first, more, k: see above.
+        relaxed: (p, p) information of the D-optimum without the prior.
+        gram: (p, p) of the held, with the prior; written over.
+        inverse: (p, p) room to work in.
+        gains: (k,) likewise.
+    """
+    m, q, p = blocks.shape[0], blocks.shape[1], blocks.shape[2]
+    if m - first < more:
+        return -INFINITY
+    share = cython.cast(cython.double, more) / k
+    for a in range(p):
+        for b in range(p):
+            gram[a, b] += share * relaxed[a, b]
+    log_det = _factor(gram, inverse)
+    if log_det == -INFINITY:
+        return INFINITY
+    total: cython.double = 0.0
+    for a in range(p):
+        for b in range(p):
+            total += inverse[a, b] * (gram[a, b] - share * relaxed[a, b])
+    gains[:more] = -1.0  # the largest so far, ascending
+    for j in range(first, m):
+        gain: cython.double = 0.0
+        for r in range(q):
+            for a in range(p):
+                inner: cython.double = 0.0
+                for b in range(p):
+                    inner += inverse[a, b] * blocks[j, r, b]
+                gain += blocks[j, r, a] * inner
+        if gain <= gains[0]:
+            continue
+        place: cython.Py_ssize_t = 0
+        while place + 1 < more and gains[place + 1] < gain:
+            gains[place] = gains[place + 1]
+            place += 1
+        gains[place] = gain
+    for place in range(more):
+        total += gains[place]
+    return log_det + p * log(total / p)

@@ -1,0 +1,92 @@
+"""RTU frames bear no number: a reply that comes late is taken for no other's.
+
+The line is a pseudo-terminal, or a socket without Modbus TCP's numbers. The reply of
+one question comes when the next has been asked; both ask for two registers.
+"""
+
+import time
+
+import pytest
+from harness import changed, fast_config, simulator
+
+from rig.core.bus import Bus, BusError
+from rig.core.drive import Drive
+from rig.simulator import parse_fault
+
+PAIRS = {'map = "leadshine_pr"': 'map = "oriental_az"'}  # status and position: 2 and 2
+PLACE = 123456
+TIMEOUT_S = 0.08
+
+
+@pytest.fixture(params=["rtu", "rtu_tcp"])
+def line(request):
+    """A drive that stands at PLACE, and its bus."""
+    if request.param == "rtu":
+        pytest.importorskip("serial", reason="serial ports need pyserial")
+    config = fast_config(PAIRS)
+    with simulator(config, transport=request.param) as sim:
+        settings = changed(sim.start().bus, timeout_s=TIMEOUT_S, read_retries=2)
+        sim.drives[0].position = PLACE
+        with Bus(settings, config.silence_s) as bus:
+            yield sim, bus, Drive(bus, config.axes[0])
+
+
+@pytest.mark.parametrize("late_s", [0.02, 0.03, 0.06, 0.09])
+def test_a_late_status_is_not_taken_for_the_position(line, late_s):
+    """H: the status came 30 ms late, and was the position."""
+    sim, _, drive = line
+    word = drive.status().word
+    assert word != PLACE
+    for number in range(3):
+        delay = TIMEOUT_S + late_s + 0.02 * number
+        sim.faults.add(parse_fault(f"delayed_reply,count=1,axis=pitch,seconds={delay}"))
+        try:
+            status = drive.status(retries=0)
+            assert (status.word, status.position) == (word, PLACE)
+        except BusError:
+            pass  # no answer is an answer; a wrong one is not
+        found = drive.status()
+        assert (found.word, found.position) == (word, PLACE)
+
+
+def test_every_reply_of_a_slow_unit_is_its_own_or_none(line):
+    """All replies are late, by more than a question's patience; then none is."""
+    sim, bus, drive = line
+    word = drive.status().word
+    sim.faults.add(parse_fault(f"delayed_reply,axis=pitch,seconds={1.4 * TIMEOUT_S}"))
+    end = time.monotonic() + 3.0
+    while time.monotonic() < end:
+        try:
+            words = bus.read_words(drive.axis.unit, 0x00CC, 2)
+            assert words == [PLACE >> 16, PLACE & 0xFFFF]
+        except BusError:
+            pass
+        try:
+            assert bus.read_words(drive.axis.unit, 0x007E, 2) == [0, word]
+        except BusError:
+            pass
+    sim.repair()
+    time.sleep(10 * TIMEOUT_S)
+    for _ in range(5):
+        found = drive.status()
+        assert (found.word, found.position) == (word, PLACE)
+
+
+def test_a_drive_that_refuses_a_pair_by_halves_is_told_apart_too(line):
+    """Its refusal answers the question as well as its registers would."""
+    sim, _, drive = line
+    word, read = drive.status().word, sim.drives[0].read
+
+    def strict(address, count):
+        if count == 1:
+            from rig.simulator.drive import DriveException
+
+            raise DriveException(2)
+        return read(address, count)
+
+    sim.drives[0].read = strict
+    sim.faults.add(
+        parse_fault(f"delayed_reply,count=1,axis=pitch,seconds={TIMEOUT_S + 0.05}")
+    )
+    found = drive.status()
+    assert (found.word, found.position) == (word, PLACE)
