@@ -20,15 +20,9 @@ import numpy as np
 
 from jaxcal import plots
 from jaxcal.plots.style import panels
-from jaxcal.selection import select
-from jaxcal.selection.fastest import (
-    Motion,
-    ParetoFront,
-    fastest_tour,
-    pareto_front,
-    select_fastest,
-    travel_times,
-)
+from jaxcal.selection import Design, select
+from jaxcal.selection.fastest import Motion, fastest_tour, travel_times
+from jaxcal.selection.fastest.run import ParetoFront
 
 MOTION = Motion(speed=(20.0,), acceleration=(100.0,), settle=1.0)
 HOME = np.zeros(3)
@@ -60,10 +54,9 @@ def show(candidates: np.ndarray, k: int, front: ParetoFront) -> None:
         )
     excess = []
     for point in front.points:
-        fast = select_fastest(
-            candidates,
+        fast = Design(candidates).fastest(
             k,
-            motion=MOTION,
+            MOTION,
             start=HOME,
             least_efficiency=min(1.0, point.efficiency * (1 - 1e-9)),
             method="heuristic",
@@ -89,10 +82,9 @@ def main() -> None:
     candidates = rng.uniform(-20.0, 20.0, (arguments.candidates, 3))
     fronts = {}
     for k in map(int, arguments.k.split(",")):
-        front = pareto_front(
-            candidates,
+        front = Design(candidates).pareto(
             k,
-            motion=MOTION,
+            MOTION,
             start=HOME,
             least_efficiency=arguments.least,
             method="exact",
@@ -101,10 +93,9 @@ def main() -> None:
         show(candidates, k, front)
         fronts[f"K = {k}, exact" if arguments.beside else f"K = {k}"] = front
         for method in filter(None, arguments.beside.split(",")):
-            other = pareto_front(
-                candidates,
+            other = Design(candidates).pareto(
                 k,
-                motion=MOTION,
+                MOTION,
                 start=HOME,
                 least_efficiency=arguments.least,
                 method=method,

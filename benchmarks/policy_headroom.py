@@ -43,6 +43,7 @@ import optax
 from numpy.typing import NDArray
 
 from jaxcal.files import write_text
+from jaxcal.selection import Design
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.exchange.exchange import (
     default_restarts,
@@ -51,12 +52,7 @@ from jaxcal.selection.exchange.exchange import (
 )
 from jaxcal.selection.greedy import greedy_indices
 from jaxcal.selection.policy import load_policy
-from jaxcal.selection.problem import (
-    Problem,
-    make_block_problem,
-    make_problem,
-    values,
-)
+from jaxcal.selection.problem import Problem, values
 
 HIT = 1e-9  # of log det
 GROUPS = ("M < 100", "M 100 to 300", "M > 300")
@@ -101,7 +97,7 @@ def draw(rng: np.random.Generator, most: int = 1000) -> tuple[Problem, str]:
     if prior:
         spread = np.exp(rng.normal(0.0, 1.0, p))
         known = np.diag(prior * spread * (blocks**2).sum(axis=1).mean(axis=0))
-    return make_block_problem(blocks, max(least, k), prior=known), shape
+    return Design.from_blocks(blocks, known).problem(max(least, k)), shape
 
 
 def log_dets(problem: Problem, chosen: Indices) -> float:
@@ -128,7 +124,7 @@ def policy_time() -> list[dict[str, float]]:
     rows = []
     for count, k in ((20, 4), (50, 4), (50, 8), (200, 8), (200, 20), (1000, 8)):
         candidates = np.random.default_rng(count).uniform(size=(count, 3))
-        problem = make_problem(candidates, k)
+        problem = Design(candidates).problem(k)
         greedy = cpu_seconds(lambda p=problem: greedy_indices(p))
         policy = cpu_seconds(lambda p=problem: choose([p], "greedy", 1, 0))
         rows.append({"M": count, "k": k, "greedy": greedy, "policy": policy})

@@ -15,7 +15,7 @@ import time
 
 import numpy as np
 
-from jaxcal.selection import Problem, exact_batch, make_problem, select
+from jaxcal.selection import Design, Problem, exact_batch, select
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
 from jaxcal.selection.exchange.exchange import exchange_indices
 
@@ -64,7 +64,7 @@ def main() -> None:
             for cap in (1, 2, k):
                 optima = np.array(
                     [
-                        branched_log_det(make_problem(c, k, max_replicates=cap))
+                        branched_log_det(Design(c, max_replicates=cap).problem(k))
                         for c in sets
                     ]
                 )

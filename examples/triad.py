@@ -48,13 +48,12 @@ def textbook(most: float) -> Array:
     return np.array([*sides, (0, 0, 1), (0, 0, 1)], dtype=float)
 
 
-def about(rule: str) -> dict:
-    """What ``select`` and ``score`` are told; I is for readings in all directions."""
-    region = orientations(180.0) if rule == "I" else None
-    return {
-        "model": MODEL, "prior": PRIOR, "noise": NOISE, "criterion": rule,
-        "region": region,
-    }  # fmt: skip
+EVERYWHERE = orientations(180.0)
+
+
+def asked(offered: Array, k: int) -> jaxcal.Design:
+    """The choice of up to k readings at the orientations offered."""
+    return jaxcal.Design(offered, MODEL, PRIOR, NOISE, max_replicates=k)
 
 
 def choose(rule: str, most: float, k: int, seed: int) -> Array:
@@ -64,7 +63,8 @@ def choose(rule: str, most: float, k: int, seed: int) -> Array:
     offered = orientations(most)
     if rule == "random":
         return offered[np.random.default_rng(seed).choice(len(offered), k, False)]
-    chosen = jaxcal.select(offered, k, "exchange", max_replicates=k, **about(rule))
+    criterion = jaxcal.I(EVERYWHERE) if rule == "I" else rule
+    chosen = asked(offered, k).select(k, criterion, "exchange")
     return offered[chosen.indices]
 
 
@@ -72,14 +72,13 @@ def efficiency(most: float) -> float:
     """I-efficiency of the textbook's orientations, at least."""
     offered = np.vstack([orientations(most), textbook(most)])
     at = np.arange(len(offered) - 6, len(offered))
-    return jaxcal.score(offered, at, max_replicates=6, **about("I")).efficiency
+    return asked(offered, 6).score(at, jaxcal.I(EVERYWHERE)).efficiency
 
 
 def study(full: bool) -> dict[tuple[str, int, str], Array]:
     """(tilt, K, rule) to (triads, 3): errors of bias, of C, of all directions; mg."""
     triads = 200 if full else 20
     found = {}
-    everywhere = orientations(180.0)
     for tilt, most in TILTS.items():
         for k in COUNTS:
             for rule in RULES:
@@ -99,7 +98,7 @@ def study(full: bool) -> dict[tuple[str, int, str], Array]:
                         chosen, readings, model=MODEL, prior=PRIOR, noise=NOISE,
                         loss="gaussian",
                     )  # fmt: skip
-                    off = fit.predict(everywhere) - (everywhere @ matrix.T + bias)
+                    off = fit.predict(EVERYWHERE) - (EVERYWHERE @ matrix.T + bias)
                     errors = (fit.bias - bias, np.triu(fit.matrix - matrix), off)
                     rows.append([np.linalg.norm(x) / len(x) ** 0.5 for x in errors])
                 found[tilt, k, rule] = 1000.0 * np.array(rows)

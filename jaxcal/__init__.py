@@ -23,12 +23,14 @@ if TYPE_CHECKING:
         regression_matrix,
     )
     from jaxcal.models import Noise, Prior, identifiability
-    from jaxcal.selection import Selection, score, select
-    from jaxcal.selection.fastest import Motion, pareto_front, select_fastest
-    from jaxcal.selection.plan import plan
+    from jaxcal.selection import As, Design, Ds, I, Motion, Selection, select
 
 __all__ = [
+    "As",
     "Calibration",
+    "Design",
+    "Ds",
+    "I",
     "Motion",
     "Noise",
     "Prior",
@@ -39,12 +41,8 @@ __all__ = [
     "information_matrix",
     "leverages",
     "log_det_information",
-    "pareto_front",
-    "plan",
     "regression_matrix",
-    "score",
     "select",
-    "select_fastest",
 ]
 
 __version__ = "0.1.0"
@@ -59,13 +57,13 @@ _HOME = {
     "Noise": "jaxcal.models",
     "Prior": "jaxcal.models",
     "identifiability": "jaxcal.models",
-    "plan": "jaxcal.selection.plan",
+    "As": "jaxcal.selection",
+    "Design": "jaxcal.selection",
+    "Ds": "jaxcal.selection",
+    "I": "jaxcal.selection",
+    "Motion": "jaxcal.selection",
     "Selection": "jaxcal.selection",
-    "score": "jaxcal.selection",
     "select": "jaxcal.selection",
-    "Motion": "jaxcal.selection.fastest",
-    "pareto_front": "jaxcal.selection.fastest",
-    "select_fastest": "jaxcal.selection.fastest",
 }
 
 

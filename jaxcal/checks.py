@@ -13,7 +13,7 @@ __all__ = [
     "axis_letter",
     "axis_names",
     "in_words",
-    "noise_levels",
+    "levels",
     "numbers",
     "one_of",
     "relative_weights",
@@ -82,18 +82,16 @@ def relative_weights(weights: ArrayLike | None, count: int) -> Array:
     return weight
 
 
-def noise_levels(noise_std: ArrayLike | None, num_outputs: int) -> Array | None:
-    if noise_std is None:
-        return None
-    noise = numbers("noise_std", noise_std)
-    if noise.shape not in ((), (num_outputs,)):
-        raise ValueError(
-            f"noise_std must be one number or ({num_outputs},), got {noise.shape}"
-        )
-    noise = np.broadcast_to(noise, (num_outputs,)).copy()
-    if (noise <= 0.0).any():
-        raise ValueError(f"noise_std must be positive, got {noise[noise <= 0.0][0]}")
-    return noise
+def levels(name: str, values: ArrayLike, count: int) -> Array:
+    """(count,) positive numbers, one for all or one each; not to be written to."""
+    given = numbers(name, values)
+    if given.shape not in ((), (count,)):
+        raise ValueError(f"{name} must be one number or ({count},), got {given.shape}")
+    if (given <= 0.0).any():
+        raise ValueError(f"{name} must be positive, got {given[given <= 0.0].flat[0]}")
+    own = np.array(np.broadcast_to(given, (count,)))
+    own.flags.writeable = False
+    return own
 
 
 def axis_names(

@@ -99,7 +99,8 @@ def _run(
     from rig.workbench.outputs.console import listen
 
     mode, say = start["mode"], functools.partial(print, flush=True)
-    procedure, kept_zero = _procedure(mode, start["inputs"], config)
+    real = start["simulated"] is None
+    procedure, kept_zero = _procedure(mode, start["inputs"], config, not real)
     # With --zero the operator put the device into its zero posture.
     zero_at = kept_zero.pulses if kept_zero and not args.zero else None
     dry_run = getattr(args, "dry_run", False)
@@ -194,7 +195,7 @@ def recorded(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
 
 
 def _procedure(
-    mode: str, inputs: dict[str, Any], config: RigConfig
+    mode: str, inputs: dict[str, Any], config: RigConfig, simulated: bool
 ) -> tuple[Callable[[Run], int], KeptZero | None]:
     """What a session does, and the zero posture that it must find."""
     import numpy as np
@@ -206,7 +207,9 @@ def _procedure(
     count = inputs["count"]
     if mode == "collect":
         return lambda run: checking.collect(run, count), None
-    saved = checking.load_calibration(pathlib.Path(inputs["calibration"]), config)
+    saved = checking.load_calibration(
+        pathlib.Path(inputs["calibration"]), config, simulated
+    )
     calibration = saved.calibration
     if mode == "verify":
         return lambda run: checking.verify(run, calibration, count), saved.zero

@@ -1,8 +1,8 @@
-"""Build wheel and sdist, install them in fresh environments, and use them there.
+"""Build wheels and sdist, install them in fresh environments, and use them there.
 
-``make release-check`` runs it; it needs a package index. Each Python that is found of
-those given (default 3.11, 3.12, 3.13) gets the wheel with all extras, the last one the
-sdist too; a version that is not found fails the check.
+``make release-check`` runs it; it needs a package index. Each Python of those given
+(default 3.11, 3.12, 3.13) builds its wheel and gets it with all extras, the last one
+the sdist too; a version that is not found fails the check.
 """
 
 from __future__ import annotations
@@ -49,47 +49,51 @@ def run(*words: object, cwd: pathlib.Path = ROOT) -> str:
     return done.stdout
 
 
-def fresh(python: str, package: str, folder: pathlib.Path) -> pathlib.Path:
-    """A new environment with a package in it; its interpreter."""
+def fresh(python: str, folder: pathlib.Path) -> pathlib.Path:
+    """A new environment; its interpreter."""
+    if shutil.which(python) is None:
+        raise SystemExit(f"{python} is not on the path")
     run(python, "-m", "venv", folder)
-    interpreter = folder / "bin" / "python"
-    install(interpreter, package)
-    return interpreter
+    return folder / "bin" / "python"
 
 
-def install(interpreter: pathlib.Path, package: str) -> None:
-    """Into the interpreter's environment, by constraints.txt."""
-    pins = ("-c", ROOT / "constraints.txt")
-    run(interpreter, "-m", "pip", "install", "-q", *pins, package)
+def pip(interpreter: pathlib.Path, verb: str, *words: object) -> None:
+    """By constraints.txt."""
+    run(interpreter, "-m", "pip", verb, "-q", "-c", ROOT / "constraints.txt", *words)
+
+
+def check(python: str, package: pathlib.Path | None, folder: pathlib.Path) -> None:
+    """Use the package there; with None, a wheel of its own, with all extras."""
+    interpreter = fresh(python, folder)
+    wanted = str(package)
+    if package is None:
+        pip(interpreter, "wheel", "--no-deps", "-w", folder / "dist", ROOT)
+        wheel = next((folder / "dist").glob("*.whl"))
+        wanted = f"{wheel}[all]"
+    pip(interpreter, "install", wanted)
+    print(python, wanted, run(interpreter, "-c", USE, cwd=folder))
+    print(run(interpreter, "-m", "jaxcal", "doctor", cwd=folder))
+    if package is None:
+        pip(interpreter, "install", "mypy")
+        (folder / "snippet.py").write_text(SNIPPET)
+        said = run(interpreter, "-m", "mypy", "--strict", "snippet.py", cwd=folder)
+        if not re.search(r'Revealed type is "(builtins\.)?bool"', said):
+            raise SystemExit(f"mypy does not see the types of jaxcal: {said}")
 
 
 def main(pythons: list[str]) -> int:
     """Check; the exit code."""
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name)
-        builder = fresh(sys.executable, "hatchling", folder / "build")
-        run(builder, "-m", "hatchling", "build", "-d", folder / "dist")
-        wheel, sdist = (
-            next((folder / "dist").glob(f"*.{s}")) for s in ("whl", "tar.gz")
-        )
-        (folder / "snippet.py").write_text(SNIPPET)
-        cases = [(python, wheel, "[all]") for python in pythons]
-        cases.append((pythons[-1], sdist, ""))
-        for python, package, extra in cases:
-            if shutil.which(python) is None:
-                raise SystemExit(f"{python} is not on the path")
-            env = folder / "env"
-            interpreter = fresh(python, f"{package}{extra}", env)
-            print(python, package.name + extra, run(interpreter, "-c", USE, cwd=folder))
-            print(run(interpreter, "-m", "jaxcal", "doctor", cwd=folder))
-            if extra:
-                install(interpreter, "mypy")
-                check = ("-m", "mypy", "--strict", "snippet.py")
-                said = run(interpreter, *check, cwd=folder)
-                if not re.search(r'Revealed type is "(builtins\.)?bool"', said):
-                    raise SystemExit(f"mypy does not see the types of jaxcal: {said}")
-            shutil.rmtree(env)
-    print("wheel and sdist install and answer")
+        for python in pythons:
+            check(python, None, folder / python)
+            shutil.rmtree(folder / python)
+        builder = fresh(sys.executable, folder / "build")
+        pip(builder, "install", "hatchling")
+        run(builder, "-m", "hatchling", "build", "-t", "sdist", "-d", folder / "dist")
+        sdist = next((folder / "dist").glob("*.tar.gz"))
+        check(pythons[-1], sdist, folder / "env")
+    print("wheels and sdist install and answer")
     return 0
 
 

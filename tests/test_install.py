@@ -23,7 +23,7 @@ assert chosen.proven, chosen
 commands = u[chosen.indices]
 calibration = jaxcal.identify(commands, commands * 0.5 + 1.0)
 assert abs(calibration.matrix[0, 0] - 0.5) < 1e-9
-jaxcal.plan(u, target_accuracy=0.2, noise_std=0.1, max_replicates=2)
+jaxcal.Design(u, max_replicates=2).plan(accuracy=0.2, noise_std=0.1)
 """
 ABSENT = """
 import importlib.util as i

@@ -21,10 +21,10 @@ from benchmarks.harness import ROOT, Budget, Line, Row, Verdict
 from benchmarks.peers import figaroh
 from jaxcal import identify, select
 from jaxcal.models import Noise, SerialChain
+from jaxcal.selection import Design, Problem
 from jaxcal.selection.exact import branch_and_bound as search
 from jaxcal.selection.exchange.exchange import default_restarts, exchange_indices
 from jaxcal.selection.greedy import greedy_indices
-from jaxcal.selection.problem import Problem, make_problem
 
 NAME = "blocks"
 TITLE = "Poses of a measured UR5, and FIGAROH's rule"
@@ -79,9 +79,7 @@ def run(budget: Budget) -> Row:
 
 
 def _problem(joints: Array, k: int, criterion: str) -> Problem:
-    return make_problem(
-        joints, k, model=arm(), noise=Noise(_NOISE), criterion=criterion
-    )
+    return Design(joints, arm(), noise=Noise(_NOISE)).problem(k, criterion)
 
 
 def _searches(row: Row, joints: Array, criterion: str, budget: Budget) -> None:

@@ -29,11 +29,6 @@ _COMMANDS = {
         "policy,exact",
         "--quiet",
     ],
-    "select, method policy": [
-        "-c",
-        "import numpy as np, jaxcal;"
-        "jaxcal.select(np.random.default_rng(0).random((50, 3)), 4, 'policy')",
-    ],
 }
 
 

@@ -21,7 +21,6 @@ def commands() -> str:
     lines = ["# Commands", "", "What `--help` prints, from the parsers.", ""]
     for title, argv in (
         *((f"jaxcal {name}", [name, "--help"]) for name in COMMANDS),
-        ("jaxcal train --task", ["train", "--task", "knee", "--help"]),
         ("jaxcal evaluate --task", ["evaluate", "--task", "knee", "--help"]),
     ):
         lines += _shown(title, _help(main, argv))
@@ -124,11 +123,9 @@ def _presets() -> str:
         for name, _, text in settings_of(kind):
             cells = []
             for config in known.values():
-                parts = (
-                    [task.environment for task in config.tasks]
-                    if part == "environment"
-                    else [getattr(config, part)]
-                )
+                parts = [getattr(config, part, config)]  # "run" is the whole
+                if part == "environment":
+                    parts = [task.environment for task in config.tasks]
                 held = sorted({str(getattr(each, name, "")) for each in parts})
                 cells.append(", ".join(held))
             rows.append(f"| `{name}` | {text} | {' | '.join(cells)} |")

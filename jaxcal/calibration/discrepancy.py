@@ -13,8 +13,8 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.checked import facts
 from jaxcal.models import Model
+from jaxcal.models.checked import facts
 
 __all__ = ["WithDiscrepancy"]
 

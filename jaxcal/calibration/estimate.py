@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.checked import facts
 from jaxcal.calibration.discrepancy import WithDiscrepancy
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
 from jaxcal.checks import in_words, one_of, whole_number
 from jaxcal.models import Model, Noise, Pose, Position, Prior, SerialChain
+from jaxcal.models.checked import facts
 
 __all__ = ["fit_model", "require_model"]
 
@@ -55,7 +55,7 @@ def fit_model(
     discrepancy: int | None,
     common_noise: bool | None,
 ) -> dict[str, Any]:
-    """The fields of a ``ModelCalibration`` but names, units and provenance."""
+    """The fields of a ``Calibration`` but names, units and provenance."""
     one_of("loss", loss, ("student", "gaussian"))
     if prior is not None and not isinstance(prior, Prior):
         raise ValueError(f"prior must be a jaxcal.Prior, got {type(prior).__name__}")
@@ -218,6 +218,7 @@ def _fields(
     return {
         "estimate": found.parameters,
         "joint_covariance": None if noise_std is None else covariance,
+        "centre": None,
         "unidentified": null,
         "prior_mean": task.mean,
         "prior_precision": found.precision,

@@ -1,6 +1,5 @@
 """A calibration as a versioned JSON file: reading, writing, and what is refused.
 
-Version 1 is an affine calibration, version 2 one of any other model, prior or loss.
 Everything under ``derived`` is for other programs to read and is ignored on loading.
 """
 
@@ -29,6 +28,7 @@ __all__ = [
 ]
 
 FORMAT = "jaxcal-calibration"
+VERSION = 3
 
 _NAMES = {"input_names": "n", "output_names": "m"}
 _TEXTS = ("command_unit", "measured_unit")
@@ -36,9 +36,8 @@ _TEXTS = ("command_unit", "measured_unit")
 
 @dataclasses.dataclass(frozen=True)
 class Schema:
-    """What a kind of calibration keeps beside its names, units and provenance."""
+    """What a calibration keeps beside its names, units and provenance."""
 
-    version: int
     # Axes in letters: n inputs, m outputs, p parameters, others any; "" for one number.
     shapes: Mapping[str, str]
     counts: Mapping[str, int]  # whole numbers and their least value
@@ -50,7 +49,7 @@ class Schema:
 
 def content_of(calibration: Any, schema: Schema) -> dict[str, Any]:
     """The content of the file: names, numbers and lists, as JSON has them."""
-    content: dict[str, Any] = {"format": FORMAT, "version": schema.version}
+    content: dict[str, Any] = {"format": FORMAT, "version": VERSION}
     content |= {key: list(getattr(calibration, key)) for key in _NAMES}
     for key in (
         *(*_TEXTS, *schema.shapes, *schema.counts, *schema.switches, "provenance"),
@@ -83,17 +82,15 @@ def read(path: str | os.PathLike[str]) -> Any:
     raise ValueError(f"{os.fspath(path)}: {problem}")
 
 
-def require_version(content: Any, known: tuple[int, ...]) -> int:
-    """The version of a calibration's content, one of those ``known``."""
+def require_version(content: Any) -> None:
+    """Refuse what is no calibration, or one of another version."""
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f'not a calibration: "format" is not "{FORMAT}"')
-    version = content.get("version")
-    if version not in known:
+    if content.get("version") != VERSION:
         raise ValueError(
-            f"a calibration of version {version!r}, this jaxcal reads version "
-            + " and ".join(str(each) for each in sorted(known))
+            f"a calibration of version {content.get('version')!r}, this jaxcal reads "
+            f"version {VERSION}: identify again from the measurements"
         )
-    return int(version)
 
 
 def fields(content: Mapping[str, Any], schema: Schema) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """``identify``: from measurements to a calibration, with honest uncertainty.
 
-The affine model by itself is weighted least squares in closed form (``least_squares``);
+The affine model by itself is weighted least squares in closed form (``closed_form``);
 every other model, prior or loss is a search (``estimate``).
 """
 
@@ -12,18 +12,17 @@ import json
 import platform
 import sys
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration.base import Calibration
-from jaxcal.calibration.least_squares import fit_affine
-from jaxcal.calibration.result import AffineCalibration
-from jaxcal.checks import axis_names, noise_levels, relative_weights, table, text
-
-if TYPE_CHECKING:
-    from jaxcal.models import Model, Noise, Prior
+from jaxcal.calibration.calibration import Calibration
+from jaxcal.calibration.closed_form import fit_affine
+from jaxcal.calibration.estimate import fit_model, require_model
+from jaxcal.checks import axis_names, levels, relative_weights, table, text
+from jaxcal.models import Affine, Model, Noise, Prior
+from jaxcal.models.model import by_name
 
 __all__ = ["identify"]
 
@@ -93,10 +92,7 @@ def identify(
         ValueError: naming the argument, the rule and the value; for commands that leave
             a direction unexcited, naming that direction.
     """
-    if model is not None:
-        from jaxcal.models.model import by_name
-
-        commands = by_name(model, commands)
+    commands = by_name(model, commands)
     commands = table("commands", commands)
     measured = table("measured", measured)
     if len(commands) != len(measured):
@@ -109,8 +105,6 @@ def identify(
     outputs = axis_names("output_names", output_names, "y", m)
     weight = relative_weights(weights, len(commands))
     if noise is not None:
-        from jaxcal.models import Noise
-
         if not isinstance(noise, Noise):
             raise ValueError(
                 f"noise must be a jaxcal.Noise, got {type(noise).__name__}; a number "
@@ -121,7 +115,7 @@ def identify(
         plain = noise.covariance is None and noise.command_std is None
         if plain and np.ndim(0.0 if noise.std is None else noise.std) < 2:
             noise_std, noise = noise.std, None
-    level = noise_levels(noise_std, m)
+    level = None if noise_std is None else levels("noise_std", noise_std, m)
     if level is not None and common_noise is not None:
         raise ValueError(
             "common_noise says how to estimate the noise and noise_std what it is: "
@@ -136,21 +130,13 @@ def identify(
     }
     affine = model is None
     if model is not None:
-        from jaxcal.calibration.estimate import require_model
-        from jaxcal.models import Affine
-
         require_model(model, commands, measured)
         affine = isinstance(model, Affine)
     if affine and loss in (None, "gaussian"):
         if prior is None and noise is None and discrepancy is None:
             shared = bool(common_noise)
             found = fit_affine(commands, measured, weight, level, shared, inputs)
-            return AffineCalibration(**found, **about)
-
-    from jaxcal.calibration.estimate import fit_model
-    from jaxcal.calibration.model import ModelCalibration
-    from jaxcal.models import Affine, Noise
-
+            return Calibration(**found, **about)
     found = fit_model(
         commands,
         measured,
@@ -162,7 +148,7 @@ def identify(
         discrepancy=discrepancy,
         common_noise=common_noise,
     )
-    return ModelCalibration(**found, **about)
+    return Calibration(**found, **about)
 
 
 def _provenance(

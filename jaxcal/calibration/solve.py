@@ -18,8 +18,8 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.checked import derivative, facts, predict
 from jaxcal.models import Model
+from jaxcal.models.checked import derivative, facts, predict
 
 __all__ = ["NU", "Solution", "Task", "solve", "student_constants"]
 

@@ -5,22 +5,22 @@ from __future__ import annotations
 import argparse
 
 from jaxcal.commands.select import (
-    about,
-    add_about,
-    add_candidates,
+    add_criterion,
+    add_design,
+    criterion_of,
+    design_of,
     show,
     whole_numbers,
 )
 from jaxcal.commands.tables import add_output, read_table
-from jaxcal.selection import score
 
 __all__ = ["add_arguments", "run"]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Flags of the command."""
-    add_candidates(parser)
-    add_about(parser)
+    add_design(parser)
+    add_criterion(parser)
     chosen = parser.add_mutually_exclusive_group(required=True)
     indices = "rows, counted from 0"
     chosen.add_argument("--indices", type=whole_numbers, metavar="I,J", help=indices)
@@ -33,7 +33,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="judge against an upper bound or the proven optimum",
     )
     parser.add_argument("--time-limit", type=float, metavar="SECONDS", help="of exact")
-    parser.set_defaults(max_replicates=None)
     add_output(parser)
 
 
@@ -46,14 +45,10 @@ def run(arguments: argparse.Namespace) -> None:
         if not (column == column.round()).all():
             raise ValueError(f"{arguments.subset}: index must hold whole numbers")
         indices = column.astype(int)
-    selection = score(
-        table.frame(table.inputs(arguments.columns)),
+    selection = design_of(arguments, table).score(
         indices,
-        available=table.available(),
-        num_outputs=arguments.num_outputs,
-        max_replicates=arguments.max_replicates,
+        criterion_of(arguments),
         reference=arguments.reference,
         time_limit=arguments.time_limit,
-        **about(arguments),
     )
     show(selection, table, arguments)

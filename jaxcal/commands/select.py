@@ -12,73 +12,98 @@ from typing import Any
 from jaxcal.arguments import several
 from jaxcal.commands.model import add_model, read_model
 from jaxcal.commands.tables import Table, add_output, read_table, written
-from jaxcal.information.criterion import CRITERIA
-from jaxcal.models import Noise
-from jaxcal.selection import Selection, select
+from jaxcal.models import Affine, Noise
+from jaxcal.selection import Design, Selection
+from jaxcal.selection.criteria import CRITERIA
+from jaxcal.selection.solvers import OPTIONS
 
 __all__ = [
-    "about",
-    "add_about",
     "add_arguments",
-    "add_candidates",
+    "add_criterion",
+    "add_design",
+    "criterion_of",
+    "design_of",
     "numbers",
+    "one_or_all",
     "run",
     "show",
     "whole_numbers",
 ]
 
-_OPTIONS = ("seed", "restarts", "time_limit", "best", "checkpoint", "decoding", "num")
-
 numbers = several(float, "numbers")
 whole_numbers = several(int, "whole numbers")
 
 
-def add_candidates(parser: argparse.ArgumentParser) -> None:
-    """The table of candidates and what a choice may hold."""
+def add_design(parser: argparse.ArgumentParser, noise_needed: bool = False) -> None:
+    """The table of candidates, what is measured, and what a choice may hold."""
     add = parser.add_argument
     add("file", metavar="FILE", help="candidates: .csv, .npz or -")
     columns = "columns of commands; those that begin with u_, else all of numbers"
     add("--columns", metavar="A,B", help=columns)
-    outputs = "outputs of the machine; as many as commands"
+    add_model(parser)
+    outputs = "outputs of y = A u + b; as many as commands"
     add("--outputs", dest="num_outputs", type=int, metavar="M", help=outputs)
+    noise = "standard deviation of a measurement; one number or one per output"
+    add("--noise", type=numbers, required=noise_needed, metavar="S", help=noise)
     often = "how often one row may be measured; 1"
     cap: dict[str, Any] = {"dest": "max_replicates", "default": 1, "metavar": "R"}
     add("--replicates", type=int, help=often, **cap)
+    required = "rows, counted from 0, that must be chosen"
+    add("--required", type=whole_numbers, metavar="I,J", help=required)
 
 
-def add_about(parser: argparse.ArgumentParser) -> None:
-    """What is measured, and how good a choice is."""
-    add_model(parser)
-    add = parser.add_argument
+def design_of(arguments: argparse.Namespace, table: Table) -> Design:
+    """The problem that the flags of ``add_design`` and a table describe."""
+    candidates = table.frame(table.inputs(arguments.columns))
+    model, outputs = read_model(arguments.model), arguments.num_outputs
+    if outputs is not None:
+        if model is not None:
+            raise ValueError("--outputs must be left out with --model, which has them")
+        model = Affine(len(candidates.columns), outputs)
+    return Design(
+        candidates,
+        model,
+        noise=None if arguments.noise is None else Noise(one_or_all(arguments.noise)),
+        available=table.available(),
+        required=arguments.required,
+        max_replicates=arguments.max_replicates,
+    )
+
+
+def one_or_all(values: list[float]) -> float | list[float]:
+    """The number itself where there is one."""
+    return values[0] if len(values) == 1 else values
+
+
+def add_criterion(parser: argparse.ArgumentParser) -> None:
+    """How good a choice is."""
     criterion = "D for y = A u + b, I for another model"
-    add("--criterion", choices=CRITERIA, help=criterion)
+    parser.add_argument("--criterion", choices=tuple(CRITERIA), help=criterion)
     names = "of Ds and As: the parameters of interest"
-    add("--parameters", type=lambda x: x.split(","), metavar="A,B", help=names)
-    noise = "standard deviation of a measurement; one number or one per output"
-    add("--noise", type=numbers, metavar="S", help=noise)
+    parser.add_argument(
+        "--parameters", type=lambda x: x.split(","), metavar="A,B", help=names
+    )
 
 
-def about(arguments: argparse.Namespace) -> dict[str, Any]:
-    """The keywords of ``add_about``'s flags."""
-    noise = arguments.noise
-    return {
-        "model": read_model(arguments.model),
-        "criterion": arguments.criterion,
-        "parameters": arguments.parameters,
-        "noise": noise and Noise(noise[0] if len(noise) == 1 else noise),
-    }
+def criterion_of(arguments: argparse.Namespace) -> Any:
+    """The criterion that the flags of ``add_criterion`` describe."""
+    name, parameters = arguments.criterion, arguments.parameters
+    if (name in ("Ds", "As")) != (parameters is not None):
+        raise ValueError(
+            "--parameters, those of interest, must be given with --criterion Ds or As, "
+            f"and with no other, got {parameters!r} with {name!r}"
+        )
+    return name if parameters is None else CRITERIA[name](parameters)  # type: ignore[call-arg]  # these two take them
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Flags of the command."""
-    add_candidates(parser)
+    add_design(parser)
     add = parser.add_argument
     add("-k", "--k", type=int, metavar="K", help="rows to choose")
     methods = "auto (the cheapest proof), exact, exchange, greedy, random or policy"
     add("--method", default="auto", help=methods)
-    add_about(parser)
-    required = "rows, counted from 0, that must be chosen"
-    add("--required", type=whole_numbers, metavar="I,J", help=required)
+    add_criterion(parser)
     add("--seed", type=int, help="of methods that draw at random; 0")
     add("--restarts", type=int, help="random starts of the exchange")
     limit = "of auto and exact; 10"
@@ -95,16 +120,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Choose and print."""
     table = read_table(arguments.file)
-    options = {n: getattr(arguments, n) for n in (*_OPTIONS, "least_efficiency")}
-    selection = select(
-        table.frame(table.inputs(arguments.columns)),
+    options = {name: getattr(arguments, name) for name in OPTIONS}
+    selection = design_of(arguments, table).select(
         arguments.k,
+        criterion_of(arguments),
         arguments.method,
-        available=table.available(),
-        required=arguments.required,
-        max_replicates=arguments.max_replicates,
-        num_outputs=arguments.num_outputs,
-        **about(arguments),
         **{name: value for name, value in options.items() if value is not None},
     )
     show(selection, table, arguments)

@@ -20,6 +20,7 @@ from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.parameters import estimate_parameters
 from jaxcal.evaluation.random_draws import draw_random, log_det_gram_of
 from jaxcal.evaluation.results import Evaluation, MethodResult
+from jaxcal.models import Affine
 
 __all__ = [
     "BASELINES",
@@ -266,9 +267,8 @@ class _Run:
                 selection.select(
                     candidates,
                     self.k,
-                    "auto",
+                    model=Affine(candidates.shape[1], self.dataset.num_outputs),
                     available=None if masks is None else masks[i],
-                    num_outputs=self.dataset.num_outputs,
                     seed=self.seed,
                 ).indices
                 for i, candidates in enumerate(part["candidates"])

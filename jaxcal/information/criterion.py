@@ -30,19 +30,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CRITERIA", "KINDS", "Criterion"]
+__all__ = ["Criterion"]
 
 Array = NDArray[np.float64]
-
-KINDS = {
-    "D": "det",
-    "Ds": "det",
-    "A": "trace",
-    "As": "trace",
-    "I": "trace",
-    "E": "least",
-}
-CRITERIA = tuple(KINDS)
 
 _EPS = float(np.finfo(np.float64).eps)
 
@@ -51,15 +41,11 @@ _EPS = float(np.finfo(np.float64).eps)
 class Criterion:
     """A criterion in the coordinates of ``root``; the table above defines the kinds."""
 
-    name: str  # a name of CRITERIA
+    name: str  # "D", "A", ...
+    kind: str  # "det", "trace" or "least"
     root: Array  # C (s, p), of full row rank; square for "least"
     times: int = 1  # how often log det V or trace V counts: outputs of equal blocks
     offset: float = 0.0  # added to phi of "det" where C was changed by a factor
-
-    @property
-    def kind(self) -> str:
-        """``det``, ``trace`` or ``least``."""
-        return KINDS[self.name]
 
     @property
     def larger_is_better(self) -> bool:

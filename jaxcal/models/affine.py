@@ -45,9 +45,10 @@ class Affine:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """``a11 a12 ... bx by bz``."""
+        """``a11 a12 ... bx by bz``; ``a1,10`` where there are more than nine."""
         n, m = self.num_inputs, self.num_outputs
-        slopes = [f"a{i + 1}{j + 1}" for i in range(m) for j in range(n)]
+        comma = "," if max(m, n) > 9 else ""
+        slopes = [f"a{i + 1}{comma}{j + 1}" for i in range(m) for j in range(n)]
         return (*slopes, *(f"b{axis_letter(i, m)}" for i in range(m)))
 
     @property

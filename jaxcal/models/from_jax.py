@@ -12,12 +12,13 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import axis_names, numbers, table, whole_number
 from jaxcal.extras import needs
 from jaxcal.models.model import as_commands, as_parameters
-from jaxcal.models.reads import entries_read, inputs_needed
 from jaxcal.models.uncertainty import Prior
 
 __all__ = ["FromJax"]
 
 Array = NDArray[np.float64]
+
+_LONGER = 1000  # entries more; one in the second half is counted from the end
 
 
 class FromJax:
@@ -58,7 +59,7 @@ class FromJax:
             import jax
         if num_inputs is None:
             with jax.enable_x64(True):
-                num_inputs = inputs_needed(f, p)
+                num_inputs = _inputs_needed(f, p)
         if num_inputs is not None:
             self._trace(whole_number("num_inputs", num_inputs, 1))
 
@@ -143,7 +144,7 @@ class FromJax:
                 ) from error
             sizes = (num_inputs, len(self.nominal))
             for i, (name, size) in enumerate(zip(("u", "theta"), sizes, strict=True)):
-                read = entries_read(self.f, sizes, i)
+                read = _entries_read(self.f, sizes, i)
                 if read > size:
                     raise ValueError(
                         f"f reads {name}[{read - 1}], which {name} of {size} entries "
@@ -197,3 +198,57 @@ class FromJax:
 
         with jax.enable_x64(True):
             return np.array(self._compiled[which](commands, parameters))
+
+
+def _entries_read(
+    f: Callable[[Any, Any], Any], sizes: tuple[int, int], argument: int
+) -> int:
+    """One more than the last index read of an argument, as far as it can be seen.
+
+    JAX does not check indices: ``theta[7]`` of seven parameters is the last one.
+    Tracing f with longer arguments shows what it would read. 0 where f does not take
+    longer arguments, as when it unpacks them.
+    """
+    import jax
+
+    longer = list(sizes)
+    longer[argument] += _LONGER
+    try:
+        traced = jax.make_jaxpr(f)(*(np.zeros(size) for size in longer)).jaxpr
+    except Exception:  # whatever f raises where a size does not fit
+        return 0
+    most = sizes[argument] + _LONGER // 2
+    return _read(traced, traced.invars[argument], most)
+
+
+def _read(traced: Any, variable: Any, most: int) -> int:
+    last = 0
+    for equation in traced.eqns:
+        for i, used in enumerate(equation.invars):
+            if used is not variable:
+                continue
+            inner = equation.params.get("jaxpr")
+            inner = getattr(inner, "jaxpr", inner)
+            if equation.primitive.name == "slice":
+                end = equation.params["limit_indices"][0]
+                last = max(last, end if end <= most else 0)
+            elif inner is not None and len(inner.invars) == len(equation.invars):
+                last = max(last, _read(inner, inner.invars[i], most))
+    return last
+
+
+def _inputs_needed(f: Callable[[Any, Any], Any], num_parameters: int) -> int | None:
+    """n of f(u (n,), theta), where it takes one size alone: it unpacks or multiplies.
+
+    The last entry that f reads does not say: a column of the commands may be unused.
+    """
+    import jax
+
+    fits = []
+    for n in range(1, 33):
+        try:
+            jax.eval_shape(f, np.zeros(n), np.zeros(num_parameters))
+        except Exception:  # whatever f raises where a size does not fit
+            continue
+        fits.append(n)
+    return fits[0] if len(fits) == 1 else None

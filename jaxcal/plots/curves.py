@@ -85,7 +85,7 @@ def plan(axes: Any, plan: Any) -> Any:
     for field, label, marker, style, colour in series:
         values = [plan.worst(getattr(row, field)) for row in plan.rows]
         axes.plot(ks, values, marker=marker, linestyle=style, color=colour, label=label)
-    target = plan.target_accuracy[plan.hardest_output]
+    target = plan.accuracy[plan.hardest_output]
     axes.axhline(target, color=BLACK, linewidth=0.8, label="target")
     axes.axvline(plan.k, color=BLACK, linewidth=0.8, linestyle=":")
     axes.set_xlabel("number of measurements K")

@@ -1,34 +1,33 @@
-"""Which few of many candidate postures to measure: one signature for every solver."""
+"""Which few of many candidate postures to measure: one problem, many questions."""
 
-from jaxcal.selection.api import score, select
 from jaxcal.selection.batch import (
     exact_batch,
     exchange_batch,
     greedy_batch,
     random_batch,
 )
-from jaxcal.selection.problem import (
-    Problem,
-    make_block_problem,
-    make_problem,
-    make_problems,
-)
+from jaxcal.selection.criteria import As, Ds, I
+from jaxcal.selection.design import Design, select
+from jaxcal.selection.fastest.motion import Motion
+from jaxcal.selection.problem import Problem, make_problems
 from jaxcal.selection.result import BatchSelection, Selection, Subset
 from jaxcal.selection.solvers import METHODS
 
 __all__ = [
     "METHODS",
+    "As",
     "BatchSelection",
+    "Design",
+    "Ds",
+    "I",
+    "Motion",
     "Problem",
     "Selection",
     "Subset",
     "exact_batch",
     "exchange_batch",
     "greedy_batch",
-    "make_block_problem",
-    "make_problem",
     "make_problems",
     "random_batch",
-    "score",
     "select",
 ]

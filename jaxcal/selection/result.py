@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from jaxcal.checks import axis_names
 from jaxcal.information.criteria import Criteria, block_criteria
+from jaxcal.selection.criteria import CRITERIA
 from jaxcal.selection.problem import Problem
 
 if TYPE_CHECKING:
@@ -19,15 +20,6 @@ if TYPE_CHECKING:
 __all__ = ["BatchSelection", "Selection", "Subset"]
 
 Indices = NDArray[np.int64]
-
-_VALUES = {  # what is printed before the value of a criterion; V is a covariance
-    "D": "log det S",
-    "A": "trace V",
-    "I": "mean variance",
-    "E": "eigenvalue",
-    "Ds": "log det V^-1",
-    "As": "trace V",
-}
 
 
 class Subset(NamedTuple):
@@ -67,7 +59,7 @@ class Selection:
 
     @property
     def criterion(self) -> str:
-        """D, A, I, E, Ds or As."""
+        """Its name in ``CRITERIA``: D, A, I, E, Ds or As."""
         return self.problem.criterion.name
 
     @property
@@ -80,7 +72,7 @@ class Selection:
     def bound(self) -> float:
         """No selection allowed has a better value: an upper bound, of A, As, I a lower.
 
-        The proven optimum where the solver or ``reference="exact"`` gave one, or where
+        The optimum where the solver proved it or ``score`` was asked to, or where
         k = n + 1 makes it cheap; otherwise the concave relaxation.
         """
         bound = self.known_bound
@@ -176,7 +168,7 @@ class Selection:
         lines = [
             f"{len(self.indices)} of {count} candidates, method {self.method}",
             *lines,
-            f"{_VALUES[self.criterion]:13} {self.value:.6g} ({best})",
+            f"{CRITERIA[self.criterion].says:13} {self.value:.6g} ({best})",
             f"{self.criterion + '-efficiency':13} {self.efficiency:.6f}"
             + ("" if self.proven else " or more"),
             f"time          {1e3 * self.seconds:.3g} ms{extra}",

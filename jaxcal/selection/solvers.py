@@ -17,7 +17,7 @@ from jaxcal.selection.exchange import exchange
 from jaxcal.selection.problem import Problem
 from jaxcal.selection.solver import Found
 
-__all__ = ["METHODS", "SOLVERS", "Solver", "checked_options", "checked_seed"]
+__all__ = ["METHODS", "OPTIONS", "SOLVERS", "Solver", "checked_options", "checked_seed"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +40,7 @@ def _policy(
 ) -> Found:
     from jaxcal.selection.policy import select_batch
 
-    if problem.candidates is None:
+    if problem.candidates is None or problem.model is None:
         raise ValueError(
             'blocks cannot be used with method "policy", which is trained on '
             "candidates of the affine model; use auto, exact or exchange"
@@ -78,8 +78,9 @@ SOLVERS = {
 }
 METHODS = tuple(SOLVERS)
 
-# Default and check of every option; a value equal to the default counts as not given.
-_OPTIONS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
+# Default and check of every option of a solver, by its name; a value equal to the
+# default counts as not given.
+OPTIONS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "seed": (0, lambda value: checked_seed(value)),
     "restarts": (None, lambda value: whole_number("restarts", value, 1)),
     "time_limit": (None, lambda value: seconds("time_limit", value)),
@@ -91,35 +92,33 @@ _OPTIONS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
 }
 
 
-def checked_options(
-    method: str, given: Mapping[str, Any], more: tuple[str, ...] = ()
-) -> dict[str, Any]:
-    """The options that a method reads, checked.
+def checked_options(method: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """The options that a method reads, checked; defaults where they are not given.
 
     Args:
         method: a name of ``SOLVERS``.
-        given: every option of ``select`` by name.
-        more: options that something beside the solver reads.
+        given: options of ``select`` by name.
 
     Raises:
-        ValueError: an option has a bad value, or belongs to other methods.
+        ValueError: an option is unknown, has a bad value, or belongs to other methods.
     """
-    one_of("method", method, METHODS)
+    one_of("method", method, tuple(SOLVERS))
     reads = SOLVERS[method].options
-    checked = {}
+    checked = {name: OPTIONS[name][0] for name in reads}
     for name, value in given.items():
-        default, check = _OPTIONS[name]
-        is_default = value is default or (
-            type(value) is type(default) and value == default
-        )
-        checked[name] = value if is_default else check(value)
-        if not is_default and name not in (*reads, *more):
-            others = [other for other in METHODS if name in SOLVERS[other].options]
+        one_of("the name of an option", name, tuple(OPTIONS))
+        default, check = OPTIONS[name]
+        if value is default or (type(value) is type(default) and value == default):
+            continue
+        value = check(value)
+        if name not in reads:
+            others = [other for other in SOLVERS if name in SOLVERS[other].options]
             raise ValueError(
                 f'{name} is not an option of method "{method}" '
                 f"(it is of {', '.join(others)})"
             )
-    return {name: checked[name] for name in reads}
+        checked[name] = value
+    return checked
 
 
 def checked_seed(value: Any) -> int:

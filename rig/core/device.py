@@ -216,6 +216,7 @@ class Device:
         self.stopper = Stopper(self.drives, emit)
         self.armed = False
         self.frame: Frame | None = None  # once the zero is taken
+        self.heard = 0  # connection of the phone by which the frame holds
         self._signals = signals
         timeouts = config.comm_timeouts_s
         self.line_watch = LineWatch(self.drives, timeouts, emit, timeouts_left or {})
@@ -286,6 +287,11 @@ class Device:
         self._signals.check_stop()
         self.stopper.check()
         self.heartbeat.feed()
+
+    @property
+    def oriented(self) -> bool:
+        """The phone has the heading that it had when the zero was taken."""
+        return self.frame is not None and self.imu.connections == self.heard
 
     def statuses(self) -> list[Status]:
         """Of all drives; raises MotionFault on a fault bit."""

@@ -29,7 +29,7 @@ class Observer:
 
     def zeroed(self, frame: Frame, pulses: Pulses) -> None:
         """Measure against this zero posture from now on."""
-        self.device.frame = frame
+        self.device.frame, self.device.heard = frame, self.device.imu.connections
         self._seen = (self.config.to_deg(pulses), np.zeros(3))
 
     def measure(
@@ -70,7 +70,7 @@ class Observer:
         angles = frame.angles(attitude)
         feedback = [status.position for status in statuses]
         self._check_position(target, feedback)
-        if self.device.frame is not None:
+        if self.device.oriented:
             self._check_agreement(self.config.to_deg(target), angles, label)
         return {
             "pulses": list(target),

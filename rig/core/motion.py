@@ -166,7 +166,7 @@ class Motion:
     def _check_attitude(self) -> None:
         """The IMU is fresh, and inside the envelope of the limits."""
         reading, frame = self.device.imu.latest(), self.device.frame
-        if frame is None:
+        if frame is None or not self.device.oriented:
             return
         margin = self.config.motion.envelope_margin_deg
         angles = frame.angles(reading.matrix)

@@ -13,8 +13,10 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from rig.config.settings import ImuSettings
-from rig.core.attitude import Reading
+from rig.core.attitude import Array, Reading
 from rig.core.faults import Fault
 from rig.core.stream import MAX_BODY, LineSplitter, Parser, StreamFault
 from rig.journal import JournalError
@@ -248,6 +250,7 @@ class Imu:
         self.connections = 0
         self._parser = Parser(settings)
         self._ring: deque[Reading] = deque(maxlen=RING)
+        self.world = np.eye(3)  # (3, 3) by which readings are turned
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
@@ -327,6 +330,13 @@ class Imu:
             recent = itertools.takewhile(lambda r: r.time >= start, newest)
             return [*recent][::-1]
 
+    def turn(self, world: Array) -> None:
+        """Turn all readings by (3, 3), those that were received too."""
+        with self._lock:
+            self.world = world @ self.world
+            turned = [Reading(r.time, world @ r.matrix) for r in self._ring]
+            self._ring = deque(turned, maxlen=RING)
+
     @property
     def counts(self) -> dict[str, int]:
         """Records that were accepted, and those dropped by reason."""
@@ -403,7 +413,7 @@ class Imu:
     def _store(self, readings: list[Reading]) -> None:
         if readings:
             self._arrived = time.monotonic()
-        for reading in readings:
+        for reading in [Reading(r.time, self.world @ r.matrix) for r in readings]:
             if not self._ring or reading.time >= self._ring[-1].time:
                 self._ring.append(reading)
             elif self._ring[-1].time - reading.time < 1e-3:

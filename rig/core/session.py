@@ -15,7 +15,7 @@ import numpy as np
 
 from rig.config import RigConfig
 from rig.config.axis import Pulses
-from rig.core.attitude import Array, Frame, frame_at
+from rig.core.attitude import Array, Frame, angle_between_deg, frame_at
 from rig.core.bus import Bus
 from rig.core.device import Device, check_plan, timeouts_left
 from rig.core.faults import (
@@ -38,10 +38,11 @@ from rig.core.motion import Motion
 from rig.core.phone import Imu
 from rig.core.record import ZEROED, DeviceRecord, check_drives, leave
 from rig.core.stop import Requests
-from rig.core.zero import KeptZero, axes_text
+from rig.core.zero import KeptZero, axes_text, check_zero, heading_turn
 from rig.journal import JournalError, Record, RunFolder
 
 STREAM_WAIT_S = 60.0  # time to start the app on the phone
+LEAST_TURN_DEG = 0.05  # of the phone's heading: less is its noise
 ZERO_FACTOR = 4  # readings of the zero posture, in those of a posture
 
 
@@ -166,7 +167,11 @@ class Run(RunFolder):
         check_plan(self.config, [target])  # it is where a resumed run looks again
         # Every posture is measured against this one, so its noise must be the smaller.
         samples = ZERO_FACTOR * self.config.settle.samples
-        measured = self.observer.measure(target, "zero", samples)
+        while True:
+            count = device.imu.connections
+            measured = self.observer.measure(target, "zero", samples)
+            if device.imu.connections == count:
+                break
         self._compare_zero(target, np.array(measured["attitude"]))
         record = self.emit("zero", sync=True, **measured)
         self.observer.zeroed(self._set_zero(record), target)
@@ -208,6 +213,38 @@ class Run(RunFolder):
             )
         self.say(f"reference posture reads {worst:.3f} deg from zero: going on")
 
+    def _reorient(self, device: Device) -> None:
+        """Read the zero again where the phone came back on a new connection.
+
+        Its world may have turned about the vertical since; later readings are turned
+        back, so that one frame holds for the whole run.
+
+        Raises:
+            MotionFault: the zero posture is elsewhere in another way than that.
+        """
+        while not device.oriented:
+            assert self.frame is not None and self.zero_pulses is not None
+            count = device.imu.connections
+            self.emit("imu_reconnected", sync=True, connection=count)
+            device.frame = None  # no comparison with the drives before it is known
+            self.motion.move_to(self.zero_pulses, "reference")
+            found = self.observer.measure(self.zero_pulses, "reference")
+            if device.imu.connections != count:
+                continue
+            now = np.array(found["attitude"])
+            told = check_zero(self.config, self.frame.zero, now, "this run")
+            turn = heading_turn(self.config, self.frame.zero, now)
+            if (turned := angle_between_deg(np.eye(3), turn)) > LEAST_TURN_DEG:
+                device.imu.turn(turn)
+            self.observer.zeroed(self.frame, self.zero_pulses)
+            self.emit(
+                "reoriented", sync=True, turned_deg=round(turned, 4),
+                world=device.imu.world.tolist(),
+            )  # fmt: skip
+            self.say(
+                f"the phone came back, its heading turned {turned:.3f} deg: {told}"
+            )
+
     # Visits
 
     def visit(self, name: str, pulses: Any, **fields: Any) -> Record | None:
@@ -224,8 +261,12 @@ class Run(RunFolder):
         begun = time.monotonic()
         self.emit("visit", name=name, pulses=[pitch, yaw, roll])
         try:
-            self.motion.move_to((pitch, yaw, roll), name)
-            measured = self.observer.measure((pitch, yaw, roll), name)
+            while True:
+                self._reorient(device)
+                self.motion.move_to((pitch, yaw, roll), name)
+                measured = self.observer.measure((pitch, yaw, roll), name)
+                if device.oriented:  # or the phone came back in between
+                    break
         except NotFollowing as fault:
             if fault.suspects:
                 self.emit("void", sync=True, names=fault.suspects)

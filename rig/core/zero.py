@@ -54,11 +54,17 @@ def moved(config: RigConfig, then: Array, now: Array) -> tuple[float, Array]:
         The angle in degrees, and as (3,) joint angles. Without an absolute heading the
         turn about the vertical that comes last is taken out of both.
     """
-    if config.imu.heading == "relative":
-        _, _, z, w = Rotation.from_matrix(now @ then.T).as_quat()
-        heading = Rotation.from_quat([0.0, 0.0, z, w] if z or w else [0, 0, 0, 1])
-        now = heading.as_matrix().T @ now
+    now = heading_turn(config, then, now) @ now
     return angle_between_deg(then, now), frame_at(config, then).angles(now)
+
+
+def heading_turn(config: RigConfig, then: Array, now: Array) -> Array:
+    """(3, 3) turn about the vertical that takes ``now`` nearest to ``then``, both
+    (3, 3); none where the heading can be trusted."""
+    if config.imu.heading == "absolute":
+        return np.eye(3)
+    _, _, z, w = Rotation.from_matrix(now @ then.T).as_quat()
+    return Rotation.from_quat([0.0, 0.0, -z, w] if z or w else [0, 0, 0, 1]).as_matrix()
 
 
 def unseen(config: RigConfig, zero: Array) -> list[str]:

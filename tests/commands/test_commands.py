@@ -209,9 +209,8 @@ def test_a_model_goes_through_every_command(tmp_path, arm, capsys):
     assert main([*judge, "--criterion", "D"]) == 0
     assert json.loads(capsys.readouterr().out)["value"] == wanted.value
     assert main(judge) == 0  # by the variance of predictions, as select would
-    judged = jaxcal.score(
-        commands, chosen["indices"], model=model, noise=jaxcal.Noise(0.01)
-    )
+    design = jaxcal.Design(commands, model, noise=jaxcal.Noise(0.01))
+    judged = design.score(chosen["indices"])
     found = json.loads(capsys.readouterr().out)
     assert (found["criterion"], found["value"]) == ("I", judged.value)
 

@@ -281,7 +281,7 @@ def test_what_ships_is_what_its_card_says(name: str) -> None:
     assert ranges.contains(commands).all()
     fit = jaxcal.identify(commands, measured)
     assert np.abs(np.diag(fit.matrix) - SCALE).max() < 0.02
-    assert fit.residual_std.max() < 0.3
+    assert fit.noise_std.max() < 0.3
 
 
 @pytest.mark.parametrize(

@@ -30,7 +30,7 @@ pytestmark = pytest.mark.slow  # one report for all; its parts are tested quickl
 
 def run(*arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "jaxcal.paper", *map(str, arguments)],
+        [sys.executable, "-m", "studies.paper", *map(str, arguments)],
         capture_output=True,
         text=True,
         cwd=ROOT,

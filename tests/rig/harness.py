@@ -129,7 +129,7 @@ def session(
         "calibrate",
         (said if said is not None else []).append,
         record=commissioned(config, folder, sim),
-        start={"simulated": {"noise": 0.0}, "inputs": {}, "maps_from": "."},
+        start={"simulated": None, "inputs": {}, "maps_from": "."},
         reset_alarms=True,
     )
     if on_imu_port or sim:

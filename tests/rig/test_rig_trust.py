@@ -474,3 +474,22 @@ def test_a_pushing_phone_comes_to_the_next_session_of_the_process(tmp_path):
                 imu.wait_for_stream(20.0)
     finally:
         phone.close()
+
+
+def test_a_simulated_calibration_moves_no_real_joint(calibrated, tmp_path, capsys):
+    """G: it has the real device's fingerprint where --config names its file."""
+    file = tmp_path / "calibration.json"
+    content = json.loads((calibrated / "calibration.json").read_text())
+    assert content["provenance"]["notes"]["simulated"] is False
+    content["provenance"]["notes"]["simulated"] = True
+    file.write_text(json.dumps(content))
+    with pytest.raises(Refused, match="made with a simulated device"):
+        load_calibration(file, fast_config())
+    assert load_calibration(file, fast_config(), simulated=True).zero.attitude is not None
+    path = tmp_path / "rig.toml"
+    path.write_text(fast_text({"port = 5020": "port = 1"}))  # opening would say so
+    for given in (["goto", str(file), "--to", "0", "0", "0"], ["verify", str(file)]):
+        given = [*given, "--config", str(path), "--arm", "--zero"]
+        assert main(given) == 2
+        error = capsys.readouterr().err
+        assert "simulated" in error and "cannot open" not in error

@@ -13,9 +13,10 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from questions import of
 
 import jaxcal
-from jaxcal.information.criterion import CRITERIA
+from jaxcal.selection.criteria import CRITERIA
 
 LIMIT = 20.0  # seconds of a call
 
@@ -26,7 +27,11 @@ def _serve(pipe):
     while True:
         name, arguments, keywords = pipe.recv()
         try:
-            found = getattr(jaxcal, name)(*arguments, **keywords)
+            if name == "score":
+                indices, about, criterion = arguments
+                found = jaxcal.Design.from_blocks(**about).score(indices, criterion)
+            else:
+                found = jaxcal.select(*arguments, **keywords)
             told = ("indices", "value", "bound", "efficiency", "proven", "reason")
             pipe.send([getattr(found, each) for each in told])
         except ValueError as error:
@@ -48,8 +53,8 @@ class Worker:
         for kind in CRITERIA:  # whatever a first call has to load
             for blocks in (rows[:, None], rows[:, None].repeat(2, axis=1)):
                 self(
-                    "select", blocks=blocks, k=4, criterion=kind, limit=300.0,
-                    parameters=[0] if kind in ("Ds", "As") else None, prior=np.eye(4),
+                    "select", blocks=blocks, k=4, criterion=of(kind, [0]), limit=300.0,
+                    prior=np.eye(4),
                 )  # fmt: skip
 
     def __call__(self, name, *arguments, limit=LIMIT, **keywords):
@@ -229,12 +234,11 @@ def share(name, value, best, size):
 def test_no_call_hangs_and_what_is_proven_is_the_optimum(worker, seed, name):
     case = drawn(seed)
     p = len(case.known)
-    positions, keywords = None, dict(case.keywords, criterion=name)
+    positions, keywords = None, dict(case.keywords, criterion=of(name, [0]))
     if name in ("Ds", "As"):
         if case.affine:  # its parameters are those of every output: blocks instead
             pytest.skip("parameters of the affine model are those of all outputs")
         positions = [0]
-        keywords["parameters"] = [0]
     found = case.brute(name, positions)
     least = name in ("A", "As", "I")
     best = (min if least else max)(found.values())
@@ -293,9 +297,7 @@ def test_columns_of_very_different_scale(worker, name):
     )
     positions = [0] if name in ("Ds", "As") else None
     found = case.brute(name, positions)
-    answer = worker(
-        "select", None, 4, "exact", blocks=blocks, criterion=name, parameters=positions
-    )
+    answer = worker("select", None, 4, "exact", blocks=blocks, criterion=of(name, [0]))
     best = (min if name in ("A", "As", "I") else max)(found.values())
     assert answer.proven
     assert found[tuple(sorted(answer.indices.tolist()))] == pytest.approx(
@@ -327,9 +329,7 @@ def test_a_bound_of_the_root_alone_is_never_below_zero(worker):
         prior = 10.0 ** float(rng.integers(-8, 0)) * np.eye(p)
         rng.permutation(m)
         indices = rng.permutation(m)[:k]
-        answer = worker(
-            "score", None, indices, blocks=blocks, criterion="A", prior=prior
-        )
+        answer = worker("score", indices, {"blocks": blocks, "prior": prior}, "A")
         assert 0.0 < answer.efficiency <= 1.0
         answer = worker(
             "select", None, k, "greedy", blocks=blocks, criterion="A", prior=prior

@@ -7,20 +7,18 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from questions import make_block_problem, make_problem, of, score
 
 import jaxcal
-from jaxcal.information.criterion import CRITERIA
 from jaxcal.models import Affine, FromJax, Linear
-from jaxcal.selection import make_block_problem, make_problem, score, select
+from jaxcal.selection import select
+from jaxcal.selection.criteria import CRITERIA
 from jaxcal.selection.exchange.exchange import exchange_from
 from jaxcal.selection.problem import values
 
 laws = settings(max_examples=20, deadline=None)
+NAMES = st.sampled_from(tuple(CRITERIA))
 SIGN = {"D": 1, "Ds": 1, "E": 1, "A": -1, "As": -1, "I": -1}  # 1: larger is better
-
-
-def interest(name):
-    return {"parameters": [0, 1]} if name in ("Ds", "As") else {}
 
 
 def definition(name, blocks, prior, chosen, region=None):
@@ -81,8 +79,7 @@ def test_heuristics_never_beat_brute_force_and_exchange_reaches_it(name):
             best = brute_force(name, blocks, prior, k)
             for method in ("random", "greedy", "exchange"):
                 found = select(
-                    blocks=blocks, prior=prior, k=k, method=method, criterion=name,
-                    **interest(name),
+                    blocks=blocks, prior=prior, k=k, method=method, criterion=of(name),
                 )  # fmt: skip
                 value = definition(name, blocks, prior, found.indices)
                 assert found.value == pytest.approx(value, rel=1e-7, abs=1e-9)
@@ -101,8 +98,8 @@ def test_rules_are_kept_and_used_by_every_criterion(name):
         blocks[5] = np.nan
         for method in ("greedy", "exchange"):
             found = select(
-                blocks=blocks, prior=prior, k=k, method=method, criterion=name,
-                **interest(name), **rules,
+                blocks=blocks, prior=prior, k=k, method=method, criterion=of(name),
+                **rules,
             )  # fmt: skip
             assert available[found.indices].all()
             assert 2 in found.indices
@@ -114,9 +111,7 @@ def test_rules_are_kept_and_used_by_every_criterion(name):
 @pytest.mark.parametrize("name", CRITERIA)
 def test_no_single_swap_improves_an_exchange(name):
     blocks, prior = drawn(3, 14, 2, 6, 0.01)
-    problem = make_block_problem(
-        blocks, 4, prior=prior, criterion=name, **interest(name)
-    )
+    problem = make_block_problem(blocks, 4, prior=prior, criterion=of(name))
     start = select(blocks=blocks, prior=prior, k=4, method="random").indices
     chosen = exchange_from(problem, start)
     best = SIGN[name] * values(problem, chosen[None])[0][0]
@@ -130,11 +125,11 @@ def test_no_single_swap_improves_an_exchange(name):
 
 
 @laws
-@given(st.integers(0, 10**6), st.sampled_from(CRITERIA), st.sampled_from([0.0, 0.1]))
+@given(st.integers(0, 10**6), NAMES, st.sampled_from([0.0, 0.1]))
 def test_order_of_the_candidates_and_knowledge(seed, name, weight):
     """Permuting the blocks permutes the answer; knowing more is never worse."""
     blocks, prior = drawn(seed, 10, 2, 4, weight)
-    rules = {"k": 3, "method": "exchange", "criterion": name, **interest(name)}
+    rules = {"k": 3, "method": "exchange", "criterion": of(name)}
     plain = select(blocks=blocks, prior=prior, **rules)
     order = np.random.default_rng(seed).permutation(10)
     moved = select(blocks=blocks[order], prior=prior, **rules)
@@ -163,7 +158,7 @@ def test_d_and_i_do_not_depend_on_the_parameters_chosen(seed, name):
 @pytest.mark.parametrize("name", CRITERIA)
 def test_what_was_measured_counts_as_if_it_were_required(name):
     blocks, prior = drawn(1, 12, 2, 4, 0.01)
-    about = {"prior": prior, "criterion": name, "region": None, **interest(name)}
+    about = {"prior": prior, "criterion": of(name), "region": None}
     if name == "I":
         about["region"] = blocks
     rules = {"blocks": blocks, "method": "exchange", **about}
@@ -178,7 +173,7 @@ def test_the_affine_model_is_judged_as_its_kronecker_blocks():
     candidates = np.random.default_rng(0).uniform(-3, 3, (12, 2))
     whole = Affine(2, 3).jacobian(candidates)
     for name in ("D", "A", "I", "E"):
-        few = score(candidates, [0, 3, 5, 8], criterion=name, num_outputs=3)
+        few = score(candidates, [0, 3, 5, 8], model=Affine(2, 3), criterion=name)
         many = score(None, [0, 3, 5, 8], blocks=whole, criterion=name)
         assert few.value == pytest.approx(many.value, rel=1e-9), name
         kept = few.criteria.as_dict()
@@ -186,8 +181,8 @@ def test_the_affine_model_is_judged_as_its_kronecker_blocks():
         assert kept == pytest.approx(many.criteria.as_dict(), rel=1e-7)
         if name != "D":
             assert kept[name] == pytest.approx(few.value, rel=1e-9)
-    slopes = {"criterion": "As", "parameters": ["a11", "a21"]}
-    found = score(candidates, [0, 3, 5], model=Affine(2, 3), **slopes)
+    slopes = jaxcal.As(["a11", "a21"])
+    found = score(candidates, [0, 3, 5], model=Affine(2, 3), criterion=slopes)
     v = np.linalg.inv(sum(whole[i].T @ whole[i] for i in (0, 3, 5)))
     assert found.value == pytest.approx(v[0, 0] + v[2, 2])
 
@@ -315,36 +310,30 @@ HELD = jaxcal.Prior(1.0, fixed=("a11", "a12", "a13", "b1"))
     ("message", "change"),
     [
         (
-            r"criterion must be one of D, Ds, A, As, I, E, got 'D\+A'",
+            r"criterion must be one of D, A, I, E, Ds, As, got 'D\+A'",
             {"criterion": "D+A"},
         ),
         ("criterion must be one of", {"criterion": ["D", "A"]}),
-        ("parameters, those of interest, must be given", {"criterion": "Ds"}),
-        ("and with no other, got .*'D'", {"parameters": [0]}),
+        (r"criterion Ds must carry its data: jaxcal.Ds\(\[", {"criterion": "Ds"}),
+        ("option must be one of seed, .*'parameters'", {"parameters": [0]}),
+        ("parameters must be indices or names", {"criterion": jaxcal.As([4])}),
+        ("parameters must be indices .*'x'", {"criterion": jaxcal.As("x")}),
+        ("parameters must name some once", {"criterion": jaxcal.As([1, 1])}),
         (
-            "parameters must be indices or names",
-            {"criterion": "As", "parameters": [4]},
-        ),
-        ("parameters must be indices .*'x'", {"criterion": "As", "parameters": ["x"]}),
-        (
-            "parameters must name some once",
-            {"criterion": "As", "parameters": [1, 1]},
+            "region, where .* must come with criterion I, once",
+            {"region": np.ones((3, 2, 4)), "criterion": jaxcal.I(np.ones((3, 2, 4)))},
         ),
         (
             r"region must have shape \(N, 2, 4\)",
             {"region": np.ones((3, 4)), "criterion": "I"},
         ),
         (
-            "region, where .* must come with criterion I, got criterion D",
+            "region, where .* must come with criterion I, once, got criterion D",
             {"region": np.ones((3, 2, 4))},
         ),
         (r"measured must have shape \(N, 2, 4\)", {"measured": np.ones((3, 1, 4))}),
         ("prior must be a .* precision with blocks", {"prior": jaxcal.Prior(1.0)}),
         ("model must come with candidates", {"model": Affine(3, 3)}),
-        (
-            "num_outputs must not be given",
-            BARE | {"model": Affine(3, 3), "num_outputs": 3},
-        ),
         (r"candidates must have shape \(M, 2\)", BARE | {"model": Affine(2, 2)}),
         ("prior must leave", BARE | {"model": Affine(3, 1), "prior": HELD}),
         (r"measured must have shape \(N, 3\)", BARE | {"measured": U[:, :2]}),

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from questions import make_problem, score
 
+from jaxcal.models import Affine
 from jaxcal.selection import auto as auto_module
-from jaxcal.selection import exact_batch, exchange_batch, make_problem, score, select
+from jaxcal.selection import exact_batch, exchange_batch, select
 from jaxcal.selection.exact import exact as exact_module
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
 from jaxcal.selection.exact.exact import solve_exact, upper_bound
@@ -89,7 +91,8 @@ def test_replicated_optimum_is_that_of_brute_force(seed, m, k, cap):
 @pytest.mark.parametrize("num_outputs", [None, 2])
 def test_any_number_of_inputs_and_outputs(n, extra, num_outputs):
     candidates = uniform(n, 11, n)
-    found = select(candidates, n + 1 + extra, "exact", num_outputs=num_outputs)
+    model = num_outputs and Affine(n, num_outputs)
+    found = select(candidates, n + 1 + extra, "exact", model=model)
     _, values = brute_force(candidates, n + 1 + extra, num_outputs=num_outputs)
     assert found.log_det == pytest.approx(values[0], abs=1e-8)
 

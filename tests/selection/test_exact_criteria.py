@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import itertools
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from questions import make_block_problem, make_problem, of
 from scipy.linalg import hadamard
 from scipy.optimize import minimize
 
 from jaxcal.information.criterion import Criterion
-from jaxcal.selection import make_block_problem, make_problem, select
+from jaxcal.models import Affine
+from jaxcal.selection import select
+from jaxcal.selection.criteria import CRITERIA
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
 from jaxcal.selection.exact.exact import upper_bound
 
@@ -37,7 +39,8 @@ def drawn(
     elif name == "I":
         root = rng.normal(size=(p, p))
     known = rng.normal(size=(p, p))
-    return rng.normal(size=(m, q, p)), weight * known.T @ known, Criterion(name, root)
+    criterion = Criterion(name, CRITERIA[name].kind, root)
+    return rng.normal(size=(m, q, p)), weight * known.T @ known, criterion
 
 
 def phi(blocks: Array, prior: Array, criterion: Criterion, chosen: object) -> float:
@@ -121,15 +124,12 @@ def test_the_relaxation_is_that_of_a_general_solver(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_select_proves_the_best_and_bounds_are_bounds(name: str) -> None:
     blocks, prior, _ = drawn(5, 9, 2, 4, name, 0.1)
-    asked: dict[str, Any] = {"parameters": [0, 1]} if name in ("Ds", "As") else {}
-    problem = make_block_problem(blocks, 3, prior=prior, criterion=name, **asked)
-    found = select(
-        blocks=blocks, k=3, prior=prior, criterion=name, method="exact", **asked
-    )
+    problem = make_block_problem(blocks, 3, prior=prior, criterion=of(name))
+    found = select(blocks=blocks, k=3, prior=prior, criterion=of(name), method="exact")
     values = {
         s: select(
-            blocks=blocks, k=3, prior=prior, criterion=name, method="greedy",
-            required=s, **asked,
+            blocks=blocks, k=3, prior=prior, criterion=of(name), method="greedy",
+            required=s,
         ).value
         for s in subsets(9, 3)
     }  # fmt: skip
@@ -145,7 +145,7 @@ def test_few_readings_are_bounded_far_below_the_natural_relaxation() -> None:
     rng = np.random.default_rng(0)
     blocks, whole = rng.normal(size=(20, 3, 12)), np.ones(20, dtype=np.int64)
     start = np.bincount([0, 1], minlength=20)
-    plain = Criterion("D", np.eye(12))
+    plain = Criterion("D", "det", np.eye(12))
     prior = 1e-4 * np.eye(12)
     sharp = branch_and_bound(
         blocks, prior, plain, 0 * whole, whole, start, root_only=True
@@ -185,7 +185,7 @@ def test_chemical_weighing_is_a_hadamard_design(name: str) -> None:
 
 def test_corners_of_the_cube_are_d_and_a_optimal_for_first_order() -> None:
     cube = np.array(list(itertools.product([-1.0, 0.0, 1.0], repeat=3)))
-    found = make_problem(cube, 8, num_outputs=1)
+    found = make_problem(cube, 8, model=Affine(3, 1))
     for name in ("D", "A"):
         blocks = np.column_stack([cube, np.ones(27)])[:, None]
         best = select(blocks=blocks, k=8, criterion=name, method="exact")

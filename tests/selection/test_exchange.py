@@ -4,9 +4,10 @@ import itertools
 
 import numpy as np
 import pytest
+from questions import make_problem
 
 from jaxcal.information.linear_algebra import draw, factor
-from jaxcal.selection import exchange_batch, make_problem, select
+from jaxcal.selection import exchange_batch, select
 from jaxcal.selection.exchange.exchange import exchange_from, exchange_indices
 
 

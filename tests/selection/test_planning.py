@@ -11,12 +11,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
+from questions import plan
 
 import jaxcal
 from jaxcal import plots
 from jaxcal.information.criteria import criteria
 from jaxcal.models import Affine, Noise, Polynomial, Prior, SerialChain
-from jaxcal.selection.plan import plan
 
 
 def value_of(candidates, indices, criterion, region=None):
@@ -49,7 +49,7 @@ def test_the_smallest_k_and_the_bounds_hold_against_brute_force(criterion, repea
         target = 0.5 * np.sqrt(best[5] * 1.0001)
         found = plan(
             candidates,
-            target_accuracy=target,
+            accuracy=target,
             noise_std=0.5,
             criterion=criterion,
             max_replicates=8 if repeat else 1,
@@ -74,7 +74,7 @@ def test_laws_of_a_plan(seed, criterion, cap, with_region):
     candidates = rng.random((14, 3)) * 50 - 20
     region = rng.random((7, 3)) * 50 - 20 if with_region else None
     wanted = {
-        "target_accuracy": 1.2,
+        "accuracy": 1.2,
         "noise_std": 1.0,
         "criterion": criterion,
         "region": region,
@@ -104,7 +104,7 @@ def test_an_affine_map_changes_no_k_and_no_error(rng):
     candidates = rng.random((15, 3))
     mapped = candidates @ (rng.normal(size=(3, 3)) + 2 * np.eye(3)) * 1e4 + 3e4
     first, second = (
-        plan(c, target_accuracy=0.9, noise_std=1.0, design="exchange")
+        plan(c, accuracy=0.9, noise_std=1.0, design="exchange")
         for c in (candidates, mapped)
     )
     assert first.k == second.k
@@ -119,7 +119,7 @@ def test_simulated_calibrations_err_as_planned(rng, criterion):
     noise = np.array([0.05, 0.1, 0.2])
     found = plan(
         candidates,
-        target_accuracy=0.17,
+        accuracy=0.17,
         noise_std=noise,
         criterion=criterion,
         max_replicates=3,
@@ -147,7 +147,7 @@ def test_simulated_calibrations_err_as_planned(rng, criterion):
 
 def test_replicates_need_no_more_measurements(rng):
     candidates = rng.random((12, 3))
-    wanted = {"target_accuracy": 0.8, "noise_std": 1.0, "design": "exchange"}
+    wanted = {"accuracy": 0.8, "noise_std": 1.0, "design": "exchange"}
     single = plan(candidates, **wanted)
     several = plan(candidates, max_replicates=4, **wanted)
     assert several.k <= single.k
@@ -156,7 +156,7 @@ def test_replicates_need_no_more_measurements(rng):
 def test_the_bound_is_that_of_kiefer_and_wolfowitz_where_nothing_limits(rng):
     """The corners of a cube are its G-optimal design: p / K is reached at K = 8."""
     corners = np.array(list(itertools.product([0.0, 1.0], repeat=3)))
-    found = plan(corners, target_accuracy=np.sqrt(0.5) * (1 + 1e-9), noise_std=1.0)
+    found = plan(corners, accuracy=np.sqrt(0.5) * (1 + 1e-9), noise_std=1.0)
     assert found.k == 8
     assert found.rows[-1].least_error[0] == pytest.approx(np.sqrt(4 / 8))
     assert found.smallest_proven
@@ -167,7 +167,7 @@ def test_required_and_masked_postures_are_kept(rng):
     available = np.arange(15) != 4
     found = plan(
         candidates,
-        target_accuracy=0.9,
+        accuracy=0.9,
         noise_std=1.0,
         required=[2, 7],
         available=available,
@@ -178,17 +178,15 @@ def test_required_and_masked_postures_are_kept(rng):
 
 def test_required_postures_in_a_plane_raise_the_least_k(rng):
     candidates = np.r_[rng.random((6, 3)) * [1, 1, 0], rng.random((8, 3))]
-    found = plan(
-        candidates, target_accuracy=9.0, noise_std=1.0, required=[0, 1, 2, 3, 4]
-    )
+    found = plan(candidates, accuracy=9.0, noise_std=1.0, required=[0, 1, 2, 3, 4])
     assert found.k == 6
 
 
 def test_each_output_has_its_own_target(rng):
     candidates = rng.random((15, 3))
     quick = {"design": "exchange"}
-    strict = plan(candidates, target_accuracy=[9, 9, 0.9], noise_std=1.0, **quick)
-    loose = plan(candidates, target_accuracy=0.9, noise_std=[0.1, 0.1, 1.0], **quick)
+    strict = plan(candidates, accuracy=[9, 9, 0.9], noise_std=1.0, **quick)
+    loose = plan(candidates, accuracy=0.9, noise_std=[0.1, 0.1, 1.0], **quick)
     assert strict.k == loose.k
     assert strict.standard_error.shape == (3,)
 
@@ -196,12 +194,12 @@ def test_each_output_has_its_own_target(rng):
 def test_out_of_reach_names_the_best_achievable(rng):
     candidates = rng.random((9, 3))
     everything = np.sqrt(value_of(candidates, range(9), "G"))
-    with pytest.raises(ValueError, match="target_accuracy must be reachable") as error:
-        plan(candidates, target_accuracy=0.01, noise_std=1.0)
+    with pytest.raises(ValueError, match="accuracy must be reachable") as error:
+        plan(candidates, accuracy=0.01, noise_std=1.0)
     assert f"{everything:.6g}" in str(error.value)
     assert "9 measurements (all that are allowed)" in str(error.value)
     with pytest.raises(ValueError, match="max_k = 5 measurements:"):
-        plan(candidates, target_accuracy=0.01, noise_std=1.0, max_k=5)
+        plan(candidates, accuracy=0.01, noise_std=1.0, max_k=5)
 
 
 @pytest.mark.parametrize(
@@ -210,9 +208,9 @@ def test_out_of_reach_names_the_best_achievable(rng):
         ({"criterion": "D"}, "criterion must be one of G, I, parameters, got 'D'"),
         ({"design": "policy"}, "design must be one of exact, exchange, got 'policy'"),
         ({"noise_std": 0.0}, "noise_std must be positive, got 0"),
-        ({"noise_std": [1.0, 2.0], "num_outputs": 3}, "noise_std must be one number"),
-        ({"target_accuracy": -1.0}, "target_accuracy must be positive, got -1"),
-        ({"target_accuracy": np.nan}, "target_accuracy must be finite"),
+        ({"noise_std": [1.0, 2.0]}, "noise_std must be one number"),
+        ({"accuracy": -1.0}, "accuracy must be positive, got -1"),
+        ({"accuracy": np.nan}, "accuracy must be finite"),
         ({"time_limit": 0}, "time_limit must be a number above 0 in seconds"),
         ({"max_k": 3}, "max_k must be at least 4, got 3"),
         ({"max_k": 13}, "max_k must not exceed the 12 measurements allowed, got 13"),
@@ -226,7 +224,7 @@ def test_out_of_reach_names_the_best_achievable(rng):
 def test_bad_requests_name_argument_rule_and_value(rng, change, message):
     given = {
         "candidates": rng.random((12, 3)),
-        "target_accuracy": 1.0,
+        "accuracy": 1.0,
         "noise_std": 1.0,
     } | change
     with pytest.raises(ValueError, match=message):
@@ -234,7 +232,7 @@ def test_bad_requests_name_argument_rule_and_value(rng, change, message):
 
 
 def test_the_table_and_the_figure_show_every_row(rng):
-    found = plan(rng.random((15, 3)), target_accuracy=0.9, noise_std=1.0, more=2)
+    found = plan(rng.random((15, 3)), accuracy=0.9, noise_std=1.0, more=2)
     lines = found.table().splitlines()
     assert str(found) == found.table()
     assert len(lines) == len(found.rows) + 3
@@ -246,7 +244,7 @@ def test_the_table_and_the_figure_show_every_row(rng):
 
 def test_a_masked_candidate_may_hold_anything(rng):
     candidates = rng.random((15, 3))
-    wanted = {"target_accuracy": 0.9, "noise_std": 1.0, "design": "exchange"}
+    wanted = {"accuracy": 0.9, "noise_std": 1.0, "design": "exchange"}
     available = np.arange(15) != 4
     plain = plan(candidates, available=available, **wanted)
     candidates[4] = np.nan
@@ -256,7 +254,7 @@ def test_a_masked_candidate_may_hold_anything(rng):
 
 def test_a_plan_keeps_its_own_levels(rng):
     noise, target = np.array([0.1, 0.1, 1.0]), np.array([0.9, 0.9, 0.9])
-    found = plan(rng.random((15, 3)), target_accuracy=target, noise_std=noise)
+    found = plan(rng.random((15, 3)), accuracy=target, noise_std=noise)
     table = found.table()
     noise[:] = 7.0
     target[:] = 7.0
@@ -269,7 +267,7 @@ def test_planning_loads_neither_jax_nor_matplotlib():
     code = (
         "import sys, numpy, jaxcal\n"
         "c = numpy.random.default_rng(0).random((9, 3))\n"
-        "jaxcal.plan(c, target_accuracy=2.0, noise_std=1.0)\n"
+        "jaxcal.Design(c).plan(accuracy=2.0, noise_std=1.0)\n"
         "print(sorted({'jax', 'matplotlib'} & set(sys.modules)))"
     )
     result = subprocess.run(
@@ -308,7 +306,7 @@ def test_blocks_are_planned_as_by_brute_force(criterion, known):
         blocks=blocks,
         prior=prior,
         region=None if criterion == "parameters" else region,
-        target_accuracy=target * best[4] * 1.0001,
+        accuracy=target * best[4] * 1.0001,
         criterion=criterion,
         more=1,
     )
@@ -316,7 +314,7 @@ def test_blocks_are_planned_as_by_brute_force(criterion, known):
     for row in found.rows:
         share = shares(row.indices)
         np.testing.assert_allclose(
-            row.standard_error / found.target_accuracy,
+            row.standard_error / found.accuracy,
             share / best[4] / 1.0001,
             rtol=1e-8,
         )
@@ -331,8 +329,8 @@ def test_blocks_are_planned_as_by_brute_force(criterion, known):
 def test_blocks_of_affine_rows_are_planned_as_the_candidates(rng):
     candidates = rng.random((12, 2))
     rows = np.c_[candidates, np.ones(12)][:, None]
-    one = plan(candidates, target_accuracy=0.09, noise_std=0.1)
-    other = plan(blocks=rows / 0.1, region=rows, target_accuracy=0.09)
+    one = plan(candidates, accuracy=0.09, noise_std=0.1)
+    other = plan(blocks=rows / 0.1, region=rows, accuracy=0.09)
     assert other.k == one.k
     for mine, its in zip(other.rows, one.rows, strict=True):
         np.testing.assert_allclose(mine.standard_error, its.standard_error[:1])
@@ -344,7 +342,7 @@ def test_the_first_k_is_one_that_identifies():
     blocks = np.random.default_rng(0).normal(size=(10, 2, 4))
     blocks[:6, :, 3] = 0.0
     blocks[6:, :, :3] = 0.0
-    found = plan(blocks=blocks, target_accuracy=1e3)
+    found = plan(blocks=blocks, accuracy=1e3)
     assert found.k == 3
     assert np.linalg.matrix_rank(blocks[found.indices].reshape(-1, 4)) == 4
 
@@ -352,17 +350,16 @@ def test_the_first_k_is_one_that_identifies():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"candidates": np.zeros((8, 3))}, "blocks must come without candidates"),
-        ({"noise_std": 1.0}, "blocks must come without candidates, noise_std"),
+        ({"noise_std": 1.0}, "noise_std must be left out with blocks"),
         ({"region": np.zeros((3, 2))}, r"region must have shape \(R, m, 3\), got"),
-        ({"blocks": None}, "candidates and noise_std must be given, or else blocks"),
+        ({"blocks": None, "candidates": np.eye(3)}, "noise_std must be given: the des"),
         ({"parameters": [0]}, "parameters must come with criterion parameters"),
-        ({"noise": Noise(1.0)}, "blocks must come without candidates"),
-        ({"target_accuracy": [1.0, 2.0, 3.0]}, r"target_accuracy must be one number"),
+        ({"noise": Noise(1.0)}, "noise and noise_std must be left out with blocks"),
+        ({"accuracy": [1.0, 2.0, 3.0]}, r"accuracy must be one number"),
     ],
 )
 def test_bad_requests_with_blocks_are_named(rng, change, message):
-    given = {"blocks": rng.normal(size=(8, 2, 3)), "target_accuracy": 1.0} | change
+    given = {"blocks": rng.normal(size=(8, 2, 3)), "accuracy": 1.0} | change
     with pytest.raises(ValueError, match=message):
         plan(**given)
 
@@ -418,7 +415,7 @@ def test_any_model_is_planned_as_by_brute_force(make, criterion):
         prior=prior,
         noise=noise,
         measured=measured,
-        target_accuracy=best[3] * 1.0001,
+        accuracy=best[3] * 1.0001,
         more=1,
         **given,
     )
@@ -437,7 +434,7 @@ def known_names(model, known):
 
 def test_the_affine_model_given_is_that_which_is_meant(rng):
     candidates, noise = rng.random((12, 2)), [0.1, 0.3]
-    wanted = {"target_accuracy": 0.3, "measured": candidates[:3]}
+    wanted = {"accuracy": 0.3, "measured": candidates[:3]}
     one = plan(candidates, noise_std=noise, **wanted)
     same = plan(candidates, model=Affine(2, 2), noise=Noise(noise), **wanted)
     full = plan(

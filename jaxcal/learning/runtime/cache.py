@@ -15,6 +15,9 @@ __all__ = ["keep_compiled_programs"]
 def keep_compiled_programs() -> None:
     """Have JAX keep compiled code, in the user's folder for it if one is chosen, else
     in ``jaxcal/jax`` under ``XDG_CACHE_HOME`` or ``~/.cache``. Does not load JAX."""
+    # jaxlib 0.10.1 reports an error for each program it reads back, of two compiler
+    # settings that it takes for features of the processor.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
     settings = {
         "jax_compilation_cache_dir": str(pathlib.Path(home) / "jaxcal" / "jax"),
@@ -22,9 +25,6 @@ def keep_compiled_programs() -> None:
         "jax_persistent_cache_min_compile_time_secs": 0.0,
         "jax_persistent_cache_min_entry_size_bytes": 0,
     }
-    # jaxlib 0.10.1 logs an error for each program from the cache where the processor
-    # has hints that XLA does not list as features; the programs are right.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     for name, value in settings.items():
         os.environ.setdefault(name.upper(), str(value))  # read when JAX is loaded
         jax = sys.modules.get("jax")

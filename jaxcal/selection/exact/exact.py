@@ -22,7 +22,7 @@ from jaxcal.selection.exact.first_use import announced
 from jaxcal.selection.exact.volume import enumeration_cost, largest_volumes
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.greedy import greedy_indices
-from jaxcal.selection.problem import Problem, make_block_problem, values
+from jaxcal.selection.problem import Asked, Problem, values
 from jaxcal.selection.solver import Found, in_threads
 
 __all__ = ["STARTING_RESTARTS", "ExactResult", "solve", "solve_exact", "upper_bound"]
@@ -153,7 +153,7 @@ def _load(rank_one: bool, known: bool) -> float:
     """Compile or load the search; seconds it took, which no time limit should count."""
     begun = time.perf_counter()
     blocks = np.eye(2)[[0, 1, 0, 1], None].repeat(1 if rank_one else 2, axis=1)
-    problem = make_block_problem(blocks, 3, prior=np.eye(2) if known else None)
+    problem = Asked.from_blocks(blocks, np.eye(2) if known else None).problem(3)
     least = np.zeros(4, dtype=np.int64)
     what, about = ("", 15) if rank_one and not known else (" for row blocks", 30)
     line = f"compiling the exact solver{what}, once per machine (about {about} s)"

@@ -48,7 +48,7 @@ def default_restarts(problem: Problem) -> int:
     most = 200 if problem.max_replicates == 1 else 400
     if problem.rank_one:
         return most
-    if problem.criterion.name == "E":  # not compiled, and from local optima of A
+    if problem.criterion.kind == "least":  # not compiled, and from local optima of A
         most = 20
     count, q, p = problem.blocks.shape
     work = _WORK["D" if problem.criterion.name == "D" else "other"]
@@ -61,7 +61,7 @@ def exchange_indices(
     """(k,) the best local optimum, required candidates first."""
     if restarts is None:
         restarts = default_restarts(problem)
-    if problem.criterion.name == "E":
+    if problem.criterion.kind == "least":
         from jaxcal.selection.exchange.eigenvalue import exchange_eigenvalue
 
         chosen, phi = exchange_eigenvalue(problem, restarts, seed)
@@ -113,7 +113,7 @@ def exchange_from(problem: Problem, indices: ArrayLike) -> Indices:
             raise ValueError(f"indices must hold every required candidate, got no {i}")
         rest.remove(i)
     chosen = np.array([*problem.required, *rest], dtype=np.int64)
-    if problem.criterion.name == "E":
+    if problem.criterion.kind == "least":
         from jaxcal.selection.exchange.eigenvalue import climb_eigenvalue
 
         chosen, phi = climb_eigenvalue(problem, chosen)

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.selection.exchange.exchange import exchange_indices
-from jaxcal.selection.fastest.refill import refills
 from jaxcal.selection.fastest.task import SAME_TIME, Search, Task
 from jaxcal.selection.solver import Found
 
@@ -17,6 +16,7 @@ Indices = NDArray[np.int64]
 _STARTS = 12  # the D-optimum and local optima of the exchange
 _KICKS = 20  # random changes of the best run found, from which to search again
 _KICK_TRIES = 50  # swaps drawn until one keeps the determinant
+_RIDGE = 1e-8  # of the whitened information of fewer postures than identify
 _TRIED = 8  # most promising swaps that are put in their best order
 
 
@@ -80,7 +80,7 @@ def _shortened(task: Task, start: Indices, wanted: float) -> tuple[Indices, floa
         swaps = [
             swap
             for i in np.flatnonzero(tour >= task.fixed)
-            for swap in refills(task, np.delete(tour, i), wanted, _TRIED + 1)
+            for swap in _refills(task, np.delete(tour, i), wanted, _TRIED + 1)
         ]
         for _, tried in sorted(swaps, key=lambda swap: swap[0])[:_TRIED]:
             if task.log_det(tried) >= wanted:
@@ -91,3 +91,39 @@ def _shortened(task: Task, start: Indices, wanted: float) -> tuple[Indices, floa
         else:
             break
     return tour, seconds
+
+
+def _refills(
+    task: Task, kept: Indices, wanted: float, most: int
+) -> list[tuple[float, Indices]]:
+    """Ways to complete k - 1 postures to k, by their estimated seconds of travel.
+
+    The estimate inserts the new posture where it adds least to the tour kept.
+
+    Args:
+        task: the postures and the times between them.
+        kept: (k - 1,) postures in the order visited.
+        wanted: least whitened log det, met to 1e-6.
+        most: completions to return.
+
+    Returns:
+        Seconds and (k,) subset of each, ascending.
+    """
+    times, begin = task.times, task.start
+    legs = np.concatenate([begin[kept[:1]], times[kept[:-1], kept[1:]], [0.0]])
+    others = np.setdiff1d(np.arange(len(task.blocks)), kept)
+    _, q, p = task.blocks.shape
+    lower = np.linalg.cholesky(task.information(kept) + _RIDGE * np.eye(p))
+    y = np.linalg.solve(lower, task.blocks[others].reshape(-1, p).T).T.reshape(-1, q, p)
+    # Factor of the determinant.
+    factor = np.linalg.det(np.eye(q) + y @ np.matrix_transpose(y))
+    into = np.vstack([begin[others], times[np.ix_(kept, others)]])
+    onward = np.vstack([times[np.ix_(kept, others)], np.zeros(len(others))])
+    seconds = (into + onward - legs[:, None]).min(axis=0)
+    value = np.log(np.maximum(factor, 1e-300)) + 2.0 * np.log(np.diag(lower)).sum()
+    seconds = np.where(value >= wanted - 1e-6, seconds + legs.sum(), np.inf)
+    best = np.argsort(seconds, kind="stable")[:most]
+    return [
+        (float(seconds[i]), np.append(kept, others[i]))
+        for i in best[np.isfinite(seconds[best])]
+    ]

@@ -6,16 +6,14 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers, seconds
-from jaxcal.models.model import Model
 from jaxcal.selection.exact.exact import ExactResult, solve_exact
 from jaxcal.selection.fastest.motion import Motion, travel_times
-from jaxcal.selection.problem import Problem, make_block_problem, make_problem
+from jaxcal.selection.problem import Asked, Problem
 from jaxcal.selection.solver import Found
 
 __all__ = ["SAME_TIME", "Search", "Task", "make_task"]
@@ -102,31 +100,19 @@ class Task:
 
 
 def make_task(
-    candidates: ArrayLike,
+    asked: Asked,
     k: int | None,
     motion: Motion,
-    *,
-    start: ArrayLike | None = None,
-    time_limit: float = 60.0,
-    model: Model | None = None,
-    blocks: ArrayLike | None = None,
-    **rules: Any,
+    start: ArrayLike | None,
+    time_limit: float,
 ) -> Task:
-    """Check the arguments of ``select_fastest``; ``rules`` are those of a problem."""
-    if blocks is not None:
-        if model is not None:
-            raise ValueError("model must come without blocks")
-        problem = make_block_problem(blocks, k, **rules)
-        points = numbers("candidates", candidates)
-        if points.ndim != 2 or len(points) != len(problem.blocks):
-            raise ValueError(
-                f"candidates must have shape ({len(problem.blocks)}, n), a command for "
-                f"each block, got {points.shape}"
-            )
-    else:
-        problem = make_problem(candidates, k, model=model, criterion="D", **rules)
-        assert problem.candidates is not None
-        points = problem.candidates
+    """The task of visiting k of the candidates, by their D-efficiency."""
+    problem, points = asked.problem(k, "D"), asked.candidates
+    if points is None:
+        raise ValueError(
+            "commands must be given with blocks, Design.from_blocks(..., commands=), "
+            "for travel between them"
+        )
     if not isinstance(motion, Motion):
         raise ValueError(f"motion must be a Motion, got {motion!r}")
     pool = problem.required

@@ -20,20 +20,19 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import one_of, seconds, whole_number
-from jaxcal.models.model import Model
-from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.plan.bound import lower_bound, region_weighting
 from jaxcal.selection.plan.designs import Design, best_design, variances_of
 from jaxcal.selection.plan.request import fewest, make_request
+from jaxcal.selection.problem import Asked
 from jaxcal.selection.solvers import checked_seed
 
-__all__ = ["Plan", "PlanRow", "plan"]
+__all__ = ["Plan", "PlanRow", "make_plan"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -69,7 +68,7 @@ class Plan:
     k: int
     indices: Indices  # (k,) sorted, into the candidates
     standard_error: Array  # (m,) predicted by the criterion, measured unit
-    target_accuracy: Array  # (m,) measured unit
+    accuracy: Array  # (m,) measured unit
     noise_std: Array | None  # one an output, measured unit; None where Noise says more
     names: tuple[str, ...]  # (m,) of the parameters, or output 1, ...
     criterion: str  # "G", "I" or "parameters"
@@ -85,15 +84,15 @@ class Plan:
     @property
     def hardest_output(self) -> int:
         """The output, or parameter, that is furthest from its target."""
-        return int((self.standard_error / self.target_accuracy).argmax())
+        return int((self.standard_error / self.accuracy).argmax())
 
     def worst(self, errors: Array) -> float:
         """Largest of (m,) errors over their targets, times that of the hardest output.
 
         Where the targets are equal, the largest error.
         """
-        share = (errors / self.target_accuracy).max()
-        return float(share * self.target_accuracy[self.hardest_output])
+        share = (errors / self.accuracy).max()
+        return float(share * self.accuracy[self.hardest_output])
 
     def __str__(self) -> str:
         return self.table()
@@ -107,7 +106,7 @@ class Plan:
         elif self.noise_std is not None:
             what += f", noise {self.noise_std[worst]:g}"
         lines = [
-            f"{what}, target {self.target_accuracy[worst]:g}",
+            f"{what}, target {self.accuracy[worst]:g}",
             "   K  distinct  standard error  no design below  D-optimal     design",
         ]
         for row in self.rows:
@@ -123,70 +122,21 @@ class Plan:
         return "\n".join([*lines, f"K = {self.k} is {proof} the smallest"])
 
 
-def plan(
-    candidates: ArrayLike | None = None,
+def make_plan(
+    asked: Asked,
+    accuracy: ArrayLike,
+    noise_std: ArrayLike | None,
+    criterion: str,
+    parameters: Any,
+    region: ArrayLike | None,
     *,
-    target_accuracy: ArrayLike,
-    noise_std: ArrayLike | None = None,
-    criterion: str = "G",
-    parameters: Sequence[str | int] | None = None,
-    region: ArrayLike | None = None,
-    model: Model | None = None,
-    blocks: ArrayLike | None = None,
-    prior: Prior | ArrayLike | None = None,
-    noise: Noise | None = None,
-    measured: ArrayLike | None = None,
-    available: ArrayLike | None = None,
-    required: ArrayLike | None = None,
-    max_replicates: int = 1,
-    num_outputs: int | None = None,
-    max_k: int | None = None,
-    more: int = 0,
-    design: str = "exact",
-    time_limit: float = 1.0,
-    seed: int | np.random.Generator = 0,
+    max_k: int | None,
+    more: int,
+    design: str,
+    time_limit: float,
+    seed: int | np.random.Generator,
 ) -> Plan:
-    """The smallest number of measurements that predicts accurately enough.
-
-    Args:
-        candidates: (M, n) commands that could be measured, in any unit.
-        target_accuracy: () or (m,) standard error a prediction may have, measured unit;
-            with "parameters" () or (s,), that of each parameter of interest.
-        noise_std: () or (m,) standard deviation of one measurement, measured unit.
-            Noise is taken as white: measuring a posture twice halves its variance.
-        criterion: "G", the largest standard error over the region, "I", the root of
-            the mean variance over it, or "parameters", the standard error of the
-            parameters themselves. It must hold for every output or parameter.
-        parameters: names or indices of the s parameters of interest; all when not
-            given.
-        region: (R, n) commands at which predictions are wanted, with blocks (R, m, p)
-            what is predicted, ``region @ theta``; what is available when not given.
-        model: of ``jaxcal.models``; ``y = A u + b`` when not given.
-        blocks: (M, q, p) instead of candidates and noise, for any model: candidate i
-            gives q readings ``B_i theta`` with noise of unit variance.
-        prior: a ``jaxcal.Prior`` of the model's parameters, its own default when not
-            given; with blocks, (p, p) precision of what is known of theta beforehand.
-        noise: a ``jaxcal.Noise`` instead of ``noise_std``.
-        measured: (N, n) commands, or (N, q, p) blocks, measured already; K counts the
-            new ones.
-        available: (M,) bool, True where a candidate may be measured.
-        required: (r,) candidates that must be measured.
-        max_replicates: how often one candidate may be measured.
-        num_outputs: m; the length of ``noise_std`` or ``target_accuracy`` where one is
-            an array, as many as inputs otherwise.
-        max_k: largest K allowed; what is available, up to 200, when not given.
-        more: rows of the table beyond the K that suffices.
-        design: the D-optimal selection to start from, "exact" or "exchange".
-        time_limit: seconds for the exact selection of each K.
-        seed: of the exchange.
-
-    Returns:
-        The plan.
-
-    Raises:
-        ValueError: naming the argument, the rule and the value; where no K up to
-            ``max_k`` suffices, with the accuracy that can be reached.
-    """
+    """See :meth:`jaxcal.Design.plan`."""
     begun = time.perf_counter()
     one_of("criterion", criterion, tuple(_SUMMARIES))
     one_of("design", design, DESIGNS)
@@ -194,11 +144,8 @@ def plan(
     more, start = whole_number("more", more, 0), checked_seed(seed)
     how = "I" if criterion == "I" else "G"
     problem, points, unit, target, level, names = make_request(
-        candidates, blocks, criterion, target_accuracy, noise_std, model=model,
-        noise=noise, num_outputs=num_outputs, parameters=parameters, region=region,
-        prior=prior, measured=measured, available=available, required=required,
-        max_replicates=max_replicates,
-    )  # fmt: skip
+        asked, criterion, accuracy, noise_std, parameters, region
+    )
     total, (identify, least_k) = problem.k, fewest(problem)
     if max_k is None:
         max_k = min(total, max(_LARGEST_K, least_k))
@@ -249,7 +196,7 @@ def plan(
         one = int((unit * np.sqrt(last.variance) / target).argmax())
         best, least = unit[one] * np.sqrt([last.variance.max(), bound_of(max_k)])
         raise ValueError(
-            f"target_accuracy must be reachable with max_k = {max_k} measurements"
+            f"accuracy must be reachable with max_k = {max_k} measurements"
             + (" (all that are allowed)" if max_k == total else "")
             + f": the best design found has a {_SUMMARIES[criterion]} standard error "
             f"of {best:.6g}, no design has less than {least:.6g}, got {target[one]:g}"
@@ -258,7 +205,7 @@ def plan(
         k=chosen.k,
         indices=chosen.indices,
         standard_error=chosen.standard_error,
-        target_accuracy=target,
+        accuracy=target,
         noise_std=level,
         names=names,
         criterion=criterion,

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers, whole_number
-from jaxcal.models.affine import Affine
-from jaxcal.models.model import Model
+from jaxcal.checks import levels, numbers, whole_number
 from jaxcal.models.uncertainty import Noise
+from jaxcal.selection.criteria import positions
 from jaxcal.selection.greedy import greedy_indices
-from jaxcal.selection.problem import Problem, make_block_problem, make_problem
-from jaxcal.selection.problem.modelled import Modelled, as_commands, shares_regressor
-from jaxcal.selection.problem.wanted import wanted_criterion
+from jaxcal.selection.problem import Asked, Problem
+from jaxcal.selection.problem.sources import shares_regressor
 
 __all__ = ["Request", "fewest", "make_request"]
 
@@ -35,79 +32,55 @@ class Request(NamedTuple):
 
 
 def make_request(
-    candidates: ArrayLike | None,
-    blocks: ArrayLike | None,
+    asked: Asked,
     criterion: str,
-    target_accuracy: ArrayLike,
+    accuracy: ArrayLike,
     noise_std: ArrayLike | None,
-    *,
-    model: Model | None,
-    noise: Noise | None,
-    num_outputs: int | None,
-    parameters: Sequence[str | int] | None,
+    parameters: Any,
     region: ArrayLike | None,
-    **rules: Any,
 ) -> Request:
-    """Check the arguments of ``plan``; ``rules`` are those of a problem."""
+    """Check the arguments of ``Design.plan``."""
     of_parameters = criterion == "parameters"
     if parameters is not None and not of_parameters:
         raise ValueError("parameters must come with criterion parameters only")
-    given: Any = candidates if blocks is None else blocks
-    cap = whole_number("max_replicates", rules["max_replicates"], 1)
-    usable = rules["available"]
-    usable = np.ones(np.shape(given)[:1]) if usable is None else usable
-    rules |= {"max_replicates": cap, "k": max(1, int(np.count_nonzero(usable)) * cap)}
+    cap = whole_number("max_replicates", asked.max_replicates, 1)
+    total = max(1, int(asked.available.sum()) * cap)
+    model, noise = asked.model, asked.noise
     shared = False  # one regressor for all outputs?
-    if blocks is not None:
-        if not (candidates is noise_std is noise is model is num_outputs is None):
+    if model is None:
+        if not (noise_std is noise is None):
             raise ValueError(
-                "blocks must come without candidates, noise_std, noise, model and "
-                "num_outputs: they are in units of the noise"
+                "noise and noise_std must be left out with blocks, which are in units "
+                "of the noise"
             )
-        problem, rows, names = _of_blocks(blocks, region, rules)
     else:
-        if candidates is None or (noise_std is None) == (noise is None):
-            raise ValueError(
-                "candidates and noise_std must be given, or else blocks; noise, a "
-                "jaxcal.Noise, may stand for noise_std"
-            )
-        if model is None:
-            m = num_outputs
-            for level in (noise_std, None if of_parameters else target_accuracy):
-                if m is None and level is not None and np.ndim(level) == 1:
-                    m = np.size(level) or None
-            n = (*np.shape(candidates), 1, 1)[1]
-            model = Affine(n, n if m is None else m)
-        elif num_outputs is not None:
-            raise ValueError("num_outputs must not be given with a model, which has it")
-        if isinstance(noise, Noise) and noise.covariance is noise.command_std is None:
-            std = 1.0 if noise.std is None else noise.std
-            noise_std = std if np.ndim(std) < 2 else None
+        if noise_std is None:
+            if noise is None:
+                raise ValueError("noise_std must be given: the design has no noise")
+            if noise.covariance is noise.command_std is None:
+                std = 1.0 if noise.std is None else noise.std
+                noise_std = std if np.ndim(std) < 2 else None
         if noise_std is not None:
-            noise_std = _level("noise_std", noise_std, model.num_outputs)
-            noise = Noise(noise_std)
-            plain = shares_regressor(model, rules["prior"], None)
-            shared = plain and not of_parameters
-        if shared:
-            noise = None  # it is in the targets
-        problem, rows, names = _of_model(
-            candidates, model, noise, region, shared, rules
-        )
+            noise_std = levels("noise_std", noise_std, model.num_outputs)
+            shared = not of_parameters and shares_regressor(model, asked.prior, None)
+            # Where outputs share a regressor the noise is in the targets.
+            asked = asked.with_noise(None if shared else Noise(noise_std))
+    problem = asked.problem(total, "D")
+    rows, names = _region(asked, problem, region, shared)
     if of_parameters:
-        asked = names if parameters is None else parameters
-        at = wanted_criterion("As", asked, names, "").positions
-        rows, names = np.eye(len(names))[None, at], tuple(names[i] for i in at or ())
+        at = positions(names if parameters is None else parameters, names)
+        rows, names = np.eye(len(names))[None, at], tuple(names[i] for i in at)
     if not len(rows):
         raise ValueError("region must hold at least one row, got none")
     m = model.num_outputs if shared and model is not None else rows.shape[1]
     if not of_parameters:
         names = tuple(f"output {i + 1}" for i in range(m))
-    target = _level("target_accuracy", target_accuracy, m)
+    target = levels("accuracy", accuracy, m)
     scale = unit = target
     if noise_std is not None and shared:
         scale = (target / noise_std).min(keepdims=True)
         unit = noise_std * scale
-    elif blocks is not None:
+    elif model is None:
         noise_std = np.ones(m)
     points = rows @ problem.basis / scale[:, None]
     if criterion == "I" and len(points) > points.shape[2]:  # fewer rows, the same mean
@@ -116,49 +89,24 @@ def make_request(
     return Request(problem, points, unit, target, noise_std, names)
 
 
-def _of_blocks(
-    blocks: ArrayLike, region: ArrayLike | None, rules: dict[str, Any]
-) -> tuple[Problem, Array, tuple[str, ...]]:
-    """The problem, the region's rows (R, m, p), and names of the p parameters."""
-    problem = make_block_problem(blocks, **rules)
-    p = problem.num_regressors
-    rows = problem.raw[problem.available]
-    if region is not None:
+def _region(
+    asked: Asked, problem: Problem, region: ArrayLike | None, shared: bool
+) -> tuple[Array, tuple[str, ...]]:
+    """What is predicted: rows (R, s, p) in the outputs' unit; names of p parameters."""
+    names = asked.source(not shared).names
+    if asked.model is None:
+        if region is None:
+            return problem.raw[problem.available], names
         rows = numbers("region", region)
-        if rows.ndim != 3 or rows.shape[2] != p:
-            raise ValueError(f"region must have shape (R, m, {p}), got {rows.shape}")
-    return problem, rows, tuple(f"theta{i + 1}" for i in range(p))
-
-
-def _of_model(
-    candidates: ArrayLike,
-    model: Model,
-    noise: Noise | None,
-    region: ArrayLike | None,
-    shared: bool,
-    rules: dict[str, Any],
-) -> tuple[Problem, Array, tuple[str, ...]]:
-    """Likewise; ``shared``: one row [u, 1] for all outputs of the affine model."""
-    problem = make_problem(candidates, model=model, noise=noise, criterion="D", **rules)
+        if rows.ndim != 3 or rows.shape[2] != len(names):
+            raise ValueError(
+                f"region must have shape (R, m, {len(names)}), got {rows.shape}"
+            )
+        return rows, names
     assert problem.candidates is not None
     where = problem.candidates[problem.available] if region is None else region
-    if shared and isinstance(model, Affine):
-        commands = as_commands("region", where, model.num_inputs)
-        return problem, model.blocks(commands), ()
-    modelled = Modelled(model, rules["prior"], None)  # in the outputs' unit
-    return problem, modelled.blocks_at("region", where, False), modelled.names
-
-
-def _level(name: str, value: ArrayLike, m: int) -> Array:
-    """(m,) positive numbers; a copy that cannot be written to."""
-    given = numbers(name, value)
-    if given.shape not in ((), (m,)):
-        raise ValueError(f"{name} must be one number or ({m},), got {given.shape}")
-    if (given <= 0.0).any():
-        raise ValueError(f"{name} must be positive, got {given.min():g}")
-    own = np.array(np.broadcast_to(given, (m,)))
-    own.flags.writeable = False
-    return own
+    source = asked.with_noise(None).source(not shared)
+    return source.at("region", where, False), names
 
 
 def fewest(problem: Problem) -> tuple[int, int]:

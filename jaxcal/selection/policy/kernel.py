@@ -57,7 +57,8 @@ def describe(x, chosen, active, k, depth, best_only, features, moments, ahead):
         ahead,
         np.empty((p, m)),
         np.empty((4, m)),
-        np.empty((depth + 3, m)),
+        np.empty((p + depth + 2, m)),
+        np.empty(p + depth),
     )
 
 
@@ -75,13 +76,22 @@ def _describe(
     y: cython.double[:, ::1],
     values: cython.double[:, ::1],
     work: cython.double[:, ::1],
+    weights: cython.double[::1],
 ):
     b: cython.Py_ssize_t
     with cython.nogil:
         for b in range(x.shape[0]):
             _conditional(x[b], chosen[b], active[b], k, y, work[0])
             _look_ahead(
-                y, active[b], k > x.shape[1], depth, best_only, None, values, work
+                y,
+                active[b],
+                k > x.shape[1],
+                depth,
+                best_only,
+                None,
+                values,
+                work,
+                weights,
             )
             _behind_best(values)
             ahead[b] = values[3]
@@ -236,12 +246,13 @@ def look_ahead(y, active, spanned, depth, best_only, factors, values):
     seen: cython.uchar[::1] = active.view(np.uint8)
     tolls: cython.double[:, ::1] = factors
     to: cython.double[:, ::1] = values
-    work: cython.double[:, ::1] = np.empty((depth + 3, len(active)))
+    work: cython.double[:, ::1] = np.empty((len(y) + depth + 2, len(active)))
+    factor: cython.double[::1] = np.empty(len(y) + depth)
     grows: cython.bint = spanned
     ahead: cython.Py_ssize_t = depth
     only: cython.bint = best_only
     with cython.nogil:
-        _look_ahead(vectors, seen, grows, ahead, only, tolls, to, work)
+        _look_ahead(vectors, seen, grows, ahead, only, tolls, to, work, factor)
 
 
 @cython.cfunc
@@ -256,14 +267,21 @@ def _look_ahead(
     factors: cython.double[:, ::1] | None,
     values: cython.double[:, ::1],
     work: cython.double[:, ::1],
+    weights: cython.double[::1],
 ) -> cython.int:
-    """``look_ahead`` with (depth + 3, M) numbers of work; raises KeyboardInterrupt."""
+    """``look_ahead``; raises KeyboardInterrupt.
+
+    Args:
+        work: (p + depth + 2, M) room.
+        weights: (p + depth,) room.
+    """
     p, m = y.shape[0], y.shape[1]
     priced: cython.bint = factors is not None
     base = 1.0 if spanned else 0.0
-    square = work[depth]
-    gains = work[depth + 1]  # of every candidate, after the choices made from a start
-    row = work[depth + 2]  # of the factor; those of choices past are work[1:depth]
+    square = work[p + depth]
+    gains = work[p + depth + 1]  # of every candidate, after choices from a start
+    # The vectors, then the factor's rows: the next is a sum of what stands above it.
+    work[:p] = y
     square[:] = 0.0
     for c in range(p):
         for j in range(m):
@@ -292,18 +310,14 @@ def _look_ahead(
         for d in range(1, depth):
             factor = 1.0 / sqrt(max(base + gains[newest], _LEAST_GAIN))
             gains[newest] = -1.0
-            row[:] = 0.0
             for c in range(p):
-                weight = factor * y[c, newest]
-                for j in range(m):
-                    row[j] += weight * y[c, j]
-            for e in range(1, d):
-                weight = factor * work[e, newest]
-                for j in range(m):
-                    row[j] -= weight * work[e, j]
+                weights[c] = factor * y[c, newest]
+            for c in range(p, p + d - 1):
+                weights[c] = -factor * work[c, newest]
+            _combine(weights, work, p + d - 1)
+            row = work[p + d - 1]
             gain: cython.double = 0.0
             for j in range(m):
-                work[d, j] = row[j]
                 gains[j] -= row[j] * row[j]
                 gain = max(gain, gains[j])
             if not priced:
@@ -326,6 +340,39 @@ def _look_ahead(
             values[d, i] = reached
         best = max(best, reached)
     return 0
+
+
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _combine(
+    weights: cython.double[::1], rows: cython.double[:, ::1], count: cython.Py_ssize_t
+) -> cython.void:
+    """``rows[count]`` is the weighted sum of those before it, four at a time."""
+    m = rows.shape[1]
+    out = rows[count]
+    out[:] = 0.0
+    done: cython.Py_ssize_t = 0
+    while done + 4 <= count:
+        w0, w1, w2, w3 = (
+            weights[done],
+            weights[done + 1],
+            weights[done + 2],
+            weights[done + 3],
+        )
+        for j in range(m):
+            out[j] += (
+                w0 * rows[done, j]
+                + w1 * rows[done + 1, j]
+                + w2 * rows[done + 2, j]
+                + w3 * rows[done + 3, j]
+            )
+        done += 4
+    while done < count:
+        w0 = weights[done]
+        for j in range(m):
+            out[j] += w0 * rows[done, j]
+        done += 1
 
 
 @cython.cfunc

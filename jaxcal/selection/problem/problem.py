@@ -84,7 +84,7 @@ class Problem:
     @property
     def subject(self) -> str:
         """The argument that errors are about."""
-        return "blocks" if self.candidates is None else "candidates"
+        return "blocks" if self.model is None else "candidates"
 
     @property
     def lower(self) -> Indices:

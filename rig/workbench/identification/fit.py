@@ -35,8 +35,7 @@ def fit(
             when not given.
         notes: stored in the calibration's file.
         zero_variance: (3,) degrees squared, of the zero reference. It shifts every
-            posture equally, so it adds to the variance of the outputs' mean; the file
-            has one such number, so the ratio of the axes' sums is taken.
+            posture equally, so it adds to the variance of the outputs' mean.
     """
     import jaxcal
 
@@ -55,9 +54,9 @@ def fit(
     )
     if zero_variance is None:
         return fitted
-    extra = float(np.sum(zero_variance) / np.sum(noise_std**2))
-    total = 1.0 / (1.0 / fitted.total_weight + extra)
-    return dataclasses.replace(fitted, total_weight=total)
+    covariance = np.array(fitted.joint_covariance)
+    covariance[-3:, -3:] += np.diag(zero_variance)
+    return dataclasses.replace(fitted, joint_covariance=covariance)
 
 
 def uncertainty(
@@ -92,8 +91,9 @@ def uncertainty(
         noise_std_deg (3,), zero_std_deg (3,), dof of an axis, basis, and (3, 4)
         half-widths of [A | b] in degrees.
     """
-    inverse = calibration.unit_covariance  # of (slopes, bias), for noise of 1 degree
     commands, measured = pairs(chosen)
+    fitted = np.column_stack([commands, np.ones(len(commands))])
+    inverse = np.linalg.inv(fitted.T @ fitted)  # of (slopes, bias), noise of 1 degree
     squares = ((measured - calibration.predict(commands)) ** 2).sum(axis=0)
     dof = len(chosen) - 4
     basis = ["residuals of the chosen postures"] if dof else []

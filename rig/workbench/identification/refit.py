@@ -157,7 +157,8 @@ def refit(
     now = parse_config(text, pathlib.Path(start["maps_from"]), str(folder))
     changed = {key: [old[key], value] for key, value in new.items()}
     records, evidence = reread(held, then, now)
-    calibration, summary = conclude(now, evidence, {"refit_of": folder.name})
+    notes = {"refit_of": folder.name, "simulated": start["simulated"] is not None}
+    calibration, summary = conclude(now, evidence, notes)
     try:
         warnings = check_matrix(calibration.matrix)
     except MotionFault as fault:

@@ -64,6 +64,8 @@ def read_runs(folder: pathlib.Path) -> tuple[list[Device], list[str]]:
             text = (path.parent / "summary.json").read_text(encoding="utf-8")
             summary = json.loads(text)
             device = start["device"]
+            if start.get("simulated"):  # never compared with a real one
+                device = {"simulated": True, **device}
             limit = start["config"]["session"]["verify_limit_deg"]
         except FileNotFoundError:
             continue  # not finished, or of a kind without a summary
@@ -142,7 +144,8 @@ def _label(fingerprint: Record) -> str:
         + " ".join(str(fingerprint.get(f"axes.{name}.{k}", "?")) for k in keys)
         for name in AXIS_NAMES
     )
-    return f"{'; '.join(axes)}; order {fingerprint['mechanism.order']}"
+    simulated = "simulated: " if fingerprint.get("simulated") else ""
+    return f"{simulated}{'; '.join(axes)}; order {fingerprint['mechanism.order']}"
 
 
 def write_trend(folder: pathlib.Path, devices: list[Device]) -> pathlib.Path:

@@ -190,11 +190,11 @@ def _identify(
     references = [postures[name] for name in (MIDDLE, END) if name in postures]
     zero = run.journal.events("zero")[-1]
     evidence = Evidence(zero, chosen, held, held_out, references)
-    notes = {"run": run.folder.name}
+    simulated = run.journal.records[0].get("simulated")
+    notes = {"run": run.folder.name, "simulated": simulated is not None}
     calibration, summary = conclude(run.config, evidence, notes)
     calibration.save(run.folder / "calibration.json")
     (run.folder / "calibration.partial.json").unlink(missing_ok=True)
-    simulated = run.journal.records[0].get("simulated")
     return {"mode": "calibrate", **summary, "simulated": simulated}
 
 

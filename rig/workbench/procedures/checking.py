@@ -17,7 +17,7 @@ from rig.core.session import Run
 from rig.core.zero import KeptZero
 from rig.workbench.identification.fit import pairs
 from rig.workbench.outputs.console import error_text, numbers
-from rig.workbench.procedures.calibrate import visit_pairs
+from rig.workbench.procedures.calibrate import END, visit_pairs
 from rig.workbench.procedures.play import CHARACTERISED, Play
 
 
@@ -34,11 +34,13 @@ def collect(run: Run, count: int) -> int:
     if run.dry_run:
         for number, target in enumerate(targets):
             run.say(f"  {number:>5}   {numbers(config.to_deg(target))}   {target}")
-    run.planned = len(targets)
+    run.planned = len(targets) + 1
     for number, target in enumerate(targets):
         run.visit(f"collect:{number}", target, role="collect")
+    closing = run.visit(END, run.zero_pulses, role="reference")
     run.emit("phase", phase="saving")
-    commands, measured = pairs(list(run.postures().values()))
+    collected = [r for r in run.postures().values() if r["role"] == "collect"]
+    commands, measured = pairs(collected)
     size = min(config.session.candidates, len(commands))
     episodes = len(commands) // max(1, size)
     run.save_pairs()
@@ -52,6 +54,14 @@ def collect(run: Run, count: int) -> int:
         f"saved: {run.folder}/pairs.csv ({len(commands)} postures), dataset.npz "
         f"({episodes} x {size})"
     )
+    drift = np.abs(closing["measured_deg"]).max() if closing else 0.0
+    limit = config.session.drift_limit_deg
+    if drift > limit:
+        run.say(
+            f"RECALIBRATE: the zero posture reads {drift:.3f} deg at the end (limit "
+            f"session.drift_limit_deg = {limit:g}). Fix the phone, and collect again"
+        )
+        return EXIT_RECALIBRATE
     return EXIT_OK
 
 
@@ -63,11 +73,19 @@ class Saved(NamedTuple):
     play: Play
 
 
-def load_calibration(path: pathlib.Path, config: RigConfig) -> Saved:
+def load_calibration(
+    path: pathlib.Path, config: RigConfig, simulated: bool = False
+) -> Saved:
     """A calibration that was made with a device configured as this one.
 
+    Args:
+        path: of the file, or of its run's folder.
+        config: of the device.
+        simulated: so is the device that is to be moved.
+
     Raises:
-        Refused: not a calibration, or of another device; names the keys.
+        Refused: not a calibration, or of another device, or a simulated one of a real
+            device; names the keys.
     """
     import jaxcal
 
@@ -77,6 +95,11 @@ def load_calibration(path: pathlib.Path, config: RigConfig) -> Saved:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise Refused(f"{path}: not a calibration: {error}") from None
     notes = calibration.provenance.get("notes", {})
+    if notes.get("simulated") and not simulated:
+        raise Refused(
+            f"{path}: made with a simulated device: it says nothing of the real one. "
+            "Calibrate the device, or use it with --simulate"
+        )
     _check_device(path, notes, config)
     zero, attitude = notes.get("zero_pulses"), notes.get("zero_attitude")
     kept = KeptZero(

@@ -1,0 +1,195 @@
+"""What a choice is judged by: D, A, I, E, Ds, As. A new criterion is one row here.
+
+A criterion judges the covariance ``V = C M^-1 C.T`` of combinations ``C theta`` of the
+parameters, M the information, by its determinant, its trace or its largest eigenvalue:
+the ``kind`` of :mod:`jaxcal.information.criterion`, which has the formulas. A class
+here says which kind, and which combinations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import one_of
+from jaxcal.information.criterion import Criterion
+
+__all__ = [
+    "CRITERIA",
+    "As",
+    "Coordinates",
+    "Ds",
+    "I",
+    "Wanted",
+    "positions",
+    "wanted",
+]
+
+Array = NDArray[np.float64]
+
+
+class Coordinates(NamedTuple):
+    """The coordinates of one problem, in which everything measured at once says I."""
+
+    basis: Array  # (p, p): combinations C of the caller's parameters are C @ basis here
+    names: tuple[str, ...]  # (p,) of the caller's parameters
+    prior: Array  # (p, p) information beforehand
+    readings: int  # that all available candidates give together
+    region: Array | None  # (R, q, p) blocks of the criterion's region, in the caller's
+    times: int  # outputs that share these parameters' information
+    log_scale: float  # log det of the caller's less this information
+
+
+class Wanted:
+    """A criterion as it is asked for; subclasses are the rows of ``CRITERIA``."""
+
+    name: ClassVar[str]
+    kind: ClassVar[str]  # "det", "trace" or "least"
+    says: ClassVar[str]  # what a table prints before the value; V is a covariance
+    per_output: ClassVar[bool] = False  # the value is one output's, not their sum
+    of_region: ClassVar[bool] = False  # it is about predictions, see ``region``
+    region: ArrayLike | None = None  # commands or blocks where; the candidates if None
+    parameters: Sequence[str | int] | None = None  # of interest; all when None
+
+    def root(self, at: Coordinates) -> Array:
+        """C (s, p) in the problem's coordinates, of full row rank."""
+        return at.basis
+
+    def criterion(self, at: Coordinates) -> Criterion:
+        """The criterion of one problem."""
+        times = 1 if self.per_output else at.times
+        return Criterion(self.name, self.kind, self.root(at), times)
+
+
+class D(Wanted):
+    """Joint uncertainty of all parameters."""
+
+    name, kind, says = "D", "det", "log det S"
+
+    def criterion(self, at: Coordinates) -> Criterion:
+        identity = np.eye(len(at.basis))
+        return Criterion(self.name, self.kind, identity, at.times, at.log_scale)
+
+
+class A(Wanted):
+    """Sum of the parameters' variances."""
+
+    name, kind, says = "A", "trace", "trace V"
+
+
+class E(Wanted):
+    """The combination of the parameters that is known worst."""
+
+    name, kind, says, per_output = "E", "least", "eigenvalue", True
+
+
+class I(Wanted):  # noqa: E742 - the criterion's own name in the literature
+    """Mean variance of the predictions over a region.
+
+    Args:
+        region: (R, n) commands, or (R, q, p) blocks, at which predictions are wanted;
+            the available candidates when not given.
+    """
+
+    name, kind, says, per_output = "I", "trace", "mean variance", True
+    of_region = True
+
+    def __init__(self, region: ArrayLike | None = None) -> None:
+        self.region = region
+
+    def root(self, at: Coordinates) -> Array:
+        if at.region is None:
+            mean = (np.eye(len(at.basis)) - at.prior) / at.readings
+        else:
+            rows = (at.region @ at.basis).reshape(-1, len(at.basis))
+            mean = rows.T @ rows / len(rows)
+        size, vectors = np.linalg.eigh(mean)
+        keep = size > 1e-14 * size[-1]
+        return np.asarray(np.sqrt(size[keep])[:, None] * vectors.T[keep])
+
+
+class _OfSome(Wanted):
+    """Of the parameters of interest; the others are nuisance.
+
+    Args:
+        parameters: their names or indices, at least one.
+    """
+
+    def __init__(self, parameters: Sequence[str | int]) -> None:
+        self.parameters = parameters
+
+    def root(self, at: Coordinates) -> Array:
+        return at.basis[positions(self.parameters or (), at.names)]
+
+
+class Ds(_OfSome):
+    """Joint uncertainty of the parameters of interest; the others are nuisance.
+
+    Args:
+        parameters: their names or indices, at least one.
+    """
+
+    name, kind, says = "Ds", "det", "log det V^-1"
+
+
+class As(_OfSome):
+    """Sum of the variances of the parameters of interest; the others are nuisance.
+
+    Args:
+        parameters: their names or indices, at least one.
+    """
+
+    name, kind, says = "As", "trace", "trace V"
+
+
+CRITERIA: dict[str, type[Wanted]] = {each.name: each for each in (D, A, I, E, Ds, As)}
+
+
+def wanted(criterion: Any, region: Any, default: str) -> Wanted:
+    """The criterion asked for by its letters, or as an object that carries its data.
+
+    Args:
+        criterion: a name of ``CRITERIA``, one of its classes' objects, or None.
+        region: of I, where it is asked for by its letter.
+        default: the criterion where none is asked for.
+    """
+    if isinstance(criterion, Wanted):
+        asked = criterion
+    else:
+        name = default if criterion is None else criterion
+        one_of("criterion", name, tuple(CRITERIA))
+        try:
+            asked = CRITERIA[name]()
+        except TypeError:
+            raise ValueError(
+                f"criterion {name} must carry its data: jaxcal.{name}([...])"
+            ) from None
+    if region is None:
+        return asked
+    if not asked.of_region or asked.region is not None:
+        raise ValueError(
+            "region, where predictions are wanted, must come with criterion I, once, "
+            f"got criterion {asked.name}"
+        )
+    return I(region)
+
+
+def positions(
+    parameters: str | Sequence[str | int], names: tuple[str, ...]
+) -> list[int]:
+    """Indices of ``parameters``, given by name or index, each once."""
+    parameters = [parameters] if isinstance(parameters, str) else list(parameters)
+    found: list[Any] = [names.index(x) if x in names else x for x in parameters]
+    for at, asked in zip(found, parameters, strict=True):
+        whole = isinstance(at, int | np.integer) and not isinstance(at, bool)
+        if not whole or not 0 <= int(at) < len(names):
+            raise ValueError(
+                "parameters must be indices or names of free parameters "
+                f"({', '.join(names)}), got {asked!r}"
+            )
+    if len(set(found)) < len(found) or not found:
+        raise ValueError(f"parameters must name some once each, got {parameters!r}")
+    return [int(at) for at in found]

@@ -1,0 +1,371 @@
+"""``Design``: what may be measured, and the questions to it; ``select`` in one call."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from jaxcal.checks import one_of, seconds
+from jaxcal.models.model import Model
+from jaxcal.models.uncertainty import Noise, Prior
+from jaxcal.selection.exact.exact import TIME_LIMIT, solve_exact
+from jaxcal.selection.fastest.motion import Motion
+from jaxcal.selection.plan import Plan, make_plan
+from jaxcal.selection.problem import Asked, Problem, values
+from jaxcal.selection.result import Selection, Subset
+from jaxcal.selection.solvers import SOLVERS, Found, checked_options
+
+if TYPE_CHECKING:
+    from jaxcal.selection.fastest.run import FastSelection, ParetoFront
+
+__all__ = ["Design", "select"]
+
+_REFERENCES = ("bound", "exact")
+_PROVEN = 1e-9  # a value this near a proven optimum, relative above 1, is that optimum
+
+
+class Design(Asked):
+    """Which few of these candidates to measure: the problem, and its questions.
+
+    Args:
+        candidates: (M, n) commands that could be measured, in any unit; an array or a
+            data frame, whose labels are kept. Rows that are not available may hold NaN.
+        model: of ``jaxcal.models``; ``y = A u + b``, with as many outputs as inputs,
+            when not given.
+        prior: a ``jaxcal.Prior`` of the model's parameters, its own default when not
+            given.
+        noise: a ``jaxcal.Noise``; when not given ``model.default_noise()`` where the
+            model has one (an arm), else of unit variance.
+        measured: (N, n) commands measured already: their information is there, and
+            answers count the new ones.
+        available: (M,) bool or 0 and 1, True where a candidate may be chosen; all by
+            default.
+        required: (r,) candidates that must be among the chosen.
+        max_replicates: how often one candidate may be chosen; 1 keeps them distinct.
+        names: (M,) names of the candidates, for the answers.
+
+    Raises:
+        ValueError: naming the argument, the rule and the value; here or when a question
+            is asked.
+    """
+
+    def select(
+        self,
+        k: int | None = None,
+        criterion: Any = None,
+        method: str = "auto",
+        *,
+        region: ArrayLike | None = None,
+        **options: Any,
+    ) -> Selection:
+        """The k candidates whose measurements say most about the parameters.
+
+        Args:
+            k: candidates to choose; the fewest that identify (n + 1) when not given.
+            criterion: "D" (joint uncertainty of the parameters), "A" (sum of their
+                variances), "I" (mean variance of the predictions), "E" (the worst-known
+                combination), or one with data: ``jaxcal.I(region)``,
+                ``jaxcal.Ds([...])``, ``jaxcal.As([...])``. D for the affine model and
+                for blocks, I for other models.
+            method: "auto" (the cheapest way to an answer proven to have
+                ``least_efficiency``), "exact" (proven), "exchange" (near-optimal),
+                "greedy", "random" or "policy" (the trained network; affine model, D).
+            region: short for ``jaxcal.I(region)``.
+            options: those that the method reads:
+
+                - seed: whole number, 0, or numpy Generator; of all but greedy.
+                - restarts: starts of exchange, and of the one that starts exact and
+                  auto; see ``exchange.default_restarts``, 30 with these.
+                - time_limit: seconds after which exact and auto return the best found
+                  with a true ``bound``, not proven; ``math.inf`` for none. 10, and 2
+                  for auto with several readings per candidate, a prior or another
+                  criterion than D.
+                - best: of exact, how many best subsets to prove, in ``alternatives``.
+                - least_efficiency: of auto, the efficiency in (0, 1] that suffices,
+                  0.999.
+                - checkpoint: of policy, folder of a trained one, else that which ships.
+                - decoding, num: of policy, how it chooses and how many it tries.
+
+        Returns:
+            The selection; never a singular one.
+
+        Raises:
+            ValueError: naming the argument, the rule and the value; also where an
+                option is given that the method does not read.
+        """
+        given = checked_options(method, options)
+        start = time.perf_counter()
+        problem = self.problem(k, criterion, region)
+        found = SOLVERS[method].solve(problem, **given)
+        return self._judged(problem, found, method, start)
+
+    def score(
+        self,
+        indices: ArrayLike,
+        criterion: Any = None,
+        *,
+        reference: str = "bound",
+        time_limit: float | None = None,
+    ) -> Selection:
+        """Judge a subset made elsewhere as if a solver had returned it.
+
+        Args:
+            indices: (k,) the subset; repeated entries are replicates.
+            criterion: as in :meth:`select`.
+            reference: what ``bound`` and ``efficiency`` are measured against, "bound"
+                (the cheapest bound, computed when read) or "exact" (the optimum).
+            time_limit: seconds for the optimum, 10 when not given.
+
+        Raises:
+            ValueError: also where the subset is singular.
+        """
+        one_of("reference", reference, _REFERENCES)
+        limit = TIME_LIMIT if time_limit is None else seconds("time_limit", time_limit)
+        start = time.perf_counter()
+        subset = np.asarray(indices)
+        if subset.ndim != 1 or not np.issubdtype(subset.dtype, np.integer):
+            raise ValueError(
+                "indices must be a (k,) array of whole numbers, got shape "
+                f"{subset.shape} and dtype {subset.dtype}"
+            )
+        if len(subset) == 0:
+            raise ValueError("indices must name at least one candidate, got none")
+        count = len(self.available)
+        outside = (subset < 0) | (subset >= count)
+        if outside.any():
+            raise ValueError(
+                f"indices must lie in [0, {count}), got {subset[outside][0]}"
+            )
+        if not self.available[subset].all():
+            masked = subset[~self.available[subset]][0]
+            raise ValueError(
+                f"indices must be available, got {masked}, which is masked"
+            )
+        problem = self.problem(len(subset), criterion)
+        repeats = int(np.unique(subset, return_counts=True)[1].max())
+        if repeats > problem.max_replicates:
+            raise ValueError(
+                "indices must repeat a candidate at most max_replicates = "
+                f"{problem.max_replicates} times, got {repeats}"
+            )
+        found = Found(subset.astype(np.int64))
+        if reference == "bound":
+            return self._judged(problem, found, "score", start)
+        optimum = solve_exact(problem, deadline=time.perf_counter() + limit)
+        value = float(values(problem, found.indices[None])[0][0])
+        near = abs(value - optimum.bound) <= _PROVEN * max(1.0, abs(optimum.bound))
+        found = Found(
+            found.indices, bound=optimum.bound, proven=optimum.proven and near
+        )
+        return self._judged(problem, found, "score", start)
+
+    def plan(
+        self,
+        accuracy: ArrayLike,
+        noise_std: ArrayLike | None = None,
+        criterion: str = "G",
+        *,
+        parameters: Any = None,
+        region: ArrayLike | None = None,
+        max_k: int | None = None,
+        more: int = 0,
+        design: str = "exact",
+        time_limit: float = 1.0,
+        seed: int | np.random.Generator = 0,
+    ) -> Plan:
+        """The smallest number of measurements that predicts accurately enough.
+
+        Args:
+            accuracy: () or (m,) standard error a prediction may have, measured unit;
+                with "parameters" () or (s,), that of each parameter of interest.
+            noise_std: () or (m,) standard deviation of one measurement, measured unit;
+                the noise of the design when not given. With blocks it is 1. Noise is
+                taken as white: measuring a posture twice halves its variance.
+            criterion: "G", the largest standard error over the region, "I", the root
+                of the mean variance over it, or "parameters", the standard error of the
+                parameters themselves. It must hold for every output or parameter.
+            parameters: names or indices of the s parameters of interest; all when not
+                given.
+            region: (R, n) commands at which predictions are wanted, with blocks
+                (R, m, p) what is predicted, ``region @ theta``; what is available when
+                not given.
+            max_k: largest K allowed; what is available, up to 200, when not given.
+            more: rows of the table beyond the K that suffices.
+            design: the D-optimal selection to start from, "exact" or "exchange".
+            time_limit: seconds for the exact selection of each K.
+            seed: of the exchange.
+
+        Raises:
+            ValueError: naming the argument, the rule and the value; where no K up to
+                ``max_k`` suffices, with the accuracy that can be reached.
+        """
+        return make_plan(
+            self, accuracy, noise_std, criterion, parameters, region, max_k=max_k,
+            more=more, design=design, time_limit=time_limit, seed=seed,
+        )  # fmt: skip
+
+    def fastest(
+        self,
+        k: int | None,
+        motion: Motion,
+        *,
+        least_efficiency: float = 0.95,
+        start: ArrayLike | None = None,
+        method: str | None = None,
+        time_limit: float = 60.0,
+        seed: int | np.random.Generator = 0,
+    ) -> FastSelection:
+        """The subset and the order of least time with a D-efficiency.
+
+        Args:
+            k: postures to choose, distinct; the fewest that identify when None.
+            motion: speeds and accelerations in the candidates' unit, settle time.
+            least_efficiency: in (0, 1], against the proven D-optimum.
+            start: (n,) where the device stands; it begins at any posture by default.
+            method: "exact" (k up to 12, with a proof unless the time runs out) or
+                "heuristic" (local search); exact up to k = 8 when not given.
+            time_limit: seconds of the exact search and of the D-optimum behind both.
+            seed: of the heuristic's starts, from which exact starts too.
+
+        Returns:
+            The selection; among runs of equal time the one with the largest
+            determinant.
+        """
+        from jaxcal.selection.fastest.run import select_fastest  # loads numba
+
+        return select_fastest(
+            self, k, motion, least_efficiency, start, method, time_limit, seed
+        )
+
+    def pareto(
+        self,
+        k: int | None,
+        motion: Motion,
+        *,
+        least_efficiency: float = 0.7,
+        start: ArrayLike | None = None,
+        method: str | None = None,
+        max_points: int = 200,
+        time_limit: float = 60.0,
+        seed: int | np.random.Generator = 0,
+    ) -> ParetoFront:
+        """Time against D-efficiency, from ``least_efficiency`` up to the D-optimum.
+
+        Each point is the fastest run more efficient than the point before it.
+
+        Args:
+            k, motion, start, method, seed: as in :meth:`fastest`.
+            least_efficiency: where to cut the front off, in (0, 1].
+            max_points: points after which to stop; the front is then not proven.
+            time_limit: seconds for each point.
+        """
+        from jaxcal.selection.fastest.run import pareto_front  # loads numba
+
+        return pareto_front(
+            self, k, motion, least_efficiency, start, method, max_points, time_limit,
+            seed,
+        )  # fmt: skip
+
+    def _judged(
+        self, problem: Problem, found: Found, method: str, start: float
+    ) -> Selection:
+        """What a solver found, judged by the caller's numbers."""
+        indices, value = found.indices, found.value
+        if value is None or problem.criterion.name != "D":
+            value, log_det = (float(each[0]) for each in values(problem, indices[None]))
+        else:
+            log_det = value
+        if np.isneginf(log_det):
+            name = "indices" if method == "score" else "method"
+            what = "" if method == "score" else f", which {method!r} returned"
+            raise ValueError(
+                f"{name} must give an invertible information matrix, but that of "
+                f"{indices.tolist()}{what} is singular"
+            )
+        subsets = [Subset(indices, value, log_det)]
+        if found.alternatives:
+            others = np.stack([each for each, _ in found.alternatives])
+            subsets = [
+                Subset(each, float(worth), float(of_all))
+                for each, worth, of_all in zip(
+                    others, *values(problem, others), strict=True
+                )
+            ]
+        return Selection(
+            indices=indices,
+            value=value,
+            log_det=log_det,
+            method=found.method or method,
+            proven=found.proven,
+            seconds=time.perf_counter() - start,
+            problem=problem,
+            reason=found.reason,
+            seed=found.seed,
+            restarts=found.restarts,
+            nodes=found.nodes,
+            alternatives=tuple(subsets),
+            known_bound=found.bound,
+            names=self.names,
+            axes=self.axes,
+        )
+
+
+def select(
+    candidates: ArrayLike | None = None,
+    k: int | None = None,
+    method: str = "auto",
+    *,
+    model: Model | None = None,
+    blocks: ArrayLike | None = None,
+    prior: Prior | ArrayLike | None = None,
+    noise: Noise | None = None,
+    criterion: Any = None,
+    region: ArrayLike | None = None,
+    measured: ArrayLike | None = None,
+    available: ArrayLike | None = None,
+    required: ArrayLike | None = None,
+    max_replicates: int = 1,
+    names: Any = None,
+    **options: Any,
+) -> Selection:
+    """Choose the k candidates whose measurements say most about the parameters.
+
+    ``Design(candidates, ...).select(k, criterion, method, ...)`` in one call.
+
+    Args:
+        candidates: (M, n) commands that could be measured, or None with blocks.
+        k: candidates to choose; the fewest that identify when not given.
+        method: "auto", "exact", "exchange", "greedy", "random" or "policy".
+        blocks: (M, q, p) instead of candidates and model, as in
+            :meth:`Design.from_blocks`; ``prior`` is then a (p, p) precision.
+        model, prior, noise, measured, available, required, max_replicates, names: of
+            the problem, see :class:`Design`.
+        criterion, region: what is best, see :meth:`Design.select`.
+        options: seed, restarts, time_limit, best, least_efficiency, checkpoint,
+            decoding, num: those that the method reads, see :meth:`Design.select`.
+
+    Returns:
+        The selection; never a singular one.
+
+    Raises:
+        ValueError: naming the argument, the rule and the value.
+    """
+    rules: dict[str, Any] = {
+        "prior": prior, "noise": noise, "measured": measured, "available": available,
+        "required": required, "max_replicates": max_replicates, "names": names,
+    }  # fmt: skip
+    checked_options(method, options)  # before any work
+    if (candidates is None) == (blocks is None):
+        got = "neither" if blocks is None else "both"
+        raise ValueError(f"either candidates or blocks must be given, got {got}")
+    if candidates is not None:
+        design = Design(candidates, model, **rules)
+    elif model is not None:
+        raise ValueError("model must come with candidates, not with blocks")
+    else:
+        assert blocks is not None
+        design = Design.from_blocks(blocks, **rules)
+    return design.select(k, criterion, method, region=region, **options)

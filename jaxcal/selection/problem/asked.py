@@ -1,0 +1,241 @@
+"""``Asked``: what may be measured and what is known, checked; it makes problems of it.
+
+:class:`jaxcal.Design` adds the questions.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import numbers
+from jaxcal.information.blocks import coarseness
+from jaxcal.models.affine import Affine
+from jaxcal.models.model import Model, by_name
+from jaxcal.models.uncertainty import Noise, Prior
+from jaxcal.selection.criteria import wanted
+from jaxcal.selection.problem.making import Rules, whitened_problems
+from jaxcal.selection.problem.problem import Problem
+from jaxcal.selection.problem.rules import check_available, usable_numbers
+from jaxcal.selection.problem.sources import (
+    Given,
+    Modelled,
+    Shared,
+    Source,
+    shares_regressor,
+)
+
+__all__ = ["Asked"]
+
+Array = NDArray[np.float64]
+
+
+class Asked:
+    """Candidates of a model or blocks, with what is known of them and the rules."""
+
+    candidates: Array | None  # (M, n) in the caller's unit; finite
+    model: Model | None  # None where blocks were given
+    noise: Noise | None  # as given, or the model's own
+    names: tuple[str, ...] | None  # (M,) of the candidates, the caller's own
+    axes: tuple[str, ...] | None  # (n,) of the inputs, the caller's own
+
+    def __init__(
+        self,
+        candidates: ArrayLike,
+        model: Model | None = None,
+        prior: Prior | None = None,
+        noise: Noise | None = None,
+        measured: ArrayLike | None = None,
+        available: ArrayLike | None = None,
+        required: ArrayLike | None = None,
+        max_replicates: int = 1,
+        *,
+        names: Sequence[str] | None = None,
+    ) -> None:
+        if model is not None and (
+            isinstance(model, type) or not hasattr(model, "default_prior")
+        ):
+            raise ValueError(
+                "model must be of jaxcal.models, or an object with the methods of "
+                f"jaxcal.models.Model, got {model!r}"
+            )
+        _require_kind("prior", prior, Prior)
+        candidates = by_name(model, candidates)
+        array = numbers("candidates", candidates, finite=False)
+        if array.ndim != 2 or 0 in array.shape:
+            raise ValueError(
+                f"candidates must have shape (M, n), neither of them 0, "
+                f"got {array.shape}"
+            )
+        self.model = Affine(array.shape[1], array.shape[1]) if model is None else model
+        if isinstance(model, Affine) and array.shape[1] != model.num_inputs:
+            raise ValueError(
+                f"candidates must have shape (M, {model.num_inputs}) for this model, "
+                f"got {array.shape}"
+            )
+        mask = check_available(available, array.shape[:1], True)
+        self.candidates = usable_numbers("candidates", array[None], mask, True)[0]
+        self.available = mask[0]
+        self._blocks: Array | None = None
+        self._coarse = coarseness(candidates)
+        if noise is None and hasattr(model, "default_noise"):
+            noise = model.default_noise()  # type: ignore[union-attr]  # it has one
+        self._set_rules(prior, noise, measured, required, max_replicates)
+        self.names, self.axes = _labels(candidates, names)
+
+    @classmethod
+    def from_blocks(
+        cls,
+        blocks: ArrayLike,
+        prior: ArrayLike | None = None,
+        noise: Noise | None = None,
+        measured: ArrayLike | None = None,
+        available: ArrayLike | None = None,
+        required: ArrayLike | None = None,
+        max_replicates: int = 1,
+        *,
+        commands: ArrayLike | None = None,
+        names: Sequence[str] | None = None,
+    ) -> Self:
+        """The problem of information blocks, of any model.
+
+        Args:
+            blocks: (M, q, p); candidate i gives q readings, ``y = B_i theta + noise``
+                with noise of unit variance, and adds ``B_i.T @ B_i`` to the
+                information.
+            prior: (p, p) precision of what is known beforehand; nothing by default.
+            noise: of the readings, where it is not of unit variance.
+            measured: (N, q, p) blocks that were measured already.
+            available, required, max_replicates, names: as for candidates.
+            commands: (M, n) of the candidates, for travel between them and for tables.
+        """
+        if isinstance(prior, Prior):
+            raise ValueError(
+                "prior must be a (p, p) precision with blocks, got a Prior"
+            )
+        array = numbers("blocks", blocks, finite=False)
+        if array.ndim != 3 or 0 in array.shape:
+            raise ValueError(
+                f"blocks must have shape (M, q, p) with none of them 0, got "
+                f"{array.shape}"
+            )
+        asked = object.__new__(cls)
+        asked.model, asked.candidates = None, None
+        mask = check_available(available, array.shape[:1], True)
+        asked._blocks = usable_numbers("blocks", array[None], mask, True)[0]
+        asked.available, asked._coarse = mask[0], coarseness(blocks)
+        if commands is not None:
+            asked.candidates = numbers("commands", commands)
+            if asked.candidates.ndim != 2 or len(asked.candidates) != len(array):
+                raise ValueError(
+                    f"commands must have shape ({len(array)}, n), one for each block, "
+                    f"got {asked.candidates.shape}"
+                )
+        asked._set_rules(prior, noise, measured, required, max_replicates)
+        asked.names, asked.axes = _labels(array, names)
+        return asked
+
+    def problem(
+        self, k: int | None = None, criterion: Any = None, region: Any = None
+    ) -> Problem:
+        """The problem of choosing k by a criterion, checked and whitened.
+
+        Args:
+            k: candidates to choose; the fewest that identify when not given.
+            criterion: letters of ``CRITERIA`` or an object of it; D for the affine
+                model and blocks, else I.
+            region: of I, where it is given by its letter.
+        """
+        default = "I" if self.model and not isinstance(self.model, Affine) else "D"
+        asked = wanted(criterion, region, default)
+        source = self.source(asked.parameters is not None)
+        raw, root = source.blocks(), source.root
+        if self._measured is not None:
+            seen = source.at("measured", self._measured, True)
+            root = _with_measured(root, seen)
+        source.require_identified(self._measured)
+        where = asked.region
+        if where is None and asked.of_region:
+            where = source.predicted()
+        return whitened_problems(
+            raw[None], root,
+            Rules(
+                k, self.available[None], self._required, self.max_replicates,
+                coarse=self._coarse,
+            ),
+            asked, names=source.names, times=source.times,
+            region=None if where is None else source.at("region", where, False),
+            candidates=None if self.candidates is None else self.candidates[None],
+            model=self.model,
+        )[0]  # fmt: skip
+
+    def source(self, of_parameters: bool) -> Source:
+        """What makes blocks; ``of_parameters``: of all parameters by name."""
+        if self._blocks is not None:
+            return Given(self._blocks, self.prior, self.noise)
+        model, candidates, prior = self.model, self.candidates, self.prior
+        assert model is not None and candidates is not None
+        if not of_parameters and isinstance(model, Affine):
+            if shares_regressor(model, prior, self.noise):
+                return Shared(model, candidates, self.noise)
+        return Modelled(model, candidates, self.available, prior, self.noise)
+
+    def with_noise(self, noise: Noise | None) -> Self:
+        """The same with other noise."""
+        other = copy.copy(self)
+        other.noise = noise
+        return other
+
+    def _set_rules(
+        self,
+        prior: Any,
+        noise: Noise | None,
+        measured: ArrayLike | None,
+        required: ArrayLike | None,
+        max_replicates: int,
+    ) -> None:
+        _require_kind("noise", noise, Noise)
+        self.prior, self.noise = prior, noise
+        # Copies: the caller's arrays may change before the next question.
+        self._measured = None if measured is None else numbers("measured", measured)
+        self._required = copy.copy(required)
+        self.max_replicates = max_replicates
+
+
+def _require_kind(argument: str, value: Any, kind: type) -> None:
+    if value is not None and not isinstance(value, kind):
+        raise ValueError(
+            f"{argument} must be a jaxcal.{kind.__name__} where candidates are given, "
+            f"got {type(value).__name__}"
+        )
+
+
+def _with_measured(root: Array, blocks: Array) -> Array:
+    """Root of a precision with the information of blocks (N, q, p) added."""
+    rows = np.concatenate([root, blocks.reshape(-1, root.shape[1])])
+    return np.linalg.qr(rows)[1] if len(rows) > root.shape[1] else rows
+
+
+def _labels(
+    candidates: Any, names: Sequence[str] | None
+) -> tuple[tuple[str, ...] | None, tuple[str, ...] | None]:
+    """Names of the candidates and of their axes, from a data frame where it is one."""
+    axes = None
+    if hasattr(candidates, "to_numpy") and hasattr(candidates, "columns"):
+        axes = tuple(str(column) for column in candidates.columns)
+        rows = tuple(str(label) for label in getattr(candidates, "index", ()))
+        if names is None and rows and rows != tuple(map(str, range(len(rows)))):
+            return rows, axes
+    if names is None:
+        return None, axes
+    given, count = tuple(names), len(candidates)
+    if len(given) != count or not all(isinstance(name, str) for name in given):
+        raise ValueError(
+            f"names must be {count} texts, one for each candidate, got {len(given)} of "
+            f"{', '.join(sorted({type(name).__name__ for name in given}))}"
+        )
+    return given, axes

@@ -1,0 +1,227 @@
+"""Where information blocks come from: the affine model, any other one, or the caller.
+
+A source answers, of candidates (M, n) of which some are available:
+
+- ``names``: (p,) of the parameters; empty where the blocks are [u, 1];
+- ``times``: how often log det and trace of the blocks count;
+- ``root``: (r, p), of the precision known beforehand;
+- ``blocks()``: (M, q, p) of the candidates, zero where not available;
+- ``at(argument, values, readings)``: (N, q, p) of what was measured (``readings``) or
+  of where predictions are wanted.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.checks import numbers
+from jaxcal.information.blocks import prior_root
+from jaxcal.models.affine import Affine
+from jaxcal.models.checked import derivative
+from jaxcal.models.identifiability import identifiability
+from jaxcal.models.model import Model
+from jaxcal.models.uncertainty import Noise, Prior
+
+__all__ = ["Given", "Modelled", "Shared", "Source", "shares_regressor"]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+class Source:
+    """See the top of the module; what is the same in most."""
+
+    names: tuple[str, ...] = ()
+    times = 1
+    root: Array
+
+    def blocks(self) -> Array:
+        raise NotImplementedError
+
+    def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
+        raise NotImplementedError
+
+    def require_identified(self, measured: ArrayLike | None) -> None:
+        """Refuse what candidates leave unknown, by the names of a model."""
+
+    def predicted(self) -> Array | None:
+        """Commands of predictions, where their blocks are not those of readings."""
+        return None
+
+
+def shares_regressor(model: Model, prior: Prior | None, noise: Noise | None) -> bool:
+    """Is one block [u, 1] / std, counted once per output, all there is to know?"""
+    if not isinstance(model, Affine):
+        return False
+    if noise is not None:
+        more = noise.covariance is not None or noise.command_std is not None
+        if more or np.ndim(1.0 if noise.std is None else noise.std):
+            return False
+    if prior is None:
+        return True
+    known = prior.resolve(model)
+    return bool(known.free.all() and not known.precision.any())
+
+
+class Shared(Source):
+    """The affine model where all outputs share one regressor [u, 1] / std."""
+
+    def __init__(self, model: Affine, candidates: Array, noise: Noise | None) -> None:
+        self._model, self._candidates = model, candidates
+        self._std = 1.0 if noise is None or noise.std is None else float(noise.std)  # type: ignore[arg-type]  # one number
+        self.times = model.multiplicity
+        self.root = np.zeros((0, model.num_inputs + 1))
+
+    def blocks(self) -> Array:
+        return self._model.blocks(self._candidates) / self._std
+
+    def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
+        points = _commands(argument, values, self._model.num_inputs)
+        return self._model.blocks(points) / self._std
+
+
+class Given(Source):
+    """Blocks of the caller's own, and a prior precision (p, p)."""
+
+    def __init__(
+        self, blocks: Array, prior: ArrayLike | None, noise: Noise | None
+    ) -> None:
+        _, self._q, p = blocks.shape
+        self._blocks, self._noise = blocks, noise
+        self.names = tuple(f"theta{i + 1}" for i in range(p))
+        self.root = np.zeros((0, p))
+        if prior is None:
+            return
+        precision = numbers("prior", prior)
+        if precision.shape != (p, p):
+            raise ValueError(
+                f"prior must be a precision of shape ({p}, {p}), got {precision.shape}"
+            )
+        self.root = prior_root(precision)
+
+    def blocks(self) -> Array:
+        return self._white(self._blocks)
+
+    def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
+        array, p = numbers(argument, values), len(self.names)
+        if array.ndim != 3 or array.shape[1:] != (self._q, p):
+            raise ValueError(
+                f"{argument} must have shape (N, {self._q}, {p}) as blocks have, got "
+                f"{array.shape}"
+            )
+        return self._white(array)
+
+    def _white(self, blocks: Array) -> Array:
+        if self._noise is None:
+            return blocks
+        return self._noise.whitening(len(blocks), self._q) @ blocks
+
+
+class Modelled(Source):
+    """A model at the mean of its prior, without the parameters that are held."""
+
+    def __init__(
+        self,
+        model: Model,
+        candidates: Array,
+        available: Mask,
+        prior: Prior | None,
+        noise: Noise | None,
+    ) -> None:
+        self._model, self._candidates, self._available = model, candidates, available
+        self._noise = Noise() if noise is None else noise
+        self._prior = model.default_prior() if prior is None else prior
+        known = self._prior.resolve(model)
+        if not known.free.any():
+            raise ValueError("prior must leave a parameter free, but it fixes them all")
+        self._mean, self._free = known.mean, known.free
+        pairs = zip(model.names, known.free, strict=True)
+        self.names = tuple(name for name, free in pairs if free)
+        self._precision = known.precision[np.ix_(known.free, known.free)]
+        self.root = prior_root(self._precision)
+
+    @property
+    def used(self) -> Array:
+        """The available candidates."""
+        return self._candidates[self._available]
+
+    def blocks(self) -> Array:
+        count, mask = len(self._candidates), self._available
+        jacobian = self._jacobian(self.used)
+        q = jacobian.shape[1]
+        slopes = None
+        if self._noise.command_std is not None:
+            slopes = np.zeros((count, q, self._candidates.shape[1]))
+            slopes[mask] = self._model.command_jacobian(self.used, self._mean)
+        white = self._noise.whitening(count, q, slopes)
+        if mask.all():
+            return _weighted(white, jacobian)
+        blocks = np.zeros((count, q, len(self.names)))
+        blocks[mask] = white[mask] @ jacobian
+        return blocks
+
+    def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
+        noise = self._noise
+        for name, axes in (("std", 1), ("covariance", 2)):
+            given = getattr(noise, name)
+            if given is not None and np.ndim(given) > axes:
+                raise ValueError(
+                    "noise must be the same for all candidates where "
+                    f"{argument} is given, got {name} of shape {np.shape(given)}"
+                )
+        points = _commands(argument, values, self._model.num_inputs)
+        slopes = None
+        if noise.command_std is not None and readings:
+            slopes = self._model.command_jacobian(points, self._mean)
+        else:
+            noise = dataclasses.replace(noise, command_std=None)
+        jacobian = self._jacobian(points)
+        white = noise.whitening(len(points), jacobian.shape[1], slopes)
+        return _weighted(white, jacobian)
+
+    def predicted(self) -> Array | None:
+        return None if self._noise.command_std is None else self.used
+
+    def require_identified(self, measured: ArrayLike | None) -> None:
+        if np.diagonal(self._precision).all():
+            return
+        commands = self.used
+        if measured is not None:
+            commands = np.concatenate([commands, np.asarray(measured)])
+        noise = self._noise.of(self._available)
+        left = identifiability(
+            self._model, commands, noise=noise, prior=self._prior
+        ).directions
+        if left:
+            raise ValueError(
+                "candidates must inform every parameter, but with what is known they "
+                f"say nothing of {'; '.join(each.words for each in left)}; give a "
+                "prior (jaxcal.Prior with finite std) or hold some (Prior with "
+                "fixed=[name])"
+            )
+
+    def _jacobian(self, commands: Array) -> Array:
+        """(N, q, p) derivative by the free parameters, checked."""
+        jacobian = derivative(self._model, commands, self._mean)
+        return jacobian if self._free.all() else jacobian[..., self._free]
+
+
+def _commands(argument: str, commands: ArrayLike, n: int) -> Array:
+    """``commands`` as finite float64 (N, n), or an error that names the argument."""
+    array = numbers(argument, commands)
+    if array.ndim != 2 or array.shape[1] != n:
+        raise ValueError(
+            f"{argument} must have shape (N, {n}) for this model, got {array.shape}"
+        )
+    return array
+
+
+def _weighted(white: Array, jacobian: Array) -> Array:
+    """``white @ jacobian`` (N, q, p), by columns where white is one diagonal matrix."""
+    scale = np.diagonal(white[0]) if len(white) else np.ones(white.shape[1])
+    if white.strides[0] == 0 and (white[0] == np.diag(scale)).all():
+        return jacobian * scale[:, None]
+    return white @ jacobian

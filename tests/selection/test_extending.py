@@ -1,0 +1,100 @@
+"""A solver and a criterion of one's own: one class or function, one row in a table."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+import jaxcal
+from jaxcal.checks import numbers
+from jaxcal.selection.criteria import CRITERIA, Coordinates, Wanted
+from jaxcal.selection.problem import Problem
+from jaxcal.selection.solver import Found
+from jaxcal.selection.solvers import SOLVERS, Solver
+
+
+class C(Wanted):
+    """Variance of one combination of the parameters."""
+
+    name, kind, says = "c", "trace", "variance"
+
+    def __init__(self, weights) -> None:
+        self.weights = numbers("weights", weights)
+
+    def root(self, at: Coordinates) -> np.ndarray:
+        return self.weights[None] @ at.basis
+
+
+class L(C):
+    """The worst known of some combinations."""
+
+    name, kind, says, per_output = "L", "least", "precision", True
+
+    def root(self, at: Coordinates) -> np.ndarray:
+        return self.weights @ at.basis
+
+
+def largest(problem: Problem, *, seed: int) -> Found:
+    """The largest candidates first."""
+    size = (problem.blocks**2).sum(axis=(1, 2)) * problem.available
+    return Found(size.argsort()[::-1][: problem.k], seed=seed)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_criterion_of_ones_own_is_solved_and_proven(monkeypatch, seed) -> None:
+    monkeypatch.setitem(CRITERIA, "c", C)
+    rng = np.random.default_rng(seed)
+    blocks, weights = rng.normal(size=(9, 2, 4)), rng.normal(size=4)
+
+    def variance(chosen) -> float:
+        rows = blocks[list(chosen)].reshape(-1, 4)
+        return float(weights @ np.linalg.solve(rows.T @ rows, weights))
+
+    best = min(map(variance, itertools.combinations(range(9), 3)))
+    design = jaxcal.Design.from_blocks(blocks)
+    for method in ("exact", "auto", "exchange", "greedy", "random"):
+        found = design.select(3, C(weights), method)
+        assert found.value == pytest.approx(variance(found.indices))
+        assert found.bound <= best * (1 + 1e-9)
+        if method in ("exact", "auto"):
+            assert found.value == pytest.approx(best, rel=2e-3)
+        assert found.proven or method != "exact"
+    assert "variance" in str(found) and found.criterion == "c"
+    with pytest.raises(ValueError, match=r"criterion c must carry its data: jaxcal\.c"):
+        design.select(3, "c")
+
+
+def test_the_worst_of_some_combinations(monkeypatch) -> None:
+    monkeypatch.setitem(CRITERIA, "L", L)
+    rng = np.random.default_rng(0)
+    blocks, some = rng.normal(size=(8, 2, 4)), rng.normal(size=(4, 4))
+
+    def precision(chosen) -> float:
+        rows = blocks[list(chosen)].reshape(-1, 4)
+        covariance = some @ np.linalg.solve(rows.T @ rows, some.T)
+        return 1.0 / float(np.linalg.eigvalsh(covariance)[-1])
+
+    best = max(map(precision, itertools.combinations(range(8), 3)))
+    design = jaxcal.Design.from_blocks(blocks)
+    for method in ("exact", "exchange"):
+        found = design.select(3, L(some), method)
+        assert found.value == pytest.approx(precision(found.indices))
+        assert found.value <= best * (1 + 1e-9) and found.bound >= best * (1 - 1e-9)
+        if method == "exact":
+            assert found.proven and found.value == pytest.approx(best)
+
+
+def test_a_solver_of_ones_own_is_asked_by_its_name(monkeypatch) -> None:
+    monkeypatch.setitem(SOLVERS, "largest", Solver(largest))
+    candidates = np.random.default_rng(0).random((12, 3))
+    available = np.arange(12) != 3
+    found = jaxcal.select(candidates, 5, "largest", available=available, seed=7)
+    chosen = np.c_[candidates, np.ones(12)]
+    hat = chosen @ np.linalg.solve(chosen[available].T @ chosen[available], chosen.T)
+    order = np.argsort(-np.where(available, np.diag(hat), 0.0))
+    assert sorted(found.indices) == sorted(order[:5])
+    assert found.method == "largest" and found.seed == 7 and found.efficiency <= 1.0
+    with pytest.raises(ValueError, match="best is not an option of method"):
+        jaxcal.select(candidates, 5, "largest", best=2)
