@@ -1,4 +1,4 @@
-"""Contacts of a real arm: a few that are chosen do what many do elsewhere."""
+"""Contacts of a real arm: a few that are chosen are better than as many at random."""
 
 import common
 import contacts
@@ -9,8 +9,8 @@ def test_twelve_chosen_contacts_calibrate_an_arm(tmp_path):
     found = common.main(contacts, ["--out", str(tmp_path)])
     error = {rule: np.mean(values) for (_, rule, _), values in found.items()}
     assert error["nominal"] > 7.0  # mm
-    assert error["I"] < 1.3 * error["all"] < 1.0
-    assert error["I"] < error["random"]
+    assert error["all"] < error["I"] < error["random"]
+    assert error["I"] < 0.12 * error["nominal"]
     assert (tmp_path / "contacts.csv").exists()
     assert (tmp_path / "contacts.png").stat().st_size > 5_000
 
