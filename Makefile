@@ -28,8 +28,8 @@ $(DOCS): $(READY)
 train: $(READY) ## set everything up and train the compact policy on this machine (a few minutes)
 	$(BIN)/python train.py $(ARGS)
 
-checkpoint: $(READY) ## train the policy that ships and put it in checkpoints/default (about 10 minutes)
-	$(BIN)/python train.py --preset general --export checkpoints/default $(ARGS)
+checkpoint: $(READY) ## train the policy that ships and put it in checkpoints/default.npz (about 10 minutes)
+	$(BIN)/python train.py --preset general --export checkpoints/default.npz $(ARGS)
 
 evaluate: $(READY) ## compare every method with the proven optimum on 1,000 unseen candidate sets
 	$(BIN)/python evaluate.py $(ARGS)

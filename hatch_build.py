@@ -103,7 +103,13 @@ class _Build:
         self.work = ROOT / "build" / "kernels" / sys.implementation.cache_tag
         found = compiler()
         self.zig = found is None
-        self.cc = [*(found or _zig()), "-I", sysconfig.get_path("include")]
+        headers = pathlib.Path(sysconfig.get_path("include"))
+        if not (headers / "Python.h").exists():
+            raise SystemExit(
+                f"Python.h must be in {headers} to compile jaxcal's kernels: install "
+                "the headers of this Python (on Debian and Ubuntu python3-dev)"
+            )
+        self.cc = [*(found or _zig()), "-I", str(headers)]
         common = [ROOT / "hatch_build.py", *ROOT.glob("jaxcal/**/*.pxd")]
         self.changed = max(path.stat().st_mtime for path in common)
 

@@ -46,8 +46,8 @@ from jaxcal.learning.policies.compact import CompactNetwork
 from jaxcal.learning.policies.features import CandidateFeatures, DecisionFeatures
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import cache
+from jaxcal.learning.training import postures as training
 from jaxcal.learning.training import presets
-from jaxcal.learning.training import run as training
 from jaxcal.learning.training.checkpoint import package_versions
 from jaxcal.selection import exact_batch, greedy_batch, select
 from jaxcal.selection.policy import select_batch
@@ -74,7 +74,9 @@ class Unlearned(CompactNetwork):
     def encode(self, features: CandidateFeatures) -> jax.Array:
         return features.vectors.columns[..., :1]
 
-    def finish(self, decision: DecisionFeatures) -> tuple[jax.Array, jax.Array]:
+    def lookahead_logits(
+        self, decision: DecisionFeatures
+    ) -> tuple[jax.Array, jax.Array]:
         score = decision.vectors.ahead[..., self.column]
         return jnp.where(decision.vectors.active, score, -1e9), score.max(-1)
 

@@ -20,7 +20,7 @@ import numpy as np
 
 HERE = pathlib.Path(__file__).parent
 NAMES = (
-    *("ankle", "ur5", "force_sensor", "triad", "camera", "tcp"),
+    *("ankle", "ur5", "contacts", "force_sensor", "triad", "camera", "tcp"),
     *("own_function", "backlash", "own_policy"),
 )
 Rows = list[dict[str, str]]

@@ -1,4 +1,8 @@
-"""The arguments of ``python -m rig``; imports nothing that takes time."""
+"""The command line: one row a command, its words, its function and its options.
+
+Imports nothing that takes time: a function is named by its module, which is loaded when
+its command was asked for.
+"""
 
 from __future__ import annotations
 
@@ -48,6 +52,18 @@ def _axes(text: str) -> list[str]:
     return names
 
 
+class _Faults(argparse._AppendAction):
+    """Appends a fault; ``list`` prints those there are, and ends."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, *more: Any) -> None:
+        if values == "list":
+            from rig.simulator.faults import KINDS
+
+            print(*(f"{kind:<16} {text}" for kind, text in KINDS.items()), sep="\n")
+            parser.exit()
+        super().__call__(parser, namespace, values, *more)
+
+
 def _number(low: float, high: float, default: float, text: str) -> dict[str, Any]:
     text = f"{text} (default {default:g})"
     return {"type": _within(low, high), "default": default, "help": text}
@@ -79,7 +95,7 @@ SIMULATOR: Options = {
         "help": "of the simulated bus; rtu is a pseudo-terminal",
     },
     "--fault": {
-        "action": "append",
+        "action": _Faults,
         "default": [],
         "metavar": "KIND[@PHASE|@Ns][,count=N]...",
         "help": "inject a fault; --fault list names them",
@@ -173,7 +189,6 @@ SETUP: Options = {
     },
 }
 
-
 ORDER = {"choices": ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")}
 REFIT: Options = FOLDER_OF | {
     "--order": {**ORDER, "help": "mechanism.order: axes of the joints"},
@@ -202,58 +217,74 @@ EXPORT: Options = FOLDER_OF | {
 RUNS: Options = {"folder": _path("folder of runs, searched with its subfolders")}
 
 
+# command, what it does, the function that runs it, its options, whether it simulates
+Row = tuple[str, str, str, Options, bool]
+STEPS, OF_RUN, RECORDED = "rig.commissioning", "rig.sessions", "rig.commands"
+COMMANDS: list[Row] = [
+    ("setup", "from cables to a device that may be calibrated; writes rig.toml",
+     f"{STEPS}:setup", STEP | BUS | SETUP | NAMES_KNOWN, True),
+    ("ports", "list serial ports, and what answers on TCP",
+     f"{STEPS}:ports", TCP, False),
+    ("scan", "which units answer, and of which family; reads only",
+     f"{STEPS}:scan", CONFIG | BUS, True),
+    ("imu", "what to type into the phone, and what it sends",
+     f"{STEPS}:imu", STEP | SECONDS, True),
+    ("jog", "move one axis by hand", f"{STEPS}:jog", JOG | STEP, True),
+    ("characterise", "measure play, dead zone and breakaway of one axis",
+     f"{STEPS}:characterise", AXIS | INTO | STEP, True),
+    ("home", "make the drives' counts mean a place",
+     f"{STEPS}:home", HERE | STEP, True),
+    ("axes", "check what turns, which way, how far; correct rig.toml",
+     f"{STEPS}:axes", NAMES_KNOWN | STEP, True),
+    ("zero", "measure the zero posture", f"{STEPS}:zero", STEP, True),
+    ("calibrate", "choose, visit, identify, verify and save",
+     f"{OF_RUN}:session", SESSION, True),
+    ("collect", "record random postures (Datasets 4 and 5)",
+     f"{OF_RUN}:session", _count(50) | SESSION, True),
+    ("verify", "compare a calibration with fresh measurements",
+     f"{OF_RUN}:session", SAVED | _count(6) | SESSION, True),
+    ("goto", "move the end-effector to a posture, calibrated",
+     f"{OF_RUN}:session", SAVED | TO | SESSION, True),
+    ("resume", "go on with a run that was paused, stopped or killed",
+     f"{OF_RUN}:resume", RUN | MOTION | LIVE, True),
+    ("watch", "show a run, also a running one, as a page in the browser",
+     f"{RECORDED}:watch", FOLDER_OF | LIVE_HOST, False),
+    ("identify", "read identity and status of every drive; write nothing",
+     f"{RECORDED}:identify", CONFIG, True),
+    ("stop", "quick-stop every drive now, and verify",
+     "rig.__main__:stop", CONFIG, False),
+    ("check", "check a configuration and list every fault",
+     f"{RECORDED}:check", FILE | CONFIG, False),
+    ("example", "print a commented example configuration",
+     f"{RECORDED}:example", NAME, False),
+    ("refit", "identify a recorded calibration anew",
+     f"{RECORDED}:refit", REFIT, False),
+    ("report", "write report.html of any run, also unfinished",
+     f"{RECORDED}:report", FOLDER_OF, False),
+    ("export", "print the inverse map of a calibration for a controller",
+     f"{RECORDED}:export", EXPORT, False),
+    ("trend", "compare the calibrations of a device over time",
+     f"{RECORDED}:trend", RUNS, False),
+    ("simulate", "serve simulated drives and a phone on loopback",
+     f"{RECORDED}:simulate", CONFIG | PORT, True),
+]  # fmt: skip
+
+
 def make_parser() -> argparse.ArgumentParser:
-    """The parser of every command."""
+    """The parser of every command; what it returns names the ``function``."""
     parser = argparse.ArgumentParser(
-        prog="python -m rig",
+        prog="jaxcal-rig",
         description="Calibrate a three-axis device over Modbus and a phone's IMU.",
         epilog=EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-
-    def add(name: str, text: str, options: Options, simulated: bool = True) -> None:
+    for name, text, function, options, simulated in COMMANDS:
         command = commands.add_parser(name, help=text, description=text)
+        command.set_defaults(function=function)
         for option, given in options.items():
             command.add_argument(option, **given)
         group = command.add_argument_group("simulator")  # left out of help where empty
         for option, given in (SIMULATOR if simulated else {}).items():
             group.add_argument(option, **given)
-
-    text = "from cables to a device that may be calibrated; writes rig.toml"
-    add("setup", text, STEP | BUS | SETUP | NAMES_KNOWN)
-    add("ports", "list serial ports, and what answers on TCP", TCP, False)
-    add("scan", "which units answer, and of which family; reads only", CONFIG | BUS)
-    add("imu", "what to type into the phone, and what it sends", STEP | SECONDS)
-    add("jog", "move one axis by hand", JOG | STEP)
-    text = "measure play, dead zone and breakaway of one axis, with intervals"
-    add("characterise", text, AXIS | INTO | STEP)
-    add("home", "make the drives' counts mean a place", HERE | STEP)
-    text = "check what turns, which way, how far; correct rig.toml"
-    add("axes", text, NAMES_KNOWN | STEP)
-    add("zero", "measure the zero posture", STEP)
-    add("calibrate", "choose, visit, identify, verify and save", SESSION)
-    text = "record random postures (Datasets 4 and 5)"
-    add("collect", text, _count(50) | SESSION)
-    text = "compare a calibration with fresh measurements"
-    add("verify", text, SAVED | _count(6) | SESSION)
-    text = "move the end-effector to a posture, calibrated"
-    add("goto", text, SAVED | TO | SESSION)
-    text = "go on with a run that was paused, stopped or killed"
-    add("resume", text, RUN | MOTION | LIVE)
-    text = "show a run, also a running one, as a page in the browser"
-    add("watch", text, FOLDER_OF | LIVE_HOST, False)
-    text = "read identity and status of every drive; write nothing"
-    add("identify", text, CONFIG)
-    add("stop", "quick-stop every drive now, and verify", CONFIG, False)
-    add("check", "check a configuration and list every fault", FILE | CONFIG, False)
-    add("example", "print a commented example configuration", NAME, False)
-    add("refit", "identify a recorded calibration anew", REFIT, False)
-    add("report", "write report.html of any run, also unfinished", FOLDER_OF, False)
-    text = "print the inverse map of a calibration for a controller"
-    add("export", text, EXPORT, False)
-    text = "compare the calibrations of a device over time"
-    add("trend", text, RUNS, False)
-    text = "serve simulated drives and a phone on loopback"
-    add("simulate", text, CONFIG | PORT)
     return parser

@@ -1,57 +1,27 @@
-"""The commands of ``python -m rig``; each imports what it needs."""
+"""The commands besides sessions and commissioning; each loads what it needs."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import sys
 import time
-from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from rig.config import example_text, load_config
-from rig.config.files import example_names
-from rig.core.bus import Bus, BusError
-from rig.core.drive import Drive
-from rig.core.faults import EXIT_FAULT, EXIT_OK
-from rig.core.lock import BusLock
-from rig.sessions import FILE, journal_of, load, make_simulator, run_session
+from rig.core.faults import EXIT_FAULT, EXIT_OK, EXIT_RECALIBRATE, Refused
+from rig.sessions import FILE, journal_of, load, make_simulator, recorded, records_of
 
-COMMISSIONING = (
-    *("ports", "scan", "imu", "jog", "home", "axes", "zero", "setup"),
-    "characterise",
-)
+if TYPE_CHECKING:
+    from rig.core.drive import Drive
 
 
-def run(args: argparse.Namespace) -> int:
-    """Run the command that was asked for; returns the exit code."""
-    if "list" in getattr(args, "fault", []):
-        from rig.simulator.faults import KINDS
+def identify(args: argparse.Namespace) -> int:
+    """Print what every drive says of itself."""
+    from rig.core.bus import Bus, BusError
+    from rig.core.drive import Drive
+    from rig.core.lock import BusLock
 
-        for kind, text in KINDS.items():
-            print(f"{kind:<16} {text}")
-        return EXIT_OK
-    commands: dict[str, Callable[[argparse.Namespace], int]] = {
-        "identify": _identify,
-        "simulate": _simulate,
-        "example": _example,
-        "check": _check,
-        "watch": _watch,
-        **dict.fromkeys(("refit", "report", "export", "trend"), _of_recorded),
-    }
-    if args.command in COMMISSIONING:
-        from rig.commissioning import run as run_step
-
-        return run_step(args)
-    return commands.get(args.command, run_session)(args)
-
-
-def _of_recorded(args: argparse.Namespace) -> int:
-    from rig import results
-
-    command: Callable[[argparse.Namespace], int] = getattr(results, args.command)
-    return command(args)
-
-
-def _identify(args: argparse.Namespace) -> int:
     config, code = load(args), EXIT_OK
     with contextlib.ExitStack() as stack:
         if args.simulate:
@@ -82,7 +52,8 @@ def _described(drive: Drive) -> list[str]:
     ]
 
 
-def _simulate(args: argparse.Namespace) -> int:
+def simulate(args: argparse.Namespace) -> int:
+    """Serve simulated drives and a phone until Ctrl-C."""
     config = load(args)
     port = config.bus.port if args.bus_port is None else args.bus_port
     with make_simulator(config, vars(args), args.fault) as simulator:
@@ -102,7 +73,8 @@ def _simulate(args: argparse.Namespace) -> int:
             return EXIT_OK
 
 
-def _watch(args: argparse.Namespace) -> int:
+def watch(args: argparse.Namespace) -> int:
+    """Serve the page of a run until Ctrl-C."""
     from jaxcal.extras import needs
     from rig.workbench.live import launch
 
@@ -116,7 +88,10 @@ def _watch(args: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-def _example(args: argparse.Namespace) -> int:
+def example(args: argparse.Namespace) -> int:
+    """Print an example, or the names of those there are."""
+    from rig.config.files import example_names
+
     if args.name is None:
         print("\n".join(example_names()))
     else:
@@ -124,7 +99,8 @@ def _example(args: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-def _check(args: argparse.Namespace) -> int:
+def check(args: argparse.Namespace) -> int:
+    """Say what a configuration comes to; ConfigError lists its faults."""
     path = args.config or args.file or FILE
     config = load_config(path)
     print(f"{path}: valid; fingerprint {config.fingerprint()[:16]}")
@@ -141,3 +117,62 @@ def _check(args: argparse.Namespace) -> int:
         f"{late if config.heartbeat_s > config.shortest_step_s else ''}"
     )
     return EXIT_OK
+
+
+def refit(args: argparse.Namespace) -> int:
+    """Identify a recorded calibration anew, into a folder of its own."""
+    from rig.workbench.identification.refit import refit as identify_anew
+
+    then, start = recorded(args)
+    if start["mode"] != "calibrate":
+        raise Refused(f"{args.run} is a {start['mode']} run; refit takes a calibration")
+    wanted = {
+        "mechanism.order": args.order,
+        "imu.order": args.imu_order,
+        "imu.signs": args.signs,
+        "imu.mounting_deg": args.mounting,
+    }
+    return identify_anew(args.run, records_of(args.run), then, wanted, print)
+
+
+def report(args: argparse.Namespace) -> int:
+    """Write report.html of a run of any kind, also of an unfinished one."""
+    from rig.workbench.outputs.report import write_report
+
+    print(write_report(args.run, records_of(args.run)))
+    return EXIT_OK
+
+
+def export(args: argparse.Namespace) -> int:
+    """Print or write the inverse map of a run's calibration."""
+    from jaxcal.files import write_text
+    from rig.workbench.outputs.export import LANGUAGES, load_inverse
+
+    inverse = load_inverse(args.run, records_of(args.run))
+    for text in inverse.warnings:
+        print(f"WARNING: {text}", file=sys.stderr)
+    text = LANGUAGES[args.to](inverse)
+    if args.out is None:
+        print(text, end="")
+    else:
+        write_text(args.out, text)
+        print(f"{args.out}: SHA-256 of the numbers {inverse.checksum}")
+    return EXIT_OK
+
+
+def trend(args: argparse.Namespace) -> int:
+    """Compare the calibrations in a folder, device by device; also as trend.html."""
+    from rig.workbench.outputs.trend import read_runs, trend_lines, write_trend
+
+    if not args.folder.is_dir():
+        raise Refused(f"{args.folder} is no folder")
+    devices, skipped = read_runs(args.folder)
+    for text in skipped:
+        print(f"left out: {text}", file=sys.stderr)
+    if not devices:
+        raise Refused(f"{args.folder} holds no finished calibration or verification")
+    for device in devices:
+        print(*trend_lines(device), sep="\n")
+    print(f"saved: {write_trend(args.folder, devices)}")
+    again = any(device.reasons for device in devices)
+    return EXIT_RECALIBRATE if again else EXIT_OK

@@ -8,7 +8,7 @@ import dataclasses
 import pathlib
 import socket
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from jaxcal.extras import needs
@@ -24,36 +24,23 @@ from rig.core.lock import BusLock
 from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
 from rig.journal import new_run_folder
 from rig.sessions import FILE, load, make_simulator
-from rig.workbench.commission import setup, steps
+from rig.workbench.commission import setup as wizard
+from rig.workbench.commission import steps
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.ports import MODBUS_PORT, serial_lines, tcp_line
-from rig.workbench.commission.scan import Found, parse_bus, scan
+from rig.workbench.commission.scan import Found, parse_bus
+from rig.workbench.commission.scan import scan as scan_bus
 
 if TYPE_CHECKING:
     from rig.simulator import Simulator
-
-
-def run(args: argparse.Namespace) -> int:
-    """Run a commissioning command; returns the exit code."""
-    commands: dict[str, Callable[[argparse.Namespace], int]] = {
-        "ports": _ports,
-        "scan": _scan,
-        "imu": _imu,
-        "jog": _jog,
-        "characterise": _characterise,
-        "home": _home,
-        "axes": _axes,
-        "zero": _zero,
-        "setup": _setup,
-    }
-    return commands[args.command](args)
 
 
 def _say(text: str) -> None:
     print(text, flush=True)
 
 
-def _ports(args: argparse.Namespace) -> int:
+def ports(args: argparse.Namespace) -> int:
+    """List serial ports, and what answers on TCP."""
     lines = serial_lines()
     print(*(lines or ["no serial port on this computer"]), sep="\n")
     code = EXIT_OK
@@ -68,16 +55,17 @@ def _ports(args: argparse.Namespace) -> int:
     return code
 
 
-def _scan(args: argparse.Namespace) -> int:
+def scan(args: argparse.Namespace) -> int:
+    """Name the units that answer."""
     if args.bus:
         bus, maps = parse_bus(args.bus), ()
         with BusLock(bus).acquire("scan"):
-            return _told(scan(bus, args.units, _say, maps))
+            return _told(scan_bus(bus, args.units, _say, maps))
     with _place(args) as place:
         config = place.config
         own = tuple(axis.map for axis in config.axes)
         with BusLock(config.bus).acquire("scan"):
-            code = _told(scan(config.bus, args.units, _say, own))
+            code = _told(scan_bus(config.bus, args.units, _say, own))
         if code == EXIT_OK:
             steps.identify(place)
         return code
@@ -93,44 +81,51 @@ def _told(found: list[Found]) -> int:
     return EXIT_OK
 
 
-def _imu(args: argparse.Namespace) -> int:
+def imu(args: argparse.Namespace) -> int:
+    """Look at the phone's stream, and listen to that phone only."""
     with _place(args) as place:
         stream = steps.look_at_phone(place, args.seconds)
-        setup.pin(place, stream.sender)
+        wizard.pin(place, stream.sender)
     return EXIT_OK
 
 
-def _jog(args: argparse.Namespace) -> int:
+def jog(args: argparse.Namespace) -> int:
+    """Move one axis by hand."""
     with _place(args, IDENTIFIED) as place:
         return steps.jog(place, AXIS_NAMES.index(args.axis), args.step)
 
 
-def _characterise(args: argparse.Namespace) -> int:
+def characterise(args: argparse.Namespace) -> int:
+    """Measure play, dead zone and breakaway of one axis."""
     with needs("policy", "characterise"):
         import jax  # noqa: F401  # before anything moves
     with _place(args, SIGN_CHECKED) as place:
         return steps.characterise(place, AXIS_NAMES.index(args.axis), args.into)
 
 
-def _home(args: argparse.Namespace) -> int:
+def home(args: argparse.Namespace) -> int:
+    """Make the drives' counts mean a place."""
     with _place(args, IDENTIFIED) as place:
         return steps.go_home(place, args.here)
 
 
-def _axes(args: argparse.Namespace) -> int:
+def axes(args: argparse.Namespace) -> int:
+    """Check the axes, and correct rig.toml."""
     with _place(args, HOMED) as place:
         return steps.axes(place, args.names_known)
 
 
-def _zero(args: argparse.Namespace) -> int:
+def zero(args: argparse.Namespace) -> int:
+    """Measure the zero posture."""
     with _place(args, SIGN_CHECKED) as place:
         return steps.take_zero(place)
 
 
-def _setup(args: argparse.Namespace) -> int:
+def setup(args: argparse.Namespace) -> int:
+    """Go through all steps from cables on."""
     path = args.config or FILE
     operator = Operator(args.yes, _say)
-    given = setup.Given(
+    given = wizard.Given(
         bus=args.bus or "",
         imu=args.imu or "",
         units=args.units,
@@ -143,19 +138,19 @@ def _setup(args: argparse.Namespace) -> int:
             simulator = stack.enter_context(_simulator(args))
             given = _given(simulator, given)
             path = args.config or _own_folder(simulator.config) / "rig.toml"
-        operator.confirm(setup.SAFETY, "setup")
+        operator.confirm(wizard.SAFETY, "setup")
         if path.exists() and args.set:
             raise Refused(f"{path} exists: edit it, or leave out --set")
         if path.exists():
             config = load_config(path)
             operator.say(f"{path} exists and is used; delete it to begin anew")
         else:
-            config = setup.write_config(path, given, operator)
+            config = wizard.write_config(path, given, operator)
         place = steps.Place(
             config, DeviceRecord.load(config.device_path), operator, path,
             reset_alarms=args.reset_alarms, full_speed=args.simulate,
         )  # fmt: skip
-        return setup.go(place, given)
+        return wizard.go(place, given)
 
 
 def _simulator(args: argparse.Namespace) -> Simulator:
@@ -163,7 +158,7 @@ def _simulator(args: argparse.Namespace) -> Simulator:
     return make_simulator(config, vars(args), args.fault)
 
 
-def _given(simulator: Simulator, given: setup.Given) -> setup.Given:
+def _given(simulator: Simulator, given: wizard.Given) -> wizard.Given:
     """What an operator would answer of a simulated device, and its phone started."""
     bus = simulator.start().bus
     where = f"{bus.transport}:{bus.host}:{bus.port}"
@@ -200,22 +195,19 @@ def _place(args: argparse.Namespace, state: str = "") -> Iterator[steps.Place]:
 
     A simulated one is first taken through the states before the command's own.
     """
-    operator = Operator(getattr(args, "yes", False), _say)
-    config = load(args)
-    path = args.config
+    config, path = load(args), args.config
     with contextlib.ExitStack() as stack:
         if not args.simulate:
+            operator = Operator(getattr(args, "yes", False), _say)
             record = DeviceRecord.load(config.device_path)
             place = steps.Place(config, record, operator, path)
         else:
             simulator = make_simulator(config, vars(args), args.fault)
             served = stack.enter_context(simulator).start()
             record = DeviceRecord(_own_folder(served) / "device.json")
-            place = steps.Place(
-                served, record, operator, path, full_speed=True,
-                on_imu_port=simulator.start_phone, listeners=(simulator.hear,),
-            )  # fmt: skip
+            place = steps.simulated(simulator, served, record, _say, path)
             steps.begin_simulated(place, state)
+            place.operator.yes = getattr(args, "yes", False)
         place.reset_alarms = getattr(args, "reset_alarms", False)
         yield place
 

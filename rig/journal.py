@@ -207,9 +207,9 @@ class RunFolder:
         if known := self.journal.events("start"):
             if changed := self.config.changed_since(known[0]["config"]):
                 raise ValueError(
-                    f"{self.folder}: the configuration changed since this run began: "
-                    f"{'; '.join(changed)}. Addresses and limits may change, nothing "
-                    "else. Start a new run"
+                    f"{self.folder}: rig.toml differs from when this run began: "
+                    f"{'; '.join(changed)}. What is measured now would not be "
+                    "comparable. Set these keys back, or start a new run"
                 )
             if known[0]["mode"] != mode:
                 raise ValueError(f"{self.folder} is a {known[0]['mode']} run")

@@ -20,7 +20,6 @@ from rig.config import (
 from rig.core.faults import Refused
 
 if TYPE_CHECKING:
-    from rig.core.record import DeviceRecord
     from rig.core.session import Run
     from rig.core.zero import KeptZero
     from rig.simulator import Simulator
@@ -61,20 +60,47 @@ def make_simulator(
     )
 
 
-def run_session(args: argparse.Namespace) -> int:
-    """Run a session, new or resumed; returns the exit code."""
+def session(args: argparse.Namespace) -> int:
+    """Run a new session; returns the exit code."""
+    if getattr(args, "count", 1) < 1:
+        raise Refused(f"--count must be at least 1, got {args.count}")
+    calibration = getattr(args, "calibration", None)
+    simulation = {name: getattr(args, name) for name in SIMULATION}
+    start = {
+        "mode": args.command,
+        "inputs": {
+            "count": getattr(args, "count", None),
+            "to": getattr(args, "to", None),
+            "calibration": None if calibration is None else str(calibration.resolve()),
+        },
+        "simulated": simulation if args.simulate else None,
+        "maps_from": str((args.config or pathlib.Path()).resolve().parent),
+    }
+    return _run(args, load(args), start)
+
+
+def resume(args: argparse.Namespace) -> int:
+    """Go on with a run; returns the exit code."""
+    return _run(args, *recorded(args), folder=args.run)
+
+
+def _run(
+    args: argparse.Namespace,
+    config: RigConfig,
+    start: dict[str, Any],
+    folder: pathlib.Path | None = None,
+) -> int:
     from rig.core.lock import BusLock
-    from rig.core.record import DeviceRecord
+    from rig.core.record import SIGN_CHECKED, DeviceRecord
     from rig.core.session import Run, run_safely
     from rig.journal import new_run_folder
     from rig.signals import Signals
+    from rig.workbench.commission.steps import begin_simulated, simulated
     from rig.workbench.outputs.console import listen
 
-    resumed = args.command == "resume"
-    config, start = recorded(args) if resumed else _new(args)
-    mode = start["mode"]
-    simulated = start["simulated"] is not None
-    procedure, kept_zero = _procedure(mode, start["inputs"], config, simulated)
+    mode, say = start["mode"], functools.partial(print, flush=True)
+    real = start["simulated"] is None
+    procedure, kept_zero = _procedure(mode, start["inputs"], config, not real)
     # With --zero the operator put the device into its zero posture.
     zero_at = kept_zero.pulses if kept_zero and not args.zero else None
     dry_run = getattr(args, "dry_run", False)
@@ -89,21 +115,23 @@ def run_session(args: argparse.Namespace) -> int:
         record = DeviceRecord.load(config.device_path)
         if simulator is None and not dry_run and (lack := record.missing(config)):
             raise Refused(lack)
-        if resumed:
-            folder = args.run
-        else:
+        if folder is None:
             folder = new_run_folder(args.out or pathlib.Path(config.output), mode)
             (folder / "rig.toml").write_text(text, encoding="utf-8")
         lock.tell(run=str(folder.resolve()))
         if simulator is not None:
             record = DeviceRecord(folder / "device.json")
             if not dry_run:
-                _commission(config, record, simulator)
-        session = Run(
+                place = simulated(simulator, config, record, say)
+                place.folder, place.locked = folder / "axes", True
+                place.folder.mkdir(exist_ok=True)
+                place.listeners = ()  # faults wait for the session's own phases
+                begin_simulated(place, SIGN_CHECKED)
+        run = Run(
             config,
             folder,
             mode,
-            functools.partial(print, flush=True),
+            say,
             start={key: start[key] for key in ("simulated", "inputs", "maps_from")},
             reset_alarms=args.reset_alarms,
             record=record,
@@ -112,35 +140,17 @@ def run_session(args: argparse.Namespace) -> int:
             dry_run=dry_run,
             signals=Signals(),
         )
-        listen(session)
+        listen(run)
         if simulator is None:
-            session.confirm = functools.partial(_confirm, args)
+            run.confirm = functools.partial(_confirm, args)
         else:
-            session.on_imu_port = simulator.start_phone
-            session.listeners.append(simulator.hear)
+            run.on_imu_port = simulator.start_phone
+            run.listeners.append(simulator.hear)
         if args.live or args.live_host:
             from rig.workbench.live import launch
 
-            session.say(launch.start(folder, args.live_host))
-        return run_safely(session, procedure)
-
-
-def _new(args: argparse.Namespace) -> tuple[RigConfig, dict[str, Any]]:
-    """The configuration of a run that begins, and what its journal says of it first."""
-    if getattr(args, "count", 1) < 1:
-        raise Refused(f"--count must be at least 1, got {args.count}")
-    calibration = getattr(args, "calibration", None)
-    simulation = {name: getattr(args, name) for name in SIMULATION}
-    return load(args), {
-        "mode": args.command,
-        "inputs": {
-            "count": getattr(args, "count", None),
-            "to": getattr(args, "to", None),
-            "calibration": None if calibration is None else str(calibration.resolve()),
-        },
-        "simulated": simulation if args.simulate else None,
-        "maps_from": str((args.config or pathlib.Path()).resolve().parent),
-    }
+            run.say(launch.start(folder, args.live_host))
+        return run_safely(run, procedure)
 
 
 def journal_of(run: pathlib.Path) -> pathlib.Path:
@@ -162,6 +172,11 @@ def records_of(run: pathlib.Path) -> list[dict[str, Any]]:
         raise Refused(str(error)) from None
     if not records or records[0]["event"] != "start":
         raise Refused(f"{run} holds no run: its journal has no start")
+    if "device" not in records[0]:
+        raise Refused(
+            f"{run} was written before jaxcal 0.1.0, whose runs are not read any more. "
+            "Make a new one"
+        )
     return records
 
 
@@ -195,34 +210,12 @@ def _procedure(
     saved = checking.load_calibration(
         pathlib.Path(inputs["calibration"]), config, simulated
     )
-    if saved.note:
-        print(saved.note, flush=True)
     calibration = saved.calibration
     if mode == "verify":
         return lambda run: checking.verify(run, calibration, count), saved.zero
     desired = np.array(inputs["to"], dtype=np.float64)
     play = saved.play
     return lambda run: checking.goto(run, calibration, desired, play), saved.zero
-
-
-def _commission(config: RigConfig, record: DeviceRecord, simulator: Simulator) -> None:
-    """Take a simulated device through every state as a real one is taken.
-
-    Raises:
-        MotionFault: its axes are not as configured.
-    """
-    from rig.core.record import SIGN_CHECKED
-    from rig.workbench.commission.operator import Operator
-    from rig.workbench.commission.steps import Place, begin_simulated
-
-    folder = record.path.parent / "axes"
-    folder.mkdir(exist_ok=True)
-    operator = Operator(yes=True, say=functools.partial(print, flush=True))
-    place = Place(
-        config, record, operator, folder=folder, full_speed=True, locked=True,
-        on_imu_port=simulator.start_phone,
-    )  # fmt: skip
-    begin_simulated(place, SIGN_CHECKED)
 
 
 def _confirm(args: argparse.Namespace, session: Run) -> None:

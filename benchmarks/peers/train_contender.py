@@ -58,8 +58,8 @@ def ours(which: str, sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
     import dataclasses
 
     from jaxcal.learning.runtime import cache
+    from jaxcal.learning.training import postures as training
     from jaxcal.learning.training import presets
-    from jaxcal.learning.training import run as training
 
     cache.keep_compiled_programs()
     config = presets.load("compact")
@@ -70,7 +70,7 @@ def ours(which: str, sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
     config = dataclasses.replace(config, validate_every=LOOK_EVERY)
     reached: list[bool] = []
 
-    def look(report: training.Report) -> None:
+    def look(report: Any) -> None:
         reached.append(clock.say(report.metrics["ratio_to_exact"]))
 
     with tempfile.TemporaryDirectory() as folder:
@@ -88,7 +88,7 @@ def brax(sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
     from jaxcal.learning.policies.build import build
     from jaxcal.learning.runtime import cache
     from jaxcal.learning.training import brax_ppo, presets
-    from jaxcal.learning.training import run as training
+    from jaxcal.learning.training import postures as training
 
     cache.keep_compiled_programs()
     config = presets.with_values(

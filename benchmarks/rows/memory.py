@@ -42,20 +42,18 @@ _UPDATE = (
     + """
 import dataclasses, jax
 from jaxcal.learning.runtime import cache
-from jaxcal.learning.policies.build import build
-from jaxcal.learning.policies import networks
-from jaxcal.learning.training import optimiser, ppo, presets
+from jaxcal.learning.core import ppo
+from jaxcal.learning.training import presets
 cache.keep_compiled_programs()
 config = presets.with_values(presets.load("compact"), {
     "episodes_per_update": EPISODES, "num_minibatches": EPISODES // 512})
-network = build(config.network)
 jax.devices()
 before = mib("VmRSS")
-state = optimiser.init(config.ppo, config.tasks[0], network)
-update = ppo.updater(config.ppo, config.tasks[0], network)
+state = ppo.begin(config.ppo, config.learners[0], jax.random.key(0))
+update = ppo.updates(config.ppo, config.learners[0])
 for _ in range(2):
-    state, metrics = update(state)
-    float(metrics["reward_mean"])
+    state, metrics = update(state, 1)
+    float(metrics["reward_mean"][0])
 print(json.dumps({"before": before, "last": mib("VmRSS"), "peak": mib("VmHWM")}))
 """
 )
@@ -65,7 +63,7 @@ _MANY = (
     + """
 import dataclasses, tempfile
 from jaxcal.learning.runtime import cache
-from jaxcal.learning.training import presets, run as training
+from jaxcal.learning.training import postures as training, presets
 cache.keep_compiled_programs()
 config = presets.with_values(presets.load("compact"), {
     "episodes_per_update": 16, "episodes_per_set": 4, "num_minibatches": 1,

@@ -17,8 +17,8 @@ from benchmarks.harness import (
     interleaved,
     median_ratio,
 )
-from jaxcal.learning.policies.build import build
-from jaxcal.learning.training import optimiser, ppo, presets
+from jaxcal.learning.core import ppo
+from jaxcal.learning.training import presets
 
 NAME = "throughput"
 TITLE = "Training throughput, paper preset (3.5 M parameters)"
@@ -29,12 +29,12 @@ _WIDTH, _M, _K, _N, _EPOCHS = 768, 50, 4, 3, 10
 def ours() -> Callable[[], None]:
     """An update of the paper preset."""
     config = presets.load("paper")
-    network = build(config.network)
-    step = ppo.updater(config.ppo, config.tasks[0], network)
-    held = [optimiser.init(config.ppo, config.tasks[0], network)]
+    learner = config.learners[0]
+    step = ppo.updates(config.ppo, learner)
+    held = [ppo.begin(config.ppo, learner, jax.random.key(0))]
 
     def update() -> None:
-        state, metrics = step(held[0])
+        state, metrics = step(held[0], 1)
         held[0] = state
         jax.block_until_ready(metrics["reward_mean"])
 
@@ -110,10 +110,9 @@ def run(budget: Budget) -> Row:
             )
         )
     config = presets.load("paper")
-    network = build(config.network)
-    state = optimiser.init(config.ppo, config.tasks[0], network)
+    params = config.learners[0].init(jax.random.key(0))
     flops, peak = floor_gigaflops(), peak_gigaflops()
-    moved = floor_gigabytes(sum(leaf.size for leaf in jax.tree.leaves(state.params)))
+    moved = floor_gigabytes(sum(leaf.size for leaf in jax.tree.leaves(params)))
     bandwidth = copy_bandwidth() / 1e9
     floor = flops / peak + moved / bandwidth
     reached = floor / statistics.median(times["jaxcal"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib.util
 import io
 import os
 import pathlib
@@ -22,7 +21,6 @@ def commands() -> str:
     lines = ["# Commands", "", "What `--help` prints, from the parsers.", ""]
     for title, argv in (
         *((f"jaxcal {name}", [name, "--help"]) for name in COMMANDS),
-        ("jaxcal train --task", ["train", "--task", "knee", "--help"]),
         ("jaxcal evaluate --task", ["evaluate", "--task", "knee", "--help"]),
     ):
         lines += _shown(title, _help(main, argv))
@@ -38,11 +36,9 @@ def commands() -> str:
 
 def configuration() -> str:
     """Keys of rig.toml and of register maps, fields and presets of training."""
-    path = ROOT / "tests" / "rig" / "reference.py"
-    spec = importlib.util.spec_from_file_location("rig_reference", path)
-    assert spec is not None and spec.loader is not None
-    tables = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tables)
+    from rig.config.config import RigConfig
+    from rig.config.maps import RegisterMap
+
     return "\n".join(
         [
             "# Configuration",
@@ -53,11 +49,22 @@ def configuration() -> str:
             "",
             "`jaxcal-rig setup` writes it; [Calibrate a device](../rig.md).",
             "",
-            tables.configuration_table(),
+            "`axes.*` are the three `[[axes]]` tables.",
+            "",
+            table(RigConfig, advanced=False),
+            "",
+            "### Advanced",
+            "",
+            "Deadlines, slacks and what hardly any device needs.",
+            "",
+            table(RigConfig, advanced=True),
             "",
             "## Register maps",
             "",
-            tables.register_map_table(),
+            "Tables and keys of a map file; predicates of the status word list the",
+            "bits that must be 1 (`set`) or 0 (`clear`).",
+            "",
+            table(RegisterMap, nested=False),
             "",
             "## Presets of training",
             "",
@@ -67,6 +74,40 @@ def configuration() -> str:
             "",
         ]
     )
+
+
+def table(model: Any, nested: bool = True, advanced: bool = False) -> str:
+    """Keys of a schema: value, default, meaning; those that are advanced, or not."""
+    from rig.config.schema import resolved, rule
+
+    root = model.model_json_schema()
+    rows = ["| key | value | default | meaning |", "|---|---|---|---|"]
+
+    def add(keys: dict[str, Any], prefix: str) -> None:
+        for name, described in keys["properties"].items():
+            inner = resolved(described, root)
+            if inner.get("type") == "array" and name == "axes":
+                inner = resolved(inner["prefixItems"][0], root)
+                name = "axes.*"
+            if nested and "properties" in inner:
+                add(inner, f"{prefix}{name}.")
+                continue
+            if described.get("advanced", False) != advanced:
+                continue
+            default = "required"
+            if "default" in described or name not in keys.get("required", ()):
+                default = _text(described.get("default"))
+            cells = (rule(described, root), default, described.get("description", ""))
+            rows.append(f"| `{prefix}{name}` | " + " | ".join(cells) + " |")
+
+    add(root, "")
+    return "\n".join(rows)
+
+
+def _text(default: Any) -> str:
+    if default in (None, "") or isinstance(default, dict):
+        return "none"
+    return str(default).lower() if isinstance(default, bool) else str(default)
 
 
 def _presets() -> str:
@@ -82,11 +123,9 @@ def _presets() -> str:
         for name, _, text in settings_of(kind):
             cells = []
             for config in known.values():
-                parts = (
-                    [task.environment for task in config.tasks]
-                    if part == "environment"
-                    else [getattr(config, part)]
-                )
+                parts = [getattr(config, part, config)]  # "run" is the whole
+                if part == "environment":
+                    parts = [task.environment for task in config.tasks]
                 held = sorted({str(getattr(each, name, "")) for each in parts})
                 cells.append(", ".join(held))
             rows.append(f"| `{name}` | {text} | {' | '.join(cells)} |")

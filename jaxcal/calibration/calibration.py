@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 import importlib
 import os
 from collections.abc import Mapping
@@ -13,8 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration import file
+from jaxcal.calibration.check import Check, check, verification
 from jaxcal.calibration.discrepancy import WithDiscrepancy
 from jaxcal.calibration.inverse import Carry, limits_of, reach, solve_affine
+from jaxcal.calibration.verdict import Verdict, verdict
 from jaxcal.checks import in_words, numbers
 from jaxcal.models import (
     Affine,
@@ -383,6 +386,62 @@ class Calibration:
     def _rows(self, points: Array) -> Array:
         return points.reshape(-1, self.num_inputs)
 
+    # -- can it be trusted -------------------------------------------------------------
+
+    @functools.cached_property
+    def verdict(self) -> Verdict | None:
+        """Of an arm: does its model explain the readings, does it help, what is wrong.
+
+        Held-out errors with an interval beside those of the nominal arm, the scatter
+        against the sensor's usual noise, and by name: outliers, contacts of another
+        socket, a socket that was moved, parameters far from what was known. None for
+        other models, and where the noise is unknown.
+        """
+        return verdict(self)
+
+    def check(
+        self,
+        commands: ArrayLike,
+        measured: ArrayLike,
+        *,
+        tolerance: float | None = None,
+        placed_anew: bool = False,
+    ) -> Check:
+        """Does the calibration still hold, by a few new measurements.
+
+        A chi-square test (F where the noise was estimated) of the readings against the
+        predictions, with the uncertainty of both, at 5 % false alarms.
+
+        Args:
+            commands: (N, n).
+            measured: (N, m) readings there.
+            tolerance: how far, root mean square over the calibration's commands, the
+                outputs may drift; three times the noise when not given.
+            placed_anew: of an arm, what its sensor reads (sockets, planes, anchors)
+                stands elsewhere than at the calibration.
+
+        Returns:
+            "holds", "does not hold", or "cannot be told": a drift of one parameter by
+            more than the tolerance would be seen with less than 80 % probability.
+        """
+        return check(self, commands, measured, tolerance, placed_anew)
+
+    def verification(
+        self, candidates: ArrayLike, k: int, *, region: ArrayLike | None = None
+    ) -> NDArray[np.int64]:
+        """The k of the candidates that show best that the calibration is wrong.
+
+        Args:
+            candidates: (M, n) commands that could be measured.
+            k: two or three see what many random ones see.
+            region: (R, n) commands where it is used, which say how much a drift of a
+                parameter matters; those of the calibration when not given.
+
+        Returns:
+            (k,) indices.
+        """
+        return verification(self, candidates, k, region)
+
     # -- an arm, written back ----------------------------------------------------------
 
     @property
@@ -460,6 +519,8 @@ class Calibration:
             lines.append(f"noise std {in_words(self.noise_std)}{unit}, {source}")
             if self.dof < 0.5:
                 lines.append("no residual degree of freedom: the noise is not checked")
+        if self.verdict is not None:
+            lines += str(self.verdict).splitlines()
         if self.unidentified is not None:
             named = [
                 name

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration.discrepancy import WithDiscrepancy
+from jaxcal.calibration.sizes import group_sizes
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
 from jaxcal.checks import in_words, one_of, whole_number
 from jaxcal.models import Model, Noise, Pose, Position, Prior, SerialChain
@@ -78,7 +79,8 @@ def fit_model(
     if isinstance(model, SerialChain):
         _require_postures(model, commands[used], measured[used])
         model = model.located(commands[used], measured[used])
-    resolved = (prior or model.default_prior()).resolve(model)
+    prior = prior or model.default_prior()
+    resolved = prior.resolve(model)
     whole, extra = model, np.zeros(0)
     if discrepancy is not None:
         features = whole_number("discrepancy", discrepancy, 1)
@@ -99,6 +101,16 @@ def fit_model(
         student=loss == "student",
     )
     found = solve(task)
+    if prior.by_data:
+        if not isinstance(model, SerialChain) or extra.size or spread.any():
+            raise ValueError(
+                "Prior.sized() is of arms, without discrepancy and command_std"
+            )
+        stated = task
+        for _ in range(2):
+            factors = group_sizes(model, stated, found)
+            task = dataclasses.replace(task, precision=stated.precision / factors**2)
+            found = solve(task)
     if common_noise is None and _levels_differ(task, found):
         task = dataclasses.replace(task, per_output=True)
         found = solve(task, found)

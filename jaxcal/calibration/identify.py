@@ -11,6 +11,7 @@ import hashlib
 import json
 import platform
 import sys
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -148,7 +149,10 @@ def identify(
         discrepancy=discrepancy,
         common_noise=common_noise,
     )
-    return Calibration(**found, **about)
+    calibration = Calibration(**found, **about)
+    if calibration.verdict is not None and not calibration.verdict.good:
+        warnings.warn(str(calibration.verdict), stacklevel=2)
+    return calibration
 
 
 def _provenance(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -216,34 +216,22 @@ class _Search:
         def off(command: Array) -> Array:
             return -self.gap(command[None], np.array([i]))[0]
 
-        def solutions() -> Iterator[Array]:
-            if isinstance(self.model, Affine):  # to the last digit, limits of any size
-                slope = self.slopes(free[None])[0]
-                there = slope @ (free / self.spread) - off(free)
-                ends = (low / self.spread, high / self.spread)
-                found = optimize.lsq_linear(
-                    slope, there, ends, method="bvls", tol=1e-15
-                )
-                yield np.clip(found.x * self.spread, low, high)
-                return
-            for begin in (free, *self.nearest[i]):
-                found = optimize.least_squares(
-                    off,
-                    np.clip(begin, low, high),
-                    lambda command: self.slopes(command[None])[0] / self.spread,
-                    (low, high),
-                    x_scale=self.spread,
-                    **{key: 1e-15 for key in ("ftol", "xtol", "gtol")},
-                )
-                yield np.asarray(found.x)
-
-        nearest, least = free, np.inf
-        for command in solutions():
-            gap = off(command)
-            if self._arrived(gap[None])[0]:
-                return command
-            if gap @ gap < least:
-                nearest, least = command, float(gap @ gap)
+        nearest, least = np.clip(free, low, high), np.inf
+        # Of a square affine map there is one command: a controller holds it there.
+        unique = isinstance(self.model, Affine) and len(wanted) == len(free)
+        for begin in () if unique else (free, *self.nearest[i]):
+            found = optimize.least_squares(
+                off,
+                np.clip(begin, low, high),
+                lambda command: self.slopes(command[None])[0] / self.spread,
+                (low, high),
+                x_scale=self.spread,
+                **{key: 1e-15 for key in ("ftol", "xtol", "gtol")},
+            )
+            if self._arrived(found.fun[None])[0]:
+                return np.asarray(found.x)
+            if found.cost < least:
+                nearest, least = np.asarray(found.x), found.cost
         if clip:
             return nearest
         beyond = np.maximum(low - free, free - high) / self.spread

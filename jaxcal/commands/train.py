@@ -1,30 +1,36 @@
-"""``python train.py`` and ``jaxcal train``: parse, train, say how it goes."""
+"""``python train.py`` and ``jaxcal train``: parse, train, say how it goes.
+
+One command trains what selects postures (``--preset``) and what picks the next
+measurement of a task (``--task``); they differ in what is read from the flags.
+"""
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
-import hashlib
 import pathlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from jaxcal.arguments import refused
-from jaxcal.commands.runs import clock, names_task, stop_on_signals
-from jaxcal.commands.tables import read_table
+from jaxcal.commands.runs import clock, stop_on_signals
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder
-from jaxcal.learning.runtime import processes
+from jaxcal.learning.runtime import cache, processes
 
 if TYPE_CHECKING:
-    from jaxcal.learning.environments.task import GivenCandidates
+    from jaxcal.adaptive.policy.config import PolicyConfig
+    from jaxcal.adaptive.rules import StateRule
+    from jaxcal.adaptive.tasks.registry import Entry
     from jaxcal.learning.training.config import TrainConfig
-    from jaxcal.learning.training.loop import Report
+    from jaxcal.learning.training.run import Report
 
 __all__ = ["main"]
+
+# Columns of progress: the reward of an update, and what is measured on fixed sets.
+_POSTURES = ("reward", "ratio to exact", "optima hit")
+_TASK = ("reward", "nats", "less the rule's")
 
 
 def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
@@ -35,12 +41,9 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
         another process of the job was lost.
     """
     given = list(sys.argv[1:] if argv is None else argv)
-    if names_task(given):
-        from jaxcal.commands import train_task
-
-        return train_task.main(given, prog)
 
     def alone() -> int:  # this process may be one of several
+        cache.keep_compiled_programs()
         try:
             with needs("policy", prog):
                 from jaxcal.commands.train_arguments import parser
@@ -54,13 +57,14 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
 
 def _run(arguments: argparse.Namespace) -> int:
     """Train, say how it went; of several processes the first speaks for all."""
-    from jaxcal.learning.runtime import cache, devices
-    from jaxcal.learning.training import checkpoint, run
-    from jaxcal.selection.teacher import fixed_validation, teacher
+    from jaxcal.learning.runtime import devices
 
-    cache.keep_compiled_programs()
-    out = pathlib.Path(arguments.out or f"runs/{arguments.preset}")
-    config = devices.on_first(lambda: _configuration(arguments, out))
+    named = pathlib.Path(arguments.task or arguments.preset).stem
+    out = pathlib.Path(arguments.out or f"runs/{named}")
+    if arguments.export and not arguments.export.endswith(".npz"):
+        raise ValueError(f"--export must be a file NAME.npz, got {arguments.export}")
+    configuration = _task_configuration if arguments.task else _configuration
+    config: Any = devices.on_first(lambda: configuration(arguments, out))
     stop = stop_on_signals()
     if arguments.trainer == "brax":
         from jaxcal.learning.training import brax_ppo
@@ -68,156 +72,138 @@ def _run(arguments: argparse.Namespace) -> int:
         brax_ppo.train(config, out, lambda line: print(line, flush=True))
         done = config.ppo.num_updates
     else:
-        mesh = devices.make_mesh(arguments.devices)
-        devices.require_divisible(config.ppo.sets_per_minibatch, mesh)
-        validation = None
-        if devices.is_first():
-            _introduce(config, out, devices.describe(mesh))
-            if not arguments.no_validation:
-                validation = fixed_validation(config)
-            print(
-                "compiling the training step (about half a minute; a few seconds "
-                "where this machine has compiled it before) ...\n"
-                "   update   episodes     /s   elapsed      left   reward"
-                "   ratio to exact   optima hit",
-                flush=True,
-            )
-        state = run.train(
-            config,
-            out,
-            resume=arguments.resume,
-            validation=validation,
-            report=_show,
-            should_stop=stop,
-            num_devices=arguments.devices,
-            teacher=teacher,
-        )
-        done = int(state.num_updates)
+        train = _train_task if arguments.task else _train_postures
+        done = train(config, arguments, out, stop)
     if not devices.is_first():
         return 0
+    task = f" --task {arguments.task}" if arguments.task else ""
     if done < config.ppo.num_updates:
         print(
             f"stopped at update {done} of {config.ppo.num_updates} and saved; go on: "
-            f"python train.py --resume --out {out}"
+            f"python train.py{task} --resume --out {out}"
         )
         return 0
-    print(f"saved {out}/checkpoint; measure it: python evaluate.py --checkpoint {out}")
+    print(
+        f"saved {out}/checkpoint; measure it: python evaluate.py{task} "
+        f"--checkpoint {out}"
+    )
     if arguments.export:
-        checkpoint.export(out, arguments.export)
+        from jaxcal.adaptive.policy import run
+        from jaxcal.learning.training import checkpoint
+
+        load: Callable[..., Any] = run.load if arguments.task else checkpoint.load
+        checkpoint.export(load(out).weights, arguments.export)
         print(f"exported the policy alone to {arguments.export}")
     return 0
 
 
+def _train_postures(
+    config: TrainConfig,
+    arguments: argparse.Namespace,
+    out: pathlib.Path,
+    stop: Callable[[], bool],
+) -> int:
+    """Updates made."""
+    from jaxcal.learning.runtime import devices
+    from jaxcal.learning.training import checkpoint, postures
+    from jaxcal.selection.teacher import fixed_validation, teacher
+
+    mesh = devices.make_mesh(arguments.devices)
+    devices.require_divisible(config.ppo.rows_per_minibatch, mesh)
+    validation = None
+    if devices.is_first():
+        _introduce(config, out, devices.describe(mesh))
+        if not arguments.no_validation:
+            validation = fixed_validation(config)
+        _begin_table("episodes", _POSTURES)
+    state = postures.train(
+        config,
+        out,
+        resume=arguments.resume,
+        validation=validation,
+        report=lambda report: _show(report, postures.MEASURED),
+        should_stop=stop,
+        num_devices=arguments.devices,
+        teacher=teacher,
+    )
+    if devices.is_first():
+        _compare_seeds(out, config, postures.MEASURED, checkpoint.SCHEMA)
+    return _updates_of(state)
+
+
+def _train_task(
+    config: PolicyConfig,
+    arguments: argparse.Namespace,
+    out: pathlib.Path,
+    stop: Callable[[], bool],
+) -> int:
+    """Updates made."""
+    from jaxcal.adaptive.policy import run
+    from jaxcal.learning.runtime import devices
+
+    if devices.is_first():
+        print(f"task {config.task}, seed {config.seed}; run folder {out}")
+        print(f"configuration: {config.as_meta()}")
+        _begin_table("decisions", _TASK)
+    state = run.train(
+        config,
+        out,
+        resume=arguments.resume,
+        report=lambda report: _show(report, run.MEASURED),
+        should_stop=stop,
+        num_devices=arguments.devices,
+    )
+    if devices.is_first():
+        _compare_seeds(out, config, run.MEASURED, run.SCHEMA)
+    return _updates_of(state)
+
+
+def _updates_of(state: Any) -> int:
+    import numpy as np
+
+    return int(np.ravel(state.num_updates)[0])
+
+
+# -- what to train ---------------------------------------------------------------------
+
+
 def _configuration(arguments: argparse.Namespace, out: pathlib.Path) -> TrainConfig:
-    """What to train, from the flags or from the run to go on with."""
+    """Of postures: from the flags, or from the run to go on with."""
     from jaxcal.commands.train_arguments import values_of
+    from jaxcal.commands.train_candidates import candidates_of, trained_on
     from jaxcal.learning.training import checkpoint, presets
     from jaxcal.learning.training.config import TrainConfig
 
-    given = values_of(arguments)
-    candidates = _candidates(arguments.candidates) if arguments.candidates else None
-    steps = out / "checkpoint"
-    if not arguments.resume and steps.is_dir() and any(steps.iterdir()):
-        raise ValueError(
-            f"--out {out} already holds a run: go on with --resume, or name another"
-        )
+    given = values_of(arguments, task=False)
+    path = arguments.candidates
+    candidates = candidates_of(path) if path else None
     config = presets.load(arguments.preset)
     if arguments.trainer == "brax":
         config = _for_brax(config, arguments, given)
     if arguments.resume:
-        if given:
-            raise ValueError(
-                f"--resume takes its configuration from {out}; leave out "
-                + ", ".join("--" + name.replace("_", "-") for name in sorted(given))
-            )
-        config = TrainConfig.from_meta(checkpoint.load(out).meta)
+        _refuse_with_resume(given, out)
+        config = TrainConfig.from_meta(checkpoint.read_meta(out)[1])
         held = config.tasks[0].given
         if held != candidates:  # they are compared by their digest
             what = f"{held.name} (SHA-256 {held.sha256[:12]})" if held else "no file"
             rule = "give the same file" if held else "leave it out"
             raise ValueError(f"--candidates: the run was trained on {what}; {rule}")
-        config = _with_candidates(config, candidates)
-    elif candidates is None:
+        if candidates is not None:
+            task = dataclasses.replace(config.tasks[0], given=candidates)
+            config = dataclasses.replace(config, tasks=(task,))
+        return config
+    _refuse_to_overwrite(out)
+    if candidates is None:
         config = presets.with_values(config, given)
     else:
-        config = _trained_on(config, candidates, given)
+        config = trained_on(config, candidates, given)
+    if config.num_seeds > 1 and arguments.no_validation:
+        raise ValueError(
+            "--seeds needs the validation by which the best is known: leave "
+            "--no-validation out"
+        )
     require_writable_folder(out)
     return config
-
-
-def _with_candidates(
-    config: TrainConfig, candidates: GivenCandidates | None
-) -> TrainConfig:
-    if candidates is None:
-        return config
-    task = dataclasses.replace(config.tasks[0], given=candidates)
-    return dataclasses.replace(config, tasks=(task,))
-
-
-def _candidates(path: str) -> GivenCandidates:
-    """The user's own candidates, each axis mapped to [0, 1] over the whole file.
-
-    The best postures do not depend on the unit; float32 and the paper's network do.
-    """
-    from jaxcal.evaluation.dataset_files import load_dataset
-    from jaxcal.learning.environments.task import GivenCandidates
-
-    if _holds_sets(path):
-        dataset = load_dataset(path)
-        values, available = dataset.candidates, dataset.available
-    else:
-        table = read_table(path)
-        values, mask = table.columns(table.inputs(None))[None], table.available()
-        available = None if mask is None else mask[None]
-    used = values if available is None else values[available]
-    used = used.reshape(-1, used.shape[-1])
-    low, high = used.min(axis=0), used.max(axis=0)
-    for axis in np.flatnonzero(~(low < high)):  # also where a cell is empty
-        raise ValueError(
-            f"{path}: every column must hold numbers that differ, got {low[axis]:g} to "
-            f"{high[axis]:g} in input {axis + 1}: leave it out"
-        )
-    return GivenCandidates(
-        name=pathlib.Path(path).name,
-        sha256=hashlib.sha256(pathlib.Path(path).read_bytes()).hexdigest(),
-        values=((values - low) / (high - low)).astype(np.float32),
-        available=available,
-    )
-
-
-def _holds_sets(path: str) -> bool:
-    """Whether a file holds episodes of candidates, in the format of datasets."""
-    if path.lower().endswith(".npz"):
-        with np.load(path, allow_pickle=False) as archive:
-            return "candidates" in archive and archive["candidates"].ndim == 3
-    with open(path, encoding="utf-8-sig", errors="replace") as file:
-        return "episode" in [cell.strip() for cell in file.readline().split(",")]
-
-
-def _trained_on(
-    config: TrainConfig, candidates: GivenCandidates, given: dict[str, Any]
-) -> TrainConfig:
-    """A preset of one task, on the user's candidates."""
-    from jaxcal.learning.training import presets
-
-    assert candidates.values is not None  # it was just read
-    num_sets, m, n = candidates.values.shape
-    if len(config.tasks) > 1:
-        raise ValueError(
-            f"--candidates goes with a preset of one task, such as compact; "
-            f"{config.preset} has {len(config.tasks)}"
-        )
-    sizes = {"num_inputs": n, "num_outputs": n, "num_selected": n + 1}
-    fixed = {"num_inputs": n} | ({"num_candidates": m} if num_sets > 1 else {})
-    for name, value in fixed.items():
-        if given.get(name, value) != value:
-            raise ValueError(
-                f"--{name.replace('_', '-')} must be {value}, as in "
-                f"{candidates.name}, got {given[name]}: leave it out"
-            )
-    config = presets.with_values(config, sizes | fixed | given)
-    candidates.source(config.tasks[0].environment)  # refuses a pool that is too small
-    return _with_candidates(config, candidates)
 
 
 def _for_brax(
@@ -226,11 +212,14 @@ def _for_brax(
     """A preset as brax trains it; what brax does not read is refused."""
     import jax
 
+    from jaxcal.commands.train_arguments import flag_of
+
     with needs("study", "--trainer brax"):
         from jaxcal.learning.training import brax_ppo
 
-    if arguments.resume:
-        raise ValueError("--resume works with --trainer jaxcal only")
+    for name in ("resume", "num_seeds"):
+        if getattr(arguments, name):
+            raise ValueError(f"{flag_of(name)} works with --trainer jaxcal only")
     if jax.process_count() > 1:
         raise ValueError("--trainer brax works in a single process only")
     if len(config.tasks) > 1:
@@ -243,37 +232,143 @@ def _for_brax(
     return brax_ppo.adapted(config)
 
 
+def _task_configuration(
+    arguments: argparse.Namespace, out: pathlib.Path
+) -> PolicyConfig:
+    """Of a task: from the flags, or from the run to go on with."""
+    from jaxcal.adaptive.policy import run
+    from jaxcal.adaptive.policy.config import PolicyConfig
+    from jaxcal.adaptive.tasks import registry
+    from jaxcal.commands.train_arguments import TASK_PARTS, values_of
+    from jaxcal.learning.settings import settings_of
+    from jaxcal.learning.training import checkpoint
+
+    entry = registry.load(arguments.task)
+    given = values_of(arguments, task=True)
+    if arguments.resume:
+        more = {"with": arguments.options} if arguments.options else {}
+        _refuse_with_resume(given | more, out)
+        _, meta = checkpoint.read_meta(out, run.SCHEMA)
+        config = PolicyConfig.from_meta(meta)
+        if config.task != arguments.task:
+            raise ValueError(f"--task must be {config.task}, that of {out}")
+        return config
+    _refuse_to_overwrite(out)
+    options = entry.train_on
+    if arguments.options:
+        options = (registry.options_from(entry, arguments.options),)
+    ppo, own = (
+        {
+            f.name: given[f.name]
+            for f in settings_of(TASK_PARTS[part])
+            if f.name in given
+        }
+        for part in ("ppo", "policy")
+    )
+    require_writable_folder(out)
+    base = entry.rules.get("state") or _tuned(entry, options[0])
+    config = PolicyConfig(task=arguments.task, base=base, options=options, **own)
+    return dataclasses.replace(config, ppo=dataclasses.replace(config.ppo, **ppo))
+
+
+def _tuned(entry: Entry, options: Mapping[str, Any]) -> StateRule:
+    """The base rule of a task that ships none: tuned before the training."""
+    from jaxcal.adaptive.rules import StateRule
+    from jaxcal.adaptive.tuning import tune
+
+    print("tuning the rule that the policy begins as ...", flush=True)
+    return tune(entry.make(**options), StateRule(), episodes=1024, seed=1)
+
+
+def _refuse_with_resume(given: Mapping[str, Any], out: pathlib.Path) -> None:
+    from jaxcal.commands.train_arguments import flag_of
+
+    if given:
+        raise ValueError(
+            f"--resume takes its configuration from {out}; leave out "
+            + ", ".join(sorted(map(flag_of, given)))
+        )
+
+
+def _refuse_to_overwrite(out: pathlib.Path) -> None:
+    steps = out / "checkpoint"
+    if steps.is_dir() and any(steps.iterdir()):
+        raise ValueError(
+            f"--out {out} already holds a run: go on with --resume, or name another"
+        )
+
+
+# -- what is said ----------------------------------------------------------------------
+
+
 def _introduce(config: TrainConfig, out: pathlib.Path, devices: str) -> None:
     """What will be trained, in one line and in every number."""
     import jax
 
-    from jaxcal.learning.policies.build import build
-    from jaxcal.learning.training import optimiser
-
-    network, task = build(config.network), config.tasks[0]
-    shapes = jax.eval_shape(lambda: optimiser.init(config.ppo, task, network))
-    size = sum(leaf.size for leaf in jax.tree.leaves(shapes.params))
+    shapes = jax.eval_shape(config.learners[0].init, jax.random.key(0))
+    size = sum(leaf.size for leaf in jax.tree.leaves(shapes))
+    task, seed = config.tasks[0], f"seed {config.seed}"
+    if config.num_seeds > 1:
+        seed = f"seeds {config.seed} to {config.seed + config.num_seeds - 1}"
     env = task.environment
     print(
         f"preset {config.preset}: {config.network.kind} network, {size:,} parameters; "
         f"choose {env.num_selected} of {env.num_candidates}"
         + (f" from {task.given.name}" if task.given else "")
-        + f"; {config.ppo.num_episodes:,} episodes, seed {config.ppo.seed}, "
+        + f"; {config.ppo.num_episodes:,} episodes, {seed}, "
         f"on {devices}; run folder {out}"
     )
     print(f"configuration: {config.as_meta()}")
 
 
-def _show(report: Report) -> None:
-    """One line of progress."""
-    metrics = report.metrics
-    ratio, hits = metrics.get("ratio_to_exact"), metrics.get("hit_rate")
-    reward = metrics.get("reward_mean")
+def _begin_table(unit: str, columns: tuple[str, str, str]) -> None:
+    reward, first, second = columns
     print(
-        f"{report.update:9,d} {report.episodes:10,d} "
-        f"{report.episodes_per_second:6,.0f} "
-        f"{clock(report.seconds):>9} {clock(report.eta):>9} "
-        + (f"{reward:8.4f} " if reward is not None else " imitate ")
-        + (f"{ratio:16.4f} {hits:12.3f}" if ratio is not None else ""),
+        "compiling the training step (about half a minute; a few seconds where this "
+        "machine has compiled it before) ...\n"
+        f"   update {unit:>10}     /s   elapsed      left {reward:>8} {first:>16} "
+        f"{second:>16}",
         flush=True,
     )
+
+
+def _show(report: Report, measured: tuple[str, ...]) -> None:
+    """One line of progress; of several seeds the mean and the standard deviation."""
+    metrics, reward = report.metrics, report.metrics.get("reward_mean")
+    cells = []
+    for name in measured:
+        if name in metrics:
+            spread = report.spread[name]
+            cell = f"{metrics[name]:.4f}" + (f" +- {spread:.4f}" if spread else "")
+            cells.append(f"{cell:>16}")
+    print(
+        f"{report.update:9,d} {report.played:10,d} {report.per_second:6,.0f} "
+        f"{clock(report.seconds):>9} {clock(report.eta):>9} "
+        + (f"{reward:8.4f} " if reward is not None else " imitate ")
+        + " ".join(cells),
+        flush=True,
+    )
+
+
+def _compare_seeds(
+    out: pathlib.Path, config: Any, measured: tuple[str, ...], schema: str
+) -> None:
+    """What every seed reached, where they were several."""
+    import numpy as np
+
+    from jaxcal.learning.training import checkpoint
+
+    if config.num_seeds == 1:
+        return
+    progress = checkpoint.read_meta(out, schema)[1]["progress"]
+    values = np.array([[each[name] for name in measured] for each in progress["seeds"]])
+    if not len(values):
+        return
+    print("     seed " + " ".join(f"{name:>16}" for name in measured))
+    for number, row in enumerate(values):
+        best = "  best" if number == progress["best"] else ""
+        print(
+            f"{config.seed + number:9d} " + " ".join(f"{x:16.4f}" for x in row) + best
+        )
+    for name, row in (("mean", values.mean(0)), ("spread", values.std(0, ddof=1))):
+        print(f"{name:>9} " + " ".join(f"{x:16.4f}" for x in row))

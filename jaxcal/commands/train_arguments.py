@@ -1,4 +1,4 @@
-"""The flags of ``train``, made from the fields of a configuration, and its help."""
+"""The flags of ``train``, made from the fields of configurations, and its help."""
 
 from __future__ import annotations
 
@@ -6,17 +6,25 @@ import argparse
 import textwrap
 from typing import Any
 
-from jaxcal.arguments import Parser
+from jaxcal.adaptive.policy.config import PPO, PolicyConfig
+from jaxcal.adaptive.tasks import registry
+from jaxcal.arguments import Parser, at_least
+from jaxcal.learning.core.ppo import PPOConfig
+from jaxcal.learning.core.streams import StreamsConfig
 from jaxcal.learning.runtime import processes
-from jaxcal.learning.settings import settings_of
+from jaxcal.learning.settings import Setting, settings_of
 from jaxcal.learning.training import presets
 from jaxcal.learning.training.config import TrainConfig
 
-__all__ = ["parser", "values_of"]
+__all__ = ["TASK_PARTS", "flag_of", "parser", "values_of"]
 
 _EPILOG = """\
-presets:
+presets, of postures:
 {presets}
+
+tasks, of sequential measurement:
+{tasks}
+  FILE.py   your own: a file that defines ENTRY (docs/adaptive.md)
 
 what to try first:
   {program}                        the compact policy, a few minutes on a laptop
@@ -27,10 +35,11 @@ what to try first:
   most where more than n + 1 postures are chosen. Other numbers rarely need a change.
 
 more examples:
-  {program} --task knee            another kind: the next measurement from the last;
-                                   {program} --task knee --help
+  {program} --task knee            the next measurement from what the last answered
+  {program} --task knee --with cells=16 sigma=0.05
+  {program} --seeds 8              eight runs side by side: mean, spread and the best
   {program} --resume --out runs/compact      go on where a run stopped
-  {program} --preset general --export checkpoints/default   what ships
+  {program} --preset general --export checkpoints/default.npz   what ships
   {program} --trainer brax --episodes 50000  the same task, brax's own PPO
   srun {program}                             all tasks of a SLURM job step
   {program} --coordinator host0:4711 --num-processes 2 --process-id 0   and 1
@@ -40,13 +49,14 @@ A run folder holds metrics.csv, TensorBoard events and checkpoint/; measure it w
 Ctrl-C saves and stops; --resume then continues bit for bit (on the same CPU).
 All devices of all processes share each update: docs/scaling.md."""
 
-_ABOVE = ("num_episodes", "seed")  # flags above the groups
+TASK_PARTS: dict[str, type] = {"ppo": StreamsConfig, "policy": PolicyConfig}
+_ABOVE = ("num_episodes", "num_updates", "seed", "num_seeds")  # flags above the groups
+_NAMES = {"num_episodes": "episodes", "num_updates": "updates", "num_seeds": "seeds"}
 
-_TITLES = {
-    "ppo": ("optimisation", "in brackets the value of compact, and of others"),
-    "network": ("network", "--kind paper reads --width alone"),
-    "environment": ("environment", "what an episode is; of presets of one task"),
-}
+
+def flag_of(name: str) -> str:
+    """The flag that sets a field."""
+    return "--" + _NAMES.get(name, name).replace("_", "-")
 
 
 def parser(prog: str) -> Parser:
@@ -55,18 +65,26 @@ def parser(prog: str) -> Parser:
     known = {name: presets.load(name) for name in presets.names()}
     out = Parser(
         prog=prog,
-        usage="%(prog)s [--preset NAME] [--episodes N] [--out DIR] [flags below]",
-        description="Train a policy that selects postures, and save it with all it "
-        "needs.",
-        epilog=_EPILOG.format(program=program, presets=_abouts(known)),
+        usage="%(prog)s [--preset NAME | --task NAME] [--out DIR] [flags below]",
+        description="Train a policy, and save it with all it needs: one that selects "
+        "postures, or with --task one that picks the next measurement.",
+        epilog=_EPILOG.format(program=program, presets=_abouts(known), tasks=_tasks()),
     )
     add = out.add_argument
-    preset = "see below [compact]"
+    preset = "of postures, see below [compact]"
     add("--preset", choices=sorted(known), default="compact", help=preset)
+    add("--task", metavar="NAME", help="of sequential measurement, see below")
+    add("--with", dest="options", nargs="+", default=[], metavar="OPTION=VALUE",
+        help="options of the task")  # fmt: skip
     budget = "training budget" + _held("num_episodes", known)
     add("--episodes", type=int, metavar="N", dest="num_episodes", help=budget)
+    updates = f"of {PPO.decisions_per_update:,} decisions each [{PPO.num_updates}]"
+    add("--updates", type=at_least(1), metavar="N", dest="num_updates",
+        help="training budget of a task: updates " + updates)  # fmt: skip
     add("--seed", type=int, metavar="S", help="of everything random [0]")
-    add("--out", metavar="DIR", help="run folder [runs/PRESET]")
+    seeds = "runs side by side in one program: seeds S, S + 1, ... [1]"
+    add("--seeds", type=at_least(1), metavar="N", dest="num_seeds", help=seeds)
+    add("--out", metavar="DIR", help="run folder [runs/PRESET or runs/TASK]")
     add("--resume", action="store_true", help="go on from the run folder's checkpoint")
     own = (
         "train on your own postures, .csv or .npz: one table is a pool that every "
@@ -75,31 +93,77 @@ def parser(prog: str) -> Parser:
     add("--candidates", metavar="FILE", help=own)
     trainer = "jaxcal's own PPO, or brax's on the same environment [jaxcal]"
     add("--trainer", choices=("jaxcal", "brax"), default="jaxcal", help=trainer)
-    add("--export", metavar="DIR", help="write the finished policy alone to DIR")
+    export = "write the finished policy alone to one file, NAME.npz"
+    add("--export", metavar="FILE", help=export)
     gap = "do not measure the gap to the proven optimum while training"
     add("--no-validation", action="store_true", help=gap)
     add("--devices", type=int, metavar="N", help="devices of each process [all]")
     processes.add_arguments(out)
-    for part, (title, description) in _TITLES.items():
+    common = {field.name for field in settings_of(PPOConfig)} | {"width"}
+    parts = presets.PARTS
+    groups: tuple[tuple[str, str, list[Setting]], ...] = (
+        (
+            "optimisation and size",
+            "in brackets the value of compact, and of others that differ",
+            [f for kind in (PPOConfig, parts["network"]) for f in settings_of(kind)
+             if f.name in common],
+        ),
+        (
+            "postures",
+            "what an episode is, in presets of one task; --kind paper reads --width "
+            "alone of the network",
+            [f for part in ("ppo", "environment", "network")
+             for f in settings_of(parts[part]) if f.name not in common],
+        ),
+        (
+            "tasks",
+            "with --task",
+            [f for part in TASK_PARTS.values() for f in settings_of(part)
+             if f.name not in common],
+        ),
+    )  # fmt: skip
+    for title, description, fields in groups:
         group = out.add_argument_group(title, description)
-        for field in settings_of(presets.PARTS[part]):
+        for field in fields:
             if field.name in _ABOVE:
                 continue
-            flag = "--" + field.name.replace("_", "-")
             line = (field.help + _held(field.name, known)).replace("%", "%%")
             if field.kind is bool:
                 yes_no = argparse.BooleanOptionalAction
-                group.add_argument(flag, action=yes_no, help=line)
+                group.add_argument(flag_of(field.name), action=yes_no, help=line)
             else:
                 metavar = {int: "N", float: "X", str: "NAME"}[field.kind]
-                group.add_argument(flag, type=field.kind, metavar=metavar, help=line)
+                group.add_argument(
+                    flag_of(field.name), type=field.kind, metavar=metavar, help=line
+                )
     return out
 
 
-def values_of(arguments: argparse.Namespace) -> dict[str, Any]:
-    """The fields of a configuration that were given: name to value."""
-    given = {name: getattr(arguments, name) for name in presets.field_names()}
-    return {name: value for name, value in given.items() if value is not None}
+def values_of(arguments: argparse.Namespace, task: bool) -> dict[str, Any]:
+    """The fields of a configuration that were given: name to value.
+
+    Raises:
+        ValueError: a flag is given that a task, or a preset, does not read.
+    """
+    own = {f.name for part in TASK_PARTS.values() for f in settings_of(part)}
+    other = presets.field_names()
+    read = own if task else other
+    given = {
+        name: value
+        for name in own | other
+        if (value := getattr(arguments, name)) is not None
+    }
+    unread = {flag_of(name) for name in set(given) - read}
+    if task:
+        unread |= {"--candidates"} if arguments.candidates else set()
+        unread |= {"--trainer"} if arguments.trainer != "jaxcal" else set()
+        unread |= {"--no-validation"} if arguments.no_validation else set()
+    elif arguments.options:
+        unread.add("--with")
+    if unread:
+        who = f"--task {arguments.task}" if task else f"preset {arguments.preset}"
+        raise ValueError(f"{who} does not read {', '.join(sorted(unread))}: leave out")
+    return given
 
 
 def _abouts(known: dict[str, TrainConfig]) -> str:
@@ -110,15 +174,27 @@ def _abouts(known: dict[str, TrainConfig]) -> str:
     return "\n".join(lines)
 
 
+def _tasks() -> str:
+    return "\n".join(
+        f"  {name:9} {registry.load(name).about}" for name in registry.names()
+    )
+
+
 def _held(name: str, known: dict[str, TrainConfig]) -> str:
-    """The value of compact, and of presets that differ: ``" [2; paper 10]"``."""
-    values = {}
+    """The value of compact, and of what differs: ``" [2; paper 10; tasks 4]"``."""
+    values: dict[str, str] = {}
     for preset, config in known.items():
         for part in (config.ppo, config.network, config.tasks[0].environment):
             if hasattr(part, name):
                 values[preset] = _shown(getattr(part, name))
-    others = [f"{p} {v}" for p, v in values.items() if v != values["compact"]]
-    return " [" + "; ".join([values["compact"], *others]) + "]"
+    sizes = {f.name: f.default for f in PolicyConfig.__dataclass_fields__.values()}
+    if hasattr(PPO, name):
+        values["tasks"] = _shown(getattr(PPO, name))
+    elif name in ("width", "per_group"):
+        values["tasks"] = _shown(sizes[name])
+    first = values.pop("compact", None) or values.pop("tasks")
+    others = [f"{p} {v}" for p, v in values.items() if v != first]
+    return " [" + "; ".join([first, *others]) + "]"
 
 
 def _shown(value: Any) -> str:

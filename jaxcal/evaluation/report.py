@@ -11,7 +11,14 @@ from jaxcal.evaluation.results import Evaluation, Summary, versions
 from jaxcal.files import atomic_write
 from jaxcal.pages import Block, Code, Figure, Page, Section, Table, Text, render
 
-__all__ = ["file_prefixes", "json_document", "notes", "text_table", "write_report"]
+__all__ = [
+    "aligned",
+    "file_prefixes",
+    "json_document",
+    "notes",
+    "text_table",
+    "write_report",
+]
 
 _COLUMNS = (
     *("method", "mean det S", "median det S", "det S/det S*", "hit rate"),
@@ -28,16 +35,21 @@ _ABOUT = (
 
 def text_table(shown: Summary, *, many: bool = False) -> str:
     """One dataset as a table; where there are ``many``, a policy's checkpoint too."""
-    rows = [_COLUMNS, *_rows(shown, many)]
+    lines = aligned([_COLUMNS, *_rows(shown, many)])
+    return "\n  ".join([_heading(shown), *lines, *notes(shown)])
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a table, its head first: names to the left, all else to the right."""
+    head, *body = rows
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    rows.insert(1, tuple("-" * width for width in widths))
     lines = []
-    for name, *cells in rows:
+    for name, *cells in (head, ["-" * width for width in widths], *body):
         pairs = zip(cells, widths[1:], strict=True)
         lines.append(
             "  ".join([name.ljust(widths[0]), *(c.rjust(w) for c, w in pairs)])
         )
-    return "\n  ".join([_heading(shown), *lines, *notes(shown)])
+    return lines
 
 
 def notes(shown: Summary) -> list[str]:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.evaluation.report import aligned
 from jaxcal.evaluation.results import versions
 from jaxcal.evaluation.sequential import METHODS, Result
 from jaxcal.files import atomic_write
@@ -28,16 +29,7 @@ _ABOUT = (
 
 def text_table(result: Result) -> str:
     """The table in the terminal."""
-    rows = _rows(result)
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    rows.insert(1, tuple("-" * width for width in widths))
-    lines = []
-    for name, *cells in rows:
-        pairs = zip(cells, widths[1:], strict=True)
-        lines.append(
-            "  ".join([name.ljust(widths[0]), *(c.rjust(w) for c, w in pairs)])
-        )
-    return "\n  ".join([_heading(result), *lines])
+    return "\n  ".join([_heading(result), *aligned(_rows(result))])
 
 
 def _rows(result: Result) -> list[tuple[str, ...]]:

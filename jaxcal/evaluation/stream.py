@@ -139,8 +139,7 @@ def evaluate_stream(
     own = [cut for cut in own if not _path(folder, cut).exists()]
     todo, done = sum(end - begin for begin, end in own), 0
     progress("episodes", 0, todo)
-    cores = len(os.sched_getaffinity(0)) if workers is None else workers
-    with _workers(cores) as run:
+    with _workers(_cores() if workers is None else workers) as run:
         written = run(functools.partial(_write_part, plan, folder), own)
         for (begin, end), _ in zip(own, written, strict=True):
             done += end - begin
@@ -251,6 +250,13 @@ def _read_part(path: pathlib.Path, cut: Cut) -> dict[str, Any]:
         raise ValueError(
             f"{path} is damaged ({error}); delete it, and it is computed again"
         ) from None
+
+
+def _cores() -> int:
+    """Cores that this process may use; macOS does not say which."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 @contextlib.contextmanager

@@ -47,11 +47,14 @@ class Prior:
             from name to number. ``inf`` and names that are left out: nothing is known.
         mean: likewise; the model's nominal value where it is left out.
         fixed: names of parameters held at the mean, out of the identification.
+        by_data: of an arm, the sizes of its lengths' and its angles' errors are taken
+            from the readings; see :meth:`sized`.
     """
 
     std: Named
     mean: Named | None = None
     fixed: Sequence[str] = ()
+    by_data: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.fixed, str):
@@ -67,6 +70,15 @@ class Prior:
                 "std of the prior must be positive (inf: nothing is known; "
                 f"fixed=[name] holds a parameter), got {in_words(std[~(std > 0.0)])}"
             )
+
+    def sized(self) -> Prior:
+        """This prior with the scale of its groups taken from the readings.
+
+        Its standard deviations then say how errors of lengths compare with each other,
+        and those of angles, not how large they are: two factors follow from the
+        readings by marginal likelihood. For an arm whose tolerances are not known.
+        """
+        return dataclasses.replace(self, by_data=True)
 
     def resolve(self, model: Parametric) -> ResolvedPrior:
         """The prior of ``model``'s parameters, checked against its names."""

@@ -8,8 +8,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from jaxcal.learning.core.network import mask_logits
 from jaxcal.learning.environments.observation import context_features
-from jaxcal.learning.policies.networks import NetworkConfig, mask_logits
+from jaxcal.learning.policies.networks import NetworkConfig
 
 __all__ = ["HEADS", "PaperNetwork"]
 

@@ -7,8 +7,9 @@ schedule are the usual ones for a network of this size.
 
 from __future__ import annotations
 
+from jaxcal.learning.core.postures import EpisodesConfig
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.training.config import PPOConfig, TrainConfig
+from jaxcal.learning.training.config import TrainConfig
 
 __all__ = ["PAPER"]
 
@@ -16,9 +17,10 @@ PAPER = TrainConfig(
     preset="paper",
     about="the paper's network (3.5 million weights) and schedule; hours on a CPU",
     network=NetworkConfig(kind="paper", width=768),
-    ppo=PPOConfig(
+    ppo=EpisodesConfig(
         num_episodes=200_000,
         episodes_per_update=16,
+        slice_rows=16,
         episodes_per_set=1,
         num_epochs=10,
         num_minibatches=1,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from jaxcal.learning.training.config import TrainConfig
-from jaxcal.learning.training.run import Validation
+from jaxcal.learning.training.postures import Validation
 
 __all__ = ["fixed_validation", "teacher"]
 

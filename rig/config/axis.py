@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
 
 from rig.config.maps import RegisterMap, load_map
 from rig.config.registers import encode
-from rig.config.schema import Section, key
+from rig.config.schema import Section, advanced, key
 
 AXIS_NAMES = ("pitch", "yaw", "roll")  # the order of every (3,) in this package
 DEFAULT_ROTATES = {"pitch": "X", "yaw": "Z", "roll": "Y"}
@@ -72,15 +72,15 @@ class Axis(Scale):
     ] = key("register map: a name, or a .toml file relative to this one")
     min_deg: float = key("soft limit", ..., -180, 180)
     max_deg: float = key("soft limit", ..., -180, 180)
-    min_pulses: int = key(
+    min_pulses: int = advanced(
         "soft limit", "of the limits", LOWEST, HIGHEST, by=_limit(min)
     )
-    max_pulses: int = key(
+    max_pulses: int = advanced(
         "soft limit", "of the limits", LOWEST, HIGHEST, by=_limit(max)
     )
     speed_deg_s: float = key("of every move", ..., 1e-3, 5000)
     accel_deg_s2: float = key("of every move, also to brake", ..., 1e-3, 1e5)
-    comm_timeout_s: float | None = key(
+    comm_timeout_s: float | None = advanced(
         "the drive stops itself when the line is silent for so long",
         "of [bus], where the map has it", 0.01, 60, by=lambda made: None,
     )  # fmt: skip

@@ -28,12 +28,6 @@ POLLS, HICCUP_S = 4, 0.5  # of the motion loop's heartbeat
 PHONE = (
     "format", "columns", "quaternion_columns", "unit", "order", "signs", "mounting_deg"
 )  # fmt: skip
-# Left out of ``fingerprint``: addresses, and what version 1 did not know. A key added
-# here leaves the fingerprints of older files as they are.
-UNCOUNTED = {
-    "imu": ("host", "port", "transport", "allow", "stale_s", "heading"),
-    "session": ("drift_limit_deg",),
-}
 # Where bus and phone are reached, and when a session gives up or says that it is good,
 # may change between a run and its resumption.
 UNMEASURED = {
@@ -192,7 +186,7 @@ class RigConfig(Section):
         return np.asarray(pulses, dtype=np.float64) / scales
 
     def described(self) -> dict[str, Any]:
-        """Everything as JSON values, in the layout of run folders of version 1."""
+        """Everything as JSON values, as the journal keeps it."""
         data = self.model_dump(exclude={"mechanism", "output", "axes", "device"})
         imu, session = data["imu"], data["session"]
         imu["quaternion"] = imu.pop("quaternion_columns")
@@ -212,9 +206,8 @@ class RigConfig(Section):
         return {**data, "axes": axes, "mechanism_order": self.mechanism.order}
 
     def fingerprint(self) -> str:
-        """SHA-256 of what a measurement depends on, as version 1 took it."""
-        data = _without(self.described(), UNCOUNTED)
-        data["motion"]["heartbeat_s"] = self.motion.heartbeat_s or 3.0  # default then
+        """SHA-256 of what a measurement depends on."""
+        data = _without(self.described(), UNMEASURED)
         text = json.dumps(data, sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()
 

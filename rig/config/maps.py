@@ -25,11 +25,6 @@ from rig.config.registers import (
 )
 from rig.config.schema import Section, key, parse, read_text
 
-LATER_KEYS = (
-    "pulses_per_rev", "target", "home", "homed", "absolute_encoder", "ready_s",
-    "set_zero", "recognise",
-    "broadcast_stop",
-)  # fmt: skip
 MAP_FOLDER = pathlib.Path(__file__).parent.parent / "maps"
 
 
@@ -91,13 +86,8 @@ class RegisterMap(Section):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the parsed file, for the run's fingerprint.
-
-        Keys that change no move and came after version 1 are left out: run folders
-        of version 1 can still be resumed.
-        """
+        """SHA-256 of the parsed file."""
         known = tomllib.loads(self.text)
-        known = {name: known[name] for name in known if name not in LATER_KEYS}
         data = json.dumps(known, sort_keys=True, default=str)
         return hashlib.sha256(data.encode()).hexdigest()
 

@@ -1,8 +1,8 @@
 """The base of every table read from a file, and its faults in words.
 
 A key is described once, by its field: type, default, bounds and meaning; its unit ends
-its name. That one description checks the value, words the fault, and fills the tables
-of docs/rig.md. Modules of tables leave out ``from __future__ import annotations``:
+its name. That one description checks the value, words the fault, and fills the
+reference. Modules of tables leave out ``from __future__ import annotations``:
 pydantic would compile every annotation again at each start.
 """
 
@@ -57,6 +57,7 @@ def key(
     high: float | None = None,
     *,
     by: Any = None,
+    advanced: bool = False,
     **more: Any,
 ) -> Any:
     """A key of a file: what it means, its default (``...``: required) and bounds.
@@ -64,11 +65,19 @@ def key(
     ``by`` makes the default from the keys before it; ``default`` then says in words
     what that comes to.
     """
+    extra: dict[str, Any] = {"advanced": True} if advanced else {}
     if by is not None:
-        more |= {"default_factory": by, "json_schema_extra": {"default": default}}
+        more["default_factory"] = by
+        extra["default"] = default
     else:
         more["default"] = default
+    more["json_schema_extra"] = extra or None
     return Field(description=about, ge=low, le=high, **more)
+
+
+def advanced(*args: Any, **more: Any) -> Any:
+    """A ``key`` that hardly any device needs; only the reference lists it."""
+    return key(*args, advanced=True, **more)
 
 
 class ConfigError(ValueError):

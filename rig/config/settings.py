@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from rig.config.schema import Section, key
+from rig.config.schema import Section, advanced, key
 
 Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
 Sign = Literal[1, -1]
@@ -32,7 +32,7 @@ class BusSettings(Section):
     stopbits: int = key("of an rtu bus", 1, 1, 2)
     bytesize: int = key("of an rtu bus", 8, 7, 8)
     timeout_s: float = key("for one reply", 0.3, 0.01, 5)
-    read_retries: int = key(
+    read_retries: int = advanced(
         "of reads, and of a move that the drive has not taken", 2, 0, 10
     )
 
@@ -78,14 +78,14 @@ class ImuSettings(Section):
     quaternion_columns: tuple[Column, Column, Column, Column] | None = key(
         "of x, y, z, w, in place of angles", None
     )
-    stamp_column: int = key(
+    stamp_column: int = advanced(
         "of the phone's clock in ms; -1: none", "-1; hyperimu: 0", -1, 200,
         by=_by_format(0, -1),
     )  # fmt: skip
-    column_count: int = key(
+    column_count: int = advanced(
         "a line of another width is refused; 0: as the first line", 0, 0, 200
     )
-    separator: str = key("between columns", ",")
+    separator: str = advanced("between columns", ",")
     unit: Literal["deg", "rad"] = key("of the angles", "deg")
     order: Order | None = key(
         "sequence of the phone's Euler angles", "ZYX; lines of angles: required",
@@ -102,12 +102,12 @@ class ImuSettings(Section):
     allow: tuple[str, ...] = key(
         "addresses that may send; none: the first phone that does", ()
     )
-    heading: Literal["relative", "absolute"] = key(
+    heading: Literal["relative", "absolute"] = advanced(
         "absolute: the phone comes back to the same heading whenever it is started",
         "relative",
     )
     stale_s: float = key("older than this while moving: stop", 0.4, 0.02, 10)
-    max_jump_deg: float = key("between two readings", 20.0, 0.1, 180)
+    max_jump_deg: float = advanced("between two readings", 20.0, 0.1, 180)
 
     def broken_rules(self) -> Iterator[str]:
         for address in self.allow:
@@ -144,33 +144,39 @@ class MotionSettings(Section):
     approach_overshoot_deg: float = key(
         "> 0: come to every posture from below; play becomes pure bias", 0.0, 0, 20
     )
-    position_tolerance_deg: float = key(
+    position_tolerance_deg: float = advanced(
         "a drive this close is on its target", 0.05, 1e-4, 5
     )
-    poll_s: float = key("between two looks at drives and IMU", 0.05, 0.001, 0.1)
-    deadline_factor: float = key("a move may take its computed time times", 2.0, 1, 20)
-    deadline_slack_s: float = key("plus", 2.0, 0.05, 60)
-    stall_s: float = key("standing so long off its target is a fault", 1.0, 0.05, 30)
-    following_deg: float = key("a drive may leave its way by", 3.0, 0.01, 45)
-    envelope_margin_deg: float = key("the IMU may read past limits by", 15.0, 0.1, 90)
-    max_disagreement_deg: float = key(
+    poll_s: float = advanced("between two looks at drives and IMU", 0.05, 0.001, 0.1)
+    deadline_factor: float = advanced(
+        "a move may take its computed time times", 2.0, 1, 20
+    )
+    deadline_slack_s: float = advanced("plus", 2.0, 0.05, 60)
+    stall_s: float = advanced(
+        "standing so long off its target is a fault", 1.0, 0.05, 30
+    )
+    following_deg: float = advanced("a drive may leave its way by", 3.0, 0.01, 45)
+    envelope_margin_deg: float = advanced(
+        "the IMU may read past limits by", 15.0, 0.1, 90
+    )
+    max_disagreement_deg: float = advanced(
         "between IMU and command at a posture", 45.0, 0.1, 180
     )
-    heartbeat_s: float | None = key(
+    heartbeat_s: float | None = advanced(
         "a motion loop silent for so long: stop; at most the shortest step",
         "of [bus] and poll_s", 0.1, 60, by=lambda made: None,
     )  # fmt: skip
-    mirror_limits: bool = key("write the soft limits to the drives too", False)
+    mirror_limits: bool = advanced("write the soft limits to the drives too", False)
 
 
 class SettleSettings(Section):
     """When a posture counts as settled, and how long it is measured."""
 
     window_s: float = key("time over which the IMU must be quiet", 0.5, 0.01, 60)
-    min_samples: int = key("readings in the window, at least", 10, 3, 10_000)
+    min_samples: int = advanced("readings in the window, at least", 10, 3, 10_000)
     std_deg: float = key("largest deviation over the window", 0.1, 1e-6, 10)
     slope_deg_s: float = key("largest slope over the window", 0.2, 1e-6, 100)
-    timeout_s: float = key("to settle", 10.0, 0.05, 600)
+    timeout_s: float = advanced("to settle", 10.0, 0.05, 600)
     samples: int = key("readings averaged for one measurement", 25, 1, 10_000)
 
     def broken_rules(self) -> Iterator[str]:
@@ -186,8 +192,8 @@ class SessionSettings(Section):
     method: Literal["policy", "auto", "exact", "exchange", "greedy", "random"] = key(
         "how they are chosen", "policy"
     )
-    min_efficiency: float = key("under this D-efficiency exact is used", 0.9, 0, 1)
-    seed: int = key("of the candidates drawn", 0, 0, 2**31 - 1)
+    min_efficiency: float = advanced("under this D-efficiency exact is used", 0.9, 0, 1)
+    seed: int = advanced("of the candidates drawn", 0, 0, 2**31 - 1)
     pitch_range_deg: Range | None = key("of the candidates; absent: the limits", None)
     yaw_range_deg: Range | None = key("likewise", None)
     roll_range_deg: Range | None = key("likewise", None)
@@ -196,10 +202,10 @@ class SessionSettings(Section):
     drift_limit_deg: float = key(
         "of the zero in a session, of what is not linear", 0.2, 1e-3, 45
     )
-    reference_tolerance_deg: float = key(
+    reference_tolerance_deg: float = advanced(
         "the zero posture may be found so far from where it was", 0.5, 1e-3, 45
     )
-    max_unreachable: int = key("postures out of reach until a fault", 3, 0, 1000)
+    max_unreachable: int = advanced("postures out of reach until a fault", 3, 0, 1000)
     zero: Literal["here", "drive"] = key(
         "here: the device stands in its zero posture; drive: go to pulse 0", "here"
     )

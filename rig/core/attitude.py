@@ -110,19 +110,11 @@ def recorded_frame(described: dict[str, Any], zero: dict[str, Any]) -> Frame:
     return Frame(attitude, mounting, described["mechanism_order"], (a, b, c))
 
 
-def attitudes(record: dict[str, Any], frame: Frame) -> Array:
-    """(samples, 3, 3) of the phone in its world, of a posture's or zero's readings.
-
-    Args:
-        record: of any version.
-        frame: in which it was measured; only version 1 needs it.
-    """
-    if "quaternions" in record:
-        return Rotation.from_quat(record["quaternions"]).as_matrix()
-    turned = frame.matrix(record["raw_deg"])  # right but for a fixed turn of the world
-    return np.array(record["attitude"]) @ mean_rotation(turned).T @ turned
+def attitudes(record: dict[str, Any]) -> Array:
+    """(samples, 3, 3) of the phone in its world, of a posture's or zero's readings."""
+    return Rotation.from_quat(record["quaternions"]).as_matrix()
 
 
 def angles(record: dict[str, Any], frame: Frame) -> Array:
     """(samples, 3) pitch, yaw and roll in degrees of every reading."""
-    return frame.angles(attitudes(record, frame))
+    return frame.angles(attitudes(record))

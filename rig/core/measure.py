@@ -113,7 +113,9 @@ class Observer:
                 if not reason:
                     return statuses
                 hint = (
-                    "Look for vibration, a loose phone, or [settle] limits too narrow"
+                    "The device or the phone still shakes, or the phone is noisier "
+                    "than the limit: compare its scatter, `jaxcal-rig imu`, and raise "
+                    "that key of [settle] above it"
                 )
             if now > deadline:
                 raise MotionFault(
@@ -130,13 +132,13 @@ class Observer:
         times = times - times.mean()
         slope = np.abs(times @ (angles - angles.mean(axis=0)) / (times @ times))
         for what, found, limit, unit in (
-            ("deviation", angles.std(axis=0, ddof=1), settle.std_deg, "deg"),
-            ("slope", slope, settle.slope_deg_s, "deg/s"),
+            ("std_deg", angles.std(axis=0, ddof=1), settle.std_deg, "deg"),
+            ("slope_deg_s", slope, settle.slope_deg_s, "deg/s"),
         ):
             worst = int(np.argmax(found))
             if found[worst] > limit:
                 axis, value = AXIS_NAMES[worst], found[worst]
-                return f"{what} of {axis} is {value:.3f} {unit} (limit {limit:g})"
+                return f"{axis} reads {value:.3f} {unit} (settle.{what} = {limit:g})"
         return ""
 
     def _collect(self, wanted: int) -> list[Reading]:

@@ -298,7 +298,7 @@ class Run(RunFolder):
     @property
     def to_go_on(self) -> str:
         """What goes on after a pause or a fault."""
-        resume = f"python -m rig resume {self.folder}"
+        resume = f"jaxcal-rig resume {self.folder}"
         if self.journal.records[0].get("simulated") is None:  # or it begins anew
             if lack := self.record.missing(self.config):
                 return f"{lack}. Then {resume}"

@@ -80,32 +80,32 @@ def truth_of(options: dict[str, Any], seed: int) -> Truth:
         ValueError: ``swapped`` does not name two axes.
     """
     order = [0, 1, 2]
-    if names := options.get("swapped"):
+    if names := options["swapped"]:
         if len(set(names)) != 2:
             raise ValueError(f"--swapped must name two axes, got {','.join(names)}")
         a, b = map(AXIS_NAMES.index, names)
         order[a], order[b] = b, a
-    pulses = options.get("gearing")
-    lost = options.get("lost_origin", 0.0)
-    turned = options.get("reversed") or ()
+    pulses = options["gearing"]
+    lost = options["lost_origin"]
+    turned = options["reversed"] or ()
     return Truth(
         noise_deg=options["noise"],
         backlash_deg=options["backlash"],
-        breakaway_deg=options.get("breakaway", 0.0),  # runs of before have none
-        dead_zone_deg=options.get("dead_zone", 0.0),
+        breakaway_deg=options["breakaway"],
+        dead_zone_deg=options["dead_zone"],
         drift_deg_per_min=options["drift"],
         seed=seed,
         reversed=tuple(name in turned for name in AXIS_NAMES),
         swapped=tuple(order),
         drive_pulses_per_rev=pulses and (pulses,) * 3,
         lost_origin_deg=(lost,) * 3,
-        **(REALISTIC if options.get("realistic") else {}),
+        **(REALISTIC if options["realistic"] else {}),
     )
 
 
 def gearing(axis: Axis, pulses_per_rev: int) -> float:
     """Signed pulses for one degree of a joint whose drive is set otherwise."""
-    return axis.direction * pulses_per_rev * axis.reduction / 360.0
+    return axis.model_copy(update={"pulses_per_rev": pulses_per_rev}).pulses_per_deg
 
 
 class Plant:

@@ -41,7 +41,7 @@ examples:
       fewer episodes and draws, to see whether everything works
   python -m studies.paper --data recordings
       Datasets 4 and 5 from a rig: dataset4.csv and dataset5.csv in that folder, each
-      the pairs.csv that python -m rig collect writes (docs/datasets.md)
+      the pairs.csv that jaxcal-rig collect writes (docs/datasets.md)
   python -m studies.paper --seed 1 --out report_1
       other candidate sets, draws and devices: how much of it is luck?
 """

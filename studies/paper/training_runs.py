@@ -69,7 +69,7 @@ def train_seed(
         ValueError: the folder holds a run of another configuration.
     """
     from jaxcal.learning.training import checkpoint
-    from jaxcal.learning.training import run as training
+    from jaxcal.learning.training import postures as training
     from jaxcal.learning.training.config import TrainConfig
     from jaxcal.selection.teacher import fixed_validation
 
@@ -214,8 +214,8 @@ def _train_all(options: argparse.Namespace) -> None:
 
         def report(now: Any, name: str = name, config: Any = config) -> None:
             text = (
-                f"{name}: {now.episodes:,} of {config.ppo.num_episodes:,} episodes, "
-                f"{now.episodes_per_second:,.0f}/s, {now.eta / 60:.1f} min left, "
+                f"{name}: {now.played:,} of {config.ppo.num_episodes:,} episodes, "
+                f"{now.per_second:,.0f}/s, {now.eta / 60:.1f} min left, "
                 f"reward {now.metrics['reward_mean']:.4f}"
             )
             print(text, file=sys.stderr, flush=True)
@@ -228,7 +228,7 @@ def _is_finished(path: pathlib.Path, config: Any) -> bool:
     """Whether this seed is done; ValueError where it is one of another training."""
     if not path.is_file():
         return False
-    wanted = (config.preset, config.ppo.num_episodes, config.ppo.seed)
+    wanted = (config.preset, config.ppo.num_episodes, config.seed)
     try:
         held = json.loads(path.read_text(encoding="utf-8"))
         same = (held["preset"], held["planned_episodes"], held["seed"])

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import pathlib
 import textwrap
 
 import jax
@@ -10,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxcal.adaptive.episodes import compare, play
-from jaxcal.adaptive.policy import run, training
+from jaxcal.adaptive.policy import run
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.policy.network import Policy, initial
 from jaxcal.adaptive.rules import Gain, Priced, StateRule
@@ -18,6 +17,9 @@ from jaxcal.adaptive.tasks import registry
 from jaxcal.adaptive.tasks.knee import STATE_RULE, knee
 from jaxcal.commands import evaluate as evaluate_command
 from jaxcal.commands import train as train_command
+from jaxcal.learning.core.ppo import make_train
+from jaxcal.learning.core.streams import Streams
+from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.weights import CheckpointError
 from jaxcal.learning.training import checkpoint
 
@@ -29,7 +31,7 @@ CONFIG = PolicyConfig(
     per_group=2,
     width=8,
     ppo=dataclasses.replace(
-        PPO, num_episodes=4 * 128, episodes_per_update=128, num_minibatches=2
+        PPO, num_updates=4, decisions_per_update=128, num_minibatches=2
     ),
 )
 
@@ -42,23 +44,6 @@ def finished(tmp_path_factory):
 
 def leaves(state):
     return [np.asarray(x) for x in jax.tree.leaves(state)]
-
-
-def test_an_advantage_counts_what_follows_by_its_chance():
-    """A session of two choices, then one of another: by hand, lambda 0.5."""
-    row = {
-        "reward": [1.0, 2.0, 4.0, 0.0],
-        "value": [10.0, 20.0, 30.0, 40.0],
-        "ended": [0.0, 1.0, 0.0, 0.0],
-        "chance": [0.25, 0.5, 1.0, 1.0],
-        "elsewhere": [3.0, 8.0, 0.0, 0.0],
-    }
-    given = {name: np.array([values]) for name, values in row.items()}
-    found = training._advantages(**given, discount=1.0, lam=0.5)
-    last = 4.0 + 40.0 - 30.0  # cut: closed by the last value
-    second = 2.0 + 8.0 - 20.0  # this outcome ended the session, another would not
-    first = 1.0 + 0.25 * 20.0 + 3.0 - 10.0 + 0.5 * second
-    np.testing.assert_allclose(found, [[first, second, last]])
 
 
 @pytest.mark.slow
@@ -80,26 +65,66 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished, tmp_path):
     for one, other in zip(leaves(whole), leaves(resumed), strict=True):
         np.testing.assert_array_equal(one, other)
     rows = (tmp_path / "metrics.csv").read_text().splitlines()
-    assert rows[0] == ",".join(run.COLUMNS) and len(rows) == 5
+    assert rows[0] == ",".join([*run.COLUMNS, *run.MEASURED]) and len(rows) == 5
+
+
+@pytest.mark.slow
+def test_the_run_trains_what_the_pure_function_does_and_tasks_are_arguments(tmp_path):
+    one = dataclasses.replace(CONFIG, options=CONFIG.options[:1])
+    state = run.train(one, tmp_path)
+    train = jax.jit(make_train(one))
+    average, metrics = train(jax.random.key(0), run.exercises(one)[0])
+    for a, b in zip(leaves(average), leaves(state.average), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5)
+    assert metrics["reward_mean"].shape == (4,)
+    train(jax.random.key(1), run.exercises(CONFIG)[1])
+    assert train._cache_size() == 1
+
+
+def test_every_stream_may_have_a_task_of_its_own():
+    (learner,) = CONFIG.learners
+    one, other = run.exercises(CONFIG)
+    both = jax.tree.map(lambda *leaves: np.stack([*leaves] * 2), one, other)
+    own = Streams(learner.config, learner.environment, learner.network, True)
+    key = jax.random.key(2)
+    params = learner.init(key, one)
+    for a, b in zip(leaves(params), leaves(own.init(key, both)), strict=True):
+        np.testing.assert_array_equal(a, b)
+    play = jax.jit(
+        lambda learner, task: learner.gather(
+            params, learner.draw(key, task), key, task
+        ),
+        static_argnums=0,
+    )
+    mixed, _ = play(own, both)
+    for task, streams in ((one, slice(0, None, 2)), (other, slice(1, None, 2))):
+        alone, _ = play(learner, task)
+        for name in ("action", "log_prob", "target"):
+            np.testing.assert_allclose(
+                getattr(mixed, name)[streams],
+                getattr(alone, name)[streams],
+                atol=1e-5,
+            )
 
 
 def test_a_checkpoint_gives_back_the_policy_and_its_configuration(finished, tmp_path):
     folder, state = finished
     trained = run.load(folder)
-    assert trained.step == 4
+    assert trained.meta["progress"]["updates"] == 4
     assert trained.config == CONFIG
     for one, other in zip(leaves(trained.params), leaves(state.average), strict=True):
         np.testing.assert_array_equal(one, other)
-    checkpoint.export(folder, tmp_path / "alone", run.load)
-    alone = run.load(tmp_path / "alone")
+    checkpoint.export(trained.weights, tmp_path / "alone.npz")
+    alone = run.load(tmp_path / "alone.npz")
     assert alone.config == CONFIG
-    assert not list((tmp_path / "alone").glob("*/state"))
+    for one, other in zip(leaves(trained.params), leaves(alone.params), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_checkpoints_of_another_kind_are_refused(finished):
     folder, _ = finished
     with pytest.raises(CheckpointError, match="must be jaxcal-sequential-policy"):
-        run.load(pathlib.Path(__file__).parents[2] / "checkpoints" / "default")
+        run.load(weights.shipped("default"))
     with pytest.raises(CheckpointError, match="must be jaxcal-policy"):
         checkpoint.load(folder)
 
@@ -112,7 +137,7 @@ def test_a_policy_mends_a_rule_that_ignores_trips(tmp_path):
         options=(SMALL,),
         per_group=3,
         ppo=dataclasses.replace(
-            PPO, num_episodes=60 * 1024, episodes_per_update=1024, num_minibatches=4
+            PPO, num_updates=60, decisions_per_update=1024, num_minibatches=4
         ),
     )
     run.train(config, tmp_path)
@@ -189,7 +214,7 @@ def test_commands_train_resume_and_compare(tmp_path, capsys):
     )
     assert train_command.main([*start, "--updates", "2"], "train.py") == 2
     assert "already holds a run" in capsys.readouterr().err
-    exported = str(tmp_path / "alone")
+    exported = str(tmp_path / "alone.npz")
     again = [*start, "--resume", "--export", exported]
     assert train_command.main(again, "train.py") == 0
     document = tmp_path / "out.json"

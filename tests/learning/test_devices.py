@@ -19,13 +19,13 @@ BEGIN = """
 import json, sys
 import jax, jax.numpy as jnp, numpy as np
 from jaxcal.learning.runtime import devices
+from jaxcal.learning.core import ppo, postures
+from jaxcal.learning.core.postures import EpisodesConfig, Postures
 from jaxcal.learning.policies.build import build
-from jaxcal.learning.policies import networks
-from jaxcal.learning.training import optimiser, ppo, presets, rollout
+from jaxcal.learning.training import presets
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.environments.task import Task
-from jaxcal.learning.training.config import PPOConfig
 out = {}
 
 def distance(one, other):
@@ -36,9 +36,9 @@ def distance(one, other):
 TINY = """
 network = build(NetworkConfig(width=8, encoder_rounds=1))
 task = Task(SelectionConfig(6, 3, 1, 1), random_starts=0.3, masked=0.2)
-config = PPOConfig(
+config = EpisodesConfig(
     num_episodes=64 * 3, episodes_per_update=64, episodes_per_set=4,
-    num_minibatches=1, num_epochs=1, warmup_updates=1, seed=3,
+    num_minibatches=1, num_epochs=1, warmup_updates=1,
 )
 """
 
@@ -49,12 +49,13 @@ config = dataclasses.replace(config, num_minibatches=2, num_epochs=2)
 
 COMPARE = """
 def run(mesh, num_updates):
-    state = devices.replicate(optimiser.init(config, task, network), mesh)
+    learner = Postures(config, task, network)
+    state = devices.replicate(ppo.begin(config, learner, jax.random.key(3)), mesh)
     rows, moments = [], None
-    update = ppo.updater(config, task, network, mesh)
+    update = ppo.updates(config, learner, mesh)
     for _ in range(num_updates):
-        state, metrics = update(state)
-        rows.append(jax.tree.map(np.asarray, metrics))
+        state, metrics = update(state, jnp.int32(1))
+        rows.append(jax.tree.map(lambda leaf: np.asarray(leaf)[0], metrics))
         # Adam's moments after one step are the gradient and its square.
         moments = moments or jax.tree.map(np.asarray, state.opt_state)
     return state, rows, moments
@@ -77,19 +78,19 @@ out["whole"] = leaf.sharding.is_fully_replicated
 """
 
 PLAY = """
-params = optimiser.init(config, task, network).params
-keys = jax.random.split(jax.random.key(1), 3)
+learner = Postures(config, task, network)
+params = learner.init(jax.random.key(0))
 
-def play(params, keys, mesh):
-    sets = devices.by_set(rollout.draw(task, 16, keys[0]), mesh)
-    return rollout.play(config, task, network, params, sets, keys[1], keys[2])[0]
+def play(params, data, mesh):
+    key = jax.random.wrap_key_data(data)
+    return learner.gather(params, ppo.spread(learner.draw(key), mesh), key)[0]
 
+data = jax.random.key_data(jax.random.key(1))
 with jax.disable_jit():
-    plain = play(params, keys, None)
-given = devices.replicate((params, jax.random.key_data(keys)), mesh)
-shared = jax.jit(
-    lambda params, keys: play(params, jax.random.wrap_key_data(keys), mesh)
-)(*given)
+    plain = play(params, data, None)
+shared = jax.jit(lambda params, data: play(params, data, mesh))(
+    *devices.replicate((params, data), mesh)
+)
 out["same actions"] = float((plain.action == np.asarray(shared.action)).mean())
 out["log_prob"] = distance(plain.log_prob, shared.log_prob)
 out["advantage"] = distance(plain.advantage, shared.advantage)
@@ -144,7 +145,7 @@ def test_a_mesh_takes_the_devices_asked_for_and_names_what_does_not_divide() -> 
         out["odd"] = error(lambda: devices.require_divisible(12, devices.make_mesh()))
         devices.require_divisible(16, devices.make_mesh())
         paper = presets.load("paper").ppo
-        devices.require_divisible(paper.sets_per_minibatch, devices.make_mesh())
+        devices.require_divisible(paper.rows_per_minibatch, devices.make_mesh())
         """,
     )
     assert out["some"] == 4 and out["one"] is True

@@ -10,23 +10,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxcal.learning.core import network as networks
+from jaxcal.learning.core import ppo
+from jaxcal.learning.core.postures import EpisodesConfig, Postures
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
-from jaxcal.learning.policies import networks
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.training import imitation, optimiser
-from jaxcal.learning.training import run as training
-from jaxcal.learning.training.config import PPOConfig, TrainConfig
+from jaxcal.learning.training import imitation
+from jaxcal.learning.training import postures as training
+from jaxcal.learning.training.config import TrainConfig
 
-PPO = PPOConfig(
+PPO = EpisodesConfig(
     num_episodes=64 * 4,
     episodes_per_update=64,
     episodes_per_set=4,
     num_minibatches=2,
     warmup_updates=1,
     imitation=0.5,
-    seed=3,
 )
 TASK = Task(
     SelectionConfig(11, 5, 1, 1, reward_gain=True),
@@ -34,6 +35,15 @@ TASK = Task(
     random_starts=0.5,
 )
 NETWORK = build(NetworkConfig(width=8, encoder_rounds=1))
+LEARNER = Postures(PPO, TASK, NETWORK)
+CONFIG = TrainConfig(
+    network=NetworkConfig(width=8, encoder_rounds=1), ppo=PPO, tasks=(TASK,), seed=3
+)
+
+
+def key_of(index):
+    """The key of a lesson, as a run derives it."""
+    return jax.random.fold_in(ppo.streams_of(jax.random.key(3))[2], index)
 
 
 def brute_force(candidates, available, given, k):
@@ -53,7 +63,7 @@ def brute_force(candidates, available, given, k):
 
 @pytest.fixture(scope="module")
 def lesson():
-    return imitation.draw(PPO, TASK, NETWORK, brute_force, 5)
+    return imitation.draw(LEARNER, brute_force, key_of(5))
 
 
 def test_a_lesson_holds_the_best_completion_of_what_is_given(lesson):
@@ -76,8 +86,8 @@ def test_a_lesson_holds_the_best_completion_of_what_is_given(lesson):
 
 
 def test_a_lesson_is_the_same_whenever_it_is_asked_for(lesson):
-    again = imitation.draw(PPO, TASK, NETWORK, brute_force, 5)
-    other = imitation.draw(PPO, TASK, NETWORK, brute_force, 6)
+    again = imitation.draw(LEARNER, brute_force, key_of(5))
+    other = imitation.draw(LEARNER, brute_force, key_of(6))
     for one, two in zip(jax.tree.leaves(lesson), jax.tree.leaves(again), strict=True):
         np.testing.assert_array_equal(one, two)
     assert not np.array_equal(lesson.candidates, other.candidates)
@@ -85,35 +95,33 @@ def test_a_lesson_is_the_same_whenever_it_is_asked_for(lesson):
 
 def test_lessons_share_no_key_with_the_weights_and_the_updates():
     # In JAX 0.10 fold_in(key, i) is split(key)[i]: streams must be split apart first.
-    key = jax.random.key(PPO.seed)
+    key = jax.random.key(3)
     np.testing.assert_array_equal(
         jax.random.key_data(jax.random.split(key)[1]),
         jax.random.key_data(jax.random.fold_in(key, 1)),
     )
-    streams = optimiser.Keys.of(PPO.seed)
-    assert np.array_equal(
-        optimiser.init(PPO, TASK, NETWORK).key,
-        jax.random.key_data(streams.updates),
-    )
+    weights, played, _ = ppo.streams_of(key)
+    assert np.array_equal(ppo.begin(PPO, LEARNER, key).key, jax.random.key_data(played))
     for index in range(3):
-        drawn = imitation.draw(PPO, TASK, NETWORK, brute_force, index)
-        for used in (streams.weights, streams.updates):
+        drawn = imitation.draw(LEARNER, brute_force, key_of(index))
+        for used in (weights, played):
             sets, _ = imitation._drawn(jax.random.split(used, 4)[0], 64, TASK)
             assert not np.array_equal(sets, drawn.candidates)
 
 
 @jax.jit
 def measured(params, lesson):
-    attempt = imitation.follow(lesson, TASK, NETWORK, params)
-    return imitation.loss(params, attempt, PPO, TASK, NETWORK)
+    learner = imitation.Imitation(LEARNER)
+    attempt, _ = learner.gather(params, lesson, jax.random.key(0), lesson)
+    return learner.loss(params, attempt, jnp.int32(0))
 
 
 @pytest.mark.slow
 def test_the_loss_is_that_of_the_definition(lesson):
-    state = optimiser.init(PPO, TASK, NETWORK)
-    total, metrics = measured(state.params, lesson)
+    params = LEARNER.init(jax.random.key(0))
+    total, metrics = measured(params, lesson)
     features = NETWORK.candidate_features(lesson.candidates, lesson.available)
-    memory = networks.encode(NETWORK, state.params, features)
+    memory = networks.encode(NETWORK, params, features)
     surprise, error, number = 0.0, 0.0, 0
     chosen = np.full((64, 5), -1)
     free, wanted = np.array(lesson.available), np.array(lesson.wanted)
@@ -122,7 +130,7 @@ def test_the_loss_is_that_of_the_definition(lesson):
         decision = NETWORK.decision_features(
             features, jnp.asarray(chosen), jnp.asarray(free), count
         )
-        logits, value = networks.decode(NETWORK, state.params, memory, decision)
+        logits, value = networks.decode(NETWORK, params, memory, decision)
         weights = np.exp(np.asarray(logits, float))
         share = weights / weights.sum(-1, keepdims=True)
         counted = count >= np.asarray(lesson.length)
@@ -143,7 +151,7 @@ def test_the_loss_is_that_of_the_definition(lesson):
 
 @pytest.mark.slow
 def test_the_order_of_the_candidates_does_not_matter(lesson, rng):
-    state = optimiser.init(PPO, TASK, NETWORK)
+    params = LEARNER.init(jax.random.key(0))
     order = rng.permutation(11)
     where = np.argsort(order)
     turned = dataclasses.replace(
@@ -153,8 +161,8 @@ def test_the_order_of_the_candidates_does_not_matter(lesson, rng):
         wanted=lesson.wanted[:, order],
         given=jnp.asarray(where)[lesson.given],
     )
-    one, _ = measured(state.params, lesson)
-    two, _ = measured(state.params, turned)
+    one, _ = measured(params, lesson)
+    two, _ = measured(params, turned)
     np.testing.assert_allclose(one, two, rtol=1e-4)
 
 
@@ -165,23 +173,23 @@ def test_lessons_teach():
     )
     # Without the look-ahead it has to be learned what to choose.
     network = build(NetworkConfig(width=8, encoder_rounds=1, lookahead=1))
-    task = Task(SelectionConfig(num_candidates=8))
-    state = optimiser.init(config, task, network)
+    learner = Postures(config, Task(SelectionConfig(num_candidates=8)), network)
+    state = ppo.begin(config, learner, jax.random.key(3))
+    update = ppo.updates(config, imitation.Imitation(learner))
     losses = []
     for index in range(config.num_imitated):
-        shown = imitation.draw(config, task, network, brute_force, index)
-        state, metrics = imitation.updater(config, task, network)(state, shown)
-        losses.append(float(metrics["policy_loss"]))
+        shown = imitation.draw(learner, brute_force, key_of(index))
+        state, metrics = update(state, jnp.int32(1), shown)
+        losses.append(float(metrics["policy_loss"][0]))
     assert np.mean(losses[-5:]) < 0.85 * np.mean(losses[:5])
 
 
 @pytest.mark.slow
 def test_resume_across_the_end_of_imitation_is_bit_for_bit(tmp_path):
-    config = TrainConfig(network=NETWORK.config, ppo=PPO, tasks=(TASK,))
-    whole = training.train(config, tmp_path / "whole", teacher=brute_force)
+    whole = training.train(CONFIG, tmp_path / "whole", teacher=brute_force)
     for last in (1, 3, 4):
         parts = training.train(
-            config,
+            CONFIG,
             tmp_path / "parts",
             resume=last > 1,
             num_updates=last,
@@ -196,6 +204,5 @@ def test_resume_across_the_end_of_imitation_is_bit_for_bit(tmp_path):
 
 
 def test_a_missing_teacher_is_told(tmp_path):
-    config = TrainConfig(network=NETWORK.config, ppo=PPO, tasks=(TASK,))
     with pytest.raises(ValueError, match=r"teacher must be given .* 2 updates"):
-        training.train(config, tmp_path)
+        training.train(CONFIG, tmp_path)

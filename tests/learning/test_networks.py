@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxcal.learning.policies import decoding, networks
+from jaxcal.learning.core import network as networks
+from jaxcal.learning.policies import decoding
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.features import remaining
 from jaxcal.learning.policies.networks import NetworkConfig

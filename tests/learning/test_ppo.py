@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import flax.linen as nn
@@ -12,17 +13,18 @@ import numpy as np
 import optax
 import pytest
 
+from jaxcal.learning.core import ppo
+from jaxcal.learning.core.network import mask_logits
+from jaxcal.learning.core.postures import EpisodesConfig, Postures
+from jaxcal.learning.core.streams import StreamsConfig
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
-from jaxcal.learning.policies import networks
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.training import optimiser, ppo, rollout
-from jaxcal.learning.training.config import PPOConfig
-from jaxcal.learning.training.ppo import surrogate
+from jaxcal.learning.training.config import TrainConfig
 
 SMALL = NetworkConfig(width=8, encoder_rounds=1)
-TINY = PPOConfig(
+TINY = EpisodesConfig(
     num_episodes=64 * 40,
     episodes_per_update=64,
     episodes_per_set=4,
@@ -31,9 +33,18 @@ TINY = PPOConfig(
 )
 
 
+def episodes(config, rewards, values):
+    """Advantages of complete episodes (T, ...): the value after the last is 0."""
+    rewards, values = jnp.asarray(rewards), jnp.asarray(values)
+    following = jnp.concatenate([values[1:], jnp.zeros_like(values[:1])])
+    goes_on = jnp.ones_like(values).at[-1].set(0.0)
+    return ppo.advantages(config, rewards, values, following, goes_on)
+
+
 def test_advantages_are_those_of_the_definition(rng):
     rewards, values = rng.normal(size=(2, 5, 3))
-    got = rollout.advantages(jnp.asarray(rewards), jnp.asarray(values), 0.9, 0.8)
+    config = dataclasses.replace(TINY, discount=0.9, gae_lambda=0.8)
+    got = episodes(config, rewards, values)
     deltas = rewards + 0.9 * np.vstack([values[1:], np.zeros((1, 3))]) - values
     for t in range(5):
         weights = (0.9 * 0.8) ** np.arange(5 - t)
@@ -42,16 +53,79 @@ def test_advantages_are_those_of_the_definition(rng):
 
 def test_undiscounted_advantages_are_return_less_value(rng):
     rewards, values = rng.normal(size=(2, 4, 2))
-    got = rollout.advantages(jnp.asarray(rewards), jnp.asarray(values), 1.0, 1.0)
+    got = episodes(TINY, rewards, values)
     returns = np.cumsum(rewards[::-1], axis=0)[::-1]
     np.testing.assert_allclose(got, returns - values, rtol=1e-5, atol=1e-6)
+
+
+def test_an_advantage_ends_with_its_session_and_counts_what_follows_by_its_chance():
+    """A session of two choices, then one of another: by hand, lambda 0.5."""
+    config = StreamsConfig(gae_lambda=0.5)
+    chance, others = jnp.array([0.25, 0.5, 1.0]), jnp.array([3.0, 8.0, 0.0])
+    goes_on, after = jnp.array([1.0, 0.0, 1.0]), jnp.array([20.0, 30.0, 40.0])
+    found = ppo.advantages(
+        config,
+        jnp.array([1.0, 2.0, 4.0]),
+        jnp.array([10.0, 20.0, 30.0]),
+        chance * goes_on * after + others,
+        goes_on,
+    )
+    last = 4.0 + 40.0 - 30.0  # cut: closed by the last value
+    second = 2.0 + 8.0 - 20.0  # this outcome ended the session, another would not
+    first = 1.0 + 0.25 * 20.0 + 3.0 - 10.0 + 0.5 * second
+    np.testing.assert_allclose(found, [first, second, last])
+
+
+def test_the_loss_is_that_of_the_definition(rng):
+    """In float64 by loops, with errors of the value on both sides of the limit."""
+    config = dataclasses.replace(
+        TINY, clip_range=0.2, value_error_limit=3.0, entropy_start=0.1, entropy_end=0.1
+    )
+    logits, shape = rng.normal(size=(6, 2, 5)), (6, 2)
+    value, target = rng.normal(size=shape), rng.normal(size=shape) * 6.0
+    action, counted = rng.integers(5, size=shape), rng.random(shape) < 0.7
+    before, advantage = -np.abs(rng.normal(size=shape)) - 1.0, rng.normal(size=shape)
+    assert (abs(value - target) > 3.0).any() and (abs(value - target) < 3.0).any()
+    batch = ppo.Batch(
+        seen=None,
+        action=jnp.asarray(action),
+        log_prob=jnp.asarray(before),
+        advantage=jnp.asarray(advantage),
+        target=jnp.asarray(target),
+        counted=jnp.asarray(counted, jnp.float32),
+    )
+    found, metrics = ppo.surrogate(
+        config, jnp.asarray(logits), jnp.asarray(value), batch, jnp.int32(0)
+    )
+    gain = error = entropy = kl = 0.0
+    for at in zip(*np.nonzero(counted), strict=True):
+        shares = np.exp(logits[at]) / np.exp(logits[at]).sum()
+        ratio = shares[action[at]] / np.exp(before[at])
+        gain += min(ratio * advantage[at], np.clip(ratio, 0.8, 1.2) * advantage[at])
+        wrong = abs(value[at] - target[at])
+        error += wrong**2 if wrong <= 3.0 else 9.0 + 6.0 * (wrong - 3.0)
+        entropy -= (shares * np.log(shares)).sum()
+        kl += ratio - 1.0 - np.log(ratio)
+    number = counted.sum()
+    np.testing.assert_allclose(metrics["policy_loss"], -gain / number, rtol=1e-5)
+    np.testing.assert_allclose(metrics["value_loss"], error / number, rtol=1e-5)
+    np.testing.assert_allclose(metrics["kl"], kl / number, rtol=1e-4)
+    whole = -gain + config.value_coefficient * error - 0.1 * entropy
+    np.testing.assert_allclose(found, whole / number, rtol=1e-5)
+
+
+def test_a_value_that_is_far_off_is_still_pulled():
+    """The square of a clipped error has no gradient beyond the limit."""
+    slopes = jax.vmap(jax.grad(lambda error: ppo.squared_error(error, 3.0)))
+    found = slopes(jnp.array([-100.0, -3.0, 0.5, 3.0, 100.0]))
+    np.testing.assert_allclose(found, [-6.0, -6.0, 1.0, 6.0, 6.0])
 
 
 @pytest.mark.parametrize("size", [1e-3, 0.2, 30.0])
 def test_clipping_is_that_of_optax(rng, size):
     grads = {"a": size * rng.normal(size=(7, 3)), "b": size * rng.normal(size=4)}
     grads = jax.tree.map(jnp.asarray, grads)
-    ours = optimiser._clip_by_global_norm(0.5)
+    ours = ppo._clip_by_global_norm(0.5)
     theirs = optax.clip_by_global_norm(0.5)
     got, _ = ours.update(grads, ours.init(grads))
     expected, _ = theirs.update(grads, theirs.init(grads))
@@ -70,22 +144,18 @@ def test_clipping_is_that_of_optax(rng, size):
 def test_the_first_minibatch_sees_the_probabilities_that_played(kind, n, k):
     # Play and loss compute the same probabilities in differently compiled programs;
     # a difference here would silently make every gradient wrong.
-    env = SelectionConfig(12, k, n, n)
-    task = Task(env, random_starts=0.5)
-    network = build(dataclasses.replace(SMALL, kind=kind))
+    task = Task(SelectionConfig(12, k, n, n), random_starts=0.5)
     config = dataclasses.replace(TINY, episodes_per_update=512)
-    state = optimiser.init(config, task, network)
-    keys = jax.random.split(jax.random.key(1), 3)
+    learner = Postures(config, task, build(dataclasses.replace(SMALL, kind=kind)))
+    params = learner.init(jax.random.key(0))
 
     @jax.jit
     def play(params):
-        sets = rollout.draw(task, 128, keys[0])
-        return rollout.play(config, task, network, params, sets, keys[1], keys[2])
+        key = jax.random.key(1)
+        return learner.gather(params, learner.draw(key), key)
 
-    played, _ = play(state.params)
-    _, metrics = jax.jit(
-        lambda params: surrogate(params, played, jnp.float32(0), config, task, network)
-    )(state.params)
+    played, _ = play(params)
+    _, metrics = jax.jit(learner.loss)(params, played, jnp.int32(0))
     assert abs(float(metrics["kl"])) < 1e-6
 
 
@@ -143,47 +213,111 @@ class Slope(nn.Module):
         return self.slope * features
 
     def decode(self, memory, available):
-        logits = networks.mask_logits(
-            jnp.broadcast_to(memory, available.shape), available
-        )
+        logits = mask_logits(jnp.broadcast_to(memory, available.shape), available)
         return logits, jnp.broadcast_to(self.value, logits.shape[:-1])
 
     def __call__(self, candidates, usable, chosen, available):
         return self.decode(self.encode(candidates[..., 0]), available)
 
 
+@dataclasses.dataclass(frozen=True)
+class Probe:
+    """What ``make_train`` needs of a configuration."""
+
+    ppo: EpisodesConfig
+
+    @property
+    def learners(self):
+        return (Postures(self.ppo, Pick(), Slope()),)
+
+
+PROBE = Probe(dataclasses.replace(TINY, learning_rate=0.3, entropy_start=0.0))
+
+
 def test_value_and_policy_are_learned_in_a_probe_environment():
-    config = dataclasses.replace(TINY, learning_rate=0.3, entropy_start=0.0)
-    state = optimiser.init(config, Pick(), Slope())
-    update = ppo.updater(config, Pick(), Slope())
-    assert ppo.updater(config, Pick(), Slope()) is update
-    rewards = []
-    for _ in range(config.num_updates):
-        state, metrics = update(state)
-        rewards.append(float(metrics["reward_mean"]))
-    assert update._cache_size() == 1
-    assert int(state.num_updates) == 40 and metrics["rewards"].shape == (64,)
+    average, metrics = jax.jit(ppo.make_train(PROBE))(jax.random.key(0))
+    rewards = metrics["reward_mean"]
+    assert metrics["rewards"].shape == (40, 64)
     # At random 1/2; the largest of six uniform numbers is 6/7 on average.
     assert abs(rewards[0] - 0.5) < 0.1 and np.mean(rewards[-5:]) > 0.75
-    assert abs(float(state.average["value"]) - np.mean(rewards[-5:])) < 0.1
+    assert abs(float(average["value"]) - np.mean(rewards[-5:])) < 0.1
+
+
+def test_training_maps_over_seeds():
+    """Each of several in one program is what it is alone, and no two are the same."""
+    train = ppo.make_train(PROBE)
+    keys = jax.random.split(jax.random.key(5), 3)
+    several, _ = jax.jit(jax.vmap(train))(keys)
+    assert len(set(np.asarray(several["slope"]).tolist())) == 3
+    alone, _ = jax.jit(train)(keys[1])
+    np.testing.assert_allclose(several["slope"][1], alone["slope"], rtol=1e-4)
+
+
+def test_a_gradient_in_slices_is_that_of_the_whole():
+    """Also where slices count unequally; 8 rows in 7 become slices of 4."""
+    config = dataclasses.replace(TINY, episodes_per_update=32, num_minibatches=1)
+    task = Task(SelectionConfig(8, 5, 2, 2, reward_gain=True), random_starts=0.6)
+    learner = Postures(config, task, build(SMALL))
+    params = learner.init(jax.random.key(0))
+    key = jax.random.key(1)
+    played, _ = jax.jit(lambda p: learner.gather(p, learner.draw(key), key))(params)
+    counted = np.asarray(played.counted).sum((1, 2))
+    assert counted[:4].sum() != counted[4:].sum()
+
+    @functools.partial(jax.jit, static_argnums=1)
+    def found(params, size):
+        one = jax.grad(
+            lambda p, rows: learner.loss(p, rows, jnp.int32(0)), has_aux=True
+        )
+
+        def rows_of(index):
+            return jax.tree.map(lambda leaf: leaf[index], played)
+
+        return ppo.sliced(one, params, rows_of, jnp.arange(8), size)
+
+    whole = found(params, 8)
+    for size in (1, 7):
+        for a, b in zip(
+            *map(jax.tree.leaves, (whole, found(params, size))), strict=True
+        ):
+            np.testing.assert_allclose(a, b, atol=2e-5)
+
+
+def test_cutting_a_run_into_calls_changes_no_bit_and_a_seed_compiles_nothing():
+    config, (learner,) = PROBE.ppo, PROBE.learners
+    update = ppo.updates(config, learner, None, 8)
+    assert ppo.updates(config, learner, None, 8) is update
+    ends = []
+    for counts in ((1,) * 6, (6,), (2, 4)):
+        state = ppo.begin(config, learner, jax.random.key(3))
+        rows = []
+        for count in counts:
+            state, metrics = update(state, jnp.int32(count))
+            assert metrics["rewards"].shape == (8, 64)
+            rows += list(np.asarray(metrics["reward_mean"])[:count])
+        ends.append((state, np.array(rows)))
+    for one, other in zip(*(jax.tree.leaves(end) for end in ends[:2]), strict=True):
+        np.testing.assert_array_equal(one, other)
+    for one, other in zip(*(jax.tree.leaves(end) for end in ends[1:]), strict=True):
+        np.testing.assert_array_equal(one, other)
+    update(ppo.begin(config, learner, jax.random.key(4)), jnp.int32(1))
+    assert update._cache_size() == 1
 
 
 @pytest.mark.slow
 def test_the_policy_learns_on_a_small_task():
     # Without the look ahead, so that it must learn by itself.
-    network = build(dataclasses.replace(SMALL, lookahead=1, width=16))
-    config = dataclasses.replace(
-        TINY, num_episodes=512 * 40, episodes_per_update=512, learning_rate=5e-3
+    config = TrainConfig(
+        network=dataclasses.replace(SMALL, lookahead=1, width=16),
+        ppo=dataclasses.replace(
+            TINY, num_episodes=512 * 40, episodes_per_update=512, learning_rate=5e-3
+        ),
+        tasks=(Task(SelectionConfig(8, 3, 2, 2)),),
     )
-    task = Task(SelectionConfig(8, 3, 2, 2))
-    state = optimiser.init(config, task, network)
-    rewards = []
-    update = ppo.updater(config, task, network)
-    for _ in range(config.num_updates):
-        state, metrics = update(state)
-        rewards.append(float(metrics["reward_mean"]))
+    _, metrics = jax.jit(ppo.make_train(config))(jax.random.key(0))
+    rewards = metrics["reward_mean"]
     assert np.mean(rewards[-5:]) > np.mean(rewards[:3]) + 0.3
-    assert float(metrics["value_loss"]) < 0.2
+    assert float(metrics["value_loss"][-1]) < 0.2
 
 
 def test_the_averaged_weights_owe_nothing_to_the_initial_ones(rng):
@@ -192,21 +326,26 @@ def test_the_averaged_weights_owe_nothing_to_the_initial_ones(rng):
         TINY, num_minibatches=1, num_epochs=1, average_decay=0.9, learning_rate=0.1
     )
     params = {"w": jnp.asarray(rng.normal(size=3) + 100.0, jnp.float32)}
-    state = optimiser.TrainState(
+    state = ppo.TrainState(
         params=params,
         average=params,
-        opt_state=optimiser.optimiser(config).init(params),
+        opt_state=ppo.optimiser(config).init(params),
         key=jax.random.key(0),
         num_updates=jnp.zeros((), jnp.int32),
     )
     data, seen = jnp.asarray(rng.normal(size=(4, 3)), jnp.float32), []
     for _ in range(4):
-        state, _ = optimiser.learn(
+        state, _ = ppo.epochs(
             state,
             config,
             4,
-            lambda index: data[index],
-            lambda params, rows: (((params["w"][None] - rows) ** 2).sum(), {}),
+            jax.grad(
+                lambda params, index: (
+                    ((params["w"][None] - data[index]) ** 2).sum(),
+                    {},
+                ),
+                has_aux=True,
+            ),
             jax.random.key(1),
         )
         seen.append(np.asarray(state.params["w"], np.float64))
@@ -223,9 +362,13 @@ def test_the_averaged_weights_owe_nothing_to_the_initial_ones(rng):
         ({"learning_rate": 0.0}, "learning_rate"),
         ({"gae_lambda": 1.5}, "gae_lambda"),
         ({"average_decay": 1.0}, "average_decay"),
-        ({"seed": -1}, "seed"),
     ],
 )
 def test_a_bad_configuration_is_named(values, named):
     with pytest.raises(ValueError, match=named):
-        PPOConfig(**values)
+        EpisodesConfig(**values)
+
+
+def test_a_bad_seed_is_named():
+    with pytest.raises(ValueError, match="seed must be 0 or more, got -1"):
+        TrainConfig(seed=-1)

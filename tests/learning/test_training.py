@@ -19,29 +19,31 @@ import numpy as np
 import pytest
 
 from jaxcal.commands import train as command
+from jaxcal.commands import train_candidates
+from jaxcal.learning.core import ppo
+from jaxcal.learning.core.postures import EpisodesConfig
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
-from jaxcal.learning.training import checkpoint, optimiser, ppo, presets
-from jaxcal.learning.training import run as training
+from jaxcal.learning.training import checkpoint, presets
+from jaxcal.learning.training import postures as training
 from jaxcal.learning.training.checkpoint import CheckpointError
-from jaxcal.learning.training.config import PPOConfig, TrainConfig
-from jaxcal.learning.training.metrics import COLUMNS, MetricsTable
-from jaxcal.learning.training.run import Validation
+from jaxcal.learning.training.config import TrainConfig
+from jaxcal.learning.training.postures import COLUMNS, MEASURED, Validation
 
 ROOT = pathlib.Path(__file__).parents[2]
 
 CONFIG = TrainConfig(
     network=NetworkConfig(width=8, encoder_rounds=1),
-    ppo=PPOConfig(
+    ppo=EpisodesConfig(
         num_episodes=64 * 6,
         episodes_per_update=64,
         episodes_per_set=4,
         num_minibatches=2,
         warmup_updates=1,
-        seed=3,
     ),
+    seed=3,
     tasks=(
         Task(SelectionConfig(8, 3, 2, 2)),
         Task(SelectionConfig(6, 3, 1, 1, reward_gain=True)),
@@ -82,19 +84,29 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished, tmp_path):
 
 
 def test_updates_compile_once_and_change_every_weight(finished):
-    network = build(CONFIG.network)
-    for task in CONFIG.tasks:
-        assert ppo.updater(CONFIG.ppo, task, network, None)._cache_size() == 1
-    begun = optimiser.init(CONFIG.ppo, CONFIG.tasks[0], network)
-    moved = jax.tree.map(lambda a, b: (a != b).any(), begun.params, finished[1].params)
+    for learner in CONFIG.learners:
+        assert ppo.updates(CONFIG.ppo, learner, None, 1, 0)._cache_size() == 1
+    begun = CONFIG.learners[0].init(ppo.streams_of(jax.random.key(3))[0])
+    moved = jax.tree.map(lambda a, b: (a != b).any(), begun, finished[1].params)
     # The value reads every part of the network, the policy all but the critic.
     assert all(jax.tree.leaves(moved))
+
+
+def test_the_run_trains_what_the_pure_function_does(finished):
+    average, metrics = jax.jit(ppo.make_train(CONFIG))(jax.random.key(3))
+    for one, other in zip(
+        jax.tree.leaves(average), jax.tree.leaves(finished[1].average), strict=True
+    ):
+        np.testing.assert_allclose(one, other, atol=1e-5)
+    with (finished[0] / "metrics.csv").open() as file:
+        rewards = [float(row["reward_mean"]) for row in csv.DictReader(file)]
+    np.testing.assert_allclose(metrics["reward_mean"], rewards, atol=1e-6)
 
 
 def test_metrics_have_the_columns_that_figures_read(finished):
     folder, _ = finished
     header = (folder / "metrics.csv").read_text().splitlines()[0]
-    assert header == ",".join(COLUMNS)
+    assert header == ",".join([*COLUMNS, *MEASURED])
     assert any(p.name.startswith("events.out.tfevents") for p in folder.iterdir())
 
 
@@ -111,12 +123,10 @@ def test_rows_that_were_never_saved_are_dropped_on_resume(finished, tmp_path):
 def test_a_checkpoint_names_its_configuration_seed_and_versions(finished):
     folder, state = finished
     policy = checkpoint.load(folder)
-    assert policy.step == 6
     assert policy.meta["seed"] == 3
     assert policy.meta["versions"]["jax"] == jax.__version__
     assert policy.meta["progress"]["episodes"] == 384
-    assert TrainConfig.from_meta(policy.meta).ppo == CONFIG.ppo
-    assert TrainConfig.from_meta(policy.meta).tasks == CONFIG.tasks
+    assert TrainConfig.from_meta(policy.meta) == CONFIG
     for one, other in zip(
         jax.tree.leaves(policy.params), jax.tree.leaves(state.average), strict=True
     ):
@@ -130,12 +140,11 @@ def test_validation_of_the_optimum_itself_is_one():
     from jaxcal.selection import exact_batch
 
     best = np.asarray(exact_batch(sets, 3, num_outputs=1).log_det)
-    network = NetworkConfig(width=8, encoder_rounds=1)
-    network = build(network)
-    state = optimiser.init(CONFIG.ppo, CONFIG.tasks[0], network)
-    ratio, hits = Validation(sets, best, 3).measure(network, state.params, 3)
+    network = build(CONFIG.network)
+    params = CONFIG.learners[0].init(jax.random.key(0))
+    ratio, hits = Validation(sets, best, 3).measure(network, params, 3)
     assert 0.0 <= ratio <= 1.0 and 0.0 <= hits <= 1.0
-    worse, none = Validation(sets, best + 1.0, 3).measure(network, state.params, 3)
+    worse, none = Validation(sets, best + 1.0, 3).measure(network, params, 3)
     assert worse == pytest.approx(ratio * np.exp(-3.0), rel=1e-3) and none == 0.0
 
 
@@ -145,6 +154,7 @@ def test_validation_of_the_optimum_itself_is_one():
         (lambda step: shutil.rmtree(step / "policy"), "weights are damaged"),
         (lambda step: (step / "meta" / "metadata").write_text("{"), "meta is damaged"),
         (lambda step: _edit(step, version=99), "version 99"),
+        (lambda step: _edit(step, version=1), "version 1; this jaxcal reads version 2"),
         (lambda step: _edit(step, schema="other"), "not a jaxcal policy"),
         (
             lambda step: _edit(step, network={"kind": "compact", "size": 1}),
@@ -200,23 +210,35 @@ def test_a_missing_folder_and_a_policy_without_state_are_told(finished, tmp_path
         training.train(CONFIG, tmp_path, resume=True)
 
 
-def test_exporting_keeps_the_policy_and_leaves_the_state(finished, tmp_path):
+def test_a_save_writes_nothing_twice(finished):
+    """The averaged weights, the weights and Adam's two moments: four times as much."""
+    folder, state = finished
+    step = folder / "checkpoint" / "6"
+    assert {path.name for path in step.iterdir() if path.is_dir()} == {
+        *("policy", "state", "meta")
+    }
+    held = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
+    weights = sum(leaf.nbytes for leaf in jax.tree.leaves(state.average))
+    assert held < 4 * weights + 100
+    assert "average" not in (step / "state" / "_METADATA").read_text()
+
+
+def test_exporting_writes_the_policy_to_one_file(finished, tmp_path):
+    path = tmp_path / "policy.npz"
     for _ in range(2):  # the second replaces the first
-        checkpoint.export(finished[0], tmp_path / "policy")
-    assert [p.name for p in tmp_path.iterdir()] == ["policy"]
-    one, other = checkpoint.load(finished[0]), checkpoint.load(tmp_path / "policy")
+        checkpoint.export(checkpoint.load(finished[0]).weights, path)
+    assert [p.name for p in tmp_path.iterdir()] == ["policy.npz"]
+    one, other = checkpoint.load(finished[0]), checkpoint.load(path)
+    assert one.weights.fingerprint == other.weights.fingerprint
+    assert one.meta == other.meta
     for a, b in zip(
         jax.tree.leaves(one.params), jax.tree.leaves(other.params), strict=True
     ):
         np.testing.assert_array_equal(a, b)
     with pytest.raises(CheckpointError, match="no training state"):
-        checkpoint.restore(tmp_path / "policy", None)
-    text = "".join(
-        path.read_text(errors="ignore")
-        for path in (tmp_path / "policy").rglob("*")
-        if path.is_file()
-    )
-    assert str(tmp_path) not in text
+        checkpoint.restore(path, finished[1])
+    with pytest.raises(ValueError, match=r"one file NAME\.npz, got .*folder"):
+        checkpoint.export(one.weights, tmp_path / "folder")
 
 
 def test_a_state_of_another_configuration_is_refused(finished, tmp_path):
@@ -240,8 +262,9 @@ def test_killed_save_leaves_the_previous_checkpoint(finished, tmp_path, pause):
             from jaxcal.learning.training import checkpoint
             policy = checkpoint.load({str(finished[0])!r})
             for step in range(1, 10_000):
-                meta = {{k: policy.meta[k] for k in ("network", "tasks")}}
-                checkpoint.save(sys.argv[1], step, policy.params, meta, policy.params)
+                names = ("network", "tasks", "num_seeds")
+                meta = {{k: policy.meta[k] for k in names}} | {{"step": step}}
+                checkpoint.save(sys.argv[1], step, policy.params, meta)
                 print(step, flush=True)
             """
         )
@@ -260,8 +283,7 @@ def test_killed_save_leaves_the_previous_checkpoint(finished, tmp_path, pause):
     rest = process.stdout.read().split()
     process.wait()
     last = int(rest[-1]) if rest else seen
-    policy = checkpoint.load(folder)
-    assert policy.step in (last, last + 1)
+    assert checkpoint.load(folder).meta["step"] in (last, last + 1)
 
 
 @pytest.mark.parametrize("preset", presets.names())
@@ -269,11 +291,8 @@ def test_presets_survive_their_own_metadata(preset):
     config = presets.load(preset)
     meta = json.loads(json.dumps(config.as_meta()))
     again = TrainConfig.from_meta(meta)
-    assert (again.network, again.ppo, again.tasks) == (
-        config.network,
-        config.ppo,
-        config.tasks,
-    )
+    own = {"about": config.about, "validate_every": again.validate_every}
+    assert dataclasses.replace(again, **own) == dataclasses.replace(config, **own)
 
 
 def test_the_paper_preset_is_table_2():
@@ -290,7 +309,7 @@ def test_single_values_change_and_unknown_ones_are_named():
         presets.load("compact"), {"num_candidates": 20, "width": 16, "seed": 5}
     )
     assert config.tasks[0].environment.num_candidates == 20
-    assert (config.network.width, config.ppo.seed) == (16, 5)
+    assert (config.network.width, config.seed) == (16, 5)
     with pytest.raises(ValueError, match="wings"):
         presets.with_values(config, {"wings": 2})
 
@@ -350,7 +369,8 @@ def test_the_writer_of_events_hides_no_package(tmp_path, monkeypatch):
     for name in [n for n in sys.modules if n.split(".")[0] == "tensorboardX"]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setattr(sys, "meta_path", [Watch(), *sys.meta_path])
-    MetricsTable(tmp_path, 0).close()
+    short = dataclasses.replace(CONFIG, tasks=CONFIG.tasks[:1])
+    training.train(short, tmp_path, num_updates=1)
     assert hidden and not any(hidden)
 
 
@@ -380,11 +400,12 @@ def signals():
 
 def test_train_command_trains_saves_and_refuses_to_overwrite(tmp_path, capsys):
     out = tmp_path / "run"
-    assert train("--out", out, "--export", tmp_path / "policy", *SMALL) == 0
+    exported = tmp_path / "policy.npz"
+    assert train("--out", out, "--export", exported, *SMALL) == 0
     said = capsys.readouterr().out
     assert "ratio to exact" in said and "saved" in said
-    assert checkpoint.load(out).step == 6
-    assert checkpoint.load(tmp_path / "policy").step == 6
+    assert checkpoint.load(out).meta["progress"]["updates"] == 6
+    assert checkpoint.load(exported).meta["progress"]["updates"] == 6
     assert train("--out", out, *SMALL) == 2
     error = capsys.readouterr().err
     assert error.startswith("train.py: --out") and "--resume" in error
@@ -409,7 +430,14 @@ BRAX = ["--trainer", "brax"]
         ([*BRAX, "--devices", "2", "--kind=paper"], "not read --devices, --kind"),
         ([*BRAX, "--preset", "general"], "trains on one task, preset general has 12"),
         ([*BRAX, "--resume"], "--resume works with --trainer jaxcal only"),
+        ([*BRAX, "--seeds=2"], "--seeds works with --trainer jaxcal only"),
         (["--candidates", "nowhere.csv"], "nowhere.csv"),
+        (["--export", "folder"], "--export must be a file NAME.npz, got folder"),
+        (["--num-selected=2", "--num-inputs=1"], "num_selected must be at least 3"),
+        (["--seeds", "2", "--no-validation"], "--seeds needs the validation"),
+        (["--updates", "2"], "preset compact does not read --updates"),
+        (["--task", "knee", "--episodes", "9"], "knee does not read --episodes"),
+        (["--task", "nee"], "task must be one of"),
     ],
 )
 def test_train_command_refuses_in_one_line(arguments, says, tmp_path, capsys):
@@ -434,9 +462,10 @@ def test_brax_saves_what_it_used_and_keeps_what_is_asked_for():
 def test_help_says_what_every_number_is(capsys):
     assert train("--help") == 0
     text = capsys.readouterr().out
-    for name in presets.field_names() - {"num_episodes"}:
+    for name in presets.field_names() - {"num_episodes", "num_seeds"}:
         assert f"--{name.replace('_', '-')}" in text
-    assert "what to try first" in text and "[2; paper 10]" in text
+    assert "what to try first" in text
+    assert "[2; paper 10; tasks 4]" in " ".join(text.split())
     for name in presets.names():
         assert f"\n  {name} " in text
 
@@ -467,10 +496,10 @@ def test_ones_own_sets_are_drawn_as_they_are(tmp_path, rng, key):
     sets, free = rng.uniform(-30, 30, size=(5, 7, 2)), rng.random((5, 7)) < 0.8
     free[:, :4] = True
     np.savez(tmp_path / "sets.npz", candidates=sets, available=free)
-    given = command._candidates(str(tmp_path / "sets.npz"))
+    given = train_candidates.candidates_of(str(tmp_path / "sets.npz"))
     low, high = sets[free].min(0), sets[free].max(0)
     np.testing.assert_allclose(given.values, (sets - low) / (high - low), rtol=1e-5)
-    config = command._trained_on(presets.load("compact"), given, {})
+    config = train_candidates.trained_on(presets.load("compact"), given, {})
     task = config.tasks[0]
     assert (task.environment.num_candidates, task.num_decisions) == (7, 3)
     states = jax.vmap(task.reset)(jax.random.split(key, 40))
@@ -482,18 +511,45 @@ def test_ones_own_sets_are_drawn_as_they_are(tmp_path, rng, key):
         seen.add(which)
     assert len(seen) == 5
     with pytest.raises(ValueError, match="--num-candidates must be 7, as in"):
-        command._trained_on(presets.load("compact"), given, {"num_candidates": 9})
+        train_candidates.trained_on(
+            presets.load("compact"), given, {"num_candidates": 9}
+        )
     with pytest.raises(ValueError, match="one task"):
-        command._trained_on(presets.load("general"), given, {})
+        train_candidates.trained_on(presets.load("general"), given, {})
 
 
 def test_ctrl_c_saves_and_resume_goes_on(tmp_path, capsys, monkeypatch):
     out = tmp_path / "run"
-    monkeypatch.setattr(command, "_show", lambda _: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(command, "_show", lambda *_: signal.raise_signal(signal.SIGINT))
     assert train("--out", out, "--no-validation", *SMALL) == 0
     assert "stopped at update 1 of 6 and saved; go on" in capsys.readouterr().out
-    assert checkpoint.load(out).step == 1
+    assert checkpoint.load(out).meta["progress"]["updates"] == 1
     assert len((out / "metrics.csv").read_text().splitlines()) - 1 == 1
     monkeypatch.undo()
     assert train("--out", out, "--resume", "--no-validation") == 0
-    assert checkpoint.load(out).step == 6
+    assert checkpoint.load(out).meta["progress"]["updates"] == 6
+
+
+def test_several_seeds_are_one_program_and_the_best_is_exported(tmp_path, capsys):
+    out, exported = tmp_path / "run", tmp_path / "best.npz"
+    assert train("--out", out, "--seeds", 3, "--export", exported, *SMALL) == 0
+    said = capsys.readouterr().out
+    assert "+-" in said and "spread" in said and said.count("  best\n") == 1
+    meta = checkpoint.read_meta(out)[1]
+    reached = [each["ratio_to_exact"] for each in meta["progress"]["seeds"]]
+    assert len(reached) == 3 and meta["progress"]["best"] == int(np.argmax(reached))
+    with (out / "seeds.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["seed"] for row in rows] == ["3", "4", "5"] * 2
+    assert [float(row["ratio_to_exact"]) for row in rows[3:]] == pytest.approx(reached)
+    # Each is what the command trains with that seed alone.
+    best = checkpoint.load(exported)
+    assert checkpoint.load(out).weights.fingerprint == best.weights.fingerprint
+    seed = f"--seed={3 + meta['progress']['best']}"
+    alone = [*(flag for flag in SMALL if "--seed" not in flag), seed]
+    assert train("--out", tmp_path / "one", "--no-validation", *alone) == 0
+    one = checkpoint.load(tmp_path / "one")
+    for a, b in zip(
+        jax.tree.leaves(one.params), jax.tree.leaves(best.params), strict=True
+    ):
+        np.testing.assert_allclose(a, b, atol=1e-5)

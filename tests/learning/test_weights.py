@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
-
 import numpy as np
 import pytest
 
+from jaxcal.adaptive.policy import run
 from jaxcal.learning.runtime import weights
-from jaxcal.learning.runtime.weights import CheckpointError, Weights, default_folder
+from jaxcal.learning.runtime.weights import CheckpointError, Weights
 from jaxcal.learning.training import checkpoint
 
 HELD = Weights(
@@ -19,7 +18,7 @@ HELD = Weights(
 
 
 def test_what_is_read_is_what_was_written(tmp_path):
-    path = tmp_path / weights.NAME
+    path = tmp_path / "policy.npz"
     weights.write(path, HELD)
     found = weights.read(path)
     assert (found.network, found.meta) == (HELD.network, HELD.meta)
@@ -30,7 +29,7 @@ def test_what_is_read_is_what_was_written(tmp_path):
 
 
 def test_no_damage_is_read_as_weights(tmp_path, rng):
-    path = tmp_path / weights.NAME
+    path = tmp_path / "policy.npz"
     weights.write(path, HELD)
     whole = path.read_bytes()
     damaged = [b"", b"x", whole[:100], whole[:-1], bytes(len(whole))]
@@ -51,31 +50,33 @@ def test_no_damage_is_read_as_weights(tmp_path, rng):
 
 
 def test_another_format_is_refused(tmp_path, monkeypatch):
-    path = tmp_path / weights.NAME
-    monkeypatch.setattr(weights, "_VERSION", 2)
+    path = tmp_path / "policy.npz"
+    monkeypatch.setattr(weights, "_VERSION", 1)
     weights.write(path, HELD)
     monkeypatch.undo()
-    with pytest.raises(CheckpointError, match="format jaxcal-policy-weights 1, got"):
+    with pytest.raises(CheckpointError, match="format jaxcal-policy-weights 2, got"):
         weights.read(path)
 
 
-def test_the_shipped_file_holds_the_shipped_checkpoint():
-    found = weights.read(weights.locate(None))
-    policy = checkpoint.load()
-    assert found.fingerprint == policy.weights.fingerprint
-    assert checkpoint.fingerprint() == found.fingerprint
-    assert found.meta == policy.meta
+@pytest.mark.parametrize("load", [checkpoint.load, run.load])
+def test_what_ships_is_one_file_that_jax_reads_too(load):
+    held = weights.read(weights.shipped("knee" if load is run.load else "default"))
+    policy = load()
+    assert policy.weights.fingerprint == held.fingerprint
+    assert policy.meta == held.meta
 
 
-def test_saving_and_the_command_write_the_file(tmp_path, capsys):
-    checkpoint.export(default_folder(), tmp_path / "copy")
-    path = weights.locate(tmp_path / "copy")
-    whole = weights.read(path)
-    assert whole.fingerprint == checkpoint.fingerprint()
-    path.unlink()
-    assert checkpoint.main([str(tmp_path / "copy")]) == 0
-    assert weights.read(path).fingerprint == whole.fingerprint
-    assert str(path) in capsys.readouterr().out
-    shutil.rmtree(path.parent / "policy")
-    assert checkpoint.main([str(tmp_path / "copy")]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+def test_weights_that_do_not_fit_their_network_are_refused(tmp_path):
+    held = weights.read(weights.locate(None))
+    held.arrays["embed.kernel"] = held.arrays["embed.kernel"][1:]
+    path = tmp_path / "policy.npz"
+    weights.write(path, held)
+    with pytest.raises(CheckpointError, match="do not fit its network"):
+        checkpoint.load(path)
+
+
+def test_names_of_arrays_become_a_tree_again():
+    tree = {"a": {"b": np.ones(2), "c": {"d": np.zeros(1)}}, "e": np.ones(())}
+    found = weights.nested(weights.flat(tree))
+    assert found.keys() == tree.keys() and found["a"]["c"].keys() == {"d"}
+    np.testing.assert_array_equal(found["a"]["b"], tree["a"]["b"])

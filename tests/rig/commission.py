@@ -10,7 +10,7 @@ from rig.__main__ import main
 from rig.config import AXIS_NAMES
 from rig.simulator import Simulator, Truth
 from rig.workbench.commission.scan import parse_bus
-from rig.workbench.commission.toml import set_values
+from rig.workbench.toml import set_values
 
 QUICK = (  # of the new rig.toml: short windows, quick axes
     "settle.window_s=0.04", "settle.min_samples=5", "settle.samples=5",
@@ -51,7 +51,7 @@ def set_up(bus: str, port: int, *more: str, values=QUICK) -> int:
 
 
 def quick_text(bus, port):
-    from rig.workbench.commission.toml import new_text
+    from rig.workbench.toml import new_text
 
     axes = [
         {"name": name, "letter": letter, "unit": unit, "family": "leadshine_pr",

@@ -35,9 +35,13 @@ from harness import (
 )
 
 from rig.config import parse_config
+from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
 from rig.core.session import Run
 from rig.journal import read_journal
 from rig.simulator import Simulator, Truth, parse_fault
+from rig.workbench.commission.operator import Operator
+from rig.workbench.commission.steps import Place
+from rig.workbench.commission.steps import axes as check_the_axes
 
 PHASES = ("zeroing", "moving", "settling", "measuring", "saving")
 FAULTS = (
@@ -86,6 +90,15 @@ MISTAKES: dict[str, dict[str, Any]] = {
 # What happens to a device without power, between a session and the next:
 # degrees by which the counters, or the joints, are elsewhere.
 OVERNIGHT = {"lost_origin": (1.4, 0.0), "moved_while_off": (0.0, 1.4)}
+# What is wrong in the file when the axes are checked, or with the phone: the factor on
+# every reduction, and the fault of the phone.
+UNPROVED = {
+    "reduction_times_10": (10.0, ""),
+    "reduction_times_100": (100.0, ""),
+    "imu_radians": (1.0, "imu_radians"),
+    "imu_radians_reduction_times_25": (25.0, "imu_radians"),
+}
+MOST_DEG = 6.0  # that a joint may be moved before it is found
 # In another process, or to this one; not in all phases, as the time differs only.
 HOST_PHASES = {
     "sigkill_watched": ("moving", "measuring"),
@@ -93,7 +106,7 @@ HOST_PHASES = {
     "other_stop": ("moving", "measuring"),
     "suspended_stop": ("moving", "measuring"),
 }
-COLUMNS = (*PHASES, "finishing", "start", "overnight")
+COLUMNS = (*PHASES, "finishing", "axes", "start", "overnight")
 DEAF = ("dead_drive", "lost_request", "exception_reply")  # cannot take a stop
 MAX_RESUMES = 6
 HARNESS = pathlib.Path(__file__).with_name("harness.py")
@@ -180,6 +193,8 @@ def run_cell(
         return _start_cell(fault, truth, folder)
     if phase == "overnight":
         return _overnight_cell(fault, truth, folder)
+    if phase == "axes":
+        return _axes_cell(fault, folder)
     said: list[str] = []
     spec = parse_fault(fault)
     hasty = fast_config(HASTY)
@@ -246,6 +261,43 @@ def _start_cell(fault: str, truth: np.ndarray, folder: pathlib.Path) -> Outcome:
             check_invariants(folder, sim, alive=True, deaf=False)
     assert not (folder / "calibration.json").exists()
     return Outcome(fault, "start", code, 0, reason, 0.0, refused=True)
+
+
+def _axes_cell(fault: str, folder: pathlib.Path) -> Outcome:
+    """The check of the axes of a device that is not as the file says."""
+    factor, kind = UNPROVED[fault]
+    folder.mkdir(parents=True)
+    said: list[str] = []
+    faults = [parse_fault(kind)] if kind else []
+    with simulator(fast_config(), faults=faults, speedup=1.0, noise_deg=0.005) as sim:
+        served = sim.start()
+        axes = tuple(
+            changed(axis, reduction=factor * axis.reduction, speed_deg_s=10.0)
+            for axis in served.axes
+        )
+        wrong = changed(served, axes=axes, output=str(folder))
+        record = DeviceRecord(folder / "device.json")
+        for state in (IDENTIFIED, HOMED):
+            record.reach(state, wrong)
+        operator = Operator(yes=True, say=said.append)
+        place = Place(wrong, record, operator, on_imu_port=sim.start_phone)
+        start, far = sim.plant.joints(), np.zeros(3)
+        attitude = sim.plant.attitude
+
+        def watched() -> np.ndarray:
+            far[:] = np.maximum(far, np.abs(sim.plant.joints() - start))
+            return attitude()
+
+        sim.plant.attitude = watched  # type: ignore[method-assign]
+        code = check_the_axes(place)
+    assert code in (1, 3), (code, said[-12:])
+    assert far.max() < MOST_DEG, f"a joint went {far.max():.1f} deg"
+    assert record.state(SIGN_CHECKED) is None
+    reason = next((s for s in said if s.startswith("fault:")), "")
+    found = next((s.strip() for s in said if ".reduction = " in s), "")
+    return Outcome(
+        fault, "axes", code, 0, reason or f"axes: {found}", 0.0, refused=True
+    )
 
 
 def _overnight_cell(fault: str, truth: np.ndarray, folder: pathlib.Path) -> Outcome:
@@ -398,6 +450,7 @@ def cells() -> list[tuple[str, str]]:
     host = [(fault, p) for fault in HOST_FAULTS for p in (*PHASES, "finishing")]
     host += [(fault, p) for fault, phases in HOST_PHASES.items() for p in phases]
     started = [(fault, "start") for fault in (*REAL, *MISTAKES)]
+    started += [(fault, "axes") for fault in UNPROVED]
     return simulated + host + started + [(fault, "overnight") for fault in OVERNIGHT]
 
 
@@ -434,7 +487,10 @@ def table(outcomes: list[Outcome]) -> str:
         "enable, a position that flickers, slow replies, a watchdog on idle lines) is "
         "ridden out. A mistake (an axis that turns the other way, two drives on each "
         "other's cables, another gearing in the drive) is *refused*: no calibration is "
-        "saved, and with exit code 2 nothing moved. *overnight*: between a stopped "
+        "saved, and with exit code 2 nothing moved. *axes*: the check of the axes with "
+        "a file whose gearing is wrong, or a phone that sends radians: it is said, no "
+        f"joint is moved by {MOST_DEG:g} degrees, and the device is not sign-checked. "
+        "*overnight*: between a stopped "
         "session and its resumption the drives were without power and count from "
         "elsewhere, or the joints were moved; the resumption is refused and measures "
         "nothing until the origin is found again. `second_session` and `other_stop` "

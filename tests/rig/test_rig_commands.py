@@ -121,7 +121,7 @@ def test_bad_input_is_one_clear_line_and_exit_code_2(
     monkeypatch.chdir(tmp_path)
     assert main(arguments) == 2
     error = capsys.readouterr().err
-    assert error.startswith("rig: ") and "Traceback" not in error
+    assert error.startswith("jaxcal-rig: ") and "Traceback" not in error
 
 
 def test_stop_works_alone_and_says_when_it_cannot(tmp_path, capsys):

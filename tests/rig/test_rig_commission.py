@@ -25,7 +25,7 @@ from rig.simulator import Truth
 from rig.workbench.commission import bench, home, steps
 from rig.workbench.commission.jog import FIRST_S, REPEAT_S, Held, Released
 from rig.workbench.commission.operator import Operator
-from rig.workbench.commission.toml import edit
+from rig.workbench.toml import edit
 
 RIG = pathlib.Path(__file__).parents[2]
 

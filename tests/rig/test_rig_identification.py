@@ -12,10 +12,8 @@ from rig.core.attitude import (
     ORDERS,
     Frame,
     Reading,
-    angles,
     attitudes,
     euler_to_matrix,
-    mean_rotation,
     raw_fields,
 )
 from rig.simulator import Truth
@@ -215,22 +213,5 @@ def test_the_readings_of_a_record_come_back(rng):
     matrices = frame.matrix(rng.normal([3, -5, 8], 0.1, (25, 3)))
     readings = [Reading(100.0 + 0.01 * i, m) for i, m in enumerate(matrices)]
     kept = raw_fields(readings)
-    np.testing.assert_allclose(attitudes(kept, frame), matrices, atol=1e-7)
+    np.testing.assert_allclose(attitudes(kept), matrices, atol=1e-7)
     np.testing.assert_allclose(np.diff(kept["stamps"]), 0.01, atol=2e-4)
-
-
-@pytest.mark.parametrize("at_zero", [True, False])
-def test_the_angles_of_version_1_tell_the_attitudes(rng, at_zero):
-    """The zero's were read against the first of its own readings, kept by nobody."""
-    frame = a_frame()
-    joints = rng.normal(0 if at_zero else 12, 0.1, (50, 3))
-    matrices = frame.matrix(joints)
-    against = frame
-    if at_zero:
-        against = Frame(matrices[0], frame.mounting, frame.order, frame.letters)
-    old = {
-        "raw_deg": against.angles(matrices).round(5).tolist(),
-        "attitude": mean_rotation(matrices).tolist(),
-    }
-    np.testing.assert_allclose(attitudes(old, frame), matrices, atol=1e-6)
-    np.testing.assert_allclose(angles(old, frame), joints, atol=1e-4)

@@ -16,8 +16,7 @@ from rig.config import parse_config
 from rig.journal import Journal, is_written, read_journal
 from rig.workbench.live import charts, words
 from rig.workbench.live.state import RunState
-from rig.workbench.live.tail import Tail
-from rig.workbench.live.watcher import Watcher
+from rig.workbench.live.watcher import Tail, Watcher
 from rig.workbench.live.worth import ellipsoid, prediction_std, reasons
 
 PICTURE = charts.LIGHT

@@ -32,7 +32,7 @@ def test_without_a_checkpoint_the_choice_is_the_exact_optimum(tmp_path, monkeypa
 
     config = parse_config(example_text("simulate"))
     candidates = config.to_deg(draw_candidates(config))
-    monkeypatch.setattr(weights, "default_folder", lambda: tmp_path / "none")
+    monkeypatch.setattr(weights, "shipped", lambda: tmp_path / "none.npz")
     choice = choose(config, candidates)
     assert (choice.method, choice.efficiency) == ("exact", 1.0)
     assert "no policy could be used" in choice.note

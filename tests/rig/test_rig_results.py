@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from rig.__main__ import main
 from rig.config import AXIS_NAMES, parse_config
-from rig.core.attitude import Frame, attitudes
+from rig.core.attitude import attitudes
 from rig.journal import read_journal
 from rig.simulator import Simulator, Truth
 from rig.workbench.identification.refit import reread
@@ -101,22 +101,8 @@ def rewritten(run, change):
     (run / "journal.jsonl").write_text("".join(lines))
 
 
-def as_version_1(record):
-    """Only angles of the readings, read against the first where it is the zero."""
-    if "quaternions" not in record:
-        return record
-    seen = attitudes(record, None)
-    # Any zero will do: what is read from the angles does not depend on it.
-    frame = Frame(seen[0], np.eye(3), "ZYX", fast_config().letters)
-    old = {k: v for k, v in record.items() if k not in ("quaternions", "stamps")}
-    return old | {"raw_deg": frame.angles(seen).round(5).tolist()}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("version", [1, 2])
-def test_refit_mends_a_wrong_order_without_new_recording(run, capsys, version):
-    if version == 1:
-        rewritten(run, as_version_1)
+def test_refit_mends_a_wrong_order_without_new_recording(run, capsys):
     before = files(run)
     assert np.abs(found(run) - TRUTH).max() > 0.05
     assert main(["refit", str(run), "--order", "ZXY"]) == 0
@@ -161,7 +147,7 @@ def test_reread_takes_the_phones_angles_as_they_were_sent(finished):
     zero = next(r for r in records if r["event"] == "zero")
     postures = {r["name"]: r for r in records if r["event"] == "posture"}
     for record in evidence.chosen:
-        seen = Rotation.from_matrix(attitudes(postures[record["name"]], None))
+        seen = Rotation.from_matrix(attitudes(postures[record["name"]]))
         sent = seen.as_euler("ZYX", degrees=True) * [-1, -1, -1]
         made = Rotation.from_euler("XYZ", sent * [1, -1, 1], degrees=True)
         off = made.inv() * Rotation.from_quat(record["quaternions"])
@@ -197,7 +183,7 @@ def test_refit_says_why_it_refuses(run, capsys, tmp_path):
     assert not beside(run)
 
 
-# Drift in a session, and runs of version 1
+# Drift in a session
 
 
 @pytest.mark.slow
@@ -217,25 +203,11 @@ def test_a_heading_that_drifts_is_taken_out_of_a_session(tmp_path):
     assert (left < 0.3 * before).all()
 
 
-def test_a_run_of_version_1_resumes_without_the_visit_in_the_middle(run, capsys):
-    def change(record):
-        if record.get("name") == "reference:middle":
-            return None
-        return as_version_1(record)
-
-    rewritten(run, change)
-    text = (run / "rig.toml").read_text()
-    assert session(parse_config(text), run) == 1  # without a phone: nothing moves
-    summary = json.loads((run / "summary.json").read_text())
-    assert len(summary["drift"]["minutes"]) == 2 and not summary["drift"]["corrected"]
-
-
-def test_new_keys_leave_the_fingerprint_as_version_1_took_it():
-    text = fast_text(session=SESSION + "drift_limit_deg = 0.1\n")
-    text = text.replace("column_count = 4", 'column_count = 4\nallow = ["10.0.0.2"]')
-    assert parse_config(text).fingerprint() == parse_config(
-        fast_text(session=SESSION)
-    ).fingerprint()  # fmt: skip
+def test_a_run_of_before_the_first_version_is_refused(run, capsys):
+    rewritten(run, lambda record: {k: v for k, v in record.items() if k != "device"})
+    for command in (["report"], ["refit"], ["export", "--to", "c"], ["resume"]):
+        assert main([command[0], str(run), *command[1:]]) == 2
+        assert "before jaxcal 0.1.0" in capsys.readouterr().err
 
 
 def test_a_journal_keeps_every_reading_in_little_room(finished):
@@ -469,7 +441,7 @@ def test_export_prints_or_writes_and_warns(run, capsys, tmp_path):
     (run / "calibration.json").unlink()
     for folder in (run, tmp_path / "none"):
         assert main(["export", str(folder), "--to", "c"]) == 2
-    assert capsys.readouterr().err.count("rig: ") == 2
+    assert capsys.readouterr().err.count("jaxcal-rig: ") == 2
 
 
 # Trend

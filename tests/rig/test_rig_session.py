@@ -143,7 +143,7 @@ def test_a_finished_run_resumes_to_the_same_without_moving(finished, tmp_path):
 
 def test_resume_refuses_a_changed_configuration(finished):
     changed = parse_config(fast_text({"std_deg = 0.1": "std_deg = 0.2"}))
-    named = r"configuration changed.*settle\.std_deg: 0\.1 then, 0\.2 now"
+    named = r"rig\.toml differs.*settle\.std_deg: 0\.1 then, 0\.2 now"
     with pytest.raises(ValueError, match=named):
         make_run(
             changed, finished[0], "calibrate", [].append,

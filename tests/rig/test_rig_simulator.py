@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from harness import fast_config, fast_text
 
+from rig.arguments import make_parser
 from rig.config import parse_config
 from rig.core.bus import Bus
 from rig.core.drive import Drive
@@ -143,7 +144,8 @@ def test_replies_take_their_time():
 
 
 def test_options_of_the_command_line_describe_a_device():
-    plain = {"noise": 0.0, "backlash": 0.0, "drift": 0.0}  # of a run of version 1
+    args = make_parser().parse_args(["simulate", "--noise", "0"])
+    plain = vars(args)
     assert truth_of(plain, 3) == Truth(noise_deg=0.0, seed=3)
     odd = {
         "reversed": ["roll"], "swapped": ["pitch", "yaw"], "gearing": 4000,

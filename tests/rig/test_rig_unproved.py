@@ -171,4 +171,4 @@ def test_no_file_asks_for_more_than_the_ceiling_of_speed():
     fast = re.sub(r"(?m)^speed_deg_s = 10", "speed_deg_s = 121", text)
     with pytest.raises(ConfigError, match=r"pitch\.speed_deg_s: .*max_speed_deg_s"):
         parse_config(fast)
-    parse_config(fast + "\n[motion]\nmax_speed_deg_s = 121\n")
+    parse_config(fast.replace("[motion]", "[motion]\nmax_speed_deg_s = 121"))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import pathlib
 import shutil
 import subprocess
 import sys
@@ -17,12 +16,12 @@ import pytest
 
 from jaxcal.extras import MissingExtraError
 from jaxcal.information.regression import log_det_gram
+from jaxcal.learning.core import network as networks
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.policies import decoding, networks
+from jaxcal.learning.policies import decoding
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
-from jaxcal.learning.runtime.weights import default_folder
 from jaxcal.learning.training import checkpoint
 from jaxcal.selection.policy import select_batch
 from jaxcal.selection.policy.compact import CompactNetwork, _Sets
@@ -226,43 +225,33 @@ def test_what_is_chosen_depends_on_no_other_set(rng):
     assert (drawn != select_batch(sets, 6, decoding="samples", num=2, seed=4)).any()
 
 
-def copy_of_the_shipped(folder: pathlib.Path) -> pathlib.Path:
-    shutil.copytree(default_folder(), folder)
-    return folder
-
-
 def test_weights_that_were_replaced_are_read_again(rng, tmp_path):
-    folder = copy_of_the_shipped(tmp_path / "policy")
+    path = tmp_path / "policy.npz"
+    shutil.copy(weights.shipped(), path)
     sets = rng.uniform(size=(30, 20, 3))
-    before = select_batch(sets, 6, checkpoint=folder)
-    path = weights.locate(folder)
+    before = select_batch(sets, 6, checkpoint=path)
     held = weights.read(path)
     held.arrays["trust"] = np.float32(-1.0)  # away from the look-ahead
     weights.write(path, held)
-    retrained = select_batch(sets, 6, checkpoint=folder)
-    assert (retrained != before).any()
-    np.testing.assert_array_equal(
-        select_batch(sets, 6, checkpoint=path), retrained
-    )  # the file itself
+    assert (select_batch(sets, 6, checkpoint=path) != before).any()
 
 
-def test_a_folder_without_the_weights_file_gives_the_same_answer(
+def test_a_runs_folder_gives_the_same_answer_as_its_policy_alone(
     rng, tmp_path, monkeypatch
 ):
-    folder = copy_of_the_shipped(tmp_path / "policy")
-    weights.locate(folder).unlink()
+    shipped = checkpoint.load()
+    for name in ("run", "other"):
+        checkpoint.save(tmp_path / name, 1, shipped.params, shipped.meta)
     sets = rng.uniform(size=(10, 20, 3))
     np.testing.assert_array_equal(
-        select_batch(sets, 4, checkpoint=folder), select_batch(sets, 4)
+        select_batch(sets, 4, checkpoint=tmp_path / "run"), select_batch(sets, 4)
     )
-    other = copy_of_the_shipped(tmp_path / "other")
-    weights.locate(other).unlink()
     monkeypatch.delitem(sys.modules, "jaxcal.learning.training.checkpoint")
     monkeypatch.delattr(sys.modules["jaxcal.learning.training"], "checkpoint")
     monkeypatch.setitem(sys.modules, "orbax", None)
     monkeypatch.setitem(sys.modules, "orbax.checkpoint", None)
-    with pytest.raises(MissingExtraError, match=r"policy\.npz.*jaxcal\[policy\]"):
-        select_batch(sets, 4, checkpoint=other)
+    with pytest.raises(MissingExtraError, match=r"training run.*jaxcal\[policy\]"):
+        select_batch(sets, 4, checkpoint=tmp_path / "other")
 
 
 @pytest.fixture(scope="module")

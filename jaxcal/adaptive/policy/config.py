@@ -7,20 +7,17 @@ from collections.abc import Mapping
 from typing import Any
 
 from jaxcal.adaptive import rules
+from jaxcal.adaptive.policy.network import Network
+from jaxcal.adaptive.policy.sessions import Sessions
 from jaxcal.adaptive.rules import Scored
+from jaxcal.learning.core.streams import Streams, StreamsConfig
 from jaxcal.learning.settings import require, setting
-from jaxcal.learning.training.config import PPOConfig
 
-__all__ = ["LENGTH", "PPO", "PolicyConfig"]
-
-LENGTH = 32  # choices that one stream of sessions makes in an update
+__all__ = ["PPO", "PolicyConfig"]
 
 _RULES: tuple[type[Scored], ...] = (rules.Priced, rules.StateRule)
 
-PPO = PPOConfig(
-    num_episodes=300 * 4096,
-    episodes_per_update=4096,
-    episodes_per_set=1,
+PPO = StreamsConfig(
     num_epochs=4,
     num_minibatches=8,
     learning_rate=2e-3,
@@ -31,7 +28,7 @@ PPO = PPOConfig(
     gae_lambda=1.0,
     average_decay=0.998,
 )
-"""Its episodes are choices: sessions differ in length."""
+"""The numbers that ship."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,23 +40,25 @@ class PolicyConfig:
     options: tuple[Mapping[str, Any], ...] = ({},)  # update u trains on u modulo n
     per_group: int = setting(6, "options of a group that the network sees")
     width: int = setting(64, "of the network's layers")
-    ppo: PPOConfig = PPO
+    ppo: StreamsConfig = PPO
+    seed: int = setting(0, "of everything random")
+    num_seeds: int = setting(1, "runs side by side: seed, seed + 1, ...")
     validate_every: float = 30.0  # seconds between validations
     save_every: float = 60.0  # seconds between checkpoints
 
     def __post_init__(self) -> None:
-        require(self, "at least 1", lambda v: v >= 1, "per_group", "width")
-        whole = LENGTH * self.ppo.num_minibatches
-        if self.ppo.episodes_per_update % whole:
-            raise ValueError(
-                f"episodes_per_update must be a multiple of {LENGTH} x num_minibatches "
-                f"= {whole}, got {self.ppo.episodes_per_update}"
-            )
+        require(self, "at least 1", lambda v: v >= 1, "per_group", "width", "num_seeds")
+        require(self, "0 or more", lambda v: v >= 0, "seed")
         if not isinstance(self.base, _RULES):
             known = ", ".join(rule.__name__ for rule in _RULES)
             raise ValueError(
                 f"base must be one of {known}, got {type(self.base).__name__}"
             )
+
+    @property
+    def learners(self) -> tuple[Streams, ...]:
+        """One: other options are other arrays of the same program."""
+        return (Streams(self.ppo, Sessions(self.per_group), Network(self.width)),)
 
     def as_meta(self) -> dict[str, Any]:
         """Plain JSON values; ``from_meta`` reads them back."""
@@ -73,6 +72,8 @@ class PolicyConfig:
             "network": {"width": self.width, "per_group": self.per_group},
             "base": {"rule": type(self.base).__name__, **constants},
             "ppo": dataclasses.asdict(self.ppo),
+            "seed": self.seed,
+            "num_seeds": self.num_seeds,
         }
 
     @staticmethod
@@ -88,6 +89,8 @@ class PolicyConfig:
                 {k: tuple(v) if isinstance(v, list) else v for k, v in options.items()}
                 for options in meta["options"]
             ),
-            ppo=PPOConfig(**meta["ppo"]),
+            ppo=StreamsConfig(**meta["ppo"]),
+            seed=meta["seed"],
+            num_seeds=meta["num_seeds"],
             **meta["network"],
         )

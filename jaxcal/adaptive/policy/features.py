@@ -22,6 +22,7 @@ class Seen:
     """A shortlist of C options."""
 
     index: jax.Array  # (C,) int32 into the options
+    designs: Any  # leaves (C, ...) of those options
     features: jax.Array  # (C, NUM_FEATURES)
     log_score: jax.Array  # (C,) of the base rule, less its maximum
     valid: jax.Array  # (C,) bool
@@ -58,30 +59,47 @@ def see(
     nearest = jnp.where(members, options.seconds[None], jnp.inf).min(axis=1)
     rate = gains / jnp.maximum(seconds, 1e-6)
     first, second = session.uses <= 1, session.uses <= 2
-    ones = jnp.ones_like(g)
-    where = _along(task, len(gains))[index]
     spent, free = _left_after(task, belief, len(gains))
-    features = jnp.stack(
-        [
-            0.2 * jnp.log(g + 1e-6), g, u, s / 5.0,
-            jnp.minimum(s / jnp.maximum(left, 1e-3), 3.0),
-            g / jnp.maximum(s, 1e-6), jnp.maximum(below, -10.0),
-            (nearest[mine] <= nearest.min() + 1e-6).astype(g.dtype),
-            where, u * first, u * second, u * u,
-            (left - s) / _SCALE, own, others, u * left / _SCALE,
-            g / (u + 0.05), jnp.sqrt(g),
-            spent[index] / 3.0, free[index] / 3.0,
-            jnp.log1p(whole), jnp.log1p(jnp.maximum(sums.sum() - whole, 0.0)),
-            # the same of all options
-            ones * left / _SCALE, ones * jnp.minimum(left / 5.0, 1.0),
-            ones * first, ones * second, ones * jnp.minimum(session.uses, 4) / 4.0,
-            ones * gains.max(), ones * rate.max(),
-            ones * session.made / 10.0, ones * jnp.nan_to_num(belief.entropy()) / 5.0,
-        ],
-        axis=-1,
-    )  # fmt: skip
+    of_option = {
+        "log_gain": 0.2 * jnp.log(g + 1e-6),
+        "gain": g,
+        "uses": u,
+        "seconds": s / 5.0,
+        "share_of_time": jnp.minimum(s / jnp.maximum(left, 1e-3), 3.0),
+        "rate": g / jnp.maximum(s, 1e-6),
+        "log_score": jnp.maximum(below, -10.0),
+        "in_nearest_group": (nearest[mine] <= nearest.min() + 1e-6).astype(g.dtype),
+        "where": _along(task, len(gains))[index],
+        "uses_at_last": u * first,
+        "uses_at_last_two": u * second,
+        "uses_squared": u * u,
+        "time_after": (left - s) / _SCALE,
+        "best_of_group": own,
+        "best_of_others": others,
+        "uses_by_time": u * left / _SCALE,
+        "gain_per_use": g / (u + 0.05),
+        "root_gain": jnp.sqrt(g),
+        "entropy_if_used": spent[index] / 3.0,
+        "entropy_if_not": free[index] / 3.0,
+        "sum_of_group": jnp.log1p(whole),
+        "sum_of_others": jnp.log1p(jnp.maximum(sums.sum() - whole, 0.0)),
+    }
+    of_session = {
+        "time": left / _SCALE,
+        "last_seconds": jnp.minimum(left / 5.0, 1.0),
+        "last_use": first,
+        "last_two_uses": second,
+        "uses_left": jnp.minimum(session.uses, 4) / 4.0,
+        "best_gain": gains.max(),
+        "best_rate": rate.max(),
+        "made": session.made / 10.0,
+        "entropy": jnp.nan_to_num(belief.entropy()) / 5.0,
+    }
+    wide = {name: jnp.full_like(g, value) for name, value in of_session.items()}
+    features = jnp.stack([*of_option.values(), *wide.values()], axis=-1)
     return Seen(
         index=index,
+        designs=jax.tree.map(lambda leaf: leaf[index], options.designs),
         features=jnp.where(valid[:, None], features, 0.0),
         log_score=jnp.where(valid, below, -1e9),
         valid=valid,

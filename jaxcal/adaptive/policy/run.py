@@ -1,4 +1,4 @@
-"""The run that trains a policy, and the checkpoint that it leaves."""
+"""The run that trains a policy, and what it leaves."""
 
 from __future__ import annotations
 
@@ -13,20 +13,23 @@ import jax.numpy as jnp
 from jaxcal.adaptive.episodes import play
 from jaxcal.adaptive.policy.config import PolicyConfig
 from jaxcal.adaptive.policy.network import Policy, initial
-from jaxcal.adaptive.policy.training import updater
+from jaxcal.adaptive.policy.sessions import Exercise
 from jaxcal.adaptive.tasks import registry
-from jaxcal.learning.runtime import weights
-from jaxcal.learning.training import checkpoint, loop, optimiser
+from jaxcal.learning.core.ppo import TrainState
+from jaxcal.learning.runtime import devices, weights
+from jaxcal.learning.runtime.weights import Weights
+from jaxcal.learning.training import checkpoint
 from jaxcal.learning.training.checkpoint import CheckpointError
-from jaxcal.learning.training.optimiser import Keys, TrainState
+from jaxcal.learning.training.run import Recipe, Report, run
 
-__all__ = ["Trained", "load", "train"]
+__all__ = ["COLUMNS", "MEASURED", "Trained", "exercises", "load", "train"]
 
 SCHEMA = "jaxcal-sequential-policy"
 COLUMNS = (
-    *("update", "episodes", "seconds", "reward_mean", "choices", "nats"),
-    *("nats_over_base", "entropy", "policy_loss", "value_loss", "kl", "learning_rate"),
+    *("update", "decisions", "seconds", "reward_mean", "choices"),
+    *("entropy", "policy_loss", "value_loss", "kl", "learning_rate"),
 )
+MEASURED = ("nats", "nats_over_base")
 _VALIDATED = 1024  # sessions
 _FRESH = 2**31 - 1  # their seed
 
@@ -38,7 +41,6 @@ class Trained:
     params: Any
     config: PolicyConfig
     meta: dict[str, Any]
-    step: int
 
     @property
     def decider(self) -> Policy:
@@ -47,15 +49,36 @@ class Trained:
             self.params, self.config.base, self.config.per_group, self.config.width
         )
 
+    @property
+    def weights(self) -> Weights:
+        """As plain arrays."""
+        return Weights(self.meta["network"], weights.flat(self.params), self.meta)
+
+
+def exercises(config: PolicyConfig) -> tuple[Exercise, ...]:
+    """What ``make_train(config)`` is given, one for each of the options.
+
+    Numbers are arrays, so that other constants do not compile again.
+
+    Raises:
+        ValueError: the registry or the task refuses its options.
+    """
+    make = registry.load(config.task).make
+    return tuple(
+        jax.tree.map(jnp.asarray, Exercise(make(**options), config.base))
+        for options in config.options
+    )
+
 
 def train(
     config: PolicyConfig,
     folder: str | pathlib.Path,
     *,
     resume: bool = False,
-    report: Callable[[loop.Report], None] = lambda report: None,
+    report: Callable[[Report], None] = lambda report: None,
     should_stop: Callable[[], bool] = lambda: False,
     num_updates: int | None = None,
+    num_devices: int | None = None,
 ) -> TrainState:
     """Train until the budget is spent or ``should_stop`` says so, and save.
 
@@ -65,44 +88,50 @@ def train(
         resume: go on from the newest checkpoint in ``folder``.
         report: called after every validation: fresh sessions of the first task, whose
             columns ``nats`` and ``nats_over_base`` (in pairs) are of averaged weights.
-        should_stop: asked between updates.
+        should_stop: asked every few seconds, between updates.
         num_updates: stop after this update instead of at the end of the budget.
+        num_devices: use so many of each process; all when None.
 
     Raises:
         CheckpointError: nothing to resume from, or damaged.
-        ValueError: the registry or the task refuses its options.
+        ValueError: the registry or the task refuses its options, or the devices cannot
+            share a minibatch evenly.
         OSError: the folder cannot be written.
     """
-    entry = registry.load(config.task)
-    tasks = [_arrays(entry.make(**options)) for options in config.options]
-    base = _arrays(config.base)
-
-    update = updater(config.ppo, config.per_group, config.width)
-
+    mesh = devices.make_mesh(num_devices)
+    devices.require_divisible(config.ppo.rows_per_minibatch, mesh)
+    given = exercises(config)
     keys = jax.random.split(jax.random.key(_FRESH), _VALIDATED)
+    task, base = given[0].task, given[0].base
     rules: list[float] = []  # nats of the base rule, once it is played
 
     def validate(average: Any) -> dict[str, float]:
         policy = Policy(average, base, config.per_group, config.width)
         if not rules:
-            rules.append(float(play(tasks[0], base, keys).gain.mean()))
-        nats = float(play(tasks[0], policy, keys).gain.mean())
-        return {"nats": nats, "nats_over_base": nats - rules[0]}
+            rules.append(float(play(task, base, keys).gain.mean()))
+        nats = float(play(task, policy, keys).gain.mean())
+        return dict(zip(MEASURED, (nats, nats - rules[0]), strict=True))
 
-    recipe = loop.Recipe(
+    recipe = Recipe(
         ppo=config.ppo,
+        learners=config.learners,
+        given=tuple((devices.replicate(each, mesh),) for each in given),
+        seed=config.seed,
+        num_seeds=config.num_seeds,
         meta=config.as_meta(),
-        init=lambda: _init(config),
-        update=lambda done, state: update(state, tasks[done % len(tasks)], base),
+        schema=SCHEMA,
+        unit="decisions",
+        per_update=config.ppo.decisions_per_update,
+        columns=COLUMNS,
+        measured=MEASURED,
         validate=validate,
         validate_every=config.validate_every,
         save_every=config.save_every,
-        columns=COLUMNS,
-        schema=SCHEMA,
     )
-    return loop.run(
+    return run(
         recipe,
         folder,
+        mesh=mesh,
         resume=resume,
         report=report,
         should_stop=should_stop,
@@ -110,35 +139,18 @@ def train(
     )
 
 
-def _arrays(tree: Any) -> Any:
-    """Numbers as arrays, so that other constants do not compile again."""
-    return jax.tree.map(jnp.asarray, tree)
-
-
-def _init(config: PolicyConfig) -> TrainState:
-    keys = Keys.of(config.ppo.seed)
-    params = initial(keys.weights, config.per_group, 1, config.width)
-    return TrainState(
-        params=params,
-        average=jax.tree.map(jnp.copy, params),
-        opt_state=optimiser.optimiser(config.ppo).init(params),
-        key=jax.random.key_data(keys.updates),
-        num_updates=jnp.zeros((), jnp.int32),
-    )
-
-
-def load(folder: str | pathlib.Path | None = None) -> Trained:
-    """The newest policy in a folder.
+def load(path: str | pathlib.Path | None = None) -> Trained:
+    """A policy; of several seeds the best by validation.
 
     Args:
-        folder: a checkpoint folder or a training run's; the one of KNEE that ships
+        path: a weights file or a training run's folder; the policy of KNEE that ships
             when None.
 
     Raises:
         CheckpointError: there is none, it is damaged, or it is of another kind.
     """
-    folder = weights.shipped("knee") if folder is None else folder
-    path, meta = checkpoint.latest(folder, SCHEMA)
+    path = weights.shipped("knee") if path is None else path
+    found, meta = checkpoint.read_meta(path, SCHEMA)
     try:
         config = PolicyConfig.from_meta(meta)
         like = jax.eval_shape(
@@ -146,7 +158,6 @@ def load(folder: str | pathlib.Path | None = None) -> Trained:
         )
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(
-            f"checkpoint {path} names no policy this jaxcal knows: {error}"
+            f"checkpoint {found} names no policy this jaxcal knows: {error}"
         ) from error
-    params = checkpoint.read_policy(path, like)
-    return Trained(params, config, meta, int(path.name))
+    return Trained(checkpoint.read(found, meta, like), config, meta)

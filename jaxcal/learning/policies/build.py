@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import cast
 
+from jaxcal.learning.core.network import Network
 from jaxcal.learning.policies.compact import CompactNetwork
-from jaxcal.learning.policies.networks import GROUP, Network, NetworkConfig
+from jaxcal.learning.policies.networks import GROUP, NetworkConfig
 from jaxcal.learning.settings import installed
 
 __all__ = ["build"]

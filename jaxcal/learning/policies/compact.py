@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from jaxcal.learning.core.network import mask_logits
 from jaxcal.learning.policies import geometry
 from jaxcal.learning.policies.features import (
     CandidateFeatures,
@@ -15,11 +18,36 @@ from jaxcal.learning.policies.features import (
     remaining,
     vector_features,
 )
-from jaxcal.learning.policies.networks import NetworkConfig, mask_logits
+from jaxcal.learning.policies.networks import NetworkConfig
 
 __all__ = ["CompactNetwork"]
 
 _SHARP = 60.0  # inverse temperature of the choices that need no learning
+
+
+class _Dense(nn.Module):
+    """A dense layer over inputs side by side, each multiplied by its own rows alone.
+
+    What all candidates share, or all decisions of a set, is then multiplied once and
+    not for each of them.
+    """
+
+    width: int
+
+    @nn.compact
+    def __call__(self, *parts: jax.Array) -> list[jax.Array]:
+        """Products (..., width), to be added up; the bias is in the first."""
+        sizes = [part.shape[-1] for part in parts]
+        init = nn.initializers.lecun_normal()
+        kernel = self.param("kernel", init, (sum(sizes), self.width))
+        bias = self.param("bias", nn.initializers.zeros, (self.width,))
+        cuts = itertools.accumulate(sizes)
+        products = [
+            part @ kernel[end - size : end]
+            for part, size, end in zip(parts, sizes, cuts, strict=True)
+        ]
+        products[0] = products[0] + jnp.broadcast_to(bias, products[0].shape)
+        return products
 
 
 class _Round(nn.Module):
@@ -30,20 +58,21 @@ class _Round(nn.Module):
     so that the cost grows with M and not with M squared.
     """
 
-    config: NetworkConfig
+    width: int
 
     @nn.compact
     def __call__(self, h: jax.Array, vectors: VectorFeatures) -> jax.Array:
         """(..., M, width) from (..., M, width)."""
-        width = self.config.width
+        width = self.width
         active = vectors.active[..., None].astype(h.dtype)
         u = nn.LayerNorm(name="norm")(h)
         v = nn.Dense(width, use_bias=False, name="send")(u) * active
         total = jnp.einsum("...mf,...mw->...fw", vectors.moments, v)
-        message = jnp.einsum("...mf,...fw->...mw", vectors.moments, total)
         number = jnp.maximum(active.sum(-2, keepdims=True), 1.0)
         mean = (u * active).sum(-2, keepdims=True) / number
-        inner = nn.Dense(2 * width, name="mix")(jnp.concatenate([u, message], axis=-1))
+        # The layer over messages is applied to their few totals instead.
+        own, sent = _Dense(2 * width, name="mix")(u, total)
+        inner = own + jnp.einsum("...mf,...fw->...mw", vectors.moments, sent)
         pooled = nn.Dense(2 * width, use_bias=False, name="pool")(mean)
         out = nn.Dense(width, name="out")(nn.relu(inner + pooled))
         return h + out * active
@@ -66,9 +95,9 @@ class CompactNetwork(nn.Module):
     def setup(self) -> None:
         config = self.config
         self.embed = nn.Dense(config.width)
-        self.encoder = [_Round(config) for _ in range(config.encoder_rounds)]
-        self.join = nn.Dense(config.width)
-        self.decoder = [_Round(config) for _ in range(config.decoder_rounds)]
+        self.encoder = [_Round(config.width) for _ in range(config.encoder_rounds)]
+        self.join = _Dense(config.width)
+        self.decoder = [_Round(config.width) for _ in range(config.decoder_rounds)]
         self.final_norm = nn.LayerNorm()
         self.actor = nn.Dense(
             1,
@@ -117,8 +146,9 @@ class CompactNetwork(nn.Module):
         )
 
     def shares_program(self, features: CandidateFeatures, k: int) -> range:
-        """Counts of choices made, out of K, after which the next is the same program:
-        the chosen span the space, and the look-ahead is not cut short by the end."""
+        """Numbers of choices made, out of K, at which the next choice compiles to the
+        same program: the chosen span the space, and the end does not cut the look-ahead
+        short."""
         p = features.whitened.shape[-1]
         ahead = max(self.config.lookahead, self.num_unlearned + 1)
         return range(p, k - ahead + 1) if k > p else range(0)
@@ -146,13 +176,10 @@ class CompactNetwork(nn.Module):
         """
         h, vectors = memory, decision.vectors
         columns, active = vectors.columns, vectors.active
-        lead = columns.shape[:-1]
         mean = jnp.einsum("...m,...mw->...w", decision.chosen, h)
         state = jnp.concatenate([mean, decision.progress], axis=-1)[..., None, :]
-        state = jnp.broadcast_to(state, (*lead, state.shape[-1]))
-        h = jnp.broadcast_to(h, (*lead, h.shape[-1]))
-        g = self.join(jnp.concatenate([h, columns, state], axis=-1))
-        g = g * active[..., None]
+        of_set, of_candidate, of_decision = self.join(h, columns, state)
+        g = (of_set + of_candidate + of_decision) * active[..., None]
         for layer in self.decoder:
             g = layer(g, vectors)
         g = self.final_norm(g)
@@ -170,8 +197,10 @@ class CompactNetwork(nn.Module):
         value = self.critic(nn.relu(self.critic_hidden(pooled)))[..., 0]
         return logits, decision.reached + value
 
-    def finish(self, decision: DecisionFeatures) -> tuple[jax.Array, jax.Array]:
-        """Logits and value of a choice that needs no network (``num_unlearned``)."""
+    def lookahead_logits(
+        self, decision: DecisionFeatures
+    ) -> tuple[jax.Array, jax.Array]:
+        """Logits and value of a choice that needs no parameters."""
         vectors = decision.vectors
         logits = mask_logits(_SHARP * vectors.ahead[..., 3], vectors.active)
         return logits, decision.reached

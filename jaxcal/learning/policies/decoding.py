@@ -12,8 +12,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxcal.learning.policies import networks
-from jaxcal.learning.policies.networks import Network
+from jaxcal.learning.core import network as networks
+from jaxcal.learning.core.network import Network
 from jaxcal.learning.small_matrices import log_det_gram
 
 __all__ = ["choose", "complete", "log_det_of", "logits_at"]
@@ -84,7 +84,7 @@ def logits_at(
         chosen.shape[-1] - count <= network.num_unlearned
     )
     if params is None or last:
-        return network.finish(decision)
+        return network.lookahead_logits(decision)
     return networks.decode(network, params, memory, decision)
 
 
@@ -107,7 +107,7 @@ def choose(
     """Choose k of M candidates for every set of a batch.
 
     Args:
-        network: from ``networks.build``.
+        network: from ``policies.networks.build``.
         params: its parameters.
         candidates: (B, M, n).
         available: (B, M) bool; required postures count as available to the encoder.

@@ -18,13 +18,9 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jaxcal.learning.runtime.processes import losing_a_process
-
 __all__ = [
     "any_process",
-    "by_set",
     "describe",
-    "everywhere",
     "is_first",
     "local",
     "make_mesh",
@@ -55,14 +51,16 @@ def make_mesh(num_devices: int | None = None) -> Mesh | None:
     return Mesh(np.asarray(chosen), ("sets",)) if len(chosen) > 1 else None
 
 
-def require_divisible(sets: int, mesh: Mesh | None) -> None:
-    """Refuse a minibatch of ``sets`` candidate sets that the devices cannot share."""
-    if mesh is not None and sets % mesh.size:
-        fewer = max(n for n in range(1, mesh.size) if sets % n == 0)
+def require_divisible(rows: int, mesh: Mesh | None) -> None:
+    """Refuse a minibatch of ``rows`` sets or streams that the devices cannot share."""
+    if mesh is not None and rows % mesh.size:
+        fewer = max(n for n in range(1, mesh.size) if rows % n == 0)
         raise ValueError(
             "episodes_per_update / (episodes_per_set x num_minibatches), the sets of a "
-            f"minibatch, must be a multiple of the {mesh.size} devices, got {sets}; "
-            f"change one of the three, or use {fewer} devices (--devices {fewer})"
+            "minibatch (of a task decisions_per_update / (stream_length x "
+            f"num_minibatches)), must be a multiple of the {mesh.size} devices, got "
+            f"{rows}; change one of the three, or use {fewer} devices (--devices "
+            f"{fewer})"
         )
 
 
@@ -74,22 +72,6 @@ def describe(mesh: Mesh | None) -> str:
     if jax.process_count() > 1:
         text += f" in {jax.process_count()} processes"
     return text
-
-
-def by_set(tree: Any, mesh: Mesh | None) -> Any:
-    """The same values, the leading axis of every leaf spread over the devices."""
-    return _placed(tree, mesh, PartitionSpec("sets"))
-
-
-def everywhere(tree: Any, mesh: Mesh | None) -> Any:
-    """The same values, whole on every device."""
-    return _placed(tree, mesh, PartitionSpec())
-
-
-def _placed(tree: Any, mesh: Mesh | None, spec: PartitionSpec) -> Any:
-    if mesh is None:
-        return tree
-    return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, spec))
 
 
 def is_first() -> bool:
@@ -115,10 +97,9 @@ def on_first(function: Callable[[], T]) -> T:
         except (ValueError, OSError) as error:
             answer = (False, error)
     data = np.frombuffer(pickle.dumps(answer), np.uint8)
-    with losing_a_process():
-        size = int(multihost_utils.broadcast_one_to_all(np.int32(data.size)))
-        buffer = data if is_first() else np.zeros(size, np.uint8)
-        data = np.asarray(multihost_utils.broadcast_one_to_all(buffer), np.uint8)
+    size = int(multihost_utils.broadcast_one_to_all(np.int32(data.size)))
+    buffer = data if is_first() else np.zeros(size, np.uint8)
+    data = np.asarray(multihost_utils.broadcast_one_to_all(buffer), np.uint8)
     fine, result = pickle.loads(data.tobytes())
     if not fine:
         raise result
@@ -129,8 +110,7 @@ def any_process(flag: bool) -> bool:
     """Whether the flag is set in any process; all processes must ask."""
     if jax.process_count() == 1:
         return flag
-    with losing_a_process():
-        return bool(multihost_utils.process_allgather(np.asarray(flag)).any())
+    return bool(multihost_utils.process_allgather(np.asarray(flag)).any())
 
 
 def replicate(tree: Any, mesh: Mesh | None) -> Any:

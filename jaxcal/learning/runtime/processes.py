@@ -1,49 +1,32 @@
-"""A job of several processes: who takes part, and what happens when one is lost.
+"""A job of several processes: who takes part, and how one joins and leaves.
 
 Every process runs the same command. It learns of the others from ``--coordinator``,
 ``--num-processes`` and ``--process-id``, or from what JAX finds under SLURM, Open MPI,
-Kubernetes and on Cloud TPU. JAX aborts a process whose partner died, with a page of
-traces; so the work is done in a child, and the parent, which holds no JAX, says in one
-line what happened. Nothing here imports JAX before the fork.
+Kubernetes and on Cloud TPU. When a process dies JAX ends the others, after a heartbeat
+was missing long enough; what was saved stays, and the next start resumes.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import os
-import pathlib
 import re
-import signal
 import sys
-import tempfile
-import threading
-import time
-import traceback
-from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NoReturn
+from collections.abc import Callable, Mapping
 
 __all__ = [
     "EXIT_LOST",
     "HEARTBEAT_SECONDS",
-    "LostProcessError",
     "add_arguments",
     "expected",
     "local_device_ids",
-    "losing_a_process",
     "run_job",
-    "supervise",
 ]
 
 EXIT_LOST = 3  # another process of the job is gone
 HEARTBEAT_SECONDS = 20  # silence after which a process counts as lost
 _CONNECT_SECONDS = 300  # for all processes to come together
 _LEAVE_SECONDS = 3600  # for the first to write, when the others are done
-_SAYS = "jaxcal: "  # begins a line of the log that is meant for the parent
-
-
-class LostProcessError(RuntimeError):
-    """A collective failed because another process of the job is gone."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -135,34 +118,32 @@ def run_job(
         job, _ = flags.parse_known_args(argv)
         if not expected(job):
             return work()
-        os.environ.pop("TF_CPP_MIN_LOG_LEVEL", None)  # what JAX logs is read below
+        os.environ.pop("TF_CPP_MIN_LOG_LEVEL", None)  # JAX's errors say who was lost
     except (ValueError, argparse.ArgumentError) as error:
         print(f"{program}: {error}", file=sys.stderr)
         return 2
 
-    def joined() -> int:
-        import jax
+    import jax
 
-        try:
-            _connect(job)
-            code = work()
-            if code == 0 and jax.distributed.is_initialized():
-                sys.stdout.flush()
-                jax.distributed.shutdown()  # whoever does not wait counts as lost
+    try:
+        _connect(job)
+        code = work()
+        if code == 0 and jax.distributed.is_initialized():
+            sys.stdout.flush()
+            jax.distributed.shutdown()  # whoever does not wait counts as lost
             return code
-        except LostProcessError as error:
-            _note(f"{_SAYS}{error}")
-            return EXIT_LOST
-        except ValueError as error:
-            print(f"{program}: {error}", file=sys.stderr)
-            return 2
-
-    return supervise(program, joined, advice)
-
-
-def _note(text: str) -> None:
-    """Write where the runtime writes: into the log that the parent reads."""
-    os.write(2, f"{text}\n".encode())
+    except ValueError as error:
+        print(f"{program}: {error}", file=sys.stderr)
+        code = 2
+    except RuntimeError as error:  # what a collective raises
+        line = (str(error).splitlines() or ["no reason given"])[0][:200]
+        print(f"{program}: the job is broken off ({line}); {advice}", file=sys.stderr)
+        code = EXIT_LOST
+    if jax.distributed.is_initialized():
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)  # without the farewell, which would wait for who is lost
+    return code
 
 
 def _connect(job: argparse.Namespace) -> None:
@@ -170,7 +151,7 @@ def _connect(job: argparse.Namespace) -> None:
 
     Raises:
         ValueError: the job is not described completely.
-        LostProcessError: not every process came in time.
+        RuntimeError: not every process came in time.
     """
     import jax
 
@@ -190,117 +171,7 @@ def _connect(job: argparse.Namespace) -> None:
             return  # none of JAX's detections found a job: this process is alone
         raise
     except RuntimeError as error:
-        raise LostProcessError(
+        raise RuntimeError(
             f"not every process came to {job.coordinator or 'the coordinator'} in "
-            f"{_CONNECT_SECONDS} s ({str(error).splitlines()[0][:120]})"
+            f"{_CONNECT_SECONDS} s: {str(error).splitlines()[0][:120]}"
         ) from None
-    _note(f"{_SAYS}process {jax.process_index()} of {jax.process_count()}")
-
-
-@contextlib.contextmanager
-def losing_a_process() -> Iterator[None]:
-    """Turn what a collective raises into ``LostProcessError``, in a job of several.
-
-    JAX names the lost process when its heartbeat has been missing long enough, and ends
-    this one: that is waited for, so that the message can say which it was.
-    """
-    import jax
-
-    try:
-        yield
-    except (RuntimeError, ValueError) as error:
-        if jax.process_count() == 1:
-            raise
-        _note(traceback.format_exc())
-        time.sleep(2 * HEARTBEAT_SECONDS)
-        raise LostProcessError("another process of the job was lost") from error
-
-
-def supervise(program: str, run: Callable[[], int], advice: str) -> int:
-    """Run in a child, and say in one line if the job lost a process.
-
-    Args:
-        program: begins the line.
-        run: the work; its exit code is passed on.
-        advice: ends the line: how to go on.
-
-    Returns:
-        The child's exit code; ``EXIT_LOST`` where another process was lost, and 128 + n
-        where signal n ended this one.
-    """
-    if not hasattr(os, "fork"):
-        return run()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    descriptor, name = tempfile.mkstemp(prefix="jaxcal-runtime-", suffix=".log")
-    parent = os.getpid()
-    child = os.fork()
-    if child == 0:
-        _work(run, parent, descriptor)
-    os.close(descriptor)
-
-    def pass_on(number: int, frame: Any) -> None:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(child, number)
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, pass_on)
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    log = pathlib.Path(name)
-    text = log.read_text(errors="replace")
-    if code >= 0 and code != EXIT_LOST:
-        log.unlink()
-        return code
-    who, what, lost = "this process", "", _lost(text)
-    for said in re.findall(f"^{_SAYS}(.*)$", text, re.MULTILINE):
-        if re.fullmatch(r"process \d+ of \d+", said):
-            who = said
-        else:
-            what = f"stops: {said}"
-    if code == EXIT_LOST or (code == -signal.SIGABRT and lost):
-        what = what or f"stops: {lost or 'another process of the job'} was lost"
-        code = EXIT_LOST
-    else:
-        what = f"was ended by signal {-code} ({signal.Signals(-code).name})"
-        code = 128 - code
-    print(f"{program}: {who} {what}; {advice} (log: {log})", file=sys.stderr)
-    return code
-
-
-def _work(run: Callable[[], int], parent: int, log: int) -> NoReturn:
-    """The child: Python's output as before, that of the runtime below into the log."""
-    os.setpgid(0, 0)  # a Ctrl-C of the terminal comes once, through the parent
-    for stream in ("stdout", "stderr"):
-        old = getattr(sys, stream)
-        kept = os.dup(old.fileno())
-        os.dup2(log, old.fileno())
-        new = open(kept, "w", encoding=old.encoding, buffering=1, errors=old.errors)
-        setattr(sys, stream, new)
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(EXIT_LOST)
-
-    threading.Thread(target=watch, daemon=True).start()
-    code: Any = 1
-    try:
-        code = run()
-    except SystemExit as leaving:
-        code = leaving.code if isinstance(leaving.code, int) else 1
-    except BaseException:
-        traceback.print_exc()
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)  # without the farewell barrier, which would wait for the lost
-
-
-def _lost(log: str) -> str | None:
-    """Which processes JAX's coordination service says are gone."""
-    found = re.search(r"stopped sending heartbeats\):\n((?:.*\n)*?)The tasks", log)
-    if found:
-        names = sorted(set(re.findall(r"\d+", found.group(1))), key=int)
-        return ", ".join(f"process {name}" for name in names)
-    if "Failed to send RPC to coordination service" in log or "Socket closed" in log:
-        return "process 0, the coordinator,"
-    return None

@@ -1,9 +1,8 @@
-"""Where a checkpoint lies, and its weights in a plain file: no JAX, no orbax.
+"""Where a checkpoint lies, and a policy in one plain file: no JAX, no orbax.
 
-``policy.npz`` lies in a step's folder beside what orbax wrote there. It holds the
-weights by flat name (``encoder_0.mix.kernel``) and ``header``: JSON with the format,
-its version, the fields of the ``NetworkConfig``, the checkpoint's meta and the SHA-256
-of network and weights, by which damage is found.
+A weights file (``.npz``) holds the weights by flat name (``encoder_0.mix.kernel``) and
+``header``: JSON with the format, its version, the fields of the ``NetworkConfig``, the
+checkpoint's meta and the SHA-256 of network and weights, by which damage is found.
 """
 
 from __future__ import annotations
@@ -22,22 +21,18 @@ from numpy.typing import NDArray
 from jaxcal.files import atomic_write
 
 __all__ = [
-    "NAME",
     "CheckpointError",
     "Weights",
-    "default_folder",
     "flat",
     "locate",
-    "newest_step",
+    "nested",
     "read",
-    "resolve",
     "shipped",
     "write",
 ]
 
-NAME = "policy.npz"
 _FORMAT = "jaxcal-policy-weights"
-_VERSION = 1
+_VERSION = 2
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -46,36 +41,30 @@ class CheckpointError(ValueError):
     """A checkpoint that is missing, damaged, or made by another version."""
 
 
-def shipped(name: str) -> pathlib.Path:
-    """A checkpoint that ships: in the installed package, or in the repository."""
+def shipped(name: str = "default") -> pathlib.Path:
+    """A policy that ships: in the installed package, or in the repository."""
     package = pathlib.Path(__file__).resolve().parents[2]
-    inside = package / "checkpoints" / name
-    return inside if inside.is_dir() else package.parent / "checkpoints" / name
+    inside = package / "checkpoints" / f"{name}.npz"
+    return inside if inside.is_file() else package.parent / "checkpoints" / inside.name
 
 
-def default_folder() -> pathlib.Path:
-    """The checkpoint of postures that ships."""
-    return shipped("default")
-
-
-def resolve(folder: str | pathlib.Path | None) -> pathlib.Path:
-    """The folder with the numbered steps: the one given, or its ``checkpoint``.
+def locate(checkpoint: str | pathlib.Path | None) -> pathlib.Path:
+    """The weights file that is named, or the newest complete step of a run.
 
     Args:
-        folder: a checkpoint folder or a training run's; the one that ships when None.
+        checkpoint: a weights file, a training run's folder or its checkpoint folder;
+            the policy of postures that ships when None.
 
     Raises:
-        CheckpointError: it does not exist.
+        CheckpointError: there is no such file or folder, or no step in it.
     """
-    path = default_folder() if folder is None else pathlib.Path(folder)
+    path = shipped() if checkpoint is None else pathlib.Path(checkpoint)
+    if path.is_file():
+        return path
     if not path.is_dir():
-        hint = " (train one with: python train.py)" if folder is None else ""
-        raise CheckpointError(f"checkpoint folder {path} does not exist{hint}")
-    return path / "checkpoint" if (path / "checkpoint").is_dir() else path
-
-
-def newest_step(folder: pathlib.Path) -> pathlib.Path:
-    """The folder of the newest complete step in a folder from ``resolve``."""
+        hint = " (train one with: python train.py)" if checkpoint is None else ""
+        raise CheckpointError(f"checkpoint {path} does not exist{hint}")
+    folder = path / "checkpoint" if (path / "checkpoint").is_dir() else path
     steps = [p for p in folder.iterdir() if p.name.isdigit() and p.is_dir()]
     if not steps:
         raise CheckpointError(f"checkpoint folder {folder} holds no checkpoint")
@@ -111,19 +100,16 @@ def flat(tree: Mapping[str, Any], above: str = "") -> Arrays:
     return arrays
 
 
-def locate(checkpoint: str | pathlib.Path | None) -> pathlib.Path:
-    """Where the weights file of a checkpoint is, or would be.
-
-    Args:
-        checkpoint: a checkpoint folder, a training run's or the file itself; the
-            checkpoint that ships when None.
-
-    Raises:
-        CheckpointError: there is no such folder, or no step in it.
-    """
-    if checkpoint is not None and pathlib.Path(checkpoint).is_file():
-        return pathlib.Path(checkpoint)
-    return newest_step(resolve(checkpoint)) / NAME
+def nested(arrays: Mapping[str, Any]) -> dict[str, Any]:
+    """What ``flat`` was given."""
+    tree: dict[str, Any] = {}
+    for name, array in arrays.items():
+        *above, last = name.split(".")
+        place = tree
+        for part in above:
+            place = place.setdefault(part, {})
+        place[last] = array
+    return tree
 
 
 def write(path: str | pathlib.Path, weights: Weights) -> None:
@@ -169,7 +155,4 @@ def read(path: str | pathlib.Path) -> Weights:
 
 
 def _damaged(path: str | pathlib.Path, what: str) -> str:
-    return (
-        f"weights file {path} is damaged ({what}): write it again with python -m "
-        f"jaxcal.learning.training.checkpoint {pathlib.Path(path).parent.parent}"
-    )
+    return f"weights file {path} is damaged ({what}): export or copy it again"

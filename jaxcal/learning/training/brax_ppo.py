@@ -20,9 +20,9 @@ from brax.training.agents.ppo import networks as brax_networks
 from brax.training.agents.ppo import train as brax_train
 from brax.training.networks import FeedForwardNetwork
 
+from jaxcal.learning.core.network import initial
 from jaxcal.learning.environments.brax_env import SelectionEnv, wrap_fresh
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.policies import networks
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.settings import settings_of
@@ -38,10 +38,9 @@ READ = {
     "gae_lambda": "gae_lambda",
     "clip_range": "clipping_epsilon",
     "max_grad_norm": "max_grad_norm",
-    "seed": "seed",
 }
 """Fields of PPOConfig that brax is given, and its names of them; beside them the number
-of episodes, the environment and the network's width."""
+of episodes, the seed, the environment and the network's width."""
 _FIXED = {
     "num_envs": 256,
     "num_eval_envs": 256,
@@ -67,7 +66,7 @@ def adapted(config: TrainConfig) -> TrainConfig:
 
 def require_read(given: Collection[str]) -> None:
     """Refuse values of fields, by name, that brax's trainer would not read."""
-    read = {*READ, "num_episodes", "width"}
+    read = {*READ, "num_episodes", "seed", "width"}
     read |= {field.name for field in settings_of(SelectionConfig)}
     if unread := sorted(set(given) - read):
         flags = ", ".join("--" + name.replace("_", "-") for name in unread)
@@ -115,7 +114,7 @@ def _networks(env: SelectionConfig, config: NetworkConfig) -> brax_networks.PPON
 
     def read(part: int) -> FeedForwardNetwork:
         return FeedForwardNetwork(
-            init=lambda key: networks.initial(network, key, m, n, env.num_selected),
+            init=lambda key: initial(network, key, m, n, env.num_selected),
             apply=lambda _, params, observation: network.apply(
                 {"params": params}, observation, m, n, method="from_observation"
             )[part],
@@ -167,6 +166,7 @@ def train(
     read = {name: getattr(ppo, name) for name in READ}
     given = _FIXED | {READ[name]: value for name, value in read.items()}
     given |= {"num_timesteps": ppo.num_episodes * length, "num_evals": num_evals}
+    given |= {"seed": config.seed}
     given |= {"episode_length": length, "unroll_length": length}
     begun = time.perf_counter()
 
@@ -191,7 +191,6 @@ def train(
         "ppo": read | {"num_episodes": ppo.num_episodes},
         "trainer": "brax",
         "brax": given,
-        "seed": ppo.seed,
         "progress": {
             "episodes": ppo.num_episodes,
             "seconds": time.perf_counter() - begun,

@@ -1,15 +1,11 @@
-"""Checkpoints, by orbax: the policy, what it was trained with, and how to go on.
+"""Checkpoints: of a run by orbax, of a policy that is finished as one plain file.
 
-A checkpoint folder holds one numbered folder a save. Each has ``policy`` (the averaged
-weights), ``meta`` (JSON: schema, configuration, seed, package versions, progress),
-``policy.npz`` (weights and meta again, for inference without JAX) and, in a training
-run, ``state`` (all an uninterrupted run would need). Orbax writes a step beside the
-others and renames it, so a kill during a save leaves the previous one; ``policy.npz``
-follows, and a step that lost it is still read through orbax.
-
-    python -m jaxcal.learning.training.checkpoint FOLDER
-
-adds ``policy.npz`` to the newest step of a folder that has none.
+A run's folder ``checkpoint`` holds one numbered folder a save. Each has ``policy`` (the
+averaged weights), ``state`` (what else an uninterrupted run would need) and ``meta``
+(JSON: schema, configuration, package versions, progress). Orbax writes a step beside
+the others and renames it, so a kill during a save leaves the previous one. ``export``
+writes the policy alone to a weights file (``runtime.weights``), which is what ships and
+what a rig reads without JAX.
 
 orbax calls this interface legacy and its successor is still experimental; it is used
 here alone, so that changing it touches one file.
@@ -25,41 +21,35 @@ import json
 import logging
 import pathlib
 import platform
-import sys
-import tempfile
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from jaxcal.learning.policies import networks
+from jaxcal.learning.core.network import Network, initial
+from jaxcal.learning.core.ppo import TrainState
 from jaxcal.learning.policies.build import build
-from jaxcal.learning.policies.networks import Network, NetworkConfig
+from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
-from jaxcal.learning.runtime.weights import (
-    CheckpointError,
-    Weights,
-    newest_step,
-    resolve,
-)
+from jaxcal.learning.runtime.weights import CheckpointError, Weights, locate
 
 __all__ = [
+    "SCHEMA",
     "CheckpointError",
     "Policy",
     "export",
     "fingerprint",
-    "latest",
     "load",
     "package_versions",
-    "read_policy",
+    "read",
+    "read_meta",
     "restore",
     "save",
 ]
 
 SCHEMA = "jaxcal-policy"
-VERSION = 1
+VERSION = 2
 _PACKAGES = ("jaxcal", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
 
 # orbax warns of every default it takes, on every load.
@@ -73,20 +63,11 @@ class Policy:
     network: Network
     params: Any
     meta: dict[str, Any]  # as saved
-    folder: pathlib.Path
-    step: int
 
     @property
     def weights(self) -> Weights:
-        """As plain arrays, which ``policy.npz`` holds."""
-        return _plain(self.params, self.meta)
-
-
-def _plain(params: Any, meta: dict[str, Any]) -> Weights:
-    network = meta["network"]
-    if meta.get("schema", SCHEMA) == SCHEMA:  # with every field, also those not saved
-        network = dataclasses.asdict(NetworkConfig(**network))
-    return Weights(network, weights.flat(params), meta)
+        """As plain arrays."""
+        return Weights(self.meta["network"], weights.flat(self.params), self.meta)
 
 
 def package_versions() -> dict[str, str]:
@@ -111,9 +92,9 @@ def _alone() -> Any:
 def save(
     folder: str | pathlib.Path,
     step: int,
-    params: Any,
+    policy: Any,
     meta: dict[str, Any],
-    state: Any = None,
+    state: TrainState | None = None,
     keep: int = 3,
 ) -> None:
     """Add a step to a checkpoint folder.
@@ -121,10 +102,10 @@ def save(
     Args:
         folder: made where missing.
         step: number of the step; a step that exists is left as it is.
-        params: the policy's weights.
-        meta: JSON values; ``network`` is the fields of a ``NetworkConfig``, or, of
-            another ``schema``, what that one says.
-        state: what ``restore`` gives back, or None for a policy only.
+        policy: the averaged weights.
+        meta: JSON values: ``schema``, and a configuration as that one says.
+        state: of the run, with that policy in it; None where there is nothing to go on
+            with.
         keep: older steps beyond these are deleted.
     """
     root = pathlib.Path(folder)
@@ -132,11 +113,11 @@ def save(
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     own: dict[str, Any] = {"schema": SCHEMA, "version": VERSION}
     meta = own | {"created": now, "versions": package_versions()} | meta
-    arrays = {"policy": params} | ({} if state is None else {"state": state})
-    # Arrays of the host, which know no device.
+    trees = {"policy": policy} | ({} if state is None else {"state": _rest(state)})
+    # Arrays of the host, which know no device; nothing is written twice.
     items = {
         name: ocp.args.StandardSave(jax.tree.map(np.asarray, tree))
-        for name, tree in arrays.items()
+        for name, tree in trees.items()
     }
     options = ocp.CheckpointManagerOptions(
         max_to_keep=keep,
@@ -151,7 +132,12 @@ def save(
         manager.save(
             step, args=ocp.args.Composite(meta=ocp.args.JsonSave(meta), **items)
         )
-    weights.write(root / str(step) / weights.NAME, _plain(params, meta))
+
+
+def _rest(state: TrainState) -> dict[str, Any]:
+    """What a state holds beside the averaged weights."""
+    names = ("params", "opt_state", "key", "num_updates")
+    return {name: getattr(state, name) for name in names}
 
 
 class _PatientLoop(asyncio.SelectorEventLoop):
@@ -200,25 +186,29 @@ def _unreadable(path: pathlib.Path, what: str, error: Exception) -> CheckpointEr
     return CheckpointError(f"checkpoint {path} cannot be {what} ({line})")
 
 
-def latest(
-    folder: str | pathlib.Path | None, schema: str = SCHEMA
+def read_meta(
+    checkpoint: str | pathlib.Path | None, schema: str = SCHEMA
 ) -> tuple[pathlib.Path, dict[str, Any]]:
-    """The newest complete step of a folder and its meta, checked.
+    """A weights file or the newest complete step of a run, and its meta, checked.
 
     Args:
-        folder: a checkpoint folder or a training run's; the one that ships when None.
+        checkpoint: a weights file, a training run's folder or its checkpoint folder;
+            the policy that ships when None.
         schema: what it must hold.
 
     Raises:
         CheckpointError: there is none, it is damaged, or holds something else.
     """
-    path = newest_step(resolve(folder))
-    try:
-        meta = json.loads((path / "meta" / "metadata").read_text())
-    except (OSError, ValueError) as error:
-        raise _unreadable(path, "read: its meta is damaged", error) from error
-    if not isinstance(meta, dict) or meta.get("schema") != schema:
-        held = meta.get("schema") if isinstance(meta, dict) else None
+    path = locate(checkpoint)
+    if path.is_file():
+        meta = weights.read(path).meta
+    else:
+        try:
+            meta = json.loads((path / "meta" / "metadata").read_text())
+        except (OSError, ValueError) as error:
+            raise _unreadable(path, "read: its meta is damaged", error) from error
+    held = meta.get("schema") if isinstance(meta, dict) else None
+    if held != schema:
         raise CheckpointError(
             f"checkpoint {path} is not a jaxcal policy of this kind: its schema must "
             f"be {schema}, got {held}"
@@ -231,16 +221,16 @@ def latest(
     return path, meta
 
 
-def load(folder: str | pathlib.Path | None = None) -> Policy:
-    """The newest policy in a folder.
+def load(checkpoint: str | pathlib.Path | None = None) -> Policy:
+    """A policy of postures; of several seeds the best by validation.
 
     Args:
-        folder: a checkpoint folder or a training run's; the one that ships when None.
+        checkpoint: as for ``read_meta``.
 
     Raises:
         CheckpointError: there is none, it is damaged, or another version made it.
     """
-    path, meta = latest(folder)
+    path, meta = read_meta(checkpoint)
     try:
         network = build(NetworkConfig(**meta["network"]))
         env = meta["tasks"][0]["environment"]
@@ -249,19 +239,41 @@ def load(folder: str | pathlib.Path | None = None) -> Policy:
         raise CheckpointError(
             f"checkpoint {path} names no network or task this jaxcal knows: {error}"
         ) from error
-    like = jax.eval_shape(lambda: networks.initial(network, jax.random.key(0), m, n, k))
-    params = read_policy(path, like)
-    return Policy(network, params, meta, path.parent, int(path.name))
+    like = jax.eval_shape(lambda: initial(network, jax.random.key(0), m, n, k))
+    return Policy(network, read(path, meta, like), meta)
 
 
-def read_policy(path: pathlib.Path, like: Any) -> Any:
-    """The weights in a step's folder, of the shapes of ``like``.
+def read(path: pathlib.Path, meta: dict[str, Any], like: Any) -> Any:
+    """The weights in a file or a step's folder, of the shapes of ``like``.
+
+    Args:
+        path, meta: from ``read_meta``.
+        like: weights of one policy; of several seeds the best is taken.
 
     Raises:
         CheckpointError: they are damaged, of other shapes or not finite.
     """
     what = "read: its weights are damaged or do not fit its network"
-    params = _read(path / "policy", like, what)
+    seeds = meta.get("num_seeds", 1)
+    if path.is_file():
+        arrays = weights.read(path).arrays
+        params = jax.tree.map(jax.numpy.asarray, weights.nested(arrays))
+        held, wanted = (
+            (jax.tree.structure(tree), [leaf.shape for leaf in jax.tree.leaves(tree)])
+            for tree in (params, like)
+        )
+        if held != wanted:
+            raise CheckpointError(f"checkpoint {path} cannot be {what}")
+    elif seeds == 1:
+        params = _read(path / "policy", like, what)
+    else:
+        several = jax.tree.map(
+            lambda leaf: jax.ShapeDtypeStruct((seeds, *leaf.shape), leaf.dtype), like
+        )
+        best = meta["progress"]["best"]
+        params = jax.tree.map(
+            lambda leaf: leaf[best], _read(path / "policy", several, what)
+        )
     for name, array in weights.flat(params).items():
         if not np.isfinite(array).all():
             raise CheckpointError(
@@ -270,83 +282,51 @@ def read_policy(path: pathlib.Path, like: Any) -> Any:
     return params
 
 
-def fingerprint(folder: str | pathlib.Path | None = None) -> str:
+def fingerprint(checkpoint: str | pathlib.Path | None = None) -> str:
     """SHA-256 of a policy's network and weights, the same wherever it lies.
 
     Raises:
         CheckpointError: see ``load``.
     """
-    return load(folder).weights.fingerprint
+    return load(checkpoint).weights.fingerprint
 
 
-def export(
-    run: str | pathlib.Path,
-    folder: str | pathlib.Path,
-    load: Callable[[str | pathlib.Path], Any] = load,
-) -> None:
-    """Write a run's policy alone, without its training state, to another folder.
+def export(policy: Weights, path: str | pathlib.Path) -> None:
+    """Write a policy alone to a weights file, atomically.
 
     Args:
-        run: a training run's folder.
-        folder: becomes a checkpoint folder with one step; one that is there is replaced
-            after the new one is complete.
-        load: reads the run's policy, with ``params``, ``meta`` and ``step``.
+        policy: of a run.
+        path: of the file, ending in ``.npz``; one that is there is replaced.
+
+    Raises:
+        ValueError: the path has another ending.
     """
-    policy = load(run)
-    target = pathlib.Path(folder)
+    target = pathlib.Path(path)
+    if target.suffix != ".npz":
+        raise ValueError(f"the policy is exported to one file NAME.npz, got {path}")
     target.parent.mkdir(parents=True, exist_ok=True)
-    own = {"version", "created", "versions"}
-    meta = {name: value for name, value in policy.meta.items() if name not in own}
-    meta["trained_with"] = policy.meta["versions"]
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".export-") as fresh:
-        new, old = pathlib.Path(fresh) / "new", pathlib.Path(fresh) / "old"
-        save(new, policy.step, policy.params, meta)
-        for marker in new.rglob("commit_success.txt"):
-            # orbax looks only whether the file is there, and writes this machine's
-            # folders into it.
-            marker.write_text("committed\n")
-        if target.exists():
-            target.rename(old)
-        new.rename(target)
+    weights.write(target, policy)
 
 
 def restore(
-    folder: str | pathlib.Path, fresh: Any, schema: str = SCHEMA
-) -> tuple[Any, dict[str, Any]]:
+    folder: str | pathlib.Path, fresh: TrainState, schema: str = SCHEMA
+) -> tuple[TrainState, dict[str, Any]]:
     """The training state of the newest step, and its meta.
 
     Args:
-        folder: as for ``load``.
+        folder: of a run, or its checkpoint folder.
         fresh: a state of the same structure, for shapes and types.
         schema: of the run.
 
     Raises:
         CheckpointError: none, damaged, or one without a training state.
     """
-    path, meta = latest(folder, schema)
+    path, meta = read_meta(folder, schema)
     if not (path / "state").exists():
         raise CheckpointError(
             f"checkpoint {path} holds a policy but no training state to resume from"
         )
     what = "resumed: its training state is damaged or of another configuration"
-    return _read(path / "state", fresh, what), meta
-
-
-def main(argv: list[str]) -> int:
-    """Add the weights file to the newest step of a checkpoint or run folder."""
-    if len(argv) != 1 or argv[0].startswith("-"):
-        print((__doc__ or "").partition("\n\n    ")[2].strip())
-        return 2
-    try:
-        policy = load(argv[0])
-        path = policy.folder / str(policy.step) / weights.NAME
-        weights.write(path, policy.weights)
-    except (CheckpointError, OSError) as error:
-        print(f"checkpoint: {error}", file=sys.stderr)
-        return 2
-    print(f"wrote {path}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    average = _read(path / "policy", fresh.average, what)
+    rest = _read(path / "state", _rest(fresh), what)
+    return TrainState(average=average, **rest), meta

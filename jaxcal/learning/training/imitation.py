@@ -9,6 +9,7 @@ Episodes that begin with given postures want the best completion of those.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -18,17 +19,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax.sharding import Mesh
 
-from jaxcal.learning.policies import networks
-from jaxcal.learning.policies.networks import Network
-from jaxcal.learning.training import rollout, update
-from jaxcal.learning.training.config import PPOConfig
-from jaxcal.learning.training.optimiser import Keys, Metrics
-from jaxcal.learning.training.rules import Rules
-from jaxcal.learning.training.update import Update
+from jaxcal.learning.core.network import decode, encode, mask_logits
+from jaxcal.learning.core.postures import Episode, Postures
+from jaxcal.learning.core.ppo import Metrics, squared_error
 
-__all__ = ["Lesson", "Lessons", "Teacher", "draw", "follow", "loss", "updater"]
+__all__ = ["Imitation", "Lesson", "Lessons", "Teacher", "draw"]
 
 Teacher = Callable[
     [np.ndarray, np.ndarray, np.ndarray, int], tuple[np.ndarray, np.ndarray]
@@ -49,15 +45,12 @@ class Lesson:
     best: jax.Array  # (B,) float32 log det(Z.T Z) of the wanted
 
 
-def draw(
-    config: PPOConfig, task: Rules, network: Network, teacher: Teacher, index: int
-) -> Lesson:
-    """The lesson of update ``index``: the same whenever it is asked for."""
-    num_sets = config.episodes_per_update
-    key = jax.random.fold_in(Keys.of(config.seed).lessons, index)
+def draw(learner: Postures, teacher: Teacher, key: jax.Array) -> Lesson:
+    """The lesson of an update: the same whenever it is asked for with the same key."""
+    task, num_sets = learner.task, learner.config.episodes_per_update
     key_sets, key_share, key_length, key_given = jax.random.split(key, 4)
     points, free = map(np.asarray, _drawn(key_sets, num_sets, task))
-    learned = task.num_decisions - network.num_unlearned
+    learned = task.num_decisions - learner.network.num_unlearned
     begun = jax.random.uniform(key_share, (num_sets,)) < task.random_starts
     length = jax.random.randint(key_length, (num_sets,), 1, max(learned, 2))
     lengths = np.asarray(jnp.where(begun, length, 0))
@@ -78,8 +71,8 @@ def draw(
 
 
 @functools.partial(jax.jit, static_argnames=("num_sets", "task"))
-def _drawn(key: jax.Array, num_sets: int, task: Rules) -> tuple[jax.Array, jax.Array]:
-    sets = rollout.draw(task, num_sets, key)
+def _drawn(key: jax.Array, num_sets: int, task: Episode) -> tuple[jax.Array, jax.Array]:
+    sets = jax.vmap(task.reset)(jax.random.split(key, num_sets))
     return sets.candidates, sets.available
 
 
@@ -114,75 +107,77 @@ class Attempt:
     best: jax.Array  # (B,) log det(Z.T Z) of what is wanted
 
 
-def follow(lesson: Lesson, task: Rules, network: Network, params: Any) -> Attempt:
-    """Go through a lesson, each time choosing what the policy likes of the wanted."""
-    features = network.candidate_features(lesson.candidates, lesson.available)
-    memory = networks.encode(network, params, features)
-    chosen = jnp.full((len(lesson.best), task.num_decisions), -1, jnp.int32)
-    free, wanted = lesson.available, lesson.wanted
-    decisions, wants, counts = [], [], []
-    for count in range(task.num_decisions - network.num_unlearned):
-        seen = network.decision_features(features, chosen, free, count)
-        logits, _ = networks.decode(network, params, memory, seen)
-        decisions.append(seen)
-        wants.append(wanted)
-        counts.append((count >= lesson.length).astype(logits.dtype))
-        favourite = jnp.argmax(networks.mask_logits(logits, wanted), axis=-1)
-        action = jnp.where(count < lesson.length, lesson.given[:, count], favourite)
-        chosen = chosen.at[:, count].set(action.astype(jnp.int32))
-        taken = jax.nn.one_hot(action, free.shape[-1], dtype=bool)
-        free, wanted = free & ~taken, wanted & ~taken
-    return Attempt(
-        features=features,
-        decisions=jax.tree.map(lambda *leaves: jnp.stack(leaves, axis=1), *decisions),
-        wanted=jnp.stack(wants, axis=1),
-        counted=jnp.stack(counts, axis=1),
-        best=lesson.best,
-    )
+@dataclasses.dataclass(frozen=True)
+class Imitation:
+    """The learner of what a teacher chooses; it is given a ``Lesson``."""
 
+    postures: Postures
 
-def loss(
-    params: Any, attempt: Attempt, config: PPOConfig, task: Rules, network: Network
-) -> tuple[jax.Array, Metrics]:
-    """Cross-entropy to the wanted postures, and the value's error, of an attempt.
+    def init(self, key: jax.Array, lesson: Lesson) -> Any:
+        """Parameters before training."""
+        return self.postures.init(key)
 
-    Returns:
-        The loss, and metrics named as those of PPO.
-    """
-    memory = networks.encode(network, params, attempt.features)
-    # (B, T, M), (B, T)
-    logits, value = networks.decode(network, params, memory, attempt.decisions, axes=1)
-    log_probs = jax.nn.log_softmax(logits)
-    hopes = networks.mask_logits(log_probs, attempt.wanted)
-    number = jnp.maximum(attempt.counted.sum(), 1.0)
+    def draw(self, key: jax.Array, lesson: Lesson) -> Lesson:
+        """The sets of the lesson."""
+        return lesson
 
-    def mean(array: jax.Array) -> jax.Array:
-        return (array * attempt.counted).sum() / number
+    def gather(
+        self, params: Any, rows: Lesson, key: jax.Array, lesson: Lesson
+    ) -> tuple[Attempt, Metrics]:
+        """Follow the lesson, each time choosing what the policy likes of the wanted."""
+        task, network = self.postures.task, self.postures.network
+        features = network.candidate_features(rows.candidates, rows.available)
+        memory = encode(network, params, features)
+        chosen = jnp.full((len(rows.best), task.num_decisions), -1, jnp.int32)
+        free, wanted = rows.available, rows.wanted
+        decisions, wants, counts = [], [], []
+        for count in range(task.num_decisions - network.num_unlearned):
+            seen = network.decision_features(features, chosen, free, count)
+            logits, _ = decode(network, params, memory, seen)
+            decisions.append(seen)
+            wants.append(wanted)
+            counts.append((count >= rows.length).astype(logits.dtype))
+            favourite = jnp.argmax(mask_logits(logits, wanted), axis=-1)
+            action = jnp.where(count < rows.length, rows.given[:, count], favourite)
+            chosen = chosen.at[:, count].set(action.astype(jnp.int32))
+            taken = jax.nn.one_hot(action, free.shape[-1], dtype=bool)
+            free, wanted = free & ~taken, wanted & ~taken
+        attempt = Attempt(
+            features=features,
+            decisions=jax.tree.map(
+                lambda *leaves: jnp.stack(leaves, axis=1), *decisions
+            ),
+            wanted=jnp.stack(wants, axis=1),
+            counted=jnp.stack(counts, axis=1),
+            best=rows.best,
+        )
+        return attempt, {}
 
-    limit = config.value_error_limit
-    error = task.value_scale * (value - attempt.best[:, None])
-    metrics = {
-        "policy_loss": -mean(jax.nn.logsumexp(hopes, axis=-1)),
-        "value_loss": mean(jnp.clip(error, -limit, limit) ** 2),
-        "entropy": mean(-(jnp.exp(log_probs) * log_probs).sum(-1)),
-    }
-    total = metrics["policy_loss"] + config.value_coefficient * metrics["value_loss"]
-    return total, metrics
+    def loss(
+        self, params: Any, experience: Attempt, done: jax.Array
+    ) -> tuple[jax.Array, Metrics]:
+        """Cross-entropy to the wanted postures, and the value's error.
 
+        Returns:
+            The loss, and metrics named as those of PPO.
+        """
+        attempt, config = experience, self.postures.config
+        network = self.postures.network
+        memory = encode(network, params, attempt.features)
+        # (B, T, M), (B, T)
+        logits, value = decode(network, params, memory, attempt.decisions, axes=1)
+        log_probs = jax.nn.log_softmax(logits)
+        hopes = mask_logits(log_probs, attempt.wanted)
+        number = jnp.maximum(attempt.counted.sum(), 1.0)
 
-@functools.lru_cache(maxsize=32)
-def updater(
-    config: PPOConfig, task: Rules, network: Network, mesh: Mesh | None = None
-) -> Update:
-    """An update: state, given up, and a ``Lesson`` -> the next state and metrics."""
+        def mean(array: jax.Array) -> jax.Array:
+            return (array * attempt.counted).sum() / number
 
-    def gather(params: Any, lesson: Lesson, key: jax.Array) -> tuple[Attempt, Metrics]:
-        return follow(lesson, task, network, params), {}
-
-    return update.jitted(
-        config,
-        mesh,
-        draw=lambda key, lesson: lesson,
-        gather=gather,
-        loss=lambda params, batch, done: loss(params, batch, config, task, network),
-    )
+        error = self.postures.task.value_scale * (value - attempt.best[:, None])
+        metrics = {
+            "policy_loss": -mean(jax.nn.logsumexp(hopes, axis=-1)),
+            "value_loss": mean(squared_error(error, config.value_error_limit)),
+            "entropy": mean(-(jnp.exp(log_probs) * log_probs).sum(-1)),
+        }
+        value_loss = config.value_coefficient * metrics["value_loss"]
+        return metrics["policy_loss"] + value_loss, metrics

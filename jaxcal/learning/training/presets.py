@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from jaxcal.learning.core.postures import EpisodesConfig
 from jaxcal.learning.environments.scenarios import SHAPES
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.settings import installed, settings_of
-from jaxcal.learning.training.config import PPOConfig, TrainConfig
+from jaxcal.learning.training.config import TrainConfig
 
 __all__ = ["PARTS", "field_names", "load", "names", "with_values"]
 
@@ -21,7 +22,7 @@ _COMPACT = TrainConfig(
     about="one task (4 of 50), PPO alone from nothing; 0.993 of the optimum in half a "
     "minute, 0.999 in a few; what to try first",
     network=NetworkConfig(),
-    ppo=PPOConfig(num_episodes=200_000),
+    ppo=EpisodesConfig(num_episodes=200_000),
 )
 
 _ALL = ("uniform", *SHAPES)  # uniform twice as often as any other
@@ -40,7 +41,7 @@ _GENERAL = TrainConfig(
     about="what ships: twelve tasks of other sizes, shapes and masks, imitating the "
     "solvers from the look-ahead rule on; ten minutes",
     network=NetworkConfig(close_up=True, initial_trust=4.0, initial_actor=0.05),
-    ppo=PPOConfig(num_episodes=300_000, entropy_start=0.002, imitation=1.0),
+    ppo=EpisodesConfig(num_episodes=300_000, entropy_start=0.002, imitation=1.0),
     tasks=(
         _task(),
         _task(6),
@@ -60,7 +61,8 @@ _GENERAL = TrainConfig(
 _OWN = {config.preset: config for config in (_COMPACT, _GENERAL)}
 
 PARTS: dict[str, type] = {
-    "ppo": PPOConfig,
+    "run": TrainConfig,
+    "ppo": EpisodesConfig,
     "network": NetworkConfig,
     "environment": SelectionConfig,
 }
@@ -106,9 +108,9 @@ def with_values(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
     """
     for name in sorted(set(values) - field_names()):
         raise ValueError(f"no configuration has the field {name}")
-    network, ppo, changed = (
+    network, ppo, own, changed = (
         {f.name: values[f.name] for f in settings_of(PARTS[part]) if f.name in values}
-        for part in ("network", "ppo", "environment")
+        for part in ("network", "ppo", "run", "environment")
     )
     for name in changed:
         held = sorted({getattr(task.environment, name) for task in config.tasks})
@@ -123,6 +125,7 @@ def with_values(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
         network=dataclasses.replace(config.network, **network),
         ppo=dataclasses.replace(config.ppo, **ppo),
         tasks=tuple(_changed(task, changed) for task in config.tasks),
+        **own,
     )
 
 

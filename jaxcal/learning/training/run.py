@@ -1,137 +1,318 @@
-"""The run that trains a policy of postures: what its updates and validation are."""
+"""The one caller of the trainer: files, resume, validation, progress, devices.
+
+A run folder holds ``metrics.csv`` (a row for each update; means where several seeds run
+side by side), ``seeds.csv`` (then: what each measured at every look),
+``last_rewards.npy`` (the rewards of the last 1,000 episodes), TensorBoard event files
+and ``checkpoint/``. The loop is on the host, over calls of several updates each, so
+that progress is printed while it runs and a signal stops it between two calls.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import csv
 import dataclasses
+import functools
+import os
 import pathlib
-from collections.abc import Callable
-from typing import Any
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TextIO
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
-from jaxcal.learning.policies import decoding
-from jaxcal.learning.policies.build import build
-from jaxcal.learning.policies.networks import Network
+from jaxcal.files import atomic_write, write_text
+from jaxcal.learning.core import ppo
+from jaxcal.learning.core.ppo import Learner, PPOConfig, TrainState
 from jaxcal.learning.runtime import devices
-from jaxcal.learning.training import imitation, loop, optimiser, ppo
-from jaxcal.learning.training.config import TrainConfig
-from jaxcal.learning.training.loop import Recipe, Report
-from jaxcal.learning.training.optimiser import Metrics, TrainState
+from jaxcal.learning.training import checkpoint
 
-__all__ = ["Report", "Validation", "train"]
+__all__ = ["Recipe", "Report", "run"]
+
+_LAST = 1000  # episodes whose rewards are kept
+_MOST = 16  # updates in one call
+_CALL_SECONDS = 2.0  # of one call: what a signal waits for
 
 
 @dataclasses.dataclass(frozen=True)
-class Validation:
-    """Fixed candidate sets with their proven optimum."""
+class Recipe:
+    """What one kind of run trains, and how."""
 
-    candidates: np.ndarray  # (B, M, n)
-    best: np.ndarray  # (B,) log det(Z.T Z) of the optimum
-    num_outputs: int
-    available: np.ndarray | None = None  # (B, M) bool; all when None
+    ppo: PPOConfig
+    learners: tuple[Learner, ...]  # update u: number u modulo theirs
+    given: tuple[tuple[Any, ...], ...]  # arrays that each learner is given
+    seed: int
+    num_seeds: int  # runs side by side: seed, seed + 1, ...
+    meta: dict[str, Any]  # JSON values saved with every checkpoint
+    schema: str  # of the checkpoints
+    unit: str  # what an update plays: "episodes" or "decisions"
+    per_update: int  # of them
+    columns: tuple[str, ...]  # of metrics.csv, for every update
+    measured: tuple[
+        str, ...
+    ]  # its columns of looks; by the first the best seed is known
+    validate: Callable[[Any], dict[str, float]] | None  # averaged weights -> measured
+    validate_every: float = 15.0  # seconds between looks
+    save_every: float = 60.0  # seconds between checkpoints
+    # The first updates of imitation: their number, and the update and what it is shown.
+    num_imitated: int = 0
+    imitate: Callable[[int], tuple[Learner, Any]] | None = None
 
-    def measure(self, network: Network, params: Any, k: int) -> tuple[float, float]:
-        """Mean det S / det S* and the share of optima hit, by greedy decoding."""
-        candidates = jnp.asarray(self.candidates, jnp.float32)
-        free = jnp.ones(candidates.shape[:2], bool)
-        if self.available is not None:
-            free = jnp.asarray(self.available)
-        nothing, unused = jnp.zeros((len(free), 0), jnp.int32), jax.random.key(0)
-        indices = decoding.choose(
-            network, params, candidates, free, nothing, unused, k=k
-        )
-        gap = np.asarray(decoding.log_det_of(candidates, indices)) - self.best
-        # float32 values against a float64 optimum: equal to a few units in the last
-        # place counts as hit; evaluate.py compares in float64.
-        return (
-            float(np.exp(self.num_outputs * np.minimum(gap, 0.0)).mean()),
-            float((gap > -2e-5).mean()),
-        )
+    def init(self) -> TrainState:
+        """The state before the first update, from the seeds alone."""
+        learner, given = self.learners[0], self.given[0]
+
+        def begin(key: jax.Array) -> TrainState:
+            return ppo.begin(self.ppo, learner, key, *given)
+
+        # One program: op by op it would be two hundred small ones, seconds to compile.
+        keys = [jax.random.key(self.seed + i) for i in range(self.num_seeds)]
+        if len(keys) == 1:
+            return jax.jit(begin)(keys[0])
+        return jax.jit(jax.vmap(begin))(jnp.stack(keys))
 
 
-def train(
-    config: TrainConfig,
+@dataclasses.dataclass(frozen=True)
+class Report:
+    """What a line of progress says."""
+
+    update: int
+    played: int  # episodes or decisions
+    seconds: float  # of training so far, earlier sittings included
+    per_second: float  # played
+    eta: float  # seconds left
+    metrics: dict[str, float]  # of the last update, validation included; means of seeds
+    spread: dict[str, float]  # standard deviation over several seeds, of validation
+
+
+def run(
+    recipe: Recipe,
     folder: str | pathlib.Path,
     *,
+    mesh: Mesh | None = None,
     resume: bool = False,
-    validation: Validation | None = None,
     report: Callable[[Report], None] = lambda report: None,
     should_stop: Callable[[], bool] = lambda: False,
     num_updates: int | None = None,
-    num_devices: int | None = None,
-    teacher: imitation.Teacher | None = None,
 ) -> TrainState:
     """Train until the budget is spent or ``should_stop`` says so, and save.
 
-    All devices take part. In a job of several processes each calls this with the same
-    configuration; the first alone touches ``folder``, validates and reports.
-
     Args:
-        config: the run.
+        recipe: what is trained.
         folder: of the run; made where missing.
+        mesh: the devices that share an update; None for one.
         resume: go on from the newest checkpoint in ``folder``.
-        validation: fixed sets to measure the averaged weights on.
-        report: called after every look at the validation set.
-        should_stop: asked between updates.
+        report: called after every look.
+        should_stop: asked between calls.
         num_updates: stop after this update instead of at the end of the budget.
-        num_devices: use so many of each process; all when None.
-        teacher: whom the first ``config.ppo.num_imitated`` updates imitate.
 
     Raises:
         CheckpointError: nothing to resume from, or damaged.
-        ValueError: the devices cannot share a minibatch evenly, or no teacher is given
-            where one is imitated.
         OSError: the folder cannot be written.
-        LostProcessError: another process of the job is gone.
     """
-    mesh = devices.make_mesh(num_devices)
-    devices.require_divisible(config.ppo.sets_per_minibatch, mesh)
-    network = build(config.network)
-    last = config.ppo.num_updates if num_updates is None else num_updates
-    imitated = min(config.ppo.num_imitated, last)
-    if teacher is None and imitated:
-        raise ValueError(
-            f"teacher must be given for the {imitated} updates that imitate, got None"
+    last = recipe.ppo.num_updates if num_updates is None else num_updates
+    root = pathlib.Path(folder)
+    state, before, recent = devices.on_first(lambda: _begin(root, recipe, resume))
+    if mesh is not None:
+        state = devices.replicate(state, mesh)
+    done = int(np.ravel(devices.local(state.num_updates))[0])
+    seeds = recipe.num_seeds if recipe.num_seeds > 1 else 0
+    count, timed = 1, False
+    with contextlib.ExitStack() as stack:
+        diary = None
+        if devices.is_first():
+            diary = _Diary(root, recipe, report, last, before, done, recent)
+            stack.enter_context(contextlib.closing(diary))
+        while done < last and not devices.any_process(should_stop()):
+            begun = time.perf_counter()
+            most, given = _MOST, recipe.given[done % len(recipe.given)]
+            learner = recipe.learners[done % len(recipe.learners)]
+            if done < recipe.num_imitated:
+                assert recipe.imitate is not None  # there are updates that imitate
+                learner, shown = recipe.imitate(done)
+                most, given = 1, (devices.replicate(shown, mesh),)
+            elif len(recipe.learners) > 1 or len(recipe.given) > 1:
+                most = 1  # the next update is of another program, or of other arrays
+            count = min(count, most, last - done)
+            update = ppo.updates(recipe.ppo, learner, mesh, most, seeds)
+            state, found = update(state, np.int32(count), *given)
+            # One transfer for all that these updates measured.
+            rows = jax.device_get(devices.local(found))
+            first, done = done, done + count
+            if diary is not None:
+                diary.note(state, first, count, rows)
+            each = (time.perf_counter() - begun) / count
+            # The first call also compiled, so the second is of one update too.
+            fit = int(_CALL_SECONDS / each) if timed else 1
+            count, timed = devices.on_first(functools.partial(max, fit, 1)), True
+    if diary is not None:
+        diary.save(state, done)
+    return state
+
+
+@dataclasses.dataclass
+class _Diary:
+    """What the first process writes and says of a run: rows, reports, checkpoints."""
+
+    root: pathlib.Path
+    recipe: Recipe
+    report: Callable[[Report], None]
+    last: int  # update at which the run ends
+    before: float  # seconds of earlier sittings
+    reported: int  # update of the last report; at first the updates made before
+    recent: np.ndarray  # the last rewards
+
+    def __post_init__(self) -> None:
+        from tensorboardX import SummaryWriter  # 0.2 s; loads PyTorch where installed
+
+        recipe = self.recipe
+        self._columns = (*recipe.columns, *recipe.measured)
+        self._rows = _table(self.root / "metrics.csv", self.reported, self._columns)
+        self._seeds: TextIO | None = None
+        self._seed_columns = ("update", "seed", *recipe.measured)
+        if recipe.num_seeds > 1:
+            path = self.root / "seeds.csv"
+            self._seeds = _table(path, self.reported, self._seed_columns)
+        self._events = SummaryWriter(str(self.root), flush_secs=30)
+        self._begun = self._looked = self._saved = time.perf_counter()
+        self._noted = self._begun
+        self._each: list[dict[str, float]] = []  # of every seed, at the last look
+
+    def note(
+        self, state: TrainState, first: int, count: int, found: Mapping[str, Any]
+    ) -> None:
+        """Keep the metrics of ``count`` updates; look and save where it is time to."""
+        recipe, now = self.recipe, time.perf_counter()
+        for number in range(count):
+            rewards = found["rewards"][number] if "rewards" in found else ()
+            if (first + number) % len(recipe.learners) == 0:
+                self.recent = np.concatenate([self.recent, np.ravel(rewards)])[-_LAST:]
+            # Only the end of a call is seen by the clock.
+            at = self._noted + (now - self._noted) * (number + 1) / count
+            done = first + number + 1
+            row: dict[str, float] = {
+                name: float(np.mean(values[number])) for name, values in found.items()
+            }
+            row |= {
+                "update": done,
+                recipe.unit: done * recipe.per_update,
+                "seconds": self._seconds(at),
+                "learning_rate": ppo.learning_rate(recipe.ppo, done),
+            }
+            if number == count - 1:
+                self._look(state, row)
+            _add(self._rows, self._columns, row)
+            for name in set(self._columns) & set(row) - {"update", recipe.unit}:
+                self._events.add_scalar(name, row[name], done)
+        self._noted = now
+        if now - self._saved > recipe.save_every:
+            self._saved = now
+            self.save(state, first + count)
+
+    def _look(self, state: TrainState, row: dict[str, float]) -> None:
+        """Validate and report where it is time to."""
+        recipe, done, now = self.recipe, int(row["update"]), time.perf_counter()
+        due = now - self._looked > recipe.validate_every
+        if not due and done not in (1, self.last):
+            return
+        spread: dict[str, float] = {}
+        if recipe.validate is not None:
+            averages = _of_each_seed(devices.local(state.average), recipe.num_seeds)
+            self._each = [recipe.validate(average) for average in averages]
+            for name in self._each[0]:
+                values = [each[name] for each in self._each]
+                row[name] = float(np.mean(values))
+                spread[name] = float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
+            if self._seeds is not None:
+                for number, each in enumerate(self._each):
+                    own = {"update": done, "seed": recipe.seed + number} | each
+                    _add(self._seeds, self._seed_columns, own)
+        rate = (done - self.reported) / max(now - self._looked, 1e-9)
+        self._looked, self.reported = time.perf_counter(), done
+        self.report(
+            Report(
+                update=done,
+                played=done * recipe.per_update,
+                seconds=self._seconds(now),
+                per_second=rate * recipe.per_update,
+                eta=(self.last - done) / rate,
+                metrics=row,
+                spread=spread,
+            )
         )
 
-    def lesson(index: int) -> imitation.Lesson:
-        assert teacher is not None  # checked above
-        return imitation.draw(
-            config.ppo, config.task_of(index), network, teacher, index
-        )
+    def _seconds(self, now: float) -> float:
+        return self.before + now - self._begun
 
-    def update(done: int, state: TrainState) -> tuple[TrainState, Metrics]:
-        what = config.ppo, config.task_of(done), network, mesh
-        if done < imitated:
-            shown = devices.replicate(lessons.at(done), mesh)
-            return imitation.updater(*what)(state, shown)
-        return ppo.updater(*what)(state)
+    def save(self, state: TrainState, done: int) -> None:
+        """Write a checkpoint of update ``done``."""
+        recipe = self.recipe
+        with atomic_write(self.root / "last_rewards.npy") as file:
+            np.save(file, self.recent)
+        progress: dict[str, Any] = {
+            "updates": done,
+            recipe.unit: done * recipe.per_update,
+            "seconds": self._seconds(time.perf_counter()),
+            "device": jax.devices()[0].device_kind,
+        }
+        if recipe.num_seeds > 1:
+            scores = [each[recipe.measured[0]] for each in self._each]
+            progress["best"] = int(np.argmax(scores)) if scores else 0
+            progress["seeds"] = self._each
+        meta = recipe.meta | {"schema": recipe.schema, "progress": progress}
+        state = devices.local(state)
+        checkpoint.save(self.root / "checkpoint", done, state.average, meta, state)
 
-    def validate(average: Any) -> dict[str, float]:
-        assert validation is not None  # else it is not called
-        found = validation.measure(network, average, config.tasks[0].num_decisions)
-        return dict(zip(("ratio_to_exact", "hit_rate"), found, strict=True))
+    def close(self) -> None:
+        """Bring the metrics to the disk."""
+        for file in filter(None, (self._rows, self._seeds)):
+            file.flush()
+            os.fsync(file.fileno())
+            file.close()
+        self._events.close()
 
-    recipe = Recipe(
-        ppo=config.ppo,
-        meta=config.as_meta(),
-        init=lambda: optimiser.init(config.ppo, config.tasks[0], network),
-        update=update,
-        validate=None if validation is None else validate,
-        keeps_rewards=lambda done: config.task_of(done) == config.tasks[0],
-        validate_every=config.validate_every,
-        save_every=config.save_every,
-    )
-    with contextlib.closing(imitation.Lessons(lesson, imitated)) as lessons:
-        return loop.run(
-            recipe,
-            folder,
-            mesh=mesh,
-            resume=resume,
-            report=report,
-            should_stop=should_stop,
-            num_updates=last,
-        )
+
+def _begin(
+    root: pathlib.Path, recipe: Recipe, resume: bool
+) -> tuple[TrainState, float, np.ndarray]:
+    """The state to start from, seconds already trained, the last rewards."""
+    root.mkdir(parents=True, exist_ok=True)
+    state = recipe.init()
+    if not resume:
+        return state, 0.0, np.zeros(0, np.float32)
+    state, meta = checkpoint.restore(root, state, recipe.schema)
+    rewards = root / "last_rewards.npy"
+    recent = np.load(rewards) if rewards.exists() else np.zeros(0, np.float32)
+    return state, float(meta["progress"]["seconds"]), recent
+
+
+def _of_each_seed(tree: Any, num_seeds: int) -> list[Any]:
+    if num_seeds == 1:
+        return [tree]
+    return [
+        jax.tree.map(lambda leaf, seed=seed: leaf[seed], tree)
+        for seed in range(num_seeds)
+    ]
+
+
+def _table(path: pathlib.Path, done: int, columns: Sequence[str]) -> TextIO:
+    """A CSV file to go on with after update ``done``: later rows were never saved."""
+    lines = path.read_text().splitlines()[1:] if path.exists() else []
+    kept = [
+        line
+        for line in lines
+        if line.count(",") == len(columns) - 1
+        and line.partition(",")[0].isdigit()
+        and int(line.partition(",")[0]) <= done
+    ]
+    write_text(path, "\n".join([",".join(columns), *kept]) + "\n")
+    return path.open("a", newline="")
+
+
+def _add(file: TextIO, columns: Sequence[str], row: Mapping[str, float]) -> None:
+    """Write a row and flush it; what is not measured is empty."""
+    csv.DictWriter(file, columns, extrasaction="ignore").writerow(row)
+    file.flush()

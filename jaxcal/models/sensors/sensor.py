@@ -87,6 +87,7 @@ class Sensor:
     kind: ClassVar[str]  # in files and for the command line
     tool: ClassVar[tuple[str, ...]] = ("x", "y", "z")  # what of the tool it sees
     zeros: ClassVar[bool] = False  # what is measured is always zero
+    sizes_prior: ClassVar[bool] = False  # shown to be better with Prior.sized()
 
     @property
     def inputs(self) -> tuple[str, ...]:

@@ -35,6 +35,7 @@ class Socket(Placed):
 
     kind = "socket"
     zeros = True
+    sizes_prior = True
     axes = ("x", "y", "z")
     axis_units = ("length",) * 3
     width = 3

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -200,6 +200,39 @@ class SerialChain(Arm):
     def measured_with(self, sensor: Sensor) -> Self:
         """The same arm with another sensor."""
         return dataclasses.replace(self, sensor=sensor)
+
+    def postures(
+        self,
+        count: int,
+        *,
+        seed: int = 0,
+        near: ArrayLike | None = None,
+        allowed: Callable[[NDArray[np.float64]], bool] | None = None,
+    ) -> Array:
+        """Postures that can be measured, to choose from.
+
+        Within the limits (180 degrees where a file has none), two degrees apart at
+        least, with the ball in the socket, the probe on the plane or the board in view:
+        inverse kinematics from random starts, so a redundant arm's self-motions are
+        among them.
+
+        Args:
+            count: how many.
+            seed: of the random starts.
+            near: where the sensor reads, roughly: (S, 3) sockets or (S, 4) planes where
+                the sensor has no places; rows (x, y, z, radius), one of which the tip
+                must be near, for a sensor that reads everywhere.
+            allowed: says of joints (J,) whether they may be taken (collisions).
+
+        Returns:
+            (count, n) commands with the sensor's columns, in an order of little travel.
+
+        Raises:
+            ValueError: there are not so many; the message says what became of the rest.
+        """
+        from jaxcal.models.serial.postures import postures
+
+        return postures(self, count, seed, near, allowed)
 
     def calibrated(self, parameters: ArrayLike, sensor: Sensor | None = None) -> Self:
         """The arm whose nominal is this one with ``parameters``.
@@ -442,7 +475,8 @@ class SerialChain(Arm):
     def default_prior(self) -> Prior:
         """Loose knowledge of any arm, by the length of its links; see the constants.
 
-        What the sensor cannot see is held.
+        What the sensor cannot see is held; where contacts are few, the scales of
+        lengths and angles are taken from them (:meth:`Prior.sized`).
         """
         length = self.length or np.inf  # axes of unknown stroke alone
         joint = [_LENGTH * length, _ANGLE, _LENGTH * length, _ANGLE, _ANGLE]
@@ -458,6 +492,7 @@ class SerialChain(Arm):
                 *self.sensor.prior_std(length),
             ],
             fixed=self.sensor.unseen(self),
+            by_data=self.sensor.sizes_prior,
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Datasets 4 and 5: what the rig recorded, as a pool of postures and draws from it.
 
-A recording is the ``pairs.csv`` that ``python -m rig collect`` writes: one posture per
+A recording is the ``pairs.csv`` that ``jaxcal-rig collect`` writes: one posture per
 line, commands under ``u_deg_pitch, u_deg_yaw, u_deg_roll`` and what the phone read
 under ``y_deg_...``; other columns may stand beside them. A folder of recordings holds
 ``dataset4.csv`` and ``dataset5.csv``, and beside each, optionally, a data card

@@ -47,28 +47,27 @@ def load_policy(checkpoint: str | pathlib.Path | None = None) -> Policy:
     """The newest policy of a checkpoint; read again only where its files have changed.
 
     Args:
-        checkpoint: a checkpoint folder, a training run's, or a weights file; the
-            checkpoint that ships when None.
+        checkpoint: a weights file or a training run's folder; the policy that ships
+            when None.
 
     Raises:
         ValueError: it is missing, damaged, or made by another version.
         MissingExtraError: it needs JAX, which is not installed.
     """
     path = weights.locate(checkpoint)
-    # A checkpoint of version 1 may have no weights file: its step's folder tells.
-    state = (path if path.exists() else path.parent).stat()
+    state = path.stat()  # a save makes another folder, an export another file
     return _loaded(path, (state.st_mtime_ns, state.st_size, state.st_ino))
 
 
 @functools.lru_cache(maxsize=8)
 def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Policy:
-    """Args: the weights file, there or not, and what changes when it is replaced."""
-    if path.exists():
+    """Args: a weights file or a run's step, and what changes when it is replaced."""
+    if path.is_file():
         found = weights.read(path)
     else:
-        with needs("policy", f"checkpoint {path.parent}, which holds no {path.name},"):
+        with needs("policy", f"checkpoint {path}, the folder of a training run,"):
             from jaxcal.learning.training import checkpoint
-        found = checkpoint.load(path.parent.parent).weights
+        found = checkpoint.load(path.parent).weights
     return Policy(found.network["kind"], found.meta, _network(found, path))
 
 
@@ -77,9 +76,9 @@ def _network(found: Weights, path: pathlib.Path) -> Network:
         from jaxcal.selection.policy.compact import CompactNetwork
 
         return CompactNetwork(found.network, found.arrays)
-    with needs("policy", f"checkpoint {path.parent}, whose network is not compact,"):
+    with needs("policy", f"checkpoint {path}, whose network is not compact,"):
         from jaxcal.selection.policy.through_jax import JaxNetwork
-    return JaxNetwork(path.parent.parent)
+    return JaxNetwork(path if path.is_file() else path.parent)
 
 
 def select_batch(

@@ -20,10 +20,10 @@ _LARGEST_CALL = 512  # sets
 
 
 class JaxNetwork:
-    """The policy of a checkpoint folder; compiled once for each shape in a process."""
+    """The policy of a checkpoint; compiled once for each shape in a process."""
 
-    def __init__(self, folder: pathlib.Path) -> None:
-        self._policy = checkpoint.load(folder)
+    def __init__(self, path: pathlib.Path) -> None:
+        self._policy = checkpoint.load(path)
 
     def __call__(
         self, problems: Sequence[Problem], decoding: str, num: int, seed: int

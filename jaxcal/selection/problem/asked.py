@@ -139,6 +139,11 @@ class Asked:
         asked.names, asked.axes = _labels(array, names)
         return asked
 
+    def __repr__(self) -> str:
+        what = "blocks" if self.model is None else type(self.model).__name__
+        count, left = len(self.available), int(self.available.sum())
+        return f"{type(self).__name__} of {count} candidates, {left} available, {what}"
+
     def problem(
         self, k: int | None = None, criterion: Any = None, region: Any = None
     ) -> Problem:

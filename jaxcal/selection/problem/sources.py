@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import numbers
 from jaxcal.information.blocks import prior_root
 from jaxcal.models.affine import Affine
-from jaxcal.models.checked import derivative
+from jaxcal.models.checked import derivative, facts
 from jaxcal.models.identifiability import identifiability
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
@@ -131,6 +131,8 @@ class Modelled(Source):
         prior: Prior | None,
         noise: Noise | None,
     ) -> None:
+        if hasattr(model, "located"):  # an arm whose sensor stands somewhere
+            model = model.located(candidates[available])
         self._model, self._candidates, self._available = model, candidates, available
         self._noise = Noise() if noise is None else noise
         self._prior = model.default_prior() if prior is None else prior
@@ -141,7 +143,8 @@ class Modelled(Source):
         pairs = zip(model.names, known.free, strict=True)
         self.names = tuple(name for name, free in pairs if free)
         self._precision = known.precision[np.ix_(known.free, known.free)]
-        self.root = prior_root(self._precision)
+        besides = facts(model, known.mean)[1][:, known.free]
+        self.root = prior_root(self._precision + besides.T @ besides)
 
     @property
     def used(self) -> Array:

@@ -11,8 +11,7 @@ from rig.config.axis import Axis, Pulses
 from rig.core.faults import MotionFault, Refused
 from rig.core.record import SIGN_CHECKED
 from rig.workbench.commission.bench import Bench
-from rig.workbench.commission.chain import CLEAR
-from rig.workbench.commission.findings import Findings, find
+from rig.workbench.commission.findings import CLEAR, Findings, Stand, find, turn
 from rig.workbench.commission.proposals import (
     Change,
     lines,
@@ -20,7 +19,6 @@ from rig.workbench.commission.proposals import (
     ratios_of,
     require_unit,
 )
-from rig.workbench.commission.stands import Stand, turn
 from rig.workbench.commission.unproved import FIRST_MOTOR_DEG, Reach, unit_proved
 
 REACH_DEG = 3.0  # each way

@@ -1,30 +1,29 @@
-"""Play, dead zone and breakaway of one axis, in a closed loop.
+"""Play, dead zone and breakaway of one axis.
 
-Every measurement follows from the last, by a belief of :mod:`jaxcal.adaptive`. The play
-comes first, away from where a dead zone may be; it is the difference of the readings at
-one place that is reached from either side. Then the dead zone, always from below, so
-that the play shifts all alike. Then the breakaway: steps from rest, on in the direction
-in which the axis came, so that no play enters.
+The play comes first, away from where a dead zone may be: the difference of the readings
+at one place that is reached from either side. Then the dead zone, always from below, so
+that the play shifts all alike: the difference of the readings on its two sides. Both
+are repeated until their intervals are narrow. Then the breakaway: steps from rest, on
+in the direction in which the axis came, so that no play enters; there every step
+follows from the last, by a belief of :mod:`jaxcal.adaptive`.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
+
+import numpy as np
+from scipy import special
 
 from jaxcal.adaptive.estimates import Estimate
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.tasks.backlash import (
-    backlash,
-    backlash_bins,
-    dead_zone,
-    dead_zone_bins,
-)
 from jaxcal.adaptive.tasks.breakaway import Cautious, breakaway
 from rig.core.attitude import mean_rotation
 from rig.core.faults import MotionFault
 from rig.workbench.commission.bench import Bench
-from rig.workbench.commission.probe import LEVEL, Probe, propose
+from rig.workbench.commission.probe import ENOUGH_DEG, LEVEL, Probe, propose
 
 MOST_DEG = 1.5  # of play
 FAR_DEG = 1.5 * MOST_DEG  # of a move after which play and friction are taken up
@@ -36,10 +35,9 @@ STEPS = 64  # of a breakaway; its threshold is looked for under so many
 STEP_DEG = 0.01  # or the next whole number of pulses
 OVERSHOOT_DEG = 0.1  # by which a step may exceed the threshold
 RISK = 0.05  # that it exceeds it by more
-MOST = 20  # measurements of the play, and of the dead zone
+LEAST, MOST = 3, 20  # pairs of readings of the play, and of the dead zone
 MOST_STEPS = 40
-LEAST_SIGMA_DEG = 0.002  # finer than this the cells of the widths are not
-BIN_DEG, OFFSET_DEG = 0.01, 0.05
+LEAST_SIGMA_DEG = 0.002  # of a reading: finer is not believed
 
 
 def characterise(run: Bench, axis: int) -> dict[str, Any]:
@@ -49,8 +47,7 @@ def characterise(run: Bench, axis: int) -> dict[str, Any]:
         Refused: the axis stands too near to a limit; nothing was moved.
         MotionFault: it does not turn the phone, or has more than is looked for.
     """
-    for task in (_play_task(0.01), _zone_task(0.01), _step_task(0.01, STEP_DEG)):
-        propose(task, [(0, 0)], Cautious() if task.design_names[0] == "step" else None)
+    propose(_step_task(0.01, STEP_DEG), [(0, 0)], Cautious())  # compiles it
     probe = Probe(run, axis, BASE_DEG + FAR_DEG, REACH_DEG + FAR_DEG)
     play, sigma = _play(probe)
     zone, centre = _zone(probe, play.mean, sigma)
@@ -61,7 +58,7 @@ def characterise(run: Bench, axis: int) -> dict[str, Any]:
         "level": LEVEL,
         "backlash_deg": _kept(play),
         "dead_zone_deg": _kept(zone),
-        "dead_zone_at_deg": round(probe.here_deg + probe.side * centre.mean, 5),
+        "dead_zone_at_deg": round(probe.here_deg + probe.side * centre, 5),
         "breakaway_deg": [_kept(each) for each in (up, down)[:: probe.side]],
         "measurements": probe.count,
     }
@@ -91,54 +88,74 @@ def _too_much(probe: Probe, what: str, deg: float, most: float) -> MotionFault:
     )
 
 
+def _repeated(measure: Callable[[int], float], sigma: float) -> Estimate:
+    """The mean of what a measurement says, again until its interval is narrow.
+
+    Each says as much as any other, so there is nothing to choose between them.
+
+    Args:
+        measure: the number of a measurement, from 1 on, to its value.
+        sigma: least standard deviation of one value.
+    """
+    values: list[float] = []
+    while len(values) < MOST:
+        values.append(measure(len(values) + 1))
+        count = len(values)
+        if count >= LEAST:
+            spread = max(sigma, float(np.std(values, ddof=1)))
+            half = special.stdtrit(count - 1, 0.5 + LEVEL / 2) * spread / count**0.5
+            if half <= ENOUGH_DEG / 2:
+                break
+    mean = max(0.0, float(np.mean(values)))
+    return Estimate(mean, max(0.0, mean - half), mean + half)
+
+
 def _play(probe: Probe) -> tuple[Estimate, float]:
     """The play, and the noise of a reading."""
     at, far = BASE_DEG, FAR_DEG
-    up = [
-        probe.stand("up", at - far, at, samples=4),
-        probe.stand("top", at + far),
-    ]
-    down = [
-        probe.stand("down", at, samples=4),
-        probe.stand("bottom", at - far),
-    ]
+    up = [probe.stand("up", at - far, at), probe.stand("top", at + far)]
+    down = [probe.stand("down", at), probe.stand("bottom", at - far)]
     middle = mean_rotation([up[0].attitude, down[0].attitude])
     probe.learn(middle, [(up[0], up[1]), (down[1], down[0])])
     first = probe.read(down[0]) - probe.read(up[0])
     if first > 0.9 * MOST_DEG:
         raise _too_much(probe, "play", first, MOST_DEG)
-    sigma = max(probe.noise(up[1], down[1]), LEAST_SIGMA_DEG)
-    bins = backlash_bins(MOST_DEG, OFFSET_DEG, BIN_DEG)
+    sigma = max(probe.noise(*up, *down), LEAST_SIGMA_DEG)
 
-    def measure(label: str, design: Any) -> int:
-        posture, direction = design
-        ways = at + direction * far, at, at + direction * posture
-        found = probe.stand(label, *ways)
-        return bins.outcome(probe.read(found) - probe.way(found) + probe.way(up[0]))
+    def measure(number: int) -> float:
+        above = probe.stand(f"{probe.name}:down:{number}", at + far, at)
+        below = probe.stand(f"{probe.name}:up:{number}", at - far, at)
+        return probe.off(above) - probe.off(below)
 
-    found = probe.seek(lambda: _play_task(sigma), measure, ("width",))
-    return found["width"], sigma
+    return _repeated(measure, 2.0**0.5 * sigma), sigma
 
 
-def _zone(probe: Probe, play: float, sigma: float) -> tuple[Estimate, Estimate]:
+def _zone(probe: Probe, play: float, sigma: float) -> tuple[Estimate, float]:
     """Width and centre of the dead zone; the play, taken up from below, is put back."""
 
-    def off(label: str, command: float, samples: int = 1) -> float:
+    def off(label: str, command: float) -> float:
         """Reading less command."""
         way = command + play / 2.0
-        found = probe.stand(label, way - FAR_DEG, way, samples=samples)
-        return probe.read(found) - probe.way(found)
+        return probe.off(probe.stand(f"{probe.name}:{label}", way - FAR_DEG, way))
 
-    above = off("above", REACH_DEG, 4)
-    bins = dead_zone_bins(ZONE_DEG, REACH_DEG, BIN_DEG, relative=True)
+    aboves: list[float] = []
 
-    def measure(label: str, design: Any) -> int:
-        return bins.outcome(off(label, design[0]) - above)
+    def measure(number: int) -> float:
+        aboves.append(off(f"above:{number}", REACH_DEG))
+        return off(f"below:{number}", -REACH_DEG) - aboves[-1]
 
-    found = probe.seek(lambda: _zone_task(1.12 * sigma), measure, ("width",))
-    if found["width"].high > 0.98 * ZONE_DEG:
-        raise _too_much(probe, "dead zone", found["width"].mean, ZONE_DEG)
-    return found["width"], found["centre"]
+    width = _repeated(measure, 2.0**0.5 * sigma)
+    if width.high > 0.98 * ZONE_DEG:
+        raise _too_much(probe, "dead zone", width.mean, ZONE_DEG)
+    if width.low == 0.0:
+        return width, 0.0
+    # Across it the joint stays, so that a command there is off by its distance.
+    commands = np.linspace(-CENTRE_DEG, CENTRE_DEG, 5)
+    seen = [off(f"across:{i}", c) - np.mean(aboves) for i, c in enumerate(commands)]
+    centres = np.linspace(-CENTRE_DEG, CENTRE_DEG, 401)
+    told = np.clip(width.mean / 2 - (commands - centres[:, None]), 0.0, width.mean)
+    errors = ((told - seen) ** 2).sum(axis=1)
+    return width, float(np.mean(centres[errors <= errors.min() + sigma**2]))
 
 
 def _breakaway(probe: Probe, sigma: float) -> tuple[Estimate, Estimate]:
@@ -161,22 +178,6 @@ def _breakaway(probe: Probe, sigma: float) -> tuple[Estimate, Estimate]:
         if found[name].high > (STEPS - 0.5) * least:
             raise _too_much(probe, "breakaway", found[name].mean, STEPS * least)
     return found["up"], found["down"]
-
-
-def _play_task(sigma: float) -> GridTask:
-    # Between the two a joint that yields late stands elsewhere than its play says.
-    return backlash(
-        MOST_DEG, OFFSET_DEG, cells=300, offset_cells=9, postures=[0.0, FAR_DEG],
-        sigma=sigma, bin_width=BIN_DEG, measurements=MOST,
-    )  # fmt: skip
-
-
-def _zone_task(sigma: float) -> GridTask:
-    return dead_zone(
-        ZONE_DEG, CENTRE_DEG, cells=160, offset_cells=16, reach=REACH_DEG,
-        reference=REACH_DEG, num_postures=17, sigma=sigma, bin_width=BIN_DEG,
-        measurements=MOST,
-    )  # fmt: skip
 
 
 def _step_task(sigma: float, least: float) -> GridTask:

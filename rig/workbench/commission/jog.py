@@ -2,17 +2,46 @@
 
 from __future__ import annotations
 
+import os
+import select
+import sys
+import termios
 import time
+import tty
 from collections.abc import Callable
+from typing import Any
 
 from rig.config import AXIS_NAMES
 from rig.config.axis import Pulses
 from rig.core.attitude import Array, angle_between_deg
 from rig.core.record import SIGN_CHECKED
 from rig.workbench.commission.bench import ALLOWED_DEG, Bench
-from rig.workbench.commission.keyboard import Keyboard
 from rig.workbench.commission.unproved import Reach
 
+
+class Keyboard:
+    """A terminal that gives each key at once; Ctrl-C still is a signal."""
+
+    def __enter__(self) -> Keyboard:
+        self._fd = sys.stdin.fileno()
+        self._before: list[Any] = termios.tcgetattr(self._fd)
+        tty.setcbreak(self._fd)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
+
+    def keys(self, wait_s: float = 0.0) -> list[str]:
+        """Keys pressed since the last call; arrows are ``+`` and ``-``."""
+        if not select.select([self._fd], [], [], wait_s)[0]:
+            return []
+        text = os.read(self._fd, 1024).decode(errors="replace")
+        for arrow, key in ARROWS.items():
+            text = text.replace(arrow, key)
+        return list(text)
+
+
+ARROWS = {"\x1b[A": "+", "\x1b[C": "+", "\x1b[B": "-", "\x1b[D": "-"}
 MOST_STEP_DEG = 3.0
 HOLD_DEG = 30.0  # a held key goes at most so far at a time
 LAG_S, NOISE_DEG = 0.2, 0.1  # of the phone, after a piece of the way

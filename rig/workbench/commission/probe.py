@@ -17,14 +17,13 @@ import numpy as np
 from jaxcal.adaptive.estimates import Estimate, estimates
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.loop import Proposal, next_measurement
-from jaxcal.adaptive.rules import Gain
 from jaxcal.adaptive.session import Decider
 from rig.config import AXIS_NAMES
 from rig.core.attitude import Array
 from rig.core.faults import MotionFault, Refused
 from rig.workbench.commission.axes import ROOM_DEG, SEEN_DEG
 from rig.workbench.commission.bench import ALLOWED_DEG, Bench
-from rig.workbench.commission.stands import Stand, turn
+from rig.workbench.commission.findings import Stand, turn
 
 LEVEL = 0.95
 ENOUGH_DEG = 0.02  # width of an interval
@@ -101,6 +100,10 @@ class Probe:
         assert self._base is not None
         return float(turn(self._base, found.attitude) @ self._line / self._rate)
 
+    def off(self, found: Stand) -> float:
+        """Reading less command, degrees of the commands."""
+        return self.read(found) - self.way(found)
+
     def noise(self, *stands: Stand) -> float:
         """Standard deviation of a reading in commanded degrees."""
         return max(s.std_deg / s.samples**0.5 for s in stands) / self._rate
@@ -110,7 +113,7 @@ class Probe:
         make: Callable[[], GridTask],
         measure: Callable[[str, Any], int],
         what: tuple[str, ...],
-        decider: Decider | None = None,
+        decider: Decider,
     ) -> dict[str, Estimate]:
         """Measure what is expected to say most, until the intervals are narrow.
 
@@ -118,7 +121,7 @@ class Probe:
             make: the task; it is made while the device stands under guard.
             measure: a label and a design's coordinates to the outcome.
             what: unknowns whose intervals are to be narrow.
-            decider: the largest expected gain when not given.
+            decider: what chooses the next.
         """
         task = self.meanwhile(make)
         history: list[tuple[int, int]] = []
@@ -144,7 +147,7 @@ class Probe:
 
 
 def propose(
-    task: GridTask, history: list[tuple[int, int]], decider: Decider | None = None
+    task: GridTask, history: list[tuple[int, int]], decider: Decider
 ) -> Proposal:
     """What is expected to say most."""
-    return next_measurement(task, history, Gain() if decider is None else decider)
+    return next_measurement(task, history, decider)

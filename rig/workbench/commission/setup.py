@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import pathlib
 from typing import Any
 
@@ -19,7 +18,7 @@ from rig.workbench.commission.home import can_home
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.ports import serial_lines
 from rig.workbench.commission.scan import Found, parse_bus, scan
-from rig.workbench.commission.toml import edit, new_text, set_values
+from rig.workbench.toml import edit, new_text, set_values
 
 FORMATS = ["hyperimu", "sensorlogger", "lines"]
 UNITS = 16
@@ -148,7 +147,7 @@ def go(place: steps.Place, given: Given) -> int:
     say(f"the device is commissioned: {record.path}")
     # A simulated device is gone with this command; another is made as rig.toml says.
     again = " --simulate" * place.full_speed
-    say(f"next: jaxcal-rig calibrate{again} --config {os.path.relpath(place.path)}")
+    say(f"next: {place.command(f'calibrate{again}')}")
     return EXIT_OK
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import os
 import pathlib
 import sys
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rig.config import AXIS_NAMES, RigConfig
 from rig.core.bus import Bus
@@ -31,7 +32,10 @@ from rig.workbench.commission.jog import MOST_STEP_DEG, by_keyboard, step, unpro
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.phone import Stream, addresses_text, watch
 from rig.workbench.commission.proposals import Change
-from rig.workbench.commission.toml import edit
+from rig.workbench.toml import edit
+
+if TYPE_CHECKING:
+    from rig.simulator import Simulator
 
 WATCH_S = 5.0
 # Below these a session's settle window would hardly ever fill.
@@ -63,6 +67,11 @@ class Place:
         update = {"bus": self.config.bus, "imu": imu}
         self.config = written.model_copy(update=update)
 
+    def command(self, words: str) -> str:
+        """A command about this device, to be typed."""
+        where = "" if self.path is None else f" --config {os.path.relpath(self.path)}"
+        return f"jaxcal-rig {words}{where}"
+
     def require(self, through: str) -> None:
         """Refused where the device has not reached a state; says what to do."""
         if text := self.record.missing(self.config, through):
@@ -93,7 +102,7 @@ class Place:
                 config, name, self.record, self.say,
                 folder=self.folder, plain=self.config, homed=limits,
                 full_speed=self.full_speed,
-                again=f"jaxcal-rig {again or name}", reset_alarms=self.reset_alarms,
+                again=self.command(again or name), reset_alarms=self.reset_alarms,
                 start={"simulated": None, "inputs": {}, "maps_from": ""},
             )  # fmt: skip
             lock.tell(run=str(bench.folder.resolve()))
@@ -163,7 +172,8 @@ def jog(place: Place, axis: int, way_deg: float | None) -> int:
         else:
             step(run, axis, way_deg, unproved(run, axis))
 
-    return place.run("jog", procedure, limits=homed)
+    way = "" if way_deg is None else f" {way_deg:g}"
+    return place.run("jog", procedure, limits=homed, again=f"jog {name}{way}")
 
 
 def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> int:
@@ -244,6 +254,20 @@ def take_zero(place: Place) -> int:
     place.require(SIGN_CHECKED)
     confirm = place.operator.confirm
     return place.run("zero", lambda run: zero(run, confirm))
+
+
+def simulated(
+    simulator: Simulator,
+    served: RigConfig,
+    record: DeviceRecord,
+    say: Callable[[str], None],
+    path: pathlib.Path | None = None,
+) -> Place:
+    """A simulated device, at which nobody needs to stand."""
+    return Place(
+        served, record, Operator(yes=True, say=say), path, full_speed=True,
+        on_imu_port=simulator.start_phone, listeners=(simulator.hear,),
+    )  # fmt: skip
 
 
 def begin_simulated(place: Place, through: str) -> None:

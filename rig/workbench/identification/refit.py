@@ -7,12 +7,16 @@ now.
 
 from __future__ import annotations
 
+import json
+import pathlib
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rig.config import RigConfig
+from jaxcal.files import write_text
+from rig.config import RigConfig, parse_config
 from rig.config.settings import ImuSettings
 from rig.core.attitude import (
     DIGITS,
@@ -24,9 +28,13 @@ from rig.core.attitude import (
     matrix_to_euler,
     mean_rotation,
 )
-from rig.core.faults import Refused
-from rig.journal import Record, measured_postures
-from rig.workbench.identification.conclusion import Evidence
+from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault, Refused
+from rig.core.record import check_matrix
+from rig.journal import Record, RunFolder, measured_postures, new_run_folder
+from rig.workbench.identification.conclusion import Evidence, conclude
+from rig.workbench.outputs.console import recalibrate, summary_lines
+from rig.workbench.outputs.report import write_report
+from rig.workbench.toml import set_values
 
 
 def require_angles(imu: ImuSettings, changes: dict[str, Any]) -> None:
@@ -71,13 +79,12 @@ def reread(
             "a calibration takes. Resume it first"
         )
     zero = kept["zero"][-1]
-    old = frame_at(then, np.array(zero["attitude"]))
-    turned = _turned(attitudes(zero, old), then.imu, now.imu)
+    turned = _turned(attitudes(zero), then.imu, now.imu)
     new = frame_at(now, mean_rotation(turned))
     zero = _remeasured(zero, turned, new)
     zero["measured_deg"] = [0.0, 0.0, 0.0]
     read = {
-        name: _remeasured(r, _turned(attitudes(r, old), then.imu, now.imu), new)
+        name: _remeasured(r, _turned(attitudes(r), then.imu, now.imu), new)
         for name, r in postures.items()
     }
     of_role: dict[str, list[Record]] = {}
@@ -107,10 +114,94 @@ def _remeasured(record: Record, matrices: Array, frame: Frame) -> Record:
     spread = frame.angles(matrices)
     std = spread.std(axis=0, ddof=1) if len(spread) > 1 else np.zeros(3)
     quaternions = Rotation.from_matrix(matrices).as_quat(canonical=True)
-    kept = {key: value for key, value in record.items() if key != "raw_deg"}
-    return kept | {
+    return record | {
         "measured_deg": frame.angles(attitude).round(9).tolist(),
         "std_deg": std.round(6).tolist(),
         "attitude": attitude.round(12).tolist(),
         "quaternions": quaternions.round(DIGITS).tolist(),
     }
+
+
+def refit(
+    folder: pathlib.Path,
+    held: list[Record],
+    then: RigConfig,
+    wanted: dict[str, Any],
+    say: Callable[[str], object],
+) -> int:
+    """Identify a recorded calibration anew, into a folder beside it.
+
+    Args:
+        folder: of the run.
+        held: the records of its journal.
+        then: its configuration.
+        wanted: keys of rig.toml to values; None leaves one as it was.
+        say: is told what came of it.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        Refused: the run does not allow it; nothing was written.
+    """
+    start = held[0]
+    old = {
+        "mechanism.order": then.mechanism.order,
+        "imu.order": then.imu.order,
+        "imu.signs": [*then.imu.signs],
+        "imu.mounting_deg": [*then.imu.mounting_deg],
+    }
+    new = {k: v for k, v in wanted.items() if v is not None and v != old[k]}
+    require_angles(then.imu, new)
+    text = set_values(then.text, new)
+    now = parse_config(text, pathlib.Path(start["maps_from"]), str(folder))
+    changed = {key: [old[key], value] for key, value in new.items()}
+    records, evidence = reread(held, then, now)
+    notes = {"refit_of": folder.name, "simulated": start["simulated"] is not None}
+    calibration, summary = conclude(now, evidence, notes)
+    try:
+        warnings = check_matrix(calibration.matrix)
+    except MotionFault as fault:
+        raise Refused(f"nothing was written: read like this, {fault}") from None
+    if changed:
+        summary.pop("after", None)  # compensated by another calibration than this
+    summary |= {
+        "mode": "refit",
+        "refit_of": folder.name,
+        "changed": changed,
+        "was": _saved(folder / "summary.json", "A", "b"),
+        "simulated": start["simulated"],
+    }
+    into = new_run_folder(folder.resolve().parent, "refit")
+    write_text(into / "rig.toml", text)
+    begun = {key: start[key] for key in ("simulated", "maps_from")}
+    run = RunFolder(now, into, "refit", {**begun, "inputs": {"run": folder.name}})
+    try:
+        for record in records:
+            fields = {k: v for k, v in record.items() if k not in ("seq", "event")}
+            run.emit(record["event"], **fields)
+        calibration.save(into / "calibration.json")
+        run.save_pairs()
+        run.save_summary(summary)
+        run.emit("end", sync=True, code=EXIT_OK, reason="")
+        write_report(into, run.journal.records)
+    finally:
+        run.journal.close()
+    say(f"{folder.name} identified anew from {len(evidence.chosen)} postures:")
+    for key, (was, value) in changed.items():
+        say(f"  {key} = {json.dumps(value)}  # was {json.dumps(was)}")
+    say("  no key was changed" if not changed else "  Set these in your rig.toml too")
+    limit = now.session.verify_limit_deg
+    for line in summary_lines(summary, limit):
+        say(line)
+    for text in warnings:
+        say(f"WARNING: {text}")
+    say(f"saved: {into}/calibration.json, pairs.csv, summary.json, report.html")
+    return EXIT_RECALIBRATE if recalibrate(summary, limit) else EXIT_OK
+
+
+def _saved(path: pathlib.Path, *keys: str) -> dict[str, Any] | None:
+    if not path.is_file():
+        return None
+    summary = json.loads(path.read_text(encoding="utf-8"))
+    return {key: summary[key] for key in keys}

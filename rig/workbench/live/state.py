@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rig.config import AXIS_NAMES
+from rig.config.axis import Scale
 from rig.workbench.live.worth import reasons
 from rig.workbench.outputs.console import event_lines
 
@@ -268,13 +269,9 @@ class RunState:
 
     def to_deg(self, pulses: Any) -> Degrees:
         """Degrees of (3,) pulses, by the scales in the journal's configuration."""
-        angles = []
-        axes = self.start["config"]["axes"]
-        for axis, count in zip(axes, pulses, strict=True):
-            scale = axis["scale"]
-            turns = count * scale["direction"] / scale["pulses_per_rev"]
-            angles.append(round(360.0 * turns / scale["reduction"], 6))
-        return angles
+        scales = [Scale(**axis["scale"]) for axis in self.start["config"]["axes"]]
+        pairs = zip(scales, pulses, strict=True)
+        return [round(scale.to_deg(count), 6) for scale, count in pairs]
 
     @property
     def mode(self) -> str:

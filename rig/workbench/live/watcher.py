@@ -16,8 +16,49 @@ from rig.core.stop import UnitStop
 from rig.journal import is_written
 from rig.stopping import stop_run
 from rig.workbench.live.state import RunState
-from rig.workbench.live.tail import Record, Tail
 from rig.workbench.outputs.telemetry import PERIOD_S, TELEMETRY
+
+Record = dict[str, Any]
+
+
+class Tail:
+    """Records of a file of JSON lines, each given once; the file may come later.
+
+    A line counts once its end is written. A file that was replaced by a new one is read
+    from its beginning.
+    """
+
+    def __init__(self, path: pathlib.Path, last_bytes: int | None = None) -> None:
+        self.path = path
+        self._inode: int | None = None
+        self._offset = 0
+        self._last_bytes = last_bytes  # of what stands there at first; None: all of it
+
+    def read(self) -> list[Record]:
+        """Records since the last call; a line that is not one is left out."""
+        try:
+            with self.path.open("rb") as file:
+                status = os.fstat(file.fileno())
+                if status.st_ino != self._inode or status.st_size < self._offset:
+                    first = self._inode is None and self._last_bytes is not None
+                    skip = status.st_size - (self._last_bytes or 0) if first else 0
+                    self._inode, self._offset = status.st_ino, max(0, skip)
+                file.seek(self._offset)
+                data = file.read()
+        except OSError:
+            return []
+        whole = data[: data.rfind(b"\n") + 1]
+        self._offset += len(whole)
+        records = []
+        for line in whole.splitlines():
+            try:
+                record = json.loads(line)
+            except ValueError:  # cut in two by last_bytes, or torn by a kill
+                continue
+            if isinstance(record, dict):
+                records.append(record)
+        return records
+
 
 JOURNAL = "journal.jsonl"
 SHOWN_S = 30.0  # of telemetry

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import math
+import shlex
 from typing import Any
 
 import numpy as np
@@ -81,7 +82,10 @@ def headline(state: RunState, running: bool) -> tuple[str, str]:
 
 
 def _go_on(state: RunState, folder: str) -> str:
-    return f"To go on: jaxcal-rig {f'resume {folder}' if state.session else state.mode}"
+    if state.session:
+        return f"To go on: jaxcal-rig resume {folder}"
+    typed = state.start.get("arguments") or [state.mode]
+    return f"To go on: jaxcal-rig {shlex.join(typed)}"
 
 
 def trouble(state: RunState, running: bool, folder: str) -> str:
@@ -249,8 +253,6 @@ def verdict(state: RunState, summary: dict[str, Any], report: bool) -> str:
         lines.append(sentence(noise_text(summary)))
     if summary.get("drift"):
         lines.append(sentence(drift_text(summary["drift"])))
-    elif summary.get("drift_deg") is not None:  # of version 1
-        lines.append(f"Zero posture at the end: {summary['drift_deg']:.4f} deg off")
     if warning := summary.get("orders", {}).get("warning"):
         lines.append(f"Warning: {warning}")
     if state.mode == "goto" and state.done:

@@ -126,10 +126,6 @@ def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
         )
     if summary.get("drift"):
         lines.append(f"drift: {drift_text(summary['drift'])}")
-    elif summary["drift_deg"] is not None:  # of version 1
-        lines.append(
-            f"zero posture at the end: {summary['drift_deg']:.4f} deg from zero"
-        )
     if summary["orders"]["warning"]:
         lines.append(f"WARNING: {summary['orders']['warning']}")
     if reasons := recalibrate(summary, limit_deg):
@@ -184,8 +180,6 @@ def noise_text(summary: dict[str, Any]) -> str:
         f"noise of one posture {', '.join(noise)} deg, from {summary['basis']} "
         f"({summary['dof']} degrees of freedom"
     )
-    if "effective_samples" not in summary:  # of version 1
-        return f"{text})"
     as_good = (f"{value:.1f}" for value in summary["effective_samples"])
     return (
         f"{text} each); {summary['samples']} readings are correlated and count as "

@@ -107,9 +107,6 @@ def _calibrated(summary: Record) -> dict[str, list[Any]]:
         blocks["Choice"] = [f"{choice_text(choice)}. {choice['note']}"]
     if summary.get("drift"):
         blocks["Drift"] = [f"{drift_text(summary['drift']).capitalize()}."]
-    elif summary.get("drift_deg") is not None:  # of version 1
-        text = f"The zero posture read {summary['drift_deg']:.4f} deg from zero."
-        blocks["Drift"] = [text]
     if (orders := summary["orders"])["rms"]:
         rows = [
             [order + " (configured)" * (order == orders["configured"]), f"{rms:.4f}"]

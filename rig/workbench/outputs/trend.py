@@ -63,7 +63,7 @@ def read_runs(folder: pathlib.Path) -> tuple[list[Device], list[str]]:
             start = read_journal(path)[0]
             text = (path.parent / "summary.json").read_text(encoding="utf-8")
             summary = json.loads(text)
-            device = start.get("device") or _described(start["config"])
+            device = start["device"]
             if start.get("simulated"):  # never compared with a real one
                 device = {"simulated": True, **device}
             limit = start["config"]["session"]["verify_limit_deg"]
@@ -79,16 +79,6 @@ def read_runs(folder: pathlib.Path) -> tuple[list[Device], list[str]]:
         }  # fmt: skip
         found.setdefault(json.dumps(device, sort_keys=True), []).append(run)
     return [_device(runs) for runs in found.values()], skipped
-
-
-def _described(config: Record) -> Record:
-    """A fingerprint of runs of version 1, which have none."""
-    device = {
-        f"axes.{axis['name']}.{key}": value
-        for axis in config["axes"]
-        for key, value in {"map": axis["map"]["name"], **axis["scale"]}.items()
-    }
-    return device | {"mechanism.order": config["mechanism_order"]}
 
 
 def _device(runs: list[Record]) -> Device:

@@ -42,8 +42,7 @@ def calibrate(run: Run) -> int:
     first.save(run.folder / "calibration.partial.json")
     held = _held_out(run, first)
     run.planned = session.k + 2 * len(held) + 2
-    # A run of version 1 that has visited the end already had no visit in the middle.
-    if held and END not in run.postures():
+    if held:
         run.visit(MIDDLE, run.zero_pulses, role="reference")
     held_out, _ = visit_pairs(run, held)
     run.visit(END, run.zero_pulses, role="reference")

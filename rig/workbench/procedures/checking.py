@@ -71,7 +71,6 @@ class Saved(NamedTuple):
     calibration: Any
     zero: KeptZero
     play: Play
-    note: str  # for the operator; empty where all is well
 
 
 def load_calibration(
@@ -101,14 +100,14 @@ def load_calibration(
             f"{path}: made with a simulated device: it says nothing of the real one. "
             "Calibrate the device, or use it with --simulate"
         )
-    note = _check_device(path, notes, config)
+    _check_device(path, notes, config)
     zero, attitude = notes.get("zero_pulses"), notes.get("zero_attitude")
     kept = KeptZero(
         f"calibration {notes.get('run', path)}",
         None if zero is None else (int(zero[0]), int(zero[1]), int(zero[2])),
         None if attitude is None else np.array(attitude, dtype=np.float64),
     )
-    return Saved(calibration, kept, Play.of(notes), note)
+    return Saved(calibration, kept, Play.of(notes))
 
 
 def calibration_path(path: pathlib.Path) -> pathlib.Path:
@@ -126,25 +125,17 @@ def keep(path: pathlib.Path, axis: str, found: dict[str, Any]) -> None:
     file.write(path, content)
 
 
-def _check_device(path: pathlib.Path, notes: dict[str, Any], config: RigConfig) -> str:
-    """What to tell of a calibration's device; Refused where it is another one."""
-    if "device" in notes:
-        if changed := differences(notes["device"], config.device_fingerprint()):
-            raise Refused(
-                f"{path}: made with another device: {'; '.join(changed)}. Correct "
-                "rig.toml, or calibrate this device"
-            )
-        return ""
-    if notes.get("fingerprint") != config.fingerprint():
+def _check_device(path: pathlib.Path, notes: dict[str, Any], config: RigConfig) -> None:
+    """Refused where a calibration is of another device."""
+    if "device" not in notes:
         raise Refused(
-            f"{path}: does not say with which device it was made, and this "
-            "configuration is not that of its run. Calibrate again"
+            f"{path}: does not say with which device it was made. Calibrate this device"
         )
-    return (
-        f"WARNING: {path} is of version 1: the configuration is that of its run, but "
-        "it keeps no attitude of the zero posture, so that lost origins cannot be "
-        "seen. Calibrate again"
-    )
+    if changed := differences(notes["device"], config.device_fingerprint()):
+        raise Refused(
+            f"{path}: made with another device: {'; '.join(changed)}. Correct "
+            "rig.toml, or calibrate this device"
+        )
 
 
 def verify(run: Run, calibration: Any, count: int) -> int:

@@ -25,16 +25,13 @@ def _network() -> dict[str, Any]:
     """Size of the ``paper`` preset's network, counted from its weights' shapes."""
     import jax
 
-    from jaxcal.learning.policies.build import build
-    from jaxcal.learning.training import optimiser
     from jaxcal.paper.network import HEADS
     from jaxcal.paper.preset import PAPER
 
-    network = build(PAPER.network)
-    shapes = jax.eval_shape(lambda: optimiser.init(PAPER.ppo, PAPER.tasks[0], network))
+    shapes = jax.eval_shape(PAPER.learners[0].init, jax.random.key(0))
     size = {
         name: sum(leaf.size for leaf in jax.tree.leaves(part))
-        for name, part in shapes.params.items()
+        for name, part in shapes.items()
     }
     total = sum(size.values())
     shared = total - sum(size[name] for name in HEADS)

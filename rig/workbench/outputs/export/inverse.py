@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rig.config import AXIS_NAMES
+from rig.config.axis import Scale
 from rig.core.faults import Refused
 from rig.journal import Record
 from rig.workbench.outputs.console import recalibrate
@@ -91,20 +92,16 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> InverseMap:
         offset_deg=at_zero.tolist(),
         min_deg=[axis["min_deg"] for axis in ordered],
         max_deg=[axis["max_deg"] for axis in ordered],
-        pulses_per_deg=[_pulses_per_deg(**axis["scale"]) for axis in ordered],
+        pulses_per_deg=[Scale(**axis["scale"]).pulses_per_deg for axis in ordered],
         min_pulses=[axis["min_pulses"] for axis in ordered],
         max_pulses=[axis["max_pulses"] for axis in ordered],
         forward=np.column_stack([calibration.matrix, calibration.bias]).tolist(),
         half_widths=summary["ci95"],
         run=folder.resolve().name,
         created=str(calibration.provenance.get("created", "")),
-        device=notes.get("device") or {"fingerprint": notes.get("fingerprint", "")},
+        device=notes["device"],
         warnings=warnings,
     )
-
-
-def _pulses_per_deg(pulses_per_rev: int, reduction: float, direction: int) -> float:
-    return direction * pulses_per_rev * reduction / 360.0
 
 
 def _plain(text: str) -> str:

@@ -147,28 +147,27 @@ def structured_text(inverse: InverseMap) -> str:
     return "\n".join([*lines, "END_IF;", "END_FUNCTION_BLOCK", ""])
 
 
+def named(inverse: InverseMap) -> dict[str, Any]:
+    """What JSON, CSV and ROS parameters write: every field under its name."""
+    return {
+        "axes": list(AXIS_NAMES),
+        **dataclasses.asdict(inverse),
+        "checksum": inverse.checksum,
+    }
+
+
 def ros_parameters(inverse: InverseMap) -> str:
     """A ROS 2 parameter file; matrices row by row."""
+    values = named(inverse)
+    for name in ("min_deg", "max_deg"):  # ROS takes no list of both kinds of number
+        values[name] = [float(x) for x in values[name]]
+    values["device"] = [f"{key} = {json.dumps(v)}" for key, v in inverse.device.items()]
+    values["warnings"] = inverse.warnings or [""]  # ROS has no empty list of texts
     lines = [f"# {line}" for line in inverse.origin]
     lines += ["/**:", "  ros__parameters:", "    jaxcal:"]
-    values: dict[str, Any] = {
-        "axes": list(AXIS_NAMES),
-        "matrix": np.ravel(inverse.matrix).tolist(),
-        "offset_deg": inverse.offset_deg,
-        "min_deg": [float(x) for x in inverse.min_deg],
-        "max_deg": [float(x) for x in inverse.max_deg],
-        "pulses_per_deg": inverse.pulses_per_deg,
-        "min_pulses": inverse.min_pulses,
-        "max_pulses": inverse.max_pulses,
-        "forward": np.ravel(inverse.forward).tolist(),
-        "half_widths": np.ravel(inverse.half_widths).tolist(),
-        "run": inverse.run,
-        "created": inverse.created,
-        "checksum": inverse.checksum,
-        "device": [f"{key} = {json.dumps(v)}" for key, v in inverse.device.items()],
-        "warnings": inverse.warnings or [""],  # ROS has no empty list of texts
-    }
-    lines += [f"      {key}: {_yaml(value)}" for key, value in values.items()]
+    for name, value in values.items():
+        flat = np.ravel(value).tolist() if isinstance(value, list) else value
+        lines.append(f"      {name}: {_yaml(flat)}")
     return "\n".join([*lines, ""])
 
 
@@ -186,9 +185,8 @@ def _real(value: float) -> str:
 
 def json_text(inverse: InverseMap) -> str:
     """All fields under their names."""
-    data = {"format": "jaxcal-inverse", "schema": 1, "axes": list(AXIS_NAMES)}
-    fields = dataclasses.asdict(inverse) | {"checksum": inverse.checksum}
-    return json.dumps(data | fields, indent=1) + "\n"
+    data = {"format": "jaxcal-inverse", "schema": 1} | named(inverse)
+    return json.dumps(data, indent=1) + "\n"
 
 
 def csv_text(inverse: InverseMap) -> str:
@@ -196,22 +194,26 @@ def csv_text(inverse: InverseMap) -> str:
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["name", "axis", "input", "value"])
-    for name in ("matrix", "forward", "half_widths"):
-        for axis, row in zip(AXIS_NAMES, getattr(inverse, name), strict=True):
-            for source, value in zip((*AXIS_NAMES, "offset"), row, strict=False):
-                table.writerow([name, axis, source, repr(value)])
-    for name in (
-        "offset_deg", "min_deg", "max_deg", "pulses_per_deg", "min_pulses",
-        "max_pulses",
-    ):  # fmt: skip
-        for axis, value in zip(AXIS_NAMES, getattr(inverse, name), strict=True):
-            table.writerow([name, axis, "", repr(value)])
-    for name in ("checksum", "run", "created"):
-        table.writerow([name, "", "", getattr(inverse, name)])
-    for key, value in inverse.device.items():
-        table.writerow(["device", key, "", json.dumps(value)])
-    for warning in inverse.warnings:
-        table.writerow(["warning", "", "", warning])
+    values = named(inverse)
+    del values["axes"]  # every row names its own
+    for name, value in values.items():
+        if name == "device":
+            rows = [(key, "", json.dumps(each)) for key, each in value.items()]
+        elif name == "warnings":
+            rows = [("", "", warning) for warning in value]
+        elif isinstance(value, str):
+            rows = [("", "", value)]
+        elif isinstance(value[0], list):
+            inputs = (*AXIS_NAMES, "offset")
+            rows = [
+                (axis, source, repr(number))
+                for axis, row in zip(AXIS_NAMES, value, strict=True)
+                for source, number in zip(inputs, row, strict=False)
+            ]
+        else:
+            pairs = zip(AXIS_NAMES, value, strict=True)
+            rows = [(axis, "", repr(number)) for axis, number in pairs]
+        table.writerows((name, *row) for row in rows)
     return text.getvalue()
 
 

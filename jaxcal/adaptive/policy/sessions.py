@@ -1,0 +1,94 @@
+"""Sessions of sequential measurement as PPO's streams play them."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxcal.adaptive.grid import GridTask
+from jaxcal.adaptive.policy.features import Seen, see
+from jaxcal.adaptive.rules import Scored
+from jaxcal.adaptive.session import Session
+from jaxcal.learning.core.streams import Step
+
+__all__ = ["Exercise", "Sessions", "State"]
+
+
+@struct.dataclass
+class Exercise:
+    """What a stream is given, as arrays: a task, and the rule to be corrected."""
+
+    task: Any
+    base: Scored
+
+
+@struct.dataclass
+class State:
+    """One session."""
+
+    truth: Any  # of the unknown
+    belief: Any
+    session: Session
+
+
+@dataclasses.dataclass(frozen=True)
+class Sessions:
+    """``learning.core.streams.Environment`` of tasks and beliefs."""
+
+    per_group: int = 6  # options of a group that the network sees
+
+    def reset(self, task: Exercise, key: jax.Array) -> State:
+        """A new session, its truth drawn from the prior."""
+        key_truth, key_begin = jax.random.split(key)
+        return State(task.task.draw(key_truth), *task.task.begin(key_begin))
+
+    def observe(self, task: Exercise, state: State, key: jax.Array) -> Seen:
+        """The shortlist."""
+        key_options, key_seen = jax.random.split(key)
+        belief, session = state.belief, state.session
+        options = task.task.options(belief, session, key_options)
+        return see(
+            *(task.task, belief, session, options, key_seen), task.base, self.per_group
+        )
+
+    def step(
+        self,
+        task: Exercise,
+        state: State,
+        seen: Seen,
+        action: jax.Array,
+        key: jax.Array,
+    ) -> Step:
+        """Make a measurement; its reward is the information it is expected to give.
+
+        The gain is estimated by draws of its own: those of the shortlist chose it, so
+        theirs is too large.
+        """
+        made, belief = task.task, state.belief
+        key_outcome, key_update, key_gain = jax.random.split(key, 3)
+        design = jax.tree.map(lambda leaf: leaf[action], seen.designs)
+        outcome = made.measure(state.truth, design, key_outcome)
+        outcomes, chance = outcome[None], jnp.ones(1)
+        happened = jnp.int32(0)
+        if isinstance(made, GridTask):  # all outcomes are known, and few
+            outcomes, chance = belief.outcomes(made, design, key_outcome)
+            happened = outcome.astype(jnp.int32)
+
+        def after(outcome: jax.Array) -> tuple[State, jax.Array]:
+            then = belief.update(made, design, outcome, key_update)
+            left = made.spend(state.session, design, outcome)
+            ended = left.over | (left.made >= made.horizon)
+            return State(state.truth, then, left), ended
+
+        states, ended = jax.vmap(after)(outcomes)
+        return Step(
+            reward=belief.gain(made, design, key_gain),
+            states=states,
+            ended=ended,
+            chance=chance,
+            happened=happened,
+        )

@@ -1,0 +1,187 @@
+"""Is a machine still as it was calibrated: a few new readings, what they can tell."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.calibration.fitted import Fitted
+from jaxcal.checks import table, whole_number
+from jaxcal.models import SerialChain
+
+__all__ = ["Check", "check", "verification"]
+
+Array = NDArray[np.float64]
+
+_POWER = 0.8
+_SWEEPS = 20  # of swaps, at most
+
+
+@dataclasses.dataclass(frozen=True)
+class Check:
+    """Printed, a sentence."""
+
+    says: str  # "holds", "does not hold" or "cannot be told"
+    p_value: float  # of readings at least this far off while it holds
+    drift: dict[str, float]  # smallest change of each parameter seen with power 0.8
+    unseen: tuple[str, ...]  # parameters whose drift by ``tolerance`` could hide
+    tolerance: float  # root mean square of the outputs' change that matters
+
+    def __str__(self) -> str:
+        text = (
+            f"the calibration {self.says}"
+            if self.says != "cannot be told"
+            else ("whether the calibration holds cannot be told")
+        )
+        text += f" (p = {self.p_value:.3g}, false alarms 5 %)"
+        if self.says == "cannot be told":
+            text += (
+                f"; a drift by {self.tolerance:.3g} could hide in "
+                f"{', '.join(self.unseen)}"
+            )
+        return text
+
+
+def check(
+    calibration: Fitted,
+    commands: ArrayLike,
+    measured: ArrayLike,
+    tolerance: float | None,
+    placed_anew: bool,
+) -> Check:
+    """See :meth:`jaxcal.calibration.Calibration.check`."""
+    from scipy import special
+
+    commands, measured = table("commands", commands), table("measured", measured)
+    if len(commands) != len(measured) or not len(commands):
+        raise ValueError(
+            "commands and measured must have as many rows, at least one, got "
+            f"{len(commands)} and {len(measured)}"
+        )
+    noise = calibration.noise_std
+    if noise is None:
+        raise ValueError("no check: the noise of the calibration is not known")
+    covariance = np.asarray(calibration.covariance)
+    model, theta = calibration.model, calibration.parameters
+    slopes = np.asarray(model.jacobian(commands, theta))
+    p, q = slopes.shape[-1], slopes.shape[1]
+    if measured.shape[1] != q:
+        raise ValueError(f"measured must have {q} columns, got {measured.shape[1]}")
+    off = (measured - calibration.predict(commands)).ravel()
+    rows = slopes.reshape(-1, p)
+    whole = np.diag(np.tile(noise**2, len(commands))) + rows @ covariance @ rows.T
+    root = np.linalg.inv(np.linalg.cholesky(whole))
+    white, by = root @ off, root @ rows
+    names = calibration.names
+    own = np.zeros(p, dtype=np.bool_)
+    if placed_anew:
+        if not (isinstance(model, SerialChain) and len(model.sensor.names)):
+            raise ValueError("placed_anew is of an arm whose sensor stands somewhere")
+        own[-len(model.sensor.names) :] = True
+    if own.any():  # what stands elsewhere now says nothing
+        left, size, _ = np.linalg.svd(by[:, own], full_matrices=True)
+        rank = int((size > 1e-9 * size.max(initial=0.0)).sum())
+        white, by = left[:, rank:].T @ white, left[:, rank:].T @ by
+    freedom = len(white)
+    if not freedom:
+        raise ValueError("measured leaves no reading beside what was placed anew")
+    square = float(white @ white)
+    if calibration.noise_known:
+        p_value = float(special.chdtrc(freedom, square))
+    else:
+        p_value = float(special.fdtrc(freedom, calibration.noise_dof, square / freedom))
+    needed = _noncentrality(freedom)
+    free = (calibration.free[:p] > 0.0) & ~own
+    seen = np.sqrt((by**2).sum(axis=0))
+    size = np.sqrt(needed) / np.where(seen > 0.0, seen, np.nan)
+    matters = (
+        float(3.0 * np.sqrt(np.mean(noise**2))) if tolerance is None else tolerance
+    )
+    if not matters > 0.0:
+        raise ValueError(f"tolerance must be positive, got {tolerance}")
+    used = np.asarray(model.jacobian(calibration.commands, theta))
+    per_unit = np.sqrt((used**2).mean(axis=(0, 1)) * q)
+    moved = np.where(np.isnan(size), np.inf, np.nan_to_num(size)) * per_unit
+    hidden = free & (per_unit > 0.0) & (moved > matters)
+    if p_value < 0.05:
+        says = "does not hold"
+    else:
+        says = "cannot be told" if hidden.any() else "holds"
+    return Check(
+        says=says,
+        p_value=p_value,
+        drift={
+            name: float(value) if np.isfinite(value) else np.inf
+            for name, value, is_free in zip(names, size, free, strict=True)
+            if is_free
+        },
+        unseen=tuple(name for name, lost in zip(names, hidden, strict=True) if lost),
+        tolerance=matters,
+    )
+
+
+def _noncentrality(freedom: int) -> float:
+    """Of a chi-square that exceeds the 5 % limit with the power that is asked for."""
+    from scipy import optimize, special
+
+    limit = special.chdtri(freedom, 0.05)
+    return float(
+        optimize.brentq(
+            lambda size: 1.0 - special.chndtr(limit, freedom, size) - _POWER, 1e-3, 1e4
+        )
+    )
+
+
+def verification(
+    calibration: Fitted,
+    candidates: ArrayLike,
+    k: int,
+    region: ArrayLike | None,
+) -> NDArray[np.int64]:
+    """See :meth:`jaxcal.calibration.Calibration.verification`.
+
+    Greedy, then swaps, for the smallest sum over parameters of the squared drift that
+    is seen, as a move of the outputs.
+    """
+    points = table("candidates", candidates)
+    if not 1 <= whole_number("k", k, 1) <= len(points):
+        raise ValueError(f"k must be in [1, {len(points)}], got {k}")
+    noise = calibration.noise_std
+    if noise is None:
+        raise ValueError("no verification: the noise of the calibration is not known")
+    model, theta = calibration.model, calibration.parameters
+    slopes = np.asarray(model.jacobian(points, theta))
+    covariance = np.asarray(calibration.covariance)
+    spread = slopes @ covariance @ np.matrix_transpose(slopes) + np.diag(noise**2)
+    white = np.linalg.inv(np.linalg.cholesky(spread)) @ slopes
+    seen = (white**2).sum(axis=1)  # (M, p) by a drift of one
+    where = calibration.commands if region is None else table("region", region)
+    used = np.asarray(model.jacobian(where, theta))
+    per_unit = (used**2).mean(axis=(0, 1))
+    matters = (calibration.free[: len(theta)] > 0.0) & (per_unit > 0.0)
+    seen = seen[:, matters] / per_unit[matters]  # by a drift that moves outputs by one
+    least = 1e-6 * seen.max(initial=0.0) or 1.0
+
+    def value(rows: list[int]) -> Array:
+        """(M,) of the rows and each candidate."""
+        together = seen[rows].sum(axis=0) + seen + least
+        return np.asarray(-(1.0 / together).sum(axis=1))
+
+    chosen: list[int] = []
+    for _ in range(k):
+        gains = value(chosen)
+        gains[chosen] = -np.inf
+        chosen.append(int(gains.argmax()))
+    for _ in range(_SWEEPS):
+        before = list(chosen)
+        for at in range(k):
+            rest = chosen[:at] + chosen[at + 1 :]
+            gains = value(rest)
+            gains[rest] = -np.inf
+            if gains.max() > gains[chosen[at]] + 1e-12:
+                chosen[at] = int(gains.argmax())
+        if chosen == before:
+            break
+    return np.array(chosen)

@@ -1,0 +1,212 @@
+"""Can a calibration be trusted: does its model explain the readings, does it help?
+
+Held-out errors are those of leaving out one measurement at a time, to first order:
+with predicted covariance S and noise R the residual r becomes ``R (R - S)^-1 r``.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.calibration.fitted import Fitted
+from jaxcal.models import SerialChain
+from jaxcal.models.sensors import Placed
+
+__all__ = ["Verdict", "verdict"]
+
+Array = NDArray[np.float64]
+
+_SCATTER = 3.0  # times the sensor's usual noise: the model does not explain that
+_UNLIKELY = 1e-4  # p-value of lack of fit
+_FAR = 4.0  # standard deviations of the prior
+_MOVED = 3.0  # times the scatter of a socket's contacts: it was moved
+_SHUFFLES = 400
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """What the readings say of a calibration; printed, the reasons line by line."""
+
+    explains: bool  # the scatter of the readings is what the sensor's noise can be
+    helps: bool  # held-out errors are smaller than those of the nominal machine
+    held_out: float  # mean held-out error of a measurement, in the readings' unit
+    interval: tuple[float, float]  # 95 % of that mean
+    nominal: float  # mean error of the nominal machine
+    reasons: tuple[str, ...]
+
+    @property
+    def good(self) -> bool:
+        """It may be used."""
+        return self.explains and self.helps
+
+    def __str__(self) -> str:
+        low, high = self.interval
+        lines = [
+            f"held-out error {self.held_out:.3g} [{low:.3g}, {high:.3g}], nominal "
+            f"{self.nominal:.3g}"
+        ]
+        if not self.explains:
+            lines.append("this model does not explain these readings")
+        if not self.helps:
+            lines.append("it is no better than the nominal machine")
+        return "\n".join([*lines, *self.reasons])
+
+
+def verdict(calibration: Fitted) -> Verdict | None:
+    """Of an arm's calibration; None of other models, and where the noise is unknown."""
+    model = calibration.model
+    if not isinstance(model, SerialChain) or calibration.noise_std is None:
+        return None
+    used = np.flatnonzero(calibration.loss_weights > 0.0)
+    commands, residuals = calibration.commands[used], calibration.residuals[used]
+    usual = np.asarray(model.default_noise().std)
+    size = usual / usual[0]  # readings of two units are compared in noise
+    errors = np.linalg.norm(_left_out(calibration, model, used) / size, axis=1)
+    measured = residuals + model.predict(commands, calibration.parameters)
+    at = model.located(commands, measured)
+    before = measured - at.predict(commands)
+    for rows in _groups(at, commands):  # a socket's place is no merit of either
+        before[rows] -= before[rows].mean(axis=0) if len(rows) else 0.0
+    nominal = float(np.linalg.norm(before / size, axis=1).mean())
+    mean = float(errors.mean())
+    half = 1.96 * errors.std() / np.sqrt(max(len(errors) - 1, 1))
+    explains, reasons = _scattered(calibration, usual)
+    swapped = _swapped(calibration, model)
+    for row, other in swapped.items():
+        reasons.append(f"measurement {row} fits {model.sensor.kind} {other} instead")
+    for row in calibration.outliers:
+        if row not in swapped:
+            reasons.append(
+                f"measurement {row} is {calibration.distance[row] ** 0.5:.3g} standard "
+                "deviations from the fit of the others"
+            )
+    right = ~np.isin(used, list(swapped))
+    reasons += _moved(model, commands[right], residuals[right], used[right])
+    reasons += _far(calibration)
+    return Verdict(
+        explains=explains,
+        helps=mean < nominal,
+        held_out=mean,
+        interval=(max(mean - half, 0.0), mean + half),
+        nominal=nominal,
+        reasons=tuple(reasons),
+    )
+
+
+def _left_out(calibration: Fitted, model: SerialChain, used: NDArray[np.intp]) -> Array:
+    """(N, q) residual of each measurement from the fit without it."""
+    noise = np.diag(np.asarray(calibration.noise_std) ** 2)
+    slopes = model.jacobian(calibration.commands[used], calibration.parameters)
+    spread = slopes @ np.asarray(calibration.covariance) @ np.matrix_transpose(slopes)
+    # Of an outlier little was fitted: its weight says how much.
+    share = np.minimum(calibration.loss_weights[used], 1.0)[:, None, None]
+    root = np.linalg.inv(np.sqrt(noise))
+    values, vectors = np.linalg.eigh(np.eye(len(noise)) - share * root @ spread @ root)
+    turned = np.matrix_transpose(vectors) / np.maximum(values, 0.02)[..., None]
+    white = (vectors @ turned @ root @ calibration.residuals[used][..., None])[..., 0]
+    return np.asarray(white @ np.sqrt(noise))
+
+
+def _scattered(calibration: Fitted, usual: Array) -> tuple[bool, list[str]]:
+    """Whether the noise explains the scatter, and why not."""
+    if calibration.noise_known:
+        fit = calibration.lack_of_fit()
+        if fit is None or fit > _UNLIKELY:
+            return True, []
+        return False, [f"lack of fit under the noise that was given: p = {fit:.2g}"]
+    noise = np.asarray(calibration.noise_std)
+    times = float(np.sqrt(np.mean((noise / usual) ** 2)))
+    if times < _SCATTER:
+        return True, []
+    largest = float(noise[(noise / usual).argmax()])
+    return False, [
+        f"the readings scatter by {largest:.3g}, {times:.3g} times what this sensor "
+        "usually does"
+    ]
+
+
+def _far(calibration: Fitted) -> list[str]:
+    """Parameters that were found far from what was known of them."""
+    names = calibration.names
+    p = len(names)
+    off = np.abs(calibration.parameters - calibration.prior_mean[:p])
+    off = off * np.sqrt(calibration.prior_precision[:p]) * calibration.free[:p]
+    return [
+        f"{names[i]} is {off[i]:.2g} standard deviations of the prior from what was "
+        "known: a wrong tip, file or unit?"
+        for i in np.flatnonzero(off > _FAR)
+    ]
+
+
+def _groups(model: SerialChain, commands: Array) -> list[NDArray[np.intp]]:
+    """Rows of each socket, plane or anchor, in the order of measuring."""
+    if not isinstance(model.sensor, Placed):
+        return []
+    which = model.sensor.of_rows(commands[:, model.num_joints :])
+    return [np.flatnonzero(which == i) for i in range(model.sensor.count)]
+
+
+def _moved(
+    model: SerialChain, commands: Array, residuals: Array, names: NDArray[np.intp]
+) -> list[str]:
+    """Sockets and planes whose first and last contacts lie apart."""
+    found = []
+    rng = np.random.default_rng(0)
+    for i, rows in enumerate(_groups(model, commands)):
+        if len(rows) < 6:
+            continue
+        value, at, apart, within = _split(residuals[rows])
+        if apart < _MOVED * within:
+            continue
+        shuffled = [
+            _split(residuals[rng.permutation(rows)])[0] for _ in range(_SHUFFLES)
+        ]
+        if value > np.quantile(shuffled, 0.99):
+            first, last = names[rows[:at]], names[rows[at:]]
+            found.append(
+                f"{model.sensor.kind} {i} seems to have moved by {apart:.3g} between "
+                f"measurements {first[-1]} and {last[0]}"
+            )
+    return found
+
+
+def _split(values: Array) -> tuple[float, int, float, float]:
+    """Best split of (n, q) in two: its share of the squares, where, step, scatter."""
+    n = len(values)
+    sums = np.cumsum(values, axis=0)
+    at = np.arange(2, n - 1)
+    first = sums[at - 1] / at[:, None]
+    last = (sums[-1] - sums[at - 1]) / (n - at)[:, None]
+    apart = np.linalg.norm(first - last, axis=1)
+    gain = apart**2 * at * (n - at) / n
+    best = int(gain.argmax())
+    total = float(((values - values.mean(axis=0)) ** 2).sum())
+    within = np.sqrt(max(total - gain[best], 0.0) / (n - 2))
+    return (
+        float(gain[best]) / total if total else 0.0,
+        int(at[best]),
+        float(apart[best]),
+        float(within),
+    )
+
+
+def _swapped(calibration: Fitted, model: SerialChain) -> dict[int, int]:
+    """Outliers that fit another socket or plane, as if their column were wrong."""
+    sensor = model.sensor
+    if not (isinstance(sensor, Placed) and sensor.zeros and sensor.count > 1):
+        return {}
+    noise = np.asarray(calibration.noise_std)
+    found: dict[int, int] = {}
+    for row in calibration.outliers:
+        command = calibration.commands[row]
+        for other in range(sensor.count):
+            trial = command.copy()
+            trial[model.num_joints] = other
+            predicted = model.predict(trial[None], calibration.parameters)[0]
+            there = other == command[model.num_joints]
+            if not there and np.abs(predicted / noise).max() < 4.0:
+                found[row] = other
+    return found

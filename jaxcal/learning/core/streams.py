@@ -1,0 +1,204 @@
+"""Streams: sessions of any length, one beginning where another ends, as PPO plays them.
+
+B streams of T decisions are an update, however long the sessions in them are. What
+follows a decision counts in expectation over what may happen, not as it happened: the
+randomness of outcomes, most of the variance, is left out, and the expectation of the
+advantages is the same.
+
+The environment is given its task as arrays, never closed over: another task of the same
+shapes compiles nothing, and each stream may have a task of its own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Protocol
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxcal.learning.core.ppo import (
+    Batch,
+    Metrics,
+    PPOConfig,
+    advantages,
+    normalised,
+    surrogate,
+)
+from jaxcal.learning.settings import require, setting
+
+__all__ = ["Environment", "Step", "Streams", "StreamsConfig"]
+
+
+@dataclasses.dataclass(frozen=True)
+class StreamsConfig(PPOConfig):
+    """How much is played, in decisions: sessions differ in length."""
+
+    num_updates: int = setting(300, "training budget")
+    decisions_per_update: int = setting(4096, "decisions in an update")
+    stream_length: int = setting(32, "decisions of one stream in an update")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        counts = ("num_updates", "decisions_per_update", "stream_length")
+        require(self, "at least 1", lambda v: v >= 1, *counts)
+        whole = self.stream_length * self.num_minibatches
+        if self.decisions_per_update % whole:
+            raise ValueError(
+                "decisions_per_update must be a multiple of stream_length x "
+                f"num_minibatches = {whole}, got {self.decisions_per_update}"
+            )
+
+    @property
+    def rows_per_update(self) -> int:
+        """Streams of an update."""
+        return self.decisions_per_update // self.stream_length
+
+
+@struct.dataclass
+class Step:
+    """What a decision leads to: Y states that may follow, one of which happened."""
+
+    reward: jax.Array  # () expected of the decision
+    states: Any  # leaves (Y, ...)
+    ended: jax.Array  # (Y,) bool, the session is over then
+    chance: jax.Array  # (Y,) probabilities; [1.0] where only what happened is known
+    happened: jax.Array  # () int32, which of them
+
+
+class Environment(Protocol):
+    """Sessions, as pure functions of a task's arrays, for one session. Hashable."""
+
+    def reset(self, task: Any, key: jax.Array) -> Any:
+        """The state of a new session."""
+
+    def observe(self, task: Any, state: Any, key: jax.Array) -> Any:
+        """What the network sees: a tree of arrays, options among it."""
+
+    def step(
+        self, task: Any, state: Any, seen: Any, action: jax.Array, key: jax.Array
+    ) -> Step:
+        """Take an option: ``action`` () int32 of those in ``seen``."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Streams:
+    """The learner of sessions; it is given one task, or a task for every stream."""
+
+    config: StreamsConfig
+    environment: Environment
+    network: nn.Module  # of what is observed: masked logits (..., A), values (...)
+    task_per_stream: bool = False  # the task's leaves have a leading axis of streams
+
+    def init(self, key: jax.Array, task: Any) -> Any:
+        """Parameters before training."""
+        if self.task_per_stream:
+            task = jax.tree.map(lambda leaf: leaf[0], task)
+
+        def observed(task: Any, key: jax.Array) -> Any:
+            state = self.environment.reset(task, key)
+            return self.environment.observe(task, state, key)
+
+        shapes = jax.eval_shape(observed, task, key)
+        blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        return self.network.init(key, blank)
+
+    def draw(self, key: jax.Array, task: Any) -> Any:
+        """A key for every stream."""
+        return jax.random.split(key, self.config.rows_per_update)
+
+    def gather(
+        self, params: Any, rows: Any, key: jax.Array, task: Any
+    ) -> tuple[Batch, Metrics]:
+        """Play every stream by sampling; one decision more than counts closes it."""
+        axis = 0 if self.task_per_stream else None
+        played = jax.vmap(self._stream, in_axes=(None, 0, axis), out_axes=1)(
+            params, rows, task
+        )
+        reward, value, ended = played["reward"], played["value"], played["ended"]
+        goes_on = 1.0 - ended[:-1]
+        following = played["chance"][:-1] * goes_on * value[1:] + played["others"][:-1]
+        advantage = advantages(self.config, reward[:-1], value[:-1], following, goes_on)
+        counted = jnp.ones_like(advantage)
+
+        def by_stream(leaf: jax.Array) -> jax.Array:
+            return jnp.moveaxis(leaf[: len(advantage)], 1, 0)  # (T, B) -> (B, T)
+
+        batch = Batch(
+            seen=jax.tree.map(by_stream, played["seen"]),
+            action=by_stream(played["action"]),
+            log_prob=by_stream(played["log_prob"]),
+            advantage=by_stream(normalised(self.config, advantage, counted, (0, 1))),
+            target=by_stream(advantage + value[:-1]),
+            counted=by_stream(counted),
+        )
+        metrics = {
+            "reward_mean": reward.sum() / jnp.maximum(ended.sum(), 1.0),
+            "choices": 1.0 / jnp.maximum(ended.mean(), 1e-6),
+            "entropy": played["entropy"].mean(),
+        }
+        return batch, metrics
+
+    def loss(
+        self, params: Any, experience: Batch, done: jax.Array
+    ) -> tuple[jax.Array, Metrics]:
+        """PPO's."""
+        logits, value = self._score(params, experience.seen)
+        return surrogate(self.config, logits, value, experience, done)
+
+    def _score(self, params: Any, seen: Any) -> tuple[jax.Array, jax.Array]:
+        scored: Any = self.network.apply(params, seen)
+        return scored
+
+    def _stream(self, params: Any, key: jax.Array, task: Any) -> dict[str, Any]:
+        """Sessions one after another, leaves (T + 1, ...)."""
+        environment = self.environment
+
+        def decide(state: Any, key: jax.Array) -> tuple[Any, dict[str, Any]]:
+            key_seen, key_action, key_step, key_next = jax.random.split(key, 4)
+            seen = environment.observe(task, state, key_seen)
+            logits, value = self._score(params, seen)
+            action = jax.random.categorical(key_action, logits).astype(jnp.int32)
+            log_probs = jax.nn.log_softmax(logits)
+            step = environment.step(task, state, seen, action, key_step)
+
+            def value_of(state: Any) -> jax.Array:
+                seen = environment.observe(task, state, key_seen)
+                return self._score(params, seen)[1]
+
+            # The value of what happened is the next decision's.
+            number = len(step.chance)
+            elsewhere = (step.happened + jnp.arange(1, number)) % number
+            others = jnp.zeros(())
+            if number > 1:
+                states = jax.tree.map(lambda leaf: leaf[elsewhere], step.states)
+                values = jnp.where(
+                    step.ended[elsewhere], 0.0, jax.vmap(value_of)(states)
+                )
+                others = step.chance[elsewhere] @ values
+            ended = step.ended[step.happened]
+            fresh = environment.reset(task, key_next)
+            state = jax.tree.map(
+                lambda new, old: jnp.where(ended, new, old[step.happened]),
+                fresh,
+                step.states,
+            )
+            return state, {
+                "seen": seen,
+                "action": action,
+                "log_prob": log_probs[action],
+                "value": value,
+                "reward": step.reward,
+                "ended": ended.astype(jnp.float32),
+                "chance": step.chance[step.happened],
+                "others": others,
+                "entropy": -(jnp.exp(log_probs) * log_probs).sum(),
+            }
+
+        key_reset, key_steps = jax.random.split(key)
+        keys = jax.random.split(key_steps, self.config.stream_length + 1)
+        begun = environment.reset(task, key_reset)
+        played: dict[str, Any] = jax.lax.scan(decide, begun, keys)[1]
+        return played

@@ -1,0 +1,105 @@
+"""Is a calibration still right: false alarms, power, and what cannot be told."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import jaxcal
+
+from ..models.arms import ur5
+
+ARM = ur5()
+RNG = np.random.default_rng(0)
+JOINTS = RNG.uniform(-120.0, 120.0, (60, 6))
+PRIOR = ARM.default_prior()
+TRUTH = ARM.nominal + np.asarray(PRIOR.std) * RNG.normal(size=39) * 0.5
+NOISE = 0.05
+MEASURED = ARM.predict(JOINTS, TRUTH) + NOISE * RNG.normal(size=(60, 3))
+FOUND = jaxcal.identify(JOINTS, MEASURED, model=ARM, noise_std=NOISE)
+
+
+def _new(theta, count, seed):
+    rng = np.random.default_rng(seed)
+    joints = rng.uniform(-120.0, 120.0, (count, 6))
+    return joints, ARM.predict(joints, theta) + NOISE * rng.normal(size=(count, 3))
+
+
+def test_false_alarms_are_five_in_a_hundred():
+    alarms = [FOUND.check(*_new(TRUTH, 4, seed)).says == "does not hold"
+              for seed in range(400)]  # fmt: skip
+    low, high = stats.binom.interval(0.999, 400, 0.05)
+    assert low <= sum(alarms) <= high
+
+
+def test_a_drift_of_the_size_it_states_is_seen_four_times_in_five():
+    joints, _ = _new(TRUTH, 4, 0)
+    rng = np.random.default_rng(1)
+    said = FOUND.check(joints, FOUND.predict(joints))
+    # The truth is where the calibration says it may be.
+    truths = rng.multivariate_normal(FOUND.parameters, FOUND.covariance, 200)
+    low, high = stats.binom.interval(0.999, 200, 0.8)
+    for name in ("theta2", "a3", "theta5"):
+        seen = 0
+        for truth in truths:
+            drifted = truth.copy()
+            drifted[ARM.names.index(name)] += said.drift[name]
+            measured = ARM.predict(joints, drifted) + NOISE * rng.normal(size=(4, 3))
+            seen += FOUND.check(joints, measured).says == "does not hold"
+        assert low <= seen <= high, (name, seen)
+
+
+def test_what_one_posture_cannot_tell_is_said():
+    joints, measured = _new(TRUTH, 1, 3)
+    result = FOUND.check(joints, measured, tolerance=0.02)
+    assert result.says == "cannot be told" and result.unseen
+    assert "cannot be told" in str(result) and "could hide in" in str(result)
+    many = FOUND.check(*_new(TRUTH, 40, 5), tolerance=5.0)
+    assert many.says == "holds" and not many.unseen
+    assert str(many).startswith("the calibration holds (p = ")
+
+
+def test_three_chosen_postures_see_what_six_random_ones_see():
+    candidates = np.random.default_rng(7).uniform(-120.0, 120.0, (200, 6))
+    chosen = FOUND.verification(candidates, 3)
+    assert len(set(chosen)) == 3
+    slopes = ARM.jacobian(JOINTS, FOUND.parameters)
+    moves = np.sqrt((slopes**2).sum(axis=1).mean(axis=0))  # of the tip, mm a unit
+
+    def worst(rows):
+        """Largest drift of the tip, of one parameter, that is seen with power 0.8."""
+        said = FOUND.check(candidates[rows], FOUND.predict(candidates[rows])).drift
+        pairs = zip(said.items(), moves, strict=True)
+        return max(size * move for (_, size), move in pairs if move > 0.0)
+
+    rng = np.random.default_rng(8)
+    six = [worst(rng.choice(200, 6, replace=False)) for _ in range(50)]
+    three = [worst(rng.choice(200, 3, replace=False)) for _ in range(50)]
+    assert worst(chosen) <= 1.05 * np.median(six)
+    assert worst(chosen) <= np.quantile(three, 0.05)
+
+
+def test_the_affine_device_is_checked_too():
+    rng = np.random.default_rng(0)
+    commands = rng.uniform(0.0, 1.0, (8, 3))
+    found = jaxcal.identify(commands, commands + 0.01 * rng.normal(size=(8, 3)))
+    new = rng.uniform(0.0, 1.0, (3, 3))
+    assert found.check(new, found.predict(new)).says != "does not hold"
+    assert found.check(new, found.predict(new) + 0.2).says == "does not hold"
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ((JOINTS[:2], MEASURED[:3]), "must have as many rows, at least one"),
+        ((JOINTS[:2], MEASURED[:2, :2]), "measured must have 3 columns"),
+        ((JOINTS[:2], MEASURED[:2], 0.0), "tolerance must be positive"),
+        ((JOINTS[:2], MEASURED[:2], None, True), "whose sensor stands somewhere"),
+    ],
+)
+def test_bad_input_is_named(given, message):
+    commands, measured, *rest = given
+    options = dict(zip(("tolerance", "placed_anew"), rest, strict=False))
+    with pytest.raises(ValueError, match=message):
+        FOUND.check(commands, measured, **options)

@@ -1,0 +1,96 @@
+"""Scales of the prior from the readings, against brute force and the truth."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import jaxcal
+from jaxcal import Prior
+from jaxcal.models import Affine
+
+from ..models.arms import ur5
+
+ARM = ur5()
+STD = np.asarray(ARM.default_prior().std)
+UNITS = np.array(ARM.units[:30])
+
+
+def _data(lengths, angles, count, seed):
+    rng = np.random.default_rng(seed)
+    factors = np.ones(39)
+    factors[:30] = np.where(UNITS == "length", lengths, angles)
+    truth = ARM.nominal + factors * STD * rng.normal(size=39)
+    joints = rng.uniform(-120.0, 120.0, (count, 6))
+    measured = ARM.predict(joints, truth) + 0.1 * rng.normal(size=(count, 3))
+    return joints, measured, truth, factors
+
+
+@pytest.mark.parametrize(("lengths", "angles"), [(0.2, 0.2), (0.2, 3.0), (3.0, 0.3)])
+def test_the_factors_are_found(lengths, angles):
+    joints, measured, *_ = _data(lengths, angles, 60, 0)
+    prior = ARM.default_prior().sized()
+    found = jaxcal.identify(joints, measured, model=ARM, prior=prior)
+    sized = found.prior_precision[:30] ** -0.5 / STD[:30]
+    for unit, factor in (("length", lengths), ("deg", angles)):
+        ratio = sized[UNITS == unit]
+        assert np.ptp(ratio) < 1e-9
+        assert 0.5 < ratio[0] / factor < 2.0, (unit, ratio[0])
+    np.testing.assert_allclose(found.prior_precision[30:] ** -0.5, STD[30:])
+
+
+def test_the_factors_maximise_the_marginal_likelihood():
+    """Brute force: the density of the readings, linear about the fit, on a grid."""
+    joints, measured, *_ = _data(0.3, 2.0, 12, 1)
+    stated = ARM.default_prior()
+    found = jaxcal.identify(
+        joints,
+        measured,
+        model=ARM,
+        prior=stated.sized(),
+        loss="gaussian",
+        noise_std=0.1,
+    )
+    slopes = ARM.jacobian(joints, found.parameters).reshape(-1, 39)
+    off = (measured - ARM.predict(joints, found.parameters)).ravel()
+    off = off + slopes @ (found.parameters - ARM.nominal)
+
+    def density(logs):
+        factors = np.ones(39)
+        factors[:30] = np.where(UNITS == "length", *np.exp(logs))
+        spread = (slopes * (factors * STD) ** 2) @ slopes.T + 0.01 * np.eye(len(off))
+        value = np.linalg.slogdet(spread)[1] + off @ np.linalg.solve(spread, off)
+        return value + (np.square(logs) / np.log(3.0) ** 2).sum()
+
+    sized = np.log(found.prior_precision[:30] ** -0.5 / STD[:30])
+    here = np.array([sized[UNITS == unit][0] for unit in ("length", "deg")])
+    steps = np.array([(a, b) for a in (-0.3, 0, 0.3) for b in (-0.3, 0, 0.3)])
+    values = [density(here + step) for step in steps]
+    # Twice round the fit moves little; no neighbour is better by more than rounding.
+    assert density(here) <= min(values) + 0.05
+
+
+def test_wrong_tolerances_cost_little():
+    """Errors a fifth of the tolerances, few poses: nearly as with the right prior."""
+    errors = {"stated": [], "sized": [], "right": []}
+    stated = ARM.default_prior()
+    for seed in range(6):
+        joints, measured, truth, factors = _data(0.2, 0.2, 12, seed)
+        rest = np.random.default_rng(99).uniform(-120.0, 120.0, (100, 6))
+        where = ARM.predict(rest, truth)
+        right = Prior(STD * factors)
+        for name, prior in zip(errors, (stated, stated.sized(), right), strict=True):
+            found = jaxcal.identify(joints, measured, model=ARM, prior=prior)
+            off = found.predict(rest) - where
+            errors[name].append(np.linalg.norm(off, axis=1).mean())
+    means = {name: np.mean(values) for name, values in errors.items()}
+    assert means["sized"] < means["right"] / 0.9
+    assert means["sized"] < means["stated"]
+
+
+def test_only_arms_have_sizes():
+    prior = dataclasses.replace(Prior(1.0), by_data=True)
+    with pytest.raises(ValueError, match=r"Prior\.sized\(\) is of arms"):
+        jaxcal.identify(np.eye(4, 3), np.eye(4, 3), model=Affine(3, 3), prior=prior)

@@ -1,0 +1,88 @@
+"""A calibration says whether its model explains the readings, and names what is wrong.
+
+The arms are real: of dinova_1's first socket seven contacts lie 11 mm from the other
+thirteen, whatever arm predicts them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+import contacts
+import numpy as np
+import pytest
+
+import jaxcal
+
+from ..models.arms import ur5
+
+PLACE = contacts.load("panda_1")["front"]
+
+
+def _fit(name, joints, sockets):
+    commands = np.column_stack([joints, sockets])
+    zeros = np.zeros((len(sockets), 3))
+    return jaxcal.identify(commands, zeros, model=contacts.arm(name))
+
+
+def test_good_contacts_get_a_good_verdict():
+    found = _fit("panda_1", *PLACE)
+    verdict = found.verdict
+    assert verdict.good and verdict.held_out < 0.05 * verdict.nominal
+    assert verdict.interval[0] < verdict.held_out < verdict.interval[1]
+    assert not [why for why in verdict.reasons if "moved" in why]
+    assert "held-out error" in found.summary()
+
+
+def test_held_out_errors_are_those_of_fits_without_each_contact():
+    rows = np.arange(0, 62, 2)
+    joints, sockets = PLACE[0][rows], PLACE[1][rows]
+    commands = np.column_stack([joints, sockets])
+    arm = contacts.arm("panda_1")
+    stated = dataclasses.replace(arm.default_prior(), by_data=False)
+    options = {"model": arm, "loss": "gaussian", "noise_std": 2e-4, "prior": stated}
+    zeros = np.zeros((len(rows), 3))
+    whole = jaxcal.identify(commands, zeros, **options)
+    errors = []
+    for i in range(len(rows)):
+        rest = np.delete(np.arange(len(rows)), i)
+        fit = jaxcal.identify(commands[rest], zeros[rest], **options)
+        errors.append(np.linalg.norm(fit.predict(commands[i])))
+    assert whole.verdict.held_out == pytest.approx(np.mean(errors), rel=0.1)
+
+
+def test_a_socket_that_was_moved_is_named():
+    with pytest.warns(UserWarning, match="does not explain these readings"):
+        verdict = _fit("dinova_1", *contacts.load("dinova_1")["front"]).verdict
+    assert not verdict.explains
+    text = str(verdict)
+    assert "this model does not explain these readings" in text
+    assert "times what this sensor usually does" in text
+    moved = [why for why in verdict.reasons if "moved" in why]
+    assert len(moved) == 1
+    said = re.fullmatch(
+        r"socket 0 seems to have moved by (\S+) between measurements 6 and 7", moved[0]
+    )
+    assert float(said[1]) == pytest.approx(0.011, rel=0.05)
+
+
+def test_rows_in_the_wrong_file_and_loose_contacts_are_named():
+    joints, sockets = PLACE[0].copy(), PLACE[1].copy()
+    sockets[[3, 40]] = 1.0 - sockets[[3, 40]]
+    joints[20, 2] += 1.0
+    verdict = _fit("panda_1", joints, sockets).verdict
+    assert "measurement 3 fits socket 0 instead" in verdict.reasons
+    assert "measurement 40 fits socket 1 instead" in verdict.reasons
+    assert any(why.startswith("measurement 20 is ") for why in verdict.reasons)
+
+
+def test_a_wrong_tip_is_named():
+    """Positions of a point 0.7 m from where the tool is said to be."""
+    arm = ur5()
+    joints = np.random.default_rng(0).uniform(-120.0, 120.0, (60, 6))
+    truth = arm.nominal.copy()
+    truth[arm.names.index("tool z")] += 700.0
+    noise = 0.1 * np.random.default_rng(1).normal(size=(60, 3))
+    found = jaxcal.identify(joints, arm.predict(joints, truth) + noise, model=arm)
+    assert any(why.startswith("tool z is ") for why in found.verdict.reasons)
