@@ -121,13 +121,8 @@ def _relaxation(row: Row, joints: Array, criterion: str, budget: Budget) -> None
             search.branch_and_bound, problem.blocks, problem.prior, problem.criterion,
             problem.lower, problem.upper, start, root_only=True,
         )  # fmt: skip
-        usual = search._SHARE
-        try:  # to the end instead of to a share of the distance to the incumbent
-            search._SHARE = 0.0
-            bound = solve().bound
-            seconds = cpu_seconds(solve, budget.pick(5, 1))
-        finally:
-            search._SHARE = usual
+        bound = solve().bound
+        seconds = cpu_seconds(solve, budget.pick(5, 1))
         case = f"{criterion}, K = {k} of 1,000"
         note = f"solved to 1e-10; bound {problem.criterion.reported(bound):.6g}"
         row.lines.append(Line(case, "relaxation", 1e3 * seconds, "ms", note))

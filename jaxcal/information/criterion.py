@@ -106,11 +106,11 @@ class Criterion:
             return value + self.times * len(self.root) * float(np.log1p(share))
         return value / (1.0 + share) if self.kind == "trace" else value * (1.0 + share)
 
-    def enough(self, phi: float, efficiency: float) -> float:
-        """The largest phi of a bound that proves ``efficiency`` of a selection."""
+    def enough(self, efficiency: float) -> tuple[float, float]:
+        """A bound on phi of at most the first times phi, plus the second, proves it."""
         if self.kind == "det":
-            return phi - len(self.root) * float(np.log(efficiency))
-        return phi * efficiency if self.kind == "trace" else phi / efficiency
+            return 1.0, -len(self.root) * float(np.log(efficiency))
+        return (efficiency if self.kind == "trace" else 1.0 / efficiency), 0.0
 
     def _half(self, information: Array) -> tuple[Array, NDArray[np.bool_]]:
         """H (..., s, p) with ``H @ H.T = V``, and where M is not singular."""

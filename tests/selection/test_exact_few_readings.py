@@ -1,4 +1,4 @@
-"""Bounds where few readings are left, their eigenvalues, and the first-use message."""
+"""Bounds where few readings are left, and what the library logs."""
 
 from __future__ import annotations
 
@@ -11,51 +11,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numba import njit
 
 from jaxcal.commands.main import main
 from jaxcal.information.criterion import Criterion
 from jaxcal.selection import select
 from jaxcal.selection.criteria import CRITERIA
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
-from jaxcal.selection.exact.eigen_kernel import eigen
-from jaxcal.selection.exact.first_use import announced
 
 Array = np.ndarray
 laws = settings(max_examples=60, deadline=None)
-
-
-@njit
-def decompose(matrix: Array) -> tuple[Array, Array]:
-    values, vectors = np.empty(len(matrix)), np.empty(matrix.shape)
-    eigen(matrix.copy(), values, vectors)
-    return values, vectors
-
-
-SPECTRA = {
-    "apart": lambda p: np.linspace(1.0, 2.0, p),
-    "equal": lambda p: np.ones(p),
-    "zero": lambda p: np.zeros(p),
-    "low rank": lambda p: np.r_[np.zeros(p - p // 2), 3.0 + np.arange(p // 2)],
-    "graded": lambda p: 10.0 ** np.linspace(-12, 8, p),
-    "indefinite": lambda p: np.linspace(-1.0, 1.0, p),
-}
-
-
-@pytest.mark.parametrize("spectrum", SPECTRA)
-@pytest.mark.parametrize("p", [1, 2, 3, 8, 39, 70])
-def test_eigenvalues_are_those_of_lapack(p: int, spectrum: str) -> None:
-    basis = np.linalg.qr(np.random.default_rng(p).normal(size=(p, p)))[0]
-    matrix = (basis * SPECTRA[spectrum](p)) @ basis.T
-    for given_matrix in (matrix + matrix.T, np.diag(SPECTRA[spectrum](p)[::-1])):
-        values, vectors = decompose(given_matrix)
-        scale = 1e-14 * p * np.abs(given_matrix).max()
-        wanted = np.linalg.eigvalsh(given_matrix)
-        np.testing.assert_allclose(values, wanted, rtol=0, atol=scale + 1e-300)
-        np.testing.assert_allclose(vectors @ vectors.T, np.eye(p), atol=1e-13 * p)
-        np.testing.assert_allclose(
-            vectors.T * values @ vectors, given_matrix, rtol=0, atol=4 * scale
-        )
 
 
 def drawn(seed: int, m: int, q: int, p: int, name: str, weight: float) -> Any:
@@ -146,34 +110,16 @@ def test_a_time_limit_is_kept_while_nodes_are_slow() -> None:
     assert found.values[0] < found.bound <= first.bound
 
 
-def test_a_first_use_says_once_that_it_compiles(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    @njit
-    def one(x: float) -> float:
-        return x + 1.0
-
-    @njit
-    def two(x: float) -> float:
-        return one(x) + 1.0
-
-    caplog.set_level(logging.INFO, logger="jaxcal")
-    for _ in range(2):
-        with announced("compiling, once"):
-            two(1.0)
-    assert [record.getMessage() for record in caplog.records] == ["compiling, once"]
-
-
 def test_the_console_shows_what_the_library_logs(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    log = logging.getLogger("jaxcal.selection.exact.first_use")
+    log = logging.getLogger("jaxcal.selection.exact")
     monkeypatch.setattr(
-        "jaxcal.commands.select.run", lambda arguments: log.info("compiling, once")
+        "jaxcal.commands.select.run", lambda arguments: log.info("said once")
     )
     for _ in range(2):
         assert main(["select", "-", "-k", "4"]) == 0
-        assert capsys.readouterr() == ("", "compiling, once\n")
+        assert capsys.readouterr() == ("", "said once\n")
 
 
 def monomials(points: Array) -> Array:

@@ -10,25 +10,18 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.information.criterion import Criterion
 
-if TYPE_CHECKING:
-    from jaxcal.selection.exact.criterion_kernel import Relaxation
-
 __all__ = ["TOLERANCE", "BranchResult", "branch_and_bound"]
 
 TOLERANCE = 1e-10  # of phi of "det"; of the others a share of it
-_CHUNK = 16  # nodes between looks at the clock, where ``enough`` may stop the search
-_PACE = 0.01  # seconds between looks where not, at which an interrupt is seen too
 _MEMORY = 64 * 2**20  # bytes of open nodes up to which the best bound goes first
 _FREE = 3e6  # node x M q p^2 spent on a proof although ``enough`` is reached: 10 ms
-_SHARE = 0.05  # of its distance to the incumbent, how far a node is left from solved;
-# the root, whose bound may be all that is asked for, is solved
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -72,90 +65,64 @@ def branch_and_bound(
             proof has had a fair try.
         root_only: stop at the bound of the relaxation.
     """
-    from jaxcal.selection.exact.branch_kernel import search
-
-    problem, scale, shift = _relaxation(blocks, prior, criterion, start)
+    search, scale, shift = _search(blocks, prior, criterion, int(start.sum()), start)
     num_blocks, q, p = blocks.shape
+    low, high, counts = np.array([lower, upper, start], dtype=np.float64)
     best_counts = np.zeros((best, num_blocks))
     best_values = np.full(best, -np.inf)
-    width = num_blocks
-    alive = np.arange(num_blocks)
+    search.offer(low, high, counts, best_counts, best_values)
     nodes, bounds = np.empty((64, 3, num_blocks)), np.full(64, np.inf)
-    nodes[0] = lower, upper, start
-    counts = best_counts
-    size, done, free, bound, chunk = 1, 0, 0, np.inf, 1
-    while size:
-        bound = max(bounds[:size].max(), best_values[0])
-        late = deadline is not None and time.perf_counter() > deadline
-        close = (
-            enough is not None
-            and done >= free
-            and (
-                scale * bound + shift
-                <= criterion.enough(float(scale * best_values[0] + shift), enough)
-            )
-        )
-        if done and (late or close or root_only):
-            break
+    nodes[0] = low, high, counts
+    good = (0.0, np.inf) if root_only else (0.0, -np.inf)
+    if enough is not None:
+        good = criterion.enough(enough)
+    tries = 1 if root_only else int(_FREE / (num_blocks * q * p * p))
+    size, done, bound, going = 1, 0, np.inf, True
+    while size and going:
         if size + 2 > len(bounds):
-            nodes, bounds = (
-                np.concatenate([a, np.empty_like(a)]) for a in (nodes, bounds)
-            )
-        begun = time.perf_counter()
-        size, more = search(
-            problem, TOLERANCE, _SHARE if done else 0.0, nodes, bounds, size, counts,
-            best_values, max(256, _MEMORY // (24 * width)), chunk,
+            room = np.empty((len(bounds), 3, num_blocks))
+            nodes = np.concatenate([nodes, room])
+            bounds = np.concatenate([bounds, np.full(len(bounds), np.inf)])
+        left = np.inf if deadline is None else deadline - time.perf_counter()
+        size, more, going = search.run(
+            nodes, bounds, size, best_counts, best_values, TOLERANCE,
+            max(256, _MEMORY // (24 * num_blocks)), max(1, tries - done), left, *good,
         )  # fmt: skip
-        if not done and size:
-            # Incumbents may use what the root rules out as no better than they are.
-            alive = np.flatnonzero(nodes[:size, 1].any(axis=0) | counts.any(axis=0))
-            nodes = np.ascontiguousarray(nodes[:, :, alive])
-            counts = np.ascontiguousarray(counts[:, alive])
-            problem = problem._replace(blocks=problem.blocks[alive])
-            width = len(alive)
-            if enough is not None:
-                free = int(_FREE / (width * q * p * p))
         done += more
-        chunk = _CHUNK
-        if enough is None:
-            seconds = max(time.perf_counter() - begun, 1e-6)
-            chunk = max(1, int(more * _PACE / seconds))
-    proven = size == 0
+    if size:
+        bound = max(bounds[:size].max(), best_values[0])
     found = np.isfinite(best_values)
-    best_counts[:, alive] = counts
     return BranchResult(
         best_counts[found].astype(np.int64),
         scale * best_values[found] + shift,
-        float(scale * (best_values[0] if proven else bound) + shift),
+        float(scale * (bound if size else best_values[0]) + shift),
         done,
-        proven,
+        size == 0,
     )
 
 
-def _relaxation(
-    blocks: Array, prior: Array, criterion: Criterion, start: Indices
-) -> tuple[Relaxation, float, float]:
-    """The problem in numbers near 1, and the unit and the origin of its values."""
-    from jaxcal.selection.exact.criterion_kernel import DS, TRACE, D, E, Relaxation
+def _search(
+    blocks: Array, prior: Array, criterion: Criterion, k: int, start: Indices
+) -> tuple[Any, float, float]:
+    """The compiled search in numbers near 1, and unit and origin of its values."""
+    from jaxcal.selection.exact.kernel import DS, TRACE, D, E, Search
 
-    k, root = int(start.sum()), criterion.root
+    root = criterion.root
     rank = 1 if blocks.shape[1] == 1 else int(np.linalg.matrix_rank(blocks).max())
     p = len(prior)
     scale, shift = 1.0, 0.0
     if criterion.kind == "det" and len(root) == p:
         kind, shift = D, -2.0 * float(np.linalg.slogdet(root)[1])
     elif criterion.kind == "det":
-        kind = DS
+        kind, lengths = DS, np.linalg.norm(root, axis=1)
+        root, shift = root / lengths[:, None], -2.0 * float(np.log(lengths).sum())
     else:
         chosen = np.repeat(blocks, start, axis=0).reshape(-1, p)
         phi = abs(float(criterion.value(prior + chosen.T @ chosen)))
         scale = phi if 0.0 < phi < np.inf else 1.0
-        if criterion.kind == "trace":
-            kind, root = TRACE, root / np.sqrt(scale)
-        else:
-            kind, root = E, root * np.sqrt(scale)
-    blocks, prior, root = (np.array(each, order="C") for each in (blocks, prior, root))
-    # Affine postures are enough for D at nearly every node: half as much to compile.
-    plain = kind == D and blocks.shape[1] == 1 and not prior.any()
-    made = Relaxation(kind, blocks, prior, None if plain else root, k, rank)
-    return made, scale, shift
+        trace = criterion.kind == "trace"
+        kind = TRACE if trace else E
+        root = root / np.sqrt(scale) if trace else root * np.sqrt(scale)
+    arrays = [np.array(each, order="C") for each in (blocks, prior, root)]
+    search: Any = Search
+    return search(kind, *arrays, k, rank), scale, shift

@@ -10,7 +10,6 @@ lie on the hull, so ``best`` > 1 does without it.
 from __future__ import annotations
 
 import dataclasses
-import functools
 import time
 from typing import Any
 
@@ -18,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
-from jaxcal.selection.exact.first_use import announced
 from jaxcal.selection.exact.volume import enumeration_cost, largest_volumes
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.greedy import greedy_indices
-from jaxcal.selection.problem import Asked, Problem, values
+from jaxcal.selection.problem import Problem, values
 from jaxcal.selection.solver import Found, in_threads
 
 __all__ = ["STARTING_RESTARTS", "ExactResult", "solve", "solve_exact", "upper_bound"]
@@ -118,18 +116,14 @@ def solve_exact(
         cost = enumeration_cost(len(pool), free)
         if best == 1 or cost <= _CHEAP:
             if enough and cost > _CHEAP:  # the relaxation may do without
-                start = np.sort(exchange_indices(problem, restarts, seed))
+                start = np.sort(exchange_indices(problem, restarts, seed, deadline))
                 relaxed = _relaxed(problem, start)
                 result = _result(problem, [start], best, relaxed, 1)
                 value = float(result.values[0])
                 if problem.criterion.efficiency(value, result.bound) >= enough:
                     return result
             return _enumerate(problem, pool, best, deadline)
-    misses = _load.cache_info().misses
-    seconds = _load(problem.rank_one, bool(len(problem.root)))
-    if deadline is not None and _load.cache_info().misses > misses:
-        deadline += seconds
-    start = exchange_indices(problem, restarts, seed)
+    start = exchange_indices(problem, restarts, seed, deadline)
     groups = _groups(problem, merge=best == 1)
     first = np.array([members[0] for members in groups])
     found = branch_and_bound(
@@ -146,23 +140,6 @@ def solve_exact(
     subsets = [_expand(problem, groups, counts) for counts in found.counts]
     bound = None if found.proven else found.bound
     return _result(problem, subsets, best, bound, found.nodes)
-
-
-@functools.cache
-def _load(rank_one: bool, known: bool) -> float:
-    """Compile or load the search; seconds it took, which no time limit should count."""
-    begun = time.perf_counter()
-    blocks = np.eye(2)[[0, 1, 0, 1], None].repeat(1 if rank_one else 2, axis=1)
-    problem = Asked.from_blocks(blocks, np.eye(2) if known else None).problem(3)
-    least = np.zeros(4, dtype=np.int64)
-    what, about = ("", 15) if rank_one and not known else (" for row blocks", 30)
-    line = f"compiling the exact solver{what}, once per machine (about {about} s)"
-    with announced(line):
-        start = np.bincount(exchange_indices(problem, 1, 0), minlength=4)
-        branch_and_bound(
-            problem.blocks, problem.prior, problem.criterion, least, least + 1, start
-        )
-    return time.perf_counter() - begun
 
 
 def upper_bound(problem: Problem) -> float:

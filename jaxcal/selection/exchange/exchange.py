@@ -1,27 +1,57 @@
 """Fedorov exchange with restarts: near-optimal in milliseconds, no proof.
 
 Each chosen candidate in turn is swapped for the one that raises the criterion most,
-until no swap helps. Rank-one problems start from random selections that are not
-singular, all others from greedy ones first. Source: Fedorov, Theory of Optimal
-Experiments, 1972; Cook and Nachtsheim 1980 for one candidate at a time.
+until no swap helps. The first starts are greedy selections, the others random ones that
+are rarely singular. Source: Fedorov, Theory of Optimal Experiments, 1972; Cook and
+Nachtsheim 1980 for one candidate at a time.
+
+E, the smallest eigenvalue, is climbed from local optima of A: the sum of the variances
+is at most p times the largest, and climbs from where the smallest eigenvalue stands
+still because two are equal. phi is concave, so with G its gradient at what is left when
+a candidate goes out, adding B_j gives at most phi there plus ``trace(B_j G B_j.T)``;
+candidates are evaluated in the order of that bound until it falls to the best found.
 """
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.selection.exchange.blocks import Blocks
-from jaxcal.selection.problem import Problem
+from jaxcal.information.blocks import largest_rank
+from jaxcal.information.criterion import Criterion
+from jaxcal.selection.problem import Problem, values
 from jaxcal.selection.solver import Found, in_threads
 
-__all__ = ["default_restarts", "exchange_from", "exchange_indices", "solve"]
+__all__ = [
+    "Climbs",
+    "default_restarts",
+    "exchange_from",
+    "exchange_indices",
+    "solve",
+]
 
+Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 # (k + 8) M q^2 p of the default starts of one call, about 10 ms; swaps for a trace or a
 # subset of the parameters cost twice those for D.
 _WORK = {"D": 24e6, "other": 12e6}
+
+# While a selection grows, a share of the information that k mean candidates give stands
+# in for those that are not chosen yet: this one, less where k candidates have fewer
+# readings than there are parameters, and in further starts of the exchange others.
+_SHARE = 0.2
+_FURTHER = (1.0, 0.03)
+_RANK_FIRST = 1e-7  # every direction that nothing is known of outweighs the rest
+_MENDING = 10  # random starts where all greedy ones are singular
+
+_CHUNK = 32  # candidates whose eigenvalues are computed at once
+_CLIMBS = 3e5  # k p^3 of the climbs of E in one call, about half a second
+_LIFTS = 1e-9  # share by which a swap must raise the eigenvalue
+_RIDGE = 1e-10  # of the information of all candidates
 
 
 def solve(problem: Problem, *, seed: int, restarts: int | None) -> Found:
@@ -55,46 +85,106 @@ def default_restarts(problem: Problem) -> int:
     return int(min(max(work / ((problem.k + 8) * count * q * q * p), 1.0), most))
 
 
+class Climbs:
+    """The available candidates of a problem as the compiled kernel takes them.
+
+    E is treated as A: an incomplete selection has no least eigenvalue to raise.
+    """
+
+    def __init__(self, problem: Problem, seed: int, deadline: float | None) -> None:
+        from jaxcal.selection.exchange.kernel import DET, SUBSET, TRACE, Climber
+
+        self._usable = np.flatnonzero(problem.available)
+        blocks = problem.blocks[self._usable]
+        self._required = np.searchsorted(self._usable, problem.required)
+        self._deadline = deadline
+        criterion, q, p = problem.criterion, blocks.shape[1], blocks.shape[2]
+        kind, root = TRACE, criterion.root
+        if criterion.kind == "det":
+            root = root / np.linalg.norm(
+                root, axis=1, keepdims=True
+            )  # variances near 1
+            kind = DET if criterion.name == "D" else SUBSET
+        span = np.zeros((0, p))
+        if len(problem.root):
+            values, vectors = np.linalg.eigh(problem.prior)
+            span = np.ascontiguousarray(vectors.T[values > 1e-6])
+        self._share = _SHARE * min(1.0, problem.k * q / p) ** 6
+        self._climber = Climber(
+            kind, blocks, problem.prior, root, problem.upper[self._usable],
+            self._required, span, largest_rank(blocks), problem.k, seed,
+        )  # fmt: skip
+
+    def seconds(self) -> float:
+        """Left until the deadline."""
+        if self._deadline is None:
+            return np.inf
+        return max(self._deadline - time.perf_counter(), 0.0)
+
+    def greedy(self) -> Indices:
+        """(k,) the required, then one at a time by the largest gain.
+
+        A selection that is singular is mended by swaps, as in the exchange.
+        """
+        for share, climbs in ((self._share, 0), (_RANK_FIRST, 0), (self._share, 1)):
+            chosen, phi = self._climber.climb_from(
+                self._required, share, climbs, self.seconds()
+            )
+            if phi > -np.inf:
+                return self._usable[chosen]
+        return self.best_of(1 + _MENDING)[0]
+
+    def climbed(self, start: Indices) -> tuple[Indices, float]:
+        """The local optimum that ``start`` (k,) climbs to, required first; its phi."""
+        chosen, phi = self._climber.climb_from(
+            np.searchsorted(self._usable, start), 0.0, True, self.seconds()
+        )
+        return self._usable[chosen], phi
+
+    def random_climb(self) -> tuple[Indices, float]:
+        """The local optimum of another random start, and its phi."""
+        return self.climbed(self._usable[self._climber.random_start()])
+
+    def best_of(self, restarts: int) -> tuple[Indices, float]:
+        """The best local optimum from greedy selections and then random starts."""
+        best, phi = self._required, -np.inf
+        shares = (self._share, *_FURTHER)[:restarts]
+        for share in shares:
+            chosen, found = self._climber.climb_from(
+                self._required, share, True, self.seconds()
+            )
+            if not phi > -np.inf or found > phi + 1e-10 * max(1.0, abs(phi)):
+                best, phi = chosen, found
+            if not self.seconds() and phi > -np.inf:
+                break
+        more = max(restarts - len(shares), 0 if phi > -np.inf else _MENDING)
+        best, phi = self._climber.random_climbs(more, best, phi, self.seconds())
+        return self._usable[best], phi
+
+
 def exchange_indices(
-    problem: Problem, restarts: int | None = None, seed: int = 0
+    problem: Problem,
+    restarts: int | None = None,
+    seed: int = 0,
+    deadline: float | None = None,
 ) -> Indices:
-    """(k,) the best local optimum, required candidates first."""
+    """(k,) the best local optimum, required candidates first.
+
+    ``deadline`` is a ``time.perf_counter()`` after which no more swaps are made.
+    """
     if restarts is None:
         restarts = default_restarts(problem)
+    climbs = Climbs(problem, seed, deadline)
     if problem.criterion.kind == "least":
-        from jaxcal.selection.exchange.eigenvalue import exchange_eigenvalue
-
-        chosen, phi = exchange_eigenvalue(problem, restarts, seed)
-    elif problem.rank_one:
-        chosen, phi = _exchange_rows(problem, restarts, seed)
+        chosen, phi = _best_eigenvalue(problem, climbs, restarts)
     else:
-        chosen, phi = Blocks(problem).exchanged(restarts, seed)
+        chosen, phi = climbs.best_of(restarts)
     if not np.isfinite(phi):
         raise ValueError(
             f"{problem.subject} must allow an invertible selection, "
             "but every start was singular"
         )
     return chosen
-
-
-def _exchange_rows(problem: Problem, restarts: int, seed: int) -> tuple[Indices, float]:
-    """For one reading per candidate, from random starts alone."""
-    from jaxcal.selection.exchange.rows_kernel import exchange_rows
-    from jaxcal.selection.exchange.starts import RIDGE
-
-    usable = np.flatnonzero(problem.available)
-    blocks, prior = problem.blocks[usable], problem.prior.copy()
-    span = np.zeros((0, problem.num_regressors))
-    if len(problem.root):
-        values, vectors = np.linalg.eigh(prior)
-        span = np.ascontiguousarray(vectors.T[values > 1e-6])
-    chosen, log_det = exchange_rows(
-        blocks, np.ascontiguousarray(blocks.transpose(1, 2, 0)), prior,
-        prior + RIDGE * np.eye(len(prior)), span, 1, problem.upper[usable],
-        np.searchsorted(usable, problem.required), problem.k, restarts,
-        np.uint64(seed % 2**64),
-    )  # fmt: skip
-    return usable[chosen], log_det
 
 
 def exchange_from(problem: Problem, indices: ArrayLike) -> Indices:
@@ -107,30 +197,97 @@ def exchange_from(problem: Problem, indices: ArrayLike) -> Indices:
     Returns:
         (k,) the required candidates first.
     """
-    rest = np.asarray(indices, dtype=np.int64).tolist()
+    given = np.asarray(indices, dtype=np.int64)
     for i in problem.required.tolist():
-        if i not in rest:
+        if i not in given:
             raise ValueError(f"indices must hold every required candidate, got no {i}")
-        rest.remove(i)
-    chosen = np.array([*problem.required, *rest], dtype=np.int64)
-    if problem.criterion.kind == "least":
-        from jaxcal.selection.exchange.eigenvalue import climb_eigenvalue
-
-        chosen, phi = climb_eigenvalue(problem, chosen)
-    elif problem.rank_one:
-        from jaxcal.selection.exchange.rows_kernel import climb_rows
-
-        blocks, prior = problem.blocks.copy(), problem.prior.copy()
-        phi = climb_rows(
-            blocks, np.ascontiguousarray(blocks.transpose(1, 2, 0)), problem.upper,
-            len(problem.required), chosen, np.bincount(chosen, minlength=len(blocks)),
-            prior, np.empty_like(prior), np.empty_like(prior),
-        )  # fmt: skip
-    else:
-        chosen, phi = Blocks(problem).climbed(chosen)
-    if not np.isfinite(phi):
+    if np.isneginf(problem.log_det(given)):
         raise ValueError(
             "indices must give an invertible information matrix, but that of "
-            f"{chosen.tolist()} is singular"
+            f"{given.tolist()} is singular"
         )
-    return chosen
+    start = _required_first(problem, given)
+    if problem.criterion.kind == "least":
+        return _climb_eigenvalue(problem, start)[0]
+    return Climbs(problem, 0, None).climbed(start)[0]
+
+
+def _required_first(problem: Problem, chosen: Indices) -> Indices:
+    rest = chosen.tolist()
+    for i in problem.required:
+        rest.remove(i)
+    return np.array([*problem.required, *rest], dtype=np.int64)
+
+
+def _best_eigenvalue(
+    problem: Problem, climbs: Climbs, restarts: int
+) -> tuple[Indices, float]:
+    """The best local optimum of E and its value, from ``restarts`` local optima of A.
+
+    On large problems only those of the best eigenvalues are climbed.
+    """
+    starts = [climbs.best_of(1), *(climbs.random_climb() for _ in range(restarts - 1))]
+    chosen = np.unique(
+        [np.sort(start) for start, phi in starts if phi > -np.inf], axis=0
+    )
+    if not len(chosen):
+        return starts[0]
+    order = np.argsort(-values(problem, chosen)[0])
+    few = max(1, int(_CLIMBS / (problem.k * problem.num_regressors**3)))
+    found = [
+        _climb_eigenvalue(problem, _required_first(problem, chosen[i]), climbs.seconds)
+        for i in order[:few]
+    ]
+    return max(found, key=lambda each: each[1])
+
+
+def _climb_eigenvalue(
+    problem: Problem, start: Indices, seconds: Callable[[], float] = lambda: np.inf
+) -> tuple[Indices, float]:
+    """The local optimum that ``start`` (k,) climbs to, and its eigenvalue."""
+    blocks, criterion = problem.blocks, problem.criterion
+    grams = np.matrix_transpose(blocks) @ blocks
+    chosen, fixed = start.copy(), len(problem.required)
+    value = float(criterion.value(problem.prior + grams[chosen].sum(axis=0)))
+    room = problem.upper - np.bincount(chosen, minlength=len(blocks))
+    since, position = 0, fixed
+    while since < len(chosen) - fixed and seconds():
+        out = chosen[position]
+        rest = problem.prior + grams[np.delete(chosen, position)].sum(axis=0)
+        least = value * (1.0 + _LIFTS)
+        best, found = _best(rest, criterion, blocks, grams, room > 0, least)
+        since += 1
+        if best >= 0:
+            value, since = found, 0
+            room[out] += 1
+            room[best] -= 1
+            chosen[position] = best
+        position = position + 1 if position + 1 < len(chosen) else fixed
+    return chosen, value
+
+
+def _best(
+    rest: Array,
+    criterion: Criterion,
+    blocks: Array,
+    grams: Array,
+    free: NDArray[np.bool_],
+    least: float,
+) -> tuple[int, float]:
+    """The candidate, or -1, that gives the largest eigenvalue above ``least``."""
+    # A little more than there is keeps the bounds true where the rest is singular.
+    more = rest + _RIDGE * np.eye(len(rest))
+    lift = ((blocks @ criterion.gradient(more)) * blocks).sum(axis=(1, 2))
+    bound = float(criterion.value(more)) + lift
+    bound = np.where(free, bound, -np.inf)
+    order = np.argsort(-bound)
+    best = -1
+    for first in range(0, len(order), _CHUNK):
+        some = order[first : first + _CHUNK]
+        some = some[bound[some] > least]
+        if not some.size:
+            break
+        values = criterion.value(rest + grams[some])
+        if values.max() > least:
+            least, best = float(values.max()), int(some[values.argmax()])
+    return best, least
