@@ -69,17 +69,14 @@ config = presets.with_values(presets.load("compact"), {
     "episodes_per_update": 16, "episodes_per_set": 4, "num_minibatches": 1,
     "num_epochs": 1, "width": 8, "encoder_rounds": 1, "num_candidates": 8,
     "num_episodes": 16 * UPDATES})
-config = dataclasses.replace(config, save_every=5.0)
+config = dataclasses.replace(config, save_every=5.0, validate_every=0.0)
 seen = {}
-done = 0
-def stop():
-    global done
-    done += 1
-    if done in (UPDATES // 5, UPDATES // 2, UPDATES):
-        seen[done] = mib("VmRSS")
-    return False
+def look(report):
+    for wanted in (UPDATES // 5, UPDATES // 2, UPDATES):
+        if report.update >= wanted and wanted not in seen:
+            seen[wanted] = mib("VmRSS")
 with tempfile.TemporaryDirectory() as folder:
-    training.train(config, folder, should_stop=stop)
+    training.train(config, folder, report=look)
 print(json.dumps({"updates": list(seen), "resident": list(seen.values()),
                   "peak": mib("VmHWM")}))
 """

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
-import http.server
+import http
 import itertools
 import select
 import socket
@@ -22,6 +23,9 @@ from rig.core.stream import MAX_BODY, LineSplitter, Parser, StreamFault
 from rig.journal import JournalError
 
 RECONNECT_S = 0.2
+MOST_OPEN = 4  # connections at a time over which messages are pushed
+MESSAGE_S = 5.0  # for a whole message
+MAX_HEAD = 8192  # bytes before its body
 LOOK_S = 0.05  # between two looks at who is silent and who waits
 
 
@@ -196,32 +200,97 @@ class LineReceiver:
         return bool(data) and not self._closing.is_set()
 
 
-def make_web(
-    settings: ImuSettings, take: Callable[[bytes, str], bool]
-) -> http.server.HTTPServer:
-    """A server of pushed messages; ``take`` gets one with its sender's address, and
-    answers whether that is heard."""
+class WebReceiver:
+    """Messages that a phone pushes over HTTP, on one thread.
 
-    class Handler(http.server.BaseHTTPRequestHandler):
-        timeout = 5.0
-        protocol_version = "HTTP/1.1"
+    Who may not be heard is refused before a byte of it is read. At most MOST_OPEN
+    connections are open, each for MESSAGE_S without a whole message.
+    """
 
-        def do_POST(self) -> None:
-            length = self.headers.get("Content-Length", "")
-            if not length.isdecimal() or int(length) > MAX_BODY:
-                self.send_error(413)
-                self.close_connection = True
-                return
-            known = take(self.rfile.read(int(length)), self.client_address[0])
-            self.send_response(200 if known else 403)
-            self.close_connection = not known
-            self.send_header("Content-Length", "0")
-            self.end_headers()
+    def __init__(
+        self,
+        settings: ImuSettings,
+        senders: Senders,
+        take: Callable[[bytes, str], bool],
+    ) -> None:
+        """``take`` gets a message and its sender's address; it answers whether that is
+        heard."""
+        self._senders = senders
+        self._take = take
+        self._closing = threading.Event()
+        self._listener = socket.create_server(
+            (settings.host, settings.port), backlog=MOST_OPEN
+        )
+        self._listener.setblocking(False)
+        self.port = self._listener.getsockname()[1]
 
-        def log_message(self, format: str, *args: object) -> None:
-            """Keep the terminal for the session."""
+    def stop(self) -> None:
+        """End ``run``, from any thread."""
+        self._closing.set()
 
-    return http.server.ThreadingHTTPServer((settings.host, settings.port), Handler)
+    def run(self) -> None:
+        """Receive until stopped."""
+        with contextlib.closing(self._listener):
+            asyncio.run(self._serve())
+
+    async def _serve(self) -> None:
+        loop, tasks = asyncio.get_running_loop(), set[asyncio.Task[None]]()
+        accept: asyncio.Task[Any] | None = None
+        while not self._closing.is_set():
+            accept = accept or loop.create_task(loop.sock_accept(self._listener))
+            if not (await asyncio.wait([accept], timeout=LOOK_S))[0]:
+                continue
+            with contextlib.suppress(OSError):
+                made, (address, _) = accept.result()
+                if self._senders.admits(address) and len(tasks) < MOST_OPEN:
+                    task = loop.create_task(self._hear(made, address))
+                    tasks.add(task)
+                    task.add_done_callback(tasks.discard)
+                else:
+                    with contextlib.closing(made):
+                        made.send(_answer(403, False))
+            accept = None
+        for each in (*tasks, *([accept] if accept else [])):
+            each.cancel()
+
+    async def _hear(self, made: socket.socket, address: str) -> None:
+        reader, writer = await asyncio.open_connection(sock=made, limit=MAX_HEAD)
+        with contextlib.suppress(OSError, EOFError, ValueError):
+            try:
+                while await asyncio.wait_for(
+                    self._message(reader, writer, address), MESSAGE_S
+                ):
+                    pass
+            except (TimeoutError, asyncio.LimitOverrunError):
+                pass
+            finally:
+                writer.close()
+
+    async def _message(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, address: str
+    ) -> bool:
+        """Answer one message; whether the connection stays open."""
+        head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
+        first, *lines = head.lower().split("\r\n")
+        parts = (line.partition(":") for line in lines)
+        fields = {name.strip(): value.strip() for name, _, value in parts}
+        length = fields.get("content-length", "")
+        known, code = False, 413
+        if first.startswith("post ") and length.isdecimal() and int(length) <= MAX_BODY:
+            if fields.get("expect") == "100-continue":
+                writer.write(b"HTTP/1.1 100 Continue\r\n\r\n")
+            known = self._take(await reader.readexactly(int(length)), address)
+            code = 200 if known else 403
+        stays = known and fields.get("connection") != "close"
+        writer.write(_answer(code, stays))
+        await writer.drain()
+        return stays
+
+
+def _answer(code: int, stays: bool) -> bytes:
+    closes = "" if stays else "Connection: close\r\n"
+    phrase = http.HTTPStatus(code).phrase
+    return f"HTTP/1.1 {code} {phrase}\r\nContent-Length: 0\r\n{closes}\r\n".encode()
 
 
 RING = 8192  # readings kept: over half a minute at 200 Hz
@@ -254,43 +323,36 @@ class Imu:
         self._lock = threading.Lock()
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
-        self._lines: LineReceiver | None = None
-        self._web: http.server.HTTPServer | None = None
+        self._receiver: LineReceiver | WebReceiver | None = None
         self._arrived = 0.0
         self._fault = ""
 
     def open(self) -> Imu:
         """Listen, or begin to connect; ImuError where the port cannot be opened."""
         s = self.settings
-        receive: Callable[[], None]
         try:
             if s.format == "sensorlogger":
-                self._web = make_web(s, self._take_body)
-                self.port, receive = (
-                    self._web.server_address[1],
-                    self._web.serve_forever,
-                )
+                self._receiver = WebReceiver(s, self._senders, self._take_body)
             else:
-                self._lines = LineReceiver(
+                self._receiver = LineReceiver(
                     s, self._senders, self._begin, self._take_lines
                 )
-                self.port, receive = self._lines.port, self._lines.run
         except OSError as error:
             raise ImuError(
                 f"cannot open the IMU port {s.host}:{s.port}: {error.strerror or error}"
             ) from None
-        self._thread = threading.Thread(target=receive, name="imu", daemon=True)
+        self.port = self._receiver.port
+        self._thread = threading.Thread(
+            target=self._receiver.run, name="imu", daemon=True
+        )
         self._thread.start()
         return self
 
     def close(self) -> None:
         """Close every socket and end the thread."""
         self._closing.set()
-        if self._lines is not None:
-            self._lines.stop()
-        if self._web is not None:
-            self._web.shutdown()
-            self._web.server_close()
+        if self._receiver is not None:
+            self._receiver.stop()
         if self._thread is not None:
             self._thread.join(2.0)
 
@@ -400,8 +462,8 @@ class Imu:
         if self._closing.is_set() or not self._senders.admits(address):
             return False
         with self._lock:
-            self.connections = 1
             readings = self._parser.body(body, time.monotonic())
+            self.connections = max(1, self._parser.sessions)
             self._store(readings)
             foreign = self._parser.foreign
         if foreign:

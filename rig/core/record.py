@@ -158,6 +158,16 @@ class DeviceRecord:
         self._left = {"time": _now(), "pulses": pulses, "homed": list(homed)}
         self.save()
 
+    def forget_left(self) -> None:
+        """Where the drives were left says nothing any more: they stand as homed."""
+        self._left = {}
+        self.save()
+
+    def lost_sight(self, name: str) -> bool:
+        """A session armed the axis and did not say afterwards where it stands."""
+        pulses = self._left.get("pulses", {})
+        return name in pulses and pulses[name] is None
+
     def left(self) -> dict[str, int]:
         """Pulses at which the last session left the axes of which that is known."""
         pulses = self._left.get("pulses", {})
@@ -229,8 +239,14 @@ def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
         return ""
     if status.fault:
         return f"{axis.name} is in alarm: {drive.alarm() or 'no code given'}"
-    if axis.name in record.left_homed() and not drive.homed(status.word):
-        return f"the homed bit of {axis.name} is gone: the drive was without power"
+    if axis.name in record.left_homed():
+        if not drive.homed(status.word):
+            return f"the homed bit of {axis.name} is gone: the drive was without power"
+    elif record.lost_sight(axis.name):
+        return (
+            f"where {axis.name} was left is not known, as the last session could not "
+            "read it any more, and its drive does not say that it kept its power"
+        )
     left = record.left().get(axis.name, status.position)
     tolerance = axis.pulses_within(config.motion.position_tolerance_deg)
     if abs(status.position - left) <= tolerance:

@@ -150,7 +150,9 @@ class Run(RunFolder):
         BusLock(config.bus).leave(config)
         self.signals.armed = True
         self.device.arm(self._reset_alarms)
-        self.record.left_at()  # not known until they stand again
+        # Where they stand is not known until they do again.
+        homed = [d.axis.name for d in device.drives if d.last and d.homed(d.last.word)]
+        self.record.left_at(homed=homed)
         self.motion, self.observer = Motion(self.device), Observer(self.device)
         self.say(f"armed: {len(config.axes)} drives on {config.bus.where}")
         return self.device

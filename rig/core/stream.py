@@ -76,6 +76,8 @@ class Parser:
         self.counts: Counter[str] = Counter()
         self.foreign = False  # the last message was of another device
         self._device: Any = None  # deviceId of the phone that is heard
+        self.sessions = 0  # of the app that pushes, by its sessionId
+        self._session: Any = None
         self.reconnected()
 
     def reconnected(self) -> None:
@@ -115,6 +117,11 @@ class Parser:
         readings = self._accept(entries, self._entry, now)
         if readings:
             self._device = device
+            if not self.sessions or message.get("sessionId") != self._session:
+                self.sessions, self._session = (
+                    self.sessions + 1,
+                    message.get("sessionId"),
+                )
         return readings
 
     def _accept(self, records: list[Any], parse: Any, now: float) -> list[Reading]:

@@ -134,6 +134,38 @@ def test_two_processes_share_results_errors_and_sums(tmp_path: pathlib.Path) -> 
         assert output == "both know: only process 0 looked" and errors == ""
 
 
+WAIT = """
+import sys, time
+from jaxcal.learning.runtime import devices, processes
+
+def work():
+    for turn in range(2000):
+        devices.any_process(False)
+        if turn == 5:
+            print("going", flush=True)
+        time.sleep(0.05)
+    return 0
+
+sys.exit(processes.run_job("job.py", None, work, "start every process again"))
+"""
+
+
+@pytest.mark.parametrize("victim", [0, 1])
+def test_a_killed_process_ends_the_other(tmp_path: pathlib.Path, victim: int) -> None:
+    script = tmp_path / "job.py"
+    script.write_text(WAIT)
+    job = start([script], 2)
+    for process in job:
+        assert process.stdout is not None
+        assert any("going" in line for line in process.stdout)
+    job[victim].kill()
+    other, _, errors = finish(job)[1 - victim]
+    # With one line where a collective fails first, else by JAX's own watch.
+    assert other in (processes.EXIT_LOST, -signal.SIGABRT)
+    if other == processes.EXIT_LOST:
+        assert errors.splitlines()[-1].endswith("; start every process again")
+
+
 def arguments(**values: object) -> argparse.Namespace:
     empty = {"coordinator": None, "num_processes": None, "process_id": None}
     return argparse.Namespace(**(empty | values))

@@ -10,6 +10,7 @@ import dataclasses
 import json
 import pathlib
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -103,6 +104,7 @@ HOST_PHASES = {
     "sigkill_watched": ("moving", "measuring"),
     "second_session": ("zeroing",),
     "other_stop": ("moving", "measuring"),
+    "suspended_stop": ("moving", "measuring"),
 }
 COLUMNS = (*PHASES, "finishing", "axes", "start", "overnight")
 DEAF = ("dead_drive", "lost_request", "exception_reply")  # cannot take a stop
@@ -228,7 +230,8 @@ def run_cell(
         while code != 0 and resumes < MAX_RESUMES:
             resumes += 1
             code = session(served, folder, sim, said)
-            check_invariants(folder, sim, alive=True, deaf=False)
+            # Refused where a drive was left unread: home it again. Nothing was armed.
+            check_invariants(folder, sim, alive=code != 2, deaf=False)
     assert code == 0, said[-12:]
     return Outcome(fault, phase, first, resumes, reason, _equal(folder, truth))
 
@@ -349,6 +352,7 @@ FIRST_CODES = {
     "full_disk": (3,),
     "second_session": (0,),
     "other_stop": (143,),
+    "suspended_stop": (-9,),
 }
 
 
@@ -360,7 +364,9 @@ def _host_cell(
     given = fast_config(WATCHED if watched else None)
     device = Truth(noise_deg=0.0, idle_watchdog=watched)
     # Slow where somebody in another terminal must come in time.
-    speedup = {"second_session": 0.3, "other_stop": 0.1}.get(fault, 1.0)
+    speedup = {"second_session": 0.3, "other_stop": 0.1, "suspended_stop": 0.1}.get(
+        fault, 1.0
+    )
     with simulator(given, truth=device, speedup=speedup) as sim:
         served, phone_port = sim.start(), _free_port()
         text = fast_text(
@@ -378,7 +384,7 @@ def _host_cell(
             stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         ) as child:  # fmt: skip
             if fault in OTHERS:
-                _elsewhere(fault, folder, path)
+                _elsewhere(fault, folder, path, child)
             said_by_child, errors = child.communicate(timeout=90)
         first = child.returncode
         assert first in FIRST_CODES[fault], (first, said_by_child, errors)
@@ -409,7 +415,9 @@ def _host_cell(
     return Outcome(fault, phase, first, resumes, reason, _equal(folder, truth))
 
 
-def _elsewhere(fault: str, folder: pathlib.Path, config: pathlib.Path) -> None:
+def _elsewhere(
+    fault: str, folder: pathlib.Path, config: pathlib.Path, child: Any
+) -> None:
     """In another terminal, once the session is in the phase."""
     deadline = time.monotonic() + 60
     while not (folder / ENTERED).exists():
@@ -418,7 +426,10 @@ def _elsewhere(fault: str, folder: pathlib.Path, config: pathlib.Path) -> None:
     command = {
         "second_session": ["calibrate", "--arm", "--zero", "--out", str(folder / "2")],
         "other_stop": ["stop"],
+        "suspended_stop": ["stop"],
     }[fault]
+    if fault == "suspended_stop":
+        child.send_signal(signal.SIGSTOP)
     done = subprocess.run(
         [sys.executable, "-m", "rig", *command, "--config", str(config)],
         capture_output=True, text=True, timeout=60, check=False,
@@ -429,6 +440,7 @@ def _elsewhere(fault: str, folder: pathlib.Path, config: pathlib.Path) -> None:
         assert not (folder / "2").exists(), "a second session was begun"
     else:
         assert done.returncode == 0, said
+        assert fault == "other_stop" or "it is ended now" in said, said
 
 
 def cells() -> list[tuple[str, str]]:

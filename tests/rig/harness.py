@@ -34,7 +34,11 @@ RATE_HZ = 250.0
 SPEEDUP = 3.0  # of the drives over what the configuration says of them
 ENTERED = "entered"  # the file by which a session says that it is in the phase
 HOST_FAULTS = ("sigint", "sigint_twice", "sigterm", "sigkill", "full_disk")
-OTHERS = ("second_session", "other_stop")  # what somebody does in another terminal
+OTHERS = (
+    "second_session",
+    "other_stop",
+    "suspended_stop",
+)  # what somebody does in another terminal
 WATCHED = {  # drives that stop themselves when the line is silent
     'map = "leadshine_pr"': 'map = "generic"\ncomm_timeout_s = 0.8',
     "timeout_s = 0.5": "timeout_s = 0.25",

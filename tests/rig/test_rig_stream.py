@@ -12,6 +12,7 @@ import pytest
 from harness import changed, fast_config
 from scipy.spatial.transform import Rotation
 
+from rig.core import phone
 from rig.core.attitude import angle_between_deg, euler_to_matrix, matrix_to_euler
 from rig.core.phone import Imu, ImuError
 from rig.core.stream import MAX_LINE, LineSplitter, Parser, StreamFault
@@ -409,3 +410,44 @@ def test_a_second_sender_of_pushed_messages_is_refused_too(second):
             assert push(imu, 15, *second) == 403
         assert angles_of(imu) == {10.0}
     assert told == [second[0]]
+
+
+def test_strangers_are_refused_before_a_byte_is_read_and_cost_no_thread():
+    """F: 400 of them were 241 threads and 376 MB, each body read before the check."""
+    settings = changed(HYPER, format="sensorlogger", port=0, allow=("127.0.0.9",))
+    body = b"x" * 65536
+    head = b"POST / HTTP/1.1\r\nContent-Length: 1000000\r\n\r\n"
+    with Imu(settings) as imu:
+        taken, made = [], []
+        imu._receiver._take = lambda body, address: taken.append(address) or False
+        before = threading.active_count()
+        for _ in range(100):
+            stranger = socket.create_connection(("127.0.0.1", imu.port), 5)
+            made.append(stranger)
+            with contextlib.suppress(OSError):  # it is refused while it sends
+                stranger.sendall(head)
+                for _ in range(15):
+                    stranger.sendall(body)
+            assert threading.active_count() == before
+        for stranger in made:
+            stranger.settimeout(5)
+            with contextlib.suppress(ConnectionError):
+                assert stranger.recv(64)[:12] in (b"HTTP/1.1 403", b"")
+            stranger.close()
+        assert not taken
+
+
+def test_connections_that_send_nothing_are_few_and_short(monkeypatch):
+    """Without imu.allow anybody may be the phone, until one is."""
+    monkeypatch.setattr(phone, "MESSAGE_S", 0.3)
+    settings = changed(HYPER, format="sensorlogger", port=0)
+    with Imu(settings) as imu:
+        idle = [connect(imu) for _ in range(20)]
+        wait_for(lambda: imu._receiver is not None)
+        time.sleep(1.5)  # none of them has said anything in time
+        assert push(imu, 10) == 200
+        for each in idle:
+            each.settimeout(2)
+            with contextlib.suppress(ConnectionError):
+                assert each.recv(64)[:12] in (b"HTTP/1.1 403", b"")
+            each.close()

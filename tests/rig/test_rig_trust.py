@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from rig.__main__ import main
 from rig.config import example_text, parse_config
-from rig.core.attitude import euler_to_matrix
+from rig.core.attitude import euler_to_matrix, frame_at
 from rig.core.faults import MotionFault, Refused
 from rig.core.phone import Imu
 from rig.core.record import (
@@ -41,7 +41,12 @@ from rig.journal import read_journal
 from rig.simulator import Truth
 from rig.simulator.faults import FaultInjector
 from rig.simulator.phone import Phone
-from rig.workbench.procedures.checking import collect, load_calibration, verify
+from rig.workbench.procedures.checking import (
+    collect,
+    load_calibration,
+    unchecked,
+    verify,
+)
 
 LOST = 1.4  # degrees, as was seen
 
@@ -280,7 +285,7 @@ def test_a_zero_by_the_drives_is_compared_with_the_last_one(tmp_path):
             )
             run.on_imu_port = sim.start_phone
             assert run_safely(run, lambda r: collect(r, 1)) == 0
-            record.left_at()
+            record.forget_left()
             sim.power_cycle((0.0, 0.0, LOST))
     assert sum("WARNING: the zero posture is not that of" in t for t in said) == 1
     assert record.state(ZEROED)["pulses"] == [0, 0, 0]
@@ -493,3 +498,29 @@ def test_a_simulated_calibration_moves_no_real_joint(calibrated, tmp_path, capsy
         assert main(given) == 2
         error = capsys.readouterr().err
         assert "simulated" in error and "cannot open" not in error
+
+
+@pytest.mark.parametrize("bit", [False, True])
+def test_a_place_that_nobody_read_is_no_home(bit, tmp_path):
+    """D: a killed session, a joint that was pushed: nothing was noticed."""
+    with simulator(fast_config()) as sim:
+        served = sim.start()
+        record = commissioned(served, tmp_path, sim)
+        for drive in sim.drives:
+            drive.homed = bit
+        record.left_at(homed=("pitch", "yaw", "roll") if bit else ())  # as when armed
+        run = make_run(served, tmp_path, "collect", [].append, record=record)
+        run.on_imu_port = sim.start_phone
+        code = run_safely(run, lambda r: collect(r, 1))
+    assert code == (0 if bit else 2)
+    assert (record.state(HOMED) is None) is not bit
+    if not bit:
+        assert "where pitch was left is not known" in record.missing(served)
+        assert sim.executions() == [[], [], []]
+
+
+def test_goto_names_what_neither_drive_nor_phone_can_tell():
+    plain = fast_config({'map = "leadshine_pr"': 'map = "generic"'})
+    frame = frame_at(plain, np.eye(3))
+    assert unchecked(plain, frame) == ["yaw"]
+    assert unchecked(fast_config(), frame_at(fast_config(), np.eye(3))) == []

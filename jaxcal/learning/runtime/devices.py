@@ -18,6 +18,8 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jaxcal.learning.runtime.processes import collective
+
 __all__ = [
     "any_process",
     "describe",
@@ -97,9 +99,10 @@ def on_first(function: Callable[[], T]) -> T:
         except (ValueError, OSError) as error:
             answer = (False, error)
     data = np.frombuffer(pickle.dumps(answer), np.uint8)
-    size = int(multihost_utils.broadcast_one_to_all(np.int32(data.size)))
-    buffer = data if is_first() else np.zeros(size, np.uint8)
-    data = np.asarray(multihost_utils.broadcast_one_to_all(buffer), np.uint8)
+    with collective():
+        size = int(multihost_utils.broadcast_one_to_all(np.int32(data.size)))
+        buffer = data if is_first() else np.zeros(size, np.uint8)
+        data = np.asarray(multihost_utils.broadcast_one_to_all(buffer), np.uint8)
     fine, result = pickle.loads(data.tobytes())
     if not fine:
         raise result
@@ -110,7 +113,8 @@ def any_process(flag: bool) -> bool:
     """Whether the flag is set in any process; all processes must ask."""
     if jax.process_count() == 1:
         return flag
-    return bool(multihost_utils.process_allgather(np.asarray(flag)).any())
+    with collective():
+        return bool(multihost_utils.process_allgather(np.asarray(flag)).any())
 
 
 def replicate(tree: Any, mesh: Mesh | None) -> Any:

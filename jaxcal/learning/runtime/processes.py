@@ -9,15 +9,17 @@ was missing long enough; what was saved stays, and the next start resumes.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 __all__ = [
     "EXIT_LOST",
     "HEARTBEAT_SECONDS",
     "add_arguments",
+    "collective",
     "expected",
     "local_device_ids",
     "run_job",
@@ -144,6 +146,22 @@ def run_job(
         sys.stderr.flush()
         os._exit(code)  # without the farewell, which would wait for who is lost
     return code
+
+
+@contextlib.contextmanager
+def collective() -> Iterator[None]:
+    """What a collective raises where another process is gone becomes RuntimeError.
+
+    JAX's transport raises ValueError, which would read as an argument that is wrong.
+    """
+    import jax
+
+    try:
+        yield
+    except ValueError as error:
+        if jax.process_count() == 1:
+            raise
+        raise RuntimeError(str(error)) from error
 
 
 def _connect(job: argparse.Namespace) -> None:

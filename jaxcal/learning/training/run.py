@@ -28,6 +28,7 @@ from jaxcal.files import atomic_write, write_text
 from jaxcal.learning.core import ppo
 from jaxcal.learning.core.ppo import Learner, PPOConfig, TrainState
 from jaxcal.learning.runtime import devices
+from jaxcal.learning.runtime.processes import collective
 from jaxcal.learning.training import checkpoint
 
 __all__ = ["Recipe", "Report", "run"]
@@ -138,9 +139,10 @@ def run(
                 most = 1  # the next update is of another program, or of other arrays
             count = min(count, most, last - done)
             update = ppo.updates(recipe.ppo, learner, mesh, most, seeds)
-            state, found = update(state, np.int32(count), *given)
-            # One transfer for all that these updates measured.
-            rows = jax.device_get(devices.local(found))
+            with collective():
+                state, found = update(state, np.int32(count), *given)
+                # One transfer for all that these updates measured.
+                rows = jax.device_get(devices.local(found))
             first, done = done, done + count
             if diary is not None:
                 diary.note(state, first, count, rows)

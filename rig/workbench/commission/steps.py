@@ -246,7 +246,7 @@ def _correct(place: Place, changes: list[Change]) -> None:
     homed = place.record.state(HOMED) or {}
     identify(place)
     place.record.reach(HOMED, place.config, **homed)
-    place.record.left_at()  # where each named axis stands is not what it was
+    place.record.forget_left()  # where each named axis stands is not what it was
 
 
 def take_zero(place: Place) -> int:

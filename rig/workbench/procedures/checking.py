@@ -10,11 +10,11 @@ import numpy as np
 from jaxcal.files import atomic_write
 from rig.config import RigConfig
 from rig.config.config import differences
-from rig.core.attitude import Array
+from rig.core.attitude import Array, Frame
 from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
 from rig.core.plan import draw, draw_held_out
 from rig.core.session import Run
-from rig.core.zero import KeptZero
+from rig.core.zero import KeptZero, unseen
 from rig.workbench.identification.fit import pairs
 from rig.workbench.outputs.console import error_text, numbers
 from rig.workbench.procedures.calibrate import END, visit_pairs
@@ -200,12 +200,32 @@ def goto(run: Run, calibration: Any, desired: Array, play: Play) -> int:
     record = run.visit("goto", pulses, role="goto")
     if record is None:
         return EXIT_RECALIBRATE
+    if names := unchecked(config, run.frame):
+        run.say(
+            f"NOT CHECKED: whether {', '.join(names)} was moved while without power. "
+            "The drive does not tell, and the phone does not see a turn about the "
+            "vertical"
+        )
     reached = np.array(record["measured_deg"])
     run.say(
         f"reached {reached.round(4).tolist()} deg, off by "
         f"{(reached - desired).round(4).tolist()}"
     )
     return EXIT_OK
+
+
+def unchecked(config: RigConfig, frame: Frame | None) -> list[str]:
+    """Axes of which neither drive nor phone tells that they were moved when off.
+
+    A drive without homed bit and absolute encoder counts from 0 when it is switched on:
+    where it was left there, its count says nothing.
+    """
+    seen = [] if frame is None else unseen(config, frame.zero)
+    return [
+        axis.name
+        for axis in config.axes
+        if axis.name in seen and not (axis.map.homed or axis.map.absolute_encoder)
+    ]
 
 
 def _with_play(run: Run, command: Array, play: Play) -> Array:
