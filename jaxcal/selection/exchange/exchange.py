@@ -14,6 +14,7 @@ candidates are evaluated in the order of that bound until it falls to the best f
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
 
@@ -97,6 +98,7 @@ class Climbs:
 
         self._usable = np.flatnonzero(problem.available)
         blocks = problem.blocks[self._usable]
+        self._rank = functools.cache(lambda: largest_rank(blocks))  # for random starts
         self._required = np.searchsorted(self._usable, problem.required)
         self._deadline = deadline
         criterion, q, p = problem.criterion, blocks.shape[1], blocks.shape[2]
@@ -113,7 +115,7 @@ class Climbs:
         self._share = _SHARE * min(1.0, problem.k * q / p) ** 6
         self._climber = Climber(
             kind, blocks, problem.prior, root, problem.upper[self._usable],
-            self._required, span, largest_rank(blocks), problem.k, seed,
+            self._required, span, problem.k, seed,
         )  # fmt: skip
 
     def seconds(self) -> float:
@@ -144,7 +146,7 @@ class Climbs:
 
     def random_climb(self) -> tuple[Indices, float]:
         """The local optimum of another random start, and its phi."""
-        return self.climbed(self._usable[self._climber.random_start()])
+        return self.climbed(self._usable[self._climber.random_start(self._rank())])
 
     def best_of(self, restarts: int) -> tuple[Indices, float]:
         """The best local optimum from greedy selections and then random starts."""
@@ -159,7 +161,10 @@ class Climbs:
             if not self.seconds() and phi > -np.inf:
                 break
         more = max(restarts - len(shares), 0 if phi > -np.inf else _MENDING)
-        best, phi = self._climber.random_climbs(more, best, phi, self.seconds())
+        if more:
+            best, phi = self._climber.random_climbs(
+                more, best, phi, self.seconds(), self._rank()
+            )
         return self._usable[best], phi
 
 

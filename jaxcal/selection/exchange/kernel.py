@@ -188,16 +188,15 @@ class Climber:
         upper: (M,) how often each may be chosen.
         required: (r,) candidates that are chosen in any case.
         span: (r, p) orthonormal directions that the prior informs.
-        full: rank that a block can have.
         k: candidates to choose.
         seed: of the random starts.
     """
 
-    def __init__(self, kind, blocks, prior, root, upper, required, span, full, k, seed):
+    def __init__(self, kind, blocks, prior, root, upper, required, span, k, seed):
         count, q, p = blocks.shape
         groups, s = -(-count // WIDE), len(root)
         self.kind, self.k, self.q, self.p, self.s = kind, k, q, p, s
-        self.fixed, self.groups, self.full = len(required), groups, full
+        self.fixed, self.groups = len(required), groups
         padded = np.zeros((groups * WIDE, q, p))
         padded[:count] = blocks
         self.blocks, self.prior, self.root = blocks.copy(), prior.copy(), root.copy()
@@ -243,16 +242,21 @@ class Climber:
         phi = self._finish(len(start), share, climbs)
         return np.array(self.chosen), phi
 
-    def random_climbs(self, count, chosen, phi, seconds):
-        """The best of ``chosen`` (k,) with its phi, and ``count`` random starts."""
+    def random_climbs(self, count, chosen, phi, seconds, full):
+        """The best of ``chosen`` (k,) with its phi, and ``count`` random starts.
+
+        ``full`` is the rank that a block can have.
+        """
+        self.full = full
         self.watch = begin(seconds)
         for r in range(len(chosen)):
             self.best[r] = chosen[r]
         phi = self._random(count, phi)
         return np.array(self.best), phi
 
-    def random_start(self):
-        """(k,) required first, then at random, rarely singular."""
+    def random_start(self, full):
+        """(k,) required first, then at random, rarely singular; ``full`` as above."""
+        self.full = full
         self._random_start()
         return np.array(self.chosen)
 
