@@ -41,7 +41,7 @@ reproduce: $(READY) ## the paper's figures, tables and claims from our own runs,
 # time. `make test-all` compiles as users do.
 test: export XLA_FLAGS ?= --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
 test: lint ## set everything up, lint, and run the quick tests (the ones CI runs)
-	$(BIN)/python -m pytest -n 2 -m 'not slow' $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not slow' $(ARGS)
 
 test-all: $(DOCS) lint ## every test, the slow ones too, hypothesis drawing new examples
 	$(BIN)/python -m pytest --hypothesis-profile=new $(ARGS)

@@ -89,10 +89,9 @@ def _run(command: list[object]) -> None:
 
 def kernels() -> list[pathlib.Path]:
     """The sources, relative to the checkout."""
-    found = sorted(ROOT.glob("jaxcal/**/*kernel.py"))
-    # Until the last of numba's is gone:
-    found = [path for path in found if "import cython" in path.read_text()]
-    return [path.relative_to(ROOT) for path in found]
+    return [
+        path.relative_to(ROOT) for path in sorted(ROOT.glob("jaxcal/**/*kernel.py"))
+    ]
 
 
 class _Build:

@@ -29,7 +29,7 @@ _PACKAGES = (
     "jax",
     "brax",
     "numpy",
-    "numba",
+    "scipy",
     "torch",
     "gymnasium",
     "stable-baselines3",

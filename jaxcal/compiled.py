@@ -25,9 +25,6 @@ def check(package: pathlib.Path) -> None:
             if not name.endswith("kernel.py"):
                 continue
             source = os.path.join(folder, name)
-            # Until the last of numba's is gone:
-            if "import cython" not in pathlib.Path(source).read_text():
-                continue
             module = source.removesuffix(".py") + EXTENSION_SUFFIXES[0]
             if not os.path.exists(module):
                 missing.append(source)

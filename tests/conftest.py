@@ -19,8 +19,6 @@ import hypothesis
 import jax
 import numpy as np
 import pytest
-from xdist.remote import Producer
-from xdist.scheduler import LoadFileScheduling
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -29,30 +27,6 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 hypothesis.settings.register_profile("same", deadline=None, derandomize=True)
 hypothesis.settings.register_profile("new", deadline=None)
 hypothesis.settings.load_profile("same")
-
-
-# Where `make test` begins: numba compiles the solvers on one worker, which runs all
-# their tests, while the other compiles JAX's programs; what needs both comes after.
-FIRST = ("selection", "learning", "adaptive", "models", "paper")
-
-
-class ByFile(LoadFileScheduling):
-    """A file's tests share a worker, and so do all tests of the solvers."""
-
-    def _split_scope(self, nodeid: str) -> str:
-        solvers = "tests/selection/"
-        return solvers if nodeid.startswith(solvers) else super()._split_scope(nodeid)
-
-
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> ByFile:
-    config.option.loadscopereorder = False
-    return ByFile(config, log)
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    items.sort(  # stable: files and tests keep their order
-        key=lambda item: (*FIRST, item.path.parent.name).index(item.path.parent.name)
-    )
 
 
 @pytest.fixture

@@ -137,7 +137,7 @@ def test_write_page_replaces_the_file_atomically(tmp_path: pathlib.Path):
 def test_pages_load_no_drawing_library():
     code = (
         "import sys, jaxcal.pages as p; p.render(p.Page('t', []));"
-        "print([m for m in ('matplotlib', 'jax', 'numba') if m in sys.modules])"
+        "print([m for m in ('matplotlib', 'jax', 'scipy') if m in sys.modules])"
     )
     shown = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True

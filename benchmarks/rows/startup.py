@@ -38,7 +38,6 @@ def seconds_of(command: list[str], caches: str) -> float:
         **os.environ,
         "JAX_COMPILATION_CACHE_DIR": f"{caches}/jax",
         "XDG_CACHE_HOME": caches,
-        "NUMBA_CACHE_DIR": f"{caches}/numba",
     }
     with tempfile.TemporaryDirectory() as folder:
         out = str(pathlib.Path(folder) / "run")

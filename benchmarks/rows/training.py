@@ -36,7 +36,6 @@ def contend(who: str, file: pathlib.Path, budget: float) -> Curve:
             **os.environ,
             "JAX_COMPILATION_CACHE_DIR": f"{empty}/jax",
             "XDG_CACHE_HOME": empty,
-            "NUMBA_CACHE_DIR": f"{empty}/numba",
         }
         command = [
             sys.executable,

@@ -17,7 +17,7 @@ from typing import Any
 
 __all__ = ["add_arguments", "report", "run"]
 
-_CORE = ("numpy", "scipy", "numba")
+_CORE = ("numpy", "scipy")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -103,13 +103,8 @@ def _devices() -> dict[str, str]:
 
 
 def _caches() -> dict[str, str]:
-    import numba
-
-    unset = "not set"
-    return {
-        "numba": numba.config.CACHE_DIR or "beside the modules",
-        "JAX_COMPILATION_CACHE_DIR": os.environ.get("JAX_COMPILATION_CACHE_DIR", unset),
-    }
+    name = "JAX_COMPILATION_CACHE_DIR"
+    return {name: os.environ.get(name, "not set")}
 
 
 def _ports() -> dict[str, str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-_HOMES = {  # loaded when first used: methods load numba, figures matplotlib
+_HOMES = {  # loaded when first used: methods load scipy, figures matplotlib
     "Dataset": "dataset",
     "Evaluation": "results",
     "Summary": "results",

@@ -149,7 +149,7 @@ class Evaluation:
 def versions() -> dict[str, str]:
     """What computed the numbers: Python and the packages that matter."""
     found = {"python": platform.python_version()}
-    for name in ("jaxcal", "numpy", "scipy", "numba", "jax", "flax"):
+    for name in ("jaxcal", "numpy", "scipy", "jax", "flax"):
         with contextlib.suppress(metadata.PackageNotFoundError):
             found[name] = metadata.version(name)
     return found

@@ -234,7 +234,7 @@ class Design(Asked):
             The selection; among runs of equal time the one with the largest
             determinant.
         """
-        from jaxcal.selection.fastest.run import select_fastest  # loads numba
+        from jaxcal.selection.fastest.run import select_fastest  # loads a kernel
 
         return select_fastest(
             self, k, motion, least_efficiency, start, method, time_limit, seed
@@ -262,7 +262,7 @@ class Design(Asked):
             max_points: points after which to stop; the front is then not proven.
             time_limit: seconds for each point.
         """
-        from jaxcal.selection.fastest.run import pareto_front  # loads numba
+        from jaxcal.selection.fastest.run import pareto_front  # loads a kernel
 
         return pareto_front(
             self, k, motion, least_efficiency, start, method, max_points, time_limit,

@@ -159,7 +159,7 @@ def test_help_and_stop_load_no_heavy_module(tmp_path):
         "    main({})\n"
         "except SystemExit:\n"
         "    pass\n"
-        "heavy = set('jax matplotlib numba scipy flax'.split()) & set(sys.modules)\n"
+        "heavy = set('jax matplotlib scipy flax'.split()) & set(sys.modules)\n"
         "sys.exit(' '.join(heavy) or 0)\n"
     )
     for arguments in (["--help"], ["stop", "--config", str(path)]):

@@ -138,7 +138,7 @@ def test_importing_jaxcal_loads_nothing_heavy():
     code = (
         "import sys, jaxcal, jaxcal.calibration, jaxcal.information, jaxcal.selection\n"
         "import jaxcal.selection.policy\n"
-        "heavy = {'jax', 'brax', 'mujoco', 'matplotlib', 'flax', 'orbax', 'numba'}\n"
+        "heavy = {'jax', 'brax', 'mujoco', 'matplotlib', 'flax', 'orbax'}\n"
         "print(sorted(heavy & set(sys.modules)))"
     )
     result = subprocess.run(

@@ -1,6 +1,6 @@
 """Largest volume |det| of q vectors out of many.
 
-Few subsets are enumerated through matrix products, without numba: by Laplace's
+Few subsets are enumerated through matrix products: by Laplace's
 expansion the determinant is a bilinear form of the minors of its first s rows and of
 its last t = q - s; for q = 4 these are the Pluecker coordinates of two pairs, and one
 (pairs, 6) x (6, pairs) product gives every tetrahedron. Subsets are split at their s-th

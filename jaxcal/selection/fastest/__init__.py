@@ -1,6 +1,6 @@
 """Which postures to measure, and in which order, so that the run takes least time.
 
-``run`` has the searches, which load numba; nothing here does.
+``run`` has the searches, compiled; nothing here loads them.
 """
 
 from jaxcal.selection.fastest.motion import Motion, travel_times
