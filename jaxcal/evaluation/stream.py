@@ -43,7 +43,7 @@ Numbers = dict[str, Any]  # of a row, see docs/evaluation.md
 
 PART = 5_000  # episodes whose rows are one file; the draws' blocks of 1,000 divide it
 _POLL_SECONDS = 1.0  # between looks for the parts of other processes
-_ONE_THREAD = [f"{name}_NUM_THREADS" for name in ("OPENBLAS", "OMP", "MKL", "NUMBA")]
+_ONE_THREAD = [f"{name}_NUM_THREADS" for name in ("OPENBLAS", "OMP", "MKL")]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -47,7 +47,7 @@ class Selection:
     reason: str = ""  # of auto, one sentence: why this answer is good enough
     seed: int | None = None  # where the solver draws at random
     restarts: int | None = None  # random starts of the exchange
-    nodes: int | None = None  # branch-and-bound nodes, or subsets enumerated
+    nodes: int | None = None  # nodes of branch and bound or of the search
     alternatives: tuple[Subset, ...] = ()  # the best subsets, best first
     known_bound: float | None = None  # bound, where the solver gave one
     names: tuple[str, ...] | None = None  # (M,) of the candidates, the caller's own
@@ -188,6 +188,6 @@ class BatchSelection:
     log_det: NDArray[np.float64]  # (B,) natural log det S
     proven: NDArray[np.bool_]  # (B,)
     bound: NDArray[np.float64]  # (B,) upper bound on log det S, inf where none is known
-    nodes: Indices  # (B,) nodes or subsets examined, 0 where not counted
+    nodes: Indices  # (B,) nodes examined, 0 where not counted
     method: str
     seconds: float  # wall time of the whole batch

@@ -28,7 +28,7 @@ class Found:
     value: float | None = None  # of the criterion, as reported to the caller
     bound: float | None = None  # no selection allowed has a better value
     proven: bool = False  # no selection is better by more than 1e-9
-    nodes: int | None = None  # branch-and-bound nodes, or subsets enumerated
+    nodes: int | None = None  # nodes of branch and bound or of the search
     alternatives: tuple[tuple[NDArray[np.int64], float], ...] = ()  # best first
     method: str | None = None  # the solver that answered, where another was asked
     reason: str = ""  # one sentence
@@ -42,6 +42,5 @@ def in_threads(
     """Solve every problem, in threads: compiled solvers release the interpreter."""
     if len(problems) == 1 or not compiled:
         return [solve(problem) for problem in problems]
-    first = solve(problems[0])  # compiles once, before the threads start
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-        return [first, *pool.map(solve, problems[1:])]
+        return list(pool.map(solve, problems))

@@ -10,6 +10,7 @@ lie on the hull, so ``best`` > 1 does without it.
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from typing import Any
 
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
-from jaxcal.selection.exact.volume import enumeration_cost, largest_volumes
+from jaxcal.selection.exact.volume import largest_volumes
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.greedy import greedy_indices
 from jaxcal.selection.problem import Problem, values
@@ -33,7 +34,7 @@ TIME_LIMIT = 10.0  # seconds of one search where none is given
 
 TOLERATED = 1e-9  # share by which rounding may change what is called proven
 
-_CHEAP = 3e7  # multiplications of an enumeration: about 20 ms
+_CHEAP = 5_000_000  # subsets: the largest volume is found within milliseconds
 _LARGEST_HULL_DIMENSION = 4  # qhull's facets grow as M^(n // 2)
 
 
@@ -44,7 +45,7 @@ class ExactResult:
     subsets: Indices  # (found, k), each sorted, best first; none of them singular
     values: Array  # (found,) of the criterion, as reported
     bound: float  # no selection has a better value; values[0] if proven
-    nodes: int  # branch-and-bound nodes, or subsets enumerated
+    nodes: int  # branch-and-bound nodes, or those of the search for volumes
     proven: bool
     rounding: float = 0.0  # share that keeps a finished search from being a proof
 
@@ -113,9 +114,9 @@ def solve_exact(
     if problem.simplex:
         pool = _pool(problem, hull=best == 1)
         free = problem.k - len(problem.required)
-        cost = enumeration_cost(len(pool), free)
-        if best == 1 or cost <= _CHEAP:
-            if enough and cost > _CHEAP:  # the relaxation may do without
+        cheap = math.comb(len(pool), free) <= _CHEAP
+        if best == 1 or cheap:
+            if enough and not cheap:  # the relaxation may do without
                 start = np.sort(exchange_indices(problem, restarts, seed, deadline))
                 relaxed = _relaxed(problem, start)
                 result = _result(problem, [start], best, relaxed, 1)
@@ -150,7 +151,7 @@ def upper_bound(problem: Problem) -> float:
     if problem.simplex:
         pool = _pool(problem, hull=True)
         free = problem.k - len(problem.required)
-        if enumeration_cost(len(pool), free) <= _CHEAP:
+        if math.comb(len(pool), free) <= _CHEAP:
             return _enumerate(problem, pool, 1, None).bound
     relaxed = _relaxed(problem, greedy_indices(problem))
     return float(problem.criterion.reported(relaxed))

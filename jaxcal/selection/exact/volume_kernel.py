@@ -1,4 +1,4 @@
-"""Compiled depth-first search for the largest volume; see ``volume.py``.
+"""Compiled depth-first search for the largest volumes; see ``volume.py``.
 
 A node has chosen s of the q vectors. What the others still add is their part outside
 the span of the chosen, held as coordinates in the q - s dimensions left over (one
@@ -29,7 +29,7 @@ def descend(
     points: cython.double[:, :, ::1],
     index: cython.Py_ssize_t[:, ::1],
     place: cython.Py_ssize_t[::1],
-    subset: cython.Py_ssize_t[::1],
+    subsets: cython.Py_ssize_t[:, ::1],
     largest: cython.double[::1],
     seconds: cython.double,
 ):
@@ -40,13 +40,14 @@ def descend(
             first; only the first q - depth of them count. The first depth is given.
         index: (q - 1, h) int64 which vectors these are.
         place: (q - 1,) int64 written: how many were chosen first at each depth.
-        subset, largest: (q,) int64 vectors and (1,) volume of the incumbent; updated.
+        subsets, largest: (best, q) int64 vectors and (best,) volumes of the incumbents,
+            the least of them first, 0 where there is none; updated.
         seconds: time limit.
 
     Returns:
         Whether the search is complete, and the nodes done.
     """
-    q, h = subset.shape[0], points.shape[1]
+    q, h = points.shape[2], points.shape[1]
     size: cython.Py_ssize_t[::1] = np.full(q - 1, h)
     volume: cython.double[::1] = np.ones(q - 1)
     chosen: cython.Py_ssize_t[::1] = np.zeros(q, np.int64)
@@ -61,8 +62,18 @@ def descend(
             if late(cython.address(watch)):
                 break
             if depth == q - 2:
-                _best_pair(points[depth], index, size, volume, chosen, subset, largest)
                 nodes += 1
+                if _best_pairs(
+                    points[depth],
+                    index,
+                    size,
+                    volume,
+                    chosen,
+                    subsets,
+                    largest,
+                    cython.address(watch),
+                ):
+                    break
                 depth -= 1
                 continue
             c = place[depth]
@@ -107,7 +118,7 @@ def _too_short(
     bound: cython.double = 1.0
     for c in range(first, first + dimension):  # the longest of them
         bound *= _length(points, c, dimension)
-    return bound < needed
+    return bound == 0.0 or bound < needed
 
 
 @cython.cfunc
@@ -207,31 +218,53 @@ def _longest_first(
 
 @cython.cfunc
 @cython.nogil
-@cython.exceptval(check=False)
-def _best_pair(
+@cython.exceptval(-1)
+def _best_pairs(
     plane: cython.double[:, ::1],
     index: cython.Py_ssize_t[:, ::1],
     size: cython.Py_ssize_t[::1],
     volume: cython.double[::1],
     chosen: cython.Py_ssize_t[::1],
-    subset: cython.Py_ssize_t[::1],
+    subsets: cython.Py_ssize_t[:, ::1],
     largest: cython.double[::1],
-) -> cython.void:
-    """The two of the planar points with the largest cross product, if it is enough."""
+    watch: cython.pointer(Watch),
+) -> cython.int:
+    """Keep the pairs of the planar points that are large enough; 1 if time is over."""
     last = chosen.shape[0] - 2
     count = size[last]
     needed = (1.0 + _TOLERANCE) * largest[0] / volume[last]
     if count > _FEW and _polygon_bound(plane, count) < needed:
-        return
+        return 0
     for i in range(count - 1):
+        if i % 64 == 63 and late(watch):
+            return 1
         x, y = plane[i, 0], plane[i, 1]
         for j in range(i + 1, count):
             found = volume[last] * fabs(x * plane[j, 1] - y * plane[j, 0])
             if found > largest[0]:
-                largest[0] = found
-                subset[:last] = chosen[:last]
-                subset[last] = index[last, i]
-                subset[last + 1] = index[last, j]
+                chosen[last], chosen[last + 1] = index[last, i], index[last, j]
+                _keep(chosen, found, subsets, largest)
+    return 0
+
+
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _keep(
+    chosen: cython.Py_ssize_t[::1],
+    found: cython.double,
+    subsets: cython.Py_ssize_t[:, ::1],
+    largest: cython.double[::1],
+) -> cython.void:
+    """Put the chosen in the place of the least incumbent, and the new least first."""
+    least: cython.Py_ssize_t = 0
+    largest[0] = found
+    for k in range(1, largest.shape[0]):
+        if largest[k] < largest[least]:
+            least = k
+    largest[0], largest[least] = largest[least], found
+    subsets[0, :] = subsets[least, :]
+    subsets[least, :] = chosen
 
 
 @cython.cfunc
