@@ -43,6 +43,7 @@ class Drive:
         self.axis = axis
         self.last: Status | None = None  # as last read
         self._origin: int | None = None
+        self.forget_origin()
 
     @property
     def origin(self) -> int:
@@ -58,7 +59,7 @@ class Drive:
 
     def forget_origin(self) -> None:
         """The next reading tells the origin, as one does that was set anew."""
-        self._origin = None
+        self._origin = None if self.axis.map.home_place else 0
 
     def status(self, retries: int | None = None) -> Status:
         """Read status and position.
@@ -79,8 +80,7 @@ class Drive:
         word = self._read(status, retries)
         count = self._read(self.axis.map.position, retries)
         if self._origin is None:
-            settable = self.axis.map.home_place is not None
-            self._origin = HOME if settable and count > HOME // 2 else 0
+            self._origin = HOME if count > HOME // 2 else 0
         position, flags = count - self._origin, status.flags(word)
         self.last = Status(word, position, time.monotonic(), **flags)
         return self.last
