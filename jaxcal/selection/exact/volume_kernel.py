@@ -41,7 +41,7 @@ def descend(
         index: (q - 1, h) int64 which vectors these are.
         place: (q - 1,) int64 written: how many were chosen first at each depth.
         subsets, largest: (best, q) int64 vectors and (best,) volumes of the incumbents,
-            the least of them first, 0 where there is none; updated.
+            0 where there is none, as a heap with the least first; updated.
         seconds: time limit.
 
     Returns:
@@ -256,15 +256,23 @@ def _keep(
     subsets: cython.Py_ssize_t[:, ::1],
     largest: cython.double[::1],
 ) -> cython.void:
-    """Put the chosen in the place of the least incumbent, and the new least first."""
-    least: cython.Py_ssize_t = 0
-    largest[0] = found
-    for k in range(1, largest.shape[0]):
-        if largest[k] < largest[least]:
-            least = k
-    largest[0], largest[least] = largest[least], found
-    subsets[0, :] = subsets[least, :]
-    subsets[least, :] = chosen
+    """Put the chosen in the place of the least incumbent, and the new least first.
+
+    The incumbents are a heap: those at 2 k + 1 and 2 k + 2 are no smaller than k.
+    """
+    best = largest.shape[0]
+    k: cython.Py_ssize_t = 0
+    while 2 * k + 1 < best:
+        child: cython.Py_ssize_t = 2 * k + 1
+        if child + 1 < best and largest[child + 1] < largest[child]:
+            child += 1
+        if largest[child] >= found:
+            break
+        largest[k] = largest[child]
+        subsets[k, :] = subsets[child, :]
+        k = child
+    largest[k] = found
+    subsets[k, :] = chosen
 
 
 @cython.cfunc
