@@ -185,7 +185,12 @@ def rank_of_blocks(blocks: Array, root: Array) -> NDArray[np.int64]:
 
 
 def largest_rank(blocks: Array) -> int:
-    """Of single blocks (N, q, p); the first is nearly always of full rank."""
+    """Of single blocks (N, q, p); the first is nearly always of full rank.
+
+    1 for one reading each, looked at or not: what is zero adds no direction anyway.
+    """
+    if blocks.shape[1] == 1:
+        return 1
     full, none = min(blocks.shape[1:]), np.zeros((0, blocks.shape[2]))
     for some in (blocks[:1], blocks):
         rank = int(rank_of_blocks(some[:, None], none).max(initial=0))

@@ -37,8 +37,9 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 # (k + 8) M q^2 p of the default starts of one call, about 10 ms; swaps for a trace or a
-# subset of the parameters cost twice those for D.
-_WORK = {"D": 24e6, "other": 12e6}
+# subset of the parameters cost twice those for D. E, whose local optima differ more,
+# gets more.
+_WORK = {"D": 24e6, "E": 48e6, "other": 12e6}
 
 # While a selection grows, a share of the information that k mean candidates give stands
 # in for those that are not chosen yet: this one, less where k candidates have fewer
@@ -48,8 +49,8 @@ _FURTHER = (1.0, 0.03)
 _RANK_FIRST = 1e-7  # every direction that nothing is known of outweighs the rest
 _MENDING = 10  # random starts where all greedy ones are singular
 
-_CHUNK = 32  # candidates whose eigenvalues are computed at once
-_CLIMBS = 3e5  # k p^3 of the climbs of E in one call, about half a second
+_CHUNK = 16  # candidates whose eigenvalues are computed at once, then twice as many
+_CLIMBS = 1.3e5  # k p^3 of the climbs of E in one call, but from 1 to 10 of them
 _LIFTS = 1e-9  # share by which a swap must raise the eigenvalue
 _RIDGE = 1e-10  # of the information of all candidates
 
@@ -78,10 +79,10 @@ def default_restarts(problem: Problem) -> int:
     most = 200 if problem.max_replicates == 1 else 400
     if problem.rank_one:
         return most
-    if problem.criterion.kind == "least":  # not compiled, and from local optima of A
-        most = 20
+    if problem.criterion.kind == "least":
+        most = 80
     count, q, p = problem.blocks.shape
-    work = _WORK["D" if problem.criterion.name == "D" else "other"]
+    work = _WORK.get(problem.criterion.name, _WORK["other"])
     return int(min(max(work / ((problem.k + 8) * count * q * q * p), 1.0), most))
 
 
@@ -224,7 +225,8 @@ def _best_eigenvalue(
 ) -> tuple[Indices, float]:
     """The best local optimum of E and its value, from ``restarts`` local optima of A.
 
-    On large problems only those of the best eigenvalues are climbed.
+    Only those of the best eigenvalues are climbed: that is not compiled, and many local
+    optima of A come closer than climbs from a few.
     """
     starts = [climbs.best_of(1), *(climbs.random_climb() for _ in range(restarts - 1))]
     chosen = np.unique(
@@ -233,7 +235,8 @@ def _best_eigenvalue(
     if not len(chosen):
         return starts[0]
     order = np.argsort(-values(problem, chosen)[0])
-    few = max(1, int(_CLIMBS / (problem.k * problem.num_regressors**3)))
+    work = problem.k * problem.num_regressors**3
+    few = int(min(max(_CLIMBS / work, 1), 10))
     found = [
         _climb_eigenvalue(problem, _required_first(problem, chosen[i]), climbs.seconds)
         for i in order[:few]
@@ -275,19 +278,31 @@ def _best(
     least: float,
 ) -> tuple[int, float]:
     """The candidate, or -1, that gives the largest eigenvalue above ``least``."""
+    root = criterion.root
     # A little more than there is keeps the bounds true where the rest is singular.
     more = rest + _RIDGE * np.eye(len(rest))
-    lift = ((blocks @ criterion.gradient(more)) * blocks).sum(axis=(1, 2))
-    bound = float(criterion.value(more)) + lift
+    across = np.linalg.solve(more, root.T)
+    variances, vectors = np.linalg.eigh(root @ across)
+    weakest = across @ vectors[:, -1] / variances[-1]  # |C weakest| = 1
+    bound = 1.0 / variances[-1] + ((blocks @ weakest) ** 2).sum(axis=1)
+    # A block of q readings leaves the variances after the q largest no smaller.
+    q = blocks.shape[1]
+    if q < len(variances):
+        bound = np.minimum(bound, 1.0 / variances[-1 - q])
     bound = np.where(free, bound, -np.inf)
     order = np.argsort(-bound)
-    best = -1
-    for first in range(0, len(order), _CHUNK):
-        some = order[first : first + _CHUNK]
-        some = some[bound[some] > least]
+    best, found = -1, least
+    first, size = 0, _CHUNK
+    while first < len(order):
+        some = order[first : first + size]
+        some = some[bound[some] > found]
         if not some.size:
             break
-        values = criterion.value(rest + grams[some])
-        if values.max() > least:
-            least, best = float(values.max()), int(some[values.argmax()])
-    return best, least
+        covariance = root @ np.linalg.inv(more + grams[some]) @ root.T
+        values = 1.0 / np.linalg.eigvalsh(covariance)[:, -1]
+        if values.max() > found:
+            found, best = float(values.max()), int(some[values.argmax()])
+        first, size = first + size, 2 * size
+    if best >= 0:  # without the ridge
+        found = float(criterion.value(rest + grams[best]))
+    return (best, found) if found > least else (-1, least)

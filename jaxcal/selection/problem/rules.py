@@ -138,7 +138,7 @@ def check_k(
     """
     q, p = raw.shape[2:]
     usable = raw.reshape(-1, q, p) if mask.all() else raw[mask]
-    most = 1 if q == 1 else largest_rank(usable)
+    most = largest_rank(usable)
     if k is None:
         k = p if regressors else _cover(usable)
     k = whole_number("k", k, 1)
