@@ -62,7 +62,11 @@ class RegisterMap(Section):
         None,
     )
     limits: Writes | None = key("`write` with `min` and `max` in pulses", None)
-    set_zero: Writes | None = key("`write`: the present position becomes 0", None)
+    set_zero: Writes | None = key(
+        "`write`: the present position becomes 0, or `home:i32` where the drive takes "
+        "a value: 2^30 is written, which it never counts when it is switched on",
+        None,
+    )
     identity: dict[str, Read] = key("registers that `identify` prints", {})
     recognise: dict[str, tuple[int, int]] = key(
         "of identity registers: [lowest, highest] that a drive of this family holds", {}
@@ -83,6 +87,11 @@ class RegisterMap(Section):
     ready_s: float = key(
         "the drive takes at most so long to enable, and to reset an alarm", 1.0, 0, 30
     )
+
+    @property
+    def home_place(self) -> tuple[int, str] | None:
+        """Where ``set_zero`` takes the count that home becomes; None: it becomes 0."""
+        return self.set_zero.place_of("home") if self.set_zero else None
 
     @property
     def digest(self) -> str:

@@ -9,7 +9,7 @@ from pydantic import BeforeValidator, Field, PlainValidator, WithJsonSchema
 from rig.config.schema import Section, key
 
 FORMATS = {"u16": ">H", "i16": ">h", "u32": ">I", "i32": ">i"}  # of struct
-VALUES = ("position", "speed", "accel", "decel", "timeout", "min", "max")
+VALUES = ("position", "speed", "accel", "decel", "timeout", "min", "max", "home")
 Kind = Literal["u16", "i16", "u32", "i32"]
 
 

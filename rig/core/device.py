@@ -238,9 +238,8 @@ class Device:
         self.stopper.check()
         for drive in self.drives:
             self._check_fit(drive, reset_alarms)
-            axis = drive.axis
             if self.config.motion.mirror_limits:
-                drive.write(axis.map.limits, min=axis.min_pulses, max=axis.max_pulses)
+                drive.mirror_limits()
         try:
             self.imu.latest()
         except ImuError as error:

@@ -6,7 +6,7 @@ import dataclasses
 import time
 from collections.abc import Callable
 
-from rig.config.axis import Axis
+from rig.config.axis import HIGHEST, LOWEST, Axis
 from rig.config.registers import Read, Writes, decode, encode
 from rig.core.bus import Bus, BusError, Rejected
 from rig.core.faults import MotionFault
@@ -14,6 +14,7 @@ from rig.core.faults import MotionFault
 POLL_S = 0.05
 PASSING = (5, 6, 8, 10, 11)  # exceptions: acknowledge, busy, CRC; silence at a gateway
 START_S = 0.2  # a drive that has taken a move shows it within this time
+HOME = 2**30  # a count that no drive shows when it is switched on
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +42,24 @@ class Drive:
         self.bus = bus
         self.axis = axis
         self.last: Status | None = None  # as last read
+        self._origin: int | None = None
+        self.forget_origin()
+
+    @property
+    def origin(self) -> int:
+        """What the drive itself counts at home: HOME where it was set so, else 0.
+
+        All pulses here are from it. It is told from the count as first read and holds
+        from then on: a drive that loses its count meanwhile is seen far away.
+        """
+        if self._origin is None:
+            self.status()
+        assert self._origin is not None
+        return self._origin
+
+    def forget_origin(self) -> None:
+        """The next reading tells the origin, as one does that was set anew."""
+        self._origin = None if self.axis.map.home_place else 0
 
     def status(self, retries: int | None = None) -> Status:
         """Read status and position.
@@ -59,8 +78,10 @@ class Drive:
     def _status(self, retries: int | None) -> Status:
         status = self.axis.map.status
         word = self._read(status, retries)
-        position = self._read(self.axis.map.position, retries)
-        flags = status.flags(word)
+        count = self._read(self.axis.map.position, retries)
+        if self._origin is None:
+            self._origin = HOME if count > HOME // 2 else 0
+        position, flags = count - self._origin, status.flags(word)
         self.last = Status(word, position, time.monotonic(), **flags)
         return self.last
 
@@ -101,7 +122,8 @@ class Drive:
                 f"{axis.name}: {pulses} pulses leave the limits "
                 f"{axis.min_pulses}..{axis.max_pulses}"
             )
-        self.write(axis.map.move, position=pulses, **axis.motion_counts())
+        count = pulses + self.origin
+        self.write(axis.map.move, position=count, **axis.motion_counts())
 
     def took(self, pulses: int, start: Status, tolerance: int) -> bool | None:
         """Whether the drive obeys a move whose reply was lost; None: unknown.
@@ -132,9 +154,17 @@ class Drive:
         """The target that the drive holds; None where it cannot be read."""
         read = self.axis.map.target
         try:
-            return None if read is None else self._read(read)
+            return None if read is None else self._read(read) - self.origin
         except Rejected:
             return None
+
+    def mirror_limits(self) -> None:
+        """Write the axis's soft limits into the drive, as far as it can count."""
+        low, high = (
+            min(max(pulses + self.origin, LOWEST), HIGHEST)
+            for pulses in (self.axis.min_pulses, self.axis.max_pulses)
+        )
+        self.write(self.axis.map.limits, min=low, max=high)
 
     def stop(self) -> None:
         """Quick stop; torque stays on."""

@@ -247,6 +247,12 @@ def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
             f"where {axis.name} was left is not known, as the last session could not "
             "read it any more, and its drive does not say that it kept its power"
         )
+    origins = (record.state(HOMED) or {}).get("origins", {})
+    if drive.origin != origins.get(axis.name, drive.origin):
+        return (
+            f"{axis.name} counts from {drive.origin} and no more from "
+            f"{origins[axis.name]}, where it was homed: it was without power"
+        )
     left = record.left().get(axis.name, status.position)
     tolerance = axis.pulses_within(config.motion.position_tolerance_deg)
     if abs(status.position - left) <= tolerance:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from rig.config.maps import RegisterMap
 from rig.config.registers import (
     FLAGS,
+    VALUES,
     Read,
     Write,
     Writes,
@@ -64,6 +65,7 @@ class SimDrive:
         self.map = register_map
         self.pulses_per_rev = pulses_per_rev
         self.offset = 0
+        self._set_to = 0  # what it was told to count there
         self.homed = False
         self.habits = habits or Habits()
         self.position = float(position)
@@ -171,13 +173,14 @@ class SimDrive:
     def find_origin(self) -> None:
         """Count from the motor's origin again, as homing ends."""
         self.position -= self.offset
-        self.target, self.offset = round(self.position), 0
+        self.target, self.offset, self._set_to = round(self.position), 0, 0
         self.homed, self._homing = True, False
 
     def power_cycle(self, offset: int = 0) -> None:
         """Off and on again: its counter comes back ``offset`` pulses away."""
         self.advance()
         self.offset += offset
+        self._set_to = 0
         self.position = float(round(self.position) + offset)
         self.target, self.velocity, self.alarm = round(self.position), 0.0, 0
         self.moving = self._stopping = self._homing = self.homed = False
@@ -242,17 +245,24 @@ class SimDrive:
             self.advance()
         elif self._begins(m.home, address, words):
             self._home()
-        elif self._begins(m.set_zero, address, words):
-            self.offset -= round(self.position)
-            self.position, self.target, self.homed = 0.0, 0, True
+        elif m.set_zero and self._begins(m.set_zero, address, words):
+            home = self._value(m.set_zero, "home")
+            self.offset += home - round(self.position)
+            self._set_to = home
+            self.position, self.target, self.homed = float(home), home, True
         elif m.comm_timeout and address == m.comm_timeout.write[0].address:
             counts = self._value(m.comm_timeout, "timeout")
             self._comm_timeout = counts / m.comm_timeout.per_s
 
     def _begins(self, table: Writes | None, address: int, words: list[int]) -> bool:
-        first = table.write[0] if table else None
-        sent = [word.value for word in first.words] if first else None
-        return bool(first and (first.address, sent) == (address, words))
+        """Whether a frame is the table's first one that says something by itself."""
+        for frame in table.write if table else ():
+            constants = {a: w.value for a, w in frame.places() if w.value not in VALUES}
+            if constants:
+                sent = {address + i: word for i, word in enumerate(words)}
+                same = (frame.address, frame.count) == (address, len(words))
+                return same and constants.items() <= sent.items()
+        return False
 
     def _value(self, table: Writes, name: str) -> int:
         """What the registers hold of a named value; 0 where the table has none."""
@@ -276,7 +286,8 @@ class SimDrive:
         if self.alarm or not self.enabled:
             raise DriveException(DEVICE_FAILURE)
         target = self._value(m.move, "position")
-        if self._travel and not self._travel[0] <= target <= self._travel[1]:
+        way = target - self._set_to
+        if self._travel and not self._travel[0] <= way <= self._travel[1]:
             raise DriveException(ILLEGAL_VALUE)
         units, per_rev = m.units, float(self.pulses_per_rev)
         speed = (self._value(m.move, "speed") or 1) / units.speed_per_unit

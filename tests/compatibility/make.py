@@ -36,7 +36,7 @@ def main() -> None:
         out = pathlib.Path(name)
         sizes = ["--num-candidates", "12", "--width", "8", "--encoder-rounds", "1"]
         sizes += ["--episodes", "4096", "--no-validation", "--out", str(out / "run")]
-        train.main([*sizes, "--export", str(FOLDER / "checkpoint")])
+        train.main([*sizes, "--export", str(FOLDER / "checkpoint.npz")])
         rig(["calibrate", "--simulate", "--speedup", "20", "--arm", "--zero",
              "--out", str(out / "rig")])  # fmt: skip
         (run,) = (out / "rig").iterdir()
@@ -53,7 +53,7 @@ def main() -> None:
         "affine": jaxcal.Calibration.load(FOLDER / "affine.json").predict(u).tolist(),
         "arm": jaxcal.Calibration.load(FOLDER / "arm.json").predict(u).tolist(),
         "policy": jaxcal.select(
-            CANDIDATES, 4, "policy", checkpoint=FOLDER / "checkpoint"
+            CANDIDATES, 4, "policy", checkpoint=FOLDER / "checkpoint.npz"
         ).indices.tolist(),
     }
     (FOLDER / "answers.json").write_text(json.dumps(answers, indent=1) + "\n")

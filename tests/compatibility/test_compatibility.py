@@ -32,7 +32,9 @@ def test_a_calibration_predicts_as_it_did(folder, answers, kind):
 
 
 def test_a_checkpoint_chooses_as_it_did(folder, answers):
-    chosen = jaxcal.select(CANDIDATES, 4, "policy", checkpoint=folder / "checkpoint")
+    chosen = jaxcal.select(
+        CANDIDATES, 4, "policy", checkpoint=folder / "checkpoint.npz"
+    )
     assert chosen.indices.tolist() == answers["policy"]
 
 

@@ -9,8 +9,10 @@ import subprocess
 import sys
 import time
 
+import numpy as np
 import pytest
 from commission import device, quick_text
+from harness import changed, fast_config, simulator
 
 from rig.__main__ import main
 from rig.config import load_config
@@ -20,8 +22,10 @@ from rig.core.record import (
     SIGN_CHECKED,
     ZEROED,
     DeviceRecord,
+    check_drives,
 )
 from rig.simulator import Truth
+from rig.simulator.drive import SimDrive
 from rig.workbench.commission import bench, home, steps
 from rig.workbench.commission.jog import FIRST_S, REPEAT_S, Held, Released
 from rig.workbench.commission.operator import Operator
@@ -214,3 +218,42 @@ def test_imu_pins_the_sender_and_tells_what_to_type(commissioned, capsys):
     said = capsys.readouterr().out
     assert f"port {config.imu.port}" in said and "readings per s" in said
     assert load_config("rig.toml").imu.allow == ("127.0.0.1",)
+
+
+@pytest.mark.parametrize("name", ["generic", "applied_motion"])
+@pytest.mark.parametrize("obeys", [True, False])
+def test_a_count_of_0_after_a_power_cycle_is_not_home(at, name, obeys, monkeypatch):
+    """D: homed at 0, switched off and pushed, such a drive said that it is at home."""
+    if not obeys:  # a drive that can be set to 0 only
+        value = SimDrive._value
+        monkeypatch.setattr(
+            SimDrive,
+            "_value",
+            lambda self, table, key: 0 if key == "home" else value(self, table, key),
+        )
+    told: list[str] = []
+    served = fast_config({'map = "leadshine_pr"': f'map = "{name}"'})
+    with simulator(served) as sim:
+        served = changed(sim.start(), output=str(at))
+        record = DeviceRecord(at / "device.json")
+        place = steps.simulated(sim, served, record, told.append)
+        steps.identify(place)
+        assert steps.go_home(place, here=True) == 0
+        counts = [round(drive.position) for drive in sim.drives]
+        assert counts == ([2**30] * 3 if obeys else [0] * 3)
+        assert record.state(HOMED)["pulses"] == [0, 0, 0]
+        assert steps.jog(place, 0, 1.0) == 0
+        assert steps.jog(place, 0, -1.0) == 0
+        np.testing.assert_allclose(sim.plant.joints(), 0.0, atol=0.1)
+        assert [round(drive.position) for drive in sim.drives] == counts
+        for drive in sim.drives:
+            drive.power_cycle(-round(drive.position))
+            assert drive.position == 0.0
+        with place.bus("look") as drives:
+            if obeys:
+                with pytest.raises(Refused, match="was without power"):
+                    check_drives(served, drives, record)
+            else:
+                check_drives(served, drives, record)
+    assert (record.state(HOMED) is None) is obeys
+    assert any("is not noticed" in line for line in told) is not obeys

@@ -202,11 +202,39 @@ def test_applied_motion_move_is_what_a_running_machine_sends(spoken):
         "05 10 00 1B 00 05 0A 0E 10 0E 10 06 90 00 03 7C E4", "74 AA"
     ) + frame("05 06 00 7C 00 67", "08 7C")
     # reduction 10: 7 rev/s are 252 deg/s, 600 rev/s^2 are 21600 deg/s^2
+    replies = {  # it is asked first whether its home is at 2**30 or at 0
+        frame("05 03 00 01 00 01"): frame("05 03 02 00 09"),
+        frame("05 03 00 06 00 02"): frame("05 03 04 00 00 00 00"),
+    }
     sent, _ = spoken(
-        "applied_motion", 5, lambda d: d.move(228580), speed_deg_s=252.0,
+        "applied_motion", 5, lambda d: d.move(228580),
+        lambda sent: replies.get(sent) or echo(sent), speed_deg_s=252.0,
         accel_deg_s2=21600.0, max_pulses=300000,
     )  # fmt: skip
-    assert sent == recorded
+    assert sent == b"".join(replies) + recorded
+
+
+def test_applied_motion_counts_from_where_home_was_set(spoken):
+    """Home at 2**30: the target and the position are counted from there."""
+    replies = {
+        frame("05 03 00 01 00 01"): frame("05 03 02 00 09"),
+        frame("05 03 00 06 00 02"): frame("05 03 04 40 00 00 05"),
+    }
+
+    def move(drive):
+        drive.move(1000)
+        return drive.last.position, drive.origin
+
+    sent, found = spoken(
+        "applied_motion", 5, move, lambda sent: replies.get(sent) or echo(sent)
+    )
+    assert found == (5, 2**30)
+    assert (2**30 + 1000).to_bytes(4, "big") in sent
+    assert (1000).to_bytes(4, "big") not in sent
+    home, _ = spoken(
+        "applied_motion", 5, lambda d: d.write(d.axis.map.set_zero, home=2**30)
+    )
+    assert home == frame("05 10 00 7C 00 06 0C 00 A5 40 00 00 00 00 00 00 00 00 00")
 
 
 def test_applied_motion_opcodes(spoken):

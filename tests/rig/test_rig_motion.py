@@ -171,7 +171,7 @@ def test_settled_means_drives_done_and_imu_quiet():
 
 def test_a_shaking_device_never_settles():
     # On a machine so busy that the phone is not heard, that is what it is told instead.
-    reason = r"did not settle.*(deviation|readings over)"
+    reason = r"did not settle.*(std_deg|readings over)"
     with bench(fast_config(UNSETTLED), noise_deg=1.0) as motion:
         with pytest.raises(MotionFault, match=reason):
             Observer(motion.device).measure(motion.device.positions())

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from rig.config import RigConfig
 from rig.config.axis import HIGHEST, LOWEST
 from rig.core.bus import BusError
-from rig.core.drive import Drive
+from rig.core.drive import HOME, Drive
 from rig.core.faults import MotionFault, Refused
 from rig.core.record import HOMED, ZEROED
 from rig.core.session import ZERO_FACTOR
@@ -40,8 +40,8 @@ def home(run: Bench, here: bool, confirm: Callable[[str, str], None]) -> None:
 
     Args:
         run: with ``unlimited`` axes.
-        here: where the device stands is home: counts become 0 where the drive can be
-            told so, and are noted where it cannot. Otherwise each drive homes itself.
+        here: where the device stands is home: each drive is told so, and its count is
+            noted where it cannot be told. Otherwise each drive homes itself.
         confirm: is told what will happen and the word to type, and raises Refused where
             it must not.
     """
@@ -69,7 +69,8 @@ def home(run: Bench, here: bool, confirm: Callable[[str, str], None]) -> None:
     positions = list(device.positions())
     how = "here" if here else "drive"
     run.emit("homed", sync=True, how=how, pulses=positions)
-    run.record.reach(HOMED, run.plain, how=how, pulses=positions)
+    origins = {drive.axis.name: drive.origin for drive in device.drives}
+    run.record.reach(HOMED, run.plain, how=how, pulses=positions, origins=origins)
     run.say(f"home: the drives count {positions} pulses")
 
 
@@ -80,24 +81,39 @@ def _set_zero(run: Bench, drive: Drive) -> None:
             f"it; home is at its count of {drive.status().position}"
         )
         return
+    if drive.axis.map.home_place is not None:
+        if _counts_from(run, drive, HOME) is None:
+            return
+        run.say(
+            f"  {drive.axis.name}: the drive does not take the count {HOME}; it is set "
+            "to 0, and a loss of power while it stands there is not noticed"
+        )
+    if (fault := _counts_from(run, drive, 0)) is not None:
+        raise MotionFault(f"{fault}. Set it with the maker's tool")
+
+
+def _counts_from(run: Bench, drive: Drive, origin: int) -> str | None:
+    """Make where the drive stands its origin; why it is not, or None."""
     tolerance = drive.axis.pulses_within(run.config.motion.position_tolerance_deg)
     lost = ""
     for _ in range(SET_TRIES):  # the same once more where a frame was lost
         try:
-            drive.write(drive.axis.map.set_zero)
+            drive.write(drive.axis.map.set_zero, home=origin)
         except BusError as error:
             lost = f" ({error})"
         end = time.monotonic() + SET_S
-        while abs(count := drive.sound().position) > tolerance:
+        while True:
+            drive.forget_origin()
+            count = drive.sound().position + drive.origin
+            if abs(count - origin) <= tolerance:
+                return None
             run.device_guard()
             if time.monotonic() > end:
                 break
             time.sleep(POLL_S)
-        else:
-            return
-    raise MotionFault(
+    return (
         f"{drive.axis.name} still counts {count} pulses after its position was set to "
-        f"0{lost}. Set it with the maker's tool"
+        f"{origin}{lost}"
     )
 
 
@@ -121,6 +137,7 @@ def _go_home(run: Bench, drive: Drive) -> None:
                 "and the homing that is set in the drive"
             )
         time.sleep(POLL_S)
+    drive.forget_origin()
     run.device_guard()
 
 

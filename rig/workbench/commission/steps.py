@@ -284,7 +284,10 @@ def begin_simulated(place: Place, through: str) -> None:
     if HOMED in states:
         with place.bus("home") as drives:
             pulses = [drive.status().position for drive in drives]
-        place.record.reach(HOMED, place.config, how="as they stand", pulses=pulses)
+            origins = {drive.axis.name: drive.origin for drive in drives}
+        place.record.reach(
+            HOMED, place.config, how="as they stand", pulses=pulses, origins=origins
+        )
     if SIGN_CHECKED not in states:
         return
     wrong: list[Change] = []

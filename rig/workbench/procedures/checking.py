@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pathlib
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -200,7 +201,8 @@ def goto(run: Run, calibration: Any, desired: Array, play: Play) -> int:
     record = run.visit("goto", pulses, role="goto")
     if record is None:
         return EXIT_RECALIBRATE
-    if names := unchecked(config, run.frame):
+    told = [d.axis.name for d in run.ready().drives if d.origin]
+    if names := unchecked(config, run.frame, told):
         run.say(
             f"NOT CHECKED: whether {', '.join(names)} was moved while without power. "
             "The drive does not tell, and the phone does not see a turn about the "
@@ -214,17 +216,21 @@ def goto(run: Run, calibration: Any, desired: Array, play: Play) -> int:
     return EXIT_OK
 
 
-def unchecked(config: RigConfig, frame: Frame | None) -> list[str]:
+def unchecked(
+    config: RigConfig, frame: Frame | None, told: Sequence[str] = ()
+) -> list[str]:
     """Axes of which neither drive nor phone tells that they were moved when off.
 
     A drive without homed bit and absolute encoder counts from 0 when it is switched on:
-    where it was left there, its count says nothing.
+    where it was left there, its count says nothing. That of ``told`` axes does, whose
+    home is at a count of its own.
     """
     seen = [] if frame is None else unseen(config, frame.zero)
     return [
         axis.name
         for axis in config.axes
-        if axis.name in seen and not (axis.map.homed or axis.map.absolute_encoder)
+        if axis.name in seen
+        and not (axis.map.homed or axis.map.absolute_encoder or axis.name in told)
     ]
 
 
