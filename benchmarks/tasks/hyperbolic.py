@@ -65,7 +65,7 @@ class Hyperbolic:
         key_who, key_delay, key_money = jax.random.split(key, 3)
         who = jax.random.randint(key_who, (count,), 0, len(unknowns))
         log_k, alpha = unknowns[who].T
-        # Worth between 2 and 98 of 100, so that both answers are likely for somebody.
+        # Worth 2 to 98 of 100, so that some parameters make either answer likely.
         odds = jax.random.uniform(key_delay, (count,), minval=-4.0, maxval=4.0)
         log_delay = odds - log_k
         worth = _LATER / (1.0 + jnp.exp(odds))

@@ -77,7 +77,7 @@ def load(name: str) -> TrainConfig:
     """A preset by its name.
 
     Raises:
-        ValueError: nobody offers it.
+        ValueError: no package offers a preset of this name.
     """
     if name in _OWN:
         return _OWN[name]
