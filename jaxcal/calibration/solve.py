@@ -111,7 +111,7 @@ def solve(task: Task, start: Solution | None = None) -> Solution:
         evidence.append(search.evidence)
         done = search.step()
         # Along a curved valley that the measurements hardly close, the search creeps.
-        # A gain of 0.1 moves it by a third of a standard deviation: ask for ever more.
+        # A gain of 0.1 moves it by a third of a standard deviation, so more is asked.
         creeps = len(evidence) > _PATIENCE and search.damping < 1e-3
         if creeps:
             gain = evidence[-_PATIENCE] - search.evidence

@@ -95,7 +95,7 @@ class BusLock:
         self.release()
 
     def holder(self) -> dict[str, Any] | None:
-        """Who holds the lock now (pid, command, since, run), None where nobody does.
+        """Who holds the lock now (pid, command, since, run), None where it is free.
 
         Never the word of a dead holder: the flock is tried first. The dictionary is
         empty where the holder has not said yet who it is.
