@@ -216,8 +216,7 @@ def test_pause_lets_the_posture_be_finished(rig, browse):
     until(lambda: shown(driver, "#pause"))
     driver.find_element("id", "pause").click()
     until(lambda: "pause asked for" in words(driver, "#answer"))
-    driver.find_element("id", "pause").click()
-    until(lambda: "asked for already" in words(driver, "#answer"))
+    driver.find_element("id", "pause").click()  # and no stop
     assert rig.session.wait(PATIENT_S) == 4
     visits = rig.records("visit")
     assert rig.records("posture")[-1]["name"] == visits[-1]["name"]

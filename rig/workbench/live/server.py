@@ -16,6 +16,7 @@ from fastapi.responses import FileResponse, PlainTextResponse
 from nicegui import Client, ui
 
 from rig.core.faults import Fault, Refused
+from rig.signals import PAUSE
 from rig.workbench.live.guard import Guard
 from rig.workbench.live.page import make_page
 from rig.workbench.live.watcher import Watcher
@@ -65,7 +66,7 @@ def make_app(watcher: Watcher, linger_s: float | None = None) -> FastAPI:
 
     @app.post("/pause")
     async def pause() -> PlainTextResponse:
-        return ask(signal.SIGINT)
+        return ask(PAUSE)
 
     @app.get("/report")
     async def report() -> FileResponse:
