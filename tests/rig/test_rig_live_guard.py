@@ -126,7 +126,7 @@ def test_the_token_is_taken_once_and_kept_in_a_cookie():
     status, headers = answer({}, token, query=f"token={token}")
     assert (status, headers[b"location"]) == (303, b"/")
     cookie = headers[b"set-cookie"].decode()
-    assert "HttpOnly" in cookie and "SameSite=Strict" in cookie
+    assert "HttpOnly" in cookie and "SameSite=strict" in cookie
     brought = {"cookie": "other=1; " + cookie.split(";")[0], "origin": OWN}
     assert answer(brought, token)[0] == 200
     assert answer(brought, token, "POST", path="/stop")[0] == 200
@@ -263,14 +263,7 @@ def served(tmp_path_factory):
     _journal(folder, os.getpid()).close()
     sock = socket.create_server(("127.0.0.1", 0))
     token = secrets.token_urlsafe(32)
-    command = [
-        sys.executable,
-        "-m",
-        "rig.workbench.live",
-        str(folder),
-        "--fd",
-        str(sock.fileno()),
-    ]
+    command = [sys.executable, "-m", launch.SERVER, str(folder), str(sock.fileno())]
     page = subprocess.Popen(
         command, pass_fds=[sock.fileno()], env=os.environ | {launch.TOKEN: token}
     )
