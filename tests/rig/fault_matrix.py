@@ -35,13 +35,12 @@ from harness import (
 )
 
 from rig.config import parse_config
-from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
-from rig.core.session import Run
-from rig.journal import read_journal
+from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord, read_journal
 from rig.simulator import Simulator, Truth, parse_fault
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.steps import Place
 from rig.workbench.commission.steps import axes as check_the_axes
+from rig.workbench.run import Run
 
 PHASES = ("zeroing", "moving", "settling", "measuring", "saving")
 FAULTS = (
@@ -280,7 +279,7 @@ def _axes_cell(fault: str, folder: pathlib.Path) -> Outcome:
         for state in (IDENTIFIED, HOMED):
             record.reach(state, wrong)
         operator = Operator(yes=True, say=said.append)
-        place = Place(wrong, record, operator, on_imu_port=sim.start_phone)
+        place = Place(wrong, record, operator, listeners=(sim.answer,))
         start, far = sim.plant.joints(), np.zeros(3)
         attitude = sim.plant.attitude
 
@@ -399,7 +398,7 @@ def _host_cell(
         code, resumes, said = first, 0, []
         while code != 0 and resumes < MAX_RESUMES:
             resumes += 1
-            code = session(config, folder, sim, said, on_imu_port=lambda port: None)
+            code = session(config, folder, sim, said, answer=False)
             # Killed in its last phase, the run has nothing left to move or to stop.
             over = fault == "sigkill" and phase == "finishing"
             armed = not over and code != 2

@@ -8,8 +8,8 @@ import numpy as np
 
 from rig.config import RigConfig
 from rig.core.attitude import ORDERS, Frame
+from rig.core.identify import pairs
 from rig.journal import Record
-from rig.workbench.identification.fit import pairs
 
 
 def order_residuals(
