@@ -6,6 +6,7 @@ import json
 import pathlib
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -64,12 +65,17 @@ FIGURES: dict[str, Callable[[], Figure]] = {
 }
 
 
+def benchmarks() -> dict[str, Any]:
+    """What `make benchmark` found, as committed."""
+    return json.loads((ROOT / "docs" / "benchmarks" / "results.json").read_text())
+
+
 def draw_all() -> dict[str, bytes]:
     """Path on the site to image."""
     found = {path: as_bytes(draw(), "png") for path, draw in FIGURES.items()}
     for name in common.NAMES:
         found[f"examples/{name}.png"] = as_bytes(common.picture(name), "png")
-    results = json.loads((ROOT / "docs" / "benchmarks" / "results.json").read_text())
+    results = benchmarks()
     found["benchmarks/benchmark.png"] = as_bytes(report.overview(results), "png")
     scaling = report.scaling(results["scaling"]["series"])
     found["benchmarks/scaling.png"] = as_bytes(scaling, "png")

@@ -85,6 +85,7 @@ def on_files(files: Any, config: Any) -> Any:
         add(f"reference/{module}.md", api_page(module))
     add("reference/commands.md", reference.commands())
     add("reference/configuration.md", reference.configuration())
+    add("benchmarks/table.md", figures.report.table(figures.benchmarks()))
     for name in ("CHANGELOG.md", "CONTRIBUTING.md"):
         text = (ROOT / name).read_text(encoding="utf-8")
         add(name, text.replace("](docs/", "]("))
