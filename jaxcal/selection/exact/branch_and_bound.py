@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal import compiled
+from jaxcal.information.blocks import largest_rank
 from jaxcal.information.criterion import Criterion
 
 __all__ = ["TOLERANCE", "BranchResult", "branch_and_bound"]
@@ -108,7 +109,7 @@ def _search(
     """The compiled search in numbers near 1, and unit and origin of its values."""
     kernel = compiled.kernel("jaxcal.selection.exact.kernel")
     root = criterion.root
-    rank = 1 if blocks.shape[1] == 1 else int(np.linalg.matrix_rank(blocks).max())
+    rank = largest_rank(blocks)
     p = len(prior)
     scale, shift = 1.0, 0.0
     if criterion.kind == "det" and len(root) == p:
