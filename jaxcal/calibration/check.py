@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration.fitted import Fitted
+from jaxcal.calibration.fit import Fit
 from jaxcal.checks import table, whole_number
 from jaxcal.models import SerialChain
 
@@ -45,7 +45,7 @@ class Check:
 
 
 def check(
-    calibration: Fitted,
+    calibration: Fit,
     commands: ArrayLike,
     measured: ArrayLike,
     tolerance: float | None,
@@ -135,7 +135,7 @@ def _noncentrality(freedom: int) -> float:
 
 
 def verification(
-    calibration: Fitted,
+    calibration: Fit,
     candidates: ArrayLike,
     k: int,
     region: ArrayLike | None,
