@@ -172,7 +172,8 @@ class Observer:
             if abs(goal - here) > axis.pulses_within(tolerance):
                 raise MotionFault(
                     f"{axis.name} left its target while settling: {here} pulses "
-                    f"instead of {goal}. Check holding torque and load"
+                    f"instead of {goal}. Check holding torque and load, and that no "
+                    "other controller moves it"
                 )
 
     def _check_agreement(self, commanded: Array, measured: Array, label: str) -> None:

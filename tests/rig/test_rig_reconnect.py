@@ -1,10 +1,18 @@
 """A phone that comes back on a new connection may have another heading."""
 
 import dataclasses
+import threading
 
 import numpy as np
 import pytest
-from harness import commissioned, fast_config, make_run, on_phase, simulator
+from harness import (
+    commissioned,
+    fast_config,
+    make_run,
+    on_phase,
+    session,
+    simulator,
+)
 
 from rig.core.session import run_safely
 from rig.journal import read_journal
@@ -70,3 +78,30 @@ def test_a_zero_that_moved_at_the_end_of_a_collection_is_told(tmp_path):
     code, _, said = collected(tmp_path / "run", "saving", heading=0.0, drift=3.0)
     assert code == 1
     assert any(line.startswith("RECALIBRATE: the zero posture reads") for line in said)
+
+
+class HeldTerminal(list):
+    """Ctrl-S was pressed: what is printed after the first warning waits."""
+
+    def __init__(self):
+        self.held = threading.Event()
+
+    def append(self, line):
+        super().append(line)
+        if line.startswith("WARNING"):
+            self.held.wait(30)
+
+
+def test_a_held_terminal_does_not_hold_the_thread_that_hears_the_phone(tmp_path):
+    said, done = HeldTerminal(), []
+    with simulator(fast_config()) as sim:
+
+        def intrude(run, entered):
+            if len(run.journal.events("posture")) == 2 and not done:
+                done.append(entered)
+                sim.faults.add(parse_fault("imu_second_sender,count=1"))
+
+        code = session(sim.start(), tmp_path / "run", sim, said, [intrude])
+    said.held.set()
+    assert code == 0, said[-5:]
+    assert any(line.startswith("WARNING: refused a sender") for line in said)

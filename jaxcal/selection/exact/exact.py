@@ -182,7 +182,8 @@ def _pool(problem: Problem, hull: bool) -> Indices:
     usable[problem.required] = False
     pool = np.flatnonzero(usable)
     n = problem.num_regressors - 1
-    if not hull or n > _LARGEST_HULL_DIMENSION or len(pool) <= n + 2:
+    few = math.comb(len(pool), n + 1) <= _CHEAP  # faster than loading qhull
+    if not hull or n > _LARGEST_HULL_DIMENSION or few:
         return pool
     # Whitened postures lie in a plane across the sum of all rows: reflected so that it
     # is the first axis, the other axes are coordinates in that plane.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,15 @@ def listen(run: Run) -> None:
 
     Both are listeners: a session neither waits for them nor needs them.
     """
-    run.listeners.append(lambda record: run.say(*_lines(run, record)))
+
+    def say(record: dict[str, Any]) -> None:
+        lines = _lines(run, record)
+        if threading.current_thread() is threading.main_thread():
+            run.say(*lines)
+        elif lines:  # a terminal held by Ctrl-S must not hold the phone's thread too
+            threading.Thread(target=run.say, args=lines, daemon=True).start()
+
+    run.listeners.append(say)
     run.attachments.append(_telemetry)
 
 
