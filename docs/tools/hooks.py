@@ -98,6 +98,15 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
+    """The home page shows the table of figures that README has."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    figures = readme.partition("<!-- figures -->")[2].partition("<!-- end -->")[0]
+    return markdown.replace(
+        "<!-- figures of README -->", figures.replace("](docs/", "](")
+    )
+
+
 def on_post_page(output: str, page: Any, config: Any) -> str:
     """The theme's only script from elsewhere gives way to docs/assets."""
     shim = page.url.count("/") * "../" + "assets/file_worker.js"
