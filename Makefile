@@ -40,8 +40,12 @@ reproduce: $(READY) ## the paper's figures, tables and claims from our own runs,
 # Most of a first run is XLA compiling: without its optimiser that takes a third of the
 # time. `make test-all` compiles as users do.
 test: export XLA_FLAGS ?= --xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false
+# Hundreds of programs are started: what one has compiled the others load.
+test: export PYTHONDONTWRITEBYTECODE =
+# Half of the rig's tests wait for a device, so four share two cores, file by file in order:
+# xdist would put the files of few long tests last.
 test: lint ## set everything up, lint, and run the quick tests (the ones CI runs)
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m 'not slow' $(ARGS)
+	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder -m 'not slow' $(ARGS)
 
 test-all: $(DOCS) lint ## every test, the slow ones too, hypothesis drawing new examples
 	$(BIN)/python -m pytest --hypothesis-profile=new $(ARGS)

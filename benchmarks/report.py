@@ -57,30 +57,52 @@ def judged(verdict: dict[str, Any], quick: bool) -> str:
 
 
 def table(results: dict[str, dict[str, Any]]) -> str:
-    """Markdown: a part a row."""
-    out = ["# Benchmarks", "", "Written by `python -m benchmarks`."]
+    """Markdown: the least favourable figure of each row, then every figure."""
+    out = ["# Benchmarks", "", "Written by `python -m benchmarks`.", ""]
+    out += ["| row | least favourable figure | promises kept |", "|---|---|---|"]
+    for row in results.values():
+        verdicts = row["verdicts"]
+        if verdicts:
+            least = judged(min(verdicts, key=margin), row["quick"])
+            kept = sum(verdict["met"] for verdict in verdicts)
+            title = f"[{row['title']}](#{row['name']})"
+            out.append(f"| {title} | {least} | {kept} of {len(verdicts)} |")
     for row in results.values():
         where = row["machine"]
-        out += ["", f"## {row['title']}", ""]
         quick = ", QUICK: sizes too small to quote" if row["quick"] else ""
         out += [
+            "",
+            f"## {row['title']} {{#{row['name']}}}",
+            "",
             f"`python -m benchmarks --only {row['name']}`, {row['date'][:10]}, "
             f"{where['cores']} cores ({where['processor']}), load average before "
             f"{where['load_before']}, {row['seconds']:.0f} s{quick}.",
             "",
-            "| case | who | figure | unit | |",
-            "|---|---|---|---|---|",
+            "| case | who | figure | |",
+            "|---|---|---|---|",
         ]
         for line in row["lines"]:
+            figure = f"{number(line['value'])} {line['unit']}"
             out.append(
-                f"| {line['case']} | {line['who']} | {number(line['value'])} | "
-                f"{line['unit']} | {line['note']} |"
+                f"| {line['case']} | {line['who']} | {figure} | {line['note']} |"
             )
-        if row["verdicts"]:
+        if any(not verdict["met"] for verdict in row["verdicts"]) or row["notes"]:
             out.append("")
-        out += [f"- {judged(verdict, row['quick'])}" for verdict in row["verdicts"]]
+        out += [
+            f"- {judged(verdict, row['quick'])}"
+            for verdict in row["verdicts"]
+            if not verdict["met"]
+        ]
         out += [f"- {note}" for note in row["notes"]]
     return "\n".join(out) + "\n"
+
+
+def margin(verdict: dict[str, Any]) -> float:
+    """What was achieved over what was wanted: below 1 where a promise is missed."""
+    value, target = verdict["value"], verdict["target"]
+    if value is None or value <= 0.0:
+        return 0.0
+    return float(value / target if verdict["larger"] else target / value)
 
 
 def write(folder: pathlib.Path, results: dict[str, dict[str, Any]]) -> None:
@@ -104,11 +126,9 @@ def overview(results: dict[str, dict[str, Any]]) -> Any:
         if row["quick"]:
             continue
         for verdict in row["verdicts"]:
-            value, target = verdict["value"], verdict["target"]
-            if value is None or value <= 0:
-                continue
-            share = value / target if verdict["larger"] else target / value
-            bars.append((f"{row['name']}: {verdict['case']}", share, number(value)))
+            if share := margin(verdict):
+                label = f"{row['name']}: {verdict['case']}"
+                bars.append((label, share, number(verdict["value"])))
     figure = Figure(figsize=(10, 1.2 + 0.3 * len(bars)), layout="constrained")
     axes = figure.add_subplot()
     for place, (_, share, shown) in enumerate(reversed(bars)):

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jaxcal.learning.core import ppo
 from jaxcal.learning.runtime import cache, devices
 from jaxcal.learning.training import presets
+from jaxcal.learning.training.run import updates
 
 
 def measure(preset: str, number: int, seeds: int, num_updates: int) -> dict[str, float]:
@@ -31,7 +32,7 @@ def measure(preset: str, number: int, seeds: int, num_updates: int) -> dict[str,
     keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
     begin = jax.vmap(lambda key: ppo.begin(config.ppo, learner, key))
     state = devices.replicate(jax.jit(begin)(keys), mesh)
-    update = ppo.updates(config.ppo, learner, mesh, num_updates, seeds)
+    update = updates(config.ppo, learner, mesh, num_updates, seeds)
     for warm in (True, False):
         wall, used = time.perf_counter(), time.process_time()
         state, _ = update(state, jnp.int32(1 if warm else num_updates))

@@ -13,18 +13,20 @@ over the seeds, the range and the standard deviation (n - 1). A run that is alre
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
 import pathlib
 import tempfile
 import time
 
 import numpy as np
 
+from jaxcal.commands.train import main as train
 from jaxcal.information.regression import log_det_information
 from jaxcal.learning.runtime import cache
 from jaxcal.learning.training import presets
 from jaxcal.selection import exact_batch
 from jaxcal.selection.policy import select_batch
-from studies.paper.training_runs import train_seed
 
 HIT = 1e-8
 NAMES = ("ratio", "hit_rate", "ratio of 8", "hits of 8")
@@ -61,10 +63,12 @@ def main() -> None:
         rows = []
         for seed in seeds:
             folder = root / f"seed_{seed}"
-            values = {"seed": seed, "num_episodes": budget}
-            config = presets.with_values(presets.load("compact"), values)
             begun = time.perf_counter()
-            train_seed(config, folder, validate=False)
+            if not (folder / "checkpoint").is_dir():
+                flags = {"--seed": seed, "--episodes": budget, "--out": folder}
+                given = [str(word) for flag in flags.items() for word in flag]
+                with contextlib.redirect_stdout(io.StringIO()):
+                    assert train(["--no-validation", *given]) == 0
             seconds = time.perf_counter() - begun
             rows.append(measure(folder, sets, optimum.log_det))
             print(f"{seed:8d}" + line(rows[-1]) + f"{seconds:14.0f}", flush=True)

@@ -1,13 +1,41 @@
-"""Whether a checkout's compiled kernels are those of its sources."""
+"""Compiled kernels: loading them, and whether a checkout's are those of its sources."""
 
 from __future__ import annotations
 
+import functools
+import importlib.util
 import os
 import pathlib
 import sys
-from importlib.machinery import EXTENSION_SUFFIXES
+from importlib.machinery import EXTENSION_SUFFIXES, PathFinder
+from typing import Any
 
-__all__ = ["check"]
+__all__ = ["check", "kernel"]
+
+
+@functools.cache
+def kernel(name: str) -> Any:
+    """The kernel ``name``, which calls BLAS, without loading the package scipy.linalg.
+
+    A compiled ``cimport`` asks for the modules scipy.linalg.cython_blas, cython_lapack
+    and only for their functions; the package around them loads for 0.4 s. So both are
+    loaded from their files here, and forgotten again: whoever imports them later gets
+    the same modules in the usual way.
+    """
+    import scipy
+
+    names = [f"scipy.linalg.cython_{each}" for each in ("blas", "lapack")]
+    alone = [each for each in names if each not in sys.modules]
+    try:
+        for each in alone:
+            spec = PathFinder.find_spec(each, [f"{scipy.__path__[0]}/linalg"])
+            if spec is not None and spec.loader is not None:
+                sys.modules[each] = importlib.util.module_from_spec(spec)
+                spec.loader.exec_module(sys.modules[each])
+        return importlib.import_module(name)
+    finally:
+        for each in alone:
+            sys.modules.pop(each, None)
 
 
 def check(package: pathlib.Path) -> None:

@@ -15,6 +15,7 @@ from rig.core.stop import Requests
 STOPS = (
     signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT, signal.SIGTSTP,
 )  # fmt: skip
+PAUSE = signal.SIGUSR1  # of the page: may come twice, and never stops
 IGNORED = (signal.SIGTTOU,)  # output from the background must not suspend it
 HANDLED_S = 0.2  # until the main thread has run a handler, unless it hangs
 
@@ -43,7 +44,7 @@ class Signals(Requests):
             listener = threading.Thread(target=self._listen, args=[self._pipe[0]])
             listener.daemon = True
             listener.start()
-            for number in STOPS:
+            for number in (*STOPS, PAUSE):
                 self._previous[number] = signal.signal(number, self._handle)
             for number in IGNORED:
                 self._previous[number] = signal.signal(number, signal.SIG_IGN)
@@ -70,7 +71,8 @@ class Signals(Requests):
         os.close(pipe)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
-        if number == signal.SIGINT and not self.pause and self.armed:
+        first = number == signal.SIGINT and not self.pause and self.armed
+        if first or number == PAUSE:
             self.pause = True
             return
         self.request_stop(signal.Signals(number).name, 128 + number)

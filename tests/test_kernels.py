@@ -79,3 +79,22 @@ def test_a_machine_without_a_compiler_builds_the_wheel(tmp_path):
     names = zipfile.ZipFile(next(tmp_path.glob("*.whl"))).namelist()
     assert any(name.startswith("jaxcal/selection/policy/kernel.") for name in names)
     assert not [name for name in names if name.endswith(("kernel.py", ".pxd"))]
+
+
+def test_the_first_answers_load_no_package_of_scipy():
+    """Its packages take 0.3 to 1 s to load; kernels call BLAS all the same."""
+    code = """
+import sys
+import numpy as np
+from jaxcal import select
+candidates = np.random.default_rng(0).random((50, 3))
+for arguments in ((4,), (6,), (6, "exchange"), (4, "policy")):
+    select(candidates, *arguments)
+print([m for m in ("scipy.linalg", "scipy.spatial") if m in sys.modules])
+import scipy.linalg.cython_blas
+print(callable(scipy.linalg.cython_blas.__pyx_capi__.get), scipy.linalg.det([[2.0]]))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines() == ["[]", "True 2.0"]

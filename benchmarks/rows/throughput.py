@@ -19,6 +19,7 @@ from benchmarks.harness import (
 )
 from jaxcal.learning.core import ppo
 from jaxcal.learning.training import presets
+from jaxcal.learning.training.run import updates
 
 NAME = "throughput"
 TITLE = "Training throughput, paper preset (3.5 M parameters)"
@@ -30,7 +31,7 @@ def ours() -> Callable[[], None]:
     """An update of the paper preset."""
     config = presets.load("paper")
     learner = config.learners[0]
-    step = ppo.updates(config.ppo, learner)
+    step = updates(config.ppo, learner)
     held = [ppo.begin(config.ppo, learner, jax.random.key(0))]
 
     def update() -> None:

@@ -85,6 +85,7 @@ def on_files(files: Any, config: Any) -> Any:
         add(f"reference/{module}.md", api_page(module))
     add("reference/commands.md", reference.commands())
     add("reference/configuration.md", reference.configuration())
+    add("benchmarks/table.md", figures.report.table(figures.benchmarks()))
     for name in ("CHANGELOG.md", "CONTRIBUTING.md"):
         text = (ROOT / name).read_text(encoding="utf-8")
         add(name, text.replace("](docs/", "]("))
@@ -95,6 +96,15 @@ def on_files(files: Any, config: Any) -> Any:
     for path, image in figures.draw_all().items():
         add(path, image)
     return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
+    """The home page shows the table of figures that README has."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    figures = readme.partition("<!-- figures -->")[2].partition("<!-- end -->")[0]
+    return markdown.replace(
+        "<!-- figures of README -->", figures.replace("](docs/", "](")
+    )
 
 
 def on_post_page(output: str, page: Any, config: Any) -> str:

@@ -11,7 +11,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.fitted import Fitted
+from jaxcal.calibration.fit import Fit
 from jaxcal.models import SerialChain
 from jaxcal.models.sensors import Placed
 
@@ -55,7 +55,7 @@ class Verdict:
         return "\n".join([*lines, *self.reasons])
 
 
-def verdict(calibration: Fitted) -> Verdict | None:
+def verdict(calibration: Fit) -> Verdict | None:
     """Of an arm's calibration; None of other models, and where the noise is unknown."""
     model = calibration.model
     if not isinstance(model, SerialChain) or calibration.noise_std is None:
@@ -96,7 +96,7 @@ def verdict(calibration: Fitted) -> Verdict | None:
     )
 
 
-def _left_out(calibration: Fitted, model: SerialChain, used: NDArray[np.intp]) -> Array:
+def _left_out(calibration: Fit, model: SerialChain, used: NDArray[np.intp]) -> Array:
     """(N, q) residual of each measurement from the fit without it."""
     noise = np.diag(np.asarray(calibration.noise_std) ** 2)
     slopes = model.jacobian(calibration.commands[used], calibration.parameters)
@@ -110,7 +110,7 @@ def _left_out(calibration: Fitted, model: SerialChain, used: NDArray[np.intp]) -
     return np.asarray(white @ np.sqrt(noise))
 
 
-def _scattered(calibration: Fitted, usual: Array) -> tuple[bool, list[str]]:
+def _scattered(calibration: Fit, usual: Array) -> tuple[bool, list[str]]:
     """Whether the noise explains the scatter, and why not."""
     if calibration.noise_known:
         fit = calibration.lack_of_fit()
@@ -128,7 +128,7 @@ def _scattered(calibration: Fitted, usual: Array) -> tuple[bool, list[str]]:
     ]
 
 
-def _far(calibration: Fitted) -> list[str]:
+def _far(calibration: Fit) -> list[str]:
     """Parameters that were found far from what was known of them."""
     names = calibration.names
     p = len(names)
@@ -193,7 +193,7 @@ def _split(values: Array) -> tuple[float, int, float, float]:
     )
 
 
-def _swapped(calibration: Fitted, model: SerialChain) -> dict[int, int]:
+def _swapped(calibration: Fit, model: SerialChain) -> dict[int, int]:
     """Outliers that fit another socket or plane, as if their column were wrong."""
     sensor = model.sensor
     if not (isinstance(sensor, Placed) and sensor.zeros and sensor.count > 1):

@@ -112,7 +112,7 @@ def parser(prog: str) -> Parser:
             "postures",
             "what an episode is, in presets of one task; --kind paper reads --width "
             "alone of the network",
-            [f for part in ("ppo", "environment", "network")
+            [f for part in ("ppo", "run", "environment", "network")
              for f in settings_of(parts[part]) if f.name not in common],
         ),
         (
@@ -184,7 +184,7 @@ def _held(name: str, known: dict[str, TrainConfig]) -> str:
     """The value of compact, and of what differs: ``" [2; paper 10; tasks 4]"``."""
     values: dict[str, str] = {}
     for preset, config in known.items():
-        for part in (config.ppo, config.network, config.tasks[0].environment):
+        for part in (config, config.ppo, config.network, config.tasks[0].environment):
             if hasattr(part, name):
                 values[preset] = _shown(getattr(part, name))
     sizes = {f.name: f.default for f in PolicyConfig.__dataclass_fields__.values()}

@@ -13,11 +13,11 @@ import dataclasses
 import functools
 import json
 import math
+import operator
 import os
 import pathlib
 import signal
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -42,7 +42,8 @@ Cut = tuple[int, int]  # first episode, one after the last
 Numbers = dict[str, Any]  # of a row, see docs/evaluation.md
 
 PART = 5_000  # episodes whose rows are one file; the draws' blocks of 1,000 divide it
-_POLL_SECONDS = 1.0  # between looks for the parts of other processes
+_AVERAGES = ("ratio_to_exact", "hit_rate", "d_efficiency", "seconds_per_selection")
+_MOMENTS = ("det_s", "log_det_s")
 _ONE_THREAD = [f"{name}_NUM_THREADS" for name in ("OPENBLAS", "OMP", "MKL")]
 
 
@@ -75,15 +76,16 @@ class Plan:
 
     def description(self) -> dict[str, Any]:
         """What ``stream.json`` says: equal for folders whose parts add up."""
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        del values["draw"]
         weights = {}
         if any(method in POLICIES for method in self.methods):
             from jaxcal.learning.training.checkpoint import fingerprint
 
             weights = {c or "default": fingerprint(c) for c in self.checkpoints}
-        known = {"format": "jaxcal-evaluation-stream", "version": 3, "part": PART}
-        return known | values | {"weights": weights, "versions": versions()}
+        return {
+            **{"format": "jaxcal-evaluation-stream", "version": 3, "part": PART},
+            **{name: value for name, value in vars(self).items() if name != "draw"},
+            **{"weights": weights, "versions": versions()},
+        }
 
 
 def open_folder(plan: Plan, folder: pathlib.Path) -> None:
@@ -127,7 +129,8 @@ def evaluate_stream(
         folder: made ready by ``open_folder``; all processes see it.
         workers: processes on this machine that solve; its cores when None, none beside
             this one where 1.
-        process: (i, n), this is the i-th of n; each takes every n-th part.
+        process: (i, n), this is the i-th of n. Each takes every n-th part, then, last
+            ones first, those that the others have not written: none waits for another.
         progress: called as parts are completed.
 
     Raises:
@@ -136,16 +139,15 @@ def evaluate_stream(
     """
     cuts = [(begin, min(begin + PART, episodes)) for begin in range(0, episodes, PART)]
     own = cuts[process[0] :: process[1]]
-    own = [cut for cut in own if not _path(folder, cut).exists()]
-    todo, done = sum(end - begin for begin, end in own), 0
+    order = [*own, *(cut for cut in reversed(cuts) if cut not in own)]
+    order = [cut for cut in order if not _path(folder, cut).exists()]
+    todo, done = sum(end - begin for begin, end in order), 0
     progress("episodes", 0, todo)
     with _workers(_cores() if workers is None else workers) as run:
-        written = run(functools.partial(_write_part, plan, folder), own)
-        for (begin, end), _ in zip(own, written, strict=True):
+        written = run(functools.partial(_write_part, plan, folder), order)
+        for (begin, end), _ in zip(order, written, strict=True):
             done += end - begin
             progress("episodes", done, todo)
-    while not all(_path(folder, cut).exists() for cut in cuts):
-        time.sleep(_POLL_SECONDS)
 
     parts = [_read_part(_path(folder, cut), cut) for cut in cuts]
     counts = [end - begin for begin, end in cuts]
@@ -157,9 +159,8 @@ def evaluate_stream(
     for numbers in rows.values():
         mean = numbers["det_s"]["mean"]
         numbers["ratio_to_random"] = mean / random if mean and random else None
-    facts = plan.draw(plan.dataset, plan.seed, 0, 1).facts() | {"episodes": episodes}
     return Summary(
-        facts,
+        plan.draw(plan.dataset, plan.seed, 0, 1).facts() | {"episodes": episodes},
         plan.k,
         plan.seed,
         sum(part["proven"] for part in parts),
@@ -176,37 +177,29 @@ def total(counts: list[int], parts: list[Numbers]) -> Numbers:
         parts: their rows: averages over their episodes, each with as many draws.
     """
 
-    def mean(values: list[float | None]) -> float | None:
+    def mean(values: Iterable[float | None]) -> float | None:
         known = [value for value in values if value is not None]
-        if len(known) < len(values):
+        if len(known) < len(counts):
             return None
-        pairs = zip(counts, known, strict=True)
-        return math.fsum(n * value for n, value in pairs) / sum(counts)
+        return math.fsum(map(operator.mul, counts, known)) / sum(counts)
 
-    def moments(name: str) -> dict[str, float | None]:
-        held = [part[name] for part in parts]
-        found = {key: mean([one[key] for one in held]) for key in ("mean", "median")}
-        middle, std = found["mean"], None
+    def moments(held: list[dict[str, Any]]) -> dict[str, float | None]:
+        middle, std = mean(one["mean"] for one in held), None
         if middle is not None and all(one["std"] is not None for one in held):
-            variance = mean(
-                [one["std"] ** 2 + (one["mean"] - middle) ** 2 for one in held]
-            )
-            std = None if variance is None else variance**0.5
-        return {"mean": middle, "std": std, "median": found["median"]}
+            square = mean(one["std"] ** 2 + (one["mean"] - middle) ** 2 for one in held)
+            std = None if square is None else square**0.5
+        return {"mean": middle, "std": std, "median": mean(o["median"] for o in held)}
 
-    averages = (
-        *("ratio_to_exact", "hit_rate", "d_efficiency"),
-        "seconds_per_selection",
-    )
     return {
         **parts[0],  # its label and number of draws are those of all
-        "det_s": moments("det_s"),
-        "log_det_s": moments("log_det_s"),
-        **{name: mean([part[name] for part in parts]) for name in averages},
+        **{name: mean(part[name] for part in parts) for name in _AVERAGES},
+        **{name: moments([part[name] for part in parts]) for name in _MOMENTS},
     }
 
 
 def _write_part(plan: Plan, folder: pathlib.Path, cut: Cut) -> None:
+    if _path(folder, cut).exists():
+        return  # another process was sooner
     part = {"episodes": cut} | _solved(plan, *cut)
     write_text(_path(folder, cut), json.dumps(part, separators=(",", ":")) + "\n")
 

@@ -168,7 +168,8 @@ def _check_position(device: Device, target: Pulses, feedback: list[int]) -> None
         if abs(goal - here) > axis.pulses_within(tolerance):
             raise MotionFault(
                 f"{axis.name} left its target while settling: {here} pulses "
-                f"instead of {goal}. Check holding torque and load"
+                f"instead of {goal}. Check holding torque and load, and that no "
+                "other controller moves it"
             )
 
 

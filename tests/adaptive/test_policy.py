@@ -87,14 +87,12 @@ def test_every_stream_may_have_a_task_of_its_own():
     both = jax.tree.map(lambda *leaves: np.stack([*leaves] * 2), one, other)
     own = Streams(learner.config, learner.environment, learner.network, True)
     key = jax.random.key(2)
+    keys = jax.random.split(key, learner.config.rows_per_update)
     params = learner.init(key, one)
     for a, b in zip(leaves(params), leaves(own.init(key, both)), strict=True):
         np.testing.assert_array_equal(a, b)
     play = jax.jit(
-        lambda learner, task: learner.gather(
-            params, learner.draw(key, task), key, task
-        ),
-        static_argnums=0,
+        lambda learner, task: learner.gather(params, keys, task), static_argnums=0
     )
     mixed, _ = play(own, both)
     for task, streams in ((one, slice(0, None, 2)), (other, slice(1, None, 2))):

@@ -154,7 +154,7 @@ def test_stopping_and_sharing_do_not_change_a_digit(
     for name, stamp in stamps.items():
         assert (stopped / name).stat().st_mtime_ns == stamp
 
-    # Three processes: each waits for the parts of the others.
+    # Three processes: each evaluates what the others have not.
     def shared(number: int) -> Summary:
         place = tmp_path / "shared"
         return run(place, 7_300, process=(number, 3))
@@ -162,6 +162,9 @@ def test_stopping_and_sharing_do_not_change_a_digit(
     with ThreadPoolExecutor(3) as threads:
         for found in threads.map(shared, range(3)):
             assert exact_numbers(found) == whole
+
+    # Of three, two died before their first part: the third waits for nobody.
+    assert exact_numbers(run(tmp_path / "left", 7_300, process=(1, 3))) == whole
 
     # More episodes later go on from the whole parts that are there.
     grown = tmp_path / "grown"

@@ -22,7 +22,7 @@ from jaxcal.learning.runtime import devices
 from jaxcal.learning.core import ppo, postures
 from jaxcal.learning.core.postures import EpisodesConfig, Postures
 from jaxcal.learning.policies.build import build
-from jaxcal.learning.training import presets
+from jaxcal.learning.training import presets, run as training
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.environments.task import Task
@@ -52,7 +52,7 @@ def run(mesh, num_updates):
     learner = Postures(config, task, network)
     state = devices.replicate(ppo.begin(config, learner, jax.random.key(3)), mesh)
     rows, moments = [], None
-    update = ppo.updates(config, learner, mesh)
+    update = training.updates(config, learner, mesh)
     for _ in range(num_updates):
         state, metrics = update(state, jnp.int32(1))
         rows.append(jax.tree.map(lambda leaf: np.asarray(leaf)[0], metrics))
@@ -64,7 +64,7 @@ mesh = devices.make_mesh()
 out["devices"] = mesh.size
 one, other = run(None, 3), run(mesh, 3)
 out["moments"] = distance(one[2], other[2])
-out["gradient"] = max(float(np.abs(x).max()) for x in jax.tree.leaves(one[2][1][0].mu))
+out["gradient"] = max(float(np.abs(x).max()) for x in jax.tree.leaves(one[2][0].mu))
 out["losses"] = distance(
     [{n: r[n] for n in ("policy_loss", "value_loss", "kl")} for r in one[1]],
     [{n: r[n] for n in ("policy_loss", "value_loss", "kl")} for r in other[1]],
@@ -82,8 +82,8 @@ learner = Postures(config, task, network)
 params = learner.init(jax.random.key(0))
 
 def play(params, data, mesh):
-    key = jax.random.wrap_key_data(data)
-    return learner.gather(params, ppo.spread(learner.draw(key), mesh), key)[0]
+    keys = jax.random.split(jax.random.wrap_key_data(data), config.rows_per_update)
+    return learner.gather(params, ppo.placed(keys, mesh, "sets"))[0]
 
 data = jax.random.key_data(jax.random.key(1))
 with jax.disable_jit():

@@ -112,7 +112,7 @@ def work():
     assert devices.any_process(own == 1) and not devices.any_process(False)
     mesh = devices.make_mesh()
     tree = devices.replicate({"x": np.arange(8.0, dtype=np.float32)}, mesh)
-    total = jax.jit(lambda tree: ppo.spread(tree, mesh)["x"].sum())(tree)
+    total = jax.jit(lambda tree: ppo.placed(tree, mesh, "sets")["x"].sum())(tree)
     assert float(total) == 28.0 and len(devices.local(tree)["x"].devices()) == 1
     def fail():
         raise ValueError(f"only process {own} looked")

@@ -20,6 +20,7 @@ from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training import imitation
 from jaxcal.learning.training import postures as training
 from jaxcal.learning.training.config import TrainConfig
+from jaxcal.learning.training.run import updates
 
 PPO = EpisodesConfig(
     num_episodes=64 * 4,
@@ -27,7 +28,6 @@ PPO = EpisodesConfig(
     episodes_per_set=4,
     num_minibatches=2,
     warmup_updates=1,
-    imitation=0.5,
 )
 TASK = Task(
     SelectionConfig(11, 5, 1, 1, reward_gain=True),
@@ -37,13 +37,17 @@ TASK = Task(
 NETWORK = build(NetworkConfig(width=8, encoder_rounds=1))
 LEARNER = Postures(PPO, TASK, NETWORK)
 CONFIG = TrainConfig(
-    network=NetworkConfig(width=8, encoder_rounds=1), ppo=PPO, tasks=(TASK,), seed=3
+    network=NetworkConfig(width=8, encoder_rounds=1),
+    ppo=PPO,
+    tasks=(TASK,),
+    imitation=0.5,
+    seed=3,
 )
 
 
 def key_of(index):
     """The key of a lesson, as a run derives it."""
-    return jax.random.fold_in(ppo.streams_of(jax.random.key(3))[2], index)
+    return jax.random.fold_in(ppo.keys_of(jax.random.key(3))[2], index)
 
 
 def brute_force(candidates, available, given, k):
@@ -100,7 +104,7 @@ def test_lessons_share_no_key_with_the_weights_and_the_updates():
         jax.random.key_data(jax.random.split(key)[1]),
         jax.random.key_data(jax.random.fold_in(key, 1)),
     )
-    weights, played, _ = ppo.streams_of(key)
+    weights, played, _ = ppo.keys_of(key)
     assert np.array_equal(ppo.begin(PPO, LEARNER, key).key, jax.random.key_data(played))
     for index in range(3):
         drawn = imitation.draw(LEARNER, brute_force, key_of(index))
@@ -168,16 +172,14 @@ def test_the_order_of_the_candidates_does_not_matter(lesson, rng):
 
 @pytest.mark.slow
 def test_lessons_teach():
-    config = dataclasses.replace(
-        PPO, num_episodes=64 * 40, imitation=1.0, learning_rate=5e-3
-    )
+    config = dataclasses.replace(PPO, num_episodes=64 * 40, learning_rate=5e-3)
     # Without the look-ahead it has to be learned what to choose.
     network = build(NetworkConfig(width=8, encoder_rounds=1, lookahead=1))
     learner = Postures(config, Task(SelectionConfig(num_candidates=8)), network)
     state = ppo.begin(config, learner, jax.random.key(3))
-    update = ppo.updates(config, imitation.Imitation(learner))
+    update = updates(config, imitation.Imitation(learner))
     losses = []
-    for index in range(config.num_imitated):
+    for index in range(config.num_updates):
         shown = imitation.draw(learner, brute_force, key_of(index))
         state, metrics = update(state, jnp.int32(1), shown)
         losses.append(float(metrics["policy_loss"][0]))

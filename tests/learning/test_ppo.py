@@ -22,6 +22,7 @@ from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training.config import TrainConfig
+from jaxcal.learning.training.run import updates
 
 SMALL = NetworkConfig(width=8, encoder_rounds=1)
 TINY = EpisodesConfig(
@@ -122,15 +123,28 @@ def test_a_value_that_is_far_off_is_still_pulled():
 
 
 @pytest.mark.parametrize("size", [1e-3, 0.2, 30.0])
-def test_clipping_is_that_of_optax(rng, size):
-    grads = {"a": size * rng.normal(size=(7, 3)), "b": size * rng.normal(size=4)}
-    grads = jax.tree.map(jnp.asarray, grads)
-    ours = ppo._clip_by_global_norm(0.5)
-    theirs = optax.clip_by_global_norm(0.5)
-    got, _ = ours.update(grads, ours.init(grads))
-    expected, _ = theirs.update(grads, theirs.init(grads))
-    for name in grads:
-        np.testing.assert_allclose(got[name], expected[name], rtol=1e-5)
+def test_a_gradient_step_is_that_of_optax(rng, size):
+    """Clipping by the global norm, then Adam under the schedule."""
+    config = dataclasses.replace(TINY, num_minibatches=1, num_epochs=1)
+    params = {"a": rng.normal(size=(7, 3)), "b": rng.normal(size=4)}
+    params = jax.tree.map(jnp.asarray, params)
+    grads = jax.tree.map(lambda leaf: size * jnp.sin(leaf), params)
+    ours = ppo.TrainState(
+        params, params, ppo.optimiser(config).init(params), None, jnp.int32(0)
+    )
+    chain = optax.chain(
+        optax.clip_by_global_norm(config.max_grad_norm),
+        optax.adam(ppo.schedule(config), eps=1e-5),
+    )
+    state, theirs = chain.init(params), params
+    for _ in range(2):
+        ours, _ = ppo.epochs(
+            config, ours, 4, lambda params, index: (grads, {}), jax.random.key(0)
+        )
+        changes, state = chain.update(grads, state, theirs)
+        theirs = optax.apply_updates(theirs, changes)
+    for name in params:
+        np.testing.assert_allclose(ours.params[name], theirs[name], rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -151,8 +165,8 @@ def test_the_first_minibatch_sees_the_probabilities_that_played(kind, n, k):
 
     @jax.jit
     def play(params):
-        key = jax.random.key(1)
-        return learner.gather(params, learner.draw(key), key)
+        keys = jax.random.split(jax.random.key(1), config.rows_per_update)
+        return learner.gather(params, keys)
 
     played, _ = play(params)
     _, metrics = jax.jit(learner.loss)(params, played, jnp.int32(0))
@@ -259,8 +273,8 @@ def test_a_gradient_in_slices_is_that_of_the_whole():
     task = Task(SelectionConfig(8, 5, 2, 2, reward_gain=True), random_starts=0.6)
     learner = Postures(config, task, build(SMALL))
     params = learner.init(jax.random.key(0))
-    key = jax.random.key(1)
-    played, _ = jax.jit(lambda p: learner.gather(p, learner.draw(key), key))(params)
+    keys = jax.random.split(jax.random.key(1), config.rows_per_update)
+    played, _ = jax.jit(learner.gather)(params, keys)
     counted = np.asarray(played.counted).sum((1, 2))
     assert counted[:4].sum() != counted[4:].sum()
 
@@ -285,8 +299,8 @@ def test_a_gradient_in_slices_is_that_of_the_whole():
 
 def test_cutting_a_run_into_calls_changes_no_bit_and_a_seed_compiles_nothing():
     config, (learner,) = PROBE.ppo, PROBE.learners
-    update = ppo.updates(config, learner, None, 8)
-    assert ppo.updates(config, learner, None, 8) is update
+    update = updates(config, learner, None, 8)
+    assert updates(config, learner, None, 8) is update
     ends = []
     for counts in ((1,) * 6, (6,), (2, 4)):
         state = ppo.begin(config, learner, jax.random.key(3))
@@ -336,8 +350,8 @@ def test_the_averaged_weights_owe_nothing_to_the_initial_ones(rng):
     data, seen = jnp.asarray(rng.normal(size=(4, 3)), jnp.float32), []
     for _ in range(4):
         state, _ = ppo.epochs(
-            state,
             config,
+            state,
             4,
             jax.grad(
                 lambda params, index: (

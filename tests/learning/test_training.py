@@ -31,6 +31,7 @@ from jaxcal.learning.training import postures as training
 from jaxcal.learning.training.checkpoint import CheckpointError
 from jaxcal.learning.training.config import TrainConfig
 from jaxcal.learning.training.postures import COLUMNS, MEASURED, Validation
+from jaxcal.learning.training.run import updates
 
 ROOT = pathlib.Path(__file__).parents[2]
 
@@ -85,8 +86,8 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished, tmp_path):
 
 def test_updates_compile_once_and_change_every_weight(finished):
     for learner in CONFIG.learners:
-        assert ppo.updates(CONFIG.ppo, learner, None, 1, 0)._cache_size() == 1
-    begun = CONFIG.learners[0].init(ppo.streams_of(jax.random.key(3))[0])
+        assert updates(CONFIG.ppo, learner, None, 1, 0)._cache_size() == 1
+    begun = CONFIG.learners[0].init(ppo.keys_of(jax.random.key(3))[0])
     moved = jax.tree.map(lambda a, b: (a != b).any(), begun, finished[1].params)
     # The value reads every part of the network, the policy all but the critic.
     assert all(jax.tree.leaves(moved))

@@ -1,19 +1,16 @@
-"""Kept training runs: thinning, what is refused, and the command from end to end."""
+"""Kept training runs: thinning, and the command from end to end."""
 
 from __future__ import annotations
 
 import json
 import pathlib
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
+from jaxcal.commands.train import main as train
 from jaxcal.evaluation.training_figure import read_metrics
 from studies.paper.training_runs import main, thinned
-
-ROOT = pathlib.Path(__file__).parents[2]
 
 
 def test_thinning_keeps_moments_and_last_values(rng: np.random.Generator) -> None:
@@ -39,71 +36,29 @@ def test_thinning_keeps_moments_and_last_values(rng: np.random.Generator) -> Non
     assert thinned(metrics, len(rewards)) is metrics
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ([], "give one of --preset and --collect"),
-        (["--preset", "best"], "--preset must be one of compact, general, paper"),
-        (["--preset", "compact", "--seeds", "x"], "a number of seeds or a list"),
-        (["--preset", "compact", "--seeds", "1,-2"], "a number of seeds or a list"),
-        (
-            ["--preset", "compact", "--episodes", "0"],
-            "--episodes: must be a whole number of at least 1, got '0'",
-        ),
-        (["--collect", "{tmp}", "--seeds", "3"], "go with --preset"),
-        (["--collect", "{tmp}"], "holds no metrics.csv"),
-    ],
-)
-def test_bad_arguments(
-    arguments: list[str],
-    message: str,
-    tmp_path: pathlib.Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    given = [word.replace("{tmp}", str(tmp_path)) for word in arguments]
-    try:
-        code = main([*given, "--out", str(tmp_path / "out")])
-    except SystemExit as stop:
-        assert isinstance(stop.code, int)
-        code = stop.code
-    error = capsys.readouterr().err
-    assert code == 2 and message in error and error.count("\n") == 1
-
-
-def test_a_kept_run_of_another_budget_is_not_overwritten(
+def test_a_folder_that_is_no_run_is_named(
     tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    held = tmp_path / "seed_0" / "summary.json"
-    held.parent.mkdir()
-    text = json.dumps(
-        {"preset": "compact", "planned_episodes": 16, "seed": 0, "finished": True}
-    )
-    held.write_text(text)
-    given = ["--preset", "compact", "--seeds", "1", "--out", str(tmp_path)]
-    assert main([*given, "--runs", str(tmp_path / "runs")]) == 2
-    assert "16 episodes" in capsys.readouterr().err
-    assert held.read_text() == text
+    assert main([str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert f"{tmp_path} holds no metrics.csv" in error and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
-def test_the_command_trains_keeps_and_does_not_train_again(
-    tmp_path: pathlib.Path,
+def test_a_run_of_train_is_kept(
+    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = [sys.executable, "-m", "studies.paper.training_runs"]
-    folders = ["--out", str(tmp_path / "kept"), "--runs", str(tmp_path / "runs")]
-    given = [*command, "--preset", "compact", "--seeds", "3,3", "--episodes", "4096"]
-    done = subprocess.run([*given, *folders], capture_output=True, text=True, cwd=ROOT)
-    assert done.returncode == 0, done.stderr
-    kept = tmp_path / "kept" / "seed_3"
+    run, kept = tmp_path / "seed_3", tmp_path / "kept" / "seed_3"
+    given = ["--seed", "3", "--episodes", "4096", "--out", str(run)]
+    assert train(given) == 0
+    assert main([str(run), "--out", str(kept.parent)]) == 0
+    assert "4,096 of 4,096 episodes" in capsys.readouterr().out
     summary = json.loads((kept / "summary.json").read_text())
     assert summary["seed"] == 3 and summary["finished"]
     assert summary["episodes"] == summary["planned_episodes"] == 4096
     assert summary["parameters"] == 42946
     assert 0.0 < summary["dataset2"]["ratio_to_exact"] <= 1.0
-    metrics = read_metrics(kept / "metrics.csv")
-    run = read_metrics(tmp_path / "runs" / "seed_3" / "metrics.csv")
-    np.testing.assert_allclose(metrics["reward_mean"], run["reward_mean"], rtol=1e-5)
-    rewards = np.load(kept / "last_rewards.npy")
-    assert rewards.shape == (1000,)
-    again = subprocess.run([*given, *folders], capture_output=True, text=True, cwd=ROOT)
-    assert again.returncode == 0 and "already finished" in again.stdout
+    metrics, whole = (read_metrics(f / "metrics.csv") for f in (kept, run))
+    np.testing.assert_allclose(metrics["reward_mean"], whole["reward_mean"], rtol=1e-5)
+    assert np.load(kept / "last_rewards.npy").shape == (1000,)

@@ -120,6 +120,7 @@ def session(
     listeners=(),
     answer: bool = True,
     figures: bool = False,
+    record: DeviceRecord | None = None,
 ) -> int:
     """One session in this process; the same call again resumes it.
 
@@ -132,7 +133,7 @@ def session(
         folder,
         "calibrate",
         (said if said is not None else []).append,
-        record=commissioned(config, folder, sim),
+        record=record or commissioned(config, folder, sim),
         start={"simulated": None, "inputs": {}, "maps_from": "."},
         reset_alarms=True,
     )

@@ -24,7 +24,7 @@ from harness import changed, fast_text, simulator
 
 from rig.config import parse_config
 from rig.journal import read_journal
-from rig.workbench.live.launch import TOKEN
+from rig.workbench.live.launch import SERVER, TOKEN
 
 pytest.importorskip("nicegui")
 webdriver = pytest.importorskip("selenium.webdriver")
@@ -69,9 +69,9 @@ class Rig:
         sock = socket.create_server(("127.0.0.1", 0))
         self.port = sock.getsockname()[1]
         with sock:
-            command = [sys.executable, "-m", "rig.workbench.live", str(self.folder)]
+            command = [sys.executable, "-m", SERVER, str(self.folder)]
             self.page = subprocess.Popen(
-                [*command, "--fd", str(sock.fileno())],
+                [*command, str(sock.fileno())],
                 pass_fds=[sock.fileno()],
                 env=os.environ | {TOKEN: token},
             )
@@ -211,13 +211,27 @@ def test_stop_stops_all_drives(rig, browse):
     assert "jaxcal-rig resume" in told
 
 
+def test_a_stop_without_an_answer_is_red_after_a_second(rig, browse):
+    """C: the page said "STOP sent", and nothing stopped."""
+    driver = browse(rig)
+    until(lambda: shown(driver, "#stop"))
+    rig.page.send_signal(signal.SIGSTOP)
+    driver.find_element("id", "stop").click()
+    begun = time.monotonic()
+    until(lambda: "NO ANSWER: use the emergency stop" in words(driver, "#answer"), 5)
+    assert 0.5 < time.monotonic() - begun < 3.0
+    assert driver.find_element("id", "answer").get_attribute("class") == "bad"
+    rig.page.send_signal(signal.SIGCONT)
+    until(lambda: words(driver, "#answer").startswith("STOPPED: pitch"))
+    assert driver.find_element("id", "answer").get_attribute("class") == "good"
+
+
 def test_pause_lets_the_posture_be_finished(rig, browse):
     driver = browse(rig)
     until(lambda: shown(driver, "#pause"))
     driver.find_element("id", "pause").click()
     until(lambda: "pause asked for" in words(driver, "#answer"))
-    driver.find_element("id", "pause").click()
-    until(lambda: "asked for already" in words(driver, "#answer"))
+    driver.find_element("id", "pause").click()  # and no stop
     assert rig.session.wait(PATIENT_S) == 4
     visits = rig.records("visit")
     assert rig.records("posture")[-1]["name"] == visits[-1]["name"]

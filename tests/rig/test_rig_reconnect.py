@@ -1,10 +1,18 @@
 """A phone that comes back on a new connection may have another heading."""
 
 import dataclasses
+import threading
 
 import numpy as np
 import pytest
-from harness import commissioned, fast_config, make_run, on_phase, simulator
+from harness import (
+    commissioned,
+    fast_config,
+    make_run,
+    on_phase,
+    session,
+    simulator,
+)
 
 from rig.journal import read_journal
 from rig.simulator import Truth, parse_fault
@@ -14,10 +22,13 @@ from rig.workbench.run import run_safely
 TURNED = 25.0  # degrees: beyond the envelope of the limits, too
 
 
-def collected(folder, phase, heading=TURNED, drift=0.0):
+PUSHING = {'format = "hyperimu"': 'format = "sensorlogger"'}
+
+
+def collected(folder, phase, heading=TURNED, drift=0.0, changes=None):
     """Code and journal of a collection; at its third posture the phone comes back."""
     folder.mkdir(exist_ok=True)
-    config, done, said = fast_config(), [], []
+    config, done, said = fast_config(changes), [], []
     with simulator(config, truth=Truth(noise_deg=0.0)) as sim:
         served = sim.start()
         run = make_run(
@@ -49,12 +60,20 @@ def angles(records):
     return {r["name"]: r["measured_deg"] for r in records if r["event"] == "posture"}
 
 
-@pytest.mark.parametrize("phase", ["moving", "settling", "measuring", "saving"])
-def test_postures_after_it_are_as_right_as_those_before(phase, tmp_path):
+@pytest.mark.parametrize(
+    ("phase", "changes"),
+    [
+        *((p, None) for p in ("moving", "settling", "measuring", "saving")),
+        ("measuring", PUSHING),  # another session of the app, on any connection
+    ],
+)
+def test_postures_after_it_are_as_right_as_those_before(phase, changes, tmp_path):
     """E: `collect` stored every later yaw wrong and ended with 0."""
-    code, plain, said = collected(tmp_path / "plain", phase, heading=0.0)
+    code, plain, said = collected(
+        tmp_path / "plain", phase, heading=0.0, changes=changes
+    )
     assert code == 0, said[-5:]
-    code, records, said = collected(tmp_path / "turned", phase)
+    code, records, said = collected(tmp_path / "turned", phase, changes=changes)
     assert code == 0, said[-5:]
     found, wanted = angles(records), angles(plain)
     assert found.keys() == wanted.keys()
@@ -70,3 +89,30 @@ def test_a_zero_that_moved_at_the_end_of_a_collection_is_told(tmp_path):
     code, _, said = collected(tmp_path / "run", "saving", heading=0.0, drift=3.0)
     assert code == 1
     assert any(line.startswith("RECALIBRATE: the zero posture reads") for line in said)
+
+
+class HeldTerminal(list):
+    """Ctrl-S was pressed: what is printed after the first warning waits."""
+
+    def __init__(self):
+        self.held = threading.Event()
+
+    def append(self, line):
+        super().append(line)
+        if line.startswith("WARNING"):
+            self.held.wait(30)
+
+
+def test_a_held_terminal_does_not_hold_the_thread_that_hears_the_phone(tmp_path):
+    said, done = HeldTerminal(), []
+    with simulator(fast_config()) as sim:
+
+        def intrude(run, entered):
+            if len(run.journal.events("posture")) == 2 and not done:
+                done.append(entered)
+                sim.faults.add(parse_fault("imu_second_sender,count=1"))
+
+        code = session(sim.start(), tmp_path / "run", sim, said, [intrude])
+    said.held.set()
+    assert code == 0, said[-5:]
+    assert any(line.startswith("WARNING: refused a sender") for line in said)

@@ -83,19 +83,11 @@ def encode(network: Network, params: Any, features: Any) -> jax.Array:
 
 
 def decode(
-    network: Network, params: Any, memory: jax.Array, decision: Any, axes: int = 0
+    network: Network, params: Any, memory: jax.Array, decision: Any
 ) -> tuple[jax.Array, jax.Array]:
-    """Apply ``network.decode`` with given parameters: logits and value.
-
-    ``axes`` axes of decisions of the same set follow the first one, of the sets.
-    """
-
-    def scored(decision: Any) -> Any:
-        return network.apply({"params": params}, memory, decision, method="decode")
-
-    for _ in range(axes):
-        scored = jax.vmap(scored, in_axes=1, out_axes=1)
-    return cast(tuple[jax.Array, jax.Array], scored(decision))
+    """Apply ``network.decode`` with given parameters: logits and value."""
+    scored: Any = network.apply({"params": params}, memory, decision, method="decode")
+    return scored
 
 
 def mask_logits(logits: jax.Array, available: jax.Array) -> jax.Array:

@@ -1,27 +1,22 @@
 """Postures: episodes of K choices among M candidates, as PPO plays and scores them.
 
-Every update draws fresh candidate sets and plays several whole episodes on each, so the
-episodes of a set share its geometry, its encoding and its first decision, and are each
-other's baseline. All episodes are equally long: they are played step by step, with the
-network's last, unlearned choices made by its look-ahead.
+A row is a fresh candidate set and several whole episodes on it: they share its
+geometry, its encoding and its first decision, and are each other's baseline. All are
+equally long, so they are played step by step; the network's last, unlearned choices are
+made by its look-ahead.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcal.learning.core.network import (
-    Network,
-    decode,
-    encode,
-    initial,
-    mask_logits,
-)
+from jaxcal.learning.core.network import Network, decode, encode, initial, mask_logits
 from jaxcal.learning.core.ppo import (
     Batch,
     Metrics,
@@ -47,9 +42,6 @@ class EpisodesConfig(PPOConfig):
     normalise_per_decision: bool = setting(
         True, "advantages: own mean and scale for each decision of an episode"
     )
-    imitation: float = setting(
-        0.0, "share of the updates, the first, that imitate the solvers"
-    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -61,17 +53,11 @@ class EpisodesConfig(PPOConfig):
                 "episodes_per_update must be a multiple of episodes_per_set x "
                 f"num_minibatches = {whole}, got {self.episodes_per_update}"
             )
-        require(self, "in [0, 1]", lambda v: 0.0 <= v <= 1.0, "imitation")
 
     @property
     def num_updates(self) -> int:
         """Updates that cover the budget, rounded up."""
         return -(-self.num_episodes // self.episodes_per_update)
-
-    @property
-    def num_imitated(self) -> int:
-        """Updates that imitate, before the others."""
-        return round(self.imitation * self.num_updates)
 
     @property
     def rows_per_update(self) -> int:
@@ -113,11 +99,11 @@ class Episode(Protocol):
 
 @struct.dataclass
 class Seen:
-    """What the network is shown of B sets: T learned decisions of G episodes each."""
+    """What the network is shown of a set: T learned decisions of G episodes."""
 
-    features: Any  # leaves (B, ...): of the candidate sets
-    first: Any  # leaves (B, ...): of the first decision, which a set's episodes share
-    later: Any  # leaves (B, T - 1, G, ...): of the others; None where T is 1
+    features: Any  # leaves (...): of the candidate set
+    first: Any  # leaves (...): of the first decision, which the episodes share
+    later: Any  # leaves (T - 1, G, ...): of the others; None where T is 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,170 +119,151 @@ class Postures:
         m, n = jax.eval_shape(self.task.reset, key).candidates.shape
         return initial(self.network, key, m, n, self.task.num_decisions)
 
-    def draw(self, key: jax.Array) -> Any:
-        """States of new episodes, one a set, each with candidates of its own."""
-        key_sets, _, _ = jax.random.split(key, 3)
-        keys = jax.random.split(key_sets, self.config.rows_per_update)
-        return jax.vmap(self.task.reset)(keys)
-
-    def gather(self, params: Any, rows: Any, key: jax.Array) -> tuple[Batch, Metrics]:
-        """Play ``episodes_per_set`` episodes on every set.
+    def gather(self, params: Any, keys: jax.Array) -> tuple[Batch, Metrics]:
+        """Play ``episodes_per_set`` episodes on a fresh set for each of the keys (B,).
 
         Returns:
-            What was played, rows (B,) of decisions (T, G); metrics: scalars, and
-            ``rewards`` (episodes_per_update,).
+            What was played, rows of decisions (T, G); metrics: scalars, and ``rewards``
+            (B G,).
         """
-        config, task, network = self.config, self.task, self.network
-        repeats = config.episodes_per_set
-        _, key_actions, key_starts = jax.random.split(key, 3)
-        features = network.candidate_features(rows.candidates, rows.available)
-        memory = encode(network, params, features)
-
-        def of_every_episode(leaf: jax.Array) -> jax.Array:
-            return jnp.broadcast_to(leaf[None], (repeats, *leaf.shape))
-
-        states = jax.tree.map(of_every_episode, rows)
-        # The rules are those of one episode.
-        advance = jax.vmap(jax.vmap(task.step))
-        paid_of, outcome_of = (
-            jax.vmap(jax.vmap(task.paid)),
-            jax.vmap(jax.vmap(task.outcome)),
-        )
-        length = _start_lengths(task, (repeats, len(rows.available)), key_starts)
-        learned = task.num_decisions - network.num_unlearned
-        seen: list[Any] = []
-        out: list[Metrics] = []
-        final = jnp.zeros(length.shape)
-        for step, key_step in enumerate(
-            jax.random.split(key_actions, task.num_decisions)
-        ):
-            key_policy, key_random = jax.random.split(key_step)
-
-            def view(states: Any, step: int = step) -> tuple[Any, jax.Array, jax.Array]:
-                decision = network.decision_features(
-                    features, states.chosen, states.available, step
-                )
-                if step < learned:
-                    return decision, *decode(network, params, memory, decision)
-                return decision, *network.lookahead_logits(decision)
-
-            if step == 0:  # one decision for all episodes of a set
-                decision, *scored = view(rows)
-                logits, value = (of_every_episode(leaf) for leaf in scored)
-            else:
-                decision, logits, value = jax.vmap(view)(states)
-            if step < learned:
-                seen.append(decision)
-            action = jax.random.categorical(key_policy, logits)
-            if task.random_starts > 0.0:
-                blind = mask_logits(jnp.zeros_like(logits), states.available)
-                action = jnp.where(
-                    step < length, jax.random.categorical(key_random, blind), action
-                )
-            # What was paid already is not to come: the value is of the rest.
-            paid = paid_of(states)
-            states, reward, _ = advance(states, action)
-            final = final + reward
-            log_probs = jax.nn.log_softmax(logits)
-            log_prob = jnp.take_along_axis(log_probs, action[..., None], axis=-1)[
-                ..., 0
-            ]
-            out.append(
-                {
-                    "action": action.astype(jnp.int32),
-                    "log_prob": log_prob,
-                    "value": value * task.value_scale - paid,
-                    "paid": paid,
-                    "reward": reward,
-                    "counted": (step >= length).astype(logits.dtype),
-                    "entropy": -(jnp.exp(log_probs) * log_probs).sum(-1),
-                }
-            )
-        played = {name: jnp.stack([each[name] for each in out]) for name in out[0]}
-        own = (length == 0).astype(final.dtype)
-        advantage, target = _advantages_and_targets(config, played, own)
-        # The last choices, made by the look-ahead alone, are not learned from.
-        counted, entropy = played["counted"][:learned], played["entropy"][:learned]
-        axes = (1, 2) if config.normalise_per_decision else (0, 1, 2)
-        advantage = normalised(config, advantage[:learned], counted, axes)
-
-        def by_set(leaf: jax.Array) -> jax.Array:
-            return jnp.moveaxis(leaf[:learned], 2, 0)  # (T, G, B) -> (B, T, G)
-
-        def stacked(*leaves: jax.Array) -> jax.Array:
-            return jnp.moveaxis(jnp.stack(leaves), 2, 0)
-
-        later = jax.tree.map(stacked, *seen[1:]) if learned > 1 else None
-        batch = Batch(
-            seen=Seen(features, seen[0], later),
-            action=by_set(played["action"]),
-            log_prob=by_set(played["log_prob"]),
-            advantage=by_set(advantage),
-            target=by_set(target),
-            counted=by_set(counted),
-        )
-        outcome = (outcome_of(states) * own).sum() / jnp.maximum(own.sum(), 1.0)
+        batch, outcome = jax.vmap(self._play, in_axes=(None, 0))(params, keys)
+        reward, own = outcome["reward"], outcome["own"]  # (B, G)
+        log_det = (outcome["log_det"] * own).sum() / jnp.maximum(own.sum(), 1.0)
         metrics = {
-            "rewards": final.reshape(-1),
-            "reward_mean": final.mean(),
-            "reward_std": final.std(),
-            "log_det_mean": outcome,
-            "entropy": (entropy * counted).sum() / jnp.maximum(counted.sum(), 1.0),
+            "rewards": reward.ravel(),
+            "reward_mean": reward.mean(),
+            "reward_std": reward.std(),
+            "log_det_mean": log_det,
         }
-        return batch, metrics
+        return normalised(self.config, batch), metrics
 
     def loss(
         self, params: Any, experience: Batch, done: jax.Array
     ) -> tuple[jax.Array, Metrics]:
         """PPO's, of whole episodes."""
-        logits, value = self.score(params, experience)
+        score = jax.vmap(functools.partial(self._score, params))
+        logits, value = score(experience.seen)
         return surrogate(self.config, logits, value, experience, done)
 
-    def score(self, params: Any, batch: Batch) -> tuple[jax.Array, jax.Array]:
-        """(B, T, G, M) logits and (B, T, G) values in reward units.
+    def _score(self, params: Any, seen: Seen) -> tuple[jax.Array, jax.Array]:
+        """(T, G, M) logits and (T, G) values in reward units of a row's decisions.
 
-        A set is encoded once, and so is its first decision.
+        The set is encoded once, and so is the first decision.
         """
-        memory = encode(self.network, params, batch.seen.features)
-        shared = decode(self.network, params, memory, batch.seen.first)
-        logits, value = (
-            jnp.repeat(x[:, None, None], batch.action.shape[-1], axis=2) for x in shared
-        )
-        if batch.seen.later is not None:
-            more = decode(self.network, params, memory, batch.seen.later, axes=2)
-            logits = jnp.concatenate([logits, more[0]], axis=1)
-            value = jnp.concatenate([value, more[1]], axis=1)
+        memory = encode(self.network, params, seen.features)
+        decide = functools.partial(decode, self.network, params, memory)
+        shape = (1, self.config.episodes_per_set)
+        scored = [jnp.broadcast_to(x, (*shape, *x.shape)) for x in decide(seen.first)]
+        if seen.later is not None:
+            later = jax.vmap(jax.vmap(decide))(seen.later)
+            scored = [jnp.concatenate(x) for x in zip(scored, later, strict=True)]
+        logits, value = scored
         return logits, value * self.task.value_scale
 
+    def _play(self, params: Any, key: jax.Array) -> tuple[Batch, Metrics]:
+        """One row; what it came to of each episode, (G,)."""
+        config, task, network = self.config, self.task, self.network
+        num_episodes = config.episodes_per_set
+        learned = task.num_decisions - network.num_unlearned
+        key_set, key_starts, key_actions = jax.random.split(key, 3)
+        start = task.reset(key_set)
+        features = network.candidate_features(start.candidates, start.available)
+        memory = encode(network, params, features)
+        num_random = _random_starts(task, num_episodes, key_starts)
 
-def _start_lengths(task: Episode, shape: tuple[int, int], key: jax.Array) -> jax.Array:
-    """``shape`` numbers of random choices that each episode begins with; mostly 0."""
+        def score(state: Any, step: int) -> tuple[Any, jax.Array, jax.Array]:
+            decision = network.decision_features(
+                features, state.chosen, state.available, step
+            )
+            if step < learned:
+                return decision, *decode(network, params, memory, decision)
+            return decision, *network.lookahead_logits(decision)
+
+        def act(
+            state: Any, logits: jax.Array, key: jax.Array, given: jax.Array
+        ) -> tuple[Any, Metrics]:
+            key_policy, key_random = jax.random.split(key)
+            action = jax.random.categorical(key_policy, logits)
+            if task.random_starts > 0.0:
+                blind = mask_logits(jnp.zeros_like(logits), state.available)
+                random = jax.random.categorical(key_random, blind)
+                action = jnp.where(given, random, action)
+            after, reward, _ = task.step(state, action)
+            return after, {
+                "action": action.astype(jnp.int32),
+                "log_prob": jax.nn.log_softmax(logits)[action],
+                "paid": task.paid(state),
+                "reward": reward,
+                "counted": 1.0 - given.astype(logits.dtype),
+            }
+
+        def of_every_episode(leaf: jax.Array) -> jax.Array:
+            return jnp.broadcast_to(leaf, (num_episodes, *leaf.shape))
+
+        states = jax.tree.map(of_every_episode, start)
+        seen, played = [], []
+        keys = jax.random.split(key_actions, (task.num_decisions, num_episodes))
+        for step in range(task.num_decisions):
+            if step == 0:  # the same for every episode
+                decision, *scored = score(start, step)
+                logits, value = map(of_every_episode, scored)
+            else:
+                of_each = jax.vmap(functools.partial(score, step=step))
+                decision, logits, value = of_each(states)
+            random = step < num_random
+            states, record = jax.vmap(act)(states, logits, keys[step], random)
+            seen.append(decision)
+            played.append(record | {"value": value * task.value_scale})
+
+        every = {name: jnp.stack([row[name] for row in played]) for name in played[0]}
+        own = 1.0 - (num_random > 0)  # the policy made the first choice itself
+        advantage, target = _advantages_and_targets(config, every, own)
+        # The last choices, made by the look-ahead alone, are not learned from.
+        later = None
+        if learned > 1:
+            later = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seen[1:learned])
+        batch = Batch(
+            seen=Seen(features, seen[0], later),
+            action=every["action"][:learned],
+            log_prob=every["log_prob"][:learned],
+            advantage=advantage[:learned],
+            target=target[:learned],
+            counted=every["counted"][:learned],
+        )
+        log_det = jax.vmap(task.outcome)(states)
+        return batch, {"reward": every["reward"].sum(0), "log_det": log_det, "own": own}
+
+
+def _random_starts(task: Episode, number: int, key: jax.Array) -> jax.Array:
+    """(number,) random choices that each episode begins with; mostly 0."""
     key_share, key_length = jax.random.split(key)
-    begun = jax.random.uniform(key_share, shape) < task.random_starts
-    length = jax.random.randint(key_length, shape, 1, max(task.num_decisions - 1, 2))
+    most = max(task.num_decisions - 1, 2)
+    begun = jax.random.uniform(key_share, (number,)) < task.random_starts
+    length = jax.random.randint(key_length, (number,), 1, most)
     return jnp.where(begun, length, 0)
 
 
 def _advantages_and_targets(
     config: EpisodesConfig, played: Metrics, own: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
-    """Advantages and value targets of every decision, (K, G, B) each.
+    """Advantages and value targets of every decision, (K, G) each.
 
     Args:
         config: discount, lambda, episodes for each set.
-        played: (K, G, B) values, rewards, and what was paid before.
-        own: (G, B) 1 where the policy made the first choice itself.
+        played: (K, G) values, rewards, and what was paid before.
+        own: (G,) 1 where the policy made the first choice itself.
     """
-    value, paid = played["value"], played["paid"]
-    following = jnp.concatenate([value[1:], jnp.zeros_like(value[:1])])
-    goes_on = jnp.ones_like(value).at[-1].set(0.0)
-    advantage = advantages(config, played["reward"], value, following, goes_on)
-    target = advantage + value + paid
+    # What was paid already is not to come: the baseline is the value of the rest.
+    rest = played["value"] - played["paid"]
+    following = jnp.concatenate([rest[1:], jnp.zeros_like(rest[:1])])
+    goes_on = jnp.ones_like(rest).at[-1].set(0.0)
+    advantage = advantages(config, played["reward"], rest, following, goes_on)
+    target = advantage + played["value"]
     if config.episodes_per_set > 1:
         # On the first decision the set's other episodes are the better baseline: those
         # that the policy began itself.
-        counts = own.sum(0, keepdims=True) - own
-        others = (target[0] * own).sum(0, keepdims=True) - target[0] * own
-        baseline = jnp.where(counts > 0, others / jnp.maximum(counts, 1.0), value[0])
+        counts = own.sum() - own
+        others = (target[0] * own).sum() - target[0] * own
+        baseline = jnp.where(counts > 0, others / jnp.maximum(counts, 1.0), rest[0])
         advantage = advantage.at[0].set(target[0] - baseline)
     return advantage, target

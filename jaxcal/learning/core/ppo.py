@@ -1,21 +1,20 @@
-"""Proximal policy optimisation, whole: loss, advantages, optimiser, update, training.
+"""Proximal policy optimisation: loss, advantages, optimiser, update, training.
 
     train = make_train(config)
     weights, metrics = jax.jit(train)(jax.random.key(0))
     jax.vmap(train)(jax.random.split(jax.random.key(0), 8))  # eight runs, one program
 
-What is played and how it is scored is a ``Learner``'s: ``postures`` plays episodes of a
-fixed number of choices, ``streams`` plays sessions that end when they end. Everything
-else is here, once for both. Nothing touches a file or the host; ``training.run`` calls
-it and does.
+A ``Learner`` plays and scores: ``postures`` does it for episodes of a fixed number of
+choices, ``streams`` for sessions that end when they end. Everything here is pure;
+``training.run`` adds files, progress and a host.
 
 Sources: Schulman et al. 2017 (clipped surrogate), 2016 (advantages).
 """
 
 from __future__ import annotations
 
+import abc
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -34,26 +33,27 @@ __all__ = [
     "Metrics",
     "PPOConfig",
     "TrainState",
+    "Update",
     "advantages",
     "begin",
     "epochs",
-    "learning_rate",
+    "keys_of",
     "make_train",
     "make_update",
     "normalised",
     "optimiser",
+    "placed",
+    "schedule",
     "sliced",
-    "spread",
     "squared_error",
     "surrogate",
-    "updates",
 ]
 
 Metrics = dict[str, jax.Array]
 
 
 @dataclasses.dataclass(frozen=True)
-class PPOConfig:
+class PPOConfig(abc.ABC):
     """Every number of the optimisation; what is played adds its sizes."""
 
     num_epochs: int = setting(2, "passes over what an update has played")
@@ -70,6 +70,7 @@ class PPOConfig:
     entropy_end: float = setting(0.0, "entropy bonus at the end; linear between")
     discount: float = setting(1.0, "of a reward one decision later")
     gae_lambda: float = setting(1.0, "of the advantages; 1 is return less value")
+    normalise_per_decision: bool = False
     advantage_limit: float = setting(
         6.0, "standard deviations; a larger advantage (a singular pick) is clipped"
     )
@@ -90,14 +91,14 @@ class PPOConfig:
         require(self, "in [0, 1)", lambda v: 0.0 <= v < 1.0, "average_decay")
 
     @property
+    @abc.abstractmethod
     def num_updates(self) -> int:
         """Updates that a run makes."""
-        raise NotImplementedError
 
     @property
+    @abc.abstractmethod
     def rows_per_update(self) -> int:
         """Rows of experience that an update plays and cuts into minibatches."""
-        raise NotImplementedError
 
     @property
     def steps_per_update(self) -> int:
@@ -123,15 +124,12 @@ class Learner(Protocol):
     def init(self, key: jax.Array, *given: Any) -> Any:
         """Parameters before training."""
 
-    def draw(self, key: jax.Array, *given: Any) -> Any:
-        """What an update plays on: ``rows_per_update`` leading rows."""
+    def gather(self, params: Any, keys: jax.Array, *given: Any) -> tuple[Any, Metrics]:
+        """Play a row of experience with each of the keys (B,).
 
-    def gather(
-        self, params: Any, rows: Any, key: jax.Array, *given: Any
-    ) -> tuple[Any, Metrics]:
-        """Play on each row: experience with as many leading rows, and metrics.
-
-        Experience has ``counted`` (rows, ...), of which ``loss`` is a mean.
+        Returns:
+            Experience with B leading rows, and metrics. Its ``counted`` (B, ...) is 1
+            where ``loss`` counts, which is a mean over that.
         """
 
     def loss(
@@ -142,70 +140,17 @@ class Learner(Protocol):
 
 @struct.dataclass
 class Batch:
-    """Experience that PPO learns from: B rows of some decisions each."""
+    """Experience that PPO learns from: B rows of T decisions (of several episodes)."""
 
     seen: Any  # leaves (B, ...): what the learner scores
-    action: jax.Array  # (B, ...) int32
-    log_prob: jax.Array  # (B, ...) of the action when it was taken
-    advantage: jax.Array  # (B, ...)
-    target: jax.Array  # (B, ...) of the value, reward units
-    counted: jax.Array  # (B, ...) 1 where the policy chose, 0 where a choice was given
+    action: jax.Array  # (B, T, ...) int32
+    log_prob: jax.Array  # (B, T, ...) of the action when it was taken
+    advantage: jax.Array  # (B, T, ...)
+    target: jax.Array  # (B, T, ...) of the value, reward units
+    counted: jax.Array  # (B, T, ...) 1 where the policy chose, 0 where it was given
 
 
-# -- the loss --------------------------------------------------------------------------
-
-
-def surrogate(
-    config: PPOConfig,
-    logits: jax.Array,
-    value: jax.Array,
-    batch: Batch,
-    done: jax.Array,
-) -> tuple[jax.Array, Metrics]:
-    """Clipped surrogate, the value's error and an entropy bonus.
-
-    Args:
-        config: coefficients and limits.
-        logits: (B, ..., A) of the decisions in ``batch``, masked by a finite minimum.
-        value: (B, ...) reward units.
-        batch: what was played.
-        done: () updates made; the entropy bonus follows it.
-    """
-    log_probs = jax.nn.log_softmax(logits)
-    taken = jnp.take_along_axis(log_probs, batch.action[..., None], axis=-1)[..., 0]
-    log_ratio = taken - batch.log_prob
-    ratio = jnp.exp(log_ratio)
-    clipped = jnp.clip(ratio, 1.0 - config.clip_range, 1.0 + config.clip_range)
-    number = jnp.maximum(batch.counted.sum(), 1.0)
-
-    def mean(array: jax.Array) -> jax.Array:
-        return (array * batch.counted).sum() / number
-
-    policy_loss = -mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
-    value_loss = mean(squared_error(value - batch.target, config.value_error_limit))
-    entropy = mean(-(jnp.exp(log_probs) * log_probs).sum(-1))
-    progress = jnp.minimum(done / config.num_updates, 1.0)
-    bonus = config.entropy_start + progress * (
-        config.entropy_end - config.entropy_start
-    )
-    loss = policy_loss + config.value_coefficient * value_loss - bonus * entropy
-    metrics = {
-        "policy_loss": policy_loss,
-        "value_loss": value_loss,
-        "kl": mean(ratio - 1.0 - log_ratio),
-    }
-    return loss, metrics
-
-
-def squared_error(error: jax.Array, limit: float) -> jax.Array:
-    """The square of an error, beyond ``limit`` going on as a line: twice Huber's loss.
-
-    Unlike the square of a clipped error it has a gradient however wrong a value is.
-    (``optax.losses.huber_loss`` cancels large numbers in its gradient.)
-    """
-    size = jnp.abs(error)
-    near = jnp.minimum(size, limit)
-    return near * (2.0 * size - near)
+# -- advantages and the loss -----------------------------------------------------------
 
 
 def advantages(
@@ -226,25 +171,80 @@ def advantages(
     """
     deltas = reward + config.discount * following - value
 
-    def back(carry: jax.Array, now: Any) -> tuple[jax.Array, jax.Array]:
+    def back(later: jax.Array, now: Any) -> tuple[jax.Array, jax.Array]:
         delta, goes_on = now
-        carry = delta + config.discount * config.gae_lambda * goes_on * carry
-        return carry, carry
+        advantage = delta + config.discount * config.gae_lambda * goes_on * later
+        return advantage, advantage
 
     start = jnp.zeros_like(deltas[0])
     return jax.lax.scan(back, start, (deltas, goes_on), reverse=True)[1]
 
 
-def normalised(
-    config: PPOConfig, advantage: jax.Array, counted: jax.Array, axes: tuple[int, ...]
-) -> jax.Array:
-    """Advantages with mean 0 and scale 1 over ``axes`` of what counts, then clipped."""
-    number = jnp.maximum(counted.sum(axes, keepdims=True), 1.0)
-    mean = (advantage * counted).sum(axes, keepdims=True) / number
-    centred = advantage - mean
-    scale = jnp.sqrt((centred**2 * counted).sum(axes, keepdims=True) / number)
+def normalised(config: PPOConfig, batch: Batch) -> Batch:
+    """Advantages with mean 0 and scale 1 over what counts, then clipped."""
+    axes = [a for a in range(batch.counted.ndim) if a != 1]
+    over = tuple(axes) if config.normalise_per_decision else None
+    number = jnp.maximum(batch.counted.sum(over, keepdims=True), 1.0)
+
+    def mean(array: jax.Array) -> jax.Array:
+        return (array * batch.counted).sum(over, keepdims=True) / number
+
+    centred = batch.advantage - mean(batch.advantage)
+    scaled = centred / (jnp.sqrt(mean(centred**2)) + 1e-6)
     limit = config.advantage_limit
-    return jnp.clip(centred / (scale + 1e-6), -limit, limit)
+    return dataclasses.replace(batch, advantage=jnp.clip(scaled, -limit, limit))
+
+
+def surrogate(
+    config: PPOConfig,
+    logits: jax.Array,
+    value: jax.Array,
+    batch: Batch,
+    done: jax.Array,
+) -> tuple[jax.Array, Metrics]:
+    """Clipped surrogate, the value's error and an entropy bonus.
+
+    Args:
+        config: coefficients and limits.
+        logits: (B, T, ..., A) of the decisions in ``batch``, masked by a finite
+            minimum.
+        value: (B, T, ...) reward units.
+        batch: what was played.
+        done: () updates made; the entropy bonus follows it.
+    """
+    log_probs = jax.nn.log_softmax(logits)
+    taken = jnp.take_along_axis(log_probs, batch.action[..., None], axis=-1)[..., 0]
+    log_ratio = taken - batch.log_prob
+    ratio = jnp.exp(log_ratio)
+    clipped = jnp.clip(ratio, 1.0 - config.clip_range, 1.0 + config.clip_range)
+    number = jnp.maximum(batch.counted.sum(), 1.0)
+
+    def mean(array: jax.Array) -> jax.Array:
+        return (array * batch.counted).sum() / number
+
+    policy_loss = -mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
+    value_loss = mean(squared_error(value - batch.target, config.value_error_limit))
+    entropy = mean(-(jnp.exp(log_probs) * log_probs).sum(-1))
+    share = jnp.minimum(done / config.num_updates, 1.0)
+    bonus = (1.0 - share) * config.entropy_start + share * config.entropy_end
+    loss = policy_loss + config.value_coefficient * value_loss - bonus * entropy
+    return loss, {
+        "policy_loss": policy_loss,
+        "value_loss": value_loss,
+        "entropy": entropy,
+        "kl": mean(ratio - 1.0 - log_ratio),
+    }
+
+
+def squared_error(error: jax.Array, limit: float) -> jax.Array:
+    """The square of an error, beyond ``limit`` going on as a line: twice Huber's loss.
+
+    Unlike the square of a clipped error it has a gradient however wrong a value is.
+    (``optax.losses.huber_loss`` cancels large numbers in its gradient.)
+    """
+    size = jnp.abs(error)
+    near = jnp.minimum(size, limit)
+    return near * (2.0 * size - near)
 
 
 # -- the optimiser ---------------------------------------------------------------------
@@ -261,55 +261,32 @@ class TrainState:
     num_updates: jax.Array  # () int32, updates made
 
 
-def streams_of(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def keys_of(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Keys of the weights, the updates and what is imitated, from that of a run.
 
     They are split apart first, since ``fold_in(key, i)`` would be ``split(key)[i]``.
     """
-    weights, played, imitated = jax.random.split(key, 3)
-    return weights, played, imitated
+    weights, updates, imitated = jax.random.split(key, 3)
+    return weights, updates, imitated
 
 
 def begin(
     config: PPOConfig, learner: Learner, key: jax.Array, *given: Any
 ) -> TrainState:
     """The state before the first update, from the key of a run."""
-    weights, played, _ = streams_of(key)
-    params = learner.init(weights, *given)
+    key_weights, key_updates, _ = keys_of(key)
+    params = learner.init(key_weights, *given)
     return TrainState(
         params=params,
         average=jax.tree.map(jnp.copy, params),
         opt_state=optimiser(config).init(params),
-        key=jax.random.key_data(played),
+        key=jax.random.key_data(key_updates),
         num_updates=jnp.zeros((), jnp.int32),
     )
 
 
-def optimiser(config: PPOConfig) -> optax.GradientTransformation:
-    """Adam under a warmed-up cosine schedule, gradients clipped by global norm."""
-    return optax.chain(
-        _clip_by_global_norm(config.max_grad_norm),
-        optax.adam(_schedule(config), eps=1e-5),
-    )
-
-
-def _clip_by_global_norm(limit: float) -> optax.GradientTransformation:
-    """``optax.clip_by_global_norm`` as one factor for every gradient.
-
-    optax divides each gradient by the norm; XLA fuses a division into neither of Adam's
-    moments and writes the clipped gradients to memory first. The factor saves 7 to 14 %
-    of an update of the paper's network.
-    """
-
-    def clip(grads: Any, state: Any, params: Any = None) -> tuple[Any, Any]:
-        norm = jnp.sqrt(sum(jnp.vdot(grad, grad) for grad in jax.tree.leaves(grads)))
-        factor = jnp.minimum(1.0, limit / jnp.maximum(norm, 1e-30))
-        return jax.tree.map(lambda grad: grad * factor, grads), state
-
-    return optax.GradientTransformation(lambda params: optax.EmptyState(), clip)
-
-
-def _schedule(config: PPOConfig) -> optax.Schedule:
+def schedule(config: PPOConfig) -> optax.Schedule:
+    """The learning rate after so many gradient steps: a rise, then a cosine."""
     steps = config.steps_per_update
     return optax.warmup_cosine_decay_schedule(
         init_value=config.learning_rate / 10,
@@ -320,14 +297,14 @@ def _schedule(config: PPOConfig) -> optax.Schedule:
     )
 
 
-def learning_rate(config: PPOConfig, update: int) -> float:
-    """The learning rate after an update."""
-    return float(_schedule(config)(update * config.steps_per_update))
+def optimiser(config: PPOConfig) -> optax.GradientTransformation:
+    """Adam under the schedule; ``epochs`` clips the gradients."""
+    return optax.adam(schedule(config), eps=1e-5)
 
 
 def epochs(
-    state: TrainState,
     config: PPOConfig,
+    state: TrainState,
     num_rows: int,
     gradient: Callable[[Any, jax.Array], tuple[Any, Metrics]],
     key: jax.Array,
@@ -335,8 +312,8 @@ def epochs(
     """Epochs of minibatches over what an update has gathered.
 
     Args:
-        state: before the update.
         config: how to optimise.
+        state: before the update.
         num_rows: gathered.
         gradient: of parameters and the (S,) indices of a minibatch's rows.
         key: orders the minibatches.
@@ -345,11 +322,15 @@ def epochs(
         The state after the update, its key as it was; the mean of each metric.
     """
     optimise = optimiser(config)
-    size = num_rows // config.num_minibatches
 
     def step(carry: Any, index: jax.Array) -> tuple[Any, Metrics]:
         params, average, opt_state, count = carry
         grads, metrics = gradient(params, index)
+        # By one factor: optax divides every gradient by the norm, which XLA fuses into
+        # neither of Adam's moments (7 to 14 % of an update of the paper's network).
+        norm = jnp.sqrt(sum(jnp.vdot(grad, grad) for grad in jax.tree.leaves(grads)))
+        factor = jnp.minimum(1.0, config.max_grad_norm / jnp.maximum(norm, 1e-30))
+        grads = jax.tree.map(lambda grad: grad * factor, grads)
         changes, opt_state = optimise.update(grads, opt_state, params)
         params = optax.apply_updates(params, changes)
         # The share of the newest weights in a mean whose weights decay and add up to
@@ -361,20 +342,14 @@ def epochs(
 
     def epoch(carry: Any, key: jax.Array) -> tuple[Any, Metrics]:
         order = jax.random.permutation(key, num_rows)
-        return jax.lax.scan(step, carry, order.reshape(config.num_minibatches, size))
+        return jax.lax.scan(step, carry, order.reshape(config.num_minibatches, -1))
 
     count = state.num_updates * config.steps_per_update
     carry = (state.params, state.average, state.opt_state, count)
     keys = jax.random.split(key, config.num_epochs)
     (params, average, opt_state, _), metrics = jax.lax.scan(epoch, carry, keys)
-    state = dataclasses.replace(
-        state,
-        params=params,
-        average=average,
-        opt_state=opt_state,
-        num_updates=state.num_updates + 1,
-    )
-    return state, {name: value.mean() for name, value in metrics.items()}
+    after = TrainState(params, average, opt_state, state.key, state.num_updates + 1)
+    return after, {name: value.mean() for name, value in metrics.items()}
 
 
 def sliced(
@@ -393,32 +368,36 @@ def sliced(
         params: parameters.
         rows_of: indices -> rows.
         index: (S,) of the minibatch.
-        size: rows of a slice, at most.
+        size: rows of a slice, at most; a divisor of S is taken.
     """
     size = max(part for part in range(1, size + 1) if len(index) % part == 0)
-    if size == len(index):
-        return gradient(params, rows_of(index))
 
-    def add(total: Any, index: jax.Array) -> tuple[Any, None]:
-        rows = rows_of(index)
+    def add(total: Any, part: jax.Array) -> tuple[Any, Any]:
+        rows = rows_of(part)
         number = rows.counted.sum()
-        found = gradient(params, rows), jnp.ones(())
-        return jax.tree.map(lambda t, f: t + number * f, total, found), None
+        grads, metrics = gradient(params, rows)
+        total = jax.tree.map(lambda t, g: t + number * g, total, grads)
+        return total, (number, metrics)
 
-    parts = index.reshape(-1, size)
-    shapes = jax.eval_shape(lambda: gradient(params, rows_of(parts[0])))
-    zero = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), jnp.zeros(())
-    (total, number), _ = jax.lax.scan(add, zero, parts)
-    mean: tuple[Any, Metrics] = jax.tree.map(
-        lambda t: t / jnp.maximum(number, 1.0), total
-    )
-    return mean
+    zero = jax.tree.map(jnp.zeros_like, params)
+    total, (number, metrics) = jax.lax.scan(add, zero, index.reshape(-1, size))
+    share = 1.0 / jnp.maximum(number.sum(), 1.0)
+    mean = {name: share * (number @ value) for name, value in metrics.items()}
+    return jax.tree.map(lambda t: share * t, total), mean
 
 
 # -- an update, and training -----------------------------------------------------------
 
 Update = Callable[..., tuple[TrainState, Metrics]]
 """(state, *given) -> the next state and metrics."""
+
+
+def placed(tree: Any, mesh: Mesh | None, *axes: str) -> Any:
+    """The same values, each leaf's leading axes spread over those of the mesh."""
+    if mesh is None:
+        return tree
+    sharding = NamedSharding(mesh, PartitionSpec(*axes))
+    return jax.lax.with_sharding_constraint(tree, sharding)
 
 
 def make_update(
@@ -435,91 +414,31 @@ def make_update(
         learner: what is trained.
         mesh: with the one axis ``sets``; None for one device, which places nothing.
     """
+    whole = mesh is not None or jax.default_backend() != "cpu"
 
     def update(state: TrainState, *given: Any) -> tuple[TrainState, Metrics]:
-        key, key_gather, key_epochs = jax.random.split(
-            jax.random.wrap_key_data(state.key), 3
-        )
-        rows = spread(learner.draw(key_gather, *given), mesh)
-        experience, metrics = learner.gather(state.params, rows, key_gather, *given)
-        experience = _everywhere(experience, mesh)
+        key = jax.random.wrap_key_data(state.key)
+        key, key_rows, key_epochs = jax.random.split(key, 3)
+        keys = jax.random.split(key_rows, config.rows_per_update)
+        rows, metrics = learner.gather(state.params, placed(keys, mesh, "sets"), *given)
+        rows = placed(rows, mesh)
+
+        def loss(params: Any, rows: Any) -> tuple[jax.Array, Metrics]:
+            return learner.loss(params, rows, state.num_updates)
 
         def rows_of(index: jax.Array) -> Any:
-            return spread(jax.tree.map(lambda leaf: leaf[index], experience), mesh)
+            return placed(jax.tree.map(lambda leaf: leaf[index], rows), mesh, "sets")
 
         def gradient(params: Any, index: jax.Array) -> tuple[Any, Metrics]:
-            whole = mesh is not None or jax.default_backend() != "cpu"
             size = len(index) if whole else min(config.slice_rows, len(index))
-            one = jax.grad(
-                lambda params, rows: learner.loss(params, rows, state.num_updates),
-                has_aux=True,
-            )
+            one = jax.grad(loss, has_aux=True)
             return sliced(one, params, rows_of, index, size)
 
-        num_rows = len(experience.counted)
-        after, losses = epochs(state, config, num_rows, gradient, key_epochs)
+        after, losses = epochs(config, state, len(rows.counted), gradient, key_epochs)
         after = dataclasses.replace(after, key=jax.random.key_data(key))
-        return _everywhere((after, metrics | losses), mesh)
+        return placed((after, metrics | losses), mesh)
 
     return update
-
-
-def spread(tree: Any, mesh: Mesh | None) -> Any:
-    """The same values, the leading axis of every leaf spread over the devices."""
-    return _placed(tree, mesh, PartitionSpec("sets"))
-
-
-def _everywhere(tree: Any, mesh: Mesh | None) -> Any:
-    return _placed(tree, mesh, PartitionSpec())
-
-
-def _placed(tree: Any, mesh: Mesh | None, spec: PartitionSpec) -> Any:
-    if mesh is None:
-        return tree
-    return jax.lax.with_sharding_constraint(tree, NamedSharding(mesh, spec))
-
-
-@functools.lru_cache(maxsize=32)
-def updates(
-    config: PPOConfig,
-    learner: Learner,
-    mesh: Mesh | None = None,
-    most: int = 1,
-    seeds: int = 0,
-) -> Callable[..., tuple[TrainState, Metrics]]:
-    """Several updates in one compiled call; nothing is compiled for another seed.
-
-    Args:
-        config, learner, mesh: as for ``make_update``.
-        most: updates of a call, at most.
-        seeds: runs side by side, each leaf of the state with a leading axis of so many;
-            0 for one run without that axis.
-
-    Returns:
-        (state, given up; () number of updates to make, at most ``most``; *given) -> the
-        next state, and metrics with a leading axis ``most``, zero from that number on.
-        An update is the same program whatever the number, so cutting a run into calls
-        in another way changes no bit of it.
-    """
-    one = make_update(config, learner, mesh)
-
-    def several(state: TrainState, count: jax.Array, *given: Any) -> Any:
-        def update(state: TrainState) -> tuple[TrainState, Metrics]:
-            return one(state, *given)
-
-        each = jax.vmap(update) if seeds else update
-
-        def step(number: jax.Array, carry: Any) -> Any:
-            state, kept = carry
-            state, found = each(state)
-            kept = jax.tree.map(lambda k, f: k.at[number].set(f), kept, found)
-            return state, kept
-
-        shapes = jax.eval_shape(each, state)[1]
-        kept = jax.tree.map(lambda m: jnp.zeros((most, *m.shape), m.dtype), shapes)
-        return jax.lax.fori_loop(0, count, step, (state, kept))
-
-    return jax.jit(several, donate_argnums=0)
 
 
 class Config(Protocol):

@@ -105,41 +105,16 @@ class Streams:
         blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         return self.network.init(key, blank)
 
-    def draw(self, key: jax.Array, task: Any) -> Any:
-        """A key for every stream."""
-        return jax.random.split(key, self.config.rows_per_update)
-
-    def gather(
-        self, params: Any, rows: Any, key: jax.Array, task: Any
-    ) -> tuple[Batch, Metrics]:
-        """Play every stream by sampling; one decision more than counts closes it."""
+    def gather(self, params: Any, keys: jax.Array, task: Any) -> tuple[Batch, Metrics]:
+        """Play a stream with each of the keys (B,)."""
         axis = 0 if self.task_per_stream else None
-        played = jax.vmap(self._stream, in_axes=(None, 0, axis), out_axes=1)(
-            params, rows, task
-        )
-        reward, value, ended = played["reward"], played["value"], played["ended"]
-        goes_on = 1.0 - ended[:-1]
-        following = played["chance"][:-1] * goes_on * value[1:] + played["others"][:-1]
-        advantage = advantages(self.config, reward[:-1], value[:-1], following, goes_on)
-        counted = jnp.ones_like(advantage)
-
-        def by_stream(leaf: jax.Array) -> jax.Array:
-            return jnp.moveaxis(leaf[: len(advantage)], 1, 0)  # (T, B) -> (B, T)
-
-        batch = Batch(
-            seen=jax.tree.map(by_stream, played["seen"]),
-            action=by_stream(played["action"]),
-            log_prob=by_stream(played["log_prob"]),
-            advantage=by_stream(normalised(self.config, advantage, counted, (0, 1))),
-            target=by_stream(advantage + value[:-1]),
-            counted=by_stream(counted),
-        )
+        play = jax.vmap(self._play, in_axes=(None, 0, axis))
+        batch, (reward, ended) = play(params, keys, task)  # (B, T + 1)
         metrics = {
             "reward_mean": reward.sum() / jnp.maximum(ended.sum(), 1.0),
             "choices": 1.0 / jnp.maximum(ended.mean(), 1e-6),
-            "entropy": played["entropy"].mean(),
         }
-        return batch, metrics
+        return normalised(self.config, batch), metrics
 
     def loss(
         self, params: Any, experience: Batch, done: jax.Array
@@ -152,8 +127,11 @@ class Streams:
         scored: Any = self.network.apply(params, seen)
         return scored
 
-    def _stream(self, params: Any, key: jax.Array, task: Any) -> dict[str, Any]:
-        """Sessions one after another, leaves (T + 1, ...)."""
+    def _play(
+        self, params: Any, key: jax.Array, task: Any
+    ) -> tuple[Batch, tuple[jax.Array, jax.Array]]:
+        """Sessions one after another: a row of T decisions, and of T + 1, of which the
+        last closes the row, the rewards and where a session ended."""
         environment = self.environment
 
         def decide(state: Any, key: jax.Array) -> tuple[Any, dict[str, Any]]:
@@ -161,7 +139,6 @@ class Streams:
             seen = environment.observe(task, state, key_seen)
             logits, value = self._score(params, seen)
             action = jax.random.categorical(key_action, logits).astype(jnp.int32)
-            log_probs = jax.nn.log_softmax(logits)
             step = environment.step(task, state, seen, action, key_step)
 
             def value_of(state: Any) -> jax.Array:
@@ -174,31 +151,41 @@ class Streams:
             others = jnp.zeros(())
             if number > 1:
                 states = jax.tree.map(lambda leaf: leaf[elsewhere], step.states)
-                values = jnp.where(
-                    step.ended[elsewhere], 0.0, jax.vmap(value_of)(states)
-                )
+                values = jax.vmap(value_of)(states)
+                values = jnp.where(step.ended[elsewhere], 0.0, values)
                 others = step.chance[elsewhere] @ values
             ended = step.ended[step.happened]
-            fresh = environment.reset(task, key_next)
             state = jax.tree.map(
                 lambda new, old: jnp.where(ended, new, old[step.happened]),
-                fresh,
+                environment.reset(task, key_next),
                 step.states,
             )
             return state, {
                 "seen": seen,
                 "action": action,
-                "log_prob": log_probs[action],
+                "log_prob": jax.nn.log_softmax(logits)[action],
                 "value": value,
                 "reward": step.reward,
-                "ended": ended.astype(jnp.float32),
+                "ended": ended.astype(value.dtype),
                 "chance": step.chance[step.happened],
                 "others": others,
-                "entropy": -(jnp.exp(log_probs) * log_probs).sum(),
             }
 
         key_reset, key_steps = jax.random.split(key)
         keys = jax.random.split(key_steps, self.config.stream_length + 1)
-        begun = environment.reset(task, key_reset)
-        played: dict[str, Any] = jax.lax.scan(decide, begun, keys)[1]
-        return played
+        every = jax.lax.scan(decide, environment.reset(task, key_reset), keys)[1]
+        row = jax.tree.map(lambda leaf: leaf[:-1], every)
+        goes_on = 1.0 - row["ended"]
+        following = row["chance"] * goes_on * every["value"][1:] + row["others"]
+        advantage = advantages(
+            self.config, row["reward"], row["value"], following, goes_on
+        )
+        batch = Batch(
+            seen=row["seen"],
+            action=row["action"],
+            log_prob=row["log_prob"],
+            advantage=advantage,
+            target=advantage + row["value"],
+            counted=jnp.ones_like(advantage),
+        )
+        return batch, (every["reward"], every["ended"])

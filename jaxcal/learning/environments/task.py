@@ -1,6 +1,6 @@
 """What is trained on: an episode of selection and where its candidates come from.
 
-A ``Task`` is all that the trainer knows of an environment; ``training.rules.Rules``
+A ``Task`` is all that the trainer knows of an environment; ``core.postures.Episode``
 says what it needs. Another environment is another class with these methods.
 """
 

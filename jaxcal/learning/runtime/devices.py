@@ -117,11 +117,14 @@ def any_process(flag: bool) -> bool:
         return bool(multihost_utils.process_allgather(np.asarray(flag)).any())
 
 
-def replicate(tree: Any, mesh: Mesh | None) -> Any:
-    """Put arrays that every process holds alike on every device of the mesh."""
+def replicate(tree: Any, mesh: Mesh | None, *axes: str) -> Any:
+    """Put arrays that every process holds alike on every device of the mesh.
+
+    Leading axes that are named are spread over those of the mesh instead.
+    """
     if mesh is None:
         return tree
-    sharding = NamedSharding(mesh, PartitionSpec())
+    sharding = NamedSharding(mesh, PartitionSpec(*axes))
 
     def put(leaf: Any) -> jax.Array:
         plain = np.asarray(leaf)

@@ -23,6 +23,9 @@ class TrainConfig:
     network: NetworkConfig = field(default_factory=NetworkConfig)
     ppo: EpisodesConfig = field(default_factory=EpisodesConfig)
     tasks: tuple[Task, ...] = field(default=(Task(),))  # update u: tasks[u % len]
+    imitation: float = setting(
+        0.0, "share of the updates, the first, that imitate the solvers"
+    )
     seed: int = setting(0, "of everything random")
     num_seeds: int = setting(1, "runs side by side: seed, seed + 1, ...")
     validate_every: float = 15.0  # seconds between looks at the validation set
@@ -32,6 +35,12 @@ class TrainConfig:
     def __post_init__(self) -> None:
         require(self, "0 or more", lambda v: v >= 0, "seed")
         require(self, "at least 1", lambda v: v >= 1, "num_seeds")
+        require(self, "in [0, 1]", lambda v: 0.0 <= v <= 1.0, "imitation")
+
+    @property
+    def num_imitated(self) -> int:
+        """Updates that imitate, before the others."""
+        return round(self.imitation * self.ppo.num_updates)
 
     @property
     def learners(self) -> tuple[Postures, ...]:
@@ -46,6 +55,7 @@ class TrainConfig:
             "network": dataclasses.asdict(self.network),
             "ppo": dataclasses.asdict(self.ppo),
             "tasks": [task.as_meta() for task in self.tasks],
+            "imitation": self.imitation,
             "seed": self.seed,
             "num_seeds": self.num_seeds,
         }
@@ -58,6 +68,7 @@ class TrainConfig:
             network=NetworkConfig(**meta["network"]),
             ppo=EpisodesConfig(**meta["ppo"]),
             tasks=tuple(Task.from_meta(task) for task in meta["tasks"]),
+            imitation=meta["imitation"],
             seed=meta["seed"],
             num_seeds=meta["num_seeds"],
         )

@@ -117,28 +117,24 @@ class Imitation:
         """Parameters before training."""
         return self.postures.init(key)
 
-    def draw(self, key: jax.Array, lesson: Lesson) -> Lesson:
-        """The sets of the lesson."""
-        return lesson
-
     def gather(
-        self, params: Any, rows: Lesson, key: jax.Array, lesson: Lesson
+        self, params: Any, keys: jax.Array, lesson: Lesson
     ) -> tuple[Attempt, Metrics]:
         """Follow the lesson, each time choosing what the policy likes of the wanted."""
         task, network = self.postures.task, self.postures.network
-        features = network.candidate_features(rows.candidates, rows.available)
+        features = network.candidate_features(lesson.candidates, lesson.available)
         memory = encode(network, params, features)
-        chosen = jnp.full((len(rows.best), task.num_decisions), -1, jnp.int32)
-        free, wanted = rows.available, rows.wanted
+        chosen = jnp.full((len(lesson.best), task.num_decisions), -1, jnp.int32)
+        free, wanted = lesson.available, lesson.wanted
         decisions, wants, counts = [], [], []
         for count in range(task.num_decisions - network.num_unlearned):
             seen = network.decision_features(features, chosen, free, count)
             logits, _ = decode(network, params, memory, seen)
             decisions.append(seen)
             wants.append(wanted)
-            counts.append((count >= rows.length).astype(logits.dtype))
+            counts.append((count >= lesson.length).astype(logits.dtype))
             favourite = jnp.argmax(mask_logits(logits, wanted), axis=-1)
-            action = jnp.where(count < rows.length, rows.given[:, count], favourite)
+            action = jnp.where(count < lesson.length, lesson.given[:, count], favourite)
             chosen = chosen.at[:, count].set(action.astype(jnp.int32))
             taken = jax.nn.one_hot(action, free.shape[-1], dtype=bool)
             free, wanted = free & ~taken, wanted & ~taken
@@ -149,7 +145,7 @@ class Imitation:
             ),
             wanted=jnp.stack(wants, axis=1),
             counted=jnp.stack(counts, axis=1),
-            best=rows.best,
+            best=lesson.best,
         )
         return attempt, {}
 
@@ -164,8 +160,9 @@ class Imitation:
         attempt, config = experience, self.postures.config
         network = self.postures.network
         memory = encode(network, params, attempt.features)
-        # (B, T, M), (B, T)
-        logits, value = decode(network, params, memory, attempt.decisions, axes=1)
+        decide = functools.partial(decode, network, params, memory)
+        of_each = jax.vmap(decide, in_axes=1, out_axes=1)
+        logits, value = of_each(attempt.decisions)  # (B, T, M), (B, T)
         log_probs = jax.nn.log_softmax(logits)
         hopes = mask_logits(log_probs, attempt.wanted)
         number = jnp.maximum(attempt.counted.sum(), 1.0)

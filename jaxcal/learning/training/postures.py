@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.learning.core.network import Network
-from jaxcal.learning.core.ppo import Learner, TrainState, streams_of
+from jaxcal.learning.core.ppo import Learner, TrainState, keys_of
 from jaxcal.learning.policies import decoding
 from jaxcal.learning.runtime import devices
 from jaxcal.learning.training import checkpoint, imitation
@@ -83,7 +83,7 @@ def train(
         should_stop: asked every few seconds, between updates.
         num_updates: stop after this update instead of at the end of the budget.
         num_devices: use so many of each process; all when None.
-        teacher: whom the first ``config.ppo.num_imitated`` updates imitate.
+        teacher: whom the first ``config.num_imitated`` updates imitate.
 
     Returns:
         The last state; each leaf has a leading axis of ``config.num_seeds`` where they
@@ -100,7 +100,7 @@ def train(
     learners = config.learners
     network, k = learners[0].network, config.tasks[0].num_decisions
     last = config.ppo.num_updates if num_updates is None else num_updates
-    imitated = min(config.ppo.num_imitated, last)
+    imitated = min(config.num_imitated, last)
     if teacher is None and imitated:
         raise ValueError(
             f"teacher must be given for the {imitated} updates that imitate, got None"
@@ -115,7 +115,7 @@ def train(
 
     def lesson(index: int) -> imitation.Lesson:
         assert teacher is not None  # checked above
-        _, _, key = streams_of(jax.random.key(config.seed))
+        _, _, key = keys_of(jax.random.key(config.seed))
         learner = learners[index % len(learners)]
         return imitation.draw(learner, teacher, jax.random.fold_in(key, index))
 

@@ -41,7 +41,8 @@ _GENERAL = TrainConfig(
     about="what ships: twelve tasks of other sizes, shapes and masks, imitating the "
     "solvers from the look-ahead rule on; ten minutes",
     network=NetworkConfig(close_up=True, initial_trust=4.0, initial_actor=0.05),
-    ppo=EpisodesConfig(num_episodes=300_000, entropy_start=0.002, imitation=1.0),
+    ppo=EpisodesConfig(num_episodes=300_000, entropy_start=0.002),
+    imitation=1.0,
     tasks=(
         _task(),
         _task(6),

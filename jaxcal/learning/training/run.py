@@ -31,7 +31,7 @@ from jaxcal.learning.runtime import devices
 from jaxcal.learning.runtime.processes import collective
 from jaxcal.learning.training import checkpoint
 
-__all__ = ["Recipe", "Report", "run"]
+__all__ = ["Recipe", "Report", "run", "updates"]
 
 _LAST = 1000  # episodes whose rewards are kept
 _MOST = 16  # updates in one call
@@ -89,6 +89,49 @@ class Report:
     spread: dict[str, float]  # standard deviation over several seeds, of validation
 
 
+@functools.lru_cache(maxsize=32)
+def updates(
+    config: PPOConfig,
+    learner: Learner,
+    mesh: Mesh | None = None,
+    most: int = 1,
+    seeds: int = 0,
+) -> ppo.Update:
+    """Several updates in one compiled call; nothing is compiled for another seed.
+
+    Args:
+        config, learner, mesh: as for ``ppo.make_update``.
+        most: updates of a call, at most.
+        seeds: runs side by side, each leaf of the state with a leading axis of so many;
+            0 for one run without that axis.
+
+    Returns:
+        (state, given up; () number of updates to make, at most ``most``; *given) -> the
+        next state, and metrics with a leading axis ``most``, zero from that number on.
+        An update is the same program whatever the number, so cutting a run into calls
+        in another way changes no bit of it.
+    """
+    one = ppo.make_update(config, learner, mesh)
+
+    def several(state: TrainState, count: jax.Array, *given: Any) -> Any:
+        def update(state: TrainState) -> tuple[TrainState, ppo.Metrics]:
+            return one(state, *given)
+
+        each = jax.vmap(update) if seeds else update
+
+        def step(number: jax.Array, carry: Any) -> Any:
+            state, kept = carry
+            state, found = each(state)
+            kept = jax.tree.map(lambda k, f: k.at[number].set(f), kept, found)
+            return state, kept
+
+        shapes = jax.eval_shape(each, state)[1]
+        kept = jax.tree.map(lambda m: jnp.zeros((most, *m.shape), m.dtype), shapes)
+        return jax.lax.fori_loop(0, count, step, (state, kept))
+
+    return jax.jit(several, donate_argnums=0)
+
+
 def run(
     recipe: Recipe,
     folder: str | pathlib.Path,
@@ -134,11 +177,11 @@ def run(
             if done < recipe.num_imitated:
                 assert recipe.imitate is not None  # there are updates that imitate
                 learner, shown = recipe.imitate(done)
-                most, given = 1, (devices.replicate(shown, mesh),)
+                most, given = 1, (devices.replicate(shown, mesh, "sets"),)
             elif len(recipe.learners) > 1 or len(recipe.given) > 1:
                 most = 1  # the next update is of another program, or of other arrays
             count = min(count, most, last - done)
-            update = ppo.updates(recipe.ppo, learner, mesh, most, seeds)
+            update = updates(recipe.ppo, learner, mesh, most, seeds)
             with collective():
                 state, found = update(state, np.int32(count), *given)
                 # One transfer for all that these updates measured.
@@ -188,6 +231,7 @@ class _Diary:
     ) -> None:
         """Keep the metrics of ``count`` updates; look and save where it is time to."""
         recipe, now = self.recipe, time.perf_counter()
+        schedule = ppo.schedule(recipe.ppo)
         for number in range(count):
             rewards = found["rewards"][number] if "rewards" in found else ()
             if (first + number) % len(recipe.learners) == 0:
@@ -202,7 +246,7 @@ class _Diary:
                 "update": done,
                 recipe.unit: done * recipe.per_update,
                 "seconds": self._seconds(at),
-                "learning_rate": ppo.learning_rate(recipe.ppo, done),
+                "learning_rate": float(schedule(done * recipe.ppo.steps_per_update)),
             }
             if number == count - 1:
                 self._look(state, row)

@@ -2,8 +2,9 @@
 
 Source: Ponte, Fampa and Lee, Branch-and-bound for integer D-Optimality with fast local
 search and variable-bound tightening, arXiv 2302.07386. A node is closed when its bound
-is within ``TOLERANCE`` of the incumbent, far above the rounding of either (1e-13), so
-"proven" means: no selection is better by more than that.
+is within ``TOLERANCE`` of the incumbent, far above the rounding of either (1e-13, which
+fused products only make smaller), so "proven" means: no selection is better by more
+than that.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal import compiled
+from jaxcal.information.blocks import largest_rank
 from jaxcal.information.criterion import Criterion
 
 __all__ = ["TOLERANCE", "BranchResult", "branch_and_bound"]
@@ -105,24 +108,22 @@ def _search(
     blocks: Array, prior: Array, criterion: Criterion, k: int, start: Indices
 ) -> tuple[Any, float, float]:
     """The compiled search in numbers near 1, and unit and origin of its values."""
-    from jaxcal.selection.exact.kernel import DS, TRACE, D, E, Search
-
+    kernel = compiled.kernel("jaxcal.selection.exact.kernel")
     root = criterion.root
-    rank = 1 if blocks.shape[1] == 1 else int(np.linalg.matrix_rank(blocks).max())
+    rank = largest_rank(blocks)
     p = len(prior)
     scale, shift = 1.0, 0.0
     if criterion.kind == "det" and len(root) == p:
-        kind, shift = D, -2.0 * float(np.linalg.slogdet(root)[1])
+        kind, shift = kernel.D, -2.0 * float(np.linalg.slogdet(root)[1])
     elif criterion.kind == "det":
-        kind, lengths = DS, np.linalg.norm(root, axis=1)
+        kind, lengths = kernel.DS, np.linalg.norm(root, axis=1)
         root, shift = root / lengths[:, None], -2.0 * float(np.log(lengths).sum())
     else:
         chosen = np.repeat(blocks, start, axis=0).reshape(-1, p)
         phi = abs(float(criterion.value(prior + chosen.T @ chosen)))
         scale = phi if 0.0 < phi < np.inf else 1.0
         trace = criterion.kind == "trace"
-        kind = TRACE if trace else E
+        kind = kernel.TRACE if trace else kernel.E
         root = root / np.sqrt(scale) if trace else root * np.sqrt(scale)
     arrays = [np.array(each, order="C") for each in (blocks, prior, root)]
-    search: Any = Search
-    return search(kind, *arrays, k, rank), scale, shift
+    return kernel.Search(kind, *arrays, k, rank), scale, shift

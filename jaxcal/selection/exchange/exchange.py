@@ -21,6 +21,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal import compiled
 from jaxcal.information.blocks import largest_rank
 from jaxcal.information.criterion import Criterion
 from jaxcal.selection.problem import Problem, values
@@ -94,26 +95,22 @@ class Climbs:
     """
 
     def __init__(self, problem: Problem, seed: int, deadline: float | None) -> None:
-        from jaxcal.selection.exchange.kernel import DET, SUBSET, TRACE, Climber
-
+        kernel = compiled.kernel("jaxcal.selection.exchange.kernel")
         self._usable = np.flatnonzero(problem.available)
         blocks = problem.blocks[self._usable]
         self._rank = functools.cache(lambda: largest_rank(blocks))  # for random starts
         self._required = np.searchsorted(self._usable, problem.required)
         self._deadline = deadline
         criterion, q, p = problem.criterion, blocks.shape[1], blocks.shape[2]
-        kind, root = TRACE, criterion.root
+        kind, root = kernel.TRACE, criterion.root
         if criterion.kind == "det":
             root = root / np.linalg.norm(
                 root, axis=1, keepdims=True
             )  # variances near 1
-            kind = DET if criterion.name == "D" else SUBSET
-        span = np.zeros((0, p))
-        if len(problem.root):
-            values, vectors = np.linalg.eigh(problem.prior)
-            span = np.ascontiguousarray(vectors.T[values > 1e-6])
+            kind = kernel.DET if criterion.name == "D" else kernel.SUBSET
+        span = problem.known if len(problem.root) else np.zeros((0, p))
         self._share = _SHARE * min(1.0, problem.k * q / p) ** 6
-        self._climber = Climber(
+        self._climber = kernel.Climber(
             kind, blocks, problem.prior, root, problem.upper[self._usable],
             self._required, span, problem.k, seed,
         )  # fmt: skip

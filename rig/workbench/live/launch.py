@@ -15,6 +15,7 @@ LOOPBACK = "127.0.0.1"
 PORT = 8642  # the usual one; where it is taken, any free one
 TOKEN = "JAXCAL_LIVE_TOKEN"  # an environment variable, which `ps` does not show
 LOG = "live.log"
+SERVER = "rig.workbench.live.server"
 
 
 def listen(host: str | None) -> tuple[socket.socket, str | None, str]:
@@ -58,9 +59,8 @@ def start(folder: pathlib.Path, host: str | None = None) -> str:
     try:
         sock, token, url = listen(host)
         with sock, (folder / LOG).open("ab") as log:
-            command = [sys.executable, "-m", "rig.workbench.live", str(folder)]
             subprocess.Popen(
-                [*command, "--fd", str(sock.fileno())],
+                [sys.executable, "-m", SERVER, str(folder), str(sock.fileno())],
                 pass_fds=[sock.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=log,

@@ -1,14 +1,21 @@
-"""The page's web server: one run, any number of browsers."""
+"""The page's web server: one run, any number of browsers.
+
+``python -m rig.workbench.live.server FOLDER FD`` is the page as `--live` starts it, on
+a listening socket.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import pathlib
 import signal
 import socket
+import sys
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncIterator
+from typing import Literal
 
 import uvicorn
 from fastapi import FastAPI, HTTPException
@@ -16,12 +23,15 @@ from fastapi.responses import FileResponse, PlainTextResponse
 from nicegui import Client, ui
 
 from rig.core.faults import Fault, Refused
+from rig.signals import PAUSE
 from rig.workbench.live.guard import Guard
+from rig.workbench.live.launch import TOKEN
 from rig.workbench.live.page import make_page
 from rig.workbench.live.watcher import Watcher
 
 HERE = pathlib.Path(__file__).parent
 POLL_S = 0.05
+LINGER_S = 600.0  # after the session's end and the last look of a browser
 
 
 def make_app(watcher: Watcher, linger_s: float | None = None) -> FastAPI:
@@ -65,7 +75,7 @@ def make_app(watcher: Watcher, linger_s: float | None = None) -> FastAPI:
 
     @app.post("/pause")
     async def pause() -> PlainTextResponse:
-        return ask(signal.SIGINT)
+        return ask(PAUSE)
 
     @app.get("/report")
     async def report() -> FileResponse:
@@ -73,8 +83,12 @@ def make_app(watcher: Watcher, linger_s: float | None = None) -> FastAPI:
             raise HTTPException(404, "this run has no report yet")
         return FileResponse(watcher.report)
 
-    for name in ("page.css", "page.js"):
-        app.get(f"/{name}")(_file(HERE / name))
+    @app.get("/page.{kind}")
+    async def file(kind: Literal["css", "js"]) -> FileResponse:
+        return FileResponse(
+            HERE / f"page.{kind}", headers={"Cache-Control": "no-cache"}
+        )
+
     ui.run_with(
         app,
         root=make_page(watcher),
@@ -86,13 +100,6 @@ def make_app(watcher: Watcher, linger_s: float | None = None) -> FastAPI:
         reconnect_timeout=10.0,
     )
     return app
-
-
-def _file(path: pathlib.Path) -> Callable[[], Awaitable[FileResponse]]:
-    async def send() -> FileResponse:
-        return FileResponse(path, headers={"Cache-Control": "no-cache"})
-
-    return send
 
 
 async def _watch(watcher: Watcher, linger_s: float | None) -> None:
@@ -129,3 +136,9 @@ def serve(
         timeout_graceful_shutdown=1,
     )
     uvicorn.Server(config).run(sockets=[sock])
+
+
+if __name__ == "__main__":
+    made = socket.socket(fileno=int(sys.argv[2]))
+    token = os.environ.pop(TOKEN, "") or None
+    serve(pathlib.Path(sys.argv[1]), made, token, LINGER_S)

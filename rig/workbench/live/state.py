@@ -12,7 +12,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rig.config import AXIS_NAMES
 from rig.config.axis import Scale
 from rig.workbench.live.worth import reasons
 from rig.workbench.outputs.console import event_lines
@@ -26,6 +25,7 @@ ENDS = ("end", "fault", "stopped", "paused", "refused")
 KEPT_PHASES = 400  # newest changes of phase: more than the plots show
 LOGGED = 200  # newest lines of what happened
 SESSIONS = ("calibrate", "collect", "verify", "goto")
+LOST = ("unreachable", "withdrawn")
 REFERENCES = {"reference:middle", "reference:end"}  # visits of a calibration
 ACTIVE = ("moving", "settling", "measuring")
 
@@ -51,24 +51,17 @@ class Posture:
     @property
     def title(self) -> str:
         """The name in words."""
-        role, _, number = self.name.partition(":")
-        words = {
-            "select": f"posture {number}",
-            "before": f"target {number}, raw",
-            "after": f"target {number}, compensated",
-            "reference": f"zero posture, {number}",
-            "collect": f"posture {number}",
-            "goto": "desired posture",
-        }
-        return words.get(role, self.name)
+        title, _ = ROLES.get(self.role, (self.name, ""))
+        return title.format(self.name.partition(":")[2])
 
 
-WHY = {
-    "before": "held out: the error without calibration",
-    "after": "held out: the error with calibration",
-    "reference": "the zero again: drift of the phone or the device",
-    "collect": "drawn at random",
-    "goto": "asked for with --to",
+ROLES = {  # of a posture: its title, and why it is visited
+    "select": ("posture {}", ""),
+    "before": ("target {}, raw", "held out: the error without calibration"),
+    "after": ("target {}, compensated", "held out: the error with calibration"),
+    "reference": ("zero posture, {}", "the zero again: drift of phone or device"),
+    "collect": ("posture {}", "drawn at random"),
+    "goto": ("desired posture", "asked for with --to"),
 }
 
 
@@ -130,8 +123,6 @@ class RunState:
                 self.pausing = True
             case "phase":
                 self._enter(record["phase"], now)
-            case "command":
-                self._command(record)
             case "visit":
                 self.current = record["name"]
                 self.target = self.to_deg(record["pulses"])
@@ -183,17 +174,6 @@ class RunState:
             self.postures[self.current].state = phase  # type: ignore[assignment]
             # one of ACTIVE, which are states
 
-    def _command(self, record: Record) -> None:
-        """Runs of older versions have no ``visit``; their commands name the posture."""
-        name, axis = record["label"], AXIS_NAMES.index(record["axis"])
-        if self.current == name or name not in self.postures:
-            return
-        self.current = name
-        self.postures[name].state = "moving"
-        pulses = [0, 0, 0]
-        pulses[axis] = record["pulses"]
-        self.target = self.postures[name].commanded or self.to_deg(pulses)
-
     def _measured(self, record: Record, now: float) -> None:
         posture = self._posture(record["name"], record["pulses"])
         posture.state, posture.note, posture.time = "done", "", now
@@ -227,7 +207,7 @@ class RunState:
         posture = self.postures.setdefault(name, Posture(name))
         if pulses is not None:
             posture.commanded = self.to_deg(pulses)
-        posture.why = posture.why or WHY.get(posture.role, "")
+        posture.why = posture.why or ROLES.get(posture.role, ("", ""))[1]
         return posture
 
     def _plan(self, names: list[str]) -> None:
@@ -291,8 +271,7 @@ class RunState:
         return [
             posture
             for posture in self.postures.values()
-            if posture.role in roles
-            and posture.state not in ("unreachable", "withdrawn")
+            if posture.role in roles and posture.state not in LOST
         ]
 
     @property
@@ -304,14 +283,12 @@ class RunState:
     @property
     def planned(self) -> int:
         """Visits of the whole run, as far as is known."""
-        lost = ("unreachable", "withdrawn")
-        known = sum(p.state not in lost for p in self.postures.values())
+        known = sum(p.state not in LOST for p in self.postures.values())
         if self.mode != "calibrate" or self.ended is not None:
             return known
-        pairs = 0 if self.by_role("before") else self.setting(
-            "session", "verify_postures", 0
-        )  # fmt: skip
-        return known + 2 * pairs + len(REFERENCES - self.postures.keys())
+        pairs = self.setting("session", "verify_postures", 0)
+        known += 0 if self.by_role("before") else 2 * pairs
+        return known + len(REFERENCES - self.postures.keys())
 
     @property
     def noise_deg(self) -> float:
@@ -323,13 +300,6 @@ class RunState:
             if p.role in ("select", "collect")
         ]
         return math.sqrt(float(np.mean(squares))) if squares else math.nan
-
-    @property
-    def drift_deg(self) -> float | None:
-        """Largest angle of the zero posture at its last visit, once visited again."""
-        if len(self.drift) < 2:
-            return None
-        return max(map(abs, self.drift[-1][1]))
 
     def left_s(self) -> float | None:
         """Seconds to the end, from the pace so far."""

@@ -14,6 +14,7 @@ from typing import Any
 from rig.core.faults import Refused
 from rig.core.stop import UnitStop
 from rig.journal import is_written
+from rig.signals import PAUSE
 from rig.stopping import stop_run
 from rig.workbench.live.state import RunState
 from rig.workbench.outputs.telemetry import PERIOD_S, TELEMETRY
@@ -79,7 +80,6 @@ class Watcher:
         self._journal = Tail(folder / JOURNAL)
         self._telemetry = Tail(folder / TELEMETRY, FIRST_BYTES)
         self._asked = 0.0
-        self._paused = -1  # session, by its number, that was asked to pause
 
     def poll(self) -> None:
         """Take what is new."""
@@ -118,7 +118,7 @@ class Watcher:
         return self.running and self.state.host == platform.node()
 
     def ask(self, number: signal.Signals) -> str:
-        """Send the session SIGTERM (stop now) or SIGINT (pause after this posture).
+        """Send the session SIGTERM (stop now) or PAUSE (after this posture).
 
         Returns:
             What was done, in words.
@@ -130,13 +130,8 @@ class Watcher:
         pid = self.state.pid
         if not self.here or pid is None or not is_written(self.folder / JOURNAL):
             raise Refused("nothing was sent: no session of this run is running here")
-        if number == signal.SIGINT:
-            if self.state.phase in ("opening", "finishing"):  # SIGINT would end the run
-                raise Refused("there is nothing to pause: nothing is moving now")
-            # A second SIGINT is a stop, also after one Ctrl-C in the terminal.
-            if self.state.pausing or self._paused == self.state.sessions:
-                raise Refused("a pause was asked for already; STOP stops at once")
-            self._paused = self.state.sessions
+        if number == PAUSE and self.state.phase in ("opening", "finishing"):
+            raise Refused("there is nothing to pause: nothing is moving now")
         try:
             os.kill(pid, number)
         except OSError as error:
@@ -144,7 +139,7 @@ class Watcher:
                 f"NOT SENT to process {pid}: {error.strerror}. Press Ctrl-C twice in "
                 "its terminal, or use the emergency stop"
             ) from None
-        if number == signal.SIGINT:
+        if number == PAUSE:
             return "pause asked for: the session finishes this posture first"
         return f"STOP sent to process {pid}"
 

@@ -12,10 +12,11 @@ import numpy as np
 from rig.config import AXIS_NAMES
 from rig.core.faults import EXIT_RECALIBRATE
 from rig.core.stop import UnitStop
-from rig.workbench.live.state import ACTIVE, Degrees, Posture, Record, RunState
+from rig.workbench.live.state import ACTIVE, Posture, Record, RunState
 from rig.workbench.live.worth import ellipsoid, prediction_std
-from rig.workbench.outputs.console import drift_text, error_text, noise_text
+from rig.workbench.outputs.console import error_text, summary_lines
 
+NONE = (None, None, None)  # of three axes, where nothing is known
 SHOWN = 40  # rows of a long queue
 STALE_S = 1.0
 MARKS = {
@@ -30,16 +31,17 @@ PHASES = {
     "saving": "Saving {}",
     "finishing": "Drives at rest; identifying",
 }
+ENDED = {
+    "end": ("good", "Done"),
+    "paused": ("warn", "Paused"),
+    "refused": ("bad", "Refused; nothing was moved"),
+    "stopped": ("bad", "Stopped on request"),
+}
 
 
 def text(value: Any) -> str:
     """Escaped for HTML."""
     return html.escape(str(value))
-
-
-def sentence(words: str) -> str:
-    """With a capital, and nothing else changed."""
-    return words[:1].upper() + words[1:]
 
 
 def angle(value: float | None, digits: int = 3) -> str:
@@ -66,19 +68,9 @@ def headline(state: RunState, running: bool) -> tuple[str, str]:
             return "run", "Saving"
         then = ", then pausing" if state.pausing else ""
         return "run", words.format(title) + then
-    code = ended.get("code", 0)
-    match ended["event"]:
-        case "end" if code == EXIT_RECALIBRATE:
-            return "warn", "Done: recalibrate"
-        case "end":
-            return "good", "Done"
-        case "paused":
-            return "warn", "Paused"
-        case "refused":
-            return "bad", "Refused; nothing was moved"
-        case "stopped":
-            return "bad", "Stopped on request"
-    return "bad", "Stopped by a fault"
+    if ended["event"] == "end" and ended.get("code") == EXIT_RECALIBRATE:
+        return "warn", "Done: recalibrate"
+    return ENDED.get(ended["event"], ("bad", "Stopped by a fault"))
 
 
 def _go_on(state: RunState, folder: str) -> str:
@@ -119,23 +111,18 @@ def trouble(state: RunState, running: bool, folder: str) -> str:
 
 def numbers(state: RunState, sample: Record, live: bool) -> str:
     """Commanded beside measured, an axis a row."""
-    commanded, drives = state.target, sample.get("drives") or [None] * 3
-    measured: Degrees | list[None] = sample.get("deg") or [None] * 3
-    scatter = sample.get("std") or [None] * 3
+    drives = sample.get("drives") or NONE
+    asked, found, std = state.target, sample.get("deg"), sample.get("std")
     if not live and state.done:
         last = state.done[-1]
-        commanded, measured = last.commanded, last.measured or [None] * 3
-        scatter = last.std or [None] * 3
+        asked, found, std = last.commanded, last.measured, last.std
     rows = []
-    for index, name in enumerate(AXIS_NAMES):
-        asked = commanded[index] if commanded else None
-        found = measured[index]
-        off = None if asked is None or found is None else found - asked
-        std = scatter[index]
-        cells = [
-            angle(asked), angle(drives[index]), angle(found), angle(off),
-            "–" if std is None else f"{std:.3f}",
-        ]  # fmt: skip
+    for name, a, d, y, s in zip(
+        AXIS_NAMES, asked or NONE, drives, found or NONE, std or NONE, strict=True
+    ):
+        off = None if a is None or y is None else y - a
+        spread = "–" if s is None else f"{s:.3f}"
+        cells = (angle(a), angle(d), angle(y), angle(off), spread)
         row = "".join(f"<td>{cell}</td>" for cell in cells)
         rows.append(f"<tr><th class='axis {name}'>{name}</th>{row}</tr>")
     titles = "degrees commanded drive measured difference scatter".split()
@@ -155,20 +142,13 @@ def stream(sample: Record, running: bool, now: float) -> str:
     return late + ("" if "deg" in sample else "; angles follow once the zero is taken")
 
 
-def progress(state: RunState) -> tuple[float, str]:
-    """Share done, and in words."""
-    done, planned = len(state.done), state.planned
-    words = f"{done} of {planned} postures" if planned else ""
-    left = state.left_s()
-    if left:
-        words += f", about {left:.0f} s left"
-    return (done / planned if planned else 0.0), words
-
-
 def head(state: RunState, running: bool, folder: str) -> str:
     """The head of the page: which run, what happens now, how far it is."""
     tone, line = headline(state, running)
-    share, said = progress(state)
+    done, planned, left = len(state.done), state.planned, state.left_s()
+    share = done / planned if planned else 0.0
+    said = f"{done} of {planned} postures" if planned else ""
+    said += f", about {left:.0f} s left" if left else ""
     simulated = "<em>simulated</em>" if state.start.get("simulated") else ""
     return (
         f"<h1>{text(state.mode)} {simulated}<small>{text(folder)}</small></h1>"
@@ -242,48 +222,24 @@ def uncertainty(state: RunState) -> str:
 
 
 def verdict(state: RunState, summary: dict[str, Any], report: bool) -> str:
-    """The result at the end of a run; empty before."""
+    """The result at the end of a run, as on the console; empty before."""
     if state.ended is None or state.ended["event"] != "end":
         return ""
     lines: list[str] = []
     limit = state.setting("session", "verify_limit_deg")
-    if "before" in summary:
-        lines.append(f"{sentence(error_text(summary))}, limit {limit:g}")
-    if "noise_std_deg" in summary:
-        lines.append(sentence(noise_text(summary)))
-    if summary.get("drift"):
-        lines.append(sentence(drift_text(summary["drift"])))
-    if warning := summary.get("orders", {}).get("warning"):
-        lines.append(f"Warning: {warning}")
-    if state.mode == "goto" and state.done:
-        found = " ".join(angle(v) for v in state.done[-1].measured or [])
-        lines.append(f"Reached {found} deg")
-    if state.mode == "collect":
-        lines.append(f"{len(state.done)} postures recorded")
-    said = "<h2>Result</h2>" + "".join(f"<p>{text(line)}</p>" for line in lines)
     if "A" in summary:
-        said += _calibration(summary)
+        lines = summary_lines(summary, limit)
+    elif "before" in summary:
+        lines = [f"{error_text(summary)}, limit {limit:g}"]
+    elif state.mode == "goto" and state.done:
+        found = " ".join(angle(v) for v in state.done[-1].measured or [])
+        lines = [f"Reached {found} deg"]
+    elif state.mode == "collect":
+        lines = [f"{len(state.done)} postures recorded"]
+    said = "<h2>Result</h2><pre>" + text("\n".join(lines)) + "</pre>"
     if report:
         said += "<p><a href='/report' target='_blank'>Full report</a></p>"
     return said
-
-
-def _calibration(summary: dict[str, Any]) -> str:
-    rows = []
-    for name, a, b, wide in zip(
-        AXIS_NAMES, summary["A"], summary["b"], summary["ci95"], strict=True
-    ):
-        cells = "".join(
-            f"<td>{value:.5f}<small> ±{width:.5f}</small></td>"
-            for value, width in zip([*a, b], wide, strict=True)
-        )
-        rows.append(f"<tr><th class='axis {name}'>{name}</th>{cells}</tr>")
-    head = "".join(f"<th>u {name}</th>" for name in AXIS_NAMES)
-    return (
-        "<p>y = A u + b in degrees, ± 95 % for all twelve at once</p>"
-        f"<div class='wide'><table class='numbers'><tr><th></th>{head}<th>b</th></tr>"
-        f"{''.join(rows)}</table></div>"
-    )
 
 
 def happened(state: RunState, clock: Any) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -36,7 +37,7 @@ class Console:
         if record["event"] == "visit":
             self._begun = record["time"]
         if record["event"] != "posture":
-            return self._run.say(*event_lines(record))
+            return self._say(event_lines(record))
         self._visits_s.append(record["time"] - self._begun)
         visited, planned = len(self._run.postures()), self._run.planned
         left = max(0, planned - visited) * float(np.mean(self._visits_s[-10:]))
@@ -46,6 +47,12 @@ class Console:
             f"y [{numbers(record['measured_deg'], 8, 3)}]  {self._visits_s[-1]:5.2f} s,"
             f" about {left:.0f} s left"
         )
+
+    def _say(self, lines: list[str]) -> None:
+        if threading.current_thread() is threading.main_thread():
+            self._run.say(*lines)
+        elif lines:  # a terminal held by Ctrl-S must not hold the phone's thread too
+            threading.Thread(target=self._run.say, args=lines, daemon=True).start()
 
 
 def listen(run: Run) -> None:
