@@ -8,15 +8,11 @@ by the next writer; any other damage is an error, never a guess.
 from __future__ import annotations
 
 import contextlib
-import csv
 import datetime
 import fcntl
-import importlib.metadata
-import io
 import json
 import os
 import pathlib
-import platform
 import sys
 import threading
 import time
@@ -191,6 +187,9 @@ class RunFolder:
             raise
 
     def _begin(self, mode: str, start: Record) -> None:
+        import importlib.metadata  # these two are slow to load, and `stop` is not to be
+        import platform
+
         now = datetime.datetime.now(datetime.UTC)
         provenance = {
             "jaxcal": importlib.metadata.version("jaxcal"),
@@ -245,6 +244,9 @@ class RunFolder:
 
     def save_pairs(self) -> None:
         """Write pairs.csv: role, commands, measurements, scatter of every posture."""
+        import csv
+        import io
+
         from rig.config import AXIS_NAMES
 
         of_axes = ("pulses", "u_deg", "y_deg", "std_deg")
