@@ -12,6 +12,7 @@ A source answers, of candidates (M, n) of which some are available:
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 
 import numpy as np
@@ -31,18 +32,18 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-class Source:
+class Source(abc.ABC):
     """See the top of the module; what is the same in most."""
 
     names: tuple[str, ...] = ()
     times = 1
     root: Array
 
-    def blocks(self) -> Array:
-        raise NotImplementedError
+    @abc.abstractmethod
+    def blocks(self) -> Array: ...
 
-    def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
-        raise NotImplementedError
+    @abc.abstractmethod
+    def at(self, argument: str, values: ArrayLike, readings: bool) -> Array: ...
 
     def require_identified(self, measured: ArrayLike | None) -> None:
         """Refuse what candidates leave unknown, by the names of a model."""
