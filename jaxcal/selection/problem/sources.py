@@ -12,8 +12,8 @@ A source answers, of candidates (M, n) of which some are available:
 
 from __future__ import annotations
 
-import abc
 import dataclasses
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,21 +32,20 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-class Source(abc.ABC):
+class Source(Protocol):
     """See the top of the module; what is the same in most."""
 
     names: tuple[str, ...] = ()
-    times = 1
+    times: int = 1
     root: Array
 
-    @abc.abstractmethod
     def blocks(self) -> Array: ...
 
-    @abc.abstractmethod
     def at(self, argument: str, values: ArrayLike, readings: bool) -> Array: ...
 
     def require_identified(self, measured: ArrayLike | None) -> None:
         """Refuse what candidates leave unknown, by the names of a model."""
+        return
 
     def predicted(self) -> Array | None:
         """Commands of predictions, where their blocks are not those of readings."""
