@@ -29,6 +29,17 @@ def read_model(path: str | None) -> Model | None:
     if path.lower().endswith(".urdf"):
         return SerialChain.from_urdf(path)
     try:
-        return from_dict(json.loads(pathlib.Path(path).read_text(encoding="utf-8")))
+        read = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
+    except ValueError:
+        raise ValueError(
+            f"{path}: a model must be a JSON file of its to_dict(), or an arm's .urdf"
+        ) from None
+    if isinstance(read, dict) and read.get("format") == "jaxcal-calibration":
+        raise ValueError(
+            f"{path}: a model is needed, this is a calibration; commands that apply "
+            "one are predict and command"
+        )
+    try:
+        return from_dict(read)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error

@@ -9,9 +9,12 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+import numpy as np
+
 from jaxcal.arguments import several
 from jaxcal.commands.model import add_model, read_model
 from jaxcal.commands.tables import Table, add_output, read_table, written
+from jaxcal.information.excitation import require_excited
 from jaxcal.models import Affine, Noise
 from jaxcal.selection import Design, Selection
 from jaxcal.selection.criteria import CRITERIA
@@ -60,11 +63,16 @@ def design_of(arguments: argparse.Namespace, table: Table) -> Design:
         if model is not None:
             raise ValueError("--outputs must be left out with --model, which has them")
         model = Affine(len(candidates.columns), outputs)
+    mask = table.available()
+    if arguments.model is None:  # said here in the names of the columns
+        used = candidates.values if mask is None else candidates.values[mask]
+        distinct = f"rows ({len(np.unique(used, axis=0))} of them distinct)"
+        require_excited(used, candidates.columns, table.source, distinct)
     return Design(
         candidates,
         model,
         noise=None if arguments.noise is None else Noise(one_or_all(arguments.noise)),
-        available=table.available(),
+        available=mask,
         required=arguments.required,
         max_replicates=arguments.max_replicates,
     )
