@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.fit import Fit
 from jaxcal.checks import table, whole_number
+from jaxcal.information.blocks import without
 from jaxcal.models import SerialChain
 
 __all__ = ["Check", "check", "verification"]
@@ -81,9 +82,7 @@ def check(
             raise ValueError("placed_anew is of an arm whose sensor stands somewhere")
         own[-len(model.sensor.names) :] = True
     if own.any():  # what stands elsewhere now says nothing
-        left, size, _ = np.linalg.svd(by[:, own], full_matrices=True)
-        rank = int((size > 1e-9 * size.max(initial=0.0)).sum())
-        white, by = left[:, rank:].T @ white, left[:, rank:].T @ by
+        white, by = without(by[:, own], white, by)
     freedom = len(white)
     if not freedom:
         raise ValueError("measured leaves no reading beside what was placed anew")

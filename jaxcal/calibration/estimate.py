@@ -12,6 +12,7 @@ from jaxcal.calibration.discrepancy import WithDiscrepancy
 from jaxcal.calibration.sizes import group_sizes
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
 from jaxcal.checks import in_words, one_of, whole_number
+from jaxcal.information.blocks import significant
 from jaxcal.models import Model, Noise, Pose, Position, Prior, SerialChain
 from jaxcal.models.checked import facts
 
@@ -20,7 +21,6 @@ __all__ = ["fit_model", "require_model"]
 Array = NDArray[np.float64]
 
 _BEYOND = 45.0  # degrees beyond a limit: files are often too narrow, never so much
-_NULL = 1e-10  # of the largest singular value: not determined
 
 
 def require_model(model: Any, commands: Array, measured: Array) -> None:
@@ -275,9 +275,10 @@ def _covariance(
         np.concatenate([rows, np.diag(np.sqrt(precision))]) / scale, "r"
     )
     _, singular, right = np.linalg.svd(triangle)
-    known = singular > _NULL * singular[0]
+    known = significant(singular)
     readings = left * len(task.commands)
-    if not known.all() and np.linalg.matrix_rank(rows / scale, _NULL) >= readings:
+    of_rows = significant(np.linalg.svd(rows / scale, compute_uv=False)).sum()
+    if not known.all() and of_rows >= readings:
         raise ValueError(
             f"measured holds {readings} independent readings, too few for "
             f"{len(free)} free parameters: {int((~known).sum())} combinations of them "

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration.solve import Solution, Task
+from jaxcal.information.blocks import without
 from jaxcal.models import SerialChain
 from jaxcal.models.checked import derivative
 
@@ -88,7 +89,6 @@ def _reduced(arm: SerialChain, task: Task, found: Solution) -> tuple[Array, Arra
     known = known / np.sqrt(precision[free & (precision > 0.0)])
     flat = rows[:, free & (precision == 0.0)]
     if flat.shape[1]:
-        left, size, _ = np.linalg.svd(flat / (np.linalg.norm(flat, axis=0) + 1e-300))
-        rank = int((size > 1e-9 * size.max(initial=0.0)).sum())
-        known, right = left[:, rank:].T @ known, left[:, rank:].T @ right
+        flat = flat / (np.linalg.norm(flat, axis=0) + 1e-300)
+        known, right = without(flat, known, right)
     return known, right

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import in_words, numbers, whole_number
+from jaxcal.information.blocks import significant
 
 __all__ = ["Noise", "Prior", "ResolvedPrior"]
 
@@ -203,8 +204,7 @@ class Noise:
             return white
         left, size, _ = np.linalg.svd(white @ unknown)
         eaten = np.zeros((count, num_outputs), dtype=np.bool_)
-        least = 1e-12 * size.max(axis=-1, initial=0.0, keepdims=True)
-        eaten[:, : size.shape[-1]] = size > least
+        eaten[:, : size.shape[-1]] = significant(size)
         return np.where(eaten[..., None], 0.0, np.matrix_transpose(left) @ white)
 
     def _of_readings(self, count: int, q: int) -> Array:

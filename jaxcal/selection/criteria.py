@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import one_of
+from jaxcal.information.blocks import significant
 from jaxcal.information.criterion import Criterion
 
 __all__ = [
@@ -107,7 +108,7 @@ class I(Wanted):  # noqa: E742 - the criterion's own name in the literature
             rows = (at.region @ at.basis).reshape(-1, len(at.basis))
             mean = rows.T @ rows / len(rows)
         size, vectors = np.linalg.eigh(mean)
-        keep = size > 1e-14 * size[-1]
+        keep = significant(size, squares=True)
         return np.asarray(np.sqrt(size[keep])[:, None] * vectors.T[keep])
 
 

@@ -108,10 +108,7 @@ class Climbs:
                 root, axis=1, keepdims=True
             )  # variances near 1
             kind = kernel.DET if criterion.name == "D" else kernel.SUBSET
-        span = np.zeros((0, p))
-        if len(problem.root):
-            values, vectors = np.linalg.eigh(problem.prior)
-            span = np.ascontiguousarray(vectors.T[values > 1e-6])
+        span = problem.known if len(problem.root) else np.zeros((0, p))
         self._share = _SHARE * min(1.0, problem.k * q / p) ** 6
         self._climber = kernel.Climber(
             kind, blocks, problem.prior, root, problem.upper[self._usable],

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import require_finite, whole_number
-from jaxcal.information.blocks import largest_rank, rank_of_blocks
+from jaxcal.information.blocks import SINGULAR, largest_rank, rank_of_blocks
 from jaxcal.selection.problem.problem import Problem
 
 __all__ = [
@@ -165,7 +165,7 @@ def _cover(blocks: Array) -> int:
     count, least = 0, 0.0
     while True:
         size = np.linalg.svd(rest, compute_uv=False)
-        least = least or 1e-9 * float(size.max())
+        least = least or SINGULAR * float(size.max())
         rank = (size > least).sum(axis=1)
         if not rank.any():
             return max(count, 1)
@@ -179,7 +179,7 @@ def _cover(blocks: Array) -> int:
 def check_required_rank(problem: Problem, where: str) -> None:
     """Enough free choices must remain to complete the span of the required ones."""
     r, p = len(problem.required), problem.num_regressors
-    rank = int(rank_of_blocks(problem.raw[problem.required], problem.root))
+    rank = problem.held_rank
     room = (problem.k - r) * problem.blocks.shape[1]
     if p - rank > room:
         raise ValueError(
