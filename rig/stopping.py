@@ -200,8 +200,8 @@ def _stop_units(target: Target, path: pathlib.Path | None) -> list[UnitStop]:
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(target.lock.acquire("stop"))
-        except (OSError, Refused) as error:  # a stop waits for nobody
-            _say(str(error))
+        except (OSError, Refused):  # a stop waits for nobody
+            _say(f"{target.lock.where} is not free: its drives are stopped anyway")
         bus = Bus(settings, silence_s)
         try:
             bus.open()

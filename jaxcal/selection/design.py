@@ -297,7 +297,7 @@ class Design(Asked):
                 f"{indices.tolist()}{what} is singular"
             )
         subsets = [Subset(indices, value, log_det)]
-        if found.alternatives:
+        if len(found.alternatives) > 1:
             others = np.stack([each for each, _ in found.alternatives])
             subsets = [
                 Subset(each, float(worth), float(of_all))

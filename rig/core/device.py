@@ -260,7 +260,7 @@ class Device:
         if status.moving:
             raise MotionFault(
                 f"{axis.name} is already moving. Stop the other controller, then run "
-                "`stop`"
+                "`jaxcal-rig stop`"
             )
         if not status.enabled:
             if not drive.bring(axis.map.enable, lambda s: s.enabled).enabled:

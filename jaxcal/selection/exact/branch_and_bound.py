@@ -2,8 +2,9 @@
 
 Source: Ponte, Fampa and Lee, Branch-and-bound for integer D-Optimality with fast local
 search and variable-bound tightening, arXiv 2302.07386. A node is closed when its bound
-is within ``TOLERANCE`` of the incumbent, far above the rounding of either (1e-13), so
-"proven" means: no selection is better by more than that.
+is within ``TOLERANCE`` of the incumbent, far above the rounding of either (1e-13, which
+fused products only make smaller), so "proven" means: no selection is better by more
+than that.
 """
 
 from __future__ import annotations

@@ -43,7 +43,7 @@ mu = 0 is the natural bound. At a given N the best mu is an eigenvalue of U, the
 whose eigenvector no longer finds room among the t readings.
 """
 
-# Sums in any order.
+# Products may be fused.
 
 from __future__ import annotations
 
@@ -51,6 +51,7 @@ import cython
 import numpy as np
 from cython.cimports.jaxcal.information.linear_algebra import (
     cholesky,
+    copy,
     factor,
     multiply,
 )
@@ -159,7 +160,8 @@ class Search:
             if not value > -INFINITY:
                 return value
         if kind == _D:
-            self.gradient[:, :] = self.inverse
+            copy(cython.address(self.gradient[0, 0]),
+                 cython.address(self.inverse[0, 0]), p * p)  # fmt: skip
         elif kind == _DS or kind == _TRACE:
             value = self._covariance(kind, self.root, self.root.shape[0], self.gradient)
         elif kind == _RANK_TRACE:
@@ -358,7 +360,7 @@ class Search:
         multiply(False, True, s, p, p, root, half, reach)
         multiply(True, False, p, p, s, reach, reach, vectors)
         self._eigen()
-        self.weights[:] = self.values
+        copy(cython.address(self.weights[0]), cython.address(self.values[0]), p)
         multiply(False, False, p, p, p, vectors, half, reach)
         multiply(False, False, p, p, p, reach, cython.address(self.known[0, 0]),
                   cython.address(self.lines[0, 0]))  # fmt: skip
@@ -596,12 +598,12 @@ class Search:
             for g in range(f):
                 right[f] -= face[f * size + g] * right[g]
                 ones[f] -= face[f * size + g] * ones[g]
-            right[f] /= face[f * size + f]
-            ones[f] /= face[f * size + f]
+            right[f] *= face[f * size + f]
+            ones[f] *= face[f * size + f]
         for b in range(size):
             f = size - 1 - b
-            right[f] /= face[f * size + f]
-            ones[f] /= face[f * size + f]
+            right[f] *= face[f * size + f]
+            ones[f] *= face[f * size + f]
             for g in range(f):
                 right[g] -= face[f * size + g] * right[f]
                 ones[g] -= face[f * size + g] * ones[f]
