@@ -47,7 +47,7 @@ _FURTHER = (1.0, 0.03)
 _RANK_FIRST = 1e-7  # every direction that nothing is known of outweighs the rest
 _MENDING = 10  # random starts where all greedy ones are singular
 
-_CLIMBS = 1.3e5  # k p^3 of the climbs of E in one call, but from 1 to 10 of them
+_CLIMBS = 2.5e5  # k p^3 of the climbs of E in one call, from each kind of start
 
 
 def solve(problem: Problem, *, seed: int, restarts: int | None) -> Found:
@@ -141,9 +141,13 @@ class Climbs:
         )
         return self._usable[chosen], phi
 
+    def random_start(self) -> Indices:
+        """(k,) another random selection, rarely singular."""
+        return self._usable[self._climber.random_start(self._rank())]
+
     def random_climb(self) -> tuple[Indices, float]:
         """The local optimum of another random start, and its phi."""
-        return self.climbed(self._usable[self._climber.random_start(self._rank())])
+        return self.climbed(self.random_start())
 
     def best_of(self, restarts: int) -> tuple[Indices, float]:
         """The best local optimum from greedy selections and then random starts."""
@@ -225,21 +229,20 @@ def _required_first(problem: Problem, chosen: Indices) -> Indices:
 def _best_eigenvalue(
     problem: Problem, climbs: Climbs, restarts: int
 ) -> tuple[Indices, float]:
-    """The best local optimum of E and its value, from ``restarts`` local optima of A.
+    """The best local optimum of E and its value.
 
-    Only those of the best eigenvalues are climbed: many local optima of A come closer
-    than climbs from a few.
+    From local optima of A, the best first, and from random selections as often: the
+    former come closer where there are many parameters, the latter where there are few.
     """
-    starts = [climbs.best_of(1), *(climbs.random_climb() for _ in range(restarts - 1))]
-    chosen = np.unique(
-        [np.sort(start) for start, phi in starts if phi > -np.inf], axis=0
-    )
-    if not len(chosen):
-        return starts[0]
-    order = np.argsort(-values(problem, chosen)[0])
+    many = (restarts + 1) // 2
     work = problem.k * problem.num_regressors**3
-    few = int(min(max(_CLIMBS / work, 1), 10))
-    found = [
-        climbs.climbed_least(_required_first(problem, chosen[i])) for i in order[:few]
-    ]
+    many_climbs = int(min(max(_CLIMBS / work, 1), many))
+    near = [climbs.best_of(1), *(climbs.random_climb() for _ in range(many - 1))]
+    starts = np.unique([np.sort(start) for start, phi in near if phi > -np.inf], axis=0)
+    if not len(starts):
+        return near[0]
+    order = np.argsort(-values(problem, starts)[0])[:many_climbs]
+    found = [climbs.climbed_least(_required_first(problem, starts[i])) for i in order]
+    for _ in range(min(many_climbs, restarts - many)):
+        found.append(climbs.climbed_least(climbs.random_start()))
     return max(found, key=lambda each: each[1])
