@@ -155,7 +155,7 @@ def on_phase(run: Run, listener) -> None:
 def no_figures():
     """The report without its figures, which take longer than a fast session."""
     text = "no figures in this test"
-    return mock.patch.object(report, "_drawn", lambda *_: text)
+    return mock.patch.object(report, "drawn", lambda *_: text)
 
 
 def in_the_middle(run: Run, phase: str) -> bool:

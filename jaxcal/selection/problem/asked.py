@@ -157,7 +157,7 @@ class Asked:
         """
         default = "I" if self.model and not isinstance(self.model, Affine) else "D"
         asked = wanted(criterion, region, default)
-        source = self.source(asked.parameters is not None)
+        source = self.source(asked.by_name)
         raw, root = source.blocks(), source.root
         if self._measured is not None:
             seen = source.at("measured", self._measured, True)
