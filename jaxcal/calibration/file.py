@@ -97,7 +97,10 @@ def read(path: str | os.PathLike[str]) -> Any:
     try:
         return json.loads(data.decode("utf-8"), parse_constant=constant)
     except json.JSONDecodeError as error:
-        problem = f"not JSON: {error.msg} in line {error.lineno}"
+        problem = (
+            f"not JSON: {error.msg} in line {error.lineno}; `jaxcal identify ... "
+            "--out FILE` writes a calibration"
+        )
     except (UnicodeDecodeError, RecursionError):
         problem = "not JSON: not text"
     except ValueError as error:

@@ -52,8 +52,10 @@ class Wanted:
     says: ClassVar[str]  # what a table prints before the value; V is a covariance
     per_output: ClassVar[bool] = False  # the value is one output's, not their sum
     of_region: ClassVar[bool] = False  # it is about predictions, see ``region``
+    by_name: ClassVar[bool] = (
+        False  # it tells the parameters apart, ``Coordinates.names``
+    )
     region: ArrayLike | None = None  # commands or blocks where; the candidates if None
-    parameters: Sequence[str | int] | None = None  # of interest; all when None
 
     def root(self, at: Coordinates) -> Array:
         """C (s, p) in the problem's coordinates, of full row rank."""
@@ -119,11 +121,13 @@ class _OfSome(Wanted):
         parameters: their names or indices, at least one.
     """
 
+    by_name = True
+
     def __init__(self, parameters: Sequence[str | int]) -> None:
         self.parameters = parameters
 
     def root(self, at: Coordinates) -> Array:
-        return at.basis[positions(self.parameters or (), at.names)]
+        return at.basis[positions(self.parameters, at.names)]
 
 
 class Ds(_OfSome):
@@ -166,7 +170,8 @@ def wanted(criterion: Any, region: Any, default: str) -> Wanted:
             asked = CRITERIA[name]()
         except TypeError:
             raise ValueError(
-                f"criterion {name} must carry its data: jaxcal.{name}([...])"
+                f"criterion {name} must carry its data: "
+                f"jaxcal.{CRITERIA[name].__name__}([...])"
             ) from None
     if region is None:
         return asked

@@ -26,13 +26,13 @@ from rig.core.drive import Drive
 from rig.core.faults import (
     MotionFault,
     NotFollowing,
+    Requests,
     Unreachable,
     ending,
 )
 from rig.core.known import check_drives, leave
 from rig.core.measure import measure, zeroed
 from rig.core.motion import Standing, move
-from rig.core.stop import Requests
 from rig.core.zero import KeptZero, axes_text, check_zero, heading_turn
 from rig.journal import ZEROED, BusLock, DeviceRecord, Record, RunFolder
 

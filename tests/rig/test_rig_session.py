@@ -31,8 +31,8 @@ from rig.core.faults import Refused
 from rig.core.plan import choose, draw_candidates
 from rig.journal import read_journal
 from rig.simulator import Truth
+from rig.workbench.identification.conclusion import order_residuals
 from rig.workbench.identification.fit import uncertainty
-from rig.workbench.identification.orders import order_residuals
 from rig.workbench.procedures.calibrate import calibrate
 from rig.workbench.procedures.checking import collect
 from rig.workbench.run import run_safely
