@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 import pytest
-from commission import QUICK, device, set_up
+from commission import QUICK, device, quick_text, set_up
 from harness import no_figures
 
 from rig import commissioning
@@ -173,3 +173,13 @@ def test_without_a_terminal_nothing_is_confirmed(at, monkeypatch, capsys):
         assert main(["setup", "--bus", bus, "--imu", f"hyperimu:{port}"]) == 2
     assert "--yes" in capsys.readouterr().err
     assert not pathlib.Path("rig.toml").exists()
+
+
+def test_a_simulated_setup_leaves_the_device_of_an_existing_file_alone(at, capsys):
+    """It used the file: the real device moved, at the speed of a simulated one."""
+    with device() as (sim, bus, port):
+        (at / "rig.toml").write_text(quick_text(bus, port))
+        given = ["setup", "--simulate", "--yes", "--config", "rig.toml"]
+        assert main(given) == 2
+        assert "--simulate writes a file of its own" in capsys.readouterr().err
+        assert sim.server.requests == 0

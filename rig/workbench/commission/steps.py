@@ -189,7 +189,7 @@ def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> i
     path = None if into is None else calibration_path(into)
     if path is not None:
         # Of this device; simulated ones alone are moved at full speed.
-        load_calibration(path, place.config, simulated=place.full_speed)
+        load_calibration(path, place.config, simulated=place.full_speed, into=True)
     name, most = AXIS_NAMES[axis], measured.BASE_DEG + measured.FAR_DEG
     place.operator.confirm(
         f"characterise: {name} will move up to {most:.2f} deg from where it stands, "
