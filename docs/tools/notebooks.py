@@ -48,7 +48,10 @@ def executed(name: str, folder: str) -> nbformat.NotebookNode:
     scripts = str(pathlib.Path(sys.executable).parent)
     os.environ["PATH"] = scripts + os.pathsep + os.environ["PATH"]
     client = NotebookClient(
-        notebook, timeout=300, resources={"metadata": {"path": folder}}
+        notebook,
+        timeout=300,
+        coalesce_streams=True,
+        resources={"metadata": {"path": folder}},
     )
     client.execute()
     for cell in notebook.cells:
