@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,21 +33,20 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-class Source:
+class Source(Protocol):
     """See the top of the module; what is the same in most."""
 
     names: tuple[str, ...] = ()
-    times = 1
+    times: int = 1
     root: Array
 
-    def blocks(self) -> Array:
-        raise NotImplementedError
+    def blocks(self) -> Array: ...
 
-    def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
-        raise NotImplementedError
+    def at(self, argument: str, values: ArrayLike, readings: bool) -> Array: ...
 
     def require_identified(self, measured: ArrayLike | None) -> None:
         """Refuse what candidates leave unknown, by the names of a model."""
+        return
 
     def predicted(self) -> Array | None:
         """Commands of predictions, where their blocks are not those of readings."""
