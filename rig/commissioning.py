@@ -209,7 +209,7 @@ def _place(args: argparse.Namespace, state: str = "") -> Iterator[steps.Place]:
             simulator = make_simulator(config, vars(args), args.fault)
             served = stack.enter_context(simulator).start()
             record = DeviceRecord(_own_folder(served) / "device.json")
-            place = steps.simulated(simulator, served, record, _say, path)
+            place = steps.simulated(simulator, served, record, _say)
             steps.begin_simulated(place, state)
             place.operator.yes = getattr(args, "yes", False)
         place.reset_alarms = getattr(args, "reset_alarms", False)

@@ -20,7 +20,11 @@ from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.criteria import wanted
 from jaxcal.selection.problem.making import Rules, whitened_problems
 from jaxcal.selection.problem.problem import Problem
-from jaxcal.selection.problem.rules import check_available, usable_numbers
+from jaxcal.selection.problem.rules import (
+    check_available,
+    one_array,
+    usable_numbers,
+)
 from jaxcal.selection.problem.sources import (
     Given,
     Modelled,
@@ -206,7 +210,9 @@ class Asked:
         self.prior, self.noise = prior, noise
         # Copies: the caller's arrays may change before the next question.
         self._measured = None if measured is None else numbers("measured", measured)
-        self._required = copy.copy(required)
+        self._required = None
+        if required is not None:
+            self._required = one_array("required", required)[None]
         self.max_replicates = max_replicates
 
 

@@ -17,6 +17,7 @@ __all__ = [
     "check_k",
     "check_required_rank",
     "in_set",
+    "one_array",
     "usable_numbers",
 ]
 
@@ -41,7 +42,8 @@ def in_set(b: int | np.integer[Any], count: int) -> str:
     return "" if count == 1 else f" in set {int(b)}"
 
 
-def _one_array(name: str, values: ArrayLike) -> NDArray[Any]:
+def one_array(name: str, values: ArrayLike) -> NDArray[Any]:
+    """A copy of ``values`` as an array of any kind."""
     try:
         return np.array(values)
     except ValueError as error:
@@ -54,7 +56,7 @@ def check_available(available: ArrayLike | None, shape: tuple[int, ...]) -> Mask
     """(S, M) or (M,), as ``shape`` says."""
     if available is None:
         return np.ones(shape, dtype=np.bool_)
-    mask = _one_array("available", available)
+    mask = one_array("available", available)
     if mask.shape != shape:
         raise ValueError(f"available must have shape {shape}, got {mask.shape}")
     if mask.dtype.kind not in "biuf" or not np.isin(mask, (0, 1)).all():
@@ -69,7 +71,7 @@ def check_available(available: ArrayLike | None, shape: tuple[int, ...]) -> Mask
 def check_counts(
     mask: Mask, k: int, required: ArrayLike | None, max_replicates: int
 ) -> tuple[int, Indices]:
-    """The cap on replicates and the required candidates (S, r), (r,) of one set."""
+    """The cap on replicates and the required candidates (S, r)."""
     cap = whole_number("max_replicates", max_replicates, 1)
     count = mask.sum(axis=1)
     if (count == 0).any():
@@ -89,12 +91,11 @@ def _check_required(required: ArrayLike | None, mask: Mask, k: int) -> Indices:
     num_sets, num_candidates = mask.shape
     if required is None or np.size(required) == 0:
         return np.zeros((num_sets, 0), dtype=np.int64)
-    given = _one_array("required", required)
-    if num_sets == given.ndim == 1:
-        given = given[None]
+    given = one_array("required", required)
     if given.ndim != 2 or len(given) != num_sets:
-        want = "(r,)" if num_sets == 1 else "(B, r)"
-        raise ValueError(f"required must have shape {want}, got {given.shape}")
+        single = num_sets == len(given) == 1  # given without this axis
+        want, got = ("(r,)", given.shape[1:]) if single else ("(B, r)", given.shape)
+        raise ValueError(f"required must have shape {want}, got {got}")
     if not np.issubdtype(given.dtype, np.integer):
         raise ValueError(f"required must hold whole numbers, got dtype {given.dtype}")
     forced = given.astype(np.int64)

@@ -272,11 +272,10 @@ def simulated(
     served: RigConfig,
     record: DeviceRecord,
     say: Callable[[str], None],
-    path: pathlib.Path | None = None,
 ) -> Place:
-    """A simulated device, at which nobody needs to stand."""
+    """A simulated device, at which nobody needs to stand; it corrects no file."""
     return Place(
-        served, record, Operator(yes=True, say=say), path, full_speed=True,
+        served, record, Operator(yes=True, say=say), full_speed=True,
         listeners=(simulator.hear,),
     )  # fmt: skip
 
