@@ -97,7 +97,10 @@ def read(path: str | os.PathLike[str]) -> Any:
     try:
         return json.loads(data.decode("utf-8"), parse_constant=constant)
     except json.JSONDecodeError as error:
-        problem = f"not JSON: {error.msg} in line {error.lineno}"
+        problem = (
+            f"not JSON: {error.msg} in line {error.lineno}; `jaxcal identify ... "
+            "--out FILE` writes a calibration"
+        )
     except (UnicodeDecodeError, RecursionError):
         problem = "not JSON: not text"
     except ValueError as error:
@@ -150,6 +153,7 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
         found[key] = tuple(found[key])
     for key, (kind, what) in _KINDS.items():
         require(isinstance(found[key], kind), key, f"be {what}")
+    require(found["loss"] in ("student", "gaussian"), "loss", "be student or gaussian")
     for key in ("model", "derived"):
         require(isinstance(content.get(key), dict), key, "be an object")
     names = content["derived"].get("parameter_names")

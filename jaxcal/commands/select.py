@@ -11,8 +11,11 @@ import json
 import pathlib
 from typing import Any
 
+import numpy as np
+
 from jaxcal.arguments import several
 from jaxcal.commands.tables import Table, add_output, read_table, written
+from jaxcal.information.excitation import require_excited
 from jaxcal.models import Affine, Model, Noise, SerialChain, from_dict
 from jaxcal.selection import Design, Selection
 from jaxcal.selection.criteria import CRITERIA
@@ -55,7 +58,18 @@ def read_model(path: str | None) -> Model | None:
     if path.lower().endswith(".urdf"):
         return SerialChain.from_urdf(path)
     try:
-        return from_dict(json.loads(pathlib.Path(path).read_text(encoding="utf-8")))
+        read = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
+    except ValueError:
+        raise ValueError(
+            f"{path}: a model must be a JSON file of its to_dict(), or an arm's .urdf"
+        ) from None
+    if isinstance(read, dict) and read.get("format") == "jaxcal-calibration":
+        raise ValueError(
+            f"{path}: a model is needed, this is a calibration; commands that apply "
+            "one are predict and command"
+        )
+    try:
+        return from_dict(read)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 
@@ -86,11 +100,16 @@ def design_of(arguments: argparse.Namespace, table: Table) -> Design:
         if model is not None:
             raise ValueError("--outputs must be left out with --model, which has them")
         model = Affine(len(candidates.columns), outputs)
+    mask = table.available()
+    if arguments.model is None:  # said here in the names of the columns
+        used = candidates.values if mask is None else candidates.values[mask]
+        distinct = f"rows ({len(np.unique(used, axis=0))} of them distinct)"
+        require_excited(used, candidates.columns, table.source, distinct)
     return Design(
         candidates,
         model,
         noise=None if arguments.noise is None else Noise(one_or_all(arguments.noise)),
-        available=table.available(),
+        available=mask,
         required=arguments.required,
         max_replicates=arguments.max_replicates,
     )

@@ -19,9 +19,9 @@ from rig.config.registers import decode, registers_of
 from rig.core.attitude import Frame
 from rig.core.bus import Bus, BusError, Rejected
 from rig.core.drive import Drive, Status
-from rig.core.faults import LimitError, MotionFault, StopRequested
+from rig.core.faults import LimitError, MotionFault, Requests, StopRequested
 from rig.core.phone import Imu, ImuError
-from rig.core.stop import Requests, Stopper
+from rig.core.stop import Stopper
 
 
 def outside(config: RigConfig, target: Pulses) -> Iterator[str]:
@@ -260,7 +260,7 @@ class Device:
         if status.moving:
             raise MotionFault(
                 f"{axis.name} is already moving. Stop the other controller, then run "
-                "`stop`"
+                "`jaxcal-rig stop`"
             )
         if not status.enabled:
             if not drive.bring(axis.map.enable, lambda s: s.enabled).enabled:

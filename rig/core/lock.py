@@ -64,7 +64,7 @@ class BusLock:
                 self.release()
                 raise Refused(
                     f"{self.where} is {held_by(told)}. Wait until it ends, or end it "
-                    "with `stop`"
+                    "with `jaxcal-rig stop`"
                 )
             time.sleep(LOOK_S)
         self._told = {}

@@ -29,6 +29,7 @@ from rig.core.faults import (
     PauseRequested,
     PlanOnly,
     Refused,
+    Requests,
     StopRequested,
     Unreachable,
 )
@@ -37,7 +38,6 @@ from rig.core.measure import Observer
 from rig.core.motion import Motion
 from rig.core.phone import Imu
 from rig.core.record import ZEROED, DeviceRecord, check_drives, leave
-from rig.core.stop import Requests
 from rig.core.zero import KeptZero, axes_text, check_zero, heading_turn
 from rig.journal import JournalError, Record, RunFolder
 

@@ -155,7 +155,7 @@ def on_phase(run: Run, listener) -> None:
 def no_figures():
     """The report without its figures, which take longer than a fast session."""
     text = "no figures in this test"
-    return mock.patch.object(report, "_drawn", lambda *_: text)
+    return mock.patch.object(report, "drawn", lambda *_: text)
 
 
 def in_the_middle(run: Run, phase: str) -> bool:
@@ -193,7 +193,8 @@ def _main(folder: str, config_path: str, fault: str, phase: str) -> int:
 
     said: list[str] = []
     whole = fault == "full_disk"  # the figures are what no longer fits on the disk
-    with BusLock(config.bus).acquire("calibrate"):
+    with BusLock(config.bus).acquire("calibrate") as lock:
+        lock.tell(run=str(pathlib.Path(folder).resolve()))
         code = session(
             config, pathlib.Path(folder), None, said, [listen], figures=whole
         )

@@ -485,7 +485,7 @@ def test_trend_tells_what_moved_and_separates_devices(run, capsys):
 def test_parameters_are_drawn_over_time(finished):
     from matplotlib.figure import Figure
 
-    from rig.workbench.outputs.figures import parameters
+    from rig.workbench.outputs.report import draw_parameters as parameters
 
     summary = json.loads((finished / "summary.json").read_text())
     runs = [summary | {"time": 0.0}, summary | {"time": 86400.0}]

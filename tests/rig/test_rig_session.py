@@ -32,8 +32,8 @@ from rig.core.plan import choose, draw_candidates
 from rig.core.session import run_safely
 from rig.journal import read_journal
 from rig.simulator import Truth
+from rig.workbench.identification.conclusion import order_residuals
 from rig.workbench.identification.fit import uncertainty
-from rig.workbench.identification.orders import order_residuals
 from rig.workbench.procedures.calibrate import calibrate
 from rig.workbench.procedures.checking import collect
 

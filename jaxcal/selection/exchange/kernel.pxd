@@ -42,6 +42,13 @@ cdef class Climber:
     cdef double[::1] det  # (WIDE,)
     cdef double[:, :, ::1] halved  # (2, p, p) V and X, with half their diagonals
     cdef double[:, ::1] part  # (p, WIDE)
+    cdef double[:, ::1] rest  # (p, p) information of the chosen but one
+    cdef double[:, ::1] metric  # (p, p) R
+    cdef double[:, ::1] bounds  # (groups, WIDE) on E
+    cdef double[::1] weakest  # (p,) y
+    cdef double[::1] values  # (p,) eigenvalues of C V C.T, the smallest first
+    cdef double[::1] lapack
+    cdef int[::1] whole
     cdef double[:, ::1] basis  # (p, p) orthonormal rows, for random starts
     cdef double[:, ::1] span  # (r, p) orthonormal directions that the prior informs
     cdef Py_ssize_t[::1] order  # (M,) a permutation
@@ -50,6 +57,11 @@ cdef class Climber:
     cdef Watch watch
     cdef int looked  # groups since the clock was read
     cdef void _set_known(self, double share, double ridge) noexcept nogil
+    cdef void _sum(self, Py_ssize_t size, Py_ssize_t skipped) noexcept nogil
+    cdef void _add(self, Py_ssize_t i) noexcept nogil
+    cdef double _climb_least(self) except? -2.0 nogil
+    cdef double _least(self) noexcept nogil
+    cdef Py_ssize_t _strongest(self, double* found) noexcept nogil
     cdef double _evaluate(self, Py_ssize_t size, double[:, :, ::1] into) noexcept nogil
     cdef double _subset(self, double[:, :, ::1] into) noexcept nogil
     cdef void _refresh(self) noexcept nogil

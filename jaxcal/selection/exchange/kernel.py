@@ -21,6 +21,12 @@ Removing i never helps: the gain of a swap is at most that of j alone. For det, 
 the trace of D_jj, Y <= I - D_ii / (1 + t), so det Y is at most the q-th power of the
 mean of that matrix's diagonal. A group in which no gain can be the largest is skipped.
 
+E, the smallest eigenvalue in the metric of R = C.T C, has no such formula. phi is
+concave: of what is left when i goes out, with y its weakest direction, ``y.T R y = 1``,
+adding B_j gives at most ``y.T M y + |B_j y|^2``. Candidates are looked at in the order
+of that bound until it falls to the best phi found, and j is better than that where
+``M + B_j.T B_j - phi R`` has a Cholesky factor.
+
 Candidates are held in groups of ``WIDE``, arrays (q, q, WIDE) or (q, p, WIDE), with
 innermost loops over a group: their length is known to the compiler, and what belongs to
 a group stays in the first cache.
@@ -32,10 +38,16 @@ from __future__ import annotations
 
 import cython
 import numpy as np
-from cython.cimports.jaxcal.information.linear_algebra import copy, factor, multiply
+from cython.cimports.jaxcal.information.linear_algebra import (
+    cholesky,
+    copy,
+    factor,
+    multiply,
+)
 from cython.cimports.jaxcal.selection.exchange.kernel import WIDE
 from cython.cimports.jaxcal.watch import begin, late
 from cython.cimports.libc.math import INFINITY, fabs, sqrt
+from cython.cimports.scipy.linalg.cython_lapack import dsyevd
 
 __all__ = ["DET", "SUBSET", "TRACE", "Climber"]
 
@@ -50,6 +62,9 @@ _MOST_SWAPS = cython.declare(cython.int, 100)  # of each place, where a few are 
 _RIDGE = cython.declare(cython.double, 1e-6)  # to climb from a singular start
 # Fall of the largest D_jj after which updated ones have lost digits.
 _CANCELLED = cython.declare(cython.double, 1e-3)
+_LIFTS = cython.declare(cython.double, 1e-9)  # share by which a swap must raise E
+# Added to what is left of E, so that its bounds are true where that is singular.
+_SLIGHT = cython.declare(cython.double, 1e-10)
 _PATIENCE = cython.declare(cython.int, 16)  # groups between two looks at the clock
 
 
@@ -335,6 +350,11 @@ class Climber:
         self.now, self.trial, self.halved = np.empty((3, 2, p, p))
         self.half, self.solved = np.empty((2, s, p))
         self.small = np.empty((s, s))
+        self.rest, self.metric = np.empty((p, p)), root.T @ root
+        self.bounds = np.empty((groups, WIDE))
+        self.weakest, self.values = np.empty((2, p))
+        self.lapack = np.empty(1 + 6 * p + 2 * p * p)
+        self.whole = np.empty(3 + 5 * p, dtype=np.intc)
         self.grown, self.kept = np.empty((2, groups, 2, q, q, WIDE))
         self.alone, self.tops = np.empty((groups, WIDE)), np.empty((groups, 2))
         self.cross, self.work = np.empty((2, 2 * q, q, WIDE)), np.empty((4, q, q, WIDE))
@@ -406,22 +426,28 @@ class Climber:
                 self.known[a, b] = (1.0 - weight) * self.prior[a, b]
             self.known[a, a] += weight + ridge
 
+    def _sum(self, size, skipped):
+        """Information of the first ``size`` chosen but one, into ``gram``."""
+        p = self.p
+        copy(cython.address(self.gram[0, 0]), cython.address(self.known[0, 0]), p * p)
+        for c in range(size):
+            if c != skipped:
+                self._add(self.chosen[c])
+
+    def _add(self, i):
+        """Add candidate i to ``gram``."""
+        p = self.p
+        gram = cython.address(self.gram[0, 0])
+        for r in range(self.q):
+            row = cython.address(self.blocks[i, r, 0])
+            for a in range(p):
+                for b in range(p):
+                    gram[a * p + b] += row[a] * row[b]
+
     def _evaluate(self, size, into):
         """phi of the first ``size`` chosen from sums made anew; V and X are filled."""
         p = self.p
-        for a in range(p):
-            for b in range(a + 1):
-                self.gram[a, b] = self.known[a, b]
-        for c in range(size):
-            i = self.chosen[c]
-            for r in range(self.q):
-                for a in range(p):
-                    weight = self.blocks[i, r, a]
-                    for b in range(a + 1):
-                        self.gram[a, b] += weight * self.blocks[i, r, b]
-        for a in range(p):
-            for b in range(a):
-                self.gram[b, a] = self.gram[a, b]
+        self._sum(size, -1)
         inverse = cython.address(into[0, 0, 0])
         value: cython.double = factor(
             cython.address(self.gram[0, 0]), inverse,
@@ -749,6 +775,141 @@ class Climber:
         for i in range(self.counts.shape[0]):
             self.counts[i] = 0
             self.closed[i] = 0.0 if self.upper[i] else INFINITY
+
+    # --- E --------------------------------------------------------------------------
+
+    def climb_least(self, start, seconds):
+        """The local optimum of E that ``start`` (k,), required first, climbs to.
+
+        Returns:
+            (k,) chosen, and E; -inf where that is singular.
+        """
+        self.watch = begin(seconds)
+        for r in range(self.k):
+            self.chosen[r] = start[r]
+        value: cython.double = 0.0
+        with cython.nogil:
+            value = self._climb_least()
+        return np.array(self.chosen), value
+
+    def _climb_least(self):
+        """Swap each chosen for its best replacement until none helps; E."""
+        k = self.k
+        self._clear()
+        for c in range(k):
+            self._count(self.chosen[c], 1)
+        self._set_known(0.0, 0.0)
+        self._sum(k, -1)
+        value = self._least()
+        position, since, swaps = self.fixed, 0, 0
+        while since < k - self.fixed and swaps < _MOST_SWAPS * k and value > 0.0:
+            if late(cython.address(self.watch)):
+                break
+            out = self.chosen[position]
+            self._sum(k, position)
+            since += 1
+            found: cython.double = (1.0 + _LIFTS) * value
+            best = self._strongest(cython.address(found))
+            if best >= 0:
+                value, since = found, 0
+                swaps += 1
+                self._count(out, -1)
+                self._count(best, 1)
+                self.chosen[position] = best
+            position = position + 1 if position + 1 < k else self.fixed
+        return value
+
+    def _least(self):
+        """E of ``gram``; V, C V and what ``_eigen`` fills are there."""
+        p = self.p
+        inverse = cython.address(self.now[0, 0, 0])
+        half, root = cython.address(self.half[0, 0]), cython.address(self.root[0, 0])
+        if (
+            not factor(
+                cython.address(self.gram[0, 0]),
+                inverse,
+                cython.address(self.lower[0, 0]),
+                p,
+            )
+            > -INFINITY
+        ):
+            return -INFINITY  # fmt: skip
+        multiply(False, False, p, p, p, root, inverse, half)
+        multiply(False, True, p, p, p, half, root, cython.address(self.small[0, 0]))
+        info: cython.int = 0
+        room: cython.int = self.lapack.shape[0]
+        whole: cython.int = self.whole.shape[0]
+        dsyevd(b"V", b"L", cython.address(p), cython.address(self.small[0, 0]),
+               cython.address(p), cython.address(self.values[0]),
+               cython.address(self.lapack[0]), cython.address(room),
+               cython.address(self.whole[0]), cython.address(whole),
+               cython.address(info))  # fmt: skip
+        return 1.0 / self.values[p - 1]
+
+    def _strongest(self, found):
+        """Who gives the largest E beside ``gram``, over ``found``; -1: none."""
+        p, q = self.p, self.q
+        gram, rest = cython.address(self.gram[0, 0]), cython.address(self.rest[0, 0])
+        copy(rest, gram, p * p)
+        for a in range(p):
+            self.gram[a, a] += _SLIGHT
+        value = self._least()
+        if not value > -INFINITY:
+            return -1
+        # A block of q readings leaves the variances after the q largest no smaller.
+        cap = 1.0 / self.values[p - 1 - q] if q < p else INFINITY
+        multiply(
+            False,
+            False,
+            1,
+            p,
+            p,
+            cython.address(self.small[p - 1, 0]),
+            cython.address(self.half[0, 0]),
+            cython.address(self.weakest[0]),
+        )
+        for a in range(p):
+            self.weakest[a] *= value
+        part = cython.address(self.part[0, 0])
+        for c in range(self.groups):
+            bound = cython.address(self.bounds[c, 0])
+            closed = cython.address(self.closed[c * WIDE])
+            for j in range(WIDE):
+                bound[j] = value
+            for s in range(q):
+                _weigh(part, cython.address(self.weakest[0]),
+                       cython.address(self.columns[c, s, 0, 0]), p)  # fmt: skip
+                for j in range(WIDE):
+                    bound[j] += part[j] * part[j]
+            for j in range(WIDE):
+                bound[j] = min(bound[j], cap) - closed[j]
+            self.tops[c, 0] = _largest(bound)
+        best: cython.Py_ssize_t = -1
+        while True:
+            g: cython.Py_ssize_t = 0
+            for c in range(1, self.groups):
+                if self.tops[c, 0] > self.tops[g, 0]:
+                    g = c
+            if not self.tops[g, 0] > found[0]:
+                return best
+            bound = cython.address(self.bounds[g, 0])
+            e: cython.Py_ssize_t = 0
+            while bound[e] != self.tops[g, 0]:
+                e += 1
+            bound[e] = -INFINITY
+            self.tops[g, 0] = _largest(bound)
+            copy(gram, rest, p * p)
+            self._add(g * WIDE + e)
+            for a in range(p):
+                for b in range(a + 1):
+                    self.lower[a, b] = self.gram[a, b] - found[0] * self.metric[a, b]
+            lower = cython.address(self.lower[0, 0])
+            if cholesky(lower, lower, p, 0.0) > -INFINITY:
+                value = self._least()
+                if value > found[0]:
+                    best, found[0] = g * WIDE + e, value
+
+    # --------------------------------------------------------------------------------
 
     def _finish(self, size, share, climbs):
         """Grow and climb from the first ``size`` chosen; phi."""

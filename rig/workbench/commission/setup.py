@@ -51,7 +51,7 @@ def write_config(path: pathlib.Path, given: Given, operator: Operator) -> RigCon
     say(f"2 scan: units 1 to {given.units} on {bus.where}; reads only")
     with BusLock(bus).acquire("setup"):
         found = scan(bus, given.units, lambda text: say(f"  {text}"))
-    say("3 axes: which unit drives which joint. `axes` checks it by moving them")
+    say("3 axes: which unit drives which joint. Step 8 checks it by moving them")
     axes = _ask_axes(found, given, operator)
     say("4 phone")
     form, _, port = (given.imu or "").partition(":")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from rig.config import AXIS_NAMES, RigConfig
-from rig.core.attitude import angles, frame_at
+from rig.core.attitude import ORDERS, Frame, angles, frame_at
 from rig.journal import Record
 from rig.workbench.identification.drift import estimate_drift, without_drift
 from rig.workbench.identification.fit import fit, held_out_errors, pairs, uncertainty
@@ -17,7 +17,6 @@ from rig.workbench.identification.noise import (
     correlation,
     effective_samples,
 )
-from rig.workbench.identification.orders import order_residuals
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +49,6 @@ def conclude(
     shared = {
         "zero_pulses": zero["pulses"],
         "zero_attitude": zero["attitude"],
-        "fingerprint": config.fingerprint(),
         "device": config.device_fingerprint(),
         "postures": [record["name"] for record in chosen],
     }
@@ -94,3 +92,42 @@ def _predicted(calibration: Any, held_out: list[Record]) -> dict[str, float]:
     off = measured - calibration.predict(commands)
     rms, worst = np.sqrt((off**2).mean()), np.abs(off).max()
     return {"prediction_rms": float(rms), "prediction_max": float(worst)}
+
+
+def order_residuals(
+    config: RigConfig, frame: Frame, records: list[Record]
+) -> dict[str, Any]:
+    """Residual of the linear fit under each of the six mechanism orders.
+
+    The right order leaves noise; a wrong one leaves degrees. Needs more than four
+    postures; with four every order fits exactly.
+
+    Returns:
+        rms (order to degrees), configured, best, warning (empty where all is well).
+    """
+    configured = config.mechanism.order
+    if len(records) < 6:
+        return {"rms": {}, "configured": configured, "warning": ""}
+    design = np.column_stack([pairs(records)[0], np.ones(len(records))])
+    across = np.eye(len(records)) - design @ np.linalg.pinv(design)
+    attitudes = np.array([r["attitude"] for r in records])
+    rms: dict[str, float] = {}
+    for order in ORDERS:
+        left = across @ frame.angles(attitudes, order)
+        rms[order] = float(np.sqrt((left**2).sum() / (3 * (len(records) - 4))))
+    best = min(rms, key=lambda order: rms[order])
+    noise = float(np.mean([r["std_deg"] for r in records]))
+    warning = ""
+    if rms[configured] > max(2.0 * rms[best], 0.02):
+        warning = (
+            f"the order {best} leaves {rms[best]:.3f} deg where the configured "
+            f"{configured} leaves {rms[configured]:.3f}: check mechanism.order and the "
+            "phone's order"
+        )
+    elif rms[configured] > max(10.0 * noise, 0.1):
+        warning = (
+            f"the fit leaves {rms[configured]:.3f} deg under the configured order "
+            f"{configured}, far above the readings' scatter of {noise:.3f}: check the "
+            "phone's order and signs ([imu] order), its mounting, and play"
+        )
+    return {"rms": rms, "configured": configured, "best": best, "warning": warning}

@@ -81,7 +81,7 @@ def event_lines(record: dict[str, Any]) -> list[str]:
         case "comm_restored" if record["error"]:
             return [
                 f"{record['axis']}: its communication timeout was not put back to "
-                f"{record['counts']} ({record['error']}); `resume` does it"
+                f"{record['counts']} ({record['error']}); `jaxcal-rig resume` does it"
             ]
         case "stop":
             units = [f"  {UnitStop(**unit)}" for unit in record["units"]]
