@@ -138,6 +138,11 @@ def setup(args: argparse.Namespace) -> int:
             simulator = stack.enter_context(_simulator(args))
             given = _given(simulator, given)
             path = args.config or _own_folder(simulator.config) / "rig.toml"
+            if path.exists():  # its bus may be that of a real device
+                raise Refused(
+                    f"{path} exists: --simulate writes a file of its own. Name a new "
+                    "one, or leave out --config or --simulate"
+                )
         operator.confirm(wizard.SAFETY, "setup")
         if path.exists() and args.set:
             raise Refused(f"{path} exists: edit it, or leave out --set")
@@ -205,7 +210,7 @@ def _place(args: argparse.Namespace, state: str = "") -> Iterator[steps.Place]:
             simulator = make_simulator(config, vars(args), args.fault)
             served = stack.enter_context(simulator).start()
             record = DeviceRecord(_own_folder(served) / "device.json")
-            place = steps.simulated(simulator, served, record, _say, path)
+            place = steps.simulated(simulator, served, record, _say)
             steps.begin_simulated(place, state)
             place.operator.yes = getattr(args, "yes", False)
         place.reset_alarms = getattr(args, "reset_alarms", False)

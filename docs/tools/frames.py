@@ -24,8 +24,9 @@ FOLDER = pathlib.Path(__file__).parents[1] / "assets"
 SIZE = (1280, 800)
 SHOWN = (960, 600)
 LOADING = 6.0  # seconds until the scene is drawn
+MOST = 24  # frames
 SECONDS = 1.0  # between two frames
-SESSION = ("calibrate", "--simulate", "--arm", "--zero", "--live")
+SESSION = ("calibrate", "--simulate", "--arm", "--zero", "--live", "--speedup", "0.3")
 
 
 def browser(scheme: str) -> Any:
@@ -74,7 +75,8 @@ def main() -> None:
                 found[scheme].append(frame(page))
                 page.quit()
     for scheme, (first, *rest) in found.items():
-        times = [250] * len(rest) + [4000]  # ms; the last stays
+        rest = rest[:: max(1, len(rest) // MOST)] + rest[-1:]
+        times = [350] * len(rest) + [4000]  # ms; the last stays
         first.save(
             FOLDER / f"live_{scheme}.webp", save_all=True, append_images=rest,
             duration=times, loop=0, quality=60, method=6,

@@ -153,6 +153,7 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
         found[key] = tuple(found[key])
     for key, (kind, what) in _KINDS.items():
         require(isinstance(found[key], kind), key, f"be {what}")
+    require(found["loss"] in ("student", "gaussian"), "loss", "be student or gaussian")
     for key in ("model", "derived"):
         require(isinstance(content.get(key), dict), key, "be an object")
     names = content["derived"].get("parameter_names")

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from jaxcal.models import Model
 from jaxcal.models.checked import derivative, facts, predict
 
-__all__ = ["NU", "Solution", "Task", "solve", "student_constants"]
+__all__ = ["Solution", "Task", "solve", "student_constants"]
 
 Array = NDArray[np.float64]
 

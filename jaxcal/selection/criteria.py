@@ -8,7 +8,7 @@ here says which kind, and which combinations.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -164,7 +164,7 @@ def wanted(criterion: Any, region: Any, default: str) -> Wanted:
     if isinstance(criterion, Wanted):
         asked = criterion
     else:
-        name = default if criterion is None else criterion
+        name = default if criterion is None else getattr(criterion, "name", criterion)
         one_of("criterion", name, tuple(CRITERIA))
         try:
             asked = CRITERIA[name]()
@@ -187,6 +187,8 @@ def positions(
     parameters: str | Sequence[str | int], names: tuple[str, ...]
 ) -> list[int]:
     """Indices of ``parameters``, given by name or index, each once."""
+    if not isinstance(parameters, Iterable):
+        raise ValueError(f"parameters must be names or indices, got {parameters!r}")
     parameters = [parameters] if isinstance(parameters, str) else list(parameters)
     found: list[Any] = [names.index(x) if x in names else x for x in parameters]
     for at, asked in zip(found, parameters, strict=True):

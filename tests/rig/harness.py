@@ -193,7 +193,8 @@ def _main(folder: str, config_path: str, fault: str, phase: str) -> int:
 
     said: list[str] = []
     whole = fault == "full_disk"  # the figures are what no longer fits on the disk
-    with BusLock(config.bus).acquire("calibrate"):
+    with BusLock(config.bus).acquire("calibrate") as lock:
+        lock.tell(run=str(pathlib.Path(folder).resolve()))
         code = session(
             config, pathlib.Path(folder), None, said, [listen], figures=whole
         )

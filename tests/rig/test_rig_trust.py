@@ -41,6 +41,8 @@ from rig.journal import read_journal
 from rig.simulator import Truth
 from rig.simulator.faults import FaultInjector
 from rig.simulator.phone import Phone
+from rig.workbench.commission.operator import Operator
+from rig.workbench.commission.steps import Place, characterise
 from rig.workbench.procedures.checking import (
     collect,
     load_calibration,
@@ -498,6 +500,21 @@ def test_a_simulated_calibration_moves_no_real_joint(calibrated, tmp_path, capsy
         assert main(given) == 2
         error = capsys.readouterr().err
         assert "simulated" in error and "cannot open" not in error
+
+
+def test_what_is_found_of_a_simulated_device_stays_out_of_a_real_calibration(
+    calibrated, tmp_path
+):
+    """G, the other way: its play would have been put back on the real joints."""
+    record = DeviceRecord(tmp_path / "device.json")
+    for state in (IDENTIFIED, HOMED, SIGN_CHECKED):
+        record.reach(state, fast_config())
+    operator = Operator(yes=True, say=[].append)
+    place = Place(fast_config(), record, operator, full_speed=True)
+    before = (calibrated / "calibration.json").read_bytes()
+    with pytest.raises(Refused, match="made with a real device"):
+        characterise(place, 0, into=calibrated)
+    assert (calibrated / "calibration.json").read_bytes() == before
 
 
 @pytest.mark.parametrize("bit", [False, True])

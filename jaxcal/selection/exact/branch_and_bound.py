@@ -20,7 +20,7 @@ from jaxcal import compiled
 from jaxcal.information.blocks import largest_rank
 from jaxcal.information.criterion import Criterion
 
-__all__ = ["TOLERANCE", "BranchResult", "branch_and_bound"]
+__all__ = ["branch_and_bound"]
 
 TOLERANCE = 1e-10  # of phi of "det"; of the others a share of it
 _MEMORY = 64 * 2**20  # bytes of open nodes up to which the best bound goes first

@@ -189,7 +189,7 @@ def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> i
     path = None if into is None else calibration_path(into)
     if path is not None:
         # Of this device; simulated ones alone are moved at full speed.
-        load_calibration(path, place.config, simulated=place.full_speed)
+        load_calibration(path, place.config, simulated=place.full_speed, into=True)
     name, most = AXIS_NAMES[axis], measured.BASE_DEG + measured.FAR_DEG
     place.operator.confirm(
         f"characterise: {name} will move up to {most:.2f} deg from where it stands, "
@@ -261,11 +261,10 @@ def simulated(
     served: RigConfig,
     record: DeviceRecord,
     say: Callable[[str], None],
-    path: pathlib.Path | None = None,
 ) -> Place:
-    """A simulated device, at which nobody needs to stand."""
+    """A simulated device, at which nobody needs to stand; it corrects no file."""
     return Place(
-        served, record, Operator(yes=True, say=say), path, full_speed=True,
+        served, record, Operator(yes=True, say=say), full_speed=True,
         on_imu_port=simulator.start_phone, listeners=(simulator.hear,),
     )  # fmt: skip
 

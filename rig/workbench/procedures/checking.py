@@ -75,7 +75,7 @@ class Saved(NamedTuple):
 
 
 def load_calibration(
-    path: pathlib.Path, config: RigConfig, simulated: bool = False
+    path: pathlib.Path, config: RigConfig, simulated: bool = False, into: bool = False
 ) -> Saved:
     """A calibration that was made with a device configured as this one.
 
@@ -83,10 +83,11 @@ def load_calibration(
         path: of the file, or of its run's folder.
         config: of the device.
         simulated: so is the device that is to be moved.
+        into: what is found of that device is to be kept in the calibration.
 
     Raises:
-        Refused: not a calibration, or of another device, or a simulated one of a real
-            device; names the keys.
+        Refused: not a calibration, or of another device (names the keys), or one of
+            the two is simulated and the other is not.
     """
     import jaxcal
 
@@ -100,6 +101,11 @@ def load_calibration(
         raise Refused(
             f"{path}: made with a simulated device: it says nothing of the real one. "
             "Calibrate the device, or use it with --simulate"
+        )
+    if into and simulated and not notes.get("simulated"):
+        raise Refused(
+            f"{path}: made with a real device: what is found of a simulated one says "
+            "nothing of it. Leave out --simulate, or name a simulated calibration"
         )
     _check_device(path, notes, config)
     zero, attitude = notes.get("zero_pulses"), notes.get("zero_attitude")
