@@ -19,7 +19,7 @@ from rig.simulator import Truth, parse_fault
 from rig.simulator.drive import SimDrive
 from rig.workbench.commission import steps
 from rig.workbench.commission.operator import Operator
-from rig.workbench.commission.proposals import require_unit
+from rig.workbench.commission.proposals import require_gearing, require_unit
 
 
 @pytest.fixture
@@ -131,6 +131,36 @@ def test_two_sound_gearings_prove_the_unit(ratios):
 def test_no_gearing_is_blamed_where_the_unit_is_not_proved(ratios):
     with pytest.raises(MotionFault, match=r"either imu\.unit or the gearings"):
         require_unit(fast_config(), ratios)
+
+
+@pytest.mark.parametrize("ratios", [(0.1, 0.1, 0.1), (10.0, 0.3, 4.0)])
+def test_a_gearing_far_off_on_all_axes_wants_the_drives_own_word(ratios):
+    """A: ten times on all three was corrected by the phone alone."""
+    config = fast_config()
+    with pytest.raises(MotionFault, match="the drive of roll has no register"):
+        require_gearing(config, ratios, (10000, 10000, None))
+    assert require_gearing(config, ratios, (10000,) * 3) is None
+    assert require_gearing(config, (ratios[0], 0.7, ratios[2]), (None,) * 3) is None
+    assert require_gearing(config, (1.9, 1.8, 1.6), (None,) * 3) is None
+
+
+@pytest.mark.slow
+def test_ten_times_on_all_axes_of_drives_without_a_register_corrects_no_file(
+    slow, capsys
+):
+    generic = fast_config({'map = "leadshine_pr"': 'map = "generic"'})
+    with device(speedup=1.0, config=generic) as (sim, bus, port):
+        text = quick_text(bus, port).replace("leadshine_pr", "generic")
+        text = axes_of(text, {"reduction": 100.0, "speed_deg_s": 10})
+        (slow / "rig.toml").write_text(text)
+        assert main(["scan", "--units", "3"]) == 0
+        assert main(["home", "--here", "--yes"]) == 0
+        watch = Watch(sim)
+        before = (slow / "rig.toml").read_text()
+        assert main(["axes", "--yes"]) == 3
+    assert "has no register that says" in capsys.readouterr().out
+    assert (slow / "rig.toml").read_text() == before
+    assert watch.far.max() < 5.0
 
 
 def test_a_frozen_phone_lets_no_axis_go_far(slow, capsys):
