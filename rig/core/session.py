@@ -311,6 +311,10 @@ class Run(RunFolder):
 
     def disarm(self) -> None:
         """Nothing more will move: close the device, free the signals."""
+        results = self.device.stopper.results if self.device else []
+        if results and all(result.standing for result in results):
+            simulated = self.journal.records[0].get("simulated") is not None
+            BusLock(self.config.bus).stood(forget=simulated)  # first: `stop` waits
         for attached in self._attached:
             attached.close()
         self._attached = []
@@ -321,10 +325,6 @@ class Run(RunFolder):
                         leave(self.device.drives, self.record)
                 except OSError as error:
                     self.say(f"{self.record.path} cannot be written: {error}")
-            results = self.device.stopper.results
-            if results and all(result.standing for result in results):
-                simulated = self.journal.records[0].get("simulated") is not None
-                BusLock(self.config.bus).stood(forget=simulated)
             self.device.close()
         self.device = None
         self.signals.armed = False
