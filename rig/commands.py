@@ -103,7 +103,7 @@ def check(args: argparse.Namespace) -> int:
     """Say what a configuration comes to; ConfigError lists its faults."""
     path = args.config or args.file or FILE
     config = load_config(path)
-    print(f"{path}: valid; fingerprint {config.fingerprint()[:16]}")
+    print(f"{path}: valid")
     for axis in config.axes:
         print(
             f"  {axis.name}: unit {axis.unit}, {axis.map.name}, "

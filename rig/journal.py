@@ -215,12 +215,9 @@ class RunFolder:
                 raise ValueError(f"{self.folder} is a {known[0]['mode']} run")
             self.emit("resume", sync=True, **provenance)
             return
-        config, fingerprint = self.config.described(), self.config.fingerprint()
-        device = self.config.device_fingerprint()
+        config, device = self.config.described(), self.config.device_fingerprint()
         start = {"config": config, "device": device, **provenance, **start}
-        self.emit(
-            "start", sync=True, schema=1, mode=mode, fingerprint=fingerprint, **start
-        )
+        self.emit("start", sync=True, schema=1, mode=mode, **start)
 
     def emit(self, event: str, *, sync: bool = False, **fields: Any) -> Record:
         """Journal an event, then tell the listeners: the one stream of a run.

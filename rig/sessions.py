@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from rig.arguments import SIMULATOR
 from rig.config import (
     ConfigError,
     RigConfig,
@@ -25,10 +26,11 @@ if TYPE_CHECKING:
     from rig.simulator import Simulator
 
 FILE = pathlib.Path("rig.toml")  # without --config
-SIMULATION = (
-    "transport", "noise", "backlash", "drift", "speedup", "rate", "reversed", "swapped",
-    "gearing", "lost_origin", "realistic", "dead_zone", "breakaway",
-)  # fmt: skip
+SIMULATION = [
+    option.strip("-").replace("-", "_")
+    for option in SIMULATOR
+    if option not in ("--simulate", "--fault")  # what the simulated device is
+]
 
 
 def load(args: argparse.Namespace) -> RigConfig:

@@ -49,7 +49,6 @@ def conclude(
     shared = {
         "zero_pulses": zero["pulses"],
         "zero_attitude": zero["attitude"],
-        "fingerprint": config.fingerprint(),
         "device": config.device_fingerprint(),
         "postures": [record["name"] for record in chosen],
     }
