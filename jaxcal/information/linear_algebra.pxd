@@ -14,12 +14,14 @@ cdef enum:
     UNTHREADED = 240_000  # multiplications up to which BLAS starts no threads
     SMALL = 300  # multiplications that take less than a call of BLAS
 
-cdef inline void copy(double* into, double* source, Py_ssize_t count) noexcept nogil:
+cdef inline void copy(
+    double* into, const double* source, Py_ssize_t count
+) noexcept nogil:
     memcpy(into, source, count * sizeof(double))
 
 cdef inline void multiply(
-    bint turn_a, bint turn_b, int rows, int columns, int inner, double* a, double* b,
-    double* out,
+    bint turn_a, bint turn_b, int rows, int columns, int inner, const double* a,
+    const double* b, double* out,
 ) noexcept nogil:
     """``out = a @ b`` (rows, columns), each transposed before where turned."""
     cdef double one = 1.0, zero = 0.0
@@ -46,7 +48,8 @@ cdef inline void multiply(
         some = min(some, rows - first)
         dgemm(
             b"T" if turn_b else b"N", b"T" if turn_a else b"N", &columns, &some, &inner,
-            &one, b, &ldb, a + (first if turn_a else first * lda), &lda, &zero,
+            &one, <double*> b, &ldb,
+            <double*> a + (first if turn_a else first * lda), &lda, &zero,
             out + first * columns, &columns,
         )
         first += some

@@ -41,6 +41,11 @@ UNMEASURED = {
     "session": ("verify_limit_deg", "reference_tolerance_deg", "max_unreachable"),
 }  # fmt: skip
 
+KEYS = {  # of rig.toml, where a description of it says otherwise
+    "scale": "", "letter": "rotates", "mechanism_order": "mechanism.order",
+    "angle_unit": "unit", "quaternion": "quaternion_columns",
+}  # fmt: skip
+
 
 def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
     """``key: VALUE then, VALUE now`` of two flat tables, where they differ."""
@@ -66,7 +71,7 @@ def _without(data: dict[str, Any], left_out: dict[str, Any]) -> dict[str, Any]:
 
 
 def _flat(data: Any, at: str = "") -> dict[str, Any]:
-    """Dotted key to value; axes are called by their names."""
+    """Key of rig.toml to value; axes are called by their names."""
     if isinstance(data, dict):
         pairs = [(str(name), value) for name, value in data.items()]
     elif data and isinstance(data, list) and isinstance(data[0], dict):
@@ -75,7 +80,8 @@ def _flat(data: Any, at: str = "") -> dict[str, Any]:
         return {at: data}
     flat: dict[str, Any] = {}
     for name, value in pairs:
-        flat |= _flat(value, f"{at}.{name}" if at else name)
+        name = KEYS.get(name, name)
+        flat |= _flat(value, ".".join(filter(None, (at, name))))
     return flat
 
 
@@ -204,12 +210,6 @@ class RigConfig(Section):
             for axis in self.axes
         ]
         return {**data, "axes": axes, "mechanism_order": self.mechanism.order}
-
-    def fingerprint(self) -> str:
-        """SHA-256 of what a measurement depends on."""
-        data = _without(self.described(), UNMEASURED)
-        text = json.dumps(data, sort_keys=True, default=str)
-        return hashlib.sha256(text.encode()).hexdigest()
 
     def changed_since(self, described: dict[str, Any]) -> list[str]:
         """Keys that would make a resumed run move or measure differently, in words.

@@ -12,7 +12,6 @@ still because two are equal.
 
 from __future__ import annotations
 
-import functools
 import time
 
 import numpy as np
@@ -90,22 +89,24 @@ class Climbs:
     def __init__(self, problem: Problem, seed: int, deadline: float | None) -> None:
         kernel = compiled.kernel("jaxcal.selection.exchange.kernel")
         self._usable = np.flatnonzero(problem.available)
-        blocks = problem.blocks[self._usable]
-        self._rank = functools.cache(lambda: largest_rank(blocks))  # for random starts
-        self._required = np.searchsorted(self._usable, problem.required)
-        self._deadline = deadline
+        blocks, self._required = problem.blocks, problem.required
+        if len(self._usable) < len(blocks):
+            blocks = blocks[self._usable]
+            self._required = np.searchsorted(self._usable, problem.required)
+        self._blocks, self._full, self._deadline = blocks, 0, deadline
         criterion, q, p = problem.criterion, blocks.shape[1], blocks.shape[2]
         kind, root = kernel.TRACE, criterion.root
-        if criterion.kind == "det":
-            root = root / np.linalg.norm(
-                root, axis=1, keepdims=True
-            )  # variances near 1
-            kind = kernel.DET if criterion.name == "D" else kernel.SUBSET
-        span = problem.known if len(problem.root) else np.zeros((0, p))
+        if criterion.name == "D":
+            kind = kernel.DET
+        elif criterion.kind == "det":  # variances near 1
+            kind = kernel.SUBSET
+            root = root / np.linalg.norm(root, axis=1, keepdims=True)
+        span = problem.known if len(problem.root) else problem.root
         self._share = _SHARE * min(1.0, problem.k * q / p) ** 6
         self._climber = kernel.Climber(
-            kind, blocks, problem.prior, root, problem.upper[self._usable],
-            self._required, span, problem.k, seed,
+            kind, np.ascontiguousarray(blocks), np.ascontiguousarray(problem.prior),
+            np.ascontiguousarray(root), min(problem.max_replicates, problem.k),
+            self._required, np.ascontiguousarray(span), problem.k, seed,
         )  # fmt: skip
 
     def seconds(self) -> float:
@@ -140,6 +141,11 @@ class Climbs:
             np.searchsorted(self._usable, start), 0.0, True, self.seconds()
         )
         return self._usable[chosen], phi
+
+    def _rank(self) -> int:
+        """That a block can have, found where an exchange starts at random."""
+        self._full = self._full or largest_rank(self._blocks)
+        return self._full
 
     def random_start(self) -> Indices:
         """(k,) another random selection, rarely singular."""

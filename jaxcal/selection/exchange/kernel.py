@@ -320,60 +320,81 @@ class Climber:
         blocks: (M, q, p) available candidates, whitened.
         prior: (p, p).
         root: C (s, p).
-        upper: (M,) how often each may be chosen.
+        cap: how often each may be chosen.
         required: (r,) candidates that are chosen in any case.
         span: (r, p) orthonormal directions that the prior informs.
         k: candidates to choose.
         seed: of the random starts.
     """
 
-    def __init__(self, kind, blocks, prior, root, upper, required, span, k, seed):
-        count, q, p = blocks.shape
-        groups, s = -(-count // WIDE), len(root)
-        self.kind, self.k, self.q, self.p, self.s = kind, k, q, p, s
-        self.fixed, self.groups = len(required), groups
+    def __init__(self, kind, blocks, prior, root, cap, required, span, k, seed):
+        count: cython.Py_ssize_t = blocks.shape[0]
+        q: cython.Py_ssize_t = blocks.shape[1]
+        p: cython.Py_ssize_t = blocks.shape[2]
+        i: cython.Py_ssize_t
+        r: cython.Py_ssize_t
+        a: cython.Py_ssize_t
+        self.kind, self.k, self.q, self.p, self.s = kind, k, q, p, len(root)
+        self.fixed, self.groups = len(required), (count + WIDE - 1) // WIDE
+        self.size = q * q * WIDE
         self.rows = q == 1 and kind == DET
-        padded = np.zeros((groups * WIDE, q, p))
-        padded[:count] = blocks
-        self.blocks, self.prior, self.root = blocks.copy(), prior.copy(), root.copy()
-        self.columns = np.ascontiguousarray(
-            padded.reshape(groups, WIDE, q, p).transpose(0, 2, 3, 1)
-        )
-        room = np.zeros(groups * WIDE, dtype=np.intp)
-        room[:count] = upper
-        self.upper, self.counts = room, np.zeros_like(room)
-        self.closed = np.zeros(groups * WIDE)
+        self.blocks, self.prior, self.root, self.span = blocks, prior, root, span
+        wide = self.groups * WIDE
+        self.upper = np.zeros(wide, dtype=np.intp)
+        self.counts = np.zeros(wide, dtype=np.intp)
         self.chosen, self.best = np.zeros((2, k), dtype=np.intp)
         for r in range(len(required)):
             self.chosen[r] = required[r]
-        self.known, self.gram, self.lower, self.basis = np.zeros((4, p, p))
-        self.now, self.trial, self.halved = np.empty((3, 2, p, p))
-        self.half, self.solved = np.empty((2, s, p))
-        self.small = np.empty((s, s))
-        self.rest, self.metric = np.empty((p, p)), root.T @ root
-        self.bounds = np.empty((groups, WIDE))
-        self.weakest, self.values = np.empty((2, p))
-        self.lapack = np.empty(1 + 6 * p + 2 * p * p)
+        for i in range(count):
+            self.upper[i] = cap
+        self.order = np.arange(count)
         self.whole = np.empty(3 + 5 * p, dtype=np.intc)
-        self.grown, self.kept = np.empty((2, groups, 2, q, q, WIDE))
-        self.alone, self.tops = np.empty((groups, WIDE)), np.empty((groups, 2))
-        self.cross, self.work = np.empty((2, 2 * q, q, WIDE)), np.empty((4, q, q, WIDE))
-        self.mixed, self.middle = (
-            np.empty((2 * q, q, WIDE)),
-            np.empty((4, 2 * q, 2 * q)),
-        )
-        self.at_out, self.tall = np.zeros((2, q, q)), np.empty((2, 2 * q, p))
-        self.changed = np.empty((2 * q, p))
-        self.gain, self.det, self.part = (
-            np.empty(WIDE),
-            np.empty(WIDE),
-            np.empty((p, WIDE)),
-        )
-        self.span, self.order = span, np.arange(count)
+        self.used = 0
+        self._lay_out()
+        self.room = np.zeros(self.used)
+        self.used = 0
+        self._lay_out()
+        for i in range(count):
+            for r in range(q):
+                for a in range(p):
+                    at = ((i // WIDE * q + r) * p + a) * WIDE + i % WIDE
+                    self.columns[at] = self.blocks[i, r, a]
+        multiply(True, False, p, p, self.s, cython.address(self.root[0, 0]),
+                 cython.address(self.root[0, 0]), self.metric)  # fmt: skip
         # Any seed is a good start of a xorshift generator but zero.
         self.state = (seed * 2685821657736338717 + 88172645463325252) % 2**64 or 1
         for _ in range(8):
             self._draw(2)
+
+    def _take(self, count):
+        """Where the next ``count`` numbers of the room are."""
+        self.used += count
+        if self.room is None:
+            return cython.NULL
+        return cython.address(self.room[0]) + (self.used - count)
+
+    def _lay_out(self):
+        """Share the room out; before there is one, count how much is needed."""
+        q, p, s, wide = self.q, self.p, self.s, self.groups * WIDE
+        self.columns = self._take(q * p * wide)
+        self.grown = self._take(2 * self.groups * self.size)
+        self.kept = self._take(2 * self.groups * self.size)
+        self.alone, self.bounds = self._take(wide), self._take(wide)
+        self.closed, self.tops = self._take(wide), self._take(2 * self.groups)
+        self.gain, self.det = self._take(WIDE), self._take(WIDE)
+        self.part = self._take(p * WIDE)
+        self.cross, self.work = self._take(4 * self.size), self._take(4 * self.size)
+        self.mixed, self.middle = self._take(2 * self.size), self._take(12 * q * q)
+        self.at_out, self.changed = self._take(2 * q * q), self._take(2 * q * p)
+        self.tall = self._take(4 * q * p)
+        self.now, self.trial = self._take(2 * p * p), self._take(2 * p * p)
+        self.halved = self._take(2 * p * p)
+        self.known, self.gram = self._take(p * p), self._take(p * p)
+        self.lower, self.basis = self._take(p * p), self._take(p * p)
+        self.rest, self.metric = self._take(p * p), self._take(p * p)
+        self.half, self.solved = self._take(s * p), self._take(s * p)
+        self.small, self.weakest = self._take(s * s), self._take(p)
+        self.values, self.lapack = self._take(p), self._take(1 + 6 * p + 2 * p * p)
 
     def climb_from(self, start, share, climbs, seconds):
         """Complete ``start`` (size,), required first, and swap while that helps.
@@ -420,16 +441,17 @@ class Climber:
 
     def _set_known(self, share, ridge):
         """What counts beside the chosen: the prior, diluted by share, and a ridge."""
+        p = self.p
         weight = share * self.k / self.blocks.shape[0]
-        for a in range(self.p):
-            for b in range(self.p):
-                self.known[a, b] = (1.0 - weight) * self.prior[a, b]
-            self.known[a, a] += weight + ridge
+        for a in range(p):
+            for b in range(p):
+                self.known[a * p + b] = (1.0 - weight) * self.prior[a, b]
+            self.known[a * p + a] += weight + ridge
 
     def _sum(self, size, skipped):
         """Information of the first ``size`` chosen but one, into ``gram``."""
         p = self.p
-        copy(cython.address(self.gram[0, 0]), cython.address(self.known[0, 0]), p * p)
+        copy(self.gram, self.known, p * p)
         for c in range(size):
             if c != skipped:
                 self._add(self.chosen[c])
@@ -437,7 +459,7 @@ class Climber:
     def _add(self, i):
         """Add candidate i to ``gram``."""
         p = self.p
-        gram = cython.address(self.gram[0, 0])
+        gram = self.gram
         for r in range(self.q):
             row = cython.address(self.blocks[i, r, 0])
             for a in range(p):
@@ -448,68 +470,69 @@ class Climber:
         """phi of the first ``size`` chosen from sums made anew; V and X are filled."""
         p = self.p
         self._sum(size, -1)
-        inverse = cython.address(into[0, 0, 0])
+        inverse = into
         value: cython.double = factor(
-            cython.address(self.gram[0, 0]), inverse,
-            cython.address(self.lower[0, 0]), p,
+            self.gram, inverse,
+            self.lower, p,
         )  # fmt: skip
         if self.kind == _DET or not value > -INFINITY:
             return value
-        half = cython.address(self.half[0, 0])
+        half = self.half
         multiply(False, False, self.s, p, p, cython.address(self.root[0, 0]), inverse,
                  half)  # fmt: skip
         if self.kind == _SUBSET:
             return self._subset(into)
-        multiply(True, False, p, p, self.s, half, half, cython.address(into[1, 0, 0]))
+        multiply(True, False, p, p, self.s, half, half, into + p * p)
         value = 0.0
         for r in range(self.s):
             for a in range(p):
-                value -= self.half[r, a] * self.root[r, a]
+                value -= self.half[r * p + a] * self.root[r, a]
         return value
 
     def _subset(self, into):
         """The same for log det of some parameters; C V is there."""
-        half, small = cython.address(self.half[0, 0]), cython.address(self.small[0, 0])
-        solved, other = cython.address(self.solved[0, 0]), cython.address(into[1, 0, 0])
         s, p = self.s, self.p
+        half, small = self.half, self.small
+        solved, other = self.solved, into + p * p
         # The covariance C V C.T in ``solved``, which has room for it, as s <= p.
         multiply(False, True, s, s, p, half, cython.address(self.root[0, 0]), solved)
-        value = -factor(solved, small, cython.address(self.lower[0, 0]), s)
+        value = -factor(solved, small, self.lower, s)
         multiply(False, False, s, p, s, small, half, solved)
         multiply(True, False, p, p, s, half, solved, other)
         for a in range(p):
             for b in range(p):
-                into[1, a, b] = into[0, a, b] - into[1, a, b]
+                into[(p + a) * p + b] = into[a * p + b] - into[(p + a) * p + b]
         return value
 
     def _refresh(self):
         """D_jj, H_jj, K and the gain of every candidate alone, of V and X."""
+        q, p = self.q, self.p
         self.tallest = 0.0
         for m in range(1 if self.kind == _DET else 2):
-            for a in range(self.p):
+            for a in range(p):
                 for b in range(a):
-                    self.halved[m, a, b] = self.now[m, a, b]
-                self.halved[m, a, a] = 0.5 * self.now[m, a, a]
+                    self.halved[(m * p + a) * p + b] = self.now[(m * p + a) * p + b]
+                self.halved[(m * p + a) * p + a] = 0.5 * self.now[(m * p + a) * p + a]
         for c in range(self.groups):
             for m in range(1 if self.kind == _DET else 2):
-                _fill(cython.address(self.columns[c, 0, 0, 0]),
-                      cython.address(self.halved[m, 0, 0]),
-                      cython.address(self.part[0, 0]),
-                      cython.address(self.grown[c, m, 0, 0, 0]),
+                _fill(self.columns + c * q * p * WIDE,
+                      self.halved + m * p * p,
+                      self.part,
+                      self.grown + (2 * c + m) * self.size,
                       self.q, self.p)  # fmt: skip
             self._keep(c)
 
     def _keep(self, c):
         """K, and the gain of each alone: a factor, or the fall of a trace."""
         q = self.q
-        alone, det = cython.address(self.alone[c, 0]), cython.address(self.det[0])
-        grown = cython.address(self.grown[c, 0, 0, 0, 0])
+        alone, det = self.alone + c * WIDE, self.det
+        grown = self.grown + 2 * c * self.size
         if self.rows:
             for j in range(WIDE):
                 alone[j] = 1.0 + grown[j]
-            self.tops[c, 1] = _largest(grown)
-            self.tops[c, 0] = 1.0 + self.tops[c, 1]
-            self.tallest = max(self.tallest, self.tops[c, 1])
+            self.tops[2 * c + 1] = _largest(grown)
+            self.tops[2 * c] = 1.0 + self.tops[2 * c + 1]
+            self.tallest = max(self.tallest, self.tops[2 * c + 1])
             return
         self._invert_grown(c, 0, alone)
         if self.kind == _SUBSET:
@@ -519,22 +542,22 @@ class Climber:
         elif self.kind == _TRACE:
             for j in range(WIDE):
                 alone[j] = 0.0
-            _dots(alone, 1.0, cython.address(self.kept[c, 0, 0, 0, 0]),
-                  cython.address(self.grown[c, 1, 0, 0, 0]), q)  # fmt: skip
+            _dots(alone, 1.0, self.kept + 2 * c * self.size,
+                  self.grown + (2 * c + 1) * self.size, q)  # fmt: skip
         for j in range(WIDE):
             det[j] = 0.0
         for r in range(q):
             for j in range(WIDE):
                 det[j] += grown[(r * q + r) * WIDE + j]
-        self.tops[c, 0], self.tops[c, 1] = _largest(alone), _largest(det)
-        self.tallest = max(self.tallest, self.tops[c, 1])
+        self.tops[2 * c], self.tops[2 * c + 1] = _largest(alone), _largest(det)
+        self.tallest = max(self.tallest, self.tops[2 * c + 1])
 
     def _invert_grown(self, c, m, det):
         """K of the group, and the determinant of what it inverts."""
         q = self.q
-        grown = cython.address(self.grown[c, m, 0, 0, 0])
-        kept = cython.address(self.kept[c, m, 0, 0, 0])
-        for a in range(q * q * WIDE):
+        grown = self.grown + (2 * c + m) * self.size
+        kept = self.kept + (2 * c + m) * self.size
+        for a in range(self.size):
             kept[a] = grown[a]
         for r in range(q):
             for j in range(WIDE):
@@ -552,17 +575,17 @@ class Climber:
         r: cython.int = q if went < 0 else 2 * q
         peak = self.tallest
         if 2 * p > 5 * r:
-            copy(cython.address(self.changed[0, 0]),
+            copy(self.changed,
                  cython.address(self.blocks[came, 0, 0]), q * p)  # fmt: skip
             if went >= 0:
-                copy(cython.address(self.changed[q, 0]),
+                copy(self.changed + q * p,
                      cython.address(self.blocks[went, 0, 0]), q * p)  # fmt: skip
             self._middles(r)
             self.tallest = 0.0
             for c in range(self.groups):
                 self._update(c, r)
                 self._keep(c)
-        copy(cython.address(self.now[0, 0, 0]), cython.address(self.trial[0, 0, 0]),
+        copy(self.now, self.trial,
              2 * p * p)  # fmt: skip
         if 2 * p <= 5 * r or self.tallest < _CANCELLED * peak:
             self._refresh()
@@ -571,16 +594,16 @@ class Climber:
     def _middles(self, r):
         """``tall`` W and U, and in ``middle`` P of both; of a trace P U A.T P / 2."""
         q, p = self.q, self.p
-        changed = cython.address(self.changed[0, 0])
+        changed = self.changed
         for m in range(1 if self.kind == _DET else 2):
-            tall = cython.address(self.tall[m, 0, 0])
-            middle = cython.address(self.middle[m, 0, 0])
-            multiply(False, False, r, p, p, changed, cython.address(self.now[m, 0, 0]),
+            tall = self.tall + 2 * m * q * p
+            middle = self.middle + 4 * m * q * q
+            multiply(False, False, r, p, p, changed, self.now + m * p * p,
                      tall)  # fmt: skip
             multiply(False, True, r, r, p, tall, changed, middle)
             if m == 1 and self.kind == _TRACE:
-                first = cython.address(self.middle[0, 0, 0])
-                part = cython.address(self.middle[2, 0, 0])
+                first = self.middle
+                part = self.middle + 8 * q * q
                 multiply(False, False, r, r, r, first, middle, part)
                 multiply(False, False, r, r, r, part, first, middle)
                 continue
@@ -591,56 +614,56 @@ class Climber:
     def _update(self, c, r):
         """D_jj and H_jj of the group."""
         q, p = self.q, self.p
-        mixed = cython.address(self.mixed[0, 0, 0])
-        cross = cython.address(self.cross[0, 0, 0, 0])
+        mixed = self.mixed
+        cross = self.cross
         for m in range(1 if self.kind == _DET else 2):
-            own = cython.address(self.cross[m, 0, 0, 0])
+            own = self.cross + 2 * m * self.size
             for s in range(q):
                 for a in range(r):
-                    _weigh(own + (a * q + s) * WIDE, cython.address(self.tall[m, a, 0]),
-                           cython.address(self.columns[c, s, 0, 0]), p)  # fmt: skip
+                    _weigh(own + (a * q + s) * WIDE, self.tall + (2 * m * q + a) * p,
+                           self.columns + (c * q + s) * p * WIDE, p)  # fmt: skip
             for a in range(r * q * WIDE):
                 mixed[a] = 0.0
             if m == 1 and self.kind == _TRACE:
-                _mix(mixed, 1.0, cython.address(self.middle[0, 0, 0]), own, r, q)
-                _mix(mixed, -0.5, cython.address(self.middle[1, 0, 0]), cross, r, q)
+                _mix(mixed, 1.0, self.middle, own, r, q)
+                _mix(mixed, -0.5, self.middle + 4 * q * q, cross, r, q)
                 own = cross
             else:
-                _mix(mixed, 0.5, cython.address(self.middle[m, 0, 0]), own, r, q)
-            _lower(cython.address(self.grown[c, m, 0, 0, 0]), own, mixed, r, q)
+                _mix(mixed, 0.5, self.middle + 4 * m * q * q, own, r, q)
+            _lower(self.grown + (2 * c + m) * self.size, own, mixed, r, q)
 
     def _shrink(self, c, m):
         """Z and Y^-1 into ``work``, det Y into ``det``; m = 1: of X in place of V."""
         q = self.q
-        solved = cython.address(self.work[0, 0, 0, 0])
-        middle = cython.address(self.work[1, 0, 0, 0])
-        cross = cython.address(self.cross[m, 0, 0, 0])
-        for a in range(q * q * WIDE):
+        solved = self.work
+        middle = self.work + self.size
+        cross = self.cross + 2 * m * self.size
+        for a in range(self.size):
             solved[a] = 0.0
-        _times(solved, 1.0, cross, cython.address(self.kept[c, m, 0, 0, 0]), False, q)
+        _times(solved, 1.0, cross, self.kept + (2 * c + m) * self.size, False, q)
         for r in range(q):
             for s in range(q):
-                stays = (1.0 if r == s else 0.0) - self.at_out[m, r, s]
+                stays = (1.0 if r == s else 0.0) - self.at_out[(m * q + r) * q + s]
                 into = middle + (r * q + s) * WIDE
                 for j in range(WIDE):
                     into[j] = stays
         _times(middle, 1.0, solved, cross, True, q)
-        _invert(middle, cython.address(self.det[0]), q)
+        _invert(middle, self.det, q)
 
     def _swaps(self, c):
         """Gains of the group when i, whose ``tall`` is there, goes out."""
         q, p = self.q, self.p
-        gain, det = cython.address(self.gain[0]), cython.address(self.det[0])
-        alone = cython.address(self.alone[c, 0])
+        gain, det = self.gain, self.det
+        alone = self.alone + c * WIDE
         for m in range(1 if self.kind == _DET else 2):
             for s in range(q):
                 for r in range(q):
-                    _weigh(cython.address(self.cross[m, 0, 0, 0]) + (r * q + s) * WIDE,
-                           cython.address(self.tall[m, r, 0]),
-                           cython.address(self.columns[c, s, 0, 0]), p)  # fmt: skip
+                    _weigh(self.cross + 2 * m * self.size + (r * q + s) * WIDE,
+                           self.tall + (2 * m * q + r) * p,
+                           self.columns + (c * q + s) * p * WIDE, p)  # fmt: skip
         if self.rows:
-            cross = cython.address(self.cross[0, 0, 0, 0])
-            stays = 1.0 - self.at_out[0, 0, 0]
+            cross = self.cross
+            stays = 1.0 - self.at_out[0]
             for j in range(WIDE):
                 gain[j] = alone[j] * stays + cross[j] * cross[j]
             return
@@ -653,21 +676,21 @@ class Climber:
                 for j in range(WIDE):
                     gain[j] /= max(det[j], 1e-300)
             return
-        solved = cython.address(self.work[0, 0, 0, 0])
-        part = cython.address(self.work[2, 0, 0, 0])
-        lost = cython.address(self.work[3, 0, 0, 0])
-        other = cython.address(self.cross[1, 0, 0, 0])
-        for a in range(q * q * WIDE):
+        solved = self.work
+        part = self.work + 2 * self.size
+        lost = self.work + 3 * self.size
+        other = self.cross + 2 * self.size
+        for a in range(self.size):
             part[a] = -other[a]
-        _times(part, 0.5, solved, cython.address(self.grown[c, 1, 0, 0, 0]), False, q)
+        _times(part, 0.5, solved, self.grown + (2 * c + 1) * self.size, False, q)
         for a in range(q * q):
-            constant = cython.address(self.at_out[1, 0, 0])[a]
+            constant = self.at_out[q * q + a]
             for j in range(WIDE):
                 lost[a * WIDE + j] = constant
         _times(lost, 2.0, part, solved, True, q)
         for j in range(WIDE):
             gain[j] = alone[j]
-        _dots(gain, -1.0, cython.address(self.work[1, 0, 0, 0]), lost, q)
+        _dots(gain, -1.0, self.work + self.size, lost, q)
         for j in range(WIDE):
             if not det[j] > 1e-14:  # singular without i
                 gain[j] = -INFINITY
@@ -697,8 +720,8 @@ class Climber:
             best: cython.Py_ssize_t = -1
             most: cython.double = -INFINITY
             for c in range(self.groups):
-                alone = cython.address(self.alone[c, 0])
-                j = _best_of(alone, cython.address(self.closed[c * WIDE]), most)
+                alone = self.alone + c * WIDE
+                j = _best_of(alone, self.closed + c * WIDE, most)
                 if j >= 0:
                     best, most = c * WIDE + j, alone[j]
             self.chosen[size] = best
@@ -746,26 +769,27 @@ class Climber:
         taken: cython.double = 0.0
         for m in range(1 if self.kind == _DET else 2):
             multiply(False, False, q, p, p, cython.address(self.blocks[out, 0, 0]),
-                     cython.address(self.now[m, 0, 0]),
-                     cython.address(self.tall[m, 0, 0]))  # fmt: skip
+                     self.now + m * p * p,
+                     self.tall + 2 * m * q * p)  # fmt: skip
+            of_out = self.grown + (2 * g + m) * self.size
             for r in range(q):
                 for s in range(q):
-                    self.at_out[m, r, s] = self.grown[g, m, r, s, e]
+                    self.at_out[(m * q + r) * q + s] = of_out[(r * q + s) * WIDE + e]
         for r in range(q):
-            taken += self.at_out[0, r, r] / q
+            taken += self.at_out[r * q + r] / q
         most: cython.double = least if self.kind == _TRACE else 1.0 + least
         best: cython.Py_ssize_t = -1
-        gain = cython.address(self.gain[0])
+        gain = self.gain
         for c in range(self.groups):
-            bound: cython.double = self.tops[c, 0]
+            bound: cython.double = self.tops[2 * c]
             if self.kind == _DET:
-                stays: cython.double = 1.0 - taken / (1.0 + self.tops[c, 1])
+                stays: cython.double = 1.0 - taken / (1.0 + self.tops[2 * c + 1])
                 for _ in range(q):
                     bound *= stays
             if bound <= most:
                 continue
             self._swaps(c)
-            j = _best_of(gain, cython.address(self.closed[c * WIDE]), most)
+            j = _best_of(gain, self.closed + c * WIDE, most)
             if j >= 0:
                 best, most = c * WIDE + j, gain[j]
         return -1 if best == out else best
@@ -822,26 +846,26 @@ class Climber:
     def _least(self):
         """E of ``gram``; V, C V and what ``_eigen`` fills are there."""
         p = self.p
-        inverse = cython.address(self.now[0, 0, 0])
-        half, root = cython.address(self.half[0, 0]), cython.address(self.root[0, 0])
+        inverse = self.now
+        half, root = self.half, cython.address(self.root[0, 0])
         if (
             not factor(
-                cython.address(self.gram[0, 0]),
+                self.gram,
                 inverse,
-                cython.address(self.lower[0, 0]),
+                self.lower,
                 p,
             )
             > -INFINITY
         ):
             return -INFINITY  # fmt: skip
         multiply(False, False, p, p, p, root, inverse, half)
-        multiply(False, True, p, p, p, half, root, cython.address(self.small[0, 0]))
+        multiply(False, True, p, p, p, half, root, self.small)
         info: cython.int = 0
-        room: cython.int = self.lapack.shape[0]
+        room: cython.int = 1 + 6 * p + 2 * p * p
         whole: cython.int = self.whole.shape[0]
-        dsyevd(b"V", b"L", cython.address(p), cython.address(self.small[0, 0]),
-               cython.address(p), cython.address(self.values[0]),
-               cython.address(self.lapack[0]), cython.address(room),
+        dsyevd(b"V", b"L", cython.address(p), self.small,
+               cython.address(p), self.values,
+               self.lapack, cython.address(room),
                cython.address(self.whole[0]), cython.address(whole),
                cython.address(info))  # fmt: skip
         return 1.0 / self.values[p - 1]
@@ -849,10 +873,10 @@ class Climber:
     def _strongest(self, found):
         """Who gives the largest E beside ``gram``, over ``found``; -1: none."""
         p, q = self.p, self.q
-        gram, rest = cython.address(self.gram[0, 0]), cython.address(self.rest[0, 0])
+        gram, rest = self.gram, self.rest
         copy(rest, gram, p * p)
         for a in range(p):
-            self.gram[a, a] += _SLIGHT
+            self.gram[a * p + a] += _SLIGHT
         value = self._least()
         if not value > -INFINITY:
             return -1
@@ -864,46 +888,48 @@ class Climber:
             1,
             p,
             p,
-            cython.address(self.small[p - 1, 0]),
-            cython.address(self.half[0, 0]),
-            cython.address(self.weakest[0]),
+            self.small + (p - 1) * p,
+            self.half,
+            self.weakest,
         )
         for a in range(p):
             self.weakest[a] *= value
-        part = cython.address(self.part[0, 0])
+        part = self.part
         for c in range(self.groups):
-            bound = cython.address(self.bounds[c, 0])
-            closed = cython.address(self.closed[c * WIDE])
+            bound = self.bounds + c * WIDE
+            closed = self.closed + c * WIDE
             for j in range(WIDE):
                 bound[j] = value
             for s in range(q):
-                _weigh(part, cython.address(self.weakest[0]),
-                       cython.address(self.columns[c, s, 0, 0]), p)  # fmt: skip
+                _weigh(part, self.weakest,
+                       self.columns + (c * q + s) * p * WIDE, p)  # fmt: skip
                 for j in range(WIDE):
                     bound[j] += part[j] * part[j]
             for j in range(WIDE):
                 bound[j] = min(bound[j], cap) - closed[j]
-            self.tops[c, 0] = _largest(bound)
+            self.tops[2 * c] = _largest(bound)
         best: cython.Py_ssize_t = -1
         while True:
             g: cython.Py_ssize_t = 0
             for c in range(1, self.groups):
-                if self.tops[c, 0] > self.tops[g, 0]:
+                if self.tops[2 * c] > self.tops[2 * g]:
                     g = c
-            if not self.tops[g, 0] > found[0]:
+            if not self.tops[2 * g] > found[0]:
                 return best
-            bound = cython.address(self.bounds[g, 0])
+            bound = self.bounds + g * WIDE
             e: cython.Py_ssize_t = 0
-            while bound[e] != self.tops[g, 0]:
+            while bound[e] != self.tops[2 * g]:
                 e += 1
             bound[e] = -INFINITY
-            self.tops[g, 0] = _largest(bound)
+            self.tops[2 * g] = _largest(bound)
             copy(gram, rest, p * p)
             self._add(g * WIDE + e)
             for a in range(p):
                 for b in range(a + 1):
-                    self.lower[a, b] = self.gram[a, b] - found[0] * self.metric[a, b]
-            lower = cython.address(self.lower[0, 0])
+                    self.lower[a * p + b] = (
+                        self.gram[a * p + b] - found[0] * self.metric[a * p + b]
+                    )
+            lower = self.lower
             if cholesky(lower, lower, p, 0.0) > -INFINITY:
                 value = self._least()
                 if value > found[0]:
@@ -946,26 +972,27 @@ class Climber:
         An orthonormal basis grows with what is chosen: first the required ones, then at
         random what leaves the span by enough.
         """
+        p = self.p
         count: cython.Py_ssize_t = self.blocks.shape[0]
         size: cython.Py_ssize_t = self.fixed
         for i in range(count):
             self.counts[i] = 0
         rank: cython.int = self.span.shape[0]
         for r in range(rank):
-            for a in range(self.p):
-                self.basis[r, a] = self.span[r, a]
+            for a in range(p):
+                self.basis[r * p + a] = self.span[r, a]
         for r in range(size):
             self.counts[self.chosen[r]] += 1
             rank = self._extend(self.chosen[r], rank, 1e-18)
         for position in range(count):
-            if rank == self.p or size == self.k:
+            if rank == p or size == self.k:
                 break
             other = position + self._draw(count - position)
             i = self.order[other]
             self.order[other], self.order[position] = self.order[position], i
             if self.counts[i] < self.upper[i]:
                 grown = self._extend(i, rank, 1e-6 / count)
-                if grown - rank >= min(self.full, self.p - rank):
+                if grown - rank >= min(self.full, p - rank):
                     rank = grown
                     self.chosen[size] = i
                     self.counts[i] += 1
@@ -980,30 +1007,31 @@ class Climber:
 
     def _extend(self, i, rank, least):
         """Add to the basis the rows of block i that are new by over ``least``; rank."""
+        p = self.p
         for s in range(self.q):
-            if rank == self.p:
+            if rank == p:
                 break
-            row = cython.address(self.basis[rank, 0])
+            row = self.basis + rank * p
             square: cython.double = 0.0
-            for a in range(self.p):
+            for a in range(p):
                 row[a] = self.blocks[i, s, a]
                 square += row[a] * row[a]
             for _ in range(2):  # twice is enough for orthogonality to rounding
                 before: cython.double = square
                 for r in range(rank):
                     dot: cython.double = 0.0
-                    for a in range(self.p):
-                        dot += self.basis[r, a] * row[a]
-                    for a in range(self.p):
-                        row[a] -= dot * self.basis[r, a]
+                    for a in range(p):
+                        dot += self.basis[r * p + a] * row[a]
+                    for a in range(p):
+                        row[a] -= dot * self.basis[r * p + a]
                 square = 0.0
-                for a in range(self.p):
+                for a in range(p):
                     square += row[a] * row[a]
                 if square > 0.5 * before:
                     break
             if square > least:
                 scale = 1.0 / sqrt(square)
-                for a in range(self.p):
+                for a in range(p):
                     row[a] *= scale
                 rank += 1
         return rank
