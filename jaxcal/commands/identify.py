@@ -43,7 +43,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--measured-unit", default="", metavar="UNIT")
     out = "save the calibration (.json), or of an arm the corrected file (.urdf)"
     add("--out", metavar="FILE", help=out)
-    add("--force", action="store_true", help="write over a .urdf that is there")
+    add(
+        "--force",
+        action="store_true",
+        help="write a .urdf over another one, or from a fit that is refused",
+    )
     add("--json", action="store_true", help="print JSON")
 
 
@@ -79,6 +83,11 @@ def run(arguments: argparse.Namespace) -> None:
         command_unit=arguments.command_unit,
         measured_unit=arguments.measured_unit,
     )
+    told = calibration.verdict
+    if arguments.out and as_urdf and told and not told.good and not arguments.force:
+        raise ValueError(
+            f"{arguments.out} is not written, --force writes it all the same:\n{told}"
+        )
     if arguments.out and as_urdf:
         tip = calibration.to_urdf(arguments.out, force=arguments.force)
     elif arguments.out:

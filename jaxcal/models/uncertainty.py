@@ -48,8 +48,8 @@ class Prior:
             from name to number. ``inf`` and names that are left out: nothing is known.
         mean: likewise; the model's nominal value where it is left out.
         fixed: names of parameters held at the mean, out of the identification.
-        by_data: of an arm, the sizes of its lengths' and its angles' errors are taken
-            from the readings; see :meth:`sized`.
+        by_data: of an arm, the sizes of the errors are taken from the readings; see
+            :meth:`sized`.
     """
 
     std: Named
@@ -75,9 +75,10 @@ class Prior:
     def sized(self) -> Prior:
         """This prior with the scale of its groups taken from the readings.
 
-        Its standard deviations then say how errors of lengths compare with each other,
-        and those of angles, not how large they are: two factors follow from the
-        readings by marginal likelihood. For an arm whose tolerances are not known.
+        Its standard deviations then say how errors compare within a group, not how
+        large they are: a factor each of lengths, turns of the axes, zeros of the joints
+        and their compliance follows from the readings by marginal likelihood. For an
+        arm whose tolerances are not known.
         """
         return dataclasses.replace(self, by_data=True)
 
