@@ -32,11 +32,12 @@ DIRECTIVES = {
     "initializedcheck": False,
 }
 FLAGS = ["-fPIC", "-fno-math-errno", "-fno-trapping-math", "-w"]
-# Rounds as written, on every processor: proofs rely on it.
+# Rounds as written, the same on every processor.
 EXACT = ["-ffp-contract=off"]
-# In a kernel with this line, sums may be taken in any order.
-ANY_ORDER = "# Sums in any order."
-FAST = ["-ffp-contract=fast", "-fassociative-math", "-fno-signed-zeros"]
+# In a kernel with this line a product and a sum may be one operation, rounded once. The
+# order of sums is as written: GCC keeps sums of several lanes in registers only then.
+FUSES = "# Products may be fused."
+FUSED = ["-ffp-contract=fast"]
 
 X86 = platform.machine().lower() in ("x86_64", "amd64") and sys.maxsize > 2**32
 # x86-64-v3 of the psABI: AVX2, FMA, BMI, LZCNT.
@@ -139,8 +140,8 @@ class _Build:
             for key, value in DIRECTIVES.items():
                 cython += ["-X", f"{key}={value}"]
             _run([*cython, f"--shared={SHARED}", "-o", code, source])
-            free = ANY_ORDER in (ROOT / source).read_text()
-            objects = self._objects(code, ["-O3", *(FAST if free else EXACT)])
+            fused = FUSES in (ROOT / source).read_text()
+            objects = self._objects(code, ["-O3", *(FUSED if fused else EXACT)])
         link = ["-bundle", "-undefined", "dynamic_lookup"]
         link = link if sys.platform == "darwin" else ["-shared", "-s"]
         # Written beside and moved: a process that runs keeps the module it loaded.

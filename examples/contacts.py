@@ -29,6 +29,8 @@ APART = [(0, 1, 0.05, 1e-4)]  # the sockets are printed 50 mm apart, to 0.1 mm
 COUNTS = (8, 12, 16)
 RULES = ("random", "I")
 DRAWS = 5
+# Its file has +-120 degrees; the postures that were measured reach 157.
+LIMITS = {"dinova_1": {"joint_6": (-160.0, 160.0)}}
 TRAINED = "front"  # place of the contacts that are fitted
 
 
@@ -36,7 +38,10 @@ def arm(name: str) -> SerialChain:
     """An arm as its maker describes it, with a ball at its tip and two sockets."""
     path = common.HERE / "contacts" / f"{ARMS[name]}.urdf"
     return SerialChain.from_urdf(
-        path, tip="ball_link", sensor=Socket(2, distances=APART)
+        path,
+        tip="ball_link",
+        sensor=Socket(2, distances=APART),
+        limits=LIMITS.get(name),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Callable
 from typing import Any, NoReturn, TypeVar
@@ -20,6 +21,8 @@ class Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, **fields)
 
     def error(self, message: str) -> NoReturn:
+        if found := re.match(r"argument (?:.*/)?(--[\w-]+): expected one", message):
+            message += f"; write {found[1]}=VALUE where it begins with a minus"
         self.exit(2, f"{self.prog}: {message}; see --help\n")
 
 

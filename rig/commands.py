@@ -20,7 +20,7 @@ def identify(args: argparse.Namespace) -> int:
     """Print what every drive says of itself."""
     from rig.core.bus import Bus, BusError
     from rig.core.drive import Drive
-    from rig.core.lock import BusLock
+    from rig.journal.lock import BusLock
 
     config, code = load(args), EXIT_OK
     with contextlib.ExitStack() as stack:
@@ -103,7 +103,7 @@ def check(args: argparse.Namespace) -> int:
     """Say what a configuration comes to; ConfigError lists its faults."""
     path = args.config or args.file or FILE
     config = load_config(path)
-    print(f"{path}: valid; fingerprint {config.fingerprint()[:16]}")
+    print(f"{path}: valid")
     for axis in config.axes:
         print(
             f"  {axis.name}: unit {axis.unit}, {axis.map.name}, "

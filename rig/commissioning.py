@@ -20,9 +20,8 @@ from rig.config import (
     parse_config,
 )
 from rig.core.faults import EXIT_FAULT, EXIT_OK, Refused
-from rig.core.lock import BusLock
-from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
-from rig.journal import new_run_folder
+from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord, new_run_folder
+from rig.journal.lock import BusLock
 from rig.sessions import FILE, load, make_simulator
 from rig.workbench.commission import setup as wizard
 from rig.workbench.commission import steps
@@ -138,6 +137,11 @@ def setup(args: argparse.Namespace) -> int:
             simulator = stack.enter_context(_simulator(args))
             given = _given(simulator, given)
             path = args.config or _own_folder(simulator.config) / "rig.toml"
+            if path.exists():  # its bus may be that of a real device
+                raise Refused(
+                    f"{path} exists: --simulate writes a file of its own. Name a new "
+                    "one, or leave out --config or --simulate"
+                )
         operator.confirm(wizard.SAFETY, "setup")
         if path.exists() and args.set:
             raise Refused(f"{path} exists: edit it, or leave out --set")
@@ -205,7 +209,7 @@ def _place(args: argparse.Namespace, state: str = "") -> Iterator[steps.Place]:
             simulator = make_simulator(config, vars(args), args.fault)
             served = stack.enter_context(simulator).start()
             record = DeviceRecord(_own_folder(served) / "device.json")
-            place = steps.simulated(simulator, served, record, _say, path)
+            place = steps.simulated(simulator, served, record, _say)
             steps.begin_simulated(place, state)
             place.operator.yes = getattr(args, "yes", False)
         place.reset_alarms = getattr(args, "reset_alarms", False)

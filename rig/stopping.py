@@ -10,18 +10,16 @@ file is read where nothing is armed. No signal ends this before the drives were 
 from __future__ import annotations
 
 import contextlib
-import json
 import pathlib
 import signal
 import time
 import tomllib
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from rig.core.faults import EXIT_FAULT, EXIT_OK, Fault, Refused
-from rig.core.lock import BusLock, armed_files, held_by, read_armed
+from rig.journal.lock import BusLock, armed_files, held_by, read_armed
 
 if TYPE_CHECKING:
     from rig.core.stop import UnitStop
@@ -39,7 +37,6 @@ class Target:
     def __init__(self, lock: BusLock, armed: dict[str, Any] | None) -> None:
         self.lock = lock
         self.armed = armed
-        self.asked = time.time()
         self.since = time.monotonic()
         self.holder: dict[str, Any] | None = None
 
@@ -65,8 +62,7 @@ class Target:
         if self.holder is None:
             return
         freed = self.lock.freed(ASK_S - (time.monotonic() - self.since))
-        reported = self._reported()
-        if not freed and reported:
+        if not freed and self._stand:
             freed = self.lock.freed(END_S)
         if not freed:
             _say("it has not answered: it is ended now")
@@ -74,31 +70,17 @@ class Target:
                 self.lock.signal_holder(signal.SIGKILL)
             if not self.lock.freed(KILLED_S):
                 _say("it still holds the bus")
-        _say(self._reported() or "it has reported no stop")
+        _say(
+            "it has no drive armed any more, as it says"
+            if self._stand
+            else "it has not said that all its drives stand"
+        )
 
-    def _reported(self) -> str:
-        """The lines of the stop that a session journalled since it was asked."""
-        if not self.holder or not self.holder.get("run"):
-            return ""
-        lines = []
-        for record in _last_records(pathlib.Path(self.holder["run"])):
-            if record["event"] == "stop" and record["time"] >= self.asked:
-                from rig.core.stop import UnitStop
-
-                lines += [f"  {UnitStop(**unit)}" for unit in record["units"]]
-        return "\n".join(["the session reported:", *lines]) if lines else ""
-
-
-def _last_records(run: pathlib.Path) -> Iterator[dict[str, Any]]:
-    """Whole records at the end of a journal that somebody may be writing."""
-    with contextlib.suppress(OSError):
-        with (run / "journal.jsonl").open("rb") as file:
-            file.seek(max(0, file.seek(0, 2) - 65536))
-            for line in file.read().split(b"\n"):
-                with contextlib.suppress(ValueError, TypeError, KeyError):
-                    record = json.loads(line)
-                    if record["time"] and record["event"]:
-                        yield record
+    @property
+    def _stand(self) -> bool:
+        """Whatever the holder armed, it has seen standing since."""
+        armed = read_armed(self.lock.armed_path)
+        return armed is None or armed["standing"]
 
 
 def stop_device(path: pathlib.Path, given: bool = True) -> int:
@@ -127,6 +109,8 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
             _say(f"{lack}: stopping all that sessions of this user have armed")
         for target in found:
             target.ask()
+        from rig.core import drive, stop  # noqa: F401  # while those asked have time
+
         with ThreadPoolExecutor(len(found)) as pool:
             codes = list(pool.map(lambda target: _stop(target, path), found))
         faults = [code for code in codes if isinstance(code, Fault)]
@@ -200,8 +184,8 @@ def _stop_units(target: Target, path: pathlib.Path | None) -> list[UnitStop]:
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(target.lock.acquire("stop"))
-        except (OSError, Refused) as error:  # a stop waits for nobody
-            _say(str(error))
+        except (OSError, Refused):  # a stop waits for nobody
+            _say(f"{target.lock.where} is not free: its drives are stopped anyway")
         bus = Bus(settings, silence_s)
         try:
             bus.open()

@@ -93,9 +93,20 @@ def on_files(files: Any, config: Any) -> Any:
         text = page.read_text(encoding="utf-8").replace("](../docs/", "](../")
         script = page.with_suffix(".py").read_text(encoding="utf-8")
         add(f"examples/{page.name}", f"{text}\n## The script\n\n```py\n{script}```\n")
+    for notebook in sorted((ROOT / "examples").glob("*.ipynb")):
+        add(f"examples/{notebook.name}", notebook.read_bytes())
     for path, image in figures.draw_all().items():
         add(path, image)
     return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Any) -> str:
+    """The home page shows the table of figures that README has."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    figures = readme.partition("<!-- figures -->")[2].partition("<!-- end -->")[0]
+    return markdown.replace(
+        "<!-- figures of README -->", figures.replace("](docs/", "](")
+    )
 
 
 def on_post_page(output: str, page: Any, config: Any) -> str:

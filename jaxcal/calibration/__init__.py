@@ -1,6 +1,7 @@
 """From measurements to a calibration: ``identify`` and the ``Calibration`` it returns.
 
-``calibration`` is what it answers, ``inverse`` how it is inverted, ``file`` its format.
+``fit`` holds what was found and predicts; ``calibration`` adds the judges (``verdict``,
+``check``), the ``inverse``, the ``summary`` and the ``file``.
 ``closed_form`` fits the affine model; ``estimate`` (from arguments to the fit),
 ``solve`` (the search) and ``discrepancy`` every other one.
 """

@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration.fitted import Fitted
+from jaxcal.calibration.fit import Fit
 from jaxcal.checks import table, whole_number
+from jaxcal.information.blocks import without
 from jaxcal.models import SerialChain
 
 __all__ = ["Check", "check", "verification"]
@@ -45,7 +46,7 @@ class Check:
 
 
 def check(
-    calibration: Fitted,
+    calibration: Fit,
     commands: ArrayLike,
     measured: ArrayLike,
     tolerance: float | None,
@@ -81,9 +82,7 @@ def check(
             raise ValueError("placed_anew is of an arm whose sensor stands somewhere")
         own[-len(model.sensor.names) :] = True
     if own.any():  # what stands elsewhere now says nothing
-        left, size, _ = np.linalg.svd(by[:, own], full_matrices=True)
-        rank = int((size > 1e-9 * size.max(initial=0.0)).sum())
-        white, by = left[:, rank:].T @ white, left[:, rank:].T @ by
+        white, by = without(by[:, own], white, by)
     freedom = len(white)
     if not freedom:
         raise ValueError("measured leaves no reading beside what was placed anew")
@@ -135,7 +134,7 @@ def _noncentrality(freedom: int) -> float:
 
 
 def verification(
-    calibration: Fitted,
+    calibration: Fit,
     candidates: ArrayLike,
     k: int,
     region: ArrayLike | None,

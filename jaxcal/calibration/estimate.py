@@ -12,15 +12,24 @@ from jaxcal.calibration.discrepancy import WithDiscrepancy
 from jaxcal.calibration.sizes import group_sizes
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
 from jaxcal.checks import in_words, one_of, whole_number
-from jaxcal.models import Model, Noise, Pose, Position, Prior, SerialChain
+from jaxcal.information.blocks import significant
+from jaxcal.models import (
+    Model,
+    Noise,
+    Pose,
+    Position,
+    Prior,
+    SerialChain,
+    Socket,
+)
 from jaxcal.models.checked import facts
 
 __all__ = ["fit_model", "require_model"]
 
 Array = NDArray[np.float64]
 
-_BEYOND = 45.0  # degrees beyond a limit: files are often too narrow, never so much
-_NULL = 1e-10  # of the largest singular value: not determined
+_BEYOND = 2.0  # degrees beyond a limit, or percent of a slide's stroke
+_NOMINAL = 0.05  # of its length: no arm is so far off before it is calibrated
 
 
 def require_model(model: Any, commands: Array, measured: Array) -> None:
@@ -79,6 +88,8 @@ def fit_model(
     if isinstance(model, SerialChain):
         _require_postures(model, commands[used], measured[used])
         model = model.located(commands[used], measured[used])
+        _require_sockets(model, commands[used])
+    asked = prior is not None
     prior = prior or model.default_prior()
     resolved = prior.resolve(model)
     whole, extra = model, np.zeros(0)
@@ -101,8 +112,9 @@ def fit_model(
         student=loss == "student",
     )
     found = solve(task)
-    if prior.by_data:
-        if not isinstance(model, SerialChain) or extra.size or spread.any():
+    beyond = extra.size or spread.any()  # what the sizes are not made for
+    if prior.by_data and (asked or not beyond):
+        if not isinstance(model, SerialChain) or beyond:
             raise ValueError(
                 "Prior.sized() is of arms, without discrepancy and command_std"
             )
@@ -110,7 +122,7 @@ def fit_model(
         for _ in range(2):
             factors = group_sizes(model, stated, found)
             task = dataclasses.replace(task, precision=stated.precision / factors**2)
-            found = solve(task)
+            found = solve(task, found)
     if common_noise is None and _levels_differ(task, found):
         task = dataclasses.replace(task, per_output=True)
         found = solve(task, found)
@@ -140,7 +152,7 @@ def _require_postures(arm: SerialChain, commands: Array, measured: Array) -> Non
     """Refuse radians for degrees, and joints far beyond their limits."""
     low, high = arm.limits.T
     units = np.array(arm.command_units)
-    slack = np.where(units == "deg", _BEYOND, 0.5 * (high - low))
+    slack = np.where(units == "deg", _BEYOND, 0.01 * _BEYOND * (high - low))
     joints = commands[:, : arm.num_joints]
     far = np.argwhere((joints < low - slack) | (joints > high + slack))
     for row, joint in far[:1]:
@@ -148,7 +160,8 @@ def _require_postures(arm: SerialChain, commands: Array, measured: Array) -> Non
             f"{arm.joint_names[joint]} must be within its limits "
             f"{in_words(arm.limits[joint])}, to {slack[joint]:g}, got "
             f"{joints[row, joint]:g} in row {row}; are the columns in this order: "
-            f"{', '.join(arm.joint_names)}?"
+            f"{', '.join(arm.joint_names)}? Where the file's limits are wrong, "
+            "give limits={name: (low, high)}"
         )
     largest = np.abs(joints[:, units == "deg"]).max(initial=0.0)
     if arm.sensor.zeros and arm.num_joints > 2 and 1.0 < largest < 7.0:
@@ -156,6 +169,41 @@ def _require_postures(arm: SerialChain, commands: Array, measured: Array) -> Non
             f"commands must be in degrees, got angles of at most {largest:.3g}, which "
             "look like radians: np.degrees(commands), --radians"
         )
+
+
+def _require_sockets(arm: SerialChain, commands: Array) -> None:
+    """Refuse contacts that no arm near the nominal one can have made."""
+    if not isinstance(arm.sensor, Socket):
+        return
+    which = arm.sensor.of_rows(commands[:, arm.num_joints :])
+    joints = commands[:, : arm.num_joints]
+    _, first, groups = np.unique(joints, axis=0, return_index=True, return_inverse=True)
+    for row in np.flatnonzero(which != which[first][groups.ravel()])[:1]:
+        raise ValueError(
+            f"a posture must have the ball in one socket, but row {row} is row "
+            f"{first[groups.ravel()[row]]} with another socket: rows of the other file?"
+        )
+    points = arm.calibrated(arm.nominal).predict(joints)
+    most, middles = _NOMINAL * arm.length, {}
+    for i in np.unique(which):
+        rows = np.flatnonzero(which == i)
+        middles[i] = np.median(points[rows], axis=0)
+        far = np.linalg.norm(points[rows] - middles[i], axis=1)
+        if len(rows) > 2 and np.median(far) > most:
+            raise ValueError(
+                f"contacts of socket {i} must be at one point within {most:.2g}, but "
+                f"the arm as described scatters by {np.median(far):.2g} there: a wrong "
+                "tip, unit, sign or order of columns, or rows of another place?"
+            )
+    for one, other, distance, _ in arm.sensor.distances:
+        if {int(one), int(other)} <= set(middles):
+            found = float(np.linalg.norm(middles[int(one)] - middles[int(other)]))
+            if abs(found - distance) > most:
+                raise ValueError(
+                    f"sockets {int(one)} and {int(other)} must be {distance:g} apart, "
+                    f"but the arm as described puts them {found:.3g} apart: "
+                    "rows of another place or another unit?"
+                )
 
 
 def _noise_of(
@@ -275,9 +323,10 @@ def _covariance(
         np.concatenate([rows, np.diag(np.sqrt(precision))]) / scale, "r"
     )
     _, singular, right = np.linalg.svd(triangle)
-    known = singular > _NULL * singular[0]
+    known = significant(singular)
     readings = left * len(task.commands)
-    if not known.all() and np.linalg.matrix_rank(rows / scale, _NULL) >= readings:
+    of_rows = significant(np.linalg.svd(rows / scale, compute_uv=False)).sum()
+    if not known.all() and of_rows >= readings:
         raise ValueError(
             f"measured holds {readings} independent readings, too few for "
             f"{len(free)} free parameters: {int((~known).sum())} combinations of them "

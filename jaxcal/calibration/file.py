@@ -6,56 +6,79 @@ Everything under ``derived`` is for other programs to read and is ignored on loa
 from __future__ import annotations
 
 import copy
-import dataclasses
 import json
 import os
 import pathlib
-from collections.abc import Mapping
 from typing import Any, NoReturn
 
 import numpy as np
 
+from jaxcal.calibration.fit import Fit
 from jaxcal.files import write_text
+from jaxcal.models import Affine, Model, from_dict
 
-__all__ = [
-    "FORMAT",
-    "Schema",
-    "content_of",
-    "fields",
-    "read",
-    "require_version",
-    "write",
-]
+__all__ = ["content_of", "fields", "read", "write"]
 
 FORMAT = "jaxcal-calibration"
 VERSION = 3
 
+# Axes in letters: n inputs, m outputs, P parameters, others any; "" for one number.
+_SHAPES = {
+    "estimate": "P",
+    "joint_covariance": "PP",
+    "centre": "n",
+    "unidentified": "zP",
+    "prior_mean": "P",
+    "prior_precision": "P",
+    "free": "P",
+    "commands": "Nn",
+    "estimated_commands": "Nn",
+    "residuals": "Nm",
+    "loss_weights": "N",
+    "distance": "N",
+    "noise_std": "m",
+    "noise_dof": "",
+    "dof": "",
+    "square": "",
+    "frequencies": "nD",
+    "phases": "D",
+}
+_MAY_BE_NULL = (
+    *("joint_covariance", "centre", "unidentified", "estimated_commands"),
+    *("noise_std", "frequencies", "phases"),
+)
+_NOT_NEGATIVE = (
+    *("prior_precision", "free", "loss_weights", "distance", "noise_std"),
+    *("noise_dof", "dof", "square"),
+)
+_COUNTS = ("num_measurements", "num_readings")
 _NAMES = {"input_names": "n", "output_names": "m"}
-_TEXTS = ("command_unit", "measured_unit")
+_KINDS = {
+    "command_unit": (str, "text"),
+    "measured_unit": (str, "text"),
+    "loss": (str, "text"),
+    "noise_known": (bool, "true or false"),
+    "provenance": (dict, "an object"),
+}
 
 
-@dataclasses.dataclass(frozen=True)
-class Schema:
-    """What a calibration keeps beside its names, units and provenance."""
-
-    # Axes in letters: n inputs, m outputs, p parameters, others any; "" for one number.
-    shapes: Mapping[str, str]
-    counts: Mapping[str, int]  # whole numbers and their least value
-    switches: tuple[str, ...]  # true or false
-    may_be_null: tuple[str, ...]
-    not_negative: tuple[str, ...]
-    positive: tuple[str, ...]
-
-
-def content_of(calibration: Any, schema: Schema) -> dict[str, Any]:
+def content_of(fit: Fit) -> dict[str, Any]:
     """The content of the file: names, numbers and lists, as JSON has them."""
     content: dict[str, Any] = {"format": FORMAT, "version": VERSION}
-    content |= {key: list(getattr(calibration, key)) for key in _NAMES}
-    for key in (
-        *(*_TEXTS, *schema.shapes, *schema.counts, *schema.switches, "provenance"),
-    ):
-        value = copy.deepcopy(getattr(calibration, key))
-        content[key] = value.tolist() if isinstance(value, np.ndarray) else value
+    for key in (*_NAMES, *_SHAPES, *_COUNTS, *_KINDS):
+        value = copy.deepcopy(getattr(fit, key))
+        array = isinstance(value, np.ndarray | tuple)
+        content[key] = np.asarray(value).tolist() if array else value
+    content["model"] = fit.model.to_dict()
+    covariance = fit.covariance
+    content["derived"] = {
+        "parameter_names": list(fit.names),
+        "parameters": fit.parameters.tolist(),
+        "covariance": None if covariance is None else covariance.tolist(),
+    }
+    if isinstance(fit.model, Affine):
+        content["derived"]["matrix"] = fit.matrix.tolist()
+        content["derived"]["bias"] = fit.bias.tolist()
     return content
 
 
@@ -74,7 +97,10 @@ def read(path: str | os.PathLike[str]) -> Any:
     try:
         return json.loads(data.decode("utf-8"), parse_constant=constant)
     except json.JSONDecodeError as error:
-        problem = f"not JSON: {error.msg} in line {error.lineno}"
+        problem = (
+            f"not JSON: {error.msg} in line {error.lineno}; `jaxcal identify ... "
+            "--out FILE` writes a calibration"
+        )
     except (UnicodeDecodeError, RecursionError):
         problem = "not JSON: not text"
     except ValueError as error:
@@ -82,8 +108,17 @@ def read(path: str | os.PathLike[str]) -> Any:
     raise ValueError(f"{os.fspath(path)}: {problem}")
 
 
-def require_version(content: Any) -> None:
-    """Refuse what is no calibration, or one of another version."""
+def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
+    """The arguments of a calibration from the content of its file, checked.
+
+    Args:
+        content: as ``content_of`` made it.
+        model: where the file cannot hold it.
+
+    Raises:
+        ValueError: it is no calibration, of another version, or damaged; naming the key
+            and what is wrong with it.
+    """
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f'not a calibration: "format" is not "{FORMAT}"')
     if content.get("version") != VERSION:
@@ -91,49 +126,49 @@ def require_version(content: Any) -> None:
             f"a calibration of version {content.get('version')!r}, this jaxcal reads "
             f"version {VERSION}: identify again from the measurements"
         )
-
-
-def fields(content: Mapping[str, Any], schema: Schema) -> dict[str, Any]:
-    """The arguments of a calibration from the content of its file, checked.
-
-    Raises:
-        ValueError: naming the key and what is wrong with it.
-    """
     found: dict[str, Any] = {}
-    keys = (*schema.shapes, *schema.counts, *_TEXTS, *_NAMES, *schema.switches)
-    for key in (*keys, "provenance"):
+    for key in (*_SHAPES, *_COUNTS, *_NAMES, *_KINDS):
         if key not in content:
             raise ValueError(f'key "{key}" is missing')
         found[key] = content[key]
 
     def require(holds: bool, key: str, rule: str) -> None:
         if not holds:
-            raise ValueError(f'"{key}" must {rule}, got {found[key]!r}')
+            raise ValueError(f'"{key}" must {rule}, got {content.get(key)!r}')
 
     sizes: dict[str, int] = {}
-    for key, shape in schema.shapes.items():
-        if found[key] is None and key in schema.may_be_null:
+    for key, shape in _SHAPES.items():
+        if found[key] is None and key in _MAY_BE_NULL:
             continue
         array = _array(key, found[key], shape, sizes)
-        require(
-            key not in schema.positive or bool((array > 0.0).all()), key, "be positive"
-        )
-        least = 0.0 if key in schema.not_negative else -np.inf
+        least = 0.0 if key in _NOT_NEGATIVE else -np.inf
         require(bool((array >= least).all()), key, "not be negative")
         found[key] = array if shape else float(array)
-    for key, least in schema.counts.items():
-        whole = type(found[key]) is int and found[key] >= least
-        require(whole, key, f"be a whole number >= {least}")
-    for key in _TEXTS:
-        require(isinstance(found[key], str), key, "be text")
+    for key in _COUNTS:
+        whole = type(found[key]) is int and found[key] >= 1
+        require(whole, key, "be a whole number >= 1")
     for key, letter in _NAMES.items():
         kinds = [type(x) for x in found[key]] if isinstance(found[key], list) else None
         require(kinds == [str] * sizes[letter], key, f"hold {sizes[letter]} names")
         found[key] = tuple(found[key])
-    for key in schema.switches:
-        require(isinstance(found[key], bool), key, "be true or false")
-    require(isinstance(found["provenance"], dict), "provenance", "be an object")
-    return found
+    for key, (kind, what) in _KINDS.items():
+        require(isinstance(found[key], kind), key, f"be {what}")
+    require(found["loss"] in ("student", "gaussian"), "loss", "be student or gaussian")
+    for key in ("model", "derived"):
+        require(isinstance(content.get(key), dict), key, "be an object")
+    names = content["derived"].get("parameter_names")
+    model = from_dict(content["model"]) if model is None else model
+    if list(model.names) != names:
+        raise ValueError(
+            f"model must have the parameters of the file, {names}, got {model.names}"
+        )
+    features = 0 if found["phases"] is None else len(found["phases"])
+    expected = len(names) + features * len(found["output_names"])
+    if len(found["estimate"]) != expected:
+        raise ValueError(f'"estimate" must have shape ({expected},)')
+    if (found["noise_std"] is None) != (found["joint_covariance"] is None):
+        raise ValueError('"noise_std" and "joint_covariance" contradict each other')
+    return found | {"model": model}
 
 
 def _array(key: str, value: Any, shape: str, sizes: dict[str, int]) -> Any:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxcal.calibration.fit import Fit
 from jaxcal.checks import in_words, numbers
 from jaxcal.information.excitation import direction_in_words
 from jaxcal.models import Affine, Model
@@ -40,7 +40,7 @@ def limits_of(limits: ArrayLike, names: tuple[str, ...]) -> Array:
     return bounds
 
 
-def solve_affine(fit: Any, wanted: Array, max_condition: float) -> Array:
+def solve_affine(fit: Fit, wanted: Array, max_condition: float) -> Array:
     """(P, n) the inverse of a square affine ``Calibration`` at outputs (P, n).
 
     Raises:

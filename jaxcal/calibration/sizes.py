@@ -1,11 +1,12 @@
 """How large an arm's errors are, from its readings: the scales of the prior's groups.
 
 The prior says how errors of lengths compare with each other, and those of angles; how
-large they are altogether is seldom known. Here two factors, of all lengths and all
-angles of the table, and the level of the noise make the readings most probable
-(marginal likelihood, the model linear about the fit), with a factor of three either
-way as what is thought of each beforehand. Sources: MacKay, 1992; Bishop, Pattern
-Recognition and Machine Learning, 3.5.
+large they are altogether is seldom known. Here a factor for all lengths, one for the
+turns of the axes (alpha, beta), one for the zeros of the joints (theta), one for their
+compliance and the level of the noise make the readings most probable (marginal
+likelihood, the model linear about the fit), with a factor of three either way as what
+is thought of each beforehand. Sources: MacKay, 1992; Bishop, Pattern Recognition and
+Machine Learning, 3.5.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration.solve import Solution, Task
+from jaxcal.information.blocks import without
 from jaxcal.models import SerialChain
 from jaxcal.models.checked import derivative
 
@@ -23,48 +25,54 @@ Array = NDArray[np.float64]
 
 _THOUGHT = np.log(3.0)  # standard deviation of the logarithm of each factor
 _MOST = 5.0  # of a logarithm
+_GROUPS = 4  # lengths, turns of the axes, zeros of the joints, their compliance
 
 
 def group_sizes(arm: SerialChain, task: Task, found: Solution) -> Array:
-    """(p,) factors of the prior's standard deviations: lengths, angles, others one.
+    """(p,) factors of the prior's standard deviations, one of parameters of no group.
 
     Args:
-        arm: whose table has the groups.
+        arm: whose parameters have the groups.
         task: with the prior that the factors are of.
         found: a fit with any such prior; the model is made linear there.
     """
     from scipy import optimize
 
     p = len(arm.names)
-    in_table = np.arange(p) < arm.table.size
-    lengths = in_table & (np.array(arm.units) == "length")
-    groups = np.where(lengths, 0, np.where(in_table, 1, 2))
+    groups = np.full(p, -1)
+    groups[: arm.table.size].reshape(-1, 5)[:] = [0, 1, 0, 2, 1]
+    groups[np.array(arm.units) == "deg per torque"] = 3
     rows, right = _reduced(arm, task, found)
-    sized = task.free[:p] & (task.precision[:p] > 0.0)
-    groups = np.asarray(groups)[sized]
+    sized = groups[task.free[:p] & (task.precision[:p] > 0.0)]
     count, width = len(right), rows.shape[1]
     # All that the readings say is in a triangle; the rest of them is noise alone.
     triangle = np.asarray(np.linalg.qr(np.column_stack([rows, right]), mode="r"))
     top = min(width, len(triangle))
     rest = float((triangle[top:, width] ** 2).sum())
     rows, right = triangle[:top, :width], triangle[:top, width]
+    member = sized == np.arange(_GROUPS)[:, None]  # (groups, s)
 
-    def cost(logs: Array) -> float:
-        """-2 log marginal likelihood, and what is thought of the factors."""
-        scaled = rows * np.exp(np.append(logs[:2], 0.0))[groups]
-        level = np.exp(2.0 * logs[2])
-        root = np.linalg.cholesky(scaled @ scaled.T + level * np.eye(top))
-        white = np.linalg.solve(root, right)
-        likely = 2.0 * np.log(np.diagonal(root)).sum() + white @ white
-        alone = (count - top) * 2.0 * logs[2] + rest / level
-        return float(likely + alone + ((logs / _THOUGHT) ** 2).sum())
+    def cost(logs: Array) -> tuple[float, Array]:
+        """-2 log marginal likelihood with what is thought of the factors; its slope."""
+        scaled = rows * np.exp(logs[:-1] @ member)
+        level = np.exp(2.0 * logs[-1])
+        inverse = np.linalg.inv(scaled @ scaled.T + level * np.eye(top))
+        white = inverse @ right
+        spread = member @ ((inverse @ scaled) * scaled).sum(axis=0)
+        alone = (count - top) * 2.0 * logs[-1] + rest / level
+        value = right @ white + alone - np.linalg.slogdet(inverse)[1]
+        slope = np.append(
+            spread - member @ (white @ scaled) ** 2,
+            level * (np.trace(inverse) - white @ white) + count - top - rest / level,
+        )
+        thought = logs / _THOUGHT
+        return float(value + thought @ thought), 2.0 * (slope + thought / _THOUGHT)
 
-    most = 1e-9 if task.known else _MOST
-    bounds = [(-_MOST, _MOST), (-_MOST, _MOST), (-most, most)]
-    best = optimize.minimize(cost, np.zeros(3), method="L-BFGS-B", bounds=bounds)
+    # A level that is known floats too: misfit beyond it is no size of the errors.
+    start, bounds = np.zeros(_GROUPS + 1), [(-_MOST, _MOST)] * (_GROUPS + 1)
+    best = optimize.minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds)
     factors = np.ones(p)
-    factors[lengths] = np.exp(best.x[0])
-    factors[in_table & ~lengths] = np.exp(best.x[1])
+    factors[groups >= 0] = np.exp(best.x[groups[groups >= 0]])
     return factors
 
 
@@ -88,7 +96,6 @@ def _reduced(arm: SerialChain, task: Task, found: Solution) -> tuple[Array, Arra
     known = known / np.sqrt(precision[free & (precision > 0.0)])
     flat = rows[:, free & (precision == 0.0)]
     if flat.shape[1]:
-        left, size, _ = np.linalg.svd(flat / (np.linalg.norm(flat, axis=0) + 1e-300))
-        rank = int((size > 1e-9 * size.max(initial=0.0)).sum())
-        known, right = left[:, rank:].T @ known, left[:, rank:].T @ right
+        flat = flat / (np.linalg.norm(flat, axis=0) + 1e-300)
+        known, right = without(flat, known, right)
     return known, right

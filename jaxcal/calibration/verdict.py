@@ -11,9 +11,9 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.fitted import Fitted
+from jaxcal.calibration.fit import Fit
 from jaxcal.models import SerialChain
-from jaxcal.models.sensors import Placed
+from jaxcal.models.sensors import Placed, Socket
 
 __all__ = ["Verdict", "verdict"]
 
@@ -24,6 +24,9 @@ _UNLIKELY = 1e-4  # p-value of lack of fit
 _FAR = 4.0  # standard deviations of the prior
 _MOVED = 3.0  # times the scatter of a socket's contacts: it was moved
 _SHUFFLES = 400
+_FEW = 4  # contacts: fewer that lie apart are outliers, not a socket that was moved
+_LOOSE = 10.0  # standard deviations: no scatter, a reading of something else
+_TIP = 0.015  # of the arm's length between the tip as found and as described
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +35,7 @@ class Verdict:
 
     explains: bool  # the scatter of the readings is what the sensor's noise can be
     helps: bool  # held-out errors are smaller than those of the nominal machine
+    clean: bool  # no reading is of another socket, or far from the fit of the others
     held_out: float  # mean held-out error of a measurement, in the readings' unit
     interval: tuple[float, float]  # 95 % of that mean
     nominal: float  # mean error of the nominal machine
@@ -40,7 +44,7 @@ class Verdict:
     @property
     def good(self) -> bool:
         """It may be used."""
-        return self.explains and self.helps
+        return self.explains and self.helps and self.clean
 
     def __str__(self) -> str:
         low, high = self.interval
@@ -52,10 +56,12 @@ class Verdict:
             lines.append("this model does not explain these readings")
         if not self.helps:
             lines.append("it is no better than the nominal machine")
+        if not self.clean:
+            lines.append("some readings contradict the others")
         return "\n".join([*lines, *self.reasons])
 
 
-def verdict(calibration: Fitted) -> Verdict | None:
+def verdict(calibration: Fit) -> Verdict | None:
     """Of an arm's calibration; None of other models, and where the noise is unknown."""
     model = calibration.model
     if not isinstance(model, SerialChain) or calibration.noise_std is None:
@@ -85,10 +91,13 @@ def verdict(calibration: Fitted) -> Verdict | None:
             )
     right = ~np.isin(used, list(swapped))
     reasons += _moved(model, commands[right], residuals[right], used[right])
-    reasons += _far(calibration)
+    exchanged = _exchanged(calibration, model)
+    reasons += exchanged + _far(calibration)
+    loose = (calibration.distance[list(calibration.outliers)] > _LOOSE**2).any()
     return Verdict(
         explains=explains,
         helps=mean < nominal,
+        clean=not (swapped or exchanged or loose),
         held_out=mean,
         interval=(max(mean - half, 0.0), mean + half),
         nominal=nominal,
@@ -96,7 +105,7 @@ def verdict(calibration: Fitted) -> Verdict | None:
     )
 
 
-def _left_out(calibration: Fitted, model: SerialChain, used: NDArray[np.intp]) -> Array:
+def _left_out(calibration: Fit, model: SerialChain, used: NDArray[np.intp]) -> Array:
     """(N, q) residual of each measurement from the fit without it."""
     noise = np.diag(np.asarray(calibration.noise_std) ** 2)
     slopes = model.jacobian(calibration.commands[used], calibration.parameters)
@@ -110,7 +119,7 @@ def _left_out(calibration: Fitted, model: SerialChain, used: NDArray[np.intp]) -
     return np.asarray(white @ np.sqrt(noise))
 
 
-def _scattered(calibration: Fitted, usual: Array) -> tuple[bool, list[str]]:
+def _scattered(calibration: Fit, usual: Array) -> tuple[bool, list[str]]:
     """Whether the noise explains the scatter, and why not."""
     if calibration.noise_known:
         fit = calibration.lack_of_fit()
@@ -128,7 +137,7 @@ def _scattered(calibration: Fitted, usual: Array) -> tuple[bool, list[str]]:
     ]
 
 
-def _far(calibration: Fitted) -> list[str]:
+def _far(calibration: Fit) -> list[str]:
     """Parameters that were found far from what was known of them."""
     names = calibration.names
     p = len(names)
@@ -138,6 +147,40 @@ def _far(calibration: Fitted) -> list[str]:
         f"{names[i]} is {off[i]:.2g} standard deviations of the prior from what was "
         "known: a wrong tip, file or unit?"
         for i in np.flatnonzero(off > _FAR)
+    ] + _other_tip(calibration)
+
+
+def _other_tip(calibration: Fit) -> list[str]:
+    """A tip far from where the arm's description has it, if a prior allowed that."""
+    model = calibration.model
+    if not (isinstance(model, SerialChain) and model.sensor.zeros):
+        return []
+    names = calibration.names
+    at = [names.index(f"tool {axis}") for axis in "xyz" if f"tool {axis}" in names]
+    moved = calibration.parameters[at] - model.nominal[at]
+    errors = np.sqrt(np.diag(np.asarray(calibration.covariance))[at])
+    far = float(np.linalg.norm(moved))
+    if far < _TIP * model.length or (np.abs(moved) < _FAR * errors).all():
+        return []
+    return [
+        f"the tip is {far:.3g} from where the arm's description has it "
+        f"(tool {', '.join(f'{each:.3g}' for each in moved)}): is it another tip?"
+    ]
+
+
+def _exchanged(calibration: Fit, model: SerialChain) -> list[str]:
+    """Sockets that were found where others were said to be."""
+    sensor = model.sensor
+    if not isinstance(sensor, Socket) or sensor.places is None:
+        return []
+    own = calibration.parameters[len(calibration.names) - sensor.places.size :]
+    apart = np.linalg.norm(own.reshape(-1, 1, 3) - sensor.places, axis=-1)
+    nearest = apart.argmin(axis=1)
+    return [
+        f"socket {i} was found where socket {j} was said to be: are their rows "
+        "exchanged?"
+        for i, j in enumerate(nearest)
+        if i != j and apart[i, j] < 0.5 * apart[i, i]
     ]
 
 
@@ -156,7 +199,7 @@ def _moved(
     found = []
     rng = np.random.default_rng(0)
     for i, rows in enumerate(_groups(model, commands)):
-        if len(rows) < 6:
+        if len(rows) < 2 * _FEW:
             continue
         value, at, apart, within = _split(residuals[rows])
         if apart < _MOVED * within:
@@ -177,7 +220,7 @@ def _split(values: Array) -> tuple[float, int, float, float]:
     """Best split of (n, q) in two: its share of the squares, where, step, scatter."""
     n = len(values)
     sums = np.cumsum(values, axis=0)
-    at = np.arange(2, n - 1)
+    at = np.arange(_FEW, n - _FEW + 1)
     first = sums[at - 1] / at[:, None]
     last = (sums[-1] - sums[at - 1]) / (n - at)[:, None]
     apart = np.linalg.norm(first - last, axis=1)
@@ -193,7 +236,7 @@ def _split(values: Array) -> tuple[float, int, float, float]:
     )
 
 
-def _swapped(calibration: Fitted, model: SerialChain) -> dict[int, int]:
+def _swapped(calibration: Fit, model: SerialChain) -> dict[int, int]:
     """Outliers that fit another socket or plane, as if their column were wrong."""
     sensor = model.sensor
     if not (isinstance(sensor, Placed) and sensor.zeros and sensor.count > 1):

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NoReturn
 
 from jaxcal.arguments import refused
-from jaxcal.commands.runs import names_task
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.learning.runtime import processes
 
@@ -36,7 +35,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
         The exit code.
     """
     given = list(sys.argv[1:] if argv is None else argv)
-    if names_task(given):
+    if any(word == "--task" or word.startswith("--task=") for word in given):
         from jaxcal.commands import evaluate_task
 
         return evaluate_task.main(given, prog)

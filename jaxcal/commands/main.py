@@ -6,6 +6,7 @@ import importlib
 import logging
 import os
 import sys
+import warnings
 
 from jaxcal.arguments import Parser, refused
 from jaxcal.extras import MissingExtraError
@@ -54,7 +55,14 @@ def main(argv: list[str] | None = None) -> int:
     log.setLevel(logging.INFO)
     log.addHandler(shown)
     try:
-        module.run(arguments)
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", UserWarning)
+            warnings.showwarning = lambda warning, *_: print(
+                f"jaxcal {arguments.command}: warning:",
+                "; ".join(str(warning).splitlines()),
+                file=sys.stderr,
+            )
+            module.run(arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of a pipe, such as head, has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -41,6 +41,11 @@ def run(arguments: argparse.Namespace) -> None:
     table = read_table(arguments.file)
     indices = arguments.indices
     if indices is None:
+        if set(arguments.subset) <= set("0123456789, "):
+            raise ValueError(
+                f"--subset must be a file, got {arguments.subset!r}; rows by their "
+                f"numbers are --indices {arguments.subset}"
+            )
         column = read_table(arguments.subset).columns(["index"])[:, 0]
         if not (column == column.round()).all():
             raise ValueError(f"{arguments.subset}: index must hold whole numbers")

@@ -7,12 +7,16 @@ kept as labels. Without --k the fewest rows that identify the model are chosen.
 from __future__ import annotations
 
 import argparse
+import json
+import pathlib
 from typing import Any
 
+import numpy as np
+
 from jaxcal.arguments import several
-from jaxcal.commands.model import add_model, read_model
 from jaxcal.commands.tables import Table, add_output, read_table, written
-from jaxcal.models import Affine, Noise
+from jaxcal.information.excitation import require_excited
+from jaxcal.models import Affine, Model, Noise, SerialChain, from_dict
 from jaxcal.selection import Design, Selection
 from jaxcal.selection.criteria import CRITERIA
 from jaxcal.selection.solvers import OPTIONS
@@ -21,10 +25,12 @@ __all__ = [
     "add_arguments",
     "add_criterion",
     "add_design",
+    "add_model",
     "criterion_of",
     "design_of",
     "numbers",
     "one_or_all",
+    "read_model",
     "run",
     "show",
     "whole_numbers",
@@ -32,6 +38,40 @@ __all__ = [
 
 numbers = several(float, "numbers")
 whole_numbers = several(int, "whole numbers")
+
+
+def add_model(parser: argparse.ArgumentParser) -> None:
+    """``--model``: a model from a file."""
+    what = "model: JSON of its to_dict(), or an arm's .urdf; y = A u + b by default"
+    parser.add_argument("--model", metavar="FILE", help=what)
+
+
+def read_model(path: str | None) -> Model | None:
+    """The model in a file; None without one.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: naming the file and what is wrong in it.
+    """
+    if path is None:
+        return None
+    if path.lower().endswith(".urdf"):
+        return SerialChain.from_urdf(path)
+    try:
+        read = json.loads(pathlib.Path(path).read_text(encoding="utf-8"))
+    except ValueError:
+        raise ValueError(
+            f"{path}: a model must be a JSON file of its to_dict(), or an arm's .urdf"
+        ) from None
+    if isinstance(read, dict) and read.get("format") == "jaxcal-calibration":
+        raise ValueError(
+            f"{path}: a model is needed, this is a calibration; commands that apply "
+            "one are predict and command"
+        )
+    try:
+        return from_dict(read)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 def add_design(parser: argparse.ArgumentParser, noise_needed: bool = False) -> None:
@@ -60,11 +100,16 @@ def design_of(arguments: argparse.Namespace, table: Table) -> Design:
         if model is not None:
             raise ValueError("--outputs must be left out with --model, which has them")
         model = Affine(len(candidates.columns), outputs)
+    mask = table.available()
+    if arguments.model is None:  # said here in the names of the columns
+        used = candidates.values if mask is None else candidates.values[mask]
+        distinct = f"rows ({len(np.unique(used, axis=0))} of them distinct)"
+        require_excited(used, candidates.columns, table.source, distinct)
     return Design(
         candidates,
         model,
         noise=None if arguments.noise is None else Noise(one_or_all(arguments.noise)),
-        available=table.available(),
+        available=mask,
         required=arguments.required,
         max_replicates=arguments.max_replicates,
     )

@@ -8,6 +8,7 @@ import dataclasses
 import io
 import json
 import pathlib
+import re
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -45,6 +46,11 @@ class Frame:
         """(N, n)."""
         return self.values
 
+    def __getitem__(self, names: Sequence[str]) -> Frame:
+        """These columns, in this order."""
+        places = [self.columns.index(name) for name in names]
+        return Frame(self.values[:, places], tuple(names), self.index)
+
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
         return np.array(self.values, dtype=dtype)
 
@@ -57,6 +63,7 @@ class Table:
     names: tuple[str, ...]  # of the numeric columns
     values: Array  # (N, len(names)), NaN where a cell is empty
     labels: dict[str, list[str]]  # columns that hold text, each of length N
+    lines: tuple[int, ...] = ()  # of the file, one for each row; of .npz none
 
     def __len__(self) -> int:
         return len(self.values)
@@ -77,9 +84,22 @@ class Table:
         return self.values[:, [self.names.index(name) for name in wanted]]
 
     def frame(self, wanted: Sequence[str]) -> Frame:
-        """The named columns, with the first column of text as the rows' names."""
-        rows = next(iter(self.labels.values()), [])
-        return Frame(self.columns(wanted), tuple(wanted), tuple(rows))
+        """The named columns, with the first column of text as the rows' names.
+
+        Raises:
+            ValueError: a cell that may be chosen is empty, NaN or infinite.
+        """
+        rows, values = next(iter(self.labels.values()), []), self.columns(wanted)
+        mask = self.available()
+        bad = ~np.isfinite(values)
+        for row, place in np.argwhere(bad if mask is None else bad & mask[:, None]):
+            line = f"line {self.lines[row]}" if self.lines else f"row {row}"
+            raise ValueError(
+                f"{self.source}: {line}, column {wanted[place]!r} must hold a number, "
+                f"got {values[row, place]} or an empty cell; fill it or leave the row "
+                "out"
+            )
+        return Frame(values, tuple(wanted), tuple(rows))
 
     def inputs(self, chosen: str | None) -> tuple[str, ...]:
         """Columns of commands: those chosen, else ``u_...``, else all but outputs."""
@@ -132,6 +152,8 @@ def read_table(path: str) -> Table:
     if path == "-":
         return _from_csv("standard input", sys.stdin.read())
     data = pathlib.Path(path).read_bytes()
+    if data.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")) and path[-4:] != ".npz":
+        raise ValueError(f"{path}: a table must be CSV or .npz; save this one as CSV")
     if path.lower().endswith(".npz"):
         return _from_npz(path, data)
     try:
@@ -171,9 +193,28 @@ def _from_csv(source: str, text: str) -> Table:
         for name, column in cells.items()
         if all(_is_number(cell) or not cell for cell in column)
     }
-    values = np.array(list(numbers.values())).reshape(len(numbers), len(rows)).T
     labels = {name: column for name, column in cells.items() if name not in numbers}
-    return Table(source, tuple(numbers), values, labels)
+    for name, column in labels.items():
+        _require_text(source, name, column, [line for line, _ in rows])
+    if not numbers:
+        raise ValueError(f"{source}: no column holds numbers: {', '.join(header)}")
+    values = np.array(list(numbers.values())).reshape(len(numbers), len(rows)).T
+    return Table(
+        source, tuple(numbers), values, labels, tuple(line for line, _ in rows)
+    )
+
+
+def _require_text(source: str, name: str, column: list[str], lines: list[int]) -> None:
+    """Refuse a column of numbers that one cell would turn into labels, by that cell."""
+    spoilt = [cell for cell in column if cell and not _is_number(cell)]
+    for line, cell in zip(lines, column, strict=True):
+        like = re.match(r"[+-]?\d+[.,]\d+", cell)
+        if cell in spoilt and (like or 2 * len(spoilt) < len(column)):
+            comma = re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", cell)
+            raise ValueError(
+                f"{source}: line {line}, column {name!r} must hold a number, got "
+                f"{cell!r}" + (": write a decimal point" if comma else "")
+            )
 
 
 def _letters(letter: str, count: int) -> list[str]:

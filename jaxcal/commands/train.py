@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import datetime
 import pathlib
+import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from jaxcal.arguments import refused
-from jaxcal.commands.runs import clock, stop_on_signals
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder
 from jaxcal.learning.runtime import cache, processes
@@ -65,7 +66,7 @@ def _run(arguments: argparse.Namespace) -> int:
         raise ValueError(f"--export must be a file NAME.npz, got {arguments.export}")
     configuration = _task_configuration if arguments.task else _configuration
     config: Any = devices.on_first(lambda: configuration(arguments, out))
-    stop = stop_on_signals()
+    stop = _stop_on_signals()
     if arguments.trainer == "brax":
         from jaxcal.learning.training import brax_ppo
 
@@ -321,6 +322,20 @@ def _introduce(config: TrainConfig, out: pathlib.Path, devices: str) -> None:
     print(f"configuration: {config.as_meta()}")
 
 
+def _stop_on_signals() -> Callable[[], bool]:
+    """Whether Ctrl-C or SIGTERM asked to save and stop; a second Ctrl-C is at once."""
+    asked: list[int] = []
+
+    def ask(number: int, frame: Any) -> None:
+        asked.append(number)
+        print("\nstopping after this update and saving ...", flush=True)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, ask)
+    return lambda: bool(asked)
+
+
 def _begin_table(unit: str, columns: tuple[str, str, str]) -> None:
     reward, first, second = columns
     print(
@@ -343,7 +358,7 @@ def _show(report: Report, measured: tuple[str, ...]) -> None:
             cells.append(f"{cell:>16}")
     print(
         f"{report.update:9,d} {report.played:10,d} {report.per_second:6,.0f} "
-        f"{clock(report.seconds):>9} {clock(report.eta):>9} "
+        f"{_clock(report.seconds):>9} {_clock(report.eta):>9} "
         + (f"{reward:8.4f} " if reward is not None else " imitate ")
         + " ".join(cells),
         flush=True,
@@ -372,3 +387,8 @@ def _compare_seeds(
         )
     for name, row in (("mean", values.mean(0)), ("spread", values.std(0, ddof=1))):
         print(f"{name:>9} " + " ".join(f"{x:16.4f}" for x in row))
+
+
+def _clock(seconds: float) -> str:
+    """h:mm:ss."""
+    return str(datetime.timedelta(seconds=round(seconds)))

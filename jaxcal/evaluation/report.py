@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from jaxcal.evaluation.results import Evaluation, Summary, versions
@@ -13,10 +13,12 @@ from jaxcal.pages import Block, Code, Figure, Page, Section, Table, Text, render
 
 __all__ = [
     "aligned",
+    "document",
     "file_prefixes",
     "json_document",
     "notes",
     "text_table",
+    "write_folder",
     "write_report",
 ]
 
@@ -73,14 +75,9 @@ def notes(shown: Summary) -> list[str]:
 
 def json_document(summaries: Sequence[Summary], *, command: Sequence[str]) -> str:
     """The numbers of several datasets; the layout is in docs/evaluation.md."""
-    document = {
-        "format": "jaxcal-evaluation",
-        "version": 1,
-        "command": list(command),
-        "versions": versions(),
-        "results": [entry for shown in summaries for entry in _entries(shown)],
-    }
-    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+    return document(
+        [entry for shown in summaries for entry in _entries(shown)], command
+    )
 
 
 def write_report(
@@ -105,43 +102,74 @@ def write_report(
     """
     from jaxcal.evaluation.figures import evaluation_figures
     from jaxcal.evaluation.training_figure import training_curves
-    from jaxcal.plots.style import as_files
 
-    files: dict[str, bytes] = {}
-
-    def drawn(name: str, figure: Any) -> Figure:
-        files[f"{name}.svg"], files[f"{name}.png"] = as_files(figure, "svg", "png")
-        return Figure(files[f"{name}.svg"], name.replace("_", " "))
-
-    sections = []
+    sections: dict[str, Part] = {}
     prefixes = file_prefixes([found.dataset.name for found in evaluations])
     for evaluation, prefix in zip(evaluations, prefixes, strict=True):
         shown = evaluation.summarise()
         blocks: list[Block] = [Table(_COLUMNS, _rows(shown, many))]
         blocks += [Text(note, "note") for note in notes(shown)]
-        for name, figure in evaluation_figures(evaluation).items():
-            blocks.append(drawn(f"{prefix}_{name}", figure))
-        sections.append(Section(_heading(shown), blocks))
-    curves = []
+        drawn = evaluation_figures(evaluation).items()
+        figures = {f"{prefix}_{name}": figure for name, figure in drawn}
+        sections[_heading(shown)] = blocks, figures
+    curves = {}
     for number, run in enumerate(runs, start=1):
         suffix = f"_{number}" if len(runs) > 1 else ""
-        curves.append(drawn(f"training_curves{suffix}", training_curves(run)))
+        curves[f"training_curves{suffix}"] = training_curves(run)
     if curves:
-        sections.append(Section("Training", curves))
+        sections["Training"] = (), curves
+    title = "Posture selection against the proven optimum"
+    return write_folder(folder, title, sections, command, _ABOUT)
+
+
+Part = tuple[Sequence[Block], Mapping[str, Any]]  # of a page: blocks, then figures
+
+
+def write_folder(
+    folder: pathlib.Path,
+    title: str,
+    sections: Mapping[str, Part],
+    command: Sequence[str],
+    about: str,
+) -> int:
+    """Write each figure as SVG and PNG, and ``index.html`` last; how many figures."""
+    from jaxcal.plots.style import as_files
+
+    files: dict[str, bytes] = {}
+    parts = []
+    for heading, (blocks, figures) in sections.items():
+        whole = list(blocks)
+        for name, figure in figures.items():
+            svg, files[f"{name}.png"] = as_files(figure, "svg", "png")
+            files[f"{name}.svg"] = svg
+            whole.append(Figure(svg, name.replace("_", " ")))
+        parts.append(Section(heading, whole))
+    count = len(files) // 2
     made_with = ", ".join(f"{name} {v}" for name, v in versions().items())
     page = Page(
-        "Posture selection against the proven optimum",
-        sections,
+        title,
+        parts,
         intro=[Text(Code(" ".join(command)), "note"), Text(made_with, "note")],
-        footer=[Text(_ABOUT, "note")],
+        footer=[Text(about, "note")],
     )
-    count = len(files) // 2
     files["index.html"] = render(page).encode()
     folder.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
         with atomic_write(folder / name) as file:
             file.write(data)
     return count
+
+
+def document(results: Sequence[dict[str, Any]], command: Sequence[str]) -> str:
+    """What every evaluation's JSON holds beside its results."""
+    whole = {
+        "format": "jaxcal-evaluation",
+        "version": 1,
+        "command": list(command),
+        "versions": versions(),
+        "results": list(results),
+    }
+    return json.dumps(whole, indent=1, allow_nan=False) + "\n"
 
 
 def file_prefixes(names: Sequence[str]) -> list[str]:

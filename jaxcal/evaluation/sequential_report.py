@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -11,11 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.evaluation.report import aligned
-from jaxcal.evaluation.results import versions
+from jaxcal.evaluation.report import aligned, document, write_folder
 from jaxcal.evaluation.sequential import METHODS, Result
-from jaxcal.files import atomic_write
-from jaxcal.pages import Block, Code, Figure, Page, Section, Table, Text, render
+from jaxcal.pages import Table
 
 __all__ = ["figure", "json_document", "text_table", "write_report"]
 
@@ -93,43 +90,17 @@ def json_document(result: Result, *, command: Sequence[str]) -> str:
         "checkpoint": result.checkpoint,
         "methods": methods,
     }
-    document = {
-        "format": "jaxcal-evaluation",
-        "version": 1,
-        "command": list(command),
-        "versions": versions(),
-        "results": [entry],
-    }
-    return json.dumps(document, indent=1, allow_nan=False) + "\n"
+    return document([entry], command)
 
 
 def write_report(
     folder: pathlib.Path, result: Result, *, command: Sequence[str]
 ) -> None:
     """Write the figure as SVG and PNG, and ``index.html`` with it and the table."""
-    from jaxcal.plots.style import as_files
-
-    files: dict[str, bytes] = {}
-    files["sequential.svg"], files["sequential.png"] = as_files(
-        figure(result), "svg", "png"
-    )
     head, *rows = _rows(result)
-    blocks: list[Block] = [
-        Table(head, rows),
-        Figure(files["sequential.svg"], "information and time of a choice"),
-    ]
-    made_with = ", ".join(f"{name} {v}" for name, v in versions().items())
-    page = Page(
-        "Deciders of sequential measurement on equal sessions",
-        [Section(_heading(result), blocks)],
-        intro=[Text(Code(" ".join(command)), "note"), Text(made_with, "note")],
-        footer=[Text(_ABOUT, "note")],
-    )
-    files["index.html"] = render(page).encode()
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, data in files.items():
-        with atomic_write(folder / name) as file:
-            file.write(data)
+    title = "Deciders of sequential measurement on equal sessions"
+    part = [Table(head, rows)], {"sequential": figure(result)}
+    write_folder(folder, title, {_heading(result): part}, command, _ABOUT)
 
 
 def figure(result: Result) -> Any:

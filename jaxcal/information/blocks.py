@@ -11,7 +11,7 @@ the last place of the numbers given, so encoder pulses far from zero keep their 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,12 +26,15 @@ __all__ = [
     "prior_root",
     "rank_of_blocks",
     "rank_rule",
+    "significant",
     "whiten",
+    "without",
 ]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+SINGULAR = 1e-10  # share of the largest; derivatives are exact to about 1e-13 of it
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)
 _LOSS = 1e-9  # of orthogonality that whitened rows may have
@@ -100,6 +103,26 @@ def null_directions(columns: Array, largest: Array) -> list[Array]:
     return null
 
 
+def significant(size: NDArray[Any], squares: bool = False) -> Mask:
+    """Which singular values (..., r) of columns in comparable units are no rounding.
+
+    The rule above is for the caller's own numbers, this one for what follows from them.
+
+    Args:
+        size: singular values, or eigenvalues.
+        squares: they are eigenvalues of a product of these columns with themselves.
+    """
+    share = 8.0 * _EPS * size.shape[-1] if squares else SINGULAR
+    return size > share * size.max(axis=-1, initial=0.0, keepdims=True)
+
+
+def without(nuisance: Array, *others: Array) -> list[Array]:
+    """``others`` (R, ...) in a basis across the columns of ``nuisance`` (R, s)."""
+    left, size, _ = np.linalg.svd(nuisance, full_matrices=True)
+    across = left[:, int(significant(size).sum()) :].T
+    return [across @ each for each in others]
+
+
 def prior_root(precision: Array) -> Array:
     """(r, p) root of a precision (p, p) of rank r, ``root.T @ root = precision``.
 
@@ -121,7 +144,7 @@ def prior_root(precision: Array) -> Array:
             "prior must be a positive semidefinite precision matrix, got eigenvalue "
             f"{values.min():.3g} in units of its diagonal"
         )
-    keep = values > 8.0 * _EPS * p
+    keep = significant(values, squares=True)
     return np.sqrt(values[keep])[:, None] * vectors.T[keep] * scale
 
 

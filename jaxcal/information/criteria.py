@@ -33,12 +33,11 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from jaxcal.information.blocks import log_det_blocks, whiten
-from jaxcal.information.regression import log_det_gram, regressors
 
-__all__ = ["Criteria", "block_criteria", "criteria", "d_efficiency"]
+__all__ = ["Criteria", "criteria"]
 
 Array = NDArray[np.float64]
 
@@ -58,55 +57,8 @@ class Criteria:
     O4: float
     O5: float
 
-    def as_dict(self) -> dict[str, float]:
-        """Name to value, in the order of the table."""
-        return dataclasses.asdict(self)
 
-
-def d_efficiency(log_det: float, log_det_best: float, num_parameters: int) -> float:
-    """D-efficiency ``(det S / det S*)^(1 / num_parameters)``.
-
-    Args:
-        log_det: natural log det S of the set judged.
-        log_det_best: that of the optimum, or an upper bound on it.
-        num_parameters: m (n + 1), 12 for three inputs and three outputs.
-    """
-    return float(np.exp((log_det - log_det_best) / num_parameters))
-
-
-def criteria(
-    commands: ArrayLike,
-    region: ArrayLike | None = None,
-    num_outputs: int | None = None,
-) -> Criteria:
-    """Every criterion of one set of postures.
-
-    Args:
-        commands: (N, n) the postures measured, in any unit.
-        region: (R, n) the postures at which predictions are wanted, for I and G; the
-            measured ones themselves when not given.
-        num_outputs: m; as many as inputs when not given.
-
-    Raises:
-        ValueError: the postures lie in one plane, so S has no inverse.
-    """
-    z = regressors(commands)
-    where = z if region is None else regressors(region)
-    if z.ndim != 2 or where.ndim != 2 or z.shape[1] != where.shape[1]:
-        raise ValueError(
-            "commands must be (N, n) and region (R, n) with the same n, got "
-            f"{z[..., :-1].shape} and {where[..., :-1].shape}"
-        )
-    m = z.shape[1] - 1 if num_outputs is None else num_outputs
-    if np.isneginf(log_det_gram(z[:, :-1])):
-        raise ValueError(
-            "commands must not all lie in one plane: the information matrix of these "
-            f"{len(z)} postures is singular"
-        )
-    return block_criteria(z[:, None], np.zeros((0, z.shape[1])), where[:, None], m)
-
-
-def block_criteria(blocks: Array, root: Array, region: Array, times: int) -> Criteria:
+def criteria(blocks: Array, root: Array, region: Array, times: int) -> Criteria:
     """Every criterion of information that is not singular.
 
     Args:

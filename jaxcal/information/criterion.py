@@ -30,11 +30,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.information.blocks import significant
+
 __all__ = ["Criterion"]
 
 Array = NDArray[np.float64]
-
-_EPS = float(np.finfo(np.float64).eps)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -115,7 +115,6 @@ class Criterion:
     def _half(self, information: Array) -> tuple[Array, NDArray[np.bool_]]:
         """H (..., s, p) with ``H @ H.T = V``, and where M is not singular."""
         values, vectors = np.linalg.eigh(information)
-        p = values.shape[-1]
-        regular = values[..., 0] > 8.0 * p * _EPS * values[..., -1]
+        regular = significant(values, squares=True)[..., 0]
         scale = np.where(regular[..., None], values, 1.0)
         return self.root @ vectors / np.sqrt(scale)[..., None, :], regular

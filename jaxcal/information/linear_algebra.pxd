@@ -3,28 +3,72 @@
 Nothing here starts a thread of BLAS: the threads of a few microseconds' work wait for a
 core where other work is done, a hundred times as long as the work. So a product is made
 in parts below the size where BLAS starts them, and factors are our own: LAPACK's start
-them from 30 rows on.
+them from 30 rows on. Of the smallest products a call of BLAS costs more than they do.
 """
 
 from libc.math cimport INFINITY, log, sqrt
+from libc.string cimport memcpy
 from scipy.linalg.cython_blas cimport dgemm
 
 cdef enum:
     UNTHREADED = 240_000  # multiplications up to which BLAS starts no threads
+    SMALL = 300  # multiplications that take less than a call of BLAS
+
+cdef inline void copy(
+    double* into, const double* source, Py_ssize_t count
+) noexcept nogil:
+    memcpy(into, source, count * sizeof(double))
+
+cdef inline double dot(const double* x, const double* y, int count) noexcept nogil:
+    """``x @ y``, in eight sums at a time."""
+    cdef double[8] sums
+    cdef double total = 0.0
+    cdef int a = 0, b
+    if count >= 16:
+        for b in range(8):
+            sums[b] = 0.0
+        while a + 8 <= count:
+            for b in range(8):
+                sums[b] += x[a + b] * y[a + b]
+            a += 8
+        for b in range(4):
+            total += sums[b] + sums[b + 4]
+    while a < count:
+        total += x[a] * y[a]
+        a += 1
+    return total
 
 cdef inline void multiply(
-    bint turn_a, bint turn_b, int rows, int columns, int inner, double* a, double* b,
-    double* out,
+    bint turn_a, bint turn_b, int rows, int columns, int inner, const double* a,
+    const double* b, double* out,
 ) noexcept nogil:
     """``out = a @ b`` (rows, columns), each transposed before where turned."""
     cdef double one = 1.0, zero = 0.0
     cdef int lda = rows if turn_a else inner, ldb = inner if turn_b else columns
     cdef int some = max(1, UNTHREADED // max(1, columns * inner)), first = 0
+    cdef int r, c, e
+    cdef double weight
+    cdef double* row
+    if rows * columns * inner <= SMALL:
+        for r in range(rows):
+            row = out + r * columns
+            for c in range(columns):
+                row[c] = 0.0
+            for e in range(inner):
+                weight = a[e * lda + r] if turn_a else a[r * lda + e]
+                if turn_b:
+                    for c in range(columns):
+                        row[c] += weight * b[c * ldb + e]
+                else:
+                    for c in range(columns):
+                        row[c] += weight * b[e * ldb + c]
+        return
     while first < rows:
         some = min(some, rows - first)
         dgemm(
             b"T" if turn_b else b"N", b"T" if turn_a else b"N", &columns, &some, &inner,
-            &one, b, &ldb, a + (first if turn_a else first * lda), &lda, &zero,
+            &one, <double*> b, &ldb,
+            <double*> a + (first if turn_a else first * lda), &lda, &zero,
             out + first * columns, &columns,
         )
         first += some
@@ -34,38 +78,40 @@ cdef inline double cholesky(
 ) noexcept nogil:
     """Log det of a positive definite matrix (p, p), and its factor; -inf without one.
 
-    ``lower`` may be the matrix itself; what is right of its diagonal is not touched.
-    Pivots are at least ``least``, where that is not zero.
+    ``lower`` holds the factor with the reciprocals of its diagonal, may be the matrix
+    itself, and what is right of its diagonal is not touched. Pivots are at least
+    ``least``, where that is not zero.
     """
-    cdef int a, b, c
-    cdef double total, value = 0.0
+    cdef int a, b
+    cdef double total, value = 0.0, product = 1.0
     for a in range(p):
         for b in range(a + 1):
-            total = matrix[a * p + b]
-            for c in range(b):
-                total -= lower[a * p + c] * lower[b * p + c]
+            total = matrix[a * p + b] - dot(lower + a * p, lower + b * p, b)
             if a > b:
-                lower[a * p + b] = total / lower[b * p + b]
+                lower[a * p + b] = total * lower[b * p + b]
             elif max(total, least) > 0.0:
                 total = max(total, least)
-                lower[a * p + a] = sqrt(total)
-                value += log(total)
+                lower[a * p + a] = 1.0 / sqrt(total)
+                if 1e-100 < product * total < 1e100:
+                    product *= total
+                else:
+                    value += log(product) + log(total)
+                    product = 1.0
             else:
                 return -INFINITY
-    return value
+    return value + log(product)
 
 cdef inline void invert_lower(double* lower, int p) noexcept nogil:
-    """A lower triangle (p, p) becomes its own inverse; the rest becomes zero."""
+    """A factor of ``cholesky`` (p, p) becomes its inverse; the rest becomes zero."""
     cdef int a, b, c
     cdef double weight, scale
     for a in range(p):
-        scale = 1.0 / lower[a * p + a]
+        scale = lower[a * p + a]
         for c in range(a):
             weight = -scale * lower[a * p + c]
             lower[a * p + c] = 0.0
             for b in range(c + 1):
                 lower[a * p + b] += weight * lower[c * p + b]
-        lower[a * p + a] = scale
         for b in range(a + 1, p):
             lower[a * p + b] = 0.0
 

@@ -82,38 +82,19 @@ class FromJax:
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
         """Outputs (N, q) at commands (N, n)."""
-        outputs = self._run(0, commands, parameters)
-        for i, j in np.argwhere(~np.isfinite(outputs)):
-            raise ValueError(
-                f"f must be finite, got {outputs[i, j]} for output {j + 1} "
-                f"at command {i}"
-            )
-        return outputs
+        return self._run(0, commands, parameters)
 
     def jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
         """(N, q, p)."""
-        slopes = self._run(1, commands, parameters)
-        for i, j, k in np.argwhere(~np.isfinite(slopes)):
-            name = self.names[self._without_derivative(i, j, k, commands, parameters)]
-            raise ValueError(
-                f"the derivative of f by {name!r} must be finite, got "
-                f"{slopes[i, j, k]} for output {j + 1} at command {i}"
-            )
-        return slopes
+        return self._run(1, commands, parameters)
 
     def command_jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
         """(N, q, n)."""
-        slopes = self._run(2, commands, parameters)
-        for i, j, k in np.argwhere(~np.isfinite(slopes)):
-            raise ValueError(
-                f"the derivative of f by input {k + 1} must be finite, got "
-                f"{slopes[i, j, k]} for output {j + 1} at command {i}"
-            )
-        return slopes
+        return self._run(2, commands, parameters)
 
     def default_prior(self) -> Prior:
         """Nothing is known beforehand."""
@@ -173,15 +154,17 @@ class FromJax:
         )
 
     def _without_derivative(
-        self, i: int, j: int, k: int, commands: ArrayLike, parameters: ArrayLike | None
+        self, i: int, j: int, k: int, commands: Array, parameters: Array
     ) -> int:
         """The parameter to blame: forward derivatives of the others are 0 inf = nan."""
         import jax
 
-        at = as_commands(commands, self.num_inputs)[i], as_parameters(self, parameters)
+        def output(command: Any, parameters: Any) -> Any:
+            return jax.numpy.ravel(self.f(command, parameters))[j]
+
         try:
             with jax.enable_x64(True):
-                row = jax.jacrev(lambda *at: jax.numpy.ravel(self.f(*at))[j], 1)(*at)
+                row = jax.jacrev(output, 1)(commands[i], parameters)
         except ValueError:  # f has a loop that JAX differentiates forward only
             return k
         bad = np.flatnonzero(~np.isfinite(np.asarray(row)))
@@ -197,7 +180,20 @@ class FromJax:
         import jax
 
         with jax.enable_x64(True):
-            return np.array(self._compiled[which](commands, parameters))
+            found = np.array(self._compiled[which](commands, parameters))
+        for at in np.argwhere(~np.isfinite(found)):
+            i, j, *by = map(int, at)
+            what = "f"
+            if which == 1:
+                k = self._without_derivative(i, j, by[0], commands, parameters)
+                what = f"the derivative of f by {self.names[k]!r}"
+            elif which == 2:
+                what = f"the derivative of f by input {by[0] + 1}"
+            raise ValueError(
+                f"{what} must be finite, got {found[tuple(at)]} for output {j + 1} "
+                f"at command {i}"
+            )
+        return found
 
 
 def _entries_read(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import table
+from jaxcal.information.blocks import SINGULAR, significant
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
 
@@ -17,8 +18,8 @@ __all__ = ["Direction", "Identifiability", "identifiability"]
 
 Array = NDArray[np.float64]
 
-# Of columns of length one. Derivatives are exact to about 1e-13 of the largest.
-_NULL, _ZERO, _FLAT = 1e-10, 1e-6, 16.0 * np.finfo(np.float64).eps
+# Of columns of length one.
+_ZERO, _FLAT = 1e-6, 16.0 * np.finfo(np.float64).eps
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -168,7 +169,7 @@ def _parallel(unit: Array, at: NDArray[np.int64]) -> list[list[int]]:
         for group in classes:
             first = unit[:, group[0]]
             apart = unit[:, i] - (first @ unit[:, i]) * first
-            if np.linalg.norm(apart) < _NULL:
+            if np.linalg.norm(apart) < SINGULAR:
                 group.append(int(i))
                 break
         else:
@@ -190,8 +191,7 @@ def _of_class(unit: Array, group: list[int], norms: Array) -> Array:
 def _sparse_null(columns: Array) -> Array:
     """(k, m) a basis of the null space of columns (R, m) with few entries each."""
     _, size, right = np.linalg.svd(columns)
-    rank = int((size > _NULL * size.max(initial=0.0)).sum())
-    null = right[rank:].copy()
+    null = right[int(significant(size).sum()) :].copy()
     for row in range(
         len(null) if null.size else 0
     ):  # reduced echelon form: a pivot of its own for each

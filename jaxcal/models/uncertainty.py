@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import in_words, numbers, whole_number
+from jaxcal.information.blocks import significant
 
 __all__ = ["Noise", "Prior", "ResolvedPrior"]
 
@@ -47,8 +48,8 @@ class Prior:
             from name to number. ``inf`` and names that are left out: nothing is known.
         mean: likewise; the model's nominal value where it is left out.
         fixed: names of parameters held at the mean, out of the identification.
-        by_data: of an arm, the sizes of its lengths' and its angles' errors are taken
-            from the readings; see :meth:`sized`.
+        by_data: of an arm, the sizes of the errors are taken from the readings; see
+            :meth:`sized`.
     """
 
     std: Named
@@ -74,9 +75,10 @@ class Prior:
     def sized(self) -> Prior:
         """This prior with the scale of its groups taken from the readings.
 
-        Its standard deviations then say how errors of lengths compare with each other,
-        and those of angles, not how large they are: two factors follow from the
-        readings by marginal likelihood. For an arm whose tolerances are not known.
+        Its standard deviations then say how errors compare within a group, not how
+        large they are: a factor each of lengths, turns of the axes, zeros of the joints
+        and their compliance follows from the readings by marginal likelihood. For an
+        arm whose tolerances are not known.
         """
         return dataclasses.replace(self, by_data=True)
 
@@ -203,8 +205,7 @@ class Noise:
             return white
         left, size, _ = np.linalg.svd(white @ unknown)
         eaten = np.zeros((count, num_outputs), dtype=np.bool_)
-        least = 1e-12 * size.max(axis=-1, initial=0.0, keepdims=True)
-        eaten[:, : size.shape[-1]] = size > least
+        eaten[:, : size.shape[-1]] = significant(size)
         return np.where(eaten[..., None], 0.0, np.matrix_transpose(left) @ white)
 
     def _of_readings(self, count: int, q: int) -> Array:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 
-from jaxcal.checks import share
 from jaxcal.selection.exact.exact import (
     STARTING_RESTARTS,
     TIME_LIMIT,
@@ -19,14 +18,9 @@ from jaxcal.selection.exact.exact import (
 from jaxcal.selection.problem import Problem
 from jaxcal.selection.solver import Found
 
-__all__ = ["check_least_efficiency", "solve"]
+__all__ = ["solve"]
 
 _BLOCKS_LIMIT = 2.0  # seconds: what is not proven by then often takes minutes
-
-
-def check_least_efficiency(value: object) -> float:
-    """``value`` as a float in (0, 1], or a ValueError naming it."""
-    return share("least_efficiency", value)
 
 
 def solve(

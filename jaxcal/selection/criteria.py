@@ -8,13 +8,14 @@ here says which kind, and which combinations.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import one_of
+from jaxcal.information.blocks import significant
 from jaxcal.information.criterion import Criterion
 
 __all__ = [
@@ -51,8 +52,10 @@ class Wanted:
     says: ClassVar[str]  # what a table prints before the value; V is a covariance
     per_output: ClassVar[bool] = False  # the value is one output's, not their sum
     of_region: ClassVar[bool] = False  # it is about predictions, see ``region``
+    by_name: ClassVar[bool] = (
+        False  # it tells the parameters apart, ``Coordinates.names``
+    )
     region: ArrayLike | None = None  # commands or blocks where; the candidates if None
-    parameters: Sequence[str | int] | None = None  # of interest; all when None
 
     def root(self, at: Coordinates) -> Array:
         """C (s, p) in the problem's coordinates, of full row rank."""
@@ -107,7 +110,7 @@ class I(Wanted):  # noqa: E742 - the criterion's own name in the literature
             rows = (at.region @ at.basis).reshape(-1, len(at.basis))
             mean = rows.T @ rows / len(rows)
         size, vectors = np.linalg.eigh(mean)
-        keep = size > 1e-14 * size[-1]
+        keep = significant(size, squares=True)
         return np.asarray(np.sqrt(size[keep])[:, None] * vectors.T[keep])
 
 
@@ -118,11 +121,13 @@ class _OfSome(Wanted):
         parameters: their names or indices, at least one.
     """
 
+    by_name = True
+
     def __init__(self, parameters: Sequence[str | int]) -> None:
         self.parameters = parameters
 
     def root(self, at: Coordinates) -> Array:
-        return at.basis[positions(self.parameters or (), at.names)]
+        return at.basis[positions(self.parameters, at.names)]
 
 
 class Ds(_OfSome):
@@ -159,13 +164,14 @@ def wanted(criterion: Any, region: Any, default: str) -> Wanted:
     if isinstance(criterion, Wanted):
         asked = criterion
     else:
-        name = default if criterion is None else criterion
+        name = default if criterion is None else getattr(criterion, "name", criterion)
         one_of("criterion", name, tuple(CRITERIA))
         try:
             asked = CRITERIA[name]()
         except TypeError:
             raise ValueError(
-                f"criterion {name} must carry its data: jaxcal.{name}([...])"
+                f"criterion {name} must carry its data: "
+                f"jaxcal.{CRITERIA[name].__name__}([...])"
             ) from None
     if region is None:
         return asked
@@ -181,6 +187,8 @@ def positions(
     parameters: str | Sequence[str | int], names: tuple[str, ...]
 ) -> list[int]:
     """Indices of ``parameters``, given by name or index, each once."""
+    if not isinstance(parameters, Iterable):
+        raise ValueError(f"parameters must be names or indices, got {parameters!r}")
     parameters = [parameters] if isinstance(parameters, str) else list(parameters)
     found: list[Any] = [names.index(x) if x in names else x for x in parameters]
     for at, asked in zip(found, parameters, strict=True):

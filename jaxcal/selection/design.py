@@ -272,8 +272,19 @@ class Design(Asked):
     def _judged(
         self, problem: Problem, found: Found, method: str, start: float
     ) -> Selection:
-        """What a solver found, judged by the caller's numbers."""
+        """What a solver found, judged by the caller's numbers.
+
+        Raises:
+            RuntimeError: it is no selection of this problem: the solver is wrong.
+        """
         indices, value = found.indices, found.value
+        counts = np.bincount(indices, minlength=len(problem.blocks))
+        allowed = (problem.lower <= counts) & (counts <= problem.upper)
+        if len(indices) != problem.k or not allowed.all():
+            raise RuntimeError(
+                f"method {method!r} must return {problem.k} candidates within lower "
+                f"and upper of its problem, got {indices.tolist()}"
+            )
         if value is None or problem.criterion.name != "D":
             value, log_det = (float(each[0]) for each in values(problem, indices[None]))
         else:
@@ -286,7 +297,7 @@ class Design(Asked):
                 f"{indices.tolist()}{what} is singular"
             )
         subsets = [Subset(indices, value, log_det)]
-        if found.alternatives:
+        if len(found.alternatives) > 1:
             others = np.stack([each for each, _ in found.alternatives])
             subsets = [
                 Subset(each, float(worth), float(of_all))

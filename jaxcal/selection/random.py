@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.information.blocks import SINGULAR
 from jaxcal.selection.problem import Problem, log_dets
 from jaxcal.selection.solver import Found
 
@@ -56,9 +57,8 @@ def _drawn(problem: Problem, rng: np.random.Generator) -> Indices:
 def _independent_first(problem: Problem, rng: np.random.Generator) -> Indices:
     """The required, then in random order what extends the span, then the rest."""
     order = _pool(problem, rng)
-    values, vectors = np.linalg.eigh(problem.prior)
-    known = vectors[:, values > 1e-6]
-    outside = problem.blocks - problem.blocks @ known @ known.T
+    known = problem.known
+    outside = problem.blocks - problem.blocks @ known.T @ known
     for i in problem.required:
         outside = _deflate(outside, i)
     chosen = list(problem.required)
@@ -78,5 +78,5 @@ def _independent_first(problem: Problem, rng: np.random.Generator) -> Indices:
 def _deflate(outside: NDArray[np.float64], i: int | np.int64) -> NDArray[np.float64]:
     """Project the rows of block i (q, p) out of all blocks (M, q, p)."""
     _, size, right = np.linalg.svd(outside[i], full_matrices=False)
-    right = right[size > 1e-9]
+    right = right[size > SINGULAR]  # of whitened blocks, whose largest is 1
     return outside - outside @ right.T @ right

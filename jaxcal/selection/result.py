@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.checks import axis_names
-from jaxcal.information.criteria import Criteria, block_criteria
+from jaxcal.information.criteria import Criteria, criteria
 from jaxcal.selection.criteria import CRITERIA
 from jaxcal.selection.problem import Problem
 
@@ -101,7 +101,7 @@ class Selection:
         """D, A, I, E, G and O1 to O5; I and G over the available candidates."""
         problem = self.problem
         chosen, region = problem.raw[self.indices], problem.raw[problem.available]
-        return block_criteria(chosen, problem.root, region, problem.multiplicity)
+        return criteria(chosen, problem.root, region, problem.multiplicity)
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, text and lists, as a JSON file takes them."""

@@ -7,10 +7,8 @@ import math
 import pathlib
 import tomllib
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import PrivateAttr
 
 from rig.config.axis import AXIS_NAMES, Axis, Pulses, Scale
@@ -23,6 +21,10 @@ from rig.config.settings import (
     SessionSettings,
     SettleSettings,
 )
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 POLLS, HICCUP_S = 4, 0.5  # of the motion loop's heartbeat
 PHONE = (
@@ -39,6 +41,11 @@ UNMEASURED = {
     ),
     "settle": ("timeout_s",),
     "session": ("verify_limit_deg", "reference_tolerance_deg", "max_unreachable"),
+}  # fmt: skip
+
+KEYS = {  # of rig.toml, where a description of it says otherwise
+    "scale": "", "letter": "rotates", "mechanism_order": "mechanism.order",
+    "angle_unit": "unit", "quaternion": "quaternion_columns",
 }  # fmt: skip
 
 
@@ -66,7 +73,7 @@ def _without(data: dict[str, Any], left_out: dict[str, Any]) -> dict[str, Any]:
 
 
 def _flat(data: Any, at: str = "") -> dict[str, Any]:
-    """Dotted key to value; axes are called by their names."""
+    """Key of rig.toml to value; axes are called by their names."""
     if isinstance(data, dict):
         pairs = [(str(name), value) for name, value in data.items()]
     elif data and isinstance(data, list) and isinstance(data[0], dict):
@@ -75,7 +82,8 @@ def _flat(data: Any, at: str = "") -> dict[str, Any]:
         return {at: data}
     flat: dict[str, Any] = {}
     for name, value in pairs:
-        flat |= _flat(value, f"{at}.{name}" if at else name)
+        name = KEYS.get(name, name)
+        flat |= _flat(value, ".".join(filter(None, (at, name))))
     return flat
 
 
@@ -180,8 +188,10 @@ class RigConfig(Section):
         )
         return a, b, c
 
-    def to_deg(self, pulses: Any) -> NDArray[np.float64]:
+    def to_deg(self, pulses: Any) -> "NDArray[np.float64]":
         """(..., 3) degrees of (..., 3) pulses."""
+        import numpy as np  # a third of what `stop` would wait for at its start
+
         scales = np.array([axis.pulses_per_deg for axis in self.axes])
         return np.asarray(pulses, dtype=np.float64) / scales
 
@@ -204,12 +214,6 @@ class RigConfig(Section):
             for axis in self.axes
         ]
         return {**data, "axes": axes, "mechanism_order": self.mechanism.order}
-
-    def fingerprint(self) -> str:
-        """SHA-256 of what a measurement depends on."""
-        data = _without(self.described(), UNMEASURED)
-        text = json.dumps(data, sort_keys=True, default=str)
-        return hashlib.sha256(text.encode()).hexdigest()
 
     def changed_since(self, described: dict[str, Any]) -> list[str]:
         """Keys that would make a resumed run move or measure differently, in words.

@@ -1,16 +1,23 @@
-"""How a run can end: exit codes, and what raises them."""
+"""How a run can end: exit codes, what raises them, and what was asked from outside.
+
+Nothing heavy is imported here: ``stop`` asks the session before it loads anything.
+"""
 
 from __future__ import annotations
+
+import pathlib
+import time
+from collections.abc import Callable
+
+from rig.journal.errors import JournalError
+from rig.journal.errors import Refused as Refused
 
 EXIT_OK = 0
 EXIT_RECALIBRATE = 1  # done, but the errors say: calibrate (again)
 EXIT_BAD_INPUT = 2
 EXIT_FAULT = 3  # stopped by a fault; `resume` goes on
 EXIT_PAUSED = 4  # paused by Ctrl-C; `resume` goes on
-
-
-class Refused(ValueError):
-    """The request makes no sense for this run; nothing was moved."""
+EXIT_INTERRUPTED = 130
 
 
 class LimitError(Refused):
@@ -55,3 +62,75 @@ class PauseRequested(BaseException):
 
 class PlanOnly(BaseException):
     """A dry run has come to the point where it would move."""
+
+
+def ending(error: BaseException, folder: pathlib.Path) -> tuple[int, str, str]:
+    """Exit code, event and reason of a session in a folder that an error ended."""
+    match error:
+        case PlanOnly():
+            return EXIT_OK, "end", ""
+        case PauseRequested():
+            return EXIT_PAUSED, "paused", str(error)
+        case StopRequested():
+            return error.exit_code, "stopped", str(error)
+        case KeyboardInterrupt():
+            return EXIT_INTERRUPTED, "stopped", "SIGINT"
+        case Refused():
+            return EXIT_BAD_INPUT, "refused", str(error)
+        case Fault() | JournalError():
+            return EXIT_FAULT, "fault", str(error)
+        case OSError():
+            text = f"cannot write to {folder}: {error.strerror or error}"
+            return EXIT_FAULT, "fault", text
+    return EXIT_FAULT, "fault", f"{type(error).__name__}: {error}"
+
+
+class Requests:
+    """What was asked of a session from outside: to pause, or to stop.
+
+    Setting a flag is all that a request does; it is looked at before every frame and in
+    every loop. ``rig.signals`` sets them from the signals of the operating system.
+    """
+
+    def __init__(self) -> None:
+        self.armed = False
+        self.ending = False  # the stop and the last lines of the journal are under way
+        self.pause = False
+        self.report: Callable[[str], object] = lambda event: None
+        self._stop: StopRequested | None = None
+        self._asked = 0.0
+        self._told = False
+
+    def __enter__(self) -> Requests:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def request_stop(self, reason: str, exit_code: int) -> None:
+        """Ask for a stop; the first request is the one that is kept."""
+        if self._stop is None:
+            self._asked = time.monotonic()
+            self._stop = StopRequested(reason, exit_code)
+
+    def overdue(self, seconds: float) -> str:
+        """The reason of a stop that was asked for so long ago; empty where none was."""
+        late = self._stop is not None and time.monotonic() - self._asked > seconds
+        return str(self._stop) if late else ""
+
+    def tell(self) -> None:
+        """Report "pausing" from a loop, once, where a pause was asked for."""
+        if self.pause and not self._told:
+            self._told = True
+            self.report("pausing")
+
+    def check_stop(self) -> None:
+        """Raise StopRequested where one has been asked for."""
+        if self._stop is not None:
+            raise self._stop
+
+    def check_pause(self) -> None:
+        """Raise PauseRequested where one has been asked for; between postures."""
+        self.check_stop()
+        if self.pause:
+            raise PauseRequested("paused by Ctrl-C")

@@ -24,6 +24,7 @@ from rig.journal import JournalError
 
 RECONNECT_S = 0.2
 MOST_OPEN = 4  # connections at a time over which messages are pushed
+BACKLOG = 128  # connections that wait for an answer; past that a phone waits 1 s
 MESSAGE_S = 5.0  # for a whole message
 MAX_HEAD = 8192  # bytes before its body
 LOOK_S = 0.05  # between two looks at who is silent and who waits
@@ -99,7 +100,7 @@ class LineReceiver:
         self._listener: socket.socket | None = None
         if settings.transport == "listen":
             where = (settings.host, settings.port)
-            self._listener = socket.create_server(where, backlog=2)
+            self._listener = socket.create_server(where, backlog=BACKLOG)
             self._listener.settimeout(0.0)
             self.port = self._listener.getsockname()[1]
 
@@ -219,7 +220,7 @@ class WebReceiver:
         self._take = take
         self._closing = threading.Event()
         self._listener = socket.create_server(
-            (settings.host, settings.port), backlog=MOST_OPEN
+            (settings.host, settings.port), backlog=BACKLOG
         )
         self._listener.setblocking(False)
         self.port = self._listener.getsockname()[1]

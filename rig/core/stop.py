@@ -18,7 +18,7 @@ from typing import Any
 from rig.config.registers import encode
 from rig.core.bus import Bus
 from rig.core.drive import Drive
-from rig.core.faults import EXIT_FAULT, PauseRequested, StopRequested
+from rig.core.faults import EXIT_FAULT, StopRequested
 
 ROUNDS = 3  # times a stop is sent to a unit that does not acknowledge
 QUICK_S = 0.05  # for a reply in the first round, besides the time of the frames
@@ -166,54 +166,3 @@ class Stopper:
         """Raise StopRequested where a stop has latched."""
         if self.reason:
             raise StopRequested(f"stopped: {self.reason}", EXIT_FAULT)
-
-
-class Requests:
-    """What was asked of a session from outside: to pause, or to stop.
-
-    Setting a flag is all that a request does; it is looked at before every frame and in
-    every loop. ``rig.signals`` sets them from the signals of the operating system.
-    """
-
-    def __init__(self) -> None:
-        self.armed = False
-        self.ending = False  # the stop and the last lines of the journal are under way
-        self.pause = False
-        self.report: Callable[[str], object] = lambda event: None
-        self._stop: StopRequested | None = None
-        self._asked = 0.0
-        self._told = False
-
-    def __enter__(self) -> Requests:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def request_stop(self, reason: str, exit_code: int) -> None:
-        """Ask for a stop; the first request is the one that is kept."""
-        if self._stop is None:
-            self._asked = time.monotonic()
-            self._stop = StopRequested(reason, exit_code)
-
-    def overdue(self, seconds: float) -> str:
-        """The reason of a stop that was asked for so long ago; empty where none was."""
-        late = self._stop is not None and time.monotonic() - self._asked > seconds
-        return str(self._stop) if late else ""
-
-    def tell(self) -> None:
-        """Report "pausing" from a loop, once, where a pause was asked for."""
-        if self.pause and not self._told:
-            self._told = True
-            self.report("pausing")
-
-    def check_stop(self) -> None:
-        """Raise StopRequested where one has been asked for."""
-        if self._stop is not None:
-            raise self._stop
-
-    def check_pause(self) -> None:
-        """Raise PauseRequested where one has been asked for; between postures."""
-        self.check_stop()
-        if self.pause:
-            raise PauseRequested("paused by Ctrl-C")

@@ -67,6 +67,7 @@ class Phone:
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._listener: socket.socket | None = None
         self._frozen = np.eye(3)
+        self._session = 0  # of the app, counted
 
     def start(self, port: int) -> int:
         """Send to the port the rig listens on, or listen there; returns the port."""
@@ -166,6 +167,9 @@ class Phone:
         with contextlib.closing(connection):
             while not self._closing.is_set():
                 payload = []
+                if self._faults.take("imu_disconnect"):
+                    self._session += 1
+                    return
                 for _ in range(BATCH):
                     q = Rotation.from_matrix(self._attitude()).as_quat()
                     if self._faults.take("imu_nan"):
@@ -178,7 +182,8 @@ class Phone:
                     self._closing.wait(self._period)
                 if self._faults.take("imu_gap"):
                     continue
-                body = json.dumps({"deviceId": "simulated", "payload": payload})
+                named = {"deviceId": "simulated", "sessionId": str(self._session)}
+                body = json.dumps(named | {"payload": payload})
                 if self._faults.take("imu_garbage"):
                     body = body[: self._random.randrange(len(body))]
                 headers = {"Content-Type": "application/json"}

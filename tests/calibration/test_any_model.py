@@ -377,7 +377,7 @@ def test_a_discrepancy_makes_the_bands_honest() -> None:
         assert len(found.parameters) == len(found.covariance) == 2
     assert share[0] < 0.3 and share[1] > 0.9
     slopes = (found.predict(test + 1e-6) - found.predict(test - 1e-6)) / 2e-6
-    whole = found._whole.command_jacobian(test, found.estimate)
+    whole = found.whole.command_jacobian(test, found.estimate)
     np.testing.assert_allclose(whole[..., 0], slopes, rtol=1e-5, atol=1e-6)
     exact = identify(
         commands,

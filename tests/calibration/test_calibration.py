@@ -726,6 +726,7 @@ def remove(key: str) -> object:
         (change("num_readings", 1.5), '"num_readings" must be a whole number'),
         (change("noise_std", None), '"noise_std" and "joint_covariance" contradict'),
         (change("loss", 3), '"loss" must be text'),
+        (change("loss", "l1"), '"loss" must be student or gaussian'),
         (change("model", {"kind": "affine"}), "affine must hold 'num_inputs'"),
         (change("noise_std", [-1, 1, 1]), '"noise_std" must not be negative'),
         (change("noise_known", "yes"), '"noise_known" must be true or false'),

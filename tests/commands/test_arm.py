@@ -69,6 +69,6 @@ def test_joints_far_beyond_their_limits_are_named(files):
     commands = np.column_stack([np.degrees(q), socket])
     swapped = commands[:, [3, 1, 2, 0, 4, 5, 6, 7]]
     with pytest.raises(
-        ValueError, match=r"panda_joint4 must be within its limits .*, to 45"
+        ValueError, match=r"panda_joint4 must be within its limits .*, to 2,"
     ):
         jaxcal.identify(swapped, np.zeros((len(q), 3)), model=arm)

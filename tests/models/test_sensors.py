@@ -97,7 +97,7 @@ CASES = {
 
 def _case(name):
     sensor, columns, readings = CASES[name]
-    model = ur5(sensor=sensor)
+    model = ur5(sensor=sensor, compliance=())
     parameters = model.nominal + np.random.default_rng(1).normal(size=len(model.names))
     return model, np.hstack([JOINTS, columns]), parameters, readings
 
@@ -179,7 +179,9 @@ def test_several_sensors_read_what_each_reads_where_it_is_mounted():
                 tool = tool @ _matrix(turn)
             turn = Rotation.from_matrix(np.array(model.sensor.mounts)[i - 1][:3, :3])
             tool = tool @ _matrix(turn)
-        alone = SerialChain.from_dh(model.table[:, :4], tool=tool, sensor=one)
+        alone = SerialChain.from_dh(
+            model.table[:, :4], tool=tool, sensor=one, compliance=()
+        )
         theta = alone.nominal.copy()
         for k, name in enumerate(alone.names):
             if not name.startswith("tool"):

@@ -206,7 +206,7 @@ def test_the_default_prior_follows_the_size_of_the_arm():
     by_unit = {"length": 1000.0, "deg": 1.0, "deg per torque": 0.001}
     np.testing.assert_allclose(ratio, [by_unit[unit] for unit in metres.units])
     std = dict(zip(ur5().names, ur5().default_prior().std, strict=True))
-    assert 2.5 < std["a2"] < 3.5 and std["alpha3"] == 0.5
+    assert 1.5 < std["a2"] < 2.1 and std["alpha3"] == 0.3 and std["theta3"] == 0.5
     assert 90.0 < std["base x"] < 130.0 and std["tool z"] == std["base x"]
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxcal.models import Pose, Position, SerialChain, Socket
+from jaxcal.models import Pose, Position, SerialChain, Socket, from_dict
 
 from .arms import UR5_TABLE, ur5
 from .test_serial_chain import _matrix
@@ -110,8 +110,9 @@ def test_what_no_file_can_hold_is_refused(tmp_path):
     model = SerialChain.from_urdf(path, compliance=[2])
     parameters = model.nominal.copy()
     parameters[model.names.index("compliance2")] = 0.1
-    with pytest.raises(ValueError, match="compliance was found of joints 2"):
-        model.to_urdf(tmp_path / "out.urdf", parameters)
+    with pytest.warns(UserWarning, match="compliance of joints 2 is left out of"):
+        model.to_urdf(tmp_path / "stiff.urdf", parameters)
+    assert (tmp_path / "stiff.urdf").read_text(encoding="utf-8") == ARM
     with pytest.raises(ValueError, match="must come from a URDF file"):
         ur5().to_urdf(tmp_path / "out.urdf", ur5().nominal)
     model = SerialChain.from_urdf(path, base="hand", tip="upper")
@@ -121,12 +122,29 @@ def test_what_no_file_can_hold_is_refused(tmp_path):
 
 
 def test_a_calibrated_arm_is_nominal_where_it_was_found(tmp_path):
-    model = ur5(sensor=Socket(), gears=[2])
+    model = ur5(sensor=Socket(), gears=[2], compliance=())
     parameters = model.nominal + 0.1 * np.random.default_rng(0).normal(size=43)
     commands = np.random.default_rng(1).uniform(-90.0, 90.0, (20, 6))
     points = model.measured_with(Position()).predict(commands, parameters[:-3])
     found = model.calibrated(parameters)
     np.testing.assert_allclose(found.predict(commands), points, atol=1e-9)
+
+
+def test_a_calibrated_arm_yields_as_it_was_found_to():
+    model = ur5(sensor=Socket())
+    by = np.array([name.startswith("compliance") for name in model.names])
+    rng = np.random.default_rng(0)
+    noise = 0.1 * rng.normal(size=len(by))
+    parameters = model.nominal + np.where(by, 1e-4 * np.abs(noise), noise)
+    commands = rng.uniform(-90.0, 90.0, (20, 6))
+    tip = model.measured_with(Position())
+    points = tip.predict(commands, parameters[:-3])
+    sag = points - tip.predict(commands, np.where(by, 0.0, parameters)[:-3])
+    found = model.calibrated(parameters)
+    again = from_dict(found.to_dict())
+    off = again.predict(commands) - points
+    # Its torques are those of the arm as calibrated, not as designed.
+    assert np.abs(sag).max() > 0.1 and np.abs(off).max() < 0.01 * np.abs(sag).max()
 
 
 def _ur_frames(text):

@@ -18,14 +18,14 @@ from unittest import mock
 from rig.config import RigConfig, parse_config
 from rig.config.files import EXAMPLES
 from rig.core import stop
-from rig.core.lock import BusLock
-from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
-from rig.core.session import Run, run_safely
+from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
+from rig.journal.lock import BusLock
 from rig.signals import Signals
 from rig.simulator import Simulator, Truth
 from rig.workbench.outputs import report
 from rig.workbench.outputs.console import listen
 from rig.workbench.procedures.calibrate import calibrate
+from rig.workbench.run import Run, run_safely
 
 # A simulated drive stands within 0.1 s; for a dead one the whole time is waited.
 stop.VERIFY_S = 0.6
@@ -118,8 +118,9 @@ def session(
     sim: Simulator | None = None,
     said: list[str] | None = None,
     listeners=(),
-    on_imu_port=None,
+    answer: bool = True,
     figures: bool = False,
+    record: DeviceRecord | None = None,
 ) -> int:
     """One session in this process; the same call again resumes it.
 
@@ -132,12 +133,12 @@ def session(
         folder,
         "calibrate",
         (said if said is not None else []).append,
-        record=commissioned(config, folder, sim),
+        record=record or commissioned(config, folder, sim),
         start={"simulated": None, "inputs": {}, "maps_from": "."},
         reset_alarms=True,
     )
-    if on_imu_port or sim:
-        run.on_imu_port = on_imu_port or sim.start_phone
+    if sim and answer:
+        run.listeners.append(sim.answer)
     for listener in listeners:
         on_phase(run, lambda phase, f=listener: f(run, phase))
     with contextlib.nullcontext() if figures else no_figures():
@@ -154,7 +155,7 @@ def on_phase(run: Run, listener) -> None:
 def no_figures():
     """The report without its figures, which take longer than a fast session."""
     text = "no figures in this test"
-    return mock.patch.object(report, "_drawn", lambda *_: text)
+    return mock.patch.object(report, "drawn", lambda *_: text)
 
 
 def in_the_middle(run: Run, phase: str) -> bool:
@@ -192,7 +193,8 @@ def _main(folder: str, config_path: str, fault: str, phase: str) -> int:
 
     said: list[str] = []
     whole = fault == "full_disk"  # the figures are what no longer fits on the disk
-    with BusLock(config.bus).acquire("calibrate"):
+    with BusLock(config.bus).acquire("calibrate") as lock:
+        lock.tell(run=str(pathlib.Path(folder).resolve()))
         code = session(
             config, pathlib.Path(folder), None, said, [listen], figures=whole
         )

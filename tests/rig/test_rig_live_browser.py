@@ -211,6 +211,21 @@ def test_stop_stops_all_drives(rig, browse):
     assert "jaxcal-rig resume" in told
 
 
+def test_a_stop_without_an_answer_is_red_after_a_second(rig, browse):
+    """C: the page said "STOP sent", and nothing stopped."""
+    driver = browse(rig)
+    until(lambda: shown(driver, "#stop"))
+    rig.page.send_signal(signal.SIGSTOP)
+    driver.find_element("id", "stop").click()
+    begun = time.monotonic()
+    until(lambda: "NO ANSWER: use the emergency stop" in words(driver, "#answer"), 5)
+    assert 0.5 < time.monotonic() - begun < 3.0
+    assert driver.find_element("id", "answer").get_attribute("class") == "bad"
+    rig.page.send_signal(signal.SIGCONT)
+    until(lambda: words(driver, "#answer").startswith("STOPPED: pitch"))
+    assert driver.find_element("id", "answer").get_attribute("class") == "good"
+
+
 def test_pause_lets_the_posture_be_finished(rig, browse):
     driver = browse(rig)
     until(lambda: shown(driver, "#pause"))

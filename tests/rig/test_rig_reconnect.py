@@ -14,25 +14,28 @@ from harness import (
     simulator,
 )
 
-from rig.core.session import run_safely
 from rig.journal import read_journal
 from rig.simulator import Truth, parse_fault
 from rig.workbench.procedures.checking import collect
+from rig.workbench.run import run_safely
 
 TURNED = 25.0  # degrees: beyond the envelope of the limits, too
 
 
-def collected(folder, phase, heading=TURNED, drift=0.0):
+PUSHING = {'format = "hyperimu"': 'format = "sensorlogger"'}
+
+
+def collected(folder, phase, heading=TURNED, drift=0.0, changes=None):
     """Code and journal of a collection; at its third posture the phone comes back."""
     folder.mkdir(exist_ok=True)
-    config, done, said = fast_config(), [], []
+    config, done, said = fast_config(changes), [], []
     with simulator(config, truth=Truth(noise_deg=0.0)) as sim:
         served = sim.start()
         run = make_run(
             served, folder, "collect", said.append,
             record=commissioned(served, folder, sim),
         )  # fmt: skip
-        run.on_imu_port = sim.start_phone
+        run.listeners.append(sim.answer)
 
         def drop(entered):
             count = len(run.journal.events("posture"))
@@ -57,12 +60,20 @@ def angles(records):
     return {r["name"]: r["measured_deg"] for r in records if r["event"] == "posture"}
 
 
-@pytest.mark.parametrize("phase", ["moving", "settling", "measuring", "saving"])
-def test_postures_after_it_are_as_right_as_those_before(phase, tmp_path):
+@pytest.mark.parametrize(
+    ("phase", "changes"),
+    [
+        *((p, None) for p in ("moving", "settling", "measuring", "saving")),
+        ("measuring", PUSHING),  # another session of the app, on any connection
+    ],
+)
+def test_postures_after_it_are_as_right_as_those_before(phase, changes, tmp_path):
     """E: `collect` stored every later yaw wrong and ended with 0."""
-    code, plain, said = collected(tmp_path / "plain", phase, heading=0.0)
+    code, plain, said = collected(
+        tmp_path / "plain", phase, heading=0.0, changes=changes
+    )
     assert code == 0, said[-5:]
-    code, records, said = collected(tmp_path / "turned", phase)
+    code, records, said = collected(tmp_path / "turned", phase, changes=changes)
     assert code == 0, said[-5:]
     found, wanted = angles(records), angles(plain)
     assert found.keys() == wanted.keys()

@@ -31,7 +31,6 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from rig.__main__ import main
 from rig.config import AXIS_NAMES, parse_config
-from rig.core.attitude import attitudes
 from rig.journal import read_journal
 from rig.simulator import Simulator, Truth
 from rig.workbench.identification.refit import reread
@@ -39,6 +38,7 @@ from rig.workbench.outputs import trend
 from rig.workbench.outputs.console import numbers
 from rig.workbench.outputs.export import LANGUAGES, load_inverse
 from rig.workbench.outputs.report import write_report
+from rig.workbench.readings import attitudes
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 SESSION = '\n[session]\nmethod = "exact"\nverify_postures = 2\n'
@@ -485,7 +485,7 @@ def test_trend_tells_what_moved_and_separates_devices(run, capsys):
 def test_parameters_are_drawn_over_time(finished):
     from matplotlib.figure import Figure
 
-    from rig.workbench.outputs.figures import parameters
+    from rig.workbench.outputs.report import draw_parameters as parameters
 
     summary = json.loads((finished / "summary.json").read_text())
     runs = [summary | {"time": 0.0}, summary | {"time": 86400.0}]
@@ -537,7 +537,7 @@ def test_a_phone_beside_the_right_one_changes_nothing_in_a_session(tmp_path):
             threading.Thread(target=send, daemon=True).start()
             sim.start_phone(port)
 
-        run.on_imu_port = intrude
+        run.listeners.append(lambda r: r["event"] == "listening" and intrude(r["port"]))
         with no_figures():
             code = run_safely(run, calibrate)
         ended.set()

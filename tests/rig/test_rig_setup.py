@@ -7,21 +7,15 @@ import re
 
 import numpy as np
 import pytest
-from commission import QUICK, device, set_up
-from harness import no_figures
+from commission import QUICK, device, quick_text, set_up
+from harness import fast_text, no_figures
 
 from rig import commissioning
 from rig.__main__ import main
 from rig.config import load_config, parse_config
 from rig.config.files import EXAMPLES
 from rig.core.faults import Refused
-from rig.core.record import (
-    HOMED,
-    IDENTIFIED,
-    SIGN_CHECKED,
-    ZEROED,
-    DeviceRecord,
-)
+from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED, DeviceRecord
 from rig.simulator import Truth
 from rig.workbench.commission import setup, steps
 from rig.workbench.commission.operator import Operator
@@ -173,3 +167,22 @@ def test_without_a_terminal_nothing_is_confirmed(at, monkeypatch, capsys):
         assert main(["setup", "--bus", bus, "--imu", f"hyperimu:{port}"]) == 2
     assert "--yes" in capsys.readouterr().err
     assert not pathlib.Path("rig.toml").exists()
+
+
+def test_a_simulated_setup_leaves_the_device_of_an_existing_file_alone(at, capsys):
+    """It used the file: the real device moved, at the speed of a simulated one."""
+    with device() as (sim, bus, port):
+        (at / "rig.toml").write_text(quick_text(bus, port))
+        given = ["setup", "--simulate", "--yes", "--config", "rig.toml"]
+        assert main(given) == 2
+        assert "--simulate writes a file of its own" in capsys.readouterr().err
+        assert sim.server.requests == 0
+
+
+def test_a_simulated_check_of_the_axes_corrects_no_file(at, capsys):
+    """It wrote what a reversed simulated axis is into the file of a real device."""
+    (at / "rig.toml").write_text(fast_text())
+    given = ["--simulate", "--yes", "--config", "rig.toml", "--reversed", "roll"]
+    assert main(["axes", *given]) == 1
+    assert "axes.roll.direction = -1 (is 1)" in capsys.readouterr().out
+    assert (at / "rig.toml").read_text() == fast_text()

@@ -23,16 +23,16 @@ from test_rig_motion import bench
 
 from rig.__main__ import main
 from rig.config import load_config
-from rig.core import lock
 from rig.core.bus import Bus, BusError
 from rig.core.drive import Drive
 from rig.core.faults import StopRequested
-from rig.core.lock import BusLock, read_armed
-from rig.core.session import run_safely
 from rig.core.stop import stop_all
+from rig.journal import lock
+from rig.journal.lock import BusLock, read_armed
 from rig.signals import Signals
 from rig.simulator import parse_fault
 from rig.workbench.procedures.checking import collect
+from rig.workbench.run import run_safely
 
 GENERIC = {'map = "leadshine_pr"': 'map = "generic"', **HASTY}
 
@@ -255,18 +255,26 @@ def test_stop_ends_the_session_that_moves_and_then_stops_every_unit(
         said = capsys.readouterr().out
         assert f"held by `calibrate` in {tmp_path}" in said
         assert f"process {child.pid}" in said and "told to stop now" in said
-        assert "the session reported:" in said
-        assert said.count("acknowledged, standing") == 6  # by the session, and by stop
+        assert "it has no drive armed any more, as it says" in said
+        assert said.count("acknowledged, standing") == 3
         assert child.wait(10) == 128 + signal.SIGTERM
     assert not any(drive.moving for drive in rig.drives)
     assert all(len(drive.stops) >= 2 for drive in rig.drives)
 
 
+LOADS = "import rig.core.stop, rig.core.drive, rig.config.files"
+
+
 @pytest.mark.parametrize("transport", ["tcp", "rtu"])
+@pytest.mark.parametrize("alone", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_suspended_session_is_ended_and_its_drives_are_stopped(
-    transport, tmp_path, capsys
+    alone, transport, tmp_path
 ):
-    """C: it took 8 s over TCP, and on a serial line nothing was stopped."""
+    """C: it took 8 s over TCP, and on a serial line nothing was stopped.
+
+    Within 2 s from the start of the process, on a computer that does nothing else; on a
+    busy one what Python takes to load is left out.
+    """
     with simulator(fast_config(), transport=transport, speedup=0.02) as sim:
         bus = sim.start().bus
         sim.path = tmp_path / "rig.toml"
@@ -280,16 +288,22 @@ def test_a_suspended_session_is_ended_and_its_drives_are_stopped(
         with running_session(sim, tmp_path) as child:
             child.send_signal(signal.SIGSTOP)
             sim.path.write_text("this is no TOML")  # what it armed is enough
-            load_all()
             begun = time.monotonic()
-            assert main(["stop", "--config", str(sim.path)]) == 0
-            took = time.monotonic() - begun
-            said = capsys.readouterr().out
-            assert "it is ended now" in said and "it has reported no stop" in said
+            subprocess.run([sys.executable, "-c", LOADS], check=True)
+            loading = 0.0 if alone else time.monotonic() - begun
+            begun = time.monotonic()
+            command = [sys.executable, "-m", "rig", "stop", "--config", str(sim.path)]
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
+            took = max(
+                min(at for at in drive.stops if at > begun) - begun
+                for drive in sim.drives
+            )
+            said = done.stdout
+            assert "it is ended now" in said and "it has not said that" in said
             assert said.count("acknowledged, standing") == 3
             assert child.wait(5) == -signal.SIGKILL
         assert not any(drive.moving for drive in sim.drives)
-        assert took < 2.0
+        assert took - loading < 2.0
 
 
 @pytest.mark.parametrize("suspended", [False, True])
@@ -522,7 +536,7 @@ def test_a_session_leaves_what_a_stop_needs_and_says_when_all_stand(tmp_path, fo
 
         record = commissioned(served, tmp_path, sim)
         run = make_run(served, tmp_path, "collect", [].append, record=record)
-        run.on_imu_port = sim.start_phone
+        run.listeners.append(sim.answer)
         on_phase(run, lambda phase: look(run, phase))
         assert run_safely(run, lambda r: collect(r, 1)) == 0
     (armed,) = {json.dumps(each, sort_keys=True) for each in seen if each}

@@ -421,7 +421,7 @@ def test_strangers_are_refused_before_a_byte_is_read_and_cost_no_thread():
         taken, made = [], []
         imu._receiver._take = lambda body, address: taken.append(address) or False
         before = threading.active_count()
-        for _ in range(100):
+        for _ in range(400):
             stranger = socket.create_connection(("127.0.0.1", imu.port), 5)
             made.append(stranger)
             with contextlib.suppress(OSError):  # it is refused while it sends

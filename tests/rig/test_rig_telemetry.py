@@ -59,7 +59,6 @@ def test_a_sample_says_what_phone_and_drives_said_last(tmp_path):
         pytest.approx(-10.0008),
     ]
     assert sample["deg"] == pytest.approx([0.0, 0.0, 0.0], abs=0.1)
-    assert sample["slope"] == pytest.approx([10.0, 0.0, 0.0], abs=0.01)
     assert sample["rate"] == pytest.approx(100.0, rel=0.02)
     readings = len(Phone().since(time.monotonic() - 0.2))
     expected = np.std(0.1 * np.arange(readings), ddof=1)

@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from jaxcal import As, Design, Ds
+from jaxcal.information import criteria as information
+from jaxcal.information.regression import regressors
 from jaxcal.selection.fastest.run import FastSelection, ParetoFront
 from jaxcal.selection.plan import Plan
 from jaxcal.selection.problem import Problem
@@ -19,6 +23,16 @@ _RULES = (
 def of(name: str, parameters: Any = (0, 1)) -> Any:
     """The criterion of a name, with parameters of interest where it needs some."""
     return {"Ds": Ds, "As": As}[name](parameters) if name in ("Ds", "As") else name
+
+
+def criteria(
+    commands: np.ndarray, region: np.ndarray | None = None, num_outputs: Any = None
+) -> information.Criteria:
+    """Of commands (N, n) of the affine model, over a region (R, n), by default them."""
+    z = regressors(commands)[:, None]
+    where = z if region is None else regressors(region)[:, None]
+    m = z.shape[2] - 1 if num_outputs is None else num_outputs
+    return information.criteria(z, np.zeros((0, z.shape[2])), where, m)
 
 
 def _asked(candidates: Any, given: dict[str, Any]) -> tuple[Design, dict[str, Any]]:

@@ -1,5 +1,6 @@
 """Every criterion on blocks, against brute force and designs of the literature."""
 
+import dataclasses
 import itertools
 
 import jax.numpy as jnp
@@ -176,9 +177,9 @@ def test_the_affine_model_is_judged_as_its_kronecker_blocks():
         few = score(candidates, [0, 3, 5, 8], model=Affine(2, 3), criterion=name)
         many = score(None, [0, 3, 5, 8], blocks=whole, criterion=name)
         assert few.value == pytest.approx(many.value, rel=1e-9), name
-        kept = few.criteria.as_dict()
+        kept = dataclasses.asdict(few.criteria)
         # Its O1 to O5 and D are those of S too; A, I, E as the criterion has them.
-        assert kept == pytest.approx(many.criteria.as_dict(), rel=1e-7)
+        assert kept == pytest.approx(dataclasses.asdict(many.criteria), rel=1e-7)
         if name != "D":
             assert kept[name] == pytest.approx(few.value, rel=1e-9)
     slopes = jaxcal.As(["a11", "a21"])
@@ -315,6 +316,10 @@ HELD = jaxcal.Prior(1.0, fixed=("a11", "a12", "a13", "b1"))
         ),
         ("criterion must be one of", {"criterion": ["D", "A"]}),
         (r"criterion Ds must carry its data: jaxcal.Ds\(\[", {"criterion": "Ds"}),
+        (r"criterion Ds must carry its data: jaxcal.Ds\(\[", {"criterion": jaxcal.Ds}),
+        ("parameters must be names or indices, got 3", {"criterion": jaxcal.Ds(3)}),
+        (r"required must have shape \(r,\), got \(1, 2\)", {"required": [[0, 1]]}),
+        ("required must be one array", {"required": [[1, 2], [3]]}),
         ("option must be one of seed, .*'parameters'", {"parameters": [0]}),
         ("parameters must be indices or names", {"criterion": jaxcal.As([4])}),
         ("parameters must be indices .*'x'", {"criterion": jaxcal.As("x")}),

@@ -19,11 +19,14 @@ class C(Wanted):
     """Variance of one combination of the parameters."""
 
     name, kind, says = "c", "trace", "variance"
+    by_name = True
 
     def __init__(self, weights) -> None:
         self.weights = numbers("weights", weights)
 
     def root(self, at: Coordinates) -> np.ndarray:
+        if self.weights.shape != (len(at.names),):
+            raise ValueError(f"weights must be ({len(at.names)},)")
         return self.weights[None] @ at.basis
 
 
@@ -37,7 +40,7 @@ class L(C):
 
 
 def largest(problem: Problem, *, seed: int) -> Found:
-    """The largest candidates first."""
+    """The largest candidates, whatever is required."""
     size = (problem.blocks**2).sum(axis=(1, 2)) * problem.available
     return Found(size.argsort()[::-1][: problem.k], seed=seed)
 
@@ -62,8 +65,24 @@ def test_a_criterion_of_ones_own_is_solved_and_proven(monkeypatch, seed) -> None
             assert found.value == pytest.approx(best, rel=2e-3)
         assert found.proven or method != "exact"
     assert "variance" in str(found) and found.criterion == "c"
-    with pytest.raises(ValueError, match=r"criterion c must carry its data: jaxcal\.c"):
+    with pytest.raises(ValueError, match=r"criterion c must carry its data: jaxcal\.C"):
         design.select(3, "c")
+
+
+def test_a_criterion_by_name_sees_every_parameter_of_the_affine_model(monkeypatch):
+    monkeypatch.setitem(CRITERIA, "c", C)
+    rng = np.random.default_rng(0)
+    candidates, weights = rng.random((9, 2)), rng.normal(size=6)
+    found = jaxcal.select(candidates, 4, "exact", criterion=C(weights))
+
+    def variance(chosen) -> float:
+        rows = jaxcal.regression_matrix(candidates[list(chosen)])
+        return float(weights @ np.linalg.solve(rows.T @ rows, weights))
+
+    best = min(map(variance, itertools.combinations(range(9), 4)))
+    assert found.value == pytest.approx(best)
+    with pytest.raises(ValueError, match=r"weights must be \(6,\)"):
+        jaxcal.select(candidates, 4, criterion=C(weights[:3]))
 
 
 def test_the_worst_of_some_combinations(monkeypatch) -> None:
@@ -98,3 +117,7 @@ def test_a_solver_of_ones_own_is_asked_by_its_name(monkeypatch) -> None:
     assert found.method == "largest" and found.seed == 7 and found.efficiency <= 1.0
     with pytest.raises(ValueError, match="best is not an option of method"):
         jaxcal.select(candidates, 5, "largest", best=2)
+    with pytest.raises(RuntimeError, match="'largest' must return 5 candidates within"):
+        jaxcal.select(
+            candidates, 5, "largest", available=available, required=[order[-2]]
+        )

@@ -11,11 +11,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
-from questions import plan
+from questions import criteria, plan
 
 import jaxcal
 from jaxcal import plots
-from jaxcal.information.criteria import criteria
 from jaxcal.models import Affine, Noise, Polynomial, Prior, SerialChain
 
 

@@ -6,10 +6,9 @@ import sys
 
 import numpy as np
 import pytest
-from questions import make_problem, score
+from questions import criteria, make_problem, score
 
 import jaxcal
-from jaxcal.information.criteria import criteria
 from jaxcal.models import Affine
 from jaxcal.selection import (
     METHODS,

@@ -19,6 +19,7 @@ class Position(Sensor):
     """x, y, z of the tip in the measuring frame; noise 0.01 % of the arm's length."""
 
     kind = "position"
+    sizes_prior = True
 
     @property
     def outputs(self) -> tuple[str, ...]:

@@ -88,6 +88,7 @@ class Sensor:
     tool: ClassVar[tuple[str, ...]] = ("x", "y", "z")  # what of the tool it sees
     zeros: ClassVar[bool] = False  # what is measured is always zero
     sizes_prior: ClassVar[bool] = False  # shown to be better with Prior.sized()
+    compliant: ClassVar[bool] = False  # shown to be better with joints that yield
 
     @property
     def inputs(self) -> tuple[str, ...]:

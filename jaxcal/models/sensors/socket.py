@@ -36,6 +36,7 @@ class Socket(Placed):
     kind = "socket"
     zeros = True
     sizes_prior = True
+    compliant = True
     axes = ("x", "y", "z")
     axis_units = ("length",) * 3
     width = 3

@@ -36,6 +36,7 @@ class Arm:
     sensor: Sensor  # what its tip is measured with
     gears: tuple[int, ...]  # joints, from 1, whose gear ratio is a parameter
     compliance: tuple[int, ...]  # joints, from 1, whose compliance is one
+    yields: Array  # (C,) what it is nominally, degrees per torque
     loads: tuple[Load, ...]  # link, weight, its centre
     gravity: tuple[float, float, float]  # direction in the measuring frame
     joint_names: tuple[str, ...]  # J of them, the first columns of the commands
@@ -67,12 +68,12 @@ class Arm:
 
     @property
     def nominal(self) -> Array:
-        """(p,) table, gear ratios of 1, stiff joints, base, tool, the sensor's own."""
+        """(p,) table, gear ratios of 1, compliance, base, tool, the sensor's own."""
         return np.concatenate(
             [
                 self.table.ravel(),
                 np.ones(len(self.gears)),
-                np.zeros(len(self.compliance)),
+                self.yields,
                 self.base[:3, 3],
                 np.zeros(3),
                 np.concatenate([self.tool[:3, 3], np.zeros(3)])[self._tool],
@@ -217,13 +218,23 @@ class Arm:
         return found.by_tip @ motion.transpose(2, 1, 0), found.by_own
 
     def _torque(self, commands: Array) -> tuple[Array, Array]:
-        """Of the compliant joints of the nominal arm (C, N), and its rate (C, n, N)."""
-        return torque(
-            len(commands),
-            self._steps(commands, self.nominal),
-            self._steps_of_joints,
-            np.array([kind == "R" for kind in self.joints]),
-            np.array(self.compliance) - 1,
-            self.loads,
-            np.array(self.gravity),
-        )
+        """Of the compliant joints of the nominal arm (C, N), and its rate (C, n, N).
+
+        A fit asks for the same commands in every step, so the last answer is kept.
+        """
+        kept = self.__dict__.get("_kept_torque")
+        if kept is None or not np.array_equal(kept[0], commands):
+            first = self.table.size + len(self.gears)
+            stiff = self.nominal
+            stiff[first : first + len(self.compliance)] = 0.0
+            found = torque(
+                len(commands),
+                self._steps(commands, stiff),
+                self._steps_of_joints,
+                np.array([kind == "R" for kind in self.joints]),
+                np.array(self.compliance) - 1,
+                self.loads,
+                np.array(self.gravity),
+            )
+            kept = self.__dict__["_kept_torque"] = (commands.copy(), found)
+        return kept[1]

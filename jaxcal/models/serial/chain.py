@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Self
 
@@ -32,9 +33,11 @@ __all__ = ["SerialChain"]
 Array = NDArray[np.float64]
 
 _COLUMNS = ("a", "alpha", "d", "theta", "beta")
-# Standard deviations of the default prior. On a UR5 (links of 1.19 m in all): 3 mm and
-# 0.5 degrees a joint, 0.12 m and 1.7 degrees of the base and the tool.
-_LENGTH, _ANGLE, _GEAR = 2.5e-3, 0.5, 5e-3  # share of the links' length; degrees; ratio
+# Standard deviations of the default prior. On a UR5 (links of 1.19 m in all): 1.8 mm,
+# 0.3 degrees of the axes and 0.5 of a joint's zero, which is set by hand; 0.12 m and
+# 1.7 degrees of the base and the tool.
+_LENGTH, _TWIST, _ZERO = 1.5e-3, 0.3, 0.5  # share of the links' length; degrees
+_GEAR, _SAG = 5e-3, 0.5  # ratio; degrees under the largest torque
 _MOUNTING, _MOUNTING_ANGLE = 0.1, 1.7
 
 
@@ -68,7 +71,8 @@ class SerialChain(Arm):
         tool: ArrayLike | None = None,
         sensor: Sensor | Mapping[str, Any] | None = None,
         gears: Sequence[int] = (),
-        compliance: Sequence[int] = (),
+        compliance: Sequence[int] | None = None,
+        yields: ArrayLike | None = None,
         loads: Sequence[tuple[int, float, ArrayLike]] = (),
         gravity: Sequence[float] = (0.0, 0.0, -1.0),
         joint_names: Sequence[str] = (),
@@ -91,9 +95,13 @@ class SerialChain(Arm):
             gears: joints, counted from 1, whose gear ratio is a parameter ("gear2"):
                 the joint moves by the ratio, nominally 1, times its command.
             compliance: revolute joints, counted from 1, that yield under the loads
-                ("compliance2"): degrees per unit of weight times length.
+                ("compliance2"): degrees per unit of weight times length. When not
+                given all of them where contacts are measured, else none.
+            yields: (C,) the compliance of these joints, as far as it is known; 0 when
+                not given.
             loads: (link, weight, centre in the frame of that row); by default a weight
-                of one at the tool. The torques are those of the nominal arm.
+                of one at the end of every link but the first, the last at the tool.
+                The torques are those of the nominal arm.
             gravity: direction of weight in the measuring frame; times 9.81 where
                 loads are masses.
             joint_names: what the columns of the commands are called.
@@ -139,12 +147,21 @@ class SerialChain(Arm):
                 f"sensor must be of jaxcal.models, such as Position(), got {sensor!r}"
             )
         end = transform("tool", tool)
+        if compliance is None:
+            turning = [i + 1 for i in range(n) if joints[i] == "R"]
+            compliance = turning if sensor.compliant else ()
         for joint in (number := joint_numbers("compliance", compliance, n)):
             if joints[joint - 1] == "P":
                 raise ValueError(
                     f"compliance must name revolute joints, joint {joint} is prismatic"
                 )
-        given = loads or ([(n, 1.0, end[:3, 3])] if number else [])
+        known = np.zeros(len(number)) if yields is None else numbers("yields", yields)
+        if known.shape != (len(number),):
+            raise ValueError(f"yields must have shape ({len(number)},)")
+        given = list(loads)
+        if number and not given:
+            given = [(i, 1.0, (0.0, 0.0, 0.0)) for i in range(2, n)]
+            given.append((n, 1.0, end[:3, 3]))
         return cls(
             rows,
             one_of("convention", convention, ("standard", "modified")),
@@ -154,6 +171,7 @@ class SerialChain(Arm):
             sensor,
             joint_numbers("gears", gears, n),
             number,
+            known,
             tuple(load(each, n) for each in given),
             triple("gravity", gravity),
             tuple(joint_names) or _numbered(columns),
@@ -172,6 +190,7 @@ class SerialChain(Arm):
         tip: str | None = None,
         sensor: Sensor | None = None,
         locked: Mapping[str, float] | None = None,
+        limits: Mapping[str, tuple[float, float]] | None = None,
         **options: Any,
     ) -> Self:
         """The arm between two links of a URDF file, as a standard table with beta.
@@ -188,14 +207,19 @@ class SerialChain(Arm):
                 last one by default.
             sensor: what the tip is measured with; Position() when not given.
             locked: joints that stand still, by name, and where: degrees, metres.
+            limits: least and greatest command of joints, by name, instead of the
+                file's.
             options: ``gears``, ``compliance``, ``loads``, ``gravity`` of
                 :meth:`from_dh`.
         """
         # scipy.spatial and the XML parser take half a second to load.
         from jaxcal.models.serial.urdf import read_urdf
 
-        arm = read_urdf(path, tip, base, locked or {})
-        return cls.from_dh(**arm._asdict(), sensor=sensor, **options)
+        arm = read_urdf(path, tip, base, locked or {})._asdict()
+        for name, ends in (limits or {}).items():
+            joint = one_of("limits", name, tuple(arm["joint_names"]))
+            arm["limits"][arm["joint_names"].index(joint)] = ends
+        return cls.from_dh(**arm, sensor=sensor, **options)
 
     def measured_with(self, sensor: Sensor) -> Self:
         """The same arm with another sensor."""
@@ -240,17 +264,9 @@ class SerialChain(Arm):
         Args:
             parameters: (p,) as ``identify`` found them.
             sensor: of the new arm; Position() when not given.
-
-        Raises:
-            ValueError: a joint yields, which no nominal arm does.
         """
         theta = as_parameters(self, parameters)
         ratios, compliance = self._drives(theta)
-        if compliance.any():
-            raise ValueError(
-                "a nominal arm has stiff joints, but compliance was found of joints "
-                f"{', '.join(map(str, self.compliance))}"
-            )
         base, tool, _ = self._split(theta)
         turned = pose_matrix(base)
         turned[:3, :3] = turned[:3, :3] @ self.base[:3, :3]
@@ -263,7 +279,22 @@ class SerialChain(Arm):
             tool=end,
             drive=ratios[:, None] * self.drive,
             offset=ratios * self.offset,
+            yields=np.array(compliance),
             sensor=sensor or Position(),
+        )
+
+    def _stiff(self, parameters: ArrayLike) -> Self:
+        """The calibrated arm without compliance, which no file of others holds."""
+        left = self._drives(as_parameters(self, parameters))[1]
+        if left.any():
+            lost = [str(i) for i, one in zip(self.compliance, left, strict=True) if one]
+            warnings.warn(
+                f"compliance of joints {', '.join(lost)} is left out of the file: its "
+                "joints are stiff",
+                stacklevel=3,
+            )
+        return dataclasses.replace(
+            self.calibrated(parameters), compliance=(), yields=np.zeros(0)
         )
 
     def to_urdf(
@@ -276,7 +307,8 @@ class SerialChain(Arm):
         """Write the URDF file that the arm came from, its origins corrected.
 
         Meshes, comments and all else stay as they are; the tip goes where ``predict``
-        of positions puts it, the base in the measuring frame included.
+        of positions puts it, the base in the measuring frame included. Such a file has
+        stiff joints: compliance is left out.
 
         Args:
             path: the file to write.
@@ -287,8 +319,8 @@ class SerialChain(Arm):
             The tip link, a new one where no fixed joint before it could hold the tool.
 
         Raises:
-            ValueError: the arm is of no URDF file; a gear ratio or a compliance was
-                found, which such a file cannot hold.
+            ValueError: the arm is of no URDF file; a gear ratio was found, which such
+                a file cannot hold.
             FileExistsError: there is a file and ``force`` is not given.
         """
         from jaxcal.models.serial.written import urdf_text
@@ -298,7 +330,7 @@ class SerialChain(Arm):
             raise ValueError(
                 f"gear{i + 1} is {ratios[i]:.6g}, which a URDF file cannot hold"
             )
-        text, tip = urdf_text(self, self.calibrated(parameters))
+        text, tip = urdf_text(self, self._stiff(parameters))
         _write_new(path, text, force)
         return tip
 
@@ -315,7 +347,7 @@ class SerialChain(Arm):
         """
         from jaxcal.models.serial.written import dh_text
 
-        _write_new(path, dh_text(self.calibrated(parameters)), force)
+        _write_new(path, dh_text(self._stiff(parameters)), force)
 
     def to_ur_kinematics(
         self,
@@ -330,7 +362,7 @@ class SerialChain(Arm):
         """
         from jaxcal.models.serial.written import ur_text
 
-        _write_new(path, ur_text(self, self.calibrated(parameters)), force)
+        _write_new(path, ur_text(self, self._stiff(parameters)), force)
 
     def together(
         self, *tables: tuple[ArrayLike, ArrayLike | None]
@@ -475,18 +507,18 @@ class SerialChain(Arm):
     def default_prior(self) -> Prior:
         """Loose knowledge of any arm, by the length of its links; see the constants.
 
-        What the sensor cannot see is held; where contacts are few, the scales of
-        lengths and angles are taken from them (:meth:`Prior.sized`).
+        What the sensor cannot see is held; of contacts and positions the scales of
+        the groups are taken from the readings (:meth:`Prior.sized`).
         """
         length = self.length or np.inf  # axes of unknown stroke alone
-        joint = [_LENGTH * length, _ANGLE, _LENGTH * length, _ANGLE, _ANGLE]
+        joint = [_LENGTH * length, _TWIST, _LENGTH * length, _ZERO, _TWIST]
         mounting = [_MOUNTING * length] * 3 + [_MOUNTING_ANGLE] * 3
         torque = length * sum(abs(weight) for _, weight, _ in self.loads)
         return Prior(
             [
                 *joint * len(self.joints),
                 *[_GEAR] * len(self.gears),
-                *[_ANGLE / torque if torque else np.inf] * len(self.compliance),
+                *[_SAG / torque if torque else np.inf] * len(self.compliance),
                 *mounting,
                 *(mounting[i] for i in self._tool),
                 *self.sensor.prior_std(length),

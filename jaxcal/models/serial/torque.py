@@ -50,8 +50,11 @@ def torque(
     second = np.maximum(at[:, None], np.arange(n))
     result, rate = np.zeros((len(at), count)), np.zeros((len(at), n, count))
     for link, weight, centre in loads:
-        frame = forward(count, steps[: OF_BASE + OF_ROW * link])[0]
-        point = frame[3] + np.einsum("k,kcn->cn", centre, frame[:3])
+        end = OF_BASE + OF_ROW * link
+        point = all_origins[end]
+        if any(centre):
+            frame = forward(count, steps[:end])[0]
+            point = point + np.einsum("k,kcn->cn", centre, frame[:3])
         motion = np.where(turns, cross(axes, point - origins), axes)
         motion[link:] = 0.0
         force = weight * gravity

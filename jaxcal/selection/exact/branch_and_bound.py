@@ -2,8 +2,9 @@
 
 Source: Ponte, Fampa and Lee, Branch-and-bound for integer D-Optimality with fast local
 search and variable-bound tightening, arXiv 2302.07386. A node is closed when its bound
-is within ``TOLERANCE`` of the incumbent, far above the rounding of either (1e-13), so
-"proven" means: no selection is better by more than that.
+is within ``TOLERANCE`` of the incumbent, far above the rounding of either (1e-13, which
+fused products only make smaller), so "proven" means: no selection is better by more
+than that.
 """
 
 from __future__ import annotations
@@ -16,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal import compiled
+from jaxcal.information.blocks import largest_rank
 from jaxcal.information.criterion import Criterion
 
-__all__ = ["TOLERANCE", "BranchResult", "branch_and_bound"]
+__all__ = ["branch_and_bound"]
 
 TOLERANCE = 1e-10  # of phi of "det"; of the others a share of it
 _MEMORY = 64 * 2**20  # bytes of open nodes up to which the best bound goes first
@@ -108,7 +110,7 @@ def _search(
     """The compiled search in numbers near 1, and unit and origin of its values."""
     kernel = compiled.kernel("jaxcal.selection.exact.kernel")
     root = criterion.root
-    rank = 1 if blocks.shape[1] == 1 else int(np.linalg.matrix_rank(blocks).max())
+    rank = largest_rank(blocks)
     p = len(prior)
     scale, shift = 1.0, 0.0
     if criterion.kind == "det" and len(root) == p:

@@ -125,20 +125,24 @@ def solve_exact(
                     return result
             return _enumerate(problem, pool, best, deadline)
     start = exchange_indices(problem, restarts, seed, deadline)
-    groups = _groups(problem, merge=best == 1)
-    first = np.array([members[0] for members in groups])
+    keep, first = _groups(problem, merge=best == 1)
+    counts = np.bincount(start, minlength=len(problem.blocks))
+    low, high, begun = (
+        np.add.reduceat(each[keep], first)
+        for each in (problem.lower, problem.upper, counts)
+    )
     found = branch_and_bound(
-        problem.blocks[first],
+        problem.blocks[keep[first]],
         problem.prior,
         problem.criterion,
-        _sums(problem.lower, groups),
-        np.minimum(_sums(problem.upper, groups), problem.k),
-        _sums(np.bincount(start, minlength=len(problem.blocks)), groups),
+        low,
+        np.minimum(high, problem.k),
+        begun,
         best,
         deadline,
         enough,
     )
-    subsets = [_expand(problem, groups, counts) for counts in found.counts]
+    subsets = [_expand(problem, keep, first, each) for each in found.counts]
     bound = None if found.proven else found.bound
     return _result(problem, subsets, best, bound, found.nodes)
 
@@ -253,36 +257,34 @@ def _result(
     return ExactResult(chosen[order], value[order], bound, nodes, False, unsure)
 
 
-def _groups(problem: Problem, merge: bool) -> list[Indices]:
-    """Available candidates, equal ones together where ``merge``: fewer branches."""
+def _groups(problem: Problem, merge: bool) -> tuple[Indices, Indices]:
+    """Available candidates (N,), and where in them each of G groups begins (G,).
+
+    Equal ones are a group where ``merge``: fewer branches.
+    """
     keep = np.flatnonzero(problem.available)
     if merge:
         flat = problem.raw[keep].reshape(len(keep), -1)
-        _, label = np.unique(flat, axis=0, return_inverse=True)
-        order = np.argsort(label, kind="stable")
-        ends = np.flatnonzero(np.diff(label[order])) + 1
-        if len(ends) + 1 < len(keep):
-            return np.split(keep[order], ends)
-    return list(keep[:, None])
+        total = np.sort(flat.sum(axis=1))
+        if (total[1:] == total[:-1]).any():  # otherwise no two are equal
+            label = np.unique(flat, axis=0, return_inverse=True)[1]
+            order = np.argsort(label, kind="stable")
+            return keep[order], np.flatnonzero(np.diff(label[order], prepend=-1))
+    return keep, np.arange(len(keep))
 
 
-def _sums(values: Indices, groups: list[Indices]) -> Indices:
-    if all(len(members) == 1 for members in groups):
-        return values[[members[0] for members in groups]]
-    return np.array([values[members].sum() for members in groups])
-
-
-def _expand(problem: Problem, groups: list[Indices], counts: Indices) -> Indices:
-    """(k,) sorted candidates of group counts, the required ones of a group first."""
-    lower, upper = problem.lower, problem.upper
+def _expand(
+    problem: Problem, keep: Indices, first: Indices, counts: Indices
+) -> Indices:
+    """(k,) sorted candidates of group counts (G,), of a group the required first."""
+    if len(first) == len(keep):
+        return np.repeat(keep, counts)
     chosen: list[int] = []
-    for group in np.flatnonzero(counts):
-        left = int(counts[group])
-        members = groups[group]
-        take = lower[members].copy()
+    for members, left in zip(np.split(keep, first[1:]), counts.tolist(), strict=True):
+        take = problem.lower[members]
         left -= int(take.sum())
-        for position, member in enumerate(members):
-            more = min(left, int(upper[member] - take[position]))
+        for position, room in enumerate((problem.upper[members] - take).tolist()):
+            more = min(left, room)
             take[position] += more
             left -= more
         chosen.extend(np.repeat(members, take))

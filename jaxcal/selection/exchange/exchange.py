@@ -7,23 +7,18 @@ Nachtsheim 1980 for one candidate at a time.
 
 E, the smallest eigenvalue, is climbed from local optima of A: the sum of the variances
 is at most p times the largest, and climbs from where the smallest eigenvalue stands
-still because two are equal. phi is concave, so with G its gradient at what is left when
-a candidate goes out, adding B_j gives at most phi there plus ``trace(B_j G B_j.T)``;
-candidates are evaluated in the order of that bound until it falls to the best found.
+still because two are equal.
 """
 
 from __future__ import annotations
 
-import functools
 import time
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal import compiled
 from jaxcal.information.blocks import largest_rank
-from jaxcal.information.criterion import Criterion
 from jaxcal.selection.problem import Problem, values
 from jaxcal.selection.solver import Found, in_threads
 
@@ -51,10 +46,7 @@ _FURTHER = (1.0, 0.03)
 _RANK_FIRST = 1e-7  # every direction that nothing is known of outweighs the rest
 _MENDING = 10  # random starts where all greedy ones are singular
 
-_CHUNK = 16  # candidates whose eigenvalues are computed at once, then twice as many
-_CLIMBS = 1.3e5  # k p^3 of the climbs of E in one call, but from 1 to 10 of them
-_LIFTS = 1e-9  # share by which a swap must raise the eigenvalue
-_RIDGE = 1e-10  # of the information of all candidates
+_CLIMBS = 2.5e5  # k p^3 of the climbs of E in one call, from each kind of start
 
 
 def solve(problem: Problem, *, seed: int, restarts: int | None) -> Found:
@@ -97,25 +89,24 @@ class Climbs:
     def __init__(self, problem: Problem, seed: int, deadline: float | None) -> None:
         kernel = compiled.kernel("jaxcal.selection.exchange.kernel")
         self._usable = np.flatnonzero(problem.available)
-        blocks = problem.blocks[self._usable]
-        self._rank = functools.cache(lambda: largest_rank(blocks))  # for random starts
-        self._required = np.searchsorted(self._usable, problem.required)
-        self._deadline = deadline
+        blocks, self._required = problem.blocks, problem.required
+        if len(self._usable) < len(blocks):
+            blocks = blocks[self._usable]
+            self._required = np.searchsorted(self._usable, problem.required)
+        self._blocks, self._full, self._deadline = blocks, 0, deadline
         criterion, q, p = problem.criterion, blocks.shape[1], blocks.shape[2]
         kind, root = kernel.TRACE, criterion.root
-        if criterion.kind == "det":
-            root = root / np.linalg.norm(
-                root, axis=1, keepdims=True
-            )  # variances near 1
-            kind = kernel.DET if criterion.name == "D" else kernel.SUBSET
-        span = np.zeros((0, p))
-        if len(problem.root):
-            values, vectors = np.linalg.eigh(problem.prior)
-            span = np.ascontiguousarray(vectors.T[values > 1e-6])
+        if criterion.name == "D":
+            kind = kernel.DET
+        elif criterion.kind == "det":  # variances near 1
+            kind = kernel.SUBSET
+            root = root / np.linalg.norm(root, axis=1, keepdims=True)
+        span = problem.known if len(problem.root) else problem.root
         self._share = _SHARE * min(1.0, problem.k * q / p) ** 6
         self._climber = kernel.Climber(
-            kind, blocks, problem.prior, root, problem.upper[self._usable],
-            self._required, span, problem.k, seed,
+            kind, np.ascontiguousarray(blocks), np.ascontiguousarray(problem.prior),
+            np.ascontiguousarray(root), min(problem.max_replicates, problem.k),
+            self._required, np.ascontiguousarray(span), problem.k, seed,
         )  # fmt: skip
 
     def seconds(self) -> float:
@@ -137,6 +128,13 @@ class Climbs:
                 return self._usable[chosen]
         return self.best_of(1 + _MENDING)[0]
 
+    def climbed_least(self, start: Indices) -> tuple[Indices, float]:
+        """The local optimum of E that ``start`` (k,) climbs to, required first; E."""
+        chosen, value = self._climber.climb_least(
+            np.searchsorted(self._usable, start), self.seconds()
+        )
+        return self._usable[chosen], value
+
     def climbed(self, start: Indices) -> tuple[Indices, float]:
         """The local optimum that ``start`` (k,) climbs to, required first; its phi."""
         chosen, phi = self._climber.climb_from(
@@ -144,9 +142,18 @@ class Climbs:
         )
         return self._usable[chosen], phi
 
+    def _rank(self) -> int:
+        """That a block can have, found where an exchange starts at random."""
+        self._full = self._full or largest_rank(self._blocks)
+        return self._full
+
+    def random_start(self) -> Indices:
+        """(k,) another random selection, rarely singular."""
+        return self._usable[self._climber.random_start(self._rank())]
+
     def random_climb(self) -> tuple[Indices, float]:
         """The local optimum of another random start, and its phi."""
-        return self.climbed(self._usable[self._climber.random_start(self._rank())])
+        return self.climbed(self.random_start())
 
     def best_of(self, restarts: int) -> tuple[Indices, float]:
         """The best local optimum from greedy selections and then random starts."""
@@ -212,10 +219,10 @@ def exchange_from(problem: Problem, indices: ArrayLike) -> Indices:
             "indices must give an invertible information matrix, but that of "
             f"{given.tolist()} is singular"
         )
-    start = _required_first(problem, given)
+    start, climbs = _required_first(problem, given), Climbs(problem, 0, None)
     if problem.criterion.kind == "least":
-        return _climb_eigenvalue(problem, start)[0]
-    return Climbs(problem, 0, None).climbed(start)[0]
+        return climbs.climbed_least(start)[0]
+    return climbs.climbed(start)[0]
 
 
 def _required_first(problem: Problem, chosen: Indices) -> Indices:
@@ -228,86 +235,20 @@ def _required_first(problem: Problem, chosen: Indices) -> Indices:
 def _best_eigenvalue(
     problem: Problem, climbs: Climbs, restarts: int
 ) -> tuple[Indices, float]:
-    """The best local optimum of E and its value, from ``restarts`` local optima of A.
+    """The best local optimum of E and its value.
 
-    Only those of the best eigenvalues are climbed: that is not compiled, and many local
-    optima of A come closer than climbs from a few.
+    From local optima of A, the best first, and from random selections as often: the
+    former come closer where there are many parameters, the latter where there are few.
     """
-    starts = [climbs.best_of(1), *(climbs.random_climb() for _ in range(restarts - 1))]
-    chosen = np.unique(
-        [np.sort(start) for start, phi in starts if phi > -np.inf], axis=0
-    )
-    if not len(chosen):
-        return starts[0]
-    order = np.argsort(-values(problem, chosen)[0])
+    many = (restarts + 1) // 2
     work = problem.k * problem.num_regressors**3
-    few = int(min(max(_CLIMBS / work, 1), 10))
-    found = [
-        _climb_eigenvalue(problem, _required_first(problem, chosen[i]), climbs.seconds)
-        for i in order[:few]
-    ]
+    many_climbs = int(min(max(_CLIMBS / work, 1), many))
+    near = [climbs.best_of(1), *(climbs.random_climb() for _ in range(many - 1))]
+    starts = np.unique([np.sort(start) for start, phi in near if phi > -np.inf], axis=0)
+    if not len(starts):
+        return near[0]
+    order = np.argsort(-values(problem, starts)[0])[:many_climbs]
+    found = [climbs.climbed_least(_required_first(problem, starts[i])) for i in order]
+    for _ in range(min(many_climbs, restarts - many)):
+        found.append(climbs.climbed_least(climbs.random_start()))
     return max(found, key=lambda each: each[1])
-
-
-def _climb_eigenvalue(
-    problem: Problem, start: Indices, seconds: Callable[[], float] = lambda: np.inf
-) -> tuple[Indices, float]:
-    """The local optimum that ``start`` (k,) climbs to, and its eigenvalue."""
-    blocks, criterion = problem.blocks, problem.criterion
-    grams = np.matrix_transpose(blocks) @ blocks
-    chosen, fixed = start.copy(), len(problem.required)
-    value = float(criterion.value(problem.prior + grams[chosen].sum(axis=0)))
-    room = problem.upper - np.bincount(chosen, minlength=len(blocks))
-    since, position = 0, fixed
-    while since < len(chosen) - fixed and seconds():
-        out = chosen[position]
-        rest = problem.prior + grams[np.delete(chosen, position)].sum(axis=0)
-        least = value * (1.0 + _LIFTS)
-        best, found = _best(rest, criterion, blocks, grams, room > 0, least)
-        since += 1
-        if best >= 0:
-            value, since = found, 0
-            room[out] += 1
-            room[best] -= 1
-            chosen[position] = best
-        position = position + 1 if position + 1 < len(chosen) else fixed
-    return chosen, value
-
-
-def _best(
-    rest: Array,
-    criterion: Criterion,
-    blocks: Array,
-    grams: Array,
-    free: NDArray[np.bool_],
-    least: float,
-) -> tuple[int, float]:
-    """The candidate, or -1, that gives the largest eigenvalue above ``least``."""
-    root = criterion.root
-    # A little more than there is keeps the bounds true where the rest is singular.
-    more = rest + _RIDGE * np.eye(len(rest))
-    across = np.linalg.solve(more, root.T)
-    variances, vectors = np.linalg.eigh(root @ across)
-    weakest = across @ vectors[:, -1] / variances[-1]  # |C weakest| = 1
-    bound = 1.0 / variances[-1] + ((blocks @ weakest) ** 2).sum(axis=1)
-    # A block of q readings leaves the variances after the q largest no smaller.
-    q = blocks.shape[1]
-    if q < len(variances):
-        bound = np.minimum(bound, 1.0 / variances[-1 - q])
-    bound = np.where(free, bound, -np.inf)
-    order = np.argsort(-bound)
-    best, found = -1, least
-    first, size = 0, _CHUNK
-    while first < len(order):
-        some = order[first : first + size]
-        some = some[bound[some] > found]
-        if not some.size:
-            break
-        covariance = root @ np.linalg.inv(more + grams[some]) @ root.T
-        values = 1.0 / np.linalg.eigvalsh(covariance)[:, -1]
-        if values.max() > found:
-            found, best = float(values.max()), int(some[values.argmax()])
-        first, size = first + size, 2 * size
-    if best >= 0:  # without the ridge
-        found = float(criterion.value(rest + grams[best]))
-    return (best, found) if found > least else (-1, least)

@@ -1,51 +1,86 @@
+cimport cython
 from jaxcal.watch cimport Watch
 
 cdef enum:
     WIDE = 64  # candidates in a group
 
+@cython.final
 cdef class Climber:
     cdef int kind  # 0 DET, 1 SUBSET, 2 TRACE
+    cdef bint rows  # one reading each, and DET
     cdef int k, q, p, s, fixed, groups
-    cdef double[:, :, ::1] blocks  # (M, q, p)
-    cdef double[:, :, :, ::1] columns  # (groups, q, p, WIDE), zeros after the M
-    cdef double[:, ::1] prior  # (p, p)
-    cdef double[:, ::1] root  # C (s, p)
+    cdef Py_ssize_t size  # q q WIDE
+    cdef double[::1] room  # which holds all that is a pointer below
+    cdef Py_ssize_t used  # of the room
+    cdef const double[:, :, ::1] blocks  # (M, q, p)
+    cdef double* columns  # (groups, q, p, WIDE), zeros after the M
+    cdef const double[:, ::1] prior  # (p, p)
+    cdef const double[:, ::1] root  # C (s, p)
     cdef Py_ssize_t[::1] upper  # (groups WIDE,), 0 after the M
     cdef Py_ssize_t[::1] counts  # (groups WIDE,)
+    cdef double* closed  # (groups WIDE,), inf where it may not be chosen once more
     cdef Py_ssize_t[::1] chosen  # (k,), the required first
     cdef Py_ssize_t[::1] best  # (k,)
-    cdef double[:, ::1] known  # (p, p) what counts beside the chosen
-    cdef double[:, ::1] gram
-    cdef double[:, ::1] lower
-    cdef double[:, :, ::1] now  # (2, p, p) V and X of the chosen
-    cdef double[:, :, ::1] trial  # (2, p, p) of those after a swap
-    cdef double[:, ::1] half  # (s, p) C V
-    cdef double[:, ::1] small  # (s, s)
-    cdef double[:, ::1] solved  # (s, p)
-    cdef double[:, :, :, :, ::1] grown  # (groups, 2, q, q, WIDE) D_jj and H_jj
-    cdef double[:, :, :, :, ::1] kept  # (groups, 2, q, q, WIDE) K
-    cdef double[:, ::1] alone  # (groups, WIDE)
-    cdef double[:, ::1] gain  # (groups, WIDE)
-    cdef double[:, :, :, ::1] cross  # (2, q, q, WIDE) D_ij and H_ij of a group
-    cdef double[:, :, :, ::1] work  # (4, q, q, WIDE)
-    cdef double[:, :, ::1] at_out  # (2, q, q) D_ii and H_ii
-    cdef double[:, :, ::1] tall  # (2, q, p) B_i V and B_i X
-    cdef double[::1] det  # (WIDE,)
-    cdef double[:, ::1] part  # (q, WIDE)
-    cdef double[:, ::1] basis  # (p, p) orthonormal rows, for random starts
-    cdef double[:, ::1] span  # (r, p) orthonormal directions that the prior informs
+    cdef double* known  # (p, p) what counts beside the chosen
+    cdef double* gram
+    cdef double* lower
+    cdef double* now  # (2, p, p) V and X of the chosen
+    cdef double* trial  # (2, p, p) of those after a swap
+    cdef double* half  # (s, p) C V
+    cdef double* small  # (s, s)
+    cdef double* solved  # (s, p)
+    cdef double* grown  # (groups, 2, q, q, WIDE) D_jj and H_jj
+    cdef double* kept  # (groups, 2, q, q, WIDE) K
+    cdef double* alone  # (groups, WIDE)
+    cdef double* tops  # (groups, 2) largest gain alone and trace of D_jj
+    cdef double tallest  # trace of D_jj since they were last made anew
+    cdef double* gain  # (WIDE,)
+    cdef double* cross  # (2, 2 q, q, WIDE) D_ij and H_ij of a group
+    cdef double* work  # (4, q, q, WIDE)
+    cdef double* mixed  # (2 q, q, WIDE)
+    cdef double* middle  # (4, 2 q, 2 q)
+    cdef double* changed  # (2 q, p) blocks that came and went
+    cdef double* at_out  # (2, q, q) D_ii and H_ii
+    cdef double* tall  # (2, 2 q, p) B_i V and B_i X
+    cdef double* det  # (WIDE,)
+    cdef double* halved  # (2, p, p) V and X, with half their diagonals
+    cdef double* part  # (p, WIDE)
+    cdef double* rest  # (p, p) information of the chosen but one
+    cdef double* metric  # (p, p) R
+    cdef double* bounds  # (groups, WIDE) on E
+    cdef double* weakest  # (p,) y
+    cdef double* values  # (p,) eigenvalues of C V C.T, the smallest first
+    cdef double* lapack
+    cdef int[::1] whole
+    cdef double* basis  # (p, p) orthonormal rows, for random starts
+    cdef const double[:, ::1] span  # (r, p) orthonormal directions that the prior informs
     cdef Py_ssize_t[::1] order  # (M,) a permutation
     cdef unsigned long long state  # of the random numbers
     cdef int full  # rank that a block can have
     cdef Watch watch
+    cdef int looked  # groups since the clock was read
+    cdef double* _take(self, Py_ssize_t count) noexcept
+    cdef void _lay_out(self) noexcept
     cdef void _set_known(self, double share, double ridge) noexcept nogil
-    cdef double _evaluate(self, Py_ssize_t size, double[:, :, ::1] into) noexcept nogil
-    cdef double _subset(self, double[:, :, ::1] into) noexcept nogil
-    cdef void _refresh(self, double[:, :, ::1] matrices) noexcept nogil
+    cdef void _sum(self, Py_ssize_t size, Py_ssize_t skipped) noexcept nogil
+    cdef void _add(self, Py_ssize_t i) noexcept nogil
+    cdef double _climb_least(self) except? -2.0 nogil
+    cdef double _least(self) noexcept nogil
+    cdef Py_ssize_t _strongest(self, double* found) noexcept nogil
+    cdef double _evaluate(self, Py_ssize_t size, double* into) noexcept nogil
+    cdef double _subset(self, double* into) noexcept nogil
+    cdef void _refresh(self) noexcept nogil
     cdef void _keep(self, Py_ssize_t c) noexcept nogil
+    cdef void _invert_grown(self, Py_ssize_t c, int m, double* det) noexcept nogil
+    cdef void _carry(self, Py_ssize_t came, Py_ssize_t went) noexcept nogil
+    cdef void _middles(self, int r) noexcept nogil
+    cdef void _update(self, Py_ssize_t c, int r) noexcept nogil
     cdef void _swaps(self, Py_ssize_t c) noexcept nogil
     cdef void _shrink(self, Py_ssize_t c, int m) noexcept nogil
-    cdef Py_ssize_t _largest(self, double[:, ::1] gain) noexcept nogil
+    cdef void _count(self, Py_ssize_t i, int more) noexcept nogil
+    cdef void _clear(self) noexcept nogil
+    cdef int _late(self) except -1 nogil
+    cdef Py_ssize_t _replacement(self, Py_ssize_t out, double least) noexcept nogil
     cdef int _grow(self, Py_ssize_t size, double share) except -1 nogil
     cdef double _climb(self) except? -2.0 nogil
     cdef double _finish(self, Py_ssize_t size, double share, bint climbs) except? -2.0 nogil

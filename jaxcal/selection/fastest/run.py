@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import one_of, share, whole_number
-from jaxcal.information.criteria import d_efficiency
 from jaxcal.selection.fastest import exact, heuristic
 from jaxcal.selection.fastest.motion import Motion
 from jaxcal.selection.fastest.task import SAME_TIME, Search, Task, make_task
@@ -139,7 +138,7 @@ def _answer(
         seconds=travel + task.settle,
         travel_seconds=travel,
         log_det=log_det,
-        efficiency=d_efficiency(log_det, bound, problem.num_parameters),
+        efficiency=problem.criterion.efficiency(log_det, bound),
         least_efficiency=least,
         proven=found.proven and task.exact.proven,
         method=str(found.method),

@@ -14,6 +14,8 @@ Wolfowitz 1960). Source: Pukelsheim, Optimal Design of Experiments, chapter 9.
 
 from __future__ import annotations
 
+import bisect
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -77,14 +79,24 @@ def _largest_sum(gain: Array, lower: Indices, upper: Indices, k: int) -> float:
 
 
 def _scaled_to(count: Array, lower: Indices, upper: Indices, k: int) -> Array:
-    """``clip(c count, lower, upper)`` with the c that makes the sum k, by bisection."""
-    low, high = 0.0, 1.0
-    while np.clip(high * count, lower, upper).sum() < k and high < 1e12:
-        high *= 2.0
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        if np.clip(middle * count, lower, upper).sum() < k:
-            low = middle
-        else:
-            high = middle
-    return np.clip(high * count, lower, upper)
+    """``clip(c count, lower, upper)`` with the c that makes the sum k.
+
+    The sum rises piecewise linearly in c, with corners where a count leaves its lower
+    limit and where it meets its upper one: bisection over the corners, then one
+    division.
+    """
+    some = count > 0.0
+    corners = np.append(lower[some] / count[some], upper[some] / count[some])
+    corners.sort()
+
+    def scaled(scale: float) -> Array:
+        return np.clip(scale * count, lower, upper)
+
+    above = bisect.bisect_left(corners, k, key=lambda scale: scaled(scale).sum())
+    if above == len(corners):  # every count at its upper limit
+        return scaled(corners[-1])
+    between = scaled(0.5 * (corners[max(above - 1, 0)] + corners[above]))
+    free = (between > lower) & (between < upper)
+    if free.any():
+        between[free] = count[free] * (k - between[~free].sum()) / count[free].sum()
+    return np.clip(between, lower, upper)

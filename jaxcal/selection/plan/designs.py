@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.information.blocks import significant
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.greedy import greedy_indices
@@ -57,7 +58,7 @@ def variances_of(problem: Problem, indices: Indices, points: Array, how: str) ->
         size, vectors = np.linalg.eigh(problem.prior)
         rows = np.vstack([rows, np.sqrt(np.maximum(size, 0.0))[:, None] * vectors.T])
     singular, right = np.linalg.svd(rows)[1:]
-    if len(singular) < rows.shape[1] or singular[-1] <= 1e-7 * singular[0]:
+    if significant(singular).sum() < rows.shape[1]:
         return np.full(points.shape[1], np.inf)
     return np.asarray(CRITERIA[how](((points @ (right.T / singular)) ** 2).sum(2), 0))
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import levels, numbers, whole_number
+from jaxcal.information.blocks import largest_rank
 from jaxcal.models.uncertainty import Noise
 from jaxcal.selection.criteria import positions
 from jaxcal.selection.greedy import greedy_indices
@@ -114,11 +115,9 @@ def fewest(problem: Problem) -> tuple[int, int]:
 
     The two differ only where blocks of several rows overlap in what they tell.
     """
-    p = problem.num_regressors
-    kept = problem.blocks[problem.required].reshape(-1, p)
-    known = np.linalg.matrix_rank(np.vstack([kept, problem.prior]), rtol=1e-9)
-    most = int(np.linalg.matrix_rank(problem.blocks, rtol=1e-9).max())
-    least = k = max(1, len(problem.required) - (-(p - int(known)) // most))
+    missing = problem.num_regressors - problem.held_rank
+    most = largest_rank(problem.blocks)
+    least = k = max(1, len(problem.required) - (-missing // most))
     if problem.blocks.shape[1] > 1:
         while k < problem.k and np.isneginf(
             problem.log_det(greedy_indices(dataclasses.replace(problem, k=k)))

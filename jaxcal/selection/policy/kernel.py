@@ -4,7 +4,7 @@ Letters: E episodes, M candidates, p regressors, c choices made, F = 13 or 16 fe
 Everything is float64; docs/policy.md describes every part.
 """
 
-# Sums in any order.
+# Products may be fused.
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from jaxcal.learning.policies import decoding as decoders
 from jaxcal.learning.training import checkpoint
 from jaxcal.selection.problem import Problem
 
-__all__ = ["JaxNetwork", "to_unit_range"]
+__all__ = ["JaxNetwork"]
 
 _CELLS = 4_000_000  # pairs of candidates scored at once: bounds memory, not the result
 _LARGEST_CALL = 512  # sets

@@ -20,7 +20,11 @@ from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.criteria import wanted
 from jaxcal.selection.problem.making import Rules, whitened_problems
 from jaxcal.selection.problem.problem import Problem
-from jaxcal.selection.problem.rules import check_available, usable_numbers
+from jaxcal.selection.problem.rules import (
+    check_available,
+    one_array,
+    usable_numbers,
+)
 from jaxcal.selection.problem.sources import (
     Given,
     Modelled,
@@ -77,9 +81,8 @@ class Asked:
                 f"candidates must have shape (M, {model.num_inputs}) for this model, "
                 f"got {array.shape}"
             )
-        mask = check_available(available, array.shape[:1], True)
-        self.candidates = usable_numbers("candidates", array[None], mask, True)[0]
-        self.available = mask[0]
+        self.available = check_available(available, array.shape[:1])
+        self.candidates = usable_numbers("candidates", array, self.available)
         self._blocks: Array | None = None
         self._coarse = coarseness(candidates)
         if noise is None and hasattr(model, "default_noise"):
@@ -125,9 +128,9 @@ class Asked:
             )
         asked = object.__new__(cls)
         asked.model, asked.candidates = None, None
-        mask = check_available(available, array.shape[:1], True)
-        asked._blocks = usable_numbers("blocks", array[None], mask, True)[0]
-        asked.available, asked._coarse = mask[0], coarseness(blocks)
+        asked.available = check_available(available, array.shape[:1])
+        asked._blocks = usable_numbers("blocks", array, asked.available)
+        asked._coarse = coarseness(blocks)
         if commands is not None:
             asked.candidates = numbers("commands", commands)
             if asked.candidates.ndim != 2 or len(asked.candidates) != len(array):
@@ -157,7 +160,7 @@ class Asked:
         """
         default = "I" if self.model and not isinstance(self.model, Affine) else "D"
         asked = wanted(criterion, region, default)
-        source = self.source(asked.parameters is not None)
+        source = self.source(asked.by_name)
         raw, root = source.blocks(), source.root
         if self._measured is not None:
             seen = source.at("measured", self._measured, True)
@@ -207,7 +210,9 @@ class Asked:
         self.prior, self.noise = prior, noise
         # Copies: the caller's arrays may change before the next question.
         self._measured = None if measured is None else numbers("measured", measured)
-        self._required = copy.copy(required)
+        self._required = None
+        if required is not None:
+            self._required = one_array("required", required)[None]
         self.max_replicates = max_replicates
 
 

@@ -41,7 +41,6 @@ class Rules(NamedTuple):
     available: Mask  # (S, M), checked
     required: ArrayLike | None
     max_replicates: int
-    single: bool = True  # one set, given without its batch axis
     coarse: float = 1.0  # how many times coarser than float64 the numbers given are
 
 
@@ -72,14 +71,12 @@ def make_problems(
         raise ValueError(
             f"candidates must have shape (B, M, n), none of them 0, got {array.shape}"
         )
-    mask = check_available(available, array.shape[:2], False)
-    array = usable_numbers("candidates", array, mask, False)
+    mask = check_available(available, array.shape[:2])
+    array = usable_numbers("candidates", array, mask)
     m = array.shape[2] if num_outputs is None else num_outputs
     model = Affine(array.shape[2], whole_number("num_outputs", m, 1))
     root = np.zeros((0, model.num_inputs + 1))
-    rules = Rules(
-        k, mask, required, max_replicates, False, coarseness(candidates)
-    )  # fmt: skip
+    rules = Rules(k, mask, required, max_replicates, coarseness(candidates))
     return whitened_problems(
         model.blocks(array), root, rules, CRITERIA["D"](), times=m, candidates=array,
         model=model,
@@ -111,12 +108,12 @@ def whitened_problems(
         candidates: (S, M, n), where there are any.
         model: what made blocks of them.
     """
-    k, mask, required, max_replicates, single, coarse = rules
+    k, mask, required, max_replicates, coarse = rules
     readings = mask.sum(axis=1) * raw.shape[2]
     if raw.shape[2] > raw.shape[3]:  # as much information in p rows, at q^3 less cost
         raw = np.asarray(np.linalg.qr(raw, mode="r"))
     k = check_k(k, raw, mask, root, regressors=not names)
-    cap, forced = check_counts(mask, k, required, max_replicates, single)
+    cap, forced = check_counts(mask, k, required, max_replicates)
     computed = bool(names) and model is not None
     if computed:  # a derivative is as exact as its own numbers
         coarse = 1.0
@@ -126,7 +123,7 @@ def whitened_problems(
         if not names and candidates is not None:
             names = (*axis_names("names", None, "u", candidates.shape[2]), "the bias")
             if not len(root):
-                which = "available ones" + in_set(b, single)
+                which = "available ones" + in_set(b, len(raw))
                 used = candidates[b][mask[b]]
                 require_excited(used, names[:-1], "candidates", which, coarse)
         _refuse_blind(raw[b][mask[b]], root, names, coarse)
@@ -148,7 +145,7 @@ def whitened_problems(
         )  # fmt: skip
     if forced.shape[1]:
         for b, problem in enumerate(problems):
-            check_required_rank(problem, in_set(b, single))
+            check_required_rank(problem, in_set(b, len(raw)))
     return problems
 
 

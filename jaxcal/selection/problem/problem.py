@@ -14,7 +14,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.information.blocks import log_det_blocks
+from jaxcal.information.blocks import log_det_blocks, significant
 from jaxcal.information.criterion import Criterion
 from jaxcal.models.model import Model
 
@@ -25,6 +25,7 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 _EPS = float(np.finfo(np.float64).eps)
+_KNOWN = 1e-6  # share of all information along a direction
 _IN_PLANE = 1e-7  # of whitened rows of height one above the origin
 
 
@@ -110,6 +111,19 @@ class Problem:
             return False
         height = self.rows @ self.rows.sum(axis=0)
         return bool((np.abs(height - 1.0) <= _IN_PLANE)[self.available].all())
+
+    @property
+    def known(self) -> Array:
+        """(s, p) orthonormal directions of which something is known beforehand."""
+        values, vectors = np.linalg.eigh(self.prior)
+        return np.ascontiguousarray(vectors.T[values > _KNOWN])
+
+    @property
+    def held_rank(self) -> int:
+        """Rank of what is known with the required candidates."""
+        rows = self.blocks[self.required].reshape(-1, self.num_regressors)
+        rows = np.concatenate([rows, self.root @ self.basis])
+        return int(significant(np.linalg.svd(rows, compute_uv=False)).sum())
 
     def uncertainty(self, indices: Indices) -> float:
         """By how much rounding may change phi of a selection (k,), as a share.

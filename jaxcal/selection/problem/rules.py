@@ -1,7 +1,4 @@
-"""Checks of which candidates may be chosen and how many, over a batch of sets.
-
-``single`` leaves the batch axis, which is there all the same, out of error messages.
-"""
+"""Checks of which candidates may be chosen and how many, over a batch of sets."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import require_finite, whole_number
-from jaxcal.information.blocks import largest_rank, rank_of_blocks
+from jaxcal.information.blocks import SINGULAR, largest_rank, rank_of_blocks
 from jaxcal.selection.problem.problem import Problem
 
 __all__ = [
@@ -20,6 +17,7 @@ __all__ = [
     "check_k",
     "check_required_rank",
     "in_set",
+    "one_array",
     "usable_numbers",
 ]
 
@@ -28,42 +26,39 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 
-def usable_numbers(name: str, array: Array, mask: Mask, single: bool) -> Array:
+def usable_numbers(name: str, array: Array, mask: Mask) -> Array:
     """A copy, finite where available; what is not finite elsewhere becomes zero."""
     own = np.array(array, order="C")
     bad = ~np.isfinite(own)
     if bad.any():
-        hidden = bad & ~mask.reshape(*mask.shape, *[1] * (own.ndim - 2))
+        hidden = bad & ~mask.reshape(*mask.shape, *[1] * (own.ndim - mask.ndim))
         own[hidden] = 0.0
-        require_finite(name, own[0] if single else own)
+        require_finite(name, own)
     return own
 
 
-def in_set(b: int | np.integer[Any], single: bool) -> str:
-    return "" if single else f" in set {int(b)}"
+def in_set(b: int | np.integer[Any], count: int) -> str:
+    """Which of the sets an error is about, where there are several."""
+    return "" if count == 1 else f" in set {int(b)}"
 
 
-def _leading_axis(name: str, values: ArrayLike) -> NDArray[Any]:
+def one_array(name: str, values: ArrayLike) -> NDArray[Any]:
+    """A copy of ``values`` as an array of any kind."""
     try:
-        return np.array(values)[None]
+        return np.array(values)
     except ValueError as error:
         raise ValueError(
             f"{name} must be one array, got {type(values).__name__} of mixed lengths"
         ) from error
 
 
-def check_available(
-    available: ArrayLike | None, shape: tuple[int, ...], single: bool
-) -> Mask:
-    """(S, M) where ``shape`` is (S, M), or (M,) of a single set."""
-    if single:
-        shape = (1, *shape)
+def check_available(available: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
+    """(S, M) or (M,), as ``shape`` says."""
     if available is None:
         return np.ones(shape, dtype=np.bool_)
-    mask = _leading_axis("available", available) if single else np.array(available)
+    mask = one_array("available", available)
     if mask.shape != shape:
-        want, got = (shape[1:], mask.shape[1:]) if single else (shape, mask.shape)
-        raise ValueError(f"available must have shape {want}, got {got}")
+        raise ValueError(f"available must have shape {shape}, got {mask.shape}")
     if mask.dtype.kind not in "biuf" or not np.isin(mask, (0, 1)).all():
         wrong = mask[~np.isin(mask, (0, 1))] if mask.dtype.kind in "iuf" else mask
         raise ValueError(
@@ -74,9 +69,9 @@ def check_available(
 
 
 def check_counts(
-    mask: Mask, k: int, required: ArrayLike | None, max_replicates: int, single: bool
+    mask: Mask, k: int, required: ArrayLike | None, max_replicates: int
 ) -> tuple[int, Indices]:
-    """The cap on replicates and the required candidates (B, r)."""
+    """The cap on replicates and the required candidates (S, r)."""
     cap = whole_number("max_replicates", max_replicates, 1)
     count = mask.sum(axis=1)
     if (count == 0).any():
@@ -87,19 +82,18 @@ def check_counts(
         raise ValueError(
             f"k must not exceed what is available: {have} candidates"
             + (f", each at most {cap} times" if cap > 1 else "")
-            + f"{in_set(short[0], single)}, got {k}"
+            + f"{in_set(short[0], len(mask))}, got {k}"
         )
-    return cap, _check_required(required, mask, k, single)
+    return cap, _check_required(required, mask, k)
 
 
-def _check_required(
-    required: ArrayLike | None, mask: Mask, k: int, single: bool
-) -> Indices:
+def _check_required(required: ArrayLike | None, mask: Mask, k: int) -> Indices:
     num_sets, num_candidates = mask.shape
     if required is None or np.size(required) == 0:
         return np.zeros((num_sets, 0), dtype=np.int64)
-    given = _leading_axis("required", required) if single else np.asarray(required)
+    given = one_array("required", required)
     if given.ndim != 2 or len(given) != num_sets:
+        single = num_sets == len(given) == 1  # given without this axis
         want, got = ("(r,)", given.shape[1:]) if single else ("(B, r)", given.shape)
         raise ValueError(f"required must have shape {want}, got {got}")
     if not np.issubdtype(given.dtype, np.integer):
@@ -165,7 +159,7 @@ def _cover(blocks: Array) -> int:
     count, least = 0, 0.0
     while True:
         size = np.linalg.svd(rest, compute_uv=False)
-        least = least or 1e-9 * float(size.max())
+        least = least or SINGULAR * float(size.max())
         rank = (size > least).sum(axis=1)
         if not rank.any():
             return max(count, 1)
@@ -179,7 +173,7 @@ def _cover(blocks: Array) -> int:
 def check_required_rank(problem: Problem, where: str) -> None:
     """Enough free choices must remain to complete the span of the required ones."""
     r, p = len(problem.required), problem.num_regressors
-    rank = int(rank_of_blocks(problem.raw[problem.required], problem.root))
+    rank = problem.held_rank
     room = (problem.k - r) * problem.blocks.shape[1]
     if p - rank > room:
         raise ValueError(

@@ -13,6 +13,8 @@ A source answers, of candidates (M, n) of which some are available:
 from __future__ import annotations
 
 import dataclasses
+import warnings
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,21 +33,20 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
-class Source:
+class Source(Protocol):
     """See the top of the module; what is the same in most."""
 
     names: tuple[str, ...] = ()
-    times = 1
+    times: int = 1
     root: Array
 
-    def blocks(self) -> Array:
-        raise NotImplementedError
+    def blocks(self) -> Array: ...
 
-    def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
-        raise NotImplementedError
+    def at(self, argument: str, values: ArrayLike, readings: bool) -> Array: ...
 
     def require_identified(self, measured: ArrayLike | None) -> None:
         """Refuse what candidates leave unknown, by the names of a model."""
+        return
 
     def predicted(self) -> Array | None:
         """Commands of predictions, where their blocks are not those of readings."""
@@ -133,6 +134,7 @@ class Modelled(Source):
     ) -> None:
         if hasattr(model, "located"):  # an arm whose sensor stands somewhere
             model = model.located(candidates[available])
+            _warn_of_radians(model, candidates[available])
         self._model, self._candidates, self._available = model, candidates, available
         self._noise = Noise() if noise is None else noise
         self._prior = model.default_prior() if prior is None else prior
@@ -228,3 +230,15 @@ def _weighted(white: Array, jacobian: Array) -> Array:
     if white.strides[0] == 0 and (white[0] == np.diag(scale)).all():
         return jacobian * scale[:, None]
     return white @ jacobian
+
+
+def _warn_of_radians(arm: Any, candidates: Array) -> None:
+    """Postures of an arm that all lie within one turn, had they been radians."""
+    turning = np.array(arm.command_units) == "deg"
+    largest = np.abs(candidates[:, turning]).max(initial=0.0)
+    if 0.0 < largest < 2.0 * np.pi:
+        warnings.warn(
+            f"no joint of any candidate is over {largest:.3g}, and joints are in "
+            "degrees; use numpy.degrees where these are radians",
+            stacklevel=2,
+        )

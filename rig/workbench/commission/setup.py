@@ -11,8 +11,8 @@ from rig.config import AXIS_NAMES, RigConfig, parse_config
 from rig.config.axis import DEFAULT_ROTATES
 from rig.config.settings import BusSettings
 from rig.core.faults import EXIT_OK, Refused
-from rig.core.lock import BusLock
-from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED
+from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED
+from rig.journal.lock import BusLock
 from rig.workbench.commission import steps
 from rig.workbench.commission.home import can_home
 from rig.workbench.commission.operator import Operator
@@ -51,7 +51,7 @@ def write_config(path: pathlib.Path, given: Given, operator: Operator) -> RigCon
     say(f"2 scan: units 1 to {given.units} on {bus.where}; reads only")
     with BusLock(bus).acquire("setup"):
         found = scan(bus, given.units, lambda text: say(f"  {text}"))
-    say("3 axes: which unit drives which joint. `axes` checks it by moving them")
+    say("3 axes: which unit drives which joint. Step 8 checks it by moving them")
     axes = _ask_axes(found, given, operator)
     say("4 phone")
     form, _, port = (given.imu or "").partition(":")

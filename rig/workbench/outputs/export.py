@@ -102,7 +102,7 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> InverseMap:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise Refused(
             f"{folder}: no calibration to export: {error}. Give the run of a "
-            "`calibrate` that has ended, or its refit"
+            "`jaxcal-rig calibrate` that has ended, or its refit"
         ) from None
     config = records[0]["config"]  # of the run, also where it was refitted
     axes = {axis["name"]: axis for axis in config["axes"]}

@@ -9,15 +9,15 @@ from __future__ import annotations
 import datetime
 import json
 import pathlib
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from jaxcal.pages import Page, Section, Strong, Table, Text, write_page
+from jaxcal.pages import Figure, Page, Section, Strong, Table, Text, write_page
 from rig.config import AXIS_NAMES
-from rig.core.attitude import angles, recorded_frame
+from rig.core.attitude import Array
 from rig.journal import Record, measured_postures
-from rig.workbench.outputs import figures
 from rig.workbench.outputs.console import (
     choice_text,
     drift_text,
@@ -26,7 +26,7 @@ from rig.workbench.outputs.console import (
     numbers,
     recalibrate,
 )
-from rig.workbench.outputs.figures import drawn as _drawn
+from rig.workbench.readings import angles, recorded_frame
 
 FOOTER = (
     "Research software, not a medical device. Calibrate with no patient attached; a "
@@ -35,6 +35,11 @@ FOOTER = (
 ENDS = ("end", "paused", "fault", "stopped", "refused")
 TOLD = (*ENDS, "resume", "stop", "void", "unreachable", "replan", "sender_refused")
 MOST_ROWS = 60  # of the table of postures; more are in pairs.csv
+MARKERS = {
+    "select": "o", "before": "^", "after": "v", "reference": "s", "collect": ".",
+    "goto": "*",
+}  # fmt: skip
+PLANES = ((0, 1), (0, 2), (1, 2))
 
 
 def write_report(folder: pathlib.Path, records: list[Record]) -> pathlib.Path:
@@ -130,7 +135,7 @@ def _checked(summary: Record) -> dict[str, list[Any]]:
             rows.append([title, *(f"{value:.4f}" for value in values)])
     parts: list[Any] = [Table(["", *AXIS_NAMES, "rms", "max"], rows)]
     if "after" in summary:
-        parts.append(_drawn(figures.errors, summary, (9, 3.4), alt))
+        parts.append(drawn(draw_errors, summary, (9, 3.4), alt))
     if "prediction_rms" in summary:
         rms = summary["prediction_rms"]
         parts.append(f"Predicted by the calibration to {rms:.4f} deg rms.")
@@ -153,13 +158,13 @@ def _measured(start: Record, records: list[Record]) -> dict[str, list[Any]]:
     more = f", the first {MOST_ROWS} of them" if len(postures) > MOST_ROWS else ""
     table = Table(head, shown, f"{len(postures)} measured{more}")
     alt = "commanded postures, three planes"
-    parts = [_drawn(figures.postures, postures, (10, 3.2), alt), table]
+    parts = [drawn(draw_postures, postures, (10, 3.2), alt), table]
     blocks = {"Postures": parts}
     if zeros := [record for record in records if record["event"] == "zero"]:
         frame = recorded_frame(start["config"], zeros[-1])
         off = [angles(r, frame) - np.array(r["measured_deg"]) for r in postures]
         alt = "readings of every posture about their mean"
-        blocks["Readings"] = [_drawn(figures.readings, off, (9, 4), alt)]
+        blocks["Readings"] = [drawn(draw_readings, off, (9, 4), alt)]
     return blocks
 
 
@@ -194,3 +199,76 @@ def _moved(summary: Record) -> Table:
     ]
     head = ["changed by", *(f"u {name}" for name in AXIS_NAMES), "b"]
     return Table(head, rows)
+
+
+# Figures
+
+
+def drawn(
+    draw: Callable[[Any, Any], None], data: Any, size: tuple[float, float], alt: str
+) -> Any:
+    """A block of a page: the figure, or words where matplotlib is not installed."""
+    try:
+        import matplotlib.figure
+
+        from jaxcal.plots import as_bytes
+    except ModuleNotFoundError:
+        missing = "no figure: matplotlib is not installed (pip install 'jaxcal[study]')"
+        return Text(f"{alt}: {missing}", "note")
+    figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
+    draw(figure, data)
+    return Figure(as_bytes(figure, "png"), alt)
+
+
+def draw_errors(figure: Any, summary: Record) -> None:
+    """Errors at held-out targets, raw beside compensated."""
+    from jaxcal import plots
+
+    axes = figure.subplots(1, 2)
+    shown = (("raw", "before", "#D55E00"), ("compensated", "after", "#0072B2"))
+    for axis, (title, key, colour) in zip(axes, shown, strict=True):
+        each = {title: summary[key]["each"]}
+        plots.before_after(axis, each, AXIS_NAMES, "deg", color=colour)
+
+
+def draw_postures(figure: Any, records: list[Record]) -> None:
+    """Commands in the three planes, by role."""
+    axes = figure.subplots(1, 3)
+    for axis, (a, b) in zip(axes, PLANES, strict=True):
+        for role, marker in MARKERS.items():
+            points = [r["commanded_deg"] for r in records if r.get("role") == role]
+            if points:
+                u = np.array(points)
+                axis.plot(u[:, a], u[:, b], marker, label=role)
+        axis.set_xlabel(f"{AXIS_NAMES[a]} [deg]")
+        axis.set_ylabel(f"{AXIS_NAMES[b]} [deg]")
+    axes[0].legend(fontsize=8)
+
+
+def draw_readings(figure: Any, off: list[Array]) -> None:
+    """(samples, 3) of each posture about its mean, one after another."""
+    from jaxcal import plots
+
+    axes = figure.subplots(3, 1, sharex=True)
+    for axis, name, column in zip(axes, AXIS_NAMES, np.vstack(off).T, strict=True):
+        plots.residuals(axis, column, markersize=2)
+        axis.set(ylabel=f"{name} [deg]", xlabel="")
+        for end in np.cumsum([len(values) for values in off])[:-1]:
+            axis.axvline(end + 0.5, color="#E6E6E6", linewidth=0.8)
+    axes[-1].set_xlabel("reading, posture by posture, less the posture's mean")
+
+
+def draw_parameters(figure: Any, runs: list[Record]) -> None:
+    """A and b with their intervals, calibration after calibration."""
+    axes = figure.subplots(3, 4, sharex=True)
+    values = np.array([np.column_stack([r["A"], r["b"]]) for r in runs])
+    wide = np.array([r["ci95"] for r in runs])
+    days = np.array([r["time"] for r in runs]) / 86400.0
+    for row, name in enumerate(AXIS_NAMES):
+        for column, source in enumerate((*(f"u {each}" for each in AXIS_NAMES), "b")):
+            axis = axes[row, column]
+            y, e = values[:, row, column], wide[:, row, column]
+            axis.errorbar(days - days[0], y, e, fmt="o-", capsize=3, markersize=4)
+            axis.set_title(f"{name}: {source}", fontsize=9)
+    for axis in axes[-1]:
+        axis.set_xlabel("days")

@@ -17,8 +17,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from rig.config import RigConfig
 from rig.core.attitude import Frame
 from rig.core.drive import Drive
@@ -28,7 +26,7 @@ TELEMETRY = "telemetry.jsonl"
 OLDER = "telemetry.old.jsonl"  # takes what does not fit into TELEMETRY
 PERIOD_S = 0.05
 MAX_BYTES = 8 << 20  # of each of the two files: together over an hour
-MOST_READINGS = 200  # of the window over which scatter and slope are taken
+MOST_READINGS = 200  # of the window over which scatter is taken
 
 
 class Telemetry(threading.Thread):
@@ -78,7 +76,7 @@ class Telemetry(threading.Thread):
             ``time``; ``drives`` (3,) degrees as last polled, None where never;
             ``age`` of the newest reading in seconds and ``rate`` of readings in Hz;
             once there is a zero ``deg`` (3,) of the newest reading, and over the
-            settle window ``std`` (3,) in degrees and ``slope`` (3,) in degrees/s.
+            settle window ``std`` (3,) in degrees.
         """
         now = time.monotonic()
         window = min(1.0, max(0.2, self._config.settle.window_s))
@@ -100,10 +98,6 @@ class Telemetry(threading.Thread):
             return record
         angles = frame.angles([reading.matrix for reading in readings])
         record["deg"] = angles[-1].round(4).tolist()
-        if span > 0 and len(readings) > 2:
-            times = np.array([reading.time for reading in readings])
-            times -= times.mean()
-            slope = times @ (angles - angles.mean(axis=0)) / (times @ times)
+        if len(readings) > 2:
             record["std"] = angles.std(axis=0, ddof=1).round(5).tolist()
-            record["slope"] = slope.round(4).tolist()
         return record

@@ -14,7 +14,7 @@ from rig.config import AXIS_NAMES
 from rig.core.attitude import Array
 from rig.journal import JournalError, Record, read_journal
 from rig.workbench.outputs.console import recalibrate
-from rig.workbench.outputs.figures import drawn, parameters
+from rig.workbench.outputs.report import draw_parameters, drawn
 
 NAMES = [f"A[{y}, {u}]" for y in AXIS_NAMES for u in AXIS_NAMES]
 NAMES = [*NAMES, *(f"b[{y}]" for y in AXIS_NAMES)]  # of the twelve parameters
@@ -161,7 +161,7 @@ def write_trend(folder: pathlib.Path, devices: list[Device]) -> pathlib.Path:
         ]
         if device.calibrations:
             alt = "A and b over time, with their 95 % intervals"
-            blocks.append(drawn(parameters, device.calibrations, (11, 7), alt))
+            blocks.append(drawn(draw_parameters, device.calibrations, (11, 7), alt))
         rows = [[key, json.dumps(v)] for key, v in device.fingerprint.items()]
         blocks.append(Table(["fingerprint", ""], rows, numeric=False))
         sections.append(Section(f"Device {number + 1}", blocks, badge=badge))

@@ -21,7 +21,7 @@ import socket
 import time
 from typing import TYPE_CHECKING, Any
 
-from rig.core.faults import Refused
+from rig.journal.errors import Refused
 
 if TYPE_CHECKING:
     from rig.config.config import RigConfig
@@ -64,7 +64,7 @@ class BusLock:
                 self.release()
                 raise Refused(
                     f"{self.where} is {held_by(told)}. Wait until it ends, or end it "
-                    "with `stop`"
+                    "with `jaxcal-rig stop`"
                 )
             time.sleep(LOOK_S)
         self._told = {}

@@ -1,0 +1,291 @@
+"""``Fit``: what identification found, its uncertainty, and predictions."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal.calibration.discrepancy import WithDiscrepancy
+from jaxcal.checks import numbers
+from jaxcal.models import Affine, Model, Prior, identifiability
+from jaxcal.models.checked import derivative, predict
+from jaxcal.models.identifiability import Identifiability
+
+__all__ = ["Fit"]
+
+Array = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Fit:
+    """The identified map from commands u (n inputs) to outputs y (m of them).
+
+    ``y = f(u; theta)`` with the most probable p parameters; P of them with those of the
+    discrepancy, if any. ``identify`` fills it, in closed form where the model is affine
+    and nothing else is asked for. Arrays are copied and frozen on entry.
+    """
+
+    residuals: Array  # (N, m) measured less predicted, measured unit
+    noise_std: Array | None  # (m,) at weight 1, behind every uncertainty
+    noise_known: bool  # True: noise_std was given; False: it comes from the residuals
+    noise_dof: float  # degrees of freedom of the noise estimated, 0 where known
+    num_measurements: int  # of positive weight
+    input_names: tuple[str, ...]
+    output_names: tuple[str, ...]
+    command_unit: str  # "" where not stated
+    measured_unit: str
+    provenance: Mapping[str, Any]  # created, packages, data_sha256, notes
+    model: Model
+    loss: str  # "student" or "gaussian"
+    estimate: Array  # (P,)
+    joint_covariance: Array | None  # (P, P); None where the noise is unknown
+    centre: Array | None  # (n,) of the affine closed form: with b the outputs there
+    unidentified: Array | None  # (z, P) directions that nothing determines
+    prior_mean: Array  # (P,)
+    prior_precision: Array  # (P,) 0 where nothing was known
+    free: Array  # (P,) 0 where held at the prior's mean, else 1
+    commands: Array  # (N, n) as given
+    estimated_commands: Array | None  # (N, n) where command_std was given
+    loss_weights: Array  # (N,) at most 1; small for an outlier, 0 where left out
+    distance: Array  # (N,) squared, from the fit without that measurement, in noise
+    dof: float  # residual degrees of freedom of all readings, prior counted
+    square: float  # sum of the squared residuals in noise
+    num_readings: int  # of a measurement, less its unknown commands
+    frequencies: Array | None  # (n, D) of the discrepancy
+    phases: Array | None  # (D,)
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                value = np.array(value)
+                value.setflags(write=False)
+                object.__setattr__(self, field.name, value)
+        object.__setattr__(self, "provenance", copy.deepcopy(self.provenance))
+
+    # -- parameters --------------------------------------------------------------------
+
+    @property
+    def num_inputs(self) -> int:
+        """n."""
+        return len(self.input_names)
+
+    @property
+    def num_outputs(self) -> int:
+        """m."""
+        return len(self.output_names)
+
+    @property
+    def parameters(self) -> Array:
+        """(p,) of the model."""
+        return self.estimate[: len(self.model.names)]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """p names of the parameters."""
+        return self.model.names
+
+    @property
+    def covariance(self) -> Array | None:
+        """(p, p) of ``parameters``, directions that nothing determines held fixed.
+
+        None where the noise is unknown.
+        """
+        if self.joint_covariance is None:
+            return None
+        p, n, m = len(self.names), self.num_inputs, self.num_outputs
+        if self.centre is None:
+            return self.joint_covariance[:p, :p]
+        # b = (the outputs at the centre) - A centre
+        to_bias = np.eye(p)
+        to_bias[m * n :, : m * n] = -np.kron(np.eye(m), self.centre)
+        return to_bias @ self.joint_covariance @ to_bias.T
+
+    @property
+    def standard_errors(self) -> Array | None:
+        """(p,); infinite where nothing determines the parameter; None as above."""
+        covariance = self.covariance
+        if covariance is None:
+            return None
+        return np.where(self.undetermined, np.inf, np.sqrt(np.diag(covariance)))
+
+    @property
+    def from_data(self) -> Array | None:
+        """(p,) share of each parameter's prior variance that the measurements removed.
+
+        0: the value is the prior's; 1: it is the measurements'.
+        """
+        if self.standard_errors is None:
+            return None
+        precision = self.prior_precision[: len(self.parameters)]
+        errors = np.where(np.isinf(self.standard_errors), 0.0, self.standard_errors)
+        share = np.clip(1.0 - errors**2 * precision, 0.0, 1.0)
+        return np.where(self.undetermined | (self.free[: len(share)] == 0), 0.0, share)
+
+    def identifiability(self) -> Identifiability:
+        """What the measurements alone say of the parameters, at the estimate."""
+        here = Prior(np.inf, mean=self.parameters)
+        return identifiability(self.model, self.commands, prior=here)
+
+    @property
+    def matrix(self) -> Array:
+        """(m, n) A of an affine model."""
+        self._require_affine("matrix")
+        return self.parameters[: -self.num_outputs].reshape(self.num_outputs, -1)
+
+    @property
+    def bias(self) -> Array:
+        """(m,) b of an affine model."""
+        self._require_affine("bias")
+        return self.parameters[-self.num_outputs :]
+
+    def confidence_intervals(self, confidence: float = 0.95) -> Array:
+        """(p, 2) lower and upper end for each parameter, one at a time.
+
+        Student's t where the noise was estimated, the normal where it was given.
+
+        Args:
+            confidence: probability in (0, 1).
+
+        Raises:
+            ValueError: the noise is unknown, or ``confidence`` is not in (0, 1).
+        """
+        self._require_noise("confidence intervals")
+        half = self._quantile(confidence) * np.asarray(self.standard_errors)
+        return np.stack([self.parameters - half, self.parameters + half], axis=-1)
+
+    def predict_interval(
+        self,
+        commands: ArrayLike,
+        confidence: float = 0.95,
+        *,
+        new_measurement: bool = False,
+    ) -> tuple[Array, Array]:
+        """Lower and upper end, (..., m) each; arguments as for ``predict_std``."""
+        centre = self.predict(commands)
+        half = self._quantile(confidence) * self.predict_std(
+            commands, new_measurement=new_measurement
+        )
+        return centre - half, centre + half
+
+    # -- the fit -----------------------------------------------------------------------
+
+    @property
+    def outliers(self) -> dict[int, float]:
+        """Rows too far from the fit of the others (1 % in all) and their weights."""
+        from scipy import special
+
+        chance = special.chdtrc(self.num_readings, self.distance)
+        at = np.flatnonzero(chance < 0.01 / self.num_measurements)
+        return {int(i): float(self.loss_weights[i]) for i in at}
+
+    def lack_of_fit(self) -> float | None:
+        """p-value of residuals at least this large under the noise that was given.
+
+        Small where the model does not hold, an outlier is among the measurements, or
+        the noise stated is too small. None where no noise was given.
+        """
+        if not self.noise_known or self.dof < 0.5:
+            return None
+        from scipy import special
+
+        return float(special.chdtrc(self.dof, self.square))
+
+    # -- prediction --------------------------------------------------------------------
+
+    def predict(self, commands: ArrayLike) -> Array:
+        """Outputs (..., m) at commands (..., n)."""
+        points = self.points("commands", commands, self.num_inputs)
+        rows = points.reshape(-1, self.num_inputs)
+        found = predict(self.whole, rows, self.estimate)
+        return found.reshape(*points.shape[:-1], self.num_outputs)
+
+    def predict_std(
+        self, commands: ArrayLike, *, new_measurement: bool = False
+    ) -> Array:
+        """Standard deviation of ``predict``.
+
+        Args:
+            commands: (..., n).
+            new_measurement: add the noise of the readings of one more measurement of
+                weight 1, for comparison with it.
+
+        Returns:
+            (..., m); infinite where it depends on what nothing determines.
+
+        Raises:
+            ValueError: the noise is unknown.
+        """
+        points = self.points("commands", commands, self.num_inputs)
+        noise = self._require_noise("prediction uncertainty")
+        rows = points.reshape(-1, self.num_inputs)
+        if self.centre is not None:
+            rows = rows - self.centre
+        slopes = derivative(self.whole, rows, self.estimate)
+        covariance = np.asarray(self.joint_covariance)
+        variance = ((slopes @ covariance) * slopes).sum(axis=-1)
+        std = np.sqrt(np.maximum(variance, 0.0) + float(new_measurement) * noise**2)
+        if self.unidentified is not None:
+            moved = slopes @ self.unidentified.T
+            size = np.abs(slopes) @ np.abs(self.unidentified).T
+            std = np.where((np.abs(moved) > 1e-7 * size).any(axis=-1), np.inf, std)
+        return std.reshape(*points.shape[:-1], self.num_outputs)
+
+    # -- inside ------------------------------------------------------------------------
+
+    @property
+    def whole(self) -> Model:
+        """The model with its discrepancy."""
+        if self.frequencies is None or self.phases is None:
+            return self.model
+        return WithDiscrepancy(self.model, self.frequencies, self.phases)  # type: ignore[return-value]  # no prior, no file of its own
+
+    @property
+    def undetermined(self) -> NDArray[np.bool_]:
+        """(p,) parameters in directions that nothing determines."""
+        if self.unidentified is None:
+            return np.zeros(len(self.parameters), dtype=np.bool_)
+        share = np.abs(self.unidentified)
+        share = share > 1e-7 * share.max(axis=1, keepdims=True)
+        return np.asarray(share.any(axis=0)[: len(self.parameters)])
+
+    def points(self, name: str, values: ArrayLike, width: int) -> Array:
+        points = numbers(name, values)
+        if points.ndim < 1 or points.shape[-1] != width:
+            raise ValueError(
+                f"{name} must have shape (..., {width}), got {points.shape}"
+            )
+        return points
+
+    def _require_noise(self, what: str) -> Array:
+        if self.noise_std is None:
+            raise ValueError(self.no_noise(what))
+        return self.noise_std
+
+    def _quantile(self, confidence: float) -> float:
+        """Half-width of an interval in standard errors."""
+        if not 0.0 < confidence < 1.0:
+            raise ValueError(f"confidence must be in (0, 1), got {confidence}")
+        from scipy import special  # loads in half the time of scipy.stats
+
+        upper = 0.5 + 0.5 * confidence
+        if self.noise_known:
+            return float(special.ndtri(upper))
+        return float(special.stdtrit(self.noise_dof, upper))
+
+    def no_noise(self, what: str) -> str:
+        left = f"only {self.dof:.2g}" if self.dof >= 0.5 else "no"
+        return (
+            f"no {what}: {self.num_measurements} measurements leave {left} residual "
+            f"degree of freedom for {int(self.free.sum())} free parameters, so the "
+            "noise is unknown; measure more or give noise_std"
+        )
+
+    def _require_affine(self, name: str) -> None:
+        if not isinstance(self.model, Affine):
+            raise AttributeError(f"{name}: only an affine model y = A u + b has one")
