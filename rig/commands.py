@@ -20,7 +20,7 @@ def identify(args: argparse.Namespace) -> int:
     """Print what every drive says of itself."""
     from rig.core.bus import Bus, BusError
     from rig.core.drive import Drive
-    from rig.core.lock import BusLock
+    from rig.journal.lock import BusLock
 
     config, code = load(args), EXIT_OK
     with contextlib.ExitStack() as stack:

@@ -20,9 +20,8 @@ from rig.config import (
     parse_config,
 )
 from rig.core.faults import EXIT_FAULT, EXIT_OK, Refused
-from rig.core.lock import BusLock
-from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
-from rig.journal import new_run_folder
+from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord, new_run_folder
+from rig.journal.lock import BusLock
 from rig.sessions import FILE, load, make_simulator
 from rig.workbench.commission import setup as wizard
 from rig.workbench.commission import steps

@@ -21,9 +21,9 @@ from rig.config import (
 from rig.core.faults import Refused
 
 if TYPE_CHECKING:
-    from rig.core.session import Run
     from rig.core.zero import KeptZero
     from rig.simulator import Simulator
+    from rig.workbench.run import Run
 
 FILE = pathlib.Path("rig.toml")  # without --config
 SIMULATION = [
@@ -92,13 +92,12 @@ def _run(
     start: dict[str, Any],
     folder: pathlib.Path | None = None,
 ) -> int:
-    from rig.core.lock import BusLock
-    from rig.core.record import SIGN_CHECKED, DeviceRecord
-    from rig.core.session import Run, run_safely
-    from rig.journal import new_run_folder
+    from rig.journal import SIGN_CHECKED, DeviceRecord, new_run_folder
+    from rig.journal.lock import BusLock
     from rig.signals import Signals
     from rig.workbench.commission.steps import begin_simulated, simulated
     from rig.workbench.outputs.console import listen
+    from rig.workbench.run import Run, run_safely
 
     mode, say = start["mode"], functools.partial(print, flush=True)
     real = start["simulated"] is None
@@ -127,7 +126,8 @@ def _run(
                 place = simulated(simulator, config, record, say)
                 place.folder, place.locked = folder / "axes", True
                 place.folder.mkdir(exist_ok=True)
-                place.listeners = ()  # faults wait for the session's own phases
+                # Faults wait for the session's own phases.
+                place.listeners = (simulator.answer,)
                 begin_simulated(place, SIGN_CHECKED)
         run = Run(
             config,
@@ -146,7 +146,6 @@ def _run(
         if simulator is None:
             run.confirm = functools.partial(_confirm, args)
         else:
-            run.on_imu_port = simulator.start_phone
             run.listeners.append(simulator.hear)
         if args.live or args.live_host:
             from rig.workbench.live import launch
@@ -222,7 +221,7 @@ def _procedure(
 
 def _confirm(args: argparse.Namespace, session: Run) -> None:
     """Ask for what --arm and --zero would have confirmed."""
-    takes_zero = session.frame is None and session.zero_at is None
+    takes_zero = not session.journal.events("zero") and session.zero_at is None
     questions = {
         "arm": "the device will move; nobody and nothing is in its way, no patient is "
         "attached, the emergency stop is at hand"

@@ -19,7 +19,7 @@ from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from rig.core.faults import EXIT_FAULT, EXIT_OK, Fault, Refused
-from rig.core.lock import BusLock, armed_files, held_by, read_armed
+from rig.journal.lock import BusLock, armed_files, held_by, read_armed
 
 if TYPE_CHECKING:
     from rig.core.stop import UnitStop

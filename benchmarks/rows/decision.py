@@ -43,8 +43,11 @@ _CASES = {
     "6 of 50": ("select(sets[0], 6)", 41, 1.0, 0.4),
     "6 of 50, exchange": ("select(sets[0], 6, 'exchange')", 41, 1.0, 0.4),
     "4 of 50, policy": ("select(sets[0], 4, 'policy')", 41, 1.0, 0.4),
+    "12 of 200 with 6 inputs, policy": (
+        "select(rng.random((200, 6)), 12, 'policy')", 41, 1.0, 0.5,
+    ),
     "arm, 8 of 200": (_ARM, 2, 3.0, 2.6),
-}
+}  # fmt: skip
 
 
 def run(budget: Budget) -> Row:

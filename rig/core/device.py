@@ -7,21 +7,33 @@ do nothing else: no JAX, no files but the callback of events.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from rig.config.axis import Pulses
 from rig.config.config import RigConfig
 from rig.config.registers import decode, registers_of
-from rig.core.attitude import Frame
+from rig.core.attitude import Array, Frame
 from rig.core.bus import Bus, BusError, Rejected
 from rig.core.drive import Drive, Status
 from rig.core.faults import LimitError, MotionFault, Requests, StopRequested
 from rig.core.phone import Imu, ImuError
+from rig.core.proof import Proof
 from rig.core.stop import Stopper
+from rig.journal import DeviceRecord, RunFolder
+
+
+class Posture(NamedTuple):
+    """Where to stand, by name."""
+
+    name: str
+    pulses: Pulses  # of pitch, yaw and roll
 
 
 def outside(config: RigConfig, target: Pulses) -> Iterator[str]:
@@ -56,6 +68,7 @@ def check_plan(config: RigConfig, targets: Iterable[Pulses]) -> None:
         raise LimitError("the plan leaves the limits: " + "; ".join(faults))
 
 
+LOOK_S = 0.002  # between two looks for a reading
 OVERDUE_S = 0.3  # of a stop that was asked for and that no loop has answered
 
 
@@ -196,37 +209,59 @@ def timeouts_left(records: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     return left
 
 
+@dataclasses.dataclass
+class Seen:
+    """What the phone has shown of the axes at postures, since the zero."""
+
+    commanded: Array = dataclasses.field(default_factory=lambda: np.zeros(3))  # deg
+    measured: Array = dataclasses.field(default_factory=lambda: np.zeros(3))
+    unproven: list[list[str]] = dataclasses.field(
+        default_factory=lambda: [[], [], []]
+    )  # names of postures since an axis was last seen to follow
+
+
 class Device:
     """Three drives and a phone: armed explicitly, and never moved once stopped."""
 
     def __init__(
         self,
         config: RigConfig,
-        bus: Bus,
-        imu: Imu,
-        signals: Requests,
-        emit: Callable[..., Any],
-        timeouts_left: Mapping[str, Mapping[str, Any]] | None = None,
+        run: RunFolder,
+        record: DeviceRecord,
+        requests: Requests | None = None,
+        *,
+        simulated: bool = False,
     ) -> None:
+        """``simulated``: it need not be slow where nothing is proved."""
         self.config = config
-        self.bus = bus
-        self.imu = imu
-        self.emit = emit
-        self.drives = [Drive(bus, axis) for axis in config.axes]
-        self.stopper = Stopper(self.drives, emit)
+        self.run = run
+        self.record = record
+        self.emit = run.emit
+        self.bus = Bus(config.bus, config.silence_s, run.emit)
+        self.imu = Imu(config.imu, report=run.emit)
+        self.drives = [Drive(self.bus, axis) for axis in config.axes]
+        self.stopper = Stopper(self.drives, run.emit)
+        self.requests = requests or Requests()
+        checked = record.missing(config) is None
+        self.proof = Proof(config.axes, checked, simulated)
         self.armed = False
-        self.frame: Frame | None = None  # once the zero is taken
+        self.moves = 0  # frames that moved a drive
+        self.arrived = 0.0  # monotonic time of the last arrival
+        self.meanwhile: Callable[[], None] = lambda: None  # at every poll of a move
+        self.zero: Posture | None = None  # once it is taken,
+        self.frame: Frame | None = None  # and what the phone reads against it
         self.heard = 0  # connection of the phone by which the frame holds
-        self._signals = signals
+        self.seen = Seen()
         timeouts = config.comm_timeouts_s
-        self.line_watch = LineWatch(self.drives, timeouts, emit, timeouts_left or {})
+        left = timeouts_left(run.journal.records)
+        self.line_watch = LineWatch(self.drives, timeouts, run.emit, left)
         self.heartbeat = Heartbeat(
             self.stopper,
-            signals,
+            self.requests,
             config.heartbeat_s,
             min(timeouts.values(), default=0.0) / 4,
         )
-        bus.check = self._before_exchange
+        self.bus.check = self._before_exchange
 
     def arm(self, reset_alarms: bool = False) -> None:
         """Check everything that must hold before anything may move.
@@ -277,13 +312,13 @@ class Device:
 
     def guard(self, moving: bool = False) -> None:
         """The loop is alive; raise StopRequested where a stop was asked for."""
-        self._signals.tell()
+        self.requests.tell()
         self._before_exchange()
         self.heartbeat.feed(moving)
 
     def _before_exchange(self) -> None:
         """Before every frame: a stop is not kept waiting for the rest of a loop."""
-        self._signals.check_stop()
+        self.requests.check_stop()
         self.stopper.check()
         self.heartbeat.feed()
 
@@ -295,6 +330,17 @@ class Device:
     def statuses(self) -> list[Status]:
         """Of all drives; raises MotionFault on a fault bit."""
         return [drive.sound() for drive in self.drives]
+
+    def attitude(self, since: float = 0.0) -> Array:
+        """(3, 3) of the phone, measured at or after a monotonic time.
+
+        Raises:
+            ImuError: it is stale. StopRequested: a stop was asked for meanwhile.
+        """
+        while (reading := self.imu.latest()).time < since:
+            self.guard()
+            time.sleep(LOOK_S)
+        return reading.matrix
 
     def positions(self) -> Pulses:
         """Where the drives stand, in pulses."""

@@ -228,10 +228,11 @@ class Drive:
         except Rejected:  # a model of the family without this register
             return None
 
-    def homed(self, word: int) -> bool:
-        """Whether a status word says that the drive is homed."""
+    @property
+    def says_homed(self) -> bool:
+        """Whether its status, as last read, says that it is homed."""
         bits = self.axis.map.homed
-        return bits is not None and bits.holds(word)
+        return bits is not None and self.last is not None and bits.holds(self.last.word)
 
     def _read(self, read: Read, retries: int | None = None) -> int:
         unit, order = self.axis.unit, self.axis.map.word_order

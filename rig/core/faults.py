@@ -5,18 +5,19 @@ Nothing heavy is imported here: ``stop`` asks the session before it loads anythi
 
 from __future__ import annotations
 
+import pathlib
 import time
 from collections.abc import Callable
+
+from rig.journal.errors import JournalError
+from rig.journal.errors import Refused as Refused
 
 EXIT_OK = 0
 EXIT_RECALIBRATE = 1  # done, but the errors say: calibrate (again)
 EXIT_BAD_INPUT = 2
 EXIT_FAULT = 3  # stopped by a fault; `resume` goes on
 EXIT_PAUSED = 4  # paused by Ctrl-C; `resume` goes on
-
-
-class Refused(ValueError):
-    """The request makes no sense for this run; nothing was moved."""
+EXIT_INTERRUPTED = 130
 
 
 class LimitError(Refused):
@@ -61,6 +62,27 @@ class PauseRequested(BaseException):
 
 class PlanOnly(BaseException):
     """A dry run has come to the point where it would move."""
+
+
+def ending(error: BaseException, folder: pathlib.Path) -> tuple[int, str, str]:
+    """Exit code, event and reason of a session in a folder that an error ended."""
+    match error:
+        case PlanOnly():
+            return EXIT_OK, "end", ""
+        case PauseRequested():
+            return EXIT_PAUSED, "paused", str(error)
+        case StopRequested():
+            return error.exit_code, "stopped", str(error)
+        case KeyboardInterrupt():
+            return EXIT_INTERRUPTED, "stopped", "SIGINT"
+        case Refused():
+            return EXIT_BAD_INPUT, "refused", str(error)
+        case Fault() | JournalError():
+            return EXIT_FAULT, "fault", str(error)
+        case OSError():
+            text = f"cannot write to {folder}: {error.strerror or error}"
+            return EXIT_FAULT, "fault", text
+    return EXIT_FAULT, "fault", f"{type(error).__name__}: {error}"
 
 
 class Requests:

@@ -9,199 +9,199 @@ import numpy as np
 
 from rig.config.axis import AXIS_NAMES, Pulses
 from rig.core.attitude import Array, Frame, Reading, frame_at, mean_rotation, raw_fields
-from rig.core.device import Device
+from rig.core.device import Device, Posture, Seen
 from rig.core.drive import Status
 from rig.core.faults import MotionFault, NotFollowing
+from rig.core.motion import Standing
 
 FOLLOW_MIN_DEG = 3.0  # a commanded change this large must be seen by the IMU
 FOLLOW_SHARE = 0.1  # at least this share of it
 FOLLOW_LEADING = 0.3  # of axes that move at least this share of the largest move
 
 
-class Observer:
-    """What the IMU says about a device that stands."""
+def zeroed(device: Device, frame: Frame, zero: Posture) -> None:
+    """Measure against this zero posture from now on."""
+    device.frame, device.zero, device.heard = frame, zero, device.imu.connections
+    device.seen = Seen(device.config.to_deg(zero.pulses))
 
-    def __init__(self, device: Device) -> None:
-        self.device = device
-        self.config = device.config
-        self._seen = (np.zeros(3), np.zeros(3))  # last commanded and measured
-        self._unproven: list[list[str]] = [[], [], []]  # postures, an axis
 
-    def zeroed(self, frame: Frame, pulses: Pulses) -> None:
-        """Measure against this zero posture from now on."""
-        self.device.frame, self.device.heard = frame, self.device.imu.connections
-        self._seen = (self.config.to_deg(pulses), np.zeros(3))
+def measure(standing: Standing, samples: int | None = None) -> dict[str, Any]:
+    """Wait until the device has settled where it stands, then average fresh readings.
 
-    def measure(
-        self, target: Pulses, label: str = "", samples: int | None = None
-    ) -> dict[str, Any]:
-        """Wait until the device has settled, then average fresh readings.
+    Args:
+        standing: the device at a posture.
+        samples: readings to average; as configured when not given.
 
-        Args:
-            target: pulses commanded.
-            label: name of the posture.
-            samples: readings to average; as configured when not given.
+    Returns:
+        For the journal: ``pulses`` commanded and ``feedback`` of the drives;
+        ``commanded_deg``, ``measured_deg`` and, of single readings, ``std_deg`` (3,);
+        ``samples``; ``attitude`` (3, 3), the mean of the phone's; ``quaternions`` and
+        ``stamps`` of every reading.
 
-        Returns:
-            For the journal: ``pulses`` commanded and ``feedback`` of the drives;
-            ``commanded_deg``, ``measured_deg`` and, of single readings, ``std_deg``
-            (3,); ``samples``; ``attitude`` (3, 3), the mean of the phone's;
-            ``quaternions`` and ``stamps`` of every reading.
+    Raises:
+        MotionFault: it does not settle in time, or the IMU disagrees with the drives.
+        ImuError, BusError, StopRequested: stop everything.
+    """
+    device, (name, target) = standing
+    settle = device.config.settle
+    deadline = time.monotonic() + settle.timeout_s
+    while True:
+        device.emit("phase", phase="settling")
+        statuses = _settled(device, deadline)
+        device.emit("phase", phase="measuring")
+        readings = _collect(device, samples or settle.samples)
+        if not readings:  # the stream paused
+            continue
+        frame, matrices = _frame(device, readings), [r.matrix for r in readings]
+        raw = frame.angles(matrices)
+        std = raw.std(axis=0, ddof=1) if len(raw) > 1 else np.zeros(3)
+        if (std <= settle.std_deg).all():
+            break  # or settle again: the readings themselves were not quiet
+    attitude = mean_rotation(matrices)
+    angles = frame.angles(attitude)
+    feedback = [status.position for status in statuses]
+    commanded = device.config.to_deg(target)
+    _check_position(device, target, feedback)
+    if device.oriented:
+        _check_agreement(device, commanded, angles, name)
+    return {
+        "pulses": list(target),
+        "feedback": feedback,
+        "commanded_deg": commanded.round(9).tolist(),
+        "measured_deg": angles.round(9).tolist(),
+        "std_deg": std.round(6).tolist(),
+        "samples": len(readings),
+        "attitude": attitude.round(12).tolist(),
+        **raw_fields(readings),
+    }
 
-        Raises:
-            MotionFault: it does not settle in time, or the IMU disagrees with the
-                drives. ImuError, BusError, StopRequested: stop everything.
-        """
-        settle = self.config.settle
-        deadline = time.monotonic() + settle.timeout_s
-        while True:
-            self.device.emit("phase", phase="settling")
-            statuses = self._settled(deadline)
-            self.device.emit("phase", phase="measuring")
-            readings = self._collect(samples or settle.samples)
-            if not readings:  # the stream paused
-                continue
-            frame, matrices = self._frame(readings), [r.matrix for r in readings]
-            raw = frame.angles(matrices)
-            std = raw.std(axis=0, ddof=1) if len(raw) > 1 else np.zeros(3)
-            if (std <= settle.std_deg).all():
-                break  # or settle again: the readings themselves were not quiet
-        attitude = mean_rotation(matrices)
-        angles = frame.angles(attitude)
-        feedback = [status.position for status in statuses]
-        self._check_position(target, feedback)
-        if self.device.oriented:
-            self._check_agreement(self.config.to_deg(target), angles, label)
-        return {
-            "pulses": list(target),
-            "feedback": feedback,
-            "commanded_deg": self.config.to_deg(target).round(9).tolist(),
-            "measured_deg": angles.round(9).tolist(),
-            "std_deg": std.round(6).tolist(),
-            "samples": len(readings),
-            "attitude": attitude.round(12).tolist(),
-            **raw_fields(readings),
-        }
 
-    def _frame(self, readings: list[Reading]) -> Frame:
-        """Before the zero is taken, the first of the readings stands for it."""
-        return self.device.frame or frame_at(self.config, readings[0].matrix)
+def _frame(device: Device, readings: list[Reading]) -> Frame:
+    """Before the zero is taken, the first of the readings stands for it."""
+    return device.frame or frame_at(device.config, readings[0].matrix)
 
-    def _settled(self, deadline: float) -> list[Status]:
-        """Poll until drives and IMU are quiet; what the drives say then."""
-        settle, poll = self.config.settle, self.config.motion.poll_s
-        since = time.monotonic()
-        while True:
-            self.device.guard()
-            statuses = self.device.statuses()
-            now = time.monotonic()
-            if any(status.moving for status in statuses):
-                since = now
-            self.device.imu.check_fault()
-            # The last window_s, or the last min_samples of a slow phone.
-            readings = self.device.imu.since(since)
-            recent = sum(reading.time >= now - settle.window_s for reading in readings)
-            readings = readings[-max(recent, settle.min_samples) :]
-            span = readings[-1].time - readings[0].time if readings else 0.0
-            hint = "Check the phone's app and its Wi-Fi"
-            if len(readings) < settle.min_samples or span < 0.8 * settle.window_s:
-                reason = f"{len(readings)} readings over {span:.2f} s of the window"
-            elif now - readings[-1].time > self.config.imu.stale_s:
-                reason = "the phone's readings are stale"
-            else:
-                reason = self._unquiet(readings)
-                if not reason:
-                    return statuses
-                hint = (
-                    "The device or the phone still shakes, or the phone is noisier "
-                    "than the limit: compare its scatter, `jaxcal-rig imu`, and raise "
-                    "that key of [settle] above it"
-                )
-            if now > deadline:
-                raise MotionFault(
-                    f"the device did not settle in {settle.timeout_s:g} s: {reason}. "
-                    f"{hint}"
-                )
-            time.sleep(poll)
 
-    def _unquiet(self, readings: list[Reading]) -> str:
-        """What of a window's readings is over its limit; empty where nothing is."""
-        settle = self.config.settle
-        angles = self._frame(readings).angles([reading.matrix for reading in readings])
-        times = np.array([reading.time for reading in readings])
-        times = times - times.mean()
-        slope = np.abs(times @ (angles - angles.mean(axis=0)) / (times @ times))
-        for what, found, limit, unit in (
-            ("std_deg", angles.std(axis=0, ddof=1), settle.std_deg, "deg"),
-            ("slope_deg_s", slope, settle.slope_deg_s, "deg/s"),
-        ):
-            worst = int(np.argmax(found))
-            if found[worst] > limit:
-                axis, value = AXIS_NAMES[worst], found[worst]
-                return f"{axis} reads {value:.3f} {unit} (settle.{what} = {limit:g})"
-        return ""
-
-    def _collect(self, wanted: int) -> list[Reading]:
-        """Fresh readings as wanted, or none where the stream paused or time is up."""
-        settle, imu = self.config.settle, self.device.imu
-        start = polled = time.monotonic()
-        deadline = start + settle.timeout_s * max(1.0, wanted / settle.samples)
-        while True:
-            self.device.guard()
-            imu.check_fault()
-            readings = imu.since(start)
-            if len(readings) >= wanted:
-                return readings[:wanted]
-            now = time.monotonic()
-            newest = readings[-1].time if readings else start
-            if now - newest > self.config.imu.stale_s or now > deadline:
-                return []
-            if now - polled > self.config.motion.poll_s:
-                polled = now
-                if any(status.moving for status in self.device.statuses()):
-                    raise MotionFault(
-                        "a drive moves while the posture is measured. Stop the other "
-                        "controller"
-                    )
-            time.sleep(0.002)
-
-    def _check_position(self, target: Pulses, feedback: list[int]) -> None:
-        """The drives still stand on their targets."""
-        tolerance = self.config.motion.position_tolerance_deg
-        for axis, goal, here in zip(self.config.axes, target, feedback, strict=True):
-            if abs(goal - here) > axis.pulses_within(tolerance):
-                raise MotionFault(
-                    f"{axis.name} left its target while settling: {here} pulses "
-                    f"instead of {goal}. Check holding torque and load, and that no "
-                    "other controller moves it"
-                )
-
-    def _check_agreement(self, commanded: Array, measured: Array, label: str) -> None:
-        """The joints are where the drives say, roughly, and moved when they moved."""
-        apart = np.abs(measured - commanded)
-        if (apart > self.config.motion.max_disagreement_deg).any():
-            worst = int(np.argmax(apart))
-            raise MotionFault(
-                f"the IMU reads {AXIS_NAMES[worst]} {apart[worst]:.1f} deg away from "
-                "the command, more than motion.max_disagreement_deg. Check zero, axis "
-                "order and signs"
+def _settled(device: Device, deadline: float) -> list[Status]:
+    """Poll until drives and IMU are quiet; what the drives say then."""
+    settle, poll = device.config.settle, device.config.motion.poll_s
+    since = time.monotonic()
+    while True:
+        device.guard()
+        statuses = device.statuses()
+        now = time.monotonic()
+        if any(status.moving for status in statuses):
+            since = now
+        device.imu.check_fault()
+        # The last window_s, or the last min_samples of a slow phone.
+        readings = device.imu.since(since)
+        recent = sum(reading.time >= now - settle.window_s for reading in readings)
+        readings = readings[-max(recent, settle.min_samples) :]
+        span = readings[-1].time - readings[0].time if readings else 0.0
+        hint = "Check the phone's app and its Wi-Fi"
+        if len(readings) < settle.min_samples or span < 0.8 * settle.window_s:
+            reason = f"{len(readings)} readings over {span:.2f} s of the window"
+        elif now - readings[-1].time > device.config.imu.stale_s:
+            reason = "the phone's readings are stale"
+        else:
+            reason = _unquiet(device, readings)
+            if not reason:
+                return statuses
+            hint = (
+                "The device or the phone still shakes, or the phone is noisier "
+                "than the limit: compare its scatter, `jaxcal-rig imu`, and raise "
+                "that key of [settle] above it"
             )
-        way = commanded - self._seen[0]
-        asked = np.abs(way)
-        seen = np.sign(way) * (measured - self._seen[1])
-        leading = max(FOLLOW_MIN_DEG, FOLLOW_LEADING * float(asked.max()))
-        for index, name in enumerate(AXIS_NAMES):
-            if asked[index] < leading:
-                self._unproven[index].append(label)
-            elif seen[index] < FOLLOW_SHARE * asked[index]:
-                hint = "a slipped coupling, a frozen stream, or axes mixed up"
-                if seen[index] < -FOLLOW_SHARE * asked[index]:
-                    hint = f"axes.{name}.direction, its wiring, and imu.signs"
-                raise NotFollowing(
-                    f"the drive of {name} turned {asked[index]:.1f} deg, the IMU "
-                    f"saw {seen[index]:.2f}. Look for {hint}",
-                    self._unproven[index],
+        if now > deadline:
+            raise MotionFault(
+                f"the device did not settle in {settle.timeout_s:g} s: {reason}. {hint}"
+            )
+        time.sleep(poll)
+
+
+def _unquiet(device: Device, readings: list[Reading]) -> str:
+    """What of a window's readings is over its limit; empty where nothing is."""
+    settle = device.config.settle
+    angles = _frame(device, readings).angles([reading.matrix for reading in readings])
+    times = np.array([reading.time for reading in readings])
+    times = times - times.mean()
+    slope = np.abs(times @ (angles - angles.mean(axis=0)) / (times @ times))
+    for what, found, limit, unit in (
+        ("std_deg", angles.std(axis=0, ddof=1), settle.std_deg, "deg"),
+        ("slope_deg_s", slope, settle.slope_deg_s, "deg/s"),
+    ):
+        worst = int(np.argmax(found))
+        if found[worst] > limit:
+            axis, value = AXIS_NAMES[worst], found[worst]
+            return f"{axis} reads {value:.3f} {unit} (settle.{what} = {limit:g})"
+    return ""
+
+
+def _collect(device: Device, wanted: int) -> list[Reading]:
+    """Fresh readings as wanted, or none where the stream paused or time is up."""
+    settle, imu = device.config.settle, device.imu
+    start = polled = time.monotonic()
+    deadline = start + settle.timeout_s * max(1.0, wanted / settle.samples)
+    while True:
+        device.guard()
+        imu.check_fault()
+        readings = imu.since(start)
+        if len(readings) >= wanted:
+            return readings[:wanted]
+        now = time.monotonic()
+        newest = readings[-1].time if readings else start
+        if now - newest > device.config.imu.stale_s or now > deadline:
+            return []
+        if now - polled > device.config.motion.poll_s:
+            polled = now
+            if any(status.moving for status in device.statuses()):
+                raise MotionFault(
+                    "a drive moves while the posture is measured. Stop the other "
+                    "controller"
                 )
-            else:
-                self._unproven[index] = []
-        self._seen = (commanded, measured)
+        time.sleep(0.002)
+
+
+def _check_position(device: Device, target: Pulses, feedback: list[int]) -> None:
+    """The drives still stand on their targets."""
+    tolerance = device.config.motion.position_tolerance_deg
+    for axis, goal, here in zip(device.config.axes, target, feedback, strict=True):
+        if abs(goal - here) > axis.pulses_within(tolerance):
+            raise MotionFault(
+                f"{axis.name} left its target while settling: {here} pulses "
+                f"instead of {goal}. Check holding torque and load, and that no "
+                "other controller moves it"
+            )
+
+
+def _check_agreement(
+    device: Device, commanded: Array, measured: Array, label: str
+) -> None:
+    """The joints are where the drives say, roughly, and moved when they moved."""
+    apart = np.abs(measured - commanded)
+    if (apart > device.config.motion.max_disagreement_deg).any():
+        worst = int(np.argmax(apart))
+        raise MotionFault(
+            f"the IMU reads {AXIS_NAMES[worst]} {apart[worst]:.1f} deg away from "
+            "the command, more than motion.max_disagreement_deg. Check zero, axis "
+            "order and signs"
+        )
+    seen = device.seen
+    way = commanded - seen.commanded
+    asked = np.abs(way)
+    followed = np.sign(way) * (measured - seen.measured)
+    leading = max(FOLLOW_MIN_DEG, FOLLOW_LEADING * float(asked.max()))
+    for index, name in enumerate(AXIS_NAMES):
+        if asked[index] < leading:
+            seen.unproven[index].append(label)
+        elif followed[index] < FOLLOW_SHARE * asked[index]:
+            hint = "a slipped coupling, a frozen stream, or axes mixed up"
+            if followed[index] < -FOLLOW_SHARE * asked[index]:
+                hint = f"axes.{name}.direction, its wiring, and imu.signs"
+            raise NotFollowing(
+                f"the drive of {name} turned {asked[index]:.1f} deg, the IMU "
+                f"saw {followed[index]:.2f}. Look for {hint}",
+                seen.unproven[index],
+            )
+        else:
+            seen.unproven[index] = []
+    seen.commanded, seen.measured = commanded, measured

@@ -152,10 +152,11 @@ class SimDrive:
         change = max(-self._accel * dt, min(self._accel * dt, wanted - self.velocity))
         self.velocity += change
         step = self.velocity * dt
-        # The last step ends on the target; only a drive sent back while it runs fast
-        # passes it.
+        # The last step ends on the target, however short it is cut by a look at the
+        # drive; only a drive sent back while it runs fast passes it.
         near = abs(error) <= max(abs(step), 0.5)
-        if near and abs(self.velocity) <= 20 * self._accel * dt + 1.0:
+        whole = STEP_S * self._speedup
+        if near and abs(self.velocity) <= 20 * self._accel * whole + 1.0:
             self.position, self.velocity = float(self.target), 0.0
             self.moving, self.done = False, True
             if self._homing:

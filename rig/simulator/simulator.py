@@ -85,8 +85,14 @@ class Simulator:
 
     def hear(self, record: dict[str, Any]) -> None:
         """Listen to the events of a session."""
+        self.answer(record)
         if record["event"] == "phase":
             self.enter(record["phase"])
+
+    def answer(self, record: dict[str, Any]) -> None:
+        """Start the phone once a session listens to it."""
+        if record["event"] == "listening":
+            self.start_phone(record["port"])
 
     def enter(self, phase: str) -> None:
         """The session entered a phase: faults that wait for it begin."""

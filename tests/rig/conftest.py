@@ -4,13 +4,9 @@ import pytest
 from commission import device, quick_text
 
 from rig.config import load_config
-from rig.core.record import (
-    HOMED,
-    IDENTIFIED,
-    SIGN_CHECKED,
-    DeviceRecord,
-)
-from rig.workbench.commission import steps, unproved
+from rig.core import proof
+from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
+from rig.workbench.commission import steps
 
 
 @pytest.fixture
@@ -18,8 +14,8 @@ def at(tmp_path, monkeypatch):
     """An empty folder to work in, and axes that need not be watched by a person."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(steps, "WATCH_S", 0.3)
-    monkeypatch.setattr(unproved, "SLOW_DEG_S", 400.0)
-    monkeypatch.setattr(unproved, "LOOK_S", 0.01)
+    monkeypatch.setattr(proof, "SLOW_DEG_S", 400.0)
+    monkeypatch.setattr(proof, "LOOK_S", 0.01)
     return tmp_path
 
 

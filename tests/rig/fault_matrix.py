@@ -40,13 +40,12 @@ from harness import (
 from rig.config import RigConfig, parse_config
 from rig.core.bus import Bus
 from rig.core.drive import Drive
-from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
-from rig.core.session import Run
-from rig.journal import read_journal
+from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord, read_journal
 from rig.simulator import Simulator, Truth, parse_fault
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.steps import Place, go_home, identify, simulated
 from rig.workbench.commission.steps import axes as check_the_axes
+from rig.workbench.run import Run
 
 PHASES = ("zeroing", "moving", "settling", "measuring", "saving")
 FAULTS = (
@@ -268,14 +267,14 @@ def _turn_the_heading(sim: Simulator, run: Run, served: RigConfig) -> None:
 
 def _send_strangers(sim: Simulator, run: Run, served: RigConfig) -> None:
     """400 of another address, each with a body of 64 kB, refused unread."""
-    assert run.device is not None
+    port = run.journal.events("listening")[-1]["port"]
     head = b"POST / HTTP/1.1\r\nContent-Length: 1000000\r\n\r\n"
     before = threading.active_count()
     for _ in range(400):
         with socket.socket() as stranger:
             stranger.bind(("127.0.0.5", 0))
             with contextlib.suppress(OSError):  # it is refused while it sends
-                stranger.connect(("127.0.0.1", run.device.imu.port))
+                stranger.connect(("127.0.0.1", port))
                 stranger.sendall(head + b"x" * 65536)
         assert threading.active_count() <= before, "a stranger has a thread"
 
@@ -379,7 +378,7 @@ def _axes_cell(fault: str, folder: pathlib.Path) -> Outcome:
         for state in (IDENTIFIED, HOMED):
             record.reach(state, wrong)
         operator = Operator(yes=True, say=said.append)
-        place = Place(wrong, record, operator, on_imu_port=sim.start_phone)
+        place = Place(wrong, record, operator, listeners=(sim.answer,))
         start, far = sim.plant.joints(), np.zeros(3)
         attitude = sim.plant.attitude
 
@@ -498,7 +497,7 @@ def _host_cell(
         code, resumes, said = first, 0, []
         while code != 0 and resumes < MAX_RESUMES:
             resumes += 1
-            code = session(config, folder, sim, said, on_imu_port=lambda port: None)
+            code = session(config, folder, sim, said, answer=False)
             # Killed in its last phase, the run has nothing left to move or to stop.
             over = fault == "sigkill" and phase == "finishing"
             armed = not over and code != 2

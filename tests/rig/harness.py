@@ -18,14 +18,14 @@ from unittest import mock
 from rig.config import RigConfig, parse_config
 from rig.config.files import EXAMPLES
 from rig.core import stop
-from rig.core.lock import BusLock
-from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
-from rig.core.session import Run, run_safely
+from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
+from rig.journal.lock import BusLock
 from rig.signals import Signals
 from rig.simulator import Simulator, Truth
 from rig.workbench.outputs import report
 from rig.workbench.outputs.console import listen
 from rig.workbench.procedures.calibrate import calibrate
+from rig.workbench.run import Run, run_safely
 
 # A simulated drive stands within 0.1 s; for a dead one the whole time is waited.
 stop.VERIFY_S = 0.6
@@ -118,7 +118,7 @@ def session(
     sim: Simulator | None = None,
     said: list[str] | None = None,
     listeners=(),
-    on_imu_port=None,
+    answer: bool = True,
     figures: bool = False,
     record: DeviceRecord | None = None,
 ) -> int:
@@ -137,8 +137,8 @@ def session(
         start={"simulated": None, "inputs": {}, "maps_from": "."},
         reset_alarms=True,
     )
-    if on_imu_port or sim:
-        run.on_imu_port = on_imu_port or sim.start_phone
+    if sim and answer:
+        run.listeners.append(sim.answer)
     for listener in listeners:
         on_phase(run, lambda phase, f=listener: f(run, phase))
     with contextlib.nullcontext() if figures else no_figures():

@@ -15,7 +15,7 @@ from test_rig_play import saved
 
 from rig.journal import read_journal
 from rig.simulator import Simulator, Truth
-from rig.workbench.commission import characterise, steps, unproved
+from rig.workbench.commission import characterise, steps
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.probe import ENOUGH_DEG
 from rig.workbench.procedures.checking import load_calibration
@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow  # minutes together; test_rig_play.py is the quick
 @pytest.fixture
 def measured(tmp_path, monkeypatch):
     """Measure an axis of a simulated device: exit code, record, text."""
-    monkeypatch.setattr(unproved, "SLOW_DEG_S", 400.0)
+    monkeypatch.setattr("rig.core.proof.SLOW_DEG_S", 400.0)
 
     def measure(axis, into=None, limits=None, **truth):
         config = fast_config(limits).model_copy(update={"output": str(tmp_path)})
@@ -36,7 +36,7 @@ def measured(tmp_path, monkeypatch):
             record = commissioned(served, tmp_path)
             place = steps.Place(
                 served, record, Operator(yes=True, say=told.append),
-                full_speed=True, on_imu_port=sim.start_phone,
+                full_speed=True, listeners=(sim.answer,),
             )  # fmt: skip
             place.folder = tmp_path / "run"
             place.folder.mkdir()

@@ -17,13 +17,8 @@ from harness import changed, fast_config, simulator
 from rig.__main__ import main
 from rig.config import load_config
 from rig.core.faults import Refused
-from rig.core.record import (
-    HOMED,
-    SIGN_CHECKED,
-    ZEROED,
-    DeviceRecord,
-    check_drives,
-)
+from rig.core.known import check_drives
+from rig.journal import HOMED, SIGN_CHECKED, ZEROED, DeviceRecord
 from rig.simulator import Truth
 from rig.simulator.drive import SimDrive
 from rig.workbench.commission import bench, home, steps
@@ -147,7 +142,7 @@ def test_a_held_key_moves_and_letting_go_stops(at):
     try:
         os.write(terminal, b"jog\n")
         wait_for("hold + or an arrow")
-        for _ in range(10):
+        for _ in range(30):
             os.write(terminal, b"+")
             time.sleep(0.1)
         wait_for("stands at")

@@ -13,14 +13,14 @@ from harness import fast_text
 
 from rig.__main__ import main
 from rig.config.settings import BusSettings
-from rig.core import lock
 from rig.core.faults import Refused
-from rig.core.lock import BusLock
+from rig.journal import lock
+from rig.journal.lock import BusLock
 
 HOLDER = """
 import sys, time
 from rig.config.settings import BusSettings
-from rig.core import lock
+from rig.journal import lock
 import pathlib
 lock.FOLDER = pathlib.Path(sys.argv[1])
 settings = BusSettings(transport="tcp", host="localhost", port=int(sys.argv[2]))

@@ -81,7 +81,8 @@ def test_a_move_that_the_drive_already_finished_counts_as_taken():
         told = spoiling(motion, once("lost_write_reply")(motion.sim))
         motion.move_to(motion.config.to_pulses([-6, 9, -2]), "x")
         assert outcomes(told) == ["obeyed"]
-        assert [len(ran) for ran in motion.sim.executions()] == [1, 1, 1]
+        for ran in motion.sim.executions():  # none was sent twice
+            assert len(ran) == len(set(ran)) > 0
 
 
 @pytest.mark.parametrize("register_map", available_maps())

@@ -5,14 +5,14 @@ import dataclasses
 import signal
 import threading
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from harness import HASTY, UNSETTLED, WATCHED, fast_config, fast_text, simulator
 
 from rig.config import parse_config
-from rig.core.bus import Bus
-from rig.core.device import Device, approach, check_plan
+from rig.core.device import Device, Posture, approach, check_plan
 from rig.core.faults import (
     LimitError,
     MotionFault,
@@ -20,11 +20,11 @@ from rig.core.faults import (
     StopRequested,
     Unreachable,
 )
-from rig.core.measure import Observer
-from rig.core.motion import Motion
-from rig.core.phone import Imu
+from rig.core.measure import measure
+from rig.core.motion import Standing, move
+from rig.core.proof import GROWTH, SHOWN_DEG
 from rig.signals import Signals
-from rig.simulator import parse_fault
+from rig.simulator import Truth, parse_fault
 
 
 @contextlib.contextmanager
@@ -33,22 +33,43 @@ def bench(config=None, arm=True, **options):
     config = config or fast_config()
     with simulator(config, **options) as sim:
         served = sim.start()
-        with Imu(served.imu) as imu, Bus(served.bus) as bus:
+        run = SimpleNamespace(
+            emit=lambda event, **fields: sim.hear({"event": event, **fields}),
+            journal=SimpleNamespace(records=[]),
+        )
+        checked = SimpleNamespace(missing=lambda config: None)
+        device = Device(served, run, checked, Signals())
+        with device.imu as imu, device.bus:
             sim.start_phone(imu.port)
             imu.wait_for_stream(5)
-            signals = Signals()
-            device = Device(
-                served, bus, imu, signals,
-                lambda event, **fields: sim.hear({"event": event, **fields}),
-            )  # fmt: skip
-            motion = Motion(device)
-            motion.sim, motion.signals = sim, signals
             if arm:
                 device.arm()
             try:
-                yield motion
+                yield Motion(device, sim)
             finally:
                 device.heartbeat.close()
+
+
+@dataclasses.dataclass
+class Motion:
+    """A device that is moved, and the simulator behind it."""
+
+    device: Device
+    sim: object
+
+    @property
+    def config(self):
+        return self.device.config
+
+    @property
+    def signals(self):
+        return self.device.requests
+
+    def move_to(self, target, name):
+        return move(self.device, Posture(name, target))
+
+    def measure(self, target):
+        return measure(Standing(self.device, Posture("", target)))
 
 
 def test_nothing_moves_before_arming():
@@ -115,16 +136,46 @@ def test_a_target_outside_sends_nothing():
 
 def test_long_moves_are_split_and_short_ones_are_not():
     with bench() as motion:
-        start = motion.config.to_deg(motion.device.positions())
+        start = motion.device.positions()
         target = motion.config.to_pulses([18.0, -18.0, 18.0])
         motion.move_to(target, "far")
-        way = np.abs(motion.config.to_deg(target) - start).max()
-        steps = int(np.ceil(way / motion.config.motion.max_step_deg))
+        first = len(motion.sim.executions()[0])
+        motion.move_to(start, "back")
+        way = np.abs(motion.config.to_deg(np.subtract(target, start))).max()
+        steps = first + int(np.ceil(way / motion.config.motion.max_step_deg))
+        assert [len(ran) for ran in motion.sim.executions()] == [steps] * 3
+        motion.move_to(target, "far")
+        steps = 2 * steps - first
         assert [len(ran) for ran in motion.sim.executions()] == [steps] * 3
         near = motion.config.to_pulses([17.0, -17.0, 17.0])
         motion.move_to(near, "near")
         assert [len(ran) for ran in motion.sim.executions()] == [steps + 1] * 3
         assert motion.device.positions() == near
+
+
+def test_a_session_begins_with_a_degree_and_grows():
+    with bench() as motion:
+        start = motion.config.to_deg(motion.device.positions())
+        target = motion.config.to_pulses([18.0, -18.0, 18.0])
+        motion.move_to(target, "far")
+        for ran, axis, begin in zip(
+            motion.sim.executions(), motion.config.axes, start, strict=True
+        ):
+            ways = np.abs(np.diff([begin, *map(axis.to_deg, ran)]))
+            assert ways[0] <= SHOWN_DEG + 0.01
+            assert (ways[1:] <= GROWTH * ways[:-1] + 0.01).all()
+
+
+def test_a_gearing_that_was_changed_since_is_seen_in_the_first_degree():
+    """Ten times as far as told, by a drive whose register does not say so."""
+    config = fast_config()
+    pulses = config.axes[0].pulses_per_rev // 10
+    truth = Truth(noise_deg=0.0, drive_pulses_per_rev=(pulses,) * 3)
+    with bench(config, truth=truth) as motion:
+        begin = motion.sim.plant.joints()
+        with pytest.raises(MotionFault, match=r"the phone turned .* that may turn it"):
+            motion.move_to(motion.config.to_pulses([10.0, -10.0, 10.0]), "far")
+        assert np.abs(motion.sim.plant.joints() - begin).max() < 10.0 * SHOWN_DEG
 
 
 def test_every_posture_is_approached_from_one_side():
@@ -134,10 +185,12 @@ def test_every_posture_is_approached_from_one_side():
             target = motion.config.to_pulses(goal)
             motion.move_to(target, "x")
             via, _ = approach(motion.config, target)
-            for ran, last, before in zip(
-                motion.sim.executions(), target, via, strict=True
+            for ran, last, before, axis in zip(
+                motion.sim.executions(), target, via, motion.config.axes, strict=True
             ):
-                assert ran[-2:] == [before, last]
+                assert before in ran and ran[-1] == last
+                up = [axis.to_deg(p) for p in ran[len(ran) - ran[::-1].index(before) :]]
+                assert up == sorted(up)
 
 
 def test_backlash_becomes_pure_bias_when_approached_from_one_side():
@@ -163,7 +216,7 @@ def test_settled_means_drives_done_and_imu_quiet():
     with bench(noise_deg=0.01) as motion:
         target = motion.config.to_pulses([5, 5, 5])
         motion.move_to(target, "x")
-        measured = Observer(motion.device).measure(target)
+        measured = motion.measure(target)
         assert measured["samples"] == motion.config.settle.samples
         assert max(measured["std_deg"]) <= motion.config.settle.std_deg
         assert measured["feedback"] == list(target)
@@ -174,7 +227,7 @@ def test_a_shaking_device_never_settles():
     reason = r"did not settle.*(std_deg|readings over)"
     with bench(fast_config(UNSETTLED), noise_deg=1.0) as motion:
         with pytest.raises(MotionFault, match=reason):
-            Observer(motion.device).measure(motion.device.positions())
+            motion.measure(motion.device.positions())
 
 
 def test_a_creeping_device_never_settles():
@@ -183,7 +236,7 @@ def test_a_creeping_device_never_settles():
         plant = motion.sim.plant
         plant.truth = dataclasses.replace(plant.truth, drift_deg_per_min=60.0)
         with pytest.raises(MotionFault, match=r"did not settle.*slope"):
-            Observer(motion.device).measure(motion.device.positions())
+            motion.measure(motion.device.positions())
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,10 @@ from harness import RATE_HZ, SPEEDUP, commissioned, fast_config, make_run
 
 import jaxcal
 from rig.core.faults import Refused
-from rig.core.session import run_safely
 from rig.simulator import Simulator, Truth
 from rig.workbench.procedures.checking import goto, keep, load_calibration
 from rig.workbench.procedures.play import CHARACTERISED, Play
+from rig.workbench.run import run_safely
 
 WIDTH = 0.4
 
@@ -78,7 +78,7 @@ def test_goto_reaches_through_play(desired, below, tmp_path):
         folder.mkdir()
         run = make_run(sim.start(), folder, "goto", said.append,
                   record=commissioned(config, folder))  # fmt: skip
-        run.on_imu_port = sim.start_phone
+        run.listeners.append(sim.answer)
         wanted = np.array(desired)
         code = run_safely(run, lambda r: goto(r, kept.calibration, wanted, kept.play))
         assert code == 0, said
@@ -96,7 +96,7 @@ def test_a_target_within_the_play_of_a_limit_is_refused(tmp_path):
               record=commissioned(config, tmp_path))  # fmt: skip
     with pytest.raises(Refused, match=r"less its play, 0\.200 deg"):
         goto(run, kept.calibration, edge, kept.play)
-    run.close()
+    run.journal.close()
 
 
 def test_keeping_an_axis_leaves_the_rest_of_the_file(tmp_path):

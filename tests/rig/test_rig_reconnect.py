@@ -14,10 +14,10 @@ from harness import (
     simulator,
 )
 
-from rig.core.session import run_safely
 from rig.journal import read_journal
 from rig.simulator import Truth, parse_fault
 from rig.workbench.procedures.checking import collect
+from rig.workbench.run import run_safely
 
 TURNED = 25.0  # degrees: beyond the envelope of the limits, too
 
@@ -35,7 +35,7 @@ def collected(folder, phase, heading=TURNED, drift=0.0, changes=None):
             served, folder, "collect", said.append,
             record=commissioned(served, folder, sim),
         )  # fmt: skip
-        run.on_imu_port = sim.start_phone
+        run.listeners.append(sim.answer)
 
         def drop(entered):
             count = len(run.journal.events("posture"))

@@ -8,14 +8,7 @@ from harness import fast_config
 from rig.config import parse_config
 from rig.config.config import differences
 from rig.core.faults import Refused
-from rig.core.record import (
-    HOMED,
-    IDENTIFIED,
-    SIGN_CHECKED,
-    STATES,
-    ZEROED,
-    DeviceRecord,
-)
+from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, STATES, ZEROED, DeviceRecord
 
 CONFIG = fast_config()
 

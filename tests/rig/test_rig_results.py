@@ -537,7 +537,7 @@ def test_a_phone_beside_the_right_one_changes_nothing_in_a_session(tmp_path):
             threading.Thread(target=send, daemon=True).start()
             sim.start_phone(port)
 
-        run.on_imu_port = intrude
+        run.listeners.append(lambda r: r["event"] == "listening" and intrude(r["port"]))
         with no_figures():
             code = run_safely(run, calibrate)
         ended.set()

@@ -29,13 +29,13 @@ from rig.__main__ import main
 from rig.config import parse_config
 from rig.core.faults import Refused
 from rig.core.plan import choose, draw_candidates
-from rig.core.session import run_safely
 from rig.journal import read_journal
 from rig.simulator import Truth
 from rig.workbench.identification.conclusion import order_residuals
 from rig.workbench.identification.fit import uncertainty
 from rig.workbench.procedures.calibrate import calibrate
 from rig.workbench.procedures.checking import collect
+from rig.workbench.run import run_safely
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 
@@ -156,7 +156,7 @@ def test_a_changed_verify_limit_does_not_keep_a_run_from_resuming(finished, tmp_
     table = '\n[session]\nmethod = "exact"\n' + limits
     judged = parse_config(fast_text({"stall_s = 0.3": "stall_s = 0.4"}, session=table))
     record = commissioned(judged, finished[0])
-    make_run(judged, finished[0], "calibrate", [].append, record=record).close()
+    make_run(judged, finished[0], "calibrate", [].append, record=record).journal.close()
     other = parse_config(fast_text({"samples = 5": "samples = 6"}, session=table))
     with pytest.raises(ValueError, match=r"settle.samples: 5 then, 6 now"):
         make_run(other, finished[0], "calibrate", [].append, record=record)
@@ -288,7 +288,7 @@ def test_a_terminal_that_goes_away_stops_the_run_and_not_the_stop(tmp_path):
 
         record = commissioned(served, folder)
         run = make_run(served, folder, "calibrate", broken, record=record)
-        run.on_imu_port = sim.start_phone
+        run.listeners.append(sim.answer)
         assert run_safely(run, calibrate) == 3
         assert all(drive.stops for drive in sim.drives)
         assert read_journal(folder / "journal.jsonl")[-1]["event"] == "stopped"
@@ -329,7 +329,7 @@ def test_collect_records_a_dataset_and_resumes(tmp_path):
         def once():
             record = commissioned(served, folder)
             run = make_run(served, folder, "collect", said.append, record=record)
-            run.on_imu_port = sim.start_phone
+            run.listeners.append(sim.answer)
 
             def press(phase):
                 if len(run.journal.events("posture")) == 3 and not pressed:

@@ -15,13 +15,7 @@ from rig.__main__ import main
 from rig.config import load_config, parse_config
 from rig.config.files import EXAMPLES
 from rig.core.faults import Refused
-from rig.core.record import (
-    HOMED,
-    IDENTIFIED,
-    SIGN_CHECKED,
-    ZEROED,
-    DeviceRecord,
-)
+from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED, DeviceRecord
 from rig.simulator import Truth
 from rig.workbench.commission import setup, steps
 from rig.workbench.commission.operator import Operator

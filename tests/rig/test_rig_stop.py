@@ -23,16 +23,16 @@ from test_rig_motion import bench
 
 from rig.__main__ import main
 from rig.config import load_config
-from rig.core import lock
 from rig.core.bus import Bus, BusError
 from rig.core.drive import Drive
 from rig.core.faults import StopRequested
-from rig.core.lock import BusLock, read_armed
-from rig.core.session import run_safely
 from rig.core.stop import stop_all
+from rig.journal import lock
+from rig.journal.lock import BusLock, read_armed
 from rig.signals import Signals
 from rig.simulator import parse_fault
 from rig.workbench.procedures.checking import collect
+from rig.workbench.run import run_safely
 
 GENERIC = {'map = "leadshine_pr"': 'map = "generic"', **HASTY}
 
@@ -523,7 +523,7 @@ def test_a_session_leaves_what_a_stop_needs_and_says_when_all_stand(tmp_path, fo
 
         record = commissioned(served, tmp_path, sim)
         run = make_run(served, tmp_path, "collect", [].append, record=record)
-        run.on_imu_port = sim.start_phone
+        run.listeners.append(sim.answer)
         on_phase(run, lambda phase: look(run, phase))
         assert run_safely(run, lambda r: collect(r, 1)) == 0
     (armed,) = {json.dumps(each, sort_keys=True) for each in seen if each}

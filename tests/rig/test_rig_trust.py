@@ -26,18 +26,17 @@ from rig.__main__ import main
 from rig.config import example_text, parse_config
 from rig.core.attitude import euler_to_matrix, frame_at
 from rig.core.faults import MotionFault, Refused
+from rig.core.identify import check_matrix
 from rig.core.phone import Imu
-from rig.core.record import (
+from rig.core.zero import KeptZero, check_zero, moved, unseen
+from rig.journal import (
     HOMED,
     IDENTIFIED,
     SIGN_CHECKED,
     ZEROED,
     DeviceRecord,
-    check_matrix,
+    read_journal,
 )
-from rig.core.session import run_safely
-from rig.core.zero import KeptZero, check_zero, moved, unseen
-from rig.journal import read_journal
 from rig.simulator import Truth
 from rig.simulator.faults import FaultInjector
 from rig.simulator.phone import Phone
@@ -49,6 +48,7 @@ from rig.workbench.procedures.checking import (
     unchecked,
     verify,
 )
+from rig.workbench.run import run_safely
 
 LOST = 1.4  # degrees, as was seen
 
@@ -68,7 +68,7 @@ def run_verify(config, calibration, folder, sim, record=None, here=False):
         record=record or commissioned(config, folder),
         zero_at=None if here else saved.zero.pulses, kept_zero=saved.zero,
     )  # fmt: skip
-    run.on_imu_port = sim.start_phone
+    run.listeners.append(sim.answer)
     return run_safely(run, lambda r: verify(r, saved.calibration, 2)), said
 
 
@@ -119,7 +119,7 @@ def test_a_refused_fit_saves_nothing_and_voids_the_sign_check(tmp_path, monkeypa
     """Where the moves themselves showed nothing."""
     from rig.core import measure as measuring
 
-    monkeypatch.setattr(measuring.Observer, "_check_agreement", lambda *_: None)
+    monkeypatch.setattr(measuring, "_check_agreement", lambda *_: None)
     config, said = fast_config(), []
     with device(config, reversed=(False, False, True)) as sim:
         assert session(sim.start(), tmp_path, sim, said) == 3
@@ -285,7 +285,7 @@ def test_a_zero_by_the_drives_is_compared_with_the_last_one(tmp_path):
             run = make_run(
                 served, tmp_path / name, "collect", said.append, record=record
             )
-            run.on_imu_port = sim.start_phone
+            run.listeners.append(sim.answer)
             assert run_safely(run, lambda r: collect(r, 1)) == 0
             record.forget_left()
             sim.power_cycle((0.0, 0.0, LOST))
@@ -304,7 +304,7 @@ def test_a_zero_at_other_pulses_than_the_last_one_is_told(tmp_path):
             run = make_run(
                 served, tmp_path / name, "collect", said.append, record=record
             )
-            run.on_imu_port = sim.start_phone
+            run.listeners.append(sim.answer)
             run.zero_at = served.to_pulses(here)  # as if an operator had put it there
             assert run_safely(run, lambda r: collect(r, 1)) == 0
     told = [text for text in said if text.startswith("WARNING")]
@@ -380,7 +380,7 @@ def test_a_drive_without_a_word_on_its_gearing_is_not_asked_for_it(tmp_path):
         served = changed(sim.start(), axes=config.axes)
         record = commissioned(served, tmp_path)
         run = make_run(served, tmp_path, "collect", [].append, record=record)
-        run.on_imu_port = sim.start_phone
+        run.listeners.append(sim.answer)
         assert run_safely(run, lambda r: collect(r, 1)) == 0
 
 
@@ -437,7 +437,7 @@ def test_after_a_lost_place_the_way_on_begins_with_home(tmp_path):
     record.void(HOMED, "yaw went into alarm")
     assert "`jaxcal-rig home`, then `jaxcal-rig axes`" in run.to_go_on
     assert run.to_go_on.endswith(f"Then jaxcal-rig resume {tmp_path}")
-    run.close()
+    run.journal.close()
 
 
 def test_while_armed_the_place_of_the_drives_is_not_known(tmp_path):
@@ -527,7 +527,7 @@ def test_a_place_that_nobody_read_is_no_home(bit, tmp_path):
             drive.homed = bit
         record.left_at(homed=("pitch", "yaw", "roll") if bit else ())  # as when armed
         run = make_run(served, tmp_path, "collect", [].append, record=record)
-        run.on_imu_port = sim.start_phone
+        run.listeners.append(sim.answer)
         code = run_safely(run, lambda r: collect(r, 1))
     assert code == (0 if bit else 2)
     assert (record.state(HOMED) is None) is not bit

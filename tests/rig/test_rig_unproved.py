@@ -12,12 +12,13 @@ from hypothesis import strategies as st
 from rig.__main__ import main
 from rig.config import ConfigError, load_config, parse_config
 from rig.config.files import EXAMPLES
+from rig.core import proof
 from rig.core.faults import MotionFault, Refused
+from rig.core.proof import GROWTH, Reach
 from rig.simulator import Truth, parse_fault
-from rig.workbench.commission import steps, unproved
+from rig.workbench.commission import steps
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.proposals import require_unit
-from rig.workbench.commission.unproved import GROWTH, Reach
 
 
 @pytest.fixture
@@ -141,7 +142,7 @@ def test_degrees_that_are_read_as_radians_are_named_too():
 def test_no_move_turns_a_joint_far_whatever_its_gearing(gain, play, wanted):
     """``gain``: degrees of the joint for a pulse; at first play hides a move."""
     axis = fast_config().axes[0]
-    first = max(1, int(unproved.FIRST_MOTOR_DEG / 360.0 * axis.pulses_per_rev))
+    first = max(1, int(proof.FIRST_MOTOR_DEG / 360.0 * axis.pulses_per_rev))
     reach, most, count = Reach(axis), 3.0, 0
     for _ in range(40):
         longer = reach.pulses(wanted, most)

@@ -17,9 +17,9 @@ from rig.config.registers import decode
 from rig.core import stop
 from rig.core.device import timeouts_left
 from rig.core.faults import MotionFault
-from rig.core.session import Run
 from rig.journal import read_journal
 from rig.simulator import Simulator, Truth, parse_fault
+from rig.workbench.run import Run
 
 WATCHED = {'map = "leadshine_pr"': 'map = "generic"'}
 REGISTER, BEFORE = 0x2B, [0, 60000, 45000]  # what the drives held; 0: no watch
@@ -200,7 +200,7 @@ def test_a_resumed_run_puts_back_what_a_killed_one_left(tmp_path):
         )  # fmt: skip
         assert child.returncode == -signal.SIGKILL
         assert timeouts(sim) != BEFORE
-        code = session(load_config(path), tmp_path, on_imu_port=lambda port: None)
+        code = session(load_config(path), tmp_path)
         assert code == 0 and timeouts(sim) == BEFORE
 
 

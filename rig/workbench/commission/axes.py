@@ -7,11 +7,14 @@ import itertools
 import numpy as np
 
 from rig.config import AXIS_NAMES
-from rig.config.axis import Axis, Pulses
+from rig.config.axis import Pulses
+from rig.core.device import Device, Posture
 from rig.core.faults import MotionFault, Refused
-from rig.core.record import SIGN_CHECKED
-from rig.workbench.commission.bench import Bench
-from rig.workbench.commission.findings import CLEAR, Findings, Stand, find, turn
+from rig.core.measure import measure
+from rig.core.motion import move
+from rig.core.proof import FIRST_MOTOR_DEG, unit_proved
+from rig.journal import SIGN_CHECKED
+from rig.workbench.commission.findings import CLEAR, Stand, find, turn
 from rig.workbench.commission.proposals import (
     Change,
     lines,
@@ -19,7 +22,7 @@ from rig.workbench.commission.proposals import (
     ratios_of,
     require_unit,
 )
-from rig.workbench.commission.unproved import FIRST_MOTOR_DEG, Reach, unit_proved
+from rig.workbench.run import Run
 
 REACH_DEG = 3.0  # each way
 FAR_ENOUGH = 1.1  # a move that would be no longer than that is not made
@@ -31,14 +34,13 @@ SEEN_DEG = 0.03  # the phone must turn at least this much in a whole move
 SEEN_SIGMA = 6.0
 
 
-def check_axes(run: Bench, names_known: bool) -> tuple[Findings, list[Change]]:
+def check_axes(run: Run, device: Device, names_known: bool) -> list[Change]:
     """Move, measure and say what is found; the corrections that follow from it.
 
     Where nothing is to be corrected the device is SIGN_CHECKED.
     """
-    stands = measure(run)
+    stands = measure_axes(run, device)
     found = find(run.config, stands, names_known)
-    device = run.arm()
     told = [drive.pulses_per_rev() for drive in device.drives]
     ratios = ratios_of(run.config, found)
     if run.config.imu.unit == "rad":
@@ -54,12 +56,12 @@ def check_axes(run: Bench, names_known: bool) -> tuple[Findings, list[Change]]:
     run.emit("axes", sync=True, **evidence, changes=[str(change) for change in changes])
     run.say(*lines(run.config, found))
     if not changes:
-        run.record.reach(SIGN_CHECKED, run.plain, **evidence)
+        run.record.reach(SIGN_CHECKED, run.config, **evidence)
         run.say("each unit turns its own joint, the right way and about as far as told")
-    return found, changes
+    return changes
 
 
-def measure(run: Bench) -> dict[str, Stand]:
+def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
     """Visit the places that ``findings.find`` reads from, and come back.
 
     Raises:
@@ -67,7 +69,6 @@ def measure(run: Bench) -> dict[str, Stand]:
         MotionFault: an axis does not turn the phone, or turns it too far, or the unit
             of the phone's angles is not the one that is configured.
     """
-    device = run.arm()
     config, start = run.config, device.positions()
     _check_room(run, start)
     stands: dict[str, Stand] = {}
@@ -80,8 +81,8 @@ def measure(run: Bench) -> dict[str, Stand]:
             target[axis] += way
         pitch, yaw, roll = target
         run.signals.check_pause()
-        run.small.move_to((pitch, yaw, roll), name)
-        measured = run.observer.measure((pitch, yaw, roll), name, samples or None)
+        posture = Posture(name, (pitch, yaw, roll))
+        measured = measure(move(device, posture), samples or None)
         run.emit("stand", sync=True, name=name, **measured)
         stands[name] = Stand.of(measured)
         return stands[name]
@@ -92,21 +93,21 @@ def measure(run: Bench) -> dict[str, Stand]:
         "most either way"
     )
     base = visit("start", {}, 4 * config.settle.samples)
-    run.small.stay_near(base.attitude)
+    device.proof.stay_near(base.attitude)
     noise = SURE_SIGMA * base.std_deg * (2.0 / config.settle.samples) ** 0.5
     wanted = [axis.to_pulses(REACH_DEG) for axis in config.axes]
 
     def turned(stand: Stand) -> float:
         return float(np.linalg.norm(turn(base.attitude, stand.attitude)))
 
-    def grow(j: int, reach: Reach, samples: int = 0) -> tuple[int, ...]:
+    def grow(j: int, unit: bool, samples: int = 0) -> tuple[int, ...]:
         """Move an axis further and further; pulses of the last two places."""
+        reach = device.proof.renew(j, unit)
         way, counts = int(np.sign(wanted[j])), [0]
         while True:
             count = reach.pulses(wanted[j], REACH_DEG)
             if count <= FAR_ENOUGH * counts[-1]:
                 return way * counts[-2], way * counts[-1]
-            _pace(run, j, reach.paced(count))
             look = visit(f"{AXIS_NAMES[j]}:plus", {j: way * count}, samples)
             reach.saw(count, turned(look), noise)
             counts.append(count)
@@ -119,7 +120,7 @@ def measure(run: Bench) -> dict[str, Stand]:
         )
         ratios = []
         for j, axis in enumerate(config.axes):
-            _, far = grow(j, Reach(axis, False), 4 * config.settle.samples)
+            _, far = grow(j, False, 4 * config.settle.samples)
             seen = turned(stands[f"{AXIS_NAMES[j]}:plus"])
             told = device.drives[j].pulses_per_rev() or axis.pulses_per_rev
             geared = told / axis.pulses_per_rev
@@ -128,8 +129,8 @@ def measure(run: Bench) -> dict[str, Stand]:
         require_unit(config, ratios)
     pair = [0, 0, 0]
     for j, name in enumerate(AXIS_NAMES):
-        axis, reach = config.axes[j], Reach(config.axes[j])
-        look, far = grow(j, reach)
+        axis = config.axes[j]
+        look, far = grow(j, True)
         plus = stands[f"{name}:plus"]
         way = turned(plus)
         if way < max(SEEN_DEG, SEEN_SIGMA * base.std_deg / plus.samples**0.5):
@@ -140,7 +141,7 @@ def measure(run: Bench) -> dict[str, Stand]:
                 "too small"
             )
         # Once more on the way up, where its play is taken up.
-        run.small.move_to(_moved(start, j, -far), name)
+        move(device, Posture(name, _moved(start, j, -far)))
         visit(f"{name}:look", {j: look if 2 * abs(look) <= abs(far) else far // 4})
         visit(f"{name}:plus", {j: far})
         visit(f"{name}:back", {j: 0})
@@ -159,14 +160,8 @@ def measure(run: Bench) -> dict[str, Stand]:
             way_a = pair[a] if sign == "+" else -pair[a]
             label = f"{AXIS_NAMES[a]}{sign}{AXIS_NAMES[b]}+"
             visit(label, {a: way_a, b: pair[b]}, samples)
-    run.small.move_to(start, "back")
+    move(device, Posture("back", start))
     return stands
-
-
-def _pace(run: Bench, index: int, axis: Axis) -> None:
-    """At a speed that what is known allows; a simulated device need not be slow."""
-    if not run.full_speed:
-        run.small.pace(index, axis)
 
 
 def _moved(start: Pulses, axis: int, way: int) -> Pulses:
@@ -176,14 +171,14 @@ def _moved(start: Pulses, axis: int, way: int) -> Pulses:
     return a, b, c
 
 
-def _room(run: Bench, start: Pulses, axis: int) -> float:
+def _room(run: Run, start: Pulses, axis: int) -> float:
     """Degrees from the start to the nearer limit of an axis."""
     each = run.config.axes[axis]
     here = each.to_deg(start[axis])
     return min(here - each.min_deg, each.max_deg - here) - ROOM_DEG
 
 
-def _check_room(run: Bench, start: Pulses) -> None:
+def _check_room(run: Run, start: Pulses) -> None:
     for j, name in enumerate(AXIS_NAMES):
         if (room := _room(run, start, j)) < REACH_DEG:
             raise Refused(

@@ -21,9 +21,10 @@ from jaxcal.adaptive.estimates import Estimate
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.tasks.breakaway import Cautious, breakaway
 from rig.core.attitude import mean_rotation
+from rig.core.device import Device
 from rig.core.faults import MotionFault
-from rig.workbench.commission.bench import Bench
 from rig.workbench.commission.probe import ENOUGH_DEG, LEVEL, Probe, propose
+from rig.workbench.run import Run
 
 MOST_DEG = 1.5  # of play
 FAR_DEG = 1.5 * MOST_DEG  # of a move after which play and friction are taken up
@@ -40,7 +41,7 @@ MOST_STEPS = 40
 LEAST_SIGMA_DEG = 0.002  # of a reading: finer is not believed
 
 
-def characterise(run: Bench, axis: int) -> dict[str, Any]:
+def characterise(run: Run, device: Device, axis: int) -> dict[str, Any]:
     """Measure an axis; what a calibration keeps of it, in degrees of its commands.
 
     Raises:
@@ -48,7 +49,7 @@ def characterise(run: Bench, axis: int) -> dict[str, Any]:
         MotionFault: it does not turn the phone, or has more than is looked for.
     """
     propose(_step_task(0.01, STEP_DEG), [(0, 0)], Cautious())  # compiles it
-    probe = Probe(run, axis, BASE_DEG + FAR_DEG, REACH_DEG + FAR_DEG)
+    probe = Probe(run, device, axis, BASE_DEG + FAR_DEG, REACH_DEG + FAR_DEG)
     play, sigma = _play(probe)
     zone, centre = _zone(probe, play.mean, sigma)
     up, down = _breakaway(probe, sigma)

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 from rig.config import RigConfig
 from rig.config.axis import HIGHEST, LOWEST
+from rig.core.attitude import Array, Reading, angle_between_deg
 from rig.core.bus import BusError
+from rig.core.device import Device, Posture
 from rig.core.drive import HOME, Drive
 from rig.core.faults import MotionFault, Refused
-from rig.core.record import HOMED, ZEROED
+from rig.core.measure import measure
+from rig.core.motion import Standing
+from rig.core.proof import NOISE_DEG
 from rig.core.session import ZERO_FACTOR
+from rig.journal import HOMED, ZEROED
 from rig.workbench.commission.bench import Bench
 
 HOME_S = 120.0  # for one axis on its own way home
 SET_S, SET_TRIES = 1.0, 3  # until a drive counts from its new zero
 ANSWER_S = 0.5  # until a drive that was sent home moves
+RATE_S = 0.2  # time over which the speed of a homing is taken
+BLIND_DEG = 10.0  # of a joint, of which the phone must see SEEN_DEG
+SEEN_DEG = 0.5
 POLL_S = 0.05
 
 
@@ -26,8 +33,7 @@ def unlimited(config: RigConfig) -> RigConfig:
         axis.model_copy(update={"min_pulses": LOWEST, "max_pulses": HIGHEST})
         for axis in config.axes
     )
-    motion = config.motion.model_copy(update={"mirror_limits": False})
-    return config.model_copy(update={"axes": axes, "motion": motion})
+    return config.model_copy(update={"axes": axes})
 
 
 def can_home(config: RigConfig) -> bool:
@@ -35,37 +41,19 @@ def can_home(config: RigConfig) -> bool:
     return all(axis.map.home is not None for axis in config.axes)
 
 
-def home(run: Bench, here: bool, confirm: Callable[[str, str], None]) -> None:
+def home(run: Bench, device: Device, here: bool) -> None:
     """Make the drives' counts mean a place; the device is HOMED.
 
     Args:
-        run: with ``unlimited`` axes.
+        run, device: with ``unlimited`` axes.
         here: where the device stands is home: each drive is told so, and its count is
             noted where it cannot be told. Otherwise each drive homes itself.
-        confirm: is told what will happen and the word to type, and raises Refused where
-            it must not.
     """
-    names = [axis.name for axis in run.config.axes]
-    if not here and not can_home(run.config):
-        without = {a.map.name for a in run.config.axes if a.map.home is None}
-        raise Refused(
-            f"the map {', '.join(sorted(without))} knows no homing. Put the device "
-            "into its home posture and use --here"
-        )
-    confirm(
-        "home: nothing moves; where the device stands now becomes the origin of its "
-        "counts"
-        if here
-        else "home: the drives run their own homing one after another, "
-        f"{', '.join(names)}, as far and as fast as they are set to",
-        "home",
-    )
-    device = run.arm()
     for drive in device.drives:
         if here:
-            _set_zero(run, drive)
+            _set_zero(run, device, drive)
         else:
-            _go_home(run, drive)
+            _go_home(run, device, drive)
     positions = list(device.positions())
     how = "here" if here else "drive"
     run.emit("homed", sync=True, how=how, pulses=positions)
@@ -74,7 +62,7 @@ def home(run: Bench, here: bool, confirm: Callable[[str, str], None]) -> None:
     run.say(f"home: the drives count {positions} pulses")
 
 
-def _set_zero(run: Bench, drive: Drive) -> None:
+def _set_zero(run: Bench, device: Device, drive: Drive) -> None:
     if drive.axis.map.set_zero is None:
         run.say(
             f"  {drive.axis.name}: the map {drive.axis.map.name} has no register for "
@@ -82,19 +70,19 @@ def _set_zero(run: Bench, drive: Drive) -> None:
         )
         return
     if drive.axis.map.home_place is not None:
-        if _counts_from(run, drive, HOME) is None:
+        if _counts_from(device, drive, HOME) is None:
             return
         run.say(
             f"  {drive.axis.name}: the drive does not take the count {HOME}; it is set "
             "to 0, and a loss of power while it stands there is not noticed"
         )
-    if (fault := _counts_from(run, drive, 0)) is not None:
+    if (fault := _counts_from(device, drive, 0)) is not None:
         raise MotionFault(f"{fault}. Set it with the maker's tool")
 
 
-def _counts_from(run: Bench, drive: Drive, origin: int) -> str | None:
+def _counts_from(device: Device, drive: Drive, origin: int) -> str | None:
     """Make where the drive stands its origin; why it is not, or None."""
-    tolerance = drive.axis.pulses_within(run.config.motion.position_tolerance_deg)
+    tolerance = drive.axis.pulses_within(device.config.motion.position_tolerance_deg)
     lost = ""
     for _ in range(SET_TRIES):  # the same once more where a frame was lost
         try:
@@ -107,7 +95,7 @@ def _counts_from(run: Bench, drive: Drive, origin: int) -> str | None:
             count = drive.sound().position + drive.origin
             if abs(count - origin) <= tolerance:
                 return None
-            run.device_guard()
+            device.guard()
             if time.monotonic() > end:
                 break
             time.sleep(POLL_S)
@@ -117,43 +105,74 @@ def _counts_from(run: Bench, drive: Drive, origin: int) -> str | None:
     )
 
 
-def _go_home(run: Bench, drive: Drive) -> None:
-    axis = drive.axis
+def _go_home(run: Bench, device: Device, drive: Drive) -> None:
+    """Let a drive home itself, as far and as fast as it is set to, under the phone.
+
+    Raises:
+        MotionFault: it takes too long; or the phone turned further than the joint may,
+            or faster, or not at all.
+    """
+    axis, motion = drive.axis, device.config.motion
     run.say(f"  {axis.name} goes home")
     run.emit("command", label="home", axis=axis.name, pulses=None)
-    begun = time.monotonic()
-    end = begun + HOME_S
+    base, begun, gone = device.attitude(), time.monotonic(), 0
+    most = axis.max_deg - axis.min_deg + motion.envelope_margin_deg
+    device.proof.stay_near(base, most)
+    last = drive.status().position
     drive.write(axis.map.home)
     while True:
-        run.device_guard(moving=True)
+        device.guard(moving=True)
         status = drive.sound()
+        reading = device.imu.latest()
+        device.proof.watch(reading.matrix)
+        _check_homing(device, drive, reading, base, gone)
+        way = abs(status.position - last)
+        gone += way if way < axis.pulses_per_rev else 0  # or it counts anew
+        last = status.position
         waited = time.monotonic() - begun
-        done = axis.map.homed is None or drive.homed(status.word)
+        done = axis.map.homed is None or drive.says_homed
         if not status.moving and waited > ANSWER_S and done:
             break
-        if time.monotonic() > end:
+        if waited > HOME_S:
             raise MotionFault(
                 f"{axis.name} is not home after {HOME_S:g} s. Check its home switch "
                 "and the homing that is set in the drive"
             )
-        time.sleep(POLL_S)
+        time.sleep(motion.poll_s)
     drive.forget_origin()
-    run.device_guard()
+    device.guard()
 
 
-def zero(run: Bench, confirm: Callable[[str, str], None]) -> None:
+def _check_homing(
+    device: Device, drive: Drive, reading: Reading, base: Array, gone: int
+) -> None:
+    """The phone has turned in so many pulses, and no faster than it may."""
+    axis, most = drive.axis, device.config.motion.max_speed_deg_s
+    recent = device.imu.since(reading.time - RATE_S)
+    turned = angle_between_deg(recent[0].matrix, reading.matrix)
+    if turned > most * RATE_S + NOISE_DEG:
+        raise MotionFault(
+            f"{axis.name} homes at {turned / RATE_S:.0f} deg a second by the phone, "
+            f"more than motion.max_speed_deg_s = {most:g}. Set the drive's homing to a "
+            "lower speed"
+        )
+    if abs(axis.to_deg(gone)) > BLIND_DEG and (
+        angle_between_deg(base, reading.matrix) < SEEN_DEG
+    ):
+        raise MotionFault(
+            f"the drive of {axis.name} has turned {abs(axis.to_deg(gone)):.0f} deg on "
+            "its way home, and the phone saw nothing of it. Look for a loose coupling, "
+            "a stream that does not change, or units that are exchanged"
+        )
+
+
+def zero(run: Bench, device: Device) -> None:
     """Measure the attitude of the zero posture, where the device stands: ZEROED."""
-    confirm(
-        "zero: nothing moves; the device stands in its zero posture (jig, level), and "
-        "the phone's attitude there is measured",
-        "zero",
-    )
-    device = run.arm()
-    target = device.positions()
+    posture = Posture("zero", device.positions())
     samples = ZERO_FACTOR * run.config.settle.samples
-    measured = run.observer.measure(target, "zero", samples)
+    measured = measure(Standing(device, posture), samples)
     run.emit("zero", sync=True, **measured)
-    zero = {"pulses": list(target), "attitude": measured["attitude"]}
+    zero = {"pulses": list(posture.pulses), "attitude": measured["attitude"]}
     run.record.reach(ZEROED, run.plain, **zero)
 
 

@@ -12,11 +12,11 @@ from collections.abc import Callable
 from typing import Any
 
 from rig.config import AXIS_NAMES
-from rig.config.axis import Pulses
-from rig.core.attitude import Array, angle_between_deg
-from rig.core.record import SIGN_CHECKED
-from rig.workbench.commission.bench import ALLOWED_DEG, Bench
-from rig.workbench.commission.unproved import Reach
+from rig.core.attitude import angle_between_deg
+from rig.core.device import Device, Posture
+from rig.core.motion import move
+from rig.core.proof import ALLOWED_DEG
+from rig.workbench.run import Run
 
 
 class Keyboard:
@@ -44,7 +44,6 @@ class Keyboard:
 ARROWS = {"\x1b[A": "+", "\x1b[C": "+", "\x1b[B": "-", "\x1b[D": "-"}
 MOST_STEP_DEG = 3.0
 HOLD_DEG = 30.0  # a held key goes at most so far at a time
-LAG_S, NOISE_DEG = 0.2, 0.1  # of the phone, after a piece of the way
 FIRST_S = 0.7  # a keyboard repeats a held key after up to so long,
 REPEAT_S = 0.2  # and then at least so often: released when it is silent for longer
 HELP = (
@@ -55,6 +54,10 @@ HELP = (
 
 class Released(Exception):
     """The key is not held any more."""
+
+
+class Enough(Exception):
+    """The phone has turned as far as the whole way was to turn it."""
 
 
 class Held:
@@ -77,66 +80,48 @@ class Held:
             raise Released
 
 
-def step(run: Bench, axis: int, way_deg: float, reach: Reach | None = None) -> Pulses:
-    """Move one axis by so many degrees, cut at its limits; where it then stands.
+def step(run: Run, device: Device, axis: int, way_deg: float) -> None:
+    """Move one axis by so many degrees, cut at its limits.
 
-    Args:
-        run, axis, way_deg: what moves, and how far.
-        reach: of an axis whose gearing is not proved: the way is gone in pieces that
-            grow, until the phone has turned so far.
+    Where its gearing is not proved it stops once the phone has turned so far.
+
+    Raises:
+        Released: as its key was let go.
     """
-    device = run.arm()
     each, here = run.config.axes[axis], list(device.positions())
-    start = here[axis]
+    start, checked = here[axis], device.proof.reaches[axis].checked
     goal = min(max(each.to_deg(start) + way_deg, each.min_deg), each.max_deg)
-    low, high = each.min_pulses, each.max_pulses
-    way = min(max(each.to_pulses(goal), low), high) - start
-    base = _attitude(run)
-    run.small.stay_near(base, max(ALLOWED_DEG, 2.0 * abs(way_deg)))
-    gone = 0
-    while gone < abs(way):
-        piece = abs(way) - gone
-        if reach is not None:
-            piece = min(piece, reach.pulses(way, MOST_STEP_DEG))
-            run.small.pace(axis, reach.paced(piece))
-        gone += piece
-        here[axis] = start + (gone if way > 0 else -gone)
-        pitch, yaw, roll = here
-        before = _attitude(run)
-        run.small.move_to((pitch, yaw, roll), "jog")
-        if reach is None:
-            continue
-        time.sleep(LAG_S)
-        now = _attitude(run)
-        reach.saw(piece, angle_between_deg(before, now), NOISE_DEG)
-        turned = angle_between_deg(base, now)
-        if gone < abs(way) and turned > abs(way_deg):
-            run.say(
-                f"  stopped: the phone has turned by {turned:.1f} deg after "
-                f"{abs(each.to_deg(gone)):.2g} commanded. Check the reduction of "
-                f"{each.name}"
-            )
-            break
-    stands = device.positions()
-    run.say(f"  {each.name} stands at {each.to_deg(stands[axis]):.3f} deg")
-    return stands
+    here[axis] = min(max(each.to_pulses(goal), each.min_pulses), each.max_pulses)
+    base, held = device.attitude(), device.meanwhile
+    device.proof.stay_near(base, max(ALLOWED_DEG, 2.0 * abs(way_deg)))
+
+    def look() -> None:
+        held()
+        turned = angle_between_deg(base, device.imu.latest().matrix)
+        if turned > abs(way_deg) and not checked:
+            raise Enough(f"{turned:.1f}")
+
+    pitch, yaw, roll = here
+    device.meanwhile = look
+    try:
+        move(device, Posture("jog", (pitch, yaw, roll)))
+    except Enough as turned:
+        device.stopper.stop("the phone has turned far enough", latch=False)
+        gone = abs(each.to_deg(device.positions()[axis] - start))
+        run.say(
+            f"  stopped: the phone has turned by {turned} deg after {gone:.2g} "
+            f"commanded. Check the reduction of {each.name}"
+        )
+    except Released:
+        device.stopper.stop("key released", latch=False)
+    finally:
+        device.meanwhile = held
+    run.say(f"  {each.name} stands at {each.to_deg(device.positions()[axis]):.3f} deg")
 
 
-def _attitude(run: Bench) -> Array:
-    return run.observer.device.imu.latest().matrix
-
-
-def unproved(run: Bench, axis: int) -> Reach | None:
-    """How far an axis may go at first; None where its gearing is proved."""
-    known = run.full_speed or run.record.missing(run.plain, SIGN_CHECKED) is None
-    return None if known else Reach(run.plain.axes[axis])
-
-
-def by_keyboard(run: Bench, axis: int) -> None:
+def by_keyboard(run: Run, device: Device, axis: int) -> None:
     """Move while a key is held, until ``q``; the drives stop when it is let go."""
-    device = run.arm()
     run.say(HELP)
-    reaches = [unproved(run, index) for index in range(3)]
     with Keyboard() as keyboard:
         while True:
             device.guard()
@@ -149,21 +134,6 @@ def by_keyboard(run: Bench, axis: int) -> None:
                     axis = [name[0] for name in AXIS_NAMES].index(key)
                     run.say(f"  {AXIS_NAMES[axis]}")
                 if key in ("+", "=", "-"):
-                    _while_held(run, axis, key, keyboard, reaches[axis])
-
-
-def _while_held(
-    run: Bench, axis: int, key: str, keyboard: Keyboard, reach: Reach | None
-) -> None:
-    device = run.arm()
-    way = -HOLD_DEG if key == "-" else HOLD_DEG
-    run.small.meanwhile = Held(keyboard, key).check
-    try:
-        step(run, axis, way, reach)
-    except Released:
-        device.stopper.stop("key released", latch=False)
-        count = device.positions()[axis]
-        name, angle = AXIS_NAMES[axis], run.config.axes[axis].to_deg(count)
-        run.say(f"  {name} stands at {angle:.3f} deg")
-    finally:
-        run.small.meanwhile = None
+                    device.meanwhile = Held(keyboard, key).check
+                    step(run, device, axis, -HOLD_DEG if key == "-" else HOLD_DEG)
+                    device.meanwhile = lambda: None

@@ -20,10 +20,14 @@ from jaxcal.adaptive.loop import Proposal, next_measurement
 from jaxcal.adaptive.session import Decider
 from rig.config import AXIS_NAMES
 from rig.core.attitude import Array
+from rig.core.device import Device, Posture
 from rig.core.faults import MotionFault, Refused
+from rig.core.measure import measure
+from rig.core.motion import Standing, move
+from rig.core.proof import ALLOWED_DEG
 from rig.workbench.commission.axes import ROOM_DEG, SEEN_DEG
-from rig.workbench.commission.bench import ALLOWED_DEG, Bench
 from rig.workbench.commission.findings import Stand, turn
+from rig.workbench.run import Run
 
 LEVEL = 0.95
 ENOUGH_DEG = 0.02  # width of an interval
@@ -33,10 +37,12 @@ T = TypeVar("T")
 class Probe:
     """The axis, where it began, and what its readings mean once that is known."""
 
-    def __init__(self, run: Bench, axis: int, up_deg: float, down_deg: float) -> None:
+    def __init__(
+        self, run: Run, device: Device, axis: int, up_deg: float, down_deg: float
+    ) -> None:
         self.run, self.axis, self.name = run, axis, AXIS_NAMES[axis]
         self.scale = run.config.axes[axis]
-        self.device = run.arm()
+        self.device = device
         self.start = self.device.positions()
         self.here_deg = self.scale.to_deg(self.start[axis])
         above = self.scale.max_deg - self.here_deg - ROOM_DEG
@@ -53,26 +59,24 @@ class Probe:
         self._base: Array | None = None  # (3, 3) attitude that readings are from
         self._line, self._rate = np.zeros(3), 1.0
         allowed = max(ALLOWED_DEG, 2.0 * up_deg)
-        run.small.stay_near(self.device.imu.latest().matrix, allowed)
+        device.proof.stay_near(device.attitude(), allowed)
 
     def stand(self, label: str, *ways_deg: float, samples: int = 1) -> Stand:
         """Go the ways one after the other, and measure at the last."""
         for way in ways_deg:
-            target = self.go(way)
-        wanted = samples * self.run.config.settle.samples
-        measured = self.run.observer.measure(target, label, wanted)
+            standing = self.go(way, label)
+        measured = measure(standing, samples * self.run.config.settle.samples)
         self.run.emit("stand", sync=True, name=label, **measured)
         self.count += 1
         return Stand.of(measured)
 
-    def go(self, way_deg: float) -> Any:
-        """Move the axis; the pulses of all three."""
+    def go(self, way_deg: float, label: str = "back") -> Standing:
+        """Move the axis."""
         target = list(self.start)
         target[self.axis] += self.scale.to_pulses(self.side * way_deg)
         pitch, yaw, roll = target
         self.run.signals.check_pause()
-        self.run.small.move_to((pitch, yaw, roll), self.name)
-        return pitch, yaw, roll
+        return move(self.device, Posture(label, (pitch, yaw, roll)))
 
     def way(self, found: Stand) -> float:
         """Degrees commanded from where the axis stood."""
@@ -140,7 +144,7 @@ class Probe:
         with ThreadPoolExecutor(1) as pool:
             result = pool.submit(function)
             while not result.done():
-                self.run.device_guard()
+                self.device.guard()
                 self.device.statuses()
                 time.sleep(self.run.config.motion.poll_s)
             return result.result()

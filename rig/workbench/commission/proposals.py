@@ -13,8 +13,8 @@ from rig.config import AXIS_NAMES, RigConfig
 from rig.config.axis import Axis, Scale
 from rig.core.attitude import matrix_to_euler
 from rig.core.faults import MotionFault
+from rig.core.proof import RADIANS
 from rig.workbench.commission.findings import MOUNTING_DEG, Findings
-from rig.workbench.commission.unproved import RADIANS
 
 # Measured against commanded: what A may take up, and what only a wrong gearing does.
 SOUND_RATIO = (0.4, 1.5)

@@ -11,8 +11,8 @@ from rig.config import AXIS_NAMES, RigConfig, parse_config
 from rig.config.axis import DEFAULT_ROTATES
 from rig.config.settings import BusSettings
 from rig.core.faults import EXIT_OK, Refused
-from rig.core.lock import BusLock
-from rig.core.record import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED
+from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED
+from rig.journal.lock import BusLock
 from rig.workbench.commission import steps
 from rig.workbench.commission.home import can_home
 from rig.workbench.commission.operator import Operator

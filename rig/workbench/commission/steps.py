@@ -8,30 +8,25 @@ import os
 import pathlib
 import sys
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rig.config import AXIS_NAMES, RigConfig
 from rig.core.bus import Bus
+from rig.core.device import Device
 from rig.core.drive import Drive
 from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault, Refused
-from rig.core.lock import BusLock
 from rig.core.phone import Imu
-from rig.core.record import (
-    HOMED,
-    IDENTIFIED,
-    SIGN_CHECKED,
-    STATES,
-    DeviceRecord,
-)
-from rig.core.session import STREAM_WAIT_S, run_safely
-from rig.journal import Record
+from rig.core.session import STREAM_WAIT_S
+from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, STATES, DeviceRecord, Record
+from rig.journal.lock import BusLock
 from rig.workbench.commission.axes import check_axes
 from rig.workbench.commission.bench import Bench
-from rig.workbench.commission.home import home, identity, unlimited, zero
-from rig.workbench.commission.jog import MOST_STEP_DEG, by_keyboard, step, unproved
+from rig.workbench.commission.home import can_home, home, identity, unlimited, zero
+from rig.workbench.commission.jog import MOST_STEP_DEG, by_keyboard, step
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.phone import Stream, addresses_text, watch
 from rig.workbench.commission.proposals import Change
+from rig.workbench.run import Run, run_safely
 from rig.workbench.toml import edit
 
 if TYPE_CHECKING:
@@ -54,7 +49,6 @@ class Place:
     full_speed: bool = False  # of a simulated device
     locked: bool = False  # the caller holds the bus
     reset_alarms: bool = False
-    on_imu_port: Callable[[int], object] = lambda port: None
     listeners: tuple[Callable[[Record], None], ...] = ()
 
     def say(self, text: str) -> None:
@@ -91,7 +85,7 @@ class Place:
     def run(
         self,
         name: str,
-        procedure: Callable[[Bench], object],
+        procedure: Callable[[Bench, Device], object],
         limits: bool = True,
         again: str = "",
     ) -> int:
@@ -100,18 +94,16 @@ class Place:
         with self._lock(name) as lock:
             bench = Bench(
                 config, name, self.record, self.say,
-                folder=self.folder, plain=self.config, homed=limits,
-                full_speed=self.full_speed,
+                folder=self.folder, homed=limits, simulated=self.full_speed,
                 again=self.command(again or name), reset_alarms=self.reset_alarms,
-                start={"simulated": None, "inputs": {}, "maps_from": ""},
             )  # fmt: skip
             lock.tell(run=str(bench.folder.resolve()))
-            bench.on_imu_port = self.on_imu_port
             bench.listeners += self.listeners
 
-            def whole(run: Any) -> int:
-                result = procedure(run)
-                return result if isinstance(result, int) else EXIT_OK
+            def whole(run: Run) -> int:
+                with run.armed() as device:
+                    procedure(bench, device)
+                return EXIT_OK
 
             return run_safely(bench, whole)
 
@@ -130,7 +122,8 @@ def look_at_phone(place: Place, seconds: float | None = None) -> Stream:
     settings = place.config.imu
     with Imu(settings) as imu:
         place.say(f"imu: {addresses_text(settings, imu.port)}; then start its stream")
-        place.on_imu_port(imu.port)
+        for listener in place.listeners:
+            listener({"event": "listening", "port": imu.port})
         stream = watch(imu, seconds or WATCH_S, STREAM_WAIT_S, place.say)
     if stream.rate_hz < SLOW_HZ or stream.longest_gap_s > LONG_GAP_S:
         place.say(
@@ -144,12 +137,26 @@ def look_at_phone(place: Place, seconds: float | None = None) -> Stream:
 def go_home(place: Place, here: bool) -> int:
     """Make the counts mean a place: HOMED."""
     place.require(IDENTIFIED)
+    names = [axis.name for axis in place.config.axes]
+    if not here and not can_home(place.config):
+        without = {a.map.name for a in place.config.axes if a.map.home is None}
+        raise Refused(
+            f"the map {', '.join(sorted(without))} knows no homing. Put the device "
+            "into its home posture and use --here"
+        )
     place.say(
         "the drives are armed; keep out of the device's reach, hand on the emergency "
         "stop"
     )
-    confirm = place.operator.confirm
-    return place.run("home", lambda run: home(run, here, confirm), limits=False)
+    place.operator.confirm(
+        "home: nothing moves; where the device stands now becomes the origin of its "
+        "counts"
+        if here
+        else "home: the drives run their own homing one after another, "
+        f"{', '.join(names)}, as far and as fast as they are set to",
+        "home",
+    )
+    return place.run("home", lambda run, dev: home(run, dev, here), limits=False)
 
 
 def jog(place: Place, axis: int, way_deg: float | None) -> int:
@@ -166,11 +173,11 @@ def jog(place: Place, axis: int, way_deg: float | None) -> int:
     move = "while a key is held" if way_deg is None else f"by {way_deg:g} deg"
     place.operator.confirm(f"jog: {name} will move {move}, slowly", "jog")
 
-    def procedure(run: Bench) -> None:
+    def procedure(run: Bench, device: Device) -> None:
         if way_deg is None:
-            by_keyboard(run, axis)
+            by_keyboard(run, device, axis)
         else:
-            step(run, axis, way_deg, unproved(run, axis))
+            step(run, device, axis, way_deg)
 
     way = "" if way_deg is None else f" {way_deg:g}"
     return place.run("jog", procedure, limits=homed, again=f"jog {name}{way}")
@@ -197,8 +204,8 @@ def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> i
         "characterise",
     )
 
-    def procedure(run: Bench) -> None:
-        found = measured.characterise(run, axis)
+    def procedure(run: Bench, device: Device) -> None:
+        found = measured.characterise(run, device, axis)
         if path is not None:
             keep(path, name, found | {"run": run.folder.name})
             run.say(f"kept in {path}: `goto` puts the play back")
@@ -218,8 +225,8 @@ def axes(place: Place, names_known: bool = False) -> int:
     for again in (False, True):
         changes: list[Change] = []
 
-        def procedure(run: Bench, changes: list[Change] = changes) -> None:
-            changes += check_axes(run, names_known)[1]
+        def procedure(run: Bench, device: Device, to: list[Change] = changes) -> None:
+            to += check_axes(run, device, names_known)
 
         if code := place.run("axes", procedure):
             return code
@@ -252,8 +259,12 @@ def _correct(place: Place, changes: list[Change]) -> None:
 def take_zero(place: Place) -> int:
     """Measure the zero posture: ZEROED."""
     place.require(SIGN_CHECKED)
-    confirm = place.operator.confirm
-    return place.run("zero", lambda run: zero(run, confirm))
+    place.operator.confirm(
+        "zero: nothing moves; the device stands in its zero posture (jig, level), and "
+        "the phone's attitude there is measured",
+        "zero",
+    )
+    return place.run("zero", zero)
 
 
 def simulated(
@@ -265,7 +276,7 @@ def simulated(
     """A simulated device, at which nobody needs to stand; it corrects no file."""
     return Place(
         served, record, Operator(yes=True, say=say), full_speed=True,
-        on_imu_port=simulator.start_phone, listeners=(simulator.hear,),
+        listeners=(simulator.hear,),
     )  # fmt: skip
 
 
@@ -290,7 +301,7 @@ def begin_simulated(place: Place, through: str) -> None:
     if SIGN_CHECKED not in states:
         return
     wrong: list[Change] = []
-    code = place.run("axes", lambda run: wrong.extend(check_axes(run, False)[1]))
+    code = place.run("axes", lambda run, dev: wrong.extend(check_axes(run, dev, False)))
     if wrong:
         raise MotionFault(
             "the configuration does not say what the device does: "

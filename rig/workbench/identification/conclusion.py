@@ -9,9 +9,10 @@ import numpy as np
 
 from rig.config import AXIS_NAMES, RigConfig
 from rig.core.attitude import ORDERS, Frame, angles, frame_at
+from rig.core.identify import identify, pairs
 from rig.journal import Record
 from rig.workbench.identification.drift import estimate_drift, without_drift
-from rig.workbench.identification.fit import fit, held_out_errors, pairs, uncertainty
+from rig.workbench.identification.fit import held_out_errors, uncertainty
 from rig.workbench.identification.noise import (
     autocorrelation_time,
     correlation,
@@ -45,7 +46,7 @@ def conclude(
     held_out, off = held_out_errors(
         config, evidence.held, {r["name"]: r for r in found}
     )
-    limits = uncertainty(fit(chosen), chosen, held_out, zero, phi)
+    limits = uncertainty(identify(chosen), chosen, held_out, zero, phi)
     shared = {
         "zero_pulses": zero["pulses"],
         "zero_attitude": zero["attitude"],
@@ -60,7 +61,7 @@ def conclude(
         "drift_corrected": drift is not None and drift.corrected,
     }
     noise = np.array(limits["noise_std_deg"])
-    calibration = fit(chosen, noise, notes, np.array(limits["zero_std_deg"]) ** 2)
+    calibration = identify(chosen, noise, notes, np.array(limits["zero_std_deg"]) ** 2)
     count = config.settle.samples
     summary = {
         "schema": 1,

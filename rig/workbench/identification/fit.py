@@ -1,62 +1,18 @@
-"""From recorded postures to A and b, their uncertainty, and errors held out."""
+"""How uncertain a fit is, and its errors at postures held out."""
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
 from scipy import special
 from scipy.optimize import brentq
 
-from rig.config import AXIS_NAMES, RigConfig
+from rig.config import RigConfig
 from rig.core.attitude import Array
+from rig.core.identify import pairs
 from rig.journal import Record
 from rig.workbench.identification.noise import effective_samples, mean_variance
-
-
-def pairs(records: list[Record]) -> tuple[Array, Array]:
-    """(N, 3) commands and (N, 3) measurements in degrees of posture records."""
-    commands = np.array([r["commanded_deg"] for r in records]).reshape(-1, 3)
-    return commands, np.array([r["measured_deg"] for r in records]).reshape(-1, 3)
-
-
-def fit(
-    records: list[Record],
-    noise_std: Array | None = None,
-    notes: Record | None = None,
-    zero_variance: Array | None = None,
-) -> Any:
-    """``jaxcal.identify`` on posture records.
-
-    Args:
-        records: chosen postures.
-        noise_std: (3,) degrees, of one recorded mean; from the scatter of its readings
-            when not given.
-        notes: stored in the calibration's file.
-        zero_variance: (3,) degrees squared, of the zero reference. It shifts every
-            posture equally, so it adds to the variance of the outputs' mean.
-    """
-    import jaxcal
-
-    if noise_std is None:
-        independent = [mean_variance(record, np.zeros(3)) for record in records]
-        noise_std = np.sqrt(np.mean(independent, axis=0))
-    noise_std = np.maximum(1e-9, noise_std)
-    fitted: Any = jaxcal.identify(
-        *pairs(records),
-        noise_std=noise_std,
-        input_names=AXIS_NAMES,
-        output_names=AXIS_NAMES,
-        command_unit="deg",
-        measured_unit="deg",
-        notes=notes,
-    )
-    if zero_variance is None:
-        return fitted
-    covariance = np.array(fitted.joint_covariance)
-    covariance[-3:, -3:] += np.diag(zero_variance)
-    return dataclasses.replace(fitted, joint_covariance=covariance)
 
 
 def uncertainty(

@@ -29,7 +29,7 @@ from rig.core.attitude import (
     mean_rotation,
 )
 from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault, Refused
-from rig.core.record import check_matrix
+from rig.core.identify import check_matrix
 from rig.journal import Record, RunFolder, measured_postures, new_run_folder
 from rig.workbench.identification.conclusion import Evidence, conclude
 from rig.workbench.outputs.console import recalibrate, summary_lines

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -10,9 +12,10 @@ import numpy as np
 from rig.config import AXIS_NAMES, RigConfig
 from rig.core.attitude import Array
 from rig.core.device import Device
-from rig.core.session import Run
 from rig.core.stop import UnitStop
+from rig.journal import Record
 from rig.workbench.outputs.telemetry import Telemetry
+from rig.workbench.run import Run
 
 
 def numbers(values: Any, width: int = 9, digits: int = 4) -> str:
@@ -21,46 +24,76 @@ def numbers(values: Any, width: int = 9, digits: int = 4) -> str:
     return " ".join(f"{value:{width}.{digits}f}" for value in rounded)
 
 
+class Console:
+    """Prints what happens in a run."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._begun = 0.0  # time of the present visit
+        self._visits_s: list[float] = []
+
+    def hear(self, record: Record) -> None:
+        """Print what an event comes to."""
+        if record["event"] == "visit":
+            self._begun = record["time"]
+        if record["event"] != "posture":
+            return self._say(event_lines(record))
+        self._visits_s.append(record["time"] - self._begun)
+        visited, planned = len(self._run.postures()), self._run.planned
+        left = max(0, planned - visited) * float(np.mean(self._visits_s[-10:]))
+        self._run.say(
+            f"  [{visited:>3}/{planned}] {record['name']:<12} "
+            f"u [{numbers(record['commanded_deg'], 8, 3)}]  "
+            f"y [{numbers(record['measured_deg'], 8, 3)}]  {self._visits_s[-1]:5.2f} s,"
+            f" about {left:.0f} s left"
+        )
+
+    def _say(self, lines: list[str]) -> None:
+        if threading.current_thread() is threading.main_thread():
+            self._run.say(*lines)
+        elif lines:  # a terminal held by Ctrl-S must not hold the phone's thread too
+            threading.Thread(target=self._run.say, args=lines, daemon=True).start()
+
+
 def listen(run: Run) -> None:
     """Print what happens in a run, and append what phone and drives say to its files.
 
-    Both are listeners: a session neither waits for them nor needs them.
+    A session neither waits for them nor needs them.
     """
-
-    def say(record: dict[str, Any]) -> None:
-        lines = _lines(run, record)
-        if threading.current_thread() is threading.main_thread():
-            run.say(*lines)
-        elif lines:  # a terminal held by Ctrl-S must not hold the phone's thread too
-            threading.Thread(target=run.say, args=lines, daemon=True).start()
-
-    run.listeners.append(say)
-    run.attachments.append(_telemetry)
+    run.listeners.append(Console(run).hear)
+    run.beside.append(_telemetry)
 
 
-def _telemetry(run: Run, device: Device) -> Telemetry:
+@contextlib.contextmanager
+def _telemetry(device: Device) -> Iterator[None]:
     telemetry = Telemetry(
-        run.folder, run.config, device.imu, device.drives, lambda: device.frame
-    )
+        device.run.folder, device.config, device.imu, device.drives,
+        lambda: device.frame,
+    )  # fmt: skip
     telemetry.start()
-    return telemetry
-
-
-def _lines(run: Run, record: dict[str, Any]) -> list[str]:
-    if record["event"] != "posture":
-        return event_lines(record)
-    visited, planned, seconds, left = run.progress
-    return [
-        f"  [{visited:>3}/{planned}] {record['name']:<12} "
-        f"u [{numbers(record['commanded_deg'], 8, 3)}]  "
-        f"y [{numbers(record['measured_deg'], 8, 3)}]  {seconds:5.2f} s, "
-        f"about {left:.0f} s left"
-    ]
+    try:
+        yield
+    finally:
+        telemetry.close()
 
 
 def event_lines(record: dict[str, Any]) -> list[str]:
     """What an event of the run comes to on the console; most are silent."""
     match record["event"]:
+        case "listening":
+            port, form = record["port"], record["format"]
+            return [f"IMU: waiting for the phone on port {port} ({form})"]
+        case "armed":
+            return [f"armed: {record['drives']} drives on {record['where']}"]
+        case "note":
+            return [record["text"]]
+        case "reference":
+            worst = max(map(abs, record["angles"]))
+            good = [f"reference posture reads {worst:.3f} deg from zero: going on"]
+            return good if worst <= record["limit"] else []
+        case "reoriented":
+            turned, told = record["turned_deg"], record["told"]
+            return [f"the phone came back, its heading turned {turned:.3f} deg: {told}"]
         case "zero":
             return [f"zero taken at pulses {record['pulses']}"]
         case "void":

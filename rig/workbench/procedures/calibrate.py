@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from rig.core.attitude import Array
-from rig.core.device import check_plan
+from rig.core.device import Device, Posture, check_plan
 from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault
+from rig.core.identify import check_matrix, identify
 from rig.core.plan import (
     Choice,
     choose,
@@ -17,12 +18,12 @@ from rig.core.plan import (
     draw_held_out,
     travel_order,
 )
-from rig.core.record import SIGN_CHECKED, check_matrix
-from rig.core.session import Run
-from rig.journal import Record
+from rig.core.session import visit
+from rig.journal import SIGN_CHECKED, Record
 from rig.workbench.identification.conclusion import Evidence, conclude
-from rig.workbench.identification.fit import fit, held_out_errors
+from rig.workbench.identification.fit import held_out_errors
 from rig.workbench.outputs.console import plan_lines, recalibrate, summary_lines
+from rig.workbench.run import Run
 
 MIDDLE, END = "reference:middle", "reference:end"  # visits of the zero posture
 
@@ -33,26 +34,24 @@ def calibrate(run: Run) -> int:
     candidates, choice = _plan(run)
     check_plan(config, [tuple(candidates[i].tolist()) for i in choice.indices])
     run.planned = session.k + 2 * session.verify_postures + 2
-    if run.zero_pulses is None:
-        run.ready()
-    chosen = _visit_chosen(run, candidates, choice)
-    run.emit("phase", phase="saving")
-    first = fit(chosen)
-    _check_gains(run, first.matrix)
-    first.save(run.folder / "calibration.partial.json")
-    held = _held_out(run, first)
-    run.planned = session.k + 2 * len(held) + 2
-    if held:
-        run.visit(MIDDLE, run.zero_pulses, role="reference")
-    held_out, _ = visit_pairs(run, held)
-    run.visit(END, run.zero_pulses, role="reference")
-    run.say("drives at rest; identifying")
-    run.emit("phase", phase="finishing")
-    run.stop("", latch=False)
-    run.disarm()
-    run.signals.check_stop()
-    summary = _identify(run, chosen, held, held_out)
-    summary["choice"] = dataclasses.asdict(choice)
+    if run.lacks([END]):
+        with run.device() as device:
+            _visit_chosen(run, device, candidates, choice)
+            run.emit("phase", phase="saving")
+            first = identify(_chosen(run))
+            _check_gains(run, first.matrix)
+            first.save(run.folder / "calibration.partial.json")
+            held = _held_out(run, first)
+            run.planned = session.k + 2 * len(held) + 2
+            if held:
+                visit(device, Posture(MIDDLE, run.zero_pulses), role="reference")
+            visit_pairs(run, device, held)
+            visit(device, Posture(END, run.zero_pulses), role="reference")
+        run.say("drives at rest; identifying")
+        run.emit("phase", phase="finishing")
+        run.signals.check_stop()
+    summary = _identify(run)
+    summary["choice"] = _last_choice(run)
     return _save(run, summary)
 
 
@@ -75,7 +74,7 @@ def _plan(run: Run) -> tuple[Array, Choice]:
 
     record = run.remember("plan", make)
     candidates, choice = np.array(record["candidates"]), Choice(**record["choice"])
-    start = config.to_deg(run.zero_pulses or (0, 0, 0))
+    start = config.to_deg(run.zero_pulses)
     chosen = np.array(choice.indices)
     order = chosen[travel_order(config, config.to_deg(candidates[chosen]), start)]
     shown = dataclasses.replace(choice, indices=tuple(order.tolist()))
@@ -83,26 +82,36 @@ def _plan(run: Run) -> tuple[Array, Choice]:
     return candidates, choice
 
 
-def _visit_chosen(run: Run, candidates: Array, choice: Choice) -> list[Record]:
+def _chosen(run: Run) -> list[Record]:
+    """Records of the postures measured to identify from."""
+    return [record for record in run.postures().values() if record["role"] == "select"]
+
+
+def _last_choice(run: Run) -> dict[str, Any]:
+    """The choice that was measured: the last one that had to be made."""
+    return [*run.journal.events("plan"), *run.journal.events("replan")][-1]["choice"]
+
+
+def _visit_chosen(run: Run, device: Device, candidates: Array, choice: Choice) -> None:
     """Measure K postures; without one out of reach the rest are selected again."""
     config, degrees = run.config, run.config.to_deg(candidates)
     available = np.ones(len(candidates), dtype=bool)
-    records: dict[int, Record] = {}
+    done: list[int] = []
     here = config.to_deg(run.zero_pulses)
     plans = iter(run.journal.events("replan"))
     while True:
-        left = np.array([i for i in choice.indices if i not in records], dtype=int)
+        left = np.array([i for i in choice.indices if i not in done], dtype=int)
         queue = left[travel_order(config, degrees[left], here)].tolist()
         run.emit("queue", names=[f"select:{index}" for index in queue])
         for index in queue:
-            record = run.visit(
-                f"select:{index}", candidates[index], role="select", index=index
-            )
-            if record is None:
+            a, b, c = candidates[index].tolist()
+            posture = Posture(f"select:{index}", (a, b, c))
+            if visit(device, posture, role="select", index=index) is None:
                 break
-            records[index], here = record, degrees[index]
+            here = degrees[index]
+            done.append(index)
         else:
-            return list(records.values())
+            return
         available[index] = False
         lost = int((~available).sum())
         if lost > config.session.max_unreachable:
@@ -112,12 +121,12 @@ def _visit_chosen(run: Run, candidates: Array, choice: Choice) -> list[Record]:
             )
         plan = next(plans, None)
         if plan is None:
-            choice = choose(config, degrees, available, tuple(records), replanning=True)
+            choice = choose(config, degrees, available, tuple(done), replanning=True)
             plan = run.emit("replan", sync=True, choice=dataclasses.asdict(choice))
         choice = Choice(**plan["choice"])
         run.say(
             f"  selected again without {index}: log det {choice.log_det:.4f}, "
-            f"{len(records)} measured postures kept"
+            f"{len(done)} measured postures kept"
         )
 
 
@@ -157,39 +166,33 @@ def _held_out(run: Run, calibration: Any) -> list[Any]:
     return run.emit("held_out", sync=True, pairs=found)["pairs"]
 
 
-def visit_pairs(run: Run, held: list[Any]) -> tuple[list[Record], dict[str, Any]]:
-    """Visit held-out targets raw and compensated, in the order of least travel.
+def pair_names(held: list[Any]) -> list[str]:
+    """Names of the visits of held-out targets, all raw and then all compensated."""
+    return [f"{role}:{i}" for role in ("before", "after") for i in range(len(held))]
 
-    Returns:
-        The records, and the errors ``before`` and ``after`` compensation, of the
-        targets of which both could be reached; no errors where there are none.
-    """
-    config, roles = run.config, ("before", "after")
-    visits = [
-        (f"{role}:{i}", role, pair[number])
-        for number, role in enumerate(roles)
-        for i, pair in enumerate(held)
-    ]
-    points = config.to_deg([pulses for *_, pulses in visits] or np.empty((0, 3)))
-    start = config.to_deg(run.zero_pulses or (0, 0, 0))
-    found: dict[str, Record] = {}
-    queue = travel_order(config, points, start)
-    run.emit("queue", names=[visits[number][0] for number in queue])
+
+def visit_pairs(run: Run, device: Device, held: list[Any]) -> None:
+    """Visit held-out targets raw and compensated, in the order of least travel."""
+    names = pair_names(held)
+    targets = [pair[number] for number in (0, 1) for pair in held]
+    points = run.config.to_deg(targets or np.empty((0, 3)))
+    start = run.config.to_deg(run.zero_pulses)
+    queue = travel_order(run.config, points, start)
+    run.emit("queue", names=[names[number] for number in queue])
     for number in queue:
-        name, role, pulses = visits[number]
-        if record := run.visit(name, pulses, role=role):
-            found[name] = record
-    return held_out_errors(config, held, found)
+        a, b, c = targets[number]
+        role = names[number].partition(":")[0]
+        visit(device, Posture(names[number], (a, b, c)), role=role)
 
 
-def _identify(
-    run: Run, chosen: list[Record], held: list[Any], held_out: list[Record]
-) -> dict[str, Any]:
+def _identify(run: Run) -> dict[str, Any]:
     """Identify A and b, save calibration.json; what the summary says of them."""
     postures = run.postures()
+    held = run.journal.events("held_out")[-1]["pairs"]
+    held_out, _ = held_out_errors(run.config, held, postures)
     references = [postures[name] for name in (MIDDLE, END) if name in postures]
     zero = run.journal.events("zero")[-1]
-    evidence = Evidence(zero, chosen, held, held_out, references)
+    evidence = Evidence(zero, _chosen(run), held, held_out, references)
     simulated = run.journal.records[0].get("simulated")
     notes = {"run": run.folder.name, "simulated": simulated is not None}
     calibration, summary = conclude(run.config, evidence, notes)

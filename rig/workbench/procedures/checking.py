@@ -12,14 +12,18 @@ from jaxcal.files import atomic_write
 from rig.config import RigConfig
 from rig.config.config import differences
 from rig.core.attitude import Array, Frame
+from rig.core.device import Device, Posture
 from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
+from rig.core.identify import pairs
+from rig.core.motion import move
 from rig.core.plan import draw, draw_held_out
-from rig.core.session import Run
+from rig.core.session import visit
 from rig.core.zero import KeptZero, unseen
-from rig.workbench.identification.fit import pairs
+from rig.workbench.identification.fit import held_out_errors
 from rig.workbench.outputs.console import error_text, numbers
-from rig.workbench.procedures.calibrate import END, visit_pairs
+from rig.workbench.procedures.calibrate import END, pair_names, visit_pairs
 from rig.workbench.procedures.play import CHARACTERISED, Play
+from rig.workbench.run import Run
 
 
 def collect(run: Run, count: int) -> int:
@@ -36,10 +40,14 @@ def collect(run: Run, count: int) -> int:
         for number, target in enumerate(targets):
             run.say(f"  {number:>5}   {numbers(config.to_deg(target))}   {target}")
     run.planned = len(targets) + 1
-    for number, target in enumerate(targets):
-        run.visit(f"collect:{number}", target, role="collect")
-    closing = run.visit(END, run.zero_pulses, role="reference")
-    run.emit("phase", phase="saving")
+    names = [f"collect:{number}" for number in range(len(targets))]
+    if run.lacks([*names, END]):
+        with run.device() as device:
+            for name, (a, b, c) in zip(names, targets, strict=True):
+                visit(device, Posture(name, (a, b, c)), role="collect")
+            visit(device, Posture(END, run.zero_pulses), role="reference")
+            run.emit("phase", phase="saving")
+    closing = run.postures().get(END)
     collected = [r for r in run.postures().values() if r["role"] == "collect"]
     commands, measured = pairs(collected)
     size = min(config.session.candidates, len(commands))
@@ -157,14 +165,17 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     if run.dry_run:
         for raw, command in held:
             run.say(f"  target {numbers(config.to_deg(raw))}  command {list(command)}")
-    records, found = visit_pairs(run, held)
+    if run.lacks(pair_names(held)):
+        with run.device() as device:
+            visit_pairs(run, device, held)
+            run.emit("phase", phase="saving")
+    records, found = held_out_errors(config, held, run.postures())
     if not found:
         raise Refused("no held-out posture could be reached")
     commands, measured = pairs(records)
     off = measured - calibration.predict(commands)
     limit = config.session.verify_limit_deg
     again = found["after"]["max"] > limit
-    run.emit("phase", phase="saving")
     run.save_pairs()
     run.save_summary(
         {
@@ -196,30 +207,39 @@ def goto(run: Run, calibration: Any, desired: Array, play: Play) -> int:
                 + f" less its play, {most:.3f} deg"
                 * bool(most)
             )
-    if play.known and "goto" not in run.postures() and not run.dry_run:
-        command = _with_play(run, command, play)
-    pulses = config.to_pulses(command)
-    run.say(
-        f"desired {desired.tolist()} deg: command {command.round(4).tolist()} deg, "
-        f"pulses {list(pulses)}"
-    )
     run.planned = 1
-    record = run.visit("goto", pulses, role="goto")
+    if run.dry_run or not play.known:
+        _tell(run, desired, command)
+    if run.lacks(["goto"]):
+        with run.device() as device:
+            if play.known:
+                command = _with_play(run, device, command, play)
+                _tell(run, desired, command)
+            visit(device, Posture("goto", config.to_pulses(command)), role="goto")
+            told = [drive.axis.name for drive in device.drives if drive.origin]
+            names = unchecked(config, device.frame, told)
+        if names:
+            run.say(
+                f"NOT CHECKED: whether {', '.join(names)} was moved while without "
+                "power. The drive does not tell, and the phone does not see a turn "
+                "about the vertical"
+            )
+    record = run.postures().get("goto")
     if record is None:
         return EXIT_RECALIBRATE
-    told = [d.axis.name for d in run.ready().drives if d.origin]
-    if names := unchecked(config, run.frame, told):
-        run.say(
-            f"NOT CHECKED: whether {', '.join(names)} was moved while without power. "
-            "The drive does not tell, and the phone does not see a turn about the "
-            "vertical"
-        )
     reached = np.array(record["measured_deg"])
     run.say(
         f"reached {reached.round(4).tolist()} deg, off by "
         f"{(reached - desired).round(4).tolist()}"
     )
     return EXIT_OK
+
+
+def _tell(run: Run, desired: Array, command: Array) -> None:
+    run.say(
+        f"desired {desired.tolist()} deg: command {command.round(4).tolist()} deg, "
+        f"pulses {list(run.config.to_pulses(command))}"
+    )
 
 
 def unchecked(
@@ -240,10 +260,10 @@ def unchecked(
     ]
 
 
-def _with_play(run: Run, command: Array, play: Play) -> Array:
+def _with_play(run: Run, device: Device, command: Array, play: Play) -> Array:
     """(3,) the command with the play put back, once what is too near has run up."""
     config, one_way = run.config, run.config.motion.approach_overshoot_deg > 0.0
-    here = config.to_deg(run.ready().positions())
+    here = config.to_deg(device.positions())
     direction = np.ones(3) if one_way else np.where(command < here, -1.0, 1.0)
     near = np.abs(command - here) < play.run_up
     if near.any() and not one_way:  # so that the last move takes the play up
@@ -253,6 +273,6 @@ def _with_play(run: Run, command: Array, play: Play) -> Array:
         turned = near & ((begin < low) | (begin > high))
         direction = np.where(turned, -direction, direction)
         begin = np.where(near, command - direction * play.run_up, here)
-        run.motion.move_to(config.to_pulses(begin), "goto")
+        move(device, Posture("goto", config.to_pulses(begin)))
     run.say(*play.lines(command, direction))
     return command + play.shift(direction)

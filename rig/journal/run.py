@@ -8,29 +8,24 @@ by the next writer; any other damage is an error, never a guess.
 from __future__ import annotations
 
 import contextlib
-import csv
 import datetime
 import fcntl
-import importlib.metadata
-import io
 import json
 import os
 import pathlib
-import platform
 import sys
 import threading
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from jaxcal.files import write_text
-from rig.config import AXIS_NAMES, RigConfig
+from rig.journal.errors import JournalError
+
+if TYPE_CHECKING:
+    from rig.config import RigConfig
 
 Record = dict[str, Any]
-
-
-class JournalError(RuntimeError):
-    """The journal cannot be written, or is damaged."""
 
 
 def _parse(data: bytes, path: pathlib.Path) -> tuple[list[Record], int]:
@@ -156,11 +151,8 @@ class Journal:
 
 
 JOURNAL = "journal.jsonl"
-SPARED = (
-    "write",
-    "stop",
-    "comm_restored",
-)  # a full disk must not keep a stop from the bus
+# A full disk must not keep a stop from the bus, nor from the console.
+SPARED = ("write", "stop", "comm_restored", "note")
 
 
 def new_run_folder(output: pathlib.Path, mode: str) -> pathlib.Path:
@@ -195,6 +187,9 @@ class RunFolder:
             raise
 
     def _begin(self, mode: str, start: Record) -> None:
+        import importlib.metadata  # these two are slow to load, and `stop` is not to be
+        import platform
+
         now = datetime.datetime.now(datetime.UTC)
         provenance = {
             "jaxcal": importlib.metadata.version("jaxcal"),
@@ -246,6 +241,11 @@ class RunFolder:
 
     def save_pairs(self) -> None:
         """Write pairs.csv: role, commands, measurements, scatter of every posture."""
+        import csv
+        import io
+
+        from rig.config import AXIS_NAMES
+
         of_axes = ("pulses", "u_deg", "y_deg", "std_deg")
         columns = [f"{what}_{axis}" for what in of_axes for axis in AXIS_NAMES]
         text = io.StringIO()

@@ -21,7 +21,7 @@ import socket
 import time
 from typing import TYPE_CHECKING, Any
 
-from rig.core.faults import Refused
+from rig.journal.errors import Refused
 
 if TYPE_CHECKING:
     from rig.config.config import RigConfig

@@ -1,0 +1,246 @@
+"""What the moves so far have proved of a device, and how far and fast the next may go.
+
+What is not proved limits pulses and the drive's own speed, never degrees: degrees are
+what is not known. Of an axis of which nothing is proved the first move turns the motor
+by FIRST_MOTOR_DEG, as slowly as the drive's registers go. After each move the phone is
+looked at: the next is at most GROWTH times as long, and no longer than it takes to turn
+the phone as far as it may, by what it was seen to turn for each pulse. Nothing seen, or
+seen in a unit that is not proved, allows UNSEEN_MOTOR_DEG of the motor and no more.
+
+An axis that was checked with this same file (SIGN_CHECKED) has its gearing, direction
+and the phone's unit from there. In a new session it still begins with SHOWN_DEG of its
+joint, and grows while the phone turns no further than the axes are moved.
+
+`motion` asks before every frame that moves, and looks after it; there is no other way.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from rig.config.axis import Axis, Pulses
+from rig.config.settings import ImuSettings
+from rig.core.attitude import Array, angle_between_deg, matrix_to_euler
+from rig.core.faults import MotionFault
+
+FIRST_MOTOR_DEG = 0.36
+UNSEEN_MOTOR_DEG = 36.0
+SHOWN_DEG = 1.0  # of a checked joint, in its first move of a session
+GROWTH = 4.0  # play of a third of a move can hide it
+LOOK_S = 0.5  # time that a move takes at least, of which little is known
+SLOW_DEG_S = 5.0  # of the joint, once the phone has shown what a pulse turns
+NOISE_DEG = 0.1  # of the phone, just after a move
+ALLOWED_DEG = 9.0  # that the phone may turn from where an unproved device began
+TOO_FAR = 2.0  # times what checked axes are moved, and MARGIN_DEG: more is a fault
+MARGIN_DEG = 1.0
+SEEN_SHARE = 0.1  # of a checked axis's move must be seen, or the moves do not grow
+ALL = np.eye(3), math.inf  # any attitude
+RADIANS = 180.0 / math.pi
+LARGEST_RAD = 2.0 * math.pi + 0.1  # no larger number is an angle in radians
+
+
+def unit_proved(imu: ImuSettings, attitude: Array) -> bool:
+    """Whether a phone's (3, 3) attitude can only have come in the configured unit.
+
+    A quaternion has none. A number over 2 pi is no angle in radians. Degrees that are
+    read as radians turn 57.3 times too far, which the first move shows.
+    """
+    if imu.format == "sensorlogger" or imu.quaternion_columns or imu.unit == "rad":
+        return True
+    sent = matrix_to_euler(attitude, str(imu.order))
+    return bool(np.abs(sent).max() > LARGEST_RAD)
+
+
+class Reach:
+    """What one axis may be sent, in pulses, by the moves so far."""
+
+    def __init__(
+        self, axis: Axis, unit_is_proved: bool = True, checked: bool = False
+    ) -> None:
+        self.axis = axis
+        self.checked = checked
+        self.factor = 1.0 if unit_is_proved else RADIANS
+        self.seen = checked  # the phone has turned, in a unit that is proved
+        self.longest = 0.0  # pulses of the longest move so far
+        self.deg_per_pulse = 0.0  # that the phone turned at most, in that move
+        if checked:
+            self.deg_per_pulse = 1.0 / abs(axis.pulses_per_deg)
+            self.longest = SHOWN_DEG / self.deg_per_pulse / GROWTH
+
+    def pulses(self, wanted: float, most_deg: float = math.inf) -> int:
+        """Pulses, at least 1, of the next move towards a wanted count.
+
+        Where that or ``most_deg`` of the joint takes several moves, they grow evenly.
+        """
+        if not self.longest:
+            first = FIRST_MOTOR_DEG / 360.0 * self.axis.pulses_per_rev
+            return max(1, math.floor(min(abs(wanted), first)))
+        goal = abs(wanted)
+        if self.deg_per_pulse:
+            goal = min(goal, most_deg / self.deg_per_pulse)
+        ratio = goal / self.longest
+        if ratio <= 1.0:
+            return max(1, math.floor(goal))
+        steps = max(1, math.ceil(math.log(ratio) / math.log(GROWTH) - 1e-9))
+        return max(1, math.floor(self.longest * ratio ** (1.0 / steps)))
+
+    def saw(self, pulses: float, turned_deg: float, noise_deg: float) -> None:
+        """A move by so many pulses turned the phone so far, give or take the noise."""
+        if abs(pulses) < self.longest:
+            return
+        if self.checked:  # its gearing is known; play may hide a short move
+            if turned_deg >= SEEN_SHARE * abs(pulses) * self.deg_per_pulse:
+                self.longest = abs(pulses)
+            return
+        self.seen |= self.factor == 1.0 and turned_deg > noise_deg
+        self.longest = abs(pulses)
+        # Of a unit that is not proved only what surely turned counts 57 times.
+        sign = 1.0 if self.factor == 1.0 else -1.0
+        most = self.factor * max(0.0, turned_deg + sign * noise_deg)
+        self.deg_per_pulse = most / self.longest
+
+    def unseen(self, begun: int, here: int, goal: int) -> int:
+        """Pulses towards a goal that may be gone without the phone's word.
+
+        Raises:
+            MotionFault: so many were gone already.
+        """
+        axis = self.axis
+        most = max(1, int(UNSEEN_MOTOR_DEG / 360.0 * axis.pulses_per_rev))
+        gone = abs(here - begun)
+        if abs(goal - begun) <= max(most, gone):
+            return abs(goal - here)
+        if gone < most:
+            return most - gone
+        why = "look for a loose coupling, a stream that does not change, or a reduction"
+        why += " that is far too small"
+        if self.factor != 1.0:
+            why = "no angle of the phone is over 6.3, so degrees are not told from "
+            why += "radians. Turn the base, or the phone's heading, by some degrees"
+        raise MotionFault(
+            f"unit {axis.unit} turned its motor by "
+            f"{gone * 360 / axis.pulses_per_rev:.3g} deg for {axis.name}, and the "
+            f"phone shows nothing to go on by: {why}"
+        )
+
+    def paced(self, pulses: float) -> Axis:
+        """The axis at the speed of a move by so many pulses."""
+        if self.checked:
+            return self.axis
+        per_s = max(1.0, abs(pulses)) / LOOK_S
+        if self.deg_per_pulse:
+            per_s = min(
+                max(per_s, self.longest / LOOK_S), SLOW_DEG_S / self.deg_per_pulse
+            )
+        return slowed(self.axis, per_s / abs(self.axis.pulses_per_deg))
+
+
+class Proof:
+    """What is proved of the three axes of a device that is armed."""
+
+    def __init__(
+        self, axes: Sequence[Axis], checked: bool, simulated: bool = False
+    ) -> None:
+        self.axes = axes
+        self.reaches = [Reach(axis, checked=checked) for axis in axes]
+        self._paced = not simulated  # what is not real need not be slow
+        self._near: tuple[Array, float] | None = None
+        self._start: Pulses | None = None  # where the unproved axes began
+        self._unit: bool | None = None  # the phone's is proved; None: to be looked at
+        self._before = np.eye(3)  # (3, 3) attitude where the present piece began
+        self._most_deg = math.inf  # that the phone may turn in it
+
+    def renew(self, index: int, unit_is_proved: bool = True) -> Reach:
+        """Nothing is proved of an axis any more: it is to be checked."""
+        self.reaches[index] = Reach(self.axes[index], unit_is_proved)
+        self._start, self._unit = None, unit_is_proved
+        return self.reaches[index]
+
+    def stay_near(self, attitude: Array, allowed_deg: float = ALLOWED_DEG) -> None:
+        """The phone may turn so far away from this attitude; more is a fault."""
+        self._near = attitude, allowed_deg
+        self._start = None
+
+    def begin(
+        self, imu: ImuSettings, attitude: Array, here: Pulses, goal: Pulses
+    ) -> Pulses:
+        """The next piece of the way from here to a goal; it ends where it may end.
+
+        Raises:
+            MotionFault: an axis was moved as far as may be, and nothing was seen.
+        """
+        unproved = [reach for reach in self.reaches if not reach.checked]
+        if unproved and self._near is None:
+            self.stay_near(attitude)
+        if unproved and self._unit is None:
+            self._unit = unit_proved(imu, attitude)
+            for reach in unproved:
+                reach.factor = 1.0 if self._unit else RADIANS
+        self._start = self._start or here
+        most = math.inf if self._near is None else self._near[1]
+        share = 1.0
+        for reach, begun, a, b in zip(
+            self.reaches, self._start, here, goal, strict=True
+        ):
+            if a != b:
+                longest = reach.pulses(b - a, most)
+                if not reach.seen:
+                    longest = min(longest, reach.unseen(begun, a, b))
+                # A pulse more, or a last one would be a move of its own.
+                share = min(share, (longest + 1) / abs(b - a))
+        if share < 1.0:
+            a, b, c = (
+                p + round((q - p) * share) for p, q in zip(here, goal, strict=True)
+            )
+            goal = a, b, c
+        self._before, self._most_deg = attitude, math.inf
+        if not unproved:
+            each = zip(self.axes, here, goal, strict=True)
+            way = sum(abs(axis.to_deg(q - p)) for axis, p, q in each)
+            self._most_deg = TOO_FAR * way + MARGIN_DEG
+        return goal
+
+    def paced(self, index: int, pulses: int) -> Axis:
+        """An axis at the speed at which it may move by so many pulses."""
+        reach = self.reaches[index]
+        return reach.paced(pulses) if self._paced else reach.axis
+
+    def grows(self, here: Pulses, end: Pulses) -> bool:
+        """A move is longer than those before: the phone must be looked at after it."""
+        ways = np.abs(np.subtract(end, here))
+        return any(w > r.longest for w, r in zip(ways, self.reaches, strict=True))
+
+    def watch(self, attitude: Array) -> None:
+        """At every poll of a move; MotionFault where the phone turns too far in it."""
+        for since, most in ((self._before, self._most_deg), self._near or ALL):
+            turned = angle_between_deg(since, attitude)
+            if turned > most:
+                raise MotionFault(
+                    f"the phone turned {turned:.1f} deg in a move that may turn it "
+                    f"{most:.1f}. Check pulses_per_rev and reduction, and that the "
+                    "phone is fixed"
+                )
+
+    def saw(self, here: Pulses, end: Pulses, attitude: Array) -> None:
+        """The phone once the move from here has ended."""
+        self.watch(attitude)
+        turned = angle_between_deg(self._before, attitude)
+        for reach, a, b in zip(self.reaches, here, end, strict=True):
+            if a != b:
+                reach.saw(abs(b - a), turned, NOISE_DEG)
+
+
+def slowed(axis: Axis, speed_deg_s: float | None = None) -> Axis:
+    """An axis no faster than that (SLOW_DEG_S), as far as its drive's registers go."""
+    speed = min(SLOW_DEG_S if speed_deg_s is None else speed_deg_s, axis.speed_deg_s)
+    while speed < axis.speed_deg_s:
+        slow = axis.model_copy(update={"speed_deg_s": speed})
+        try:
+            slow.motion_counts()
+            return slow
+        except ValueError:  # slower than the drive's register can say
+            speed *= 1.5
+    return axis

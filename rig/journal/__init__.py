@@ -1,0 +1,31 @@
+"""What the rig keeps on disk: its runs, its device, and who moves it.
+
+``stop`` reads these before anything heavy is loaded, so nothing here loads pydantic.
+"""
+
+from rig.journal.device import (
+    HOMED,
+    IDENTIFIED,
+    SIGN_CHECKED,
+    STATES,
+    ZEROED,
+    DeviceRecord,
+)
+from rig.journal.errors import JournalError, Refused
+from rig.journal.lock import BusLock
+from rig.journal.run import (
+    JOURNAL,
+    Journal,
+    Record,
+    RunFolder,
+    is_written,
+    measured_postures,
+    new_run_folder,
+    read_journal,
+)
+
+__all__ = [
+    "HOMED", "IDENTIFIED", "JOURNAL", "SIGN_CHECKED", "STATES", "ZEROED", "BusLock",
+    "DeviceRecord", "Journal", "JournalError", "Record", "Refused", "RunFolder",
+    "is_written", "measured_postures", "new_run_folder", "read_journal",
+]  # fmt: skip
