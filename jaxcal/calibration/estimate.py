@@ -29,7 +29,7 @@ __all__ = ["fit_model", "require_model"]
 Array = NDArray[np.float64]
 
 _BEYOND = 2.0  # degrees beyond a limit, or percent of a slide's stroke
-_NOMINAL = 0.3  # of its length: no arm, and no tip, is so far off before it is fitted
+_NOMINAL = 0.5  # of its length: no arm, and no tip, is so far off before it is fitted
 
 
 def require_model(model: Any, commands: Array, measured: Array) -> None:
