@@ -26,7 +26,6 @@ from rig.__main__ import main
 from rig.config import example_text, parse_config
 from rig.core.attitude import euler_to_matrix, frame_at
 from rig.core.faults import MotionFault, Refused
-from rig.core.identify import check_matrix
 from rig.core.phone import Imu
 from rig.core.zero import KeptZero, check_zero, moved, unseen
 from rig.journal import (
@@ -42,6 +41,7 @@ from rig.simulator.faults import FaultInjector
 from rig.simulator.phone import Phone
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.steps import Place, characterise
+from rig.workbench.identification.conclusion import check_matrix
 from rig.workbench.procedures.checking import (
     collect,
     load_calibration,
