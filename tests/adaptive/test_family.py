@@ -73,6 +73,7 @@ def pairs():
     return [(task, jax.tree.map(jnp.asarray, pad(task, SHAPE))) for task in tasks]
 
 
+@pytest.mark.slow
 def test_a_padded_task_is_the_task(pairs):
     """Belief, costs, budget and the rule's choice agree, after some measurements."""
     looked = jax.jit(
@@ -91,7 +92,7 @@ def test_a_padded_task_is_the_task(pairs):
         )
     )
     rng = np.random.default_rng(1)
-    for small, large in pairs[:8]:
+    for small, large in pairs[:3]:
         count, outcomes, states = small.likelihood.shape
         key = jax.random.key(3)
         (belief, session), (wide, state) = small.begin(key), large.begin(key)
@@ -103,7 +104,8 @@ def test_a_padded_task_is_the_task(pairs):
             np.testing.assert_allclose(p[:count, :outcomes], one[0], atol=2e-6)
             np.testing.assert_allclose(gains[:count], one[1], atol=1e-5)
             # Entropies are of what a design depends on; a padded task has one part.
-            seen = (np.asarray(one[0]) > 1e-4) & (small.parts[0].axes == whole(small))
+            seen = np.asarray(one[0]) > 1e-4
+            seen &= [part.axes for part in small.parts] == [whole(small)]
             np.testing.assert_allclose(
                 np.asarray(after)[:count, :outcomes][seen], np.asarray(one[2])[seen],
                 rtol=1e-3, atol=2e-3,
