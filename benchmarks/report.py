@@ -118,29 +118,21 @@ def write(folder: pathlib.Path, results: dict[str, dict[str, Any]]) -> None:
 
 
 def overview(results: dict[str, dict[str, Any]]) -> Any:
-    """How far every promise is kept: achieved over wanted, logarithmic."""
-    from matplotlib.figure import Figure
+    """How far every promise is kept: a mark each, achieved over wanted."""
+    from jaxcal.plots.style import COLOURS, panels
 
-    bars = []
-    for row in results.values():
-        if row["quick"]:
-            continue
-        for verdict in row["verdicts"]:
-            if share := margin(verdict):
-                label = f"{row['name']}: {verdict['case']}"
-                bars.append((label, share, number(verdict["value"])))
-    figure = Figure(figsize=(10, 1.2 + 0.3 * len(bars)), layout="constrained")
-    axes = figure.add_subplot()
-    for place, (_, share, shown) in enumerate(reversed(bars)):
-        colour = "tab:blue" if share >= 1.0 else "tab:red"
-        axes.barh(place, share, color=colour, height=0.6)
-        axes.text(max(share, 1.0) * 1.1, place, shown, va="center", fontsize=8)
-    axes.set_yticks(range(len(bars)), [name for name, _, _ in reversed(bars)])
-    axes.tick_params(axis="y", labelsize=8)
+    rows = [row for row in results.values() if row["verdicts"] and not row["quick"]]
+    figure, axes = panels((6.4, 0.9 + 0.34 * len(rows)))
+    for place, row in enumerate(reversed(rows)):
+        shares = [share for share in map(margin, row["verdicts"]) if share]
+        for kept, mark in ((True, "o"), (False, "X")):
+            drawn = [share for share in shares if (share >= 1.0) == kept]
+            look = {"color": COLOURS[0 if kept else 1], "marker": mark, "alpha": 0.7}
+            axes.plot(drawn, [place] * len(drawn), linestyle="none", **look)
+    axes.set_yticks(range(len(rows)), [row["name"] for row in reversed(rows)])
     axes.axvline(1.0, color="black", linewidth=1)
     axes.set_xscale("log")
-    axes.set_xlabel("achieved / wanted (right of the line: kept)")
-    axes.margins(x=0.15, y=0.01)
+    axes.set_xlabel("achieved / wanted; left of the line: missed")
     return figure
 
 
@@ -148,7 +140,7 @@ def scaling(series: dict[str, Any]) -> Any:
     """Seconds against size, one panel a size, the exponent in the legend."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 8), layout="constrained")
+    figure = Figure(figsize=(8, 6.5), layout="constrained")
     markers = "osD^"
     for place, (axis, curves) in enumerate(series.items()):
         axes = figure.add_subplot(2, 2, place + 1)

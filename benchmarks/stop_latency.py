@@ -1,6 +1,6 @@
 """How long after SIGTERM, or `stop`, the last drive that still listens hears its stop.
 
-    python benchmarks/stop_latency.py [--repeats 20]
+    python benchmarks/stop_latency.py [--repeats 20] [--transport rtu] [--dead]
 
 Simulated Leadshine drives with bus.timeout_s = 0.3 and two tries more of each read, as
 in the examples. Healthy, and with the first unit dead from up to two time-outs before
@@ -121,12 +121,15 @@ def command(transport: str, dead: bool, folder: pathlib.Path) -> tuple[float, fl
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=20)
-    repeats, rng = parser.parse_args().repeats, random.Random(0)
+    parser.add_argument("--transport", choices=("tcp", "rtu"), help="only this")
+    parser.add_argument("--dead", action="store_true", help="only with a dead unit")
+    args = parser.parse_args()
+    repeats, rng = args.repeats, random.Random(0)
     print(f"{'':<34}{'median':>9}{'worst':>9}  ms")
     with tempfile.TemporaryDirectory() as scratch:
         folder = pathlib.Path(scratch)
-        for transport in ("tcp", "rtu"):
-            for dead in (False, True):
+        for transport in [args.transport] if args.transport else ["tcp", "rtu"]:
+            for dead in [True] if args.dead else [False, True]:
                 name = f"{transport}, {'unit 1 dead' if dead else 'healthy'}"
                 found = [session(transport, dead, rng) for _ in range(repeats)]
                 commands = [command(transport, dead, folder) for _ in range(repeats)]

@@ -93,6 +93,8 @@ def on_files(files: Any, config: Any) -> Any:
         text = page.read_text(encoding="utf-8").replace("](../docs/", "](../")
         script = page.with_suffix(".py").read_text(encoding="utf-8")
         add(f"examples/{page.name}", f"{text}\n## The script\n\n```py\n{script}```\n")
+    for notebook in sorted((ROOT / "examples").glob("*.ipynb")):
+        add(f"examples/{notebook.name}", notebook.read_bytes())
     for path, image in figures.draw_all().items():
         add(path, image)
     return files

@@ -7,10 +7,8 @@ import math
 import pathlib
 import tomllib
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import PrivateAttr
 
 from rig.config.axis import AXIS_NAMES, Axis, Pulses, Scale
@@ -23,6 +21,10 @@ from rig.config.settings import (
     SessionSettings,
     SettleSettings,
 )
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 POLLS, HICCUP_S = 4, 0.5  # of the motion loop's heartbeat
 PHONE = (
@@ -186,8 +188,10 @@ class RigConfig(Section):
         )
         return a, b, c
 
-    def to_deg(self, pulses: Any) -> NDArray[np.float64]:
+    def to_deg(self, pulses: Any) -> "NDArray[np.float64]":
         """(..., 3) degrees of (..., 3) pulses."""
+        import numpy as np  # a third of what `stop` would wait for at its start
+
         scales = np.array([axis.pulses_per_deg for axis in self.axes])
         return np.asarray(pulses, dtype=np.float64) / scales
 

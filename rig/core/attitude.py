@@ -100,21 +100,3 @@ def frame_at(config: RigConfig, zero: Array) -> Frame:
     """The frame in which the (3, 3) attitude ``zero`` of the phone is the zero."""
     mounting = euler_to_matrix(config.imu.mounting_deg, "ZYX")
     return Frame(zero, mounting, config.mechanism.order, config.letters)
-
-
-def recorded_frame(described: dict[str, Any], zero: dict[str, Any]) -> Frame:
-    """The same from the journal: ``config`` of its start, and a zero record."""
-    mounting = euler_to_matrix(described["imu"]["mounting_deg"], "ZYX")
-    a, b, c = (axis["letter"] for axis in described["axes"])
-    attitude = np.array(zero["attitude"])
-    return Frame(attitude, mounting, described["mechanism_order"], (a, b, c))
-
-
-def attitudes(record: dict[str, Any]) -> Array:
-    """(samples, 3, 3) of the phone in its world, of a posture's or zero's readings."""
-    return Rotation.from_quat(record["quaternions"]).as_matrix()
-
-
-def angles(record: dict[str, Any], frame: Frame) -> Array:
-    """(samples, 3) pitch, yaw and roll in degrees of every reading."""
-    return frame.angles(attitudes(record))

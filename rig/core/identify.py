@@ -1,4 +1,4 @@
-"""What follows from the readings: A and b, and whether they can be a sound device's."""
+"""What follows from the readings: A and b of ``y = A u + b``."""
 
 from __future__ import annotations
 
@@ -6,14 +6,10 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from rig.config import AXIS_NAMES
 from rig.core.attitude import Array
-from rig.core.faults import MotionFault
 from rig.journal import Record
-
-USUAL = (1 / 3, 3.0)  # degrees of a joint for one commanded; outside it is told
 
 
 def pairs(records: list[Record]) -> tuple[Array, Array]:
@@ -58,37 +54,3 @@ def identify(
     covariance = np.array(fitted.joint_covariance)
     covariance[-3:, -3:] += np.diag(zero_variance)
     return dataclasses.replace(fitted, joint_covariance=covariance)
-
-
-def check_matrix(matrix: ArrayLike) -> list[str]:
-    """A (3, 3) fitted matrix A is one of a device whose axes turn as they are named.
-
-    Returns:
-        Warnings: gains that are far from 1.
-
-    Raises:
-        MotionFault: an axis answers the other way, or another axis's command.
-    """
-    gains = np.asarray(matrix, dtype=np.float64)
-    faults, warnings = [], []
-    for i, name in enumerate(AXIS_NAMES):
-        gain, strongest = gains[i, i], int(np.abs(gains[i]).argmax())
-        if strongest != i:
-            faults.append(
-                f"{name} follows the command of {AXIS_NAMES[strongest]} "
-                f"({gains[i, strongest]:.2f} deg for each degree) more than its own "
-                f"({gain:.2f}): units, cables or `rotates` are exchanged"
-            )
-        elif gain <= 0:
-            faults.append(
-                f"{name} turns {gain:.2f} deg for each degree commanded, the other "
-                f"way: check axes.{name}.direction, wiring and imu.signs"
-            )
-        elif not USUAL[0] <= gain <= USUAL[1]:
-            warnings.append(
-                f"{name} turns {gain:.2f} deg for each degree commanded: check "
-                f"pulses_per_rev and reduction of axes.{name}"
-            )
-    if faults:
-        raise MotionFault(f"no calibration is saved: {'; '.join(faults)}")
-    return warnings

@@ -97,7 +97,10 @@ def open_device(
             raise
         finally:
             if device.requests.armed:
-                device.stopper.stop(reason, latch)
+                results = device.stopper.stop(reason, latch)
+                if all(result.standing for result in results):  # `stop` waits for it
+                    gone = run.journal.records[0].get("simulated") is not None
+                    BusLock(config.bus).stood(forget=gone)
 
 
 def _close(device: Device) -> None:
@@ -109,10 +112,6 @@ def _close(device: Device) -> None:
         except OSError as error:
             text = f"{device.record.path} cannot be written: {error}"
             device.emit("note", text=text)
-    results = device.stopper.results
-    if results and all(result.standing for result in results):
-        simulated = device.run.journal.records[0].get("simulated") is not None
-        BusLock(device.config.bus).stood(forget=simulated)
     device.close()
     device.requests.armed = False
 

@@ -8,19 +8,13 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from rig.core.attitude import (
-    ORDERS,
-    Frame,
-    Reading,
-    attitudes,
-    euler_to_matrix,
-    raw_fields,
-)
+from rig.core.attitude import ORDERS, Frame, Reading, euler_to_matrix, raw_fields
 from rig.simulator import Truth
 from rig.workbench.identification import noise
 from rig.workbench.identification.drift import estimate_drift, without_drift
 from rig.workbench.identification.fit import uncertainty
 from rig.workbench.outputs.console import drift_text, recalibrate
+from rig.workbench.readings import attitudes
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 LETTERS = ("X", "Z", "Y")

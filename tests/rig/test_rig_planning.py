@@ -12,7 +12,7 @@ from harness import (
 
 import jaxcal
 from rig.config import example_text, parse_config
-from rig.core.plan import choose, draw_candidates, travel_order
+from rig.workbench.procedures.plan import choose, draw_candidates, travel_order
 
 
 @pytest.mark.slow

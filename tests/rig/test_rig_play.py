@@ -55,7 +55,6 @@ def test_the_shift_brings_a_joint_to_where_the_calibration_means(below, directio
     assert abs(command[1] - 2.0) <= play.most[1] + 1e-9
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("desired", "below"),
     [([5.0, -3.0, 4.0], False), ([-2.0, 3.0, -4.0], False), ([0.1, 0.1, -0.1], False),

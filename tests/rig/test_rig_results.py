@@ -31,7 +31,6 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from rig.__main__ import main
 from rig.config import AXIS_NAMES, parse_config
-from rig.core.attitude import attitudes
 from rig.journal import read_journal
 from rig.simulator import Simulator, Truth
 from rig.workbench.identification.refit import reread
@@ -39,6 +38,7 @@ from rig.workbench.outputs import trend
 from rig.workbench.outputs.console import numbers
 from rig.workbench.outputs.export import LANGUAGES, load_inverse
 from rig.workbench.outputs.report import write_report
+from rig.workbench.readings import attitudes
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 SESSION = '\n[session]\nmethod = "exact"\nverify_postures = 2\n'

@@ -28,13 +28,13 @@ import jaxcal
 from rig.__main__ import main
 from rig.config import parse_config
 from rig.core.faults import Refused
-from rig.core.plan import choose, draw_candidates
 from rig.journal import read_journal
 from rig.simulator import Truth
 from rig.workbench.identification.conclusion import order_residuals
 from rig.workbench.identification.fit import uncertainty
 from rig.workbench.procedures.calibrate import calibrate
 from rig.workbench.procedures.checking import collect
+from rig.workbench.procedures.plan import choose, draw_candidates
 from rig.workbench.run import run_safely
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])

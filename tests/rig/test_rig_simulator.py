@@ -1,6 +1,7 @@
 """The simulator: what real drives do, and what may be wired or set wrongly."""
 
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -158,3 +159,22 @@ def test_options_of_the_command_line_describe_a_device():
     assert truth.jitter_counts == 1 and truth.idle_watchdog and truth.enable_delay_s
     with pytest.raises(ValueError, match="swapped must name two axes"):
         truth_of(plain | {"swapped": ["yaw"]}, 0)
+
+
+def test_a_drive_ends_on_its_target_and_never_passes_it(monkeypatch):
+    """However often it is looked at; play keeps what it once went too far."""
+    now, rng = [0.0], np.random.default_rng(0)
+    clock = SimpleNamespace(monotonic=lambda: now[0])
+    monkeypatch.setattr("rig.simulator.drive.time", clock)
+    axis = fast_config().axes[0]
+    for target in rng.integers(100, 8000, 60):
+        drive = SimDrive(axis.map, axis.pulses_per_rev, speedup=3.0)
+        drive._speed = axis.speed_deg_s * axis.pulses_per_deg
+        drive._accel = axis.accel_deg_s2 * axis.pulses_per_deg
+        drive.target, drive.moving, drive.done = int(target), True, False
+        furthest = 0.0
+        while not drive.done:
+            now[0] += rng.choice([1e-5, 1e-4, 4e-4, 1e-3, 3e-3])
+            drive.advance()
+            furthest = max(furthest, drive.position)
+        assert furthest == drive.position == target

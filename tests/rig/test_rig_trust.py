@@ -26,7 +26,6 @@ from rig.__main__ import main
 from rig.config import example_text, parse_config
 from rig.core.attitude import euler_to_matrix, frame_at
 from rig.core.faults import MotionFault, Refused
-from rig.core.identify import check_matrix
 from rig.core.phone import Imu
 from rig.core.zero import KeptZero, check_zero, moved, unseen
 from rig.journal import (
@@ -42,6 +41,7 @@ from rig.simulator.faults import FaultInjector
 from rig.simulator.phone import Phone
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.steps import Place, characterise
+from rig.workbench.identification.conclusion import check_matrix
 from rig.workbench.procedures.checking import (
     collect,
     load_calibration,
@@ -500,6 +500,18 @@ def test_a_simulated_calibration_moves_no_real_joint(calibrated, tmp_path, capsy
         assert main(given) == 2
         error = capsys.readouterr().err
         assert "simulated" in error and "cannot open" not in error
+
+
+def test_the_run_of_a_real_device_is_not_resumed_as_a_simulated_one(
+    calibrated, tmp_path, capsys
+):
+    """G: --simulate was left aside, and the real device moved."""
+    path = tmp_path / "rig.toml"
+    path.write_text(fast_text({"port = 5020": "port = 1"}))
+    given = ["resume", str(calibrated), "--simulate", "--arm", "--config", str(path)]
+    assert main(given) == 2
+    error = capsys.readouterr().err
+    assert "was made with a real device" in error and "cannot open" not in error
 
 
 def test_what_is_found_of_a_simulated_device_stays_out_of_a_real_calibration(

@@ -16,9 +16,10 @@ from rig.core import proof
 from rig.core.faults import MotionFault, Refused
 from rig.core.proof import GROWTH, Reach
 from rig.simulator import Truth, parse_fault
+from rig.simulator.drive import SimDrive
 from rig.workbench.commission import steps
 from rig.workbench.commission.operator import Operator
-from rig.workbench.commission.proposals import require_unit
+from rig.workbench.commission.proposals import require_gearing, require_unit
 
 
 @pytest.fixture
@@ -121,13 +122,88 @@ def test_radians_with_a_reduction_that_is_too_high_move_nothing_far(slow, capsys
 
 @pytest.mark.parametrize("ratios", [(0.43, 0.71, 0.87), (1.0, 1.0, 0.1)])
 def test_two_sound_gearings_prove_the_unit(ratios):
-    require_unit(fast_config(), ratios)
+    assert require_unit(fast_config(), ratios) is None
+    with pytest.raises(MotionFault):  # one of them does not
+        require_unit(fast_config(), [ratios[0], *(0.1 for _ in ratios[1:])])
 
 
 @pytest.mark.parametrize("ratios", [(0.1, 0.1, 0.1), (10.0, 10.0, 1.0)])
 def test_no_gearing_is_blamed_where_the_unit_is_not_proved(ratios):
     with pytest.raises(MotionFault, match=r"either imu\.unit or the gearings"):
         require_unit(fast_config(), ratios)
+
+
+@pytest.mark.parametrize("ratios", [(0.1, 0.1, 0.1), (10.0, 0.3, 4.0)])
+def test_a_gearing_far_off_on_all_axes_wants_the_drives_own_word(ratios):
+    """A: ten times on all three was corrected by the phone alone."""
+    config = fast_config()
+    with pytest.raises(MotionFault, match="the drive of roll has no register"):
+        require_gearing(config, ratios, (10000, 10000, None))
+    assert require_gearing(config, ratios, (10000,) * 3) is None
+    assert require_gearing(config, (ratios[0], 0.7, ratios[2]), (None,) * 3) is None
+    assert require_gearing(config, (1.9, 1.8, 1.6), (None,) * 3) is None
+
+
+@pytest.mark.slow
+def test_ten_times_on_all_axes_of_drives_without_a_register_corrects_no_file(
+    slow, capsys
+):
+    generic = fast_config({'map = "leadshine_pr"': 'map = "generic"'})
+    with device(speedup=1.0, config=generic) as (sim, bus, port):
+        text = quick_text(bus, port).replace("leadshine_pr", "generic")
+        text = axes_of(text, {"reduction": 100.0, "speed_deg_s": 10})
+        (slow / "rig.toml").write_text(text)
+        assert main(["scan", "--units", "3"]) == 0
+        assert main(["home", "--here", "--yes"]) == 0
+        watch = Watch(sim)
+        before = (slow / "rig.toml").read_text()
+        assert main(["axes", "--yes"]) == 3
+    assert "has no register that says" in capsys.readouterr().out
+    assert (slow / "rig.toml").read_text() == before
+    assert watch.far.max() < 5.0
+
+
+def test_a_frozen_phone_lets_no_axis_go_far(slow, capsys):
+    """A file 100 times too high, and nothing seen: a degree commanded is 100."""
+    with device(speedup=1.0, faults=[parse_fault("imu_frozen")]) as (sim, bus, port):
+        text = axes_of(quick_text(bus, port), {"reduction": 1000, "speed_deg_s": 10})
+        (slow / "rig.toml").write_text(text)
+        assert main(["scan", "--units", "3"]) == 0
+        watch = Watch(sim)
+        assert main(["jog", "roll", "2", "--yes"]) == 3
+    assert "the phone shows nothing to go on by" in capsys.readouterr().out
+    assert watch.far.max() < 5.0
+
+
+@pytest.mark.parametrize(
+    ("away_deg", "fault", "values", "said"),
+    [(8, None, {}, None), (100, None, {}, r"the phone turned 5\d\.\d deg in a move"),
+     (40, "imu_frozen", {}, "the phone saw nothing of it"),
+     (15, None, {"speed_deg_s": 10, "max_speed_deg_s": 12}, "homes at .* by the phone"),
+     (40, "imu_gap,seconds=20", {}, "silent|stale|no reading")],
+    ids=["home", "too far", "frozen", "too fast", "silent"],
+)  # fmt: skip
+def test_a_drives_own_homing_is_watched_by_the_phone(
+    at, away_deg, fault, values, said, capsys, monkeypatch
+):
+    with device(speedup=0.3 if fault else 3.0) as (sim, bus, port):
+        drive = sim.drives[1]
+        drive.position = float(sim.config.axes[1].to_pulses(away_deg))
+        drive.target = round(drive.position)
+
+        def home(drive, begin=SimDrive._home):
+            if fault:
+                sim.faults.add(parse_fault(fault))
+            begin(drive)
+
+        monkeypatch.setattr(SimDrive, "_home", home)
+        text = axes_of(quick_text(bus, port), values)
+        (at / "rig.toml").write_text(text)
+        assert main(["scan", "--units", "3"]) == 0
+        assert main(["home", "--yes"]) == (3 if said else 0)
+        assert not any(drive.moving for drive in sim.drives)
+    out = capsys.readouterr().out
+    assert said is None or re.search(said, out), out
 
 
 def test_degrees_that_are_read_as_radians_are_named_too():

@@ -52,6 +52,7 @@ import numpy as np
 from cython.cimports.jaxcal.information.linear_algebra import (
     cholesky,
     copy,
+    dot,
     factor,
     multiply,
 )
@@ -431,9 +432,8 @@ class Search:
         picked = cython.address(self.picked[0, 0])
         turned = cython.address(self.turned[0, 0])
         for i in range(m):
-            for r in range(q):
-                for a in range(p):
-                    self.picked[i * q + r, a] = self.blocks[self.which[i], r, a]
+            copy(picked + i * q * p,
+                 cython.address(self.blocks[self.which[i], 0, 0]), q * p)  # fmt: skip
         for i in range(m * m):
             out[i] = 0.0
         if kind >= _E:
@@ -474,14 +474,19 @@ class Search:
         for i in range(m):
             self.ends[i] = 0.0
             for a in range(p):
+                into, bend = plain + at, cython.address(self.bend[a, 0])
                 for b in range(a + 1):
-                    total: cython.double = 0.0
-                    for r in range(q):
-                        total += self.turned[i * q + r, a] * self.turned[i * q + r, b]
-                    plain[at] = total
-                    bent[at] = -total * self.bend[a, b] * (1.0 if a == b else 2.0)
-                    at += 1
-                self.ends[i] += self.tail[a] * plain[at - 1]
+                    into[b] = 0.0
+                for r in range(q):
+                    row = cython.address(self.turned[i * q + r, 0])
+                    weight = row[a]
+                    for b in range(a + 1):
+                        into[b] += weight * row[b]
+                for b in range(a):
+                    bent[at + b] = -2.0 * into[b] * bend[b]
+                bent[at + a] = -into[a] * bend[a]
+                self.ends[i] += self.tail[a] * into[a]
+                at += a + 1
         out = cython.address(self.curvature[0])
         multiply(False, True, m, m, size, plain, bent, out)
         for i in range(m):
@@ -490,17 +495,27 @@ class Search:
 
     def _leverages(self, low, high):
         """``trace(B_i G B_i.T)`` where the count is not fixed."""
-        num_blocks, q, p = low.shape[0], self.blocks.shape[1], self.gram.shape[0]
-        for i in range(num_blocks):
-            value: cython.double = 0.0
-            if low[i] < high[i]:
-                for r in range(q):
-                    for a in range(p):
-                        part: cython.double = 0.0
-                        for b in range(p):
-                            part += self.gradient[a, b] * self.blocks[i, r, b]
-                        value += part * self.blocks[i, r, a]
-            self.leverage[i] = value
+        q: cython.int = self.blocks.shape[1]
+        p: cython.int = self.blocks.shape[2]
+        picked = cython.address(self.picked[0, 0])
+        turned = cython.address(self.turned[0, 0])
+        count: cython.Py_ssize_t = low.shape[0]
+        i: cython.Py_ssize_t = 0
+        while i < count:
+            m: cython.int = 0
+            while i < count and m < self.which.shape[0]:
+                self.leverage[i] = 0.0
+                if low[i] < high[i]:
+                    copy(
+                        picked + m * q * p, cython.address(self.blocks[i, 0, 0]), q * p
+                    )
+                    self.which[m] = i
+                    m += 1
+                i += 1
+            self._turn(m, self.gradient, False)
+            for f in range(m):
+                at = f * q * p
+                self.leverage[self.which[f]] = dot(picked + at, turned + at, q * p)
 
     def _linear_gain(self, low, high, c):
         """Largest ``sum of (c'_i - c_i) d_i`` within the bounds; sets the multiplier.
@@ -914,7 +929,7 @@ class Search:
 
     def run(
         self, nodes, bounds, size, best_counts, best_values, slack, widest, tries,
-        seconds, slope, shift,
+        seconds, slope, shift
     ):  # fmt: skip
         """Branch until no open node is left, the room is full or the time is over.
 
@@ -944,7 +959,7 @@ class Search:
 
     def _run(
         self, nodes, bounds, size, done, best_counts, best_values, slack, widest, tries,
-        slope, shift,
+        slope, shift
     ):  # fmt: skip
         last = best_values.shape[0] - 1
         low, high, c = self.node[0], self.node[1], self.node[2]

@@ -20,6 +20,7 @@ from rig.workbench.commission.proposals import (
     lines,
     proposals,
     ratios_of,
+    require_gearing,
     require_unit,
 )
 from rig.workbench.run import Run
@@ -45,6 +46,7 @@ def check_axes(run: Run, device: Device, names_known: bool) -> list[Change]:
     ratios = ratios_of(run.config, found)
     if run.config.imu.unit == "rad":
         require_unit(run.config, ratios, proved=True)
+    require_gearing(run.config, ratios, told)
     changes = proposals(run.config, found, told)
     evidence = {
         "ratio": dict(zip(AXIS_NAMES, np.round(ratios, 4).tolist(), strict=True)),

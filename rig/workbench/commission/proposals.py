@@ -20,6 +20,7 @@ from rig.workbench.commission.findings import MOUNTING_DEG, Findings
 SOUND_RATIO = (0.4, 1.5)
 # The same where the phone sends radians for degrees, and those are allowed for.
 NEAR_UNIT = (0.3, 2.0)
+UNPROVED_FACTOR = 2.0  # by which a gearing is corrected on the phone's word alone
 DIGITS = 4  # of a reduction that was measured
 SKEW_DEG = 20.0  # axes of a sound device read at right angles but for cross-coupling
 OF_DRIVE = ("unit", "map", "pulses_per_rev", "comm_timeout_s")  # go with the cable
@@ -83,6 +84,36 @@ def require_unit(
             "reduction as the drives and the gearboxes' plates say, then run "
             "`jaxcal-rig axes` again"
         )
+
+
+def require_gearing(
+    config: RigConfig, ratios: Sequence[float], told: Sequence[int | None]
+) -> None:
+    """A gearing that is off by more than a factor of 2 has a second proof.
+
+    That is the drive's own register, or another axis that turns as it is told: what is
+    off by as much on all three may be the phone, or what the file says of all drives.
+
+    Args:
+        config, ratios: as of ``require_unit``.
+        told: pulses for one turn by each drive's own word, None where it has none.
+
+    Raises:
+        MotionFault: there is none.
+    """
+    low, high = SOUND_RATIO
+    if any(low <= ratio <= high for ratio in ratios):
+        return
+    for axis, ratio, register in zip(config.axes, ratios, told, strict=True):
+        if register is None and max(ratio, 1.0 / ratio) > UNPROVED_FACTOR:
+            seen = ", ".join(f"{each:.3g}" for each in ratios)
+            raise MotionFault(
+                f"the phone turned {seen} of what pitch, yaw and roll were commanded, "
+                f"and the drive of {axis.name} has no register that says its pulses "
+                "for a turn, so it is not known what is wrong. Nothing was corrected. "
+                "Set pulses_per_rev and reduction as the drives and the gearboxes' "
+                "plates say, then run `jaxcal-rig axes` again"
+            )
 
 
 def proposals(

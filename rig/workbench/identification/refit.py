@@ -22,18 +22,17 @@ from rig.core.attitude import (
     DIGITS,
     Array,
     Frame,
-    attitudes,
     euler_to_matrix,
     frame_at,
     matrix_to_euler,
     mean_rotation,
 )
 from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault, Refused
-from rig.core.identify import check_matrix
 from rig.journal import Record, RunFolder, measured_postures, new_run_folder
-from rig.workbench.identification.conclusion import Evidence, conclude
+from rig.workbench.identification.conclusion import Evidence, check_matrix, conclude
 from rig.workbench.outputs.console import recalibrate, summary_lines
 from rig.workbench.outputs.report import write_report
+from rig.workbench.readings import attitudes
 from rig.workbench.toml import set_values
 
 

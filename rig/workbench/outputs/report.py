@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxcal.pages import Figure, Page, Section, Strong, Table, Text, write_page
 from rig.config import AXIS_NAMES
-from rig.core.attitude import Array, angles, recorded_frame
+from rig.core.attitude import Array
 from rig.journal import Record, measured_postures
 from rig.workbench.outputs.console import (
     choice_text,
@@ -26,6 +26,7 @@ from rig.workbench.outputs.console import (
     numbers,
     recalibrate,
 )
+from rig.workbench.readings import angles, recorded_frame
 
 FOOTER = (
     "Research software, not a medical device. Calibrate with no patient attached; a "

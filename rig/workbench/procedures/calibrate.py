@@ -10,19 +10,19 @@ import numpy as np
 from rig.core.attitude import Array
 from rig.core.device import Device, Posture, check_plan
 from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault
-from rig.core.identify import check_matrix, identify
-from rig.core.plan import (
+from rig.core.identify import identify
+from rig.core.session import visit
+from rig.journal import SIGN_CHECKED, Record
+from rig.workbench.identification.conclusion import Evidence, check_matrix, conclude
+from rig.workbench.identification.fit import held_out_errors
+from rig.workbench.outputs.console import plan_lines, recalibrate, summary_lines
+from rig.workbench.procedures.plan import (
     Choice,
     choose,
     draw_candidates,
     draw_held_out,
     travel_order,
 )
-from rig.core.session import visit
-from rig.journal import SIGN_CHECKED, Record
-from rig.workbench.identification.conclusion import Evidence, conclude
-from rig.workbench.identification.fit import held_out_errors
-from rig.workbench.outputs.console import plan_lines, recalibrate, summary_lines
 from rig.workbench.run import Run
 
 MIDDLE, END = "reference:middle", "reference:end"  # visits of the zero posture

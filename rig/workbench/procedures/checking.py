@@ -16,12 +16,12 @@ from rig.core.device import Device, Posture
 from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
 from rig.core.identify import pairs
 from rig.core.motion import move
-from rig.core.plan import draw, draw_held_out
 from rig.core.session import visit
 from rig.core.zero import KeptZero, unseen
 from rig.workbench.identification.fit import held_out_errors
 from rig.workbench.outputs.console import error_text, numbers
 from rig.workbench.procedures.calibrate import END, pair_names, visit_pairs
+from rig.workbench.procedures.plan import draw, draw_held_out
 from rig.workbench.procedures.play import CHARACTERISED, Play
 from rig.workbench.run import Run
 
