@@ -170,7 +170,8 @@ class Shares(Rule):
 
 
 SHARES = Shares(1.4, 1.8, 0.2, -0.7)
-"""``benchmarks/families.py --tune`` found the constants, on the family's structures."""
+"""Rounded from a search over tasks of the family such as ``benchmarks/families.py
+--tune`` makes."""
 
 
 class Scored(Rule):
