@@ -49,8 +49,8 @@ from jaxcal.selection.exchange.exchange import (
     default_restarts,
     exchange_from,
     exchange_indices,
+    greedy_indices,
 )
-from jaxcal.selection.greedy import greedy_indices
 from jaxcal.selection.policy import load_policy
 from jaxcal.selection.problem import Problem, values
 

@@ -56,7 +56,7 @@ def ports(args: argparse.Namespace) -> int:
 
 def scan(args: argparse.Namespace) -> int:
     """Name the units that answer."""
-    if args.bus:
+    if args.bus and not args.simulate:
         bus, maps = parse_bus(args.bus), ()
         with BusLock(bus).acquire("scan"):
             return _told(scan_bus(bus, args.units, _say, maps))

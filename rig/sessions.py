@@ -83,7 +83,13 @@ def session(args: argparse.Namespace) -> int:
 
 def resume(args: argparse.Namespace) -> int:
     """Go on with a run; returns the exit code."""
-    return _run(args, *recorded(args), folder=args.run)
+    config, start = recorded(args)
+    if args.simulate and start["simulated"] is None:
+        raise Refused(
+            f"{args.run} was made with a real device, and going on moves that. Leave "
+            "out --simulate, or begin a simulated run of its own"
+        )
+    return _run(args, config, start, folder=args.run)
 
 
 def _run(

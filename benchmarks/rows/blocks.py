@@ -23,8 +23,11 @@ from jaxcal import identify, select
 from jaxcal.models import Noise, SerialChain
 from jaxcal.selection import Design, Problem
 from jaxcal.selection.exact import branch_and_bound as search
-from jaxcal.selection.exchange.exchange import default_restarts, exchange_indices
-from jaxcal.selection.greedy import greedy_indices
+from jaxcal.selection.exchange.exchange import (
+    default_restarts,
+    exchange_indices,
+    greedy_indices,
+)
 
 NAME = "blocks"
 TITLE = "Poses of a measured UR5, and FIGAROH's rule"

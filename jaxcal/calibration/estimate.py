@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration.discrepancy import WithDiscrepancy
-from jaxcal.calibration.sizes import group_sizes
+from jaxcal.calibration.sizes import Sizes, group_sizes, of_sizes
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
 from jaxcal.checks import in_words, one_of, whole_number
 from jaxcal.information.blocks import significant
@@ -29,7 +29,7 @@ __all__ = ["fit_model", "require_model"]
 Array = NDArray[np.float64]
 
 _BEYOND = 2.0  # degrees beyond a limit, or percent of a slide's stroke
-_NOMINAL = 0.05  # of its length: no arm is so far off before it is calibrated
+_NOMINAL = 0.5  # of its length: no arm, and no tip, is so far off before it is fitted
 
 
 def require_model(model: Any, commands: Array, measured: Array) -> None:
@@ -88,7 +88,7 @@ def fit_model(
     if isinstance(model, SerialChain):
         _require_postures(model, commands[used], measured[used])
         model = model.located(commands[used], measured[used])
-        _require_sockets(model, commands[used])
+        _require_sockets(model, commands[used], measured[used])
     asked = prior is not None
     prior = prior or model.default_prior()
     resolved = prior.resolve(model)
@@ -112,6 +112,7 @@ def fit_model(
         student=loss == "student",
     )
     found = solve(task)
+    sizes: Sizes | None = None
     beyond = extra.size or spread.any()  # what the sizes are not made for
     if prior.by_data and (asked or not beyond):
         if not isinstance(model, SerialChain) or beyond:
@@ -120,13 +121,16 @@ def fit_model(
             )
         stated = task
         for _ in range(2):
-            factors = group_sizes(model, stated, found)
-            task = dataclasses.replace(task, precision=stated.precision / factors**2)
+            sizes = group_sizes(model, stated, found)
+            scaled = stated.precision / sizes.factors**2
+            task = dataclasses.replace(task, precision=scaled)
             found = solve(task, found)
     if common_noise is None and _levels_differ(task, found):
         task = dataclasses.replace(task, per_output=True)
         found = solve(task, found)
     fields = _fields(task, found, commands, measured, weights)
+    if sizes is not None and fields["joint_covariance"] is not None:
+        fields["joint_covariance"] += of_sizes(task, found, sizes)
     return fields | {"model": model, "loss": loss}
 
 
@@ -171,7 +175,7 @@ def _require_postures(arm: SerialChain, commands: Array, measured: Array) -> Non
         )
 
 
-def _require_sockets(arm: SerialChain, commands: Array) -> None:
+def _require_sockets(arm: SerialChain, commands: Array, measured: Array) -> None:
     """Refuse contacts that no arm near the nominal one can have made."""
     if not isinstance(arm.sensor, Socket):
         return
@@ -183,7 +187,7 @@ def _require_sockets(arm: SerialChain, commands: Array) -> None:
             f"a posture must have the ball in one socket, but row {row} is row "
             f"{first[groups.ravel()[row]]} with another socket: rows of the other file?"
         )
-    points = arm.calibrated(arm.nominal).predict(joints)
+    points = arm.calibrated(arm.nominal).predict(joints) - measured
     most, middles = _NOMINAL * arm.length, {}
     for i in np.unique(which):
         rows = np.flatnonzero(which == i)

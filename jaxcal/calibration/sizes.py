@@ -11,15 +11,17 @@ Machine Learning, 3.5.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration.solve import Solution, Task
 from jaxcal.information.blocks import without
 from jaxcal.models import SerialChain
-from jaxcal.models.checked import derivative
+from jaxcal.models.checked import derivative, facts
 
-__all__ = ["group_sizes"]
+__all__ = ["Sizes", "group_sizes", "of_sizes"]
 
 Array = NDArray[np.float64]
 
@@ -28,8 +30,16 @@ _MOST = 5.0  # of a logarithm
 _GROUPS = 4  # lengths, turns of the axes, zeros of the joints, their compliance
 
 
-def group_sizes(arm: SerialChain, task: Task, found: Solution) -> Array:
-    """(p,) factors of the prior's standard deviations, one of parameters of no group.
+class Sizes(NamedTuple):
+    """Factors of the prior's standard deviations."""
+
+    factors: Array  # (p,) 1 of parameters of no group
+    groups: NDArray[np.int64]  # (p,) -1 of no group
+    covariance: Array  # (G, G) of the logarithms of the groups' factors
+
+
+def group_sizes(arm: SerialChain, task: Task, found: Solution) -> Sizes:
+    """The factors that make the readings most probable.
 
     Args:
         arm: whose parameters have the groups.
@@ -73,7 +83,48 @@ def group_sizes(arm: SerialChain, task: Task, found: Solution) -> Array:
     best = optimize.minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds)
     factors = np.ones(p)
     factors[groups >= 0] = np.exp(best.x[groups[groups >= 0]])
-    return factors
+    steps = 1e-3 * np.eye(len(start))
+    curve = [cost(best.x + step)[1] - cost(best.x - step)[1] for step in steps]
+    size, axes = np.linalg.eigh(np.array(curve) / 4e-3)  # of half the cost
+    size = np.maximum(size, _THOUGHT**-2.0)
+    inside = (axes / size) @ axes.T
+    return Sizes(factors, groups, inside[:_GROUPS, :_GROUPS])
+
+
+def of_sizes(task: Task, found: Solution, sizes: Sizes) -> Array:
+    """(P, P) what the sizes, which are estimates too, add to the covariance.
+
+    Along each axis of their covariance, one standard deviation either way, the mean
+    and the covariance of the parameters are averaged; the model is linear.
+    """
+    free = task.free
+    groups = sizes.groups[free]
+    weights = np.sqrt(np.minimum(found.weights, 1.0))[:, None, None]
+    rows = (weights * found.rows).reshape(-1, found.rows.shape[-1])
+    known = facts(task.model, found.parameters)[1][:, free]
+    gram = rows.T @ rows + known.T @ known
+    precision = task.precision[free]
+    scale = 1.0 / np.sqrt(np.diagonal(gram) + precision + 1e-300)
+    off = (found.parameters - task.mean)[free]
+    right = scale * (gram @ off + precision * off)  # as the fit balances them
+
+    def at(logs: Array) -> tuple[Array, Array]:
+        factor = np.where(groups >= 0, np.exp(-2.0 * logs[groups]), 1.0)
+        whole = scale[:, None] * gram * scale + np.diag(scale**2 * precision * factor)
+        inverse = np.asarray(np.linalg.pinv(whole, hermitian=True), dtype=np.float64)
+        return inverse @ right, inverse
+
+    values, axes = np.linalg.eigh(sizes.covariance)
+    middle, spread = at(np.zeros(_GROUPS))[1], np.zeros_like(gram)
+    for axis in (np.sqrt(np.maximum(values, 0.0)) * axes).T:
+        (first, one), (last, other) = at(axis), at(-axis)
+        spread += 0.5 * (one + other) - middle
+        spread += 0.25 * np.outer(first - last, first - last)
+    values, axes = np.linalg.eigh(spread)
+    spread = (np.maximum(values, 0.0) * axes) @ axes.T
+    result = np.zeros((len(free), len(free)))
+    result[np.ix_(free, free)] = scale[:, None] * spread * scale
+    return result
 
 
 def _reduced(arm: SerialChain, task: Task, found: Solution) -> tuple[Array, Array]:

@@ -63,9 +63,11 @@ def _solve(
 ) -> BatchSelection:
     start = time.perf_counter()
     problems = make_problems(candidates, k, **rules)
-    solve_many = SOLVERS[method].solve_many
-    assert solve_many is not None, method
-    found = solve_many(problems, **options)
+    solver = SOLVERS[method]
+    if solver.solve_many is None:
+        found = [solver.solve(problem, **options) for problem in problems]
+    else:
+        found = solver.solve_many(problems, **options)
     indices = np.stack([one.indices for one in found])
     if found[0].value is None:
         values = log_dets(problems, indices[:, None])[:, 0]

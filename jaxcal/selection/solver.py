@@ -37,10 +37,10 @@ class Found:
 
 
 def in_threads(
-    problems: list[Problem], solve: Callable[[Problem], Found], compiled: bool = True
+    problems: list[Problem], solve: Callable[[Problem], Found]
 ) -> list[Found]:
     """Solve every problem, in threads: compiled solvers release the interpreter."""
-    if len(problems) == 1 or not compiled:
+    if len(problems) == 1:
         return [solve(problem) for problem in problems]
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
         return list(pool.map(solve, problems))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxcal.checks import one_of, seconds, share, whole_number
-from jaxcal.selection import auto, greedy, random
+from jaxcal.selection import random
 from jaxcal.selection.exact import exact
 from jaxcal.selection.exchange import exchange
 from jaxcal.selection.problem import Problem
@@ -70,11 +70,11 @@ def _policy(
 
 SOLVERS = {
     "random": Solver(random.solve, random.solve_many),
-    "greedy": Solver(greedy.solve, greedy.solve_many),
+    "greedy": Solver(exchange.solve_greedy),
     "exchange": Solver(exchange.solve, exchange.solve_many),
     "exact": Solver(exact.solve, exact.solve_many),
     "policy": Solver(_policy),
-    "auto": Solver(auto.solve),
+    "auto": Solver(exact.solve_auto),
 }
 METHODS = tuple(SOLVERS)
 

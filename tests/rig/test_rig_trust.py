@@ -502,6 +502,18 @@ def test_a_simulated_calibration_moves_no_real_joint(calibrated, tmp_path, capsy
         assert "simulated" in error and "cannot open" not in error
 
 
+def test_the_run_of_a_real_device_is_not_resumed_as_a_simulated_one(
+    calibrated, tmp_path, capsys
+):
+    """G: --simulate was left aside, and the real device moved."""
+    path = tmp_path / "rig.toml"
+    path.write_text(fast_text({"port = 5020": "port = 1"}))
+    given = ["resume", str(calibrated), "--simulate", "--arm", "--config", str(path)]
+    assert main(given) == 2
+    error = capsys.readouterr().err
+    assert "was made with a real device" in error and "cannot open" not in error
+
+
 def test_what_is_found_of_a_simulated_device_stays_out_of_a_real_calibration(
     calibrated, tmp_path
 ):

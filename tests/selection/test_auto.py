@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from questions import make_problem
 
 import jaxcal
-from jaxcal.selection.auto import solve
+from jaxcal.selection.exact.exact import solve_auto as solve
 
 OPTIONS = {"seed": 0, "restarts": None, "time_limit": None}
 

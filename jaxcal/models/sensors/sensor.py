@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
@@ -69,7 +70,7 @@ class Reading(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Sensor:
+class Sensor(abc.ABC):
     """A sensor of an arm; this one has no parameters and no column of its own.
 
     A sensor of one's own is a frozen dataclass of this kind: ``read`` says what it
@@ -96,9 +97,9 @@ class Sensor:
         return ()
 
     @property
+    @abc.abstractmethod
     def outputs(self) -> tuple[str, ...]:
         """q names of the readings."""
-        raise NotImplementedError
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -119,17 +120,17 @@ class Sensor:
         """(s,) of its own parameters, for an arm of this length; nothing is known."""
         return np.full(len(self.names), np.inf)
 
+    @abc.abstractmethod
     def usual_noise(self, length: float) -> ArrayLike:
         """() or (q,) standard deviation of a reading, for an arm of this length."""
-        raise NotImplementedError
 
     def unseen(self, arm: Named) -> tuple[str, ...]:
         """Parameters that no posture shows; held unless a prior says otherwise."""
         return ()
 
+    @abc.abstractmethod
     def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
         """Readings at N postures, with columns ``inputs`` (N, e) and parameters."""
-        raise NotImplementedError
 
     def located(
         self, tip: Tip, inputs: Array, measured: Array | None

@@ -19,18 +19,25 @@ from numpy.typing import NDArray
 
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
 from jaxcal.selection.exact.volume import largest_volumes
-from jaxcal.selection.exchange.exchange import exchange_indices
-from jaxcal.selection.greedy import greedy_indices
+from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
 from jaxcal.selection.problem import Problem, values
 from jaxcal.selection.solver import Found, in_threads
 
-__all__ = ["STARTING_RESTARTS", "ExactResult", "solve", "solve_exact", "upper_bound"]
+__all__ = [
+    "STARTING_RESTARTS",
+    "ExactResult",
+    "solve",
+    "solve_auto",
+    "solve_exact",
+    "upper_bound",
+]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 STARTING_RESTARTS = 30  # of the exchange: the search does the rest
 TIME_LIMIT = 10.0  # seconds of one search where none is given
+_BLOCKS_LIMIT = 2.0  # of auto: what is not proven by then often takes minutes
 
 TOLERATED = 1e-9  # share by which rounding may change what is called proven
 
@@ -70,9 +77,59 @@ def solve_many(
 ) -> list[Found]:
     """One by one, in ``time_limit`` seconds for them all; no limit when None."""
     deadline = None if time_limit is None else time.perf_counter() + time_limit
-    compiled = problems[0].k != problems[0].num_regressors
-    return in_threads(
-        problems, lambda p: as_found(solve_exact(p, deadline=deadline)), compiled
+
+    def solved(problem: Problem) -> Found:
+        return as_found(solve_exact(problem, deadline=deadline))
+
+    if problems[0].simplex:  # mostly the hull, which keeps other threads waiting
+        return [solved(problem) for problem in problems]
+    return in_threads(problems, solved)
+
+
+def solve_auto(
+    problem: Problem,
+    *,
+    seed: int,
+    restarts: int | None,
+    time_limit: float | None,
+    least_efficiency: float,
+) -> Found:
+    """The solver "auto": the cheapest way to an answer that is proven good enough.
+
+    Small problems are solved to the proven optimum. On larger ones the search stops as
+    soon as its bound proves the best selection found (by exchange, at first) to have
+    ``least_efficiency``; the bound at the root often does. Where no time limit is given
+    10 s, 2 s on blocks.
+
+    The answer's ``method`` is "exact" where the search was run to its end or its time
+    limit, "exchange" where the bound proved enough before.
+    """
+    limit = time_limit or (TIME_LIMIT if problem.rank_one else _BLOCKS_LIMIT)
+    restarts = restarts or STARTING_RESTARTS
+    deadline = time.perf_counter() + limit
+    result = solve_exact(problem, 1, deadline, restarts, seed, least_efficiency)
+    name = f"{problem.criterion.name}-efficiency"
+    proven_share = problem.criterion.efficiency(float(result.values[0]), result.bound)
+    close = proven_share >= least_efficiency
+    if result.proven:
+        reason = "the exact search proved this optimum"
+    elif close:
+        reason = (
+            f"the bound proves a {name} of at least {proven_share:.6f}, and "
+            f"{least_efficiency:g} was asked for"
+        )
+    else:
+        reason = (
+            f"the exact search ran out of time after {limit:g} s with a {name} "
+            f"of at least {proven_share:.6f} proven; {least_efficiency:g} was asked for"
+        )
+    stopped = not result.proven and close and not result.rounding
+    return as_found(
+        result,
+        method="exchange" if stopped else "exact",
+        reason=reason,
+        seed=seed,
+        restarts=restarts,
     )
 
 

@@ -929,7 +929,7 @@ class Search:
 
     def run(
         self, nodes, bounds, size, best_counts, best_values, slack, widest, tries,
-        seconds, slope, shift,
+        seconds, slope, shift
     ):  # fmt: skip
         """Branch until no open node is left, the room is full or the time is over.
 
@@ -959,7 +959,7 @@ class Search:
 
     def _run(
         self, nodes, bounds, size, done, best_counts, best_values, slack, widest, tries,
-        slope, shift,
+        slope, shift
     ):  # fmt: skip
         last = best_values.shape[0] - 1
         low, high, c = self.node[0], self.node[1], self.node[2]

@@ -848,15 +848,7 @@ class Climber:
         p = self.p
         inverse = self.now
         half, root = self.half, cython.address(self.root[0, 0])
-        if (
-            not factor(
-                self.gram,
-                inverse,
-                self.lower,
-                p,
-            )
-            > -INFINITY
-        ):
+        if not factor(self.gram, inverse, self.lower, p) > -INFINITY:
             return -INFINITY  # fmt: skip
         multiply(False, False, p, p, p, root, inverse, half)
         multiply(False, True, p, p, p, half, root, self.small)
@@ -883,14 +875,7 @@ class Climber:
         # A block of q readings leaves the variances after the q largest no smaller.
         cap = 1.0 / self.values[p - 1 - q] if q < p else INFINITY
         multiply(
-            False,
-            False,
-            1,
-            p,
-            p,
-            self.small + (p - 1) * p,
-            self.half,
-            self.weakest,
+            False, False, 1, p, p, self.small + (p - 1) * p, self.half, self.weakest
         )
         for a in range(p):
             self.weakest[a] *= value

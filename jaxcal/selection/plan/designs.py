@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from jaxcal.information.blocks import significant
 from jaxcal.selection.exact.exact import solve_exact
-from jaxcal.selection.exchange.exchange import exchange_indices
-from jaxcal.selection.greedy import greedy_indices
+from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
 from jaxcal.selection.problem import Problem
 
 __all__ = ["CRITERIA", "Design", "best_design", "variances_of"]

@@ -12,7 +12,7 @@ from jaxcal.checks import levels, numbers, whole_number
 from jaxcal.information.blocks import largest_rank
 from jaxcal.models.uncertainty import Noise
 from jaxcal.selection.criteria import positions
-from jaxcal.selection.greedy import greedy_indices
+from jaxcal.selection.exchange.exchange import greedy_indices
 from jaxcal.selection.problem import Asked, Problem
 from jaxcal.selection.problem.sources import shares_regressor
 

@@ -128,15 +128,17 @@ class Problem:
     def uncertainty(self, indices: Indices) -> float:
         """By how much rounding may change phi of a selection (k,), as a share.
 
-        Of "det" the share of every eigenvalue: phi itself changes by it times s. With
-        errors E_i of the blocks, M changes by 2 |E_i| / sqrt(least eigenvalue of M) of
-        itself each, beside what sums are rounded by.
+        Of "det" the share of every eigenvalue: phi itself changes by it times s. With E
+        the errors of the chosen blocks B, one below the other, and M = L L.T, M changes
+        by ``E.T B + B.T E``, of itself by 2 |B L^-T| |E L^-T|, of which the first is at
+        most 1 and the second |E| / sqrt(least eigenvalue of M); beside what sums are
+        rounded by.
         """
         rows = self.blocks[indices].reshape(-1, self.num_regressors)
         least, largest = np.linalg.eigvalsh(rows.T @ rows + self.prior)[[0, -1]]
         if not least > 0.0:
             return np.inf
-        of_blocks = 2.0 * self.rounding[indices].sum() / np.sqrt(least)
+        of_blocks = 2.0 * np.linalg.norm(self.rounding[indices]) / np.sqrt(least)
         return float(of_blocks + _EPS * len(rows) * largest / least)
 
     def log_det(self, indices: Indices) -> float:

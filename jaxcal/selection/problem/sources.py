@@ -235,7 +235,7 @@ def _weighted(white: Array, jacobian: Array) -> Array:
 def _warn_of_radians(arm: Any, candidates: Array) -> None:
     """Postures of an arm that all lie within one turn, had they been radians."""
     turning = np.array(arm.command_units) == "deg"
-    largest = np.abs(candidates[:, turning]).max(initial=0.0)
+    largest = np.abs(candidates[:, : arm.num_joints][:, turning]).max(initial=0.0)
     if 0.0 < largest < 2.0 * np.pi:
         warnings.warn(
             f"no joint of any candidate is over {largest:.3g}, and joints are in "
