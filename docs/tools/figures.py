@@ -128,6 +128,7 @@ def in_space() -> Figure:
     axes = figure.add_subplot(projection="3d")
     chosen = jaxcal.select(candidates, 4)
     plots.selection(axes, candidates, chosen.indices, ("pitch", "yaw", "roll"))
+    axes.set_box_aspect((4, 4, 3), zoom=0.88)  # the label of the upright axis fits
     axes.legend(frameon=False)
     return figure
 

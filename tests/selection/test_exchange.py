@@ -4,14 +4,17 @@ import itertools
 
 import numpy as np
 import pytest
-from questions import make_problem
+from questions import make_problem, of
 
+import jaxcal
 from jaxcal.selection import exchange_batch, select
+from jaxcal.selection.criteria import CRITERIA
 from jaxcal.selection.exchange.exchange import (
     Climbs,
     exchange_from,
     exchange_indices,
 )
+from jaxcal.selection.problem import values
 
 
 def uniform(seed, m, n=3):
@@ -30,6 +33,28 @@ def test_no_single_swap_improves_the_result(k, cap):
         swapped[position] = new
         if np.bincount(swapped).max() <= cap:
             assert problem.log_det(swapped) <= best + 1e-8
+
+
+@pytest.mark.parametrize("q", [1, 2, 5])
+@pytest.mark.parametrize("name", CRITERIA)
+def test_no_single_swap_of_blocks_improves_the_result(name, q):
+    """14 parameters: leverages are updated for 1 or 2 readings, made anew for 5."""
+    rng = np.random.default_rng(q)
+    blocks = rng.normal(size=(150, q, 14)) * 10.0 ** rng.uniform(-1, 1, size=14)
+    design = jaxcal.Design.from_blocks(blocks, prior=0.1 * np.eye(14))
+    problem = design.problem(6, of(name))
+    chosen = exchange_indices(problem, restarts=1)
+    best = design.score(chosen, of(name)).value
+    swapped = np.repeat(chosen[None], 6 * 150, axis=0).reshape(6, 150, 6)
+    for position in range(6):
+        swapped[position, :, position] = np.arange(150)
+    twice = np.sort(swapped, axis=2)
+    swapped = swapped[(np.diff(twice, axis=2) > 0).all(axis=2)]
+    found = values(problem, swapped)[0]
+    if problem.criterion.larger_is_better:
+        assert found.max() <= best + 1e-8 * max(1.0, abs(best))
+    else:
+        assert found.min() >= best * (1.0 - 1e-8)
 
 
 @pytest.mark.parametrize("k", [4, 8, 12])

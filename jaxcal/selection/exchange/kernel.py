@@ -440,7 +440,7 @@ class Climber:
         return np.array(self.chosen)
 
     def _set_known(self, share, ridge):
-        """What counts beside the chosen: the prior, diluted by share, and a ridge."""
+        """Fill ``known``: prior, ``share`` of k mean candidates' information, ridge."""
         p = self.p
         weight = share * self.k / self.blocks.shape[0]
         for a in range(p):
