@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import importlib
 import pathlib
 import signal
 import sys
@@ -11,7 +10,9 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NoReturn
 
 from jaxcal.arguments import refused
+from jaxcal.commands import evaluate_task
 from jaxcal.extras import MissingExtraError, needs
+from jaxcal.files import require_writable_folder
 from jaxcal.learning.runtime import processes
 
 if TYPE_CHECKING:
@@ -36,8 +37,6 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
     """
     given = list(sys.argv[1:] if argv is None else argv)
     if any(word == "--task" or word.startswith("--task=") for word in given):
-        from jaxcal.commands import evaluate_task
-
         return evaluate_task.main(given, prog)
     advice = "finished parts stay: start every process again"
     return processes.run_job(prog, given, lambda: _alone(given, prog), advice)
@@ -221,19 +220,9 @@ def _process() -> tuple[int, int]:
 
 def _check_outputs(options: argparse.Namespace) -> None:
     """Refuse outputs that cannot be written before anything is computed."""
-    from jaxcal.files import require_writable_folder
-
-    if options.json is not None:
-        if options.json.is_dir():
-            raise ValueError(f"--json must be a file, {options.json} is a folder")
-        require_writable_folder(options.json.parent)
-    if options.report is not None:
-        with needs("study", "--report"):
-            importlib.import_module("jinja2")
-            importlib.import_module("matplotlib")
-    for folder in (options.report, options.stream):
-        if folder is not None:
-            require_writable_folder(folder)
+    evaluate_task.require_outputs(options)
+    if options.stream is not None:
+        require_writable_folder(options.stream)
     if options.workers is not None and options.stream is None:
         raise ValueError("--workers needs --stream")
     for folder in options.run:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import pathlib
 import sys
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from jaxcal.arguments import Parser, at_least, refused, several
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder, write_text
 
-__all__ = ["main"]
+__all__ = ["main", "require_outputs"]
 
 EXIT_INTERRUPTED = 130
 _METHODS = "random,gain,rate,shares,two_step,policy"
@@ -84,21 +85,26 @@ def _parser(prog: str, typed: str) -> Parser:
     return out
 
 
-def _run(options: argparse.Namespace, command: list[str]) -> None:
-    from jaxcal.adaptive.tasks import registry
-    from jaxcal.evaluation import sequential, sequential_report
-    from jaxcal.learning.runtime import cache
-    from jaxcal.progress import Progress
-
+def require_outputs(options: argparse.Namespace) -> None:
+    """Refuse --json and --report that cannot be written, before computing anything."""
     if options.json is not None:
         if options.json.is_dir():
             raise ValueError(f"--json must be a file, {options.json} is a folder")
         require_writable_folder(options.json.parent)
     if options.report is not None:
         with needs("study", "--report"):
-            import jinja2  # noqa: F401  # looks whether it is there
-            import matplotlib  # noqa: F401  # looks whether it is there
+            importlib.import_module("jinja2")
+            importlib.import_module("matplotlib")
         require_writable_folder(options.report)
+
+
+def _run(options: argparse.Namespace, command: list[str]) -> None:
+    from jaxcal.adaptive.tasks import registry
+    from jaxcal.evaluation import sequential, sequential_report
+    from jaxcal.learning.runtime import cache
+    from jaxcal.progress import Progress
+
+    require_outputs(options)
     entry = registry.load(options.task)
     methods = options.methods or list(entry.methods)
     if not methods:
