@@ -81,6 +81,7 @@ def test_the_run_trains_what_the_pure_function_does_and_tasks_are_arguments(tmp_
     assert train._cache_size() == 1
 
 
+@pytest.mark.slow
 def test_every_stream_may_have_a_task_of_its_own():
     (learner,) = CONFIG.learners
     one, other = run.exercises(CONFIG)

@@ -97,6 +97,7 @@ def test_a_lesson_is_the_same_whenever_it_is_asked_for(lesson):
     assert not np.array_equal(lesson.candidates, other.candidates)
 
 
+@pytest.mark.slow
 def test_lessons_share_no_key_with_the_weights_and_the_updates():
     # In JAX 0.10 fold_in(key, i) is split(key)[i]: streams must be split apart first.
     key = jax.random.key(3)

@@ -295,6 +295,7 @@ def test_a_run_trains_what_the_pure_function_does(tmp_path):
     np.testing.assert_allclose(metrics["reward_mean"], rows["reward_mean"], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_gradient_in_slices_is_that_of_the_whole():
     """Also where slices count unequally; 8 rows in 7 become slices of 4."""
     config = dataclasses.replace(TINY, episodes_per_update=32, num_minibatches=1)

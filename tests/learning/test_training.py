@@ -521,6 +521,7 @@ def test_ctrl_c_saves_and_resume_goes_on(tmp_path, capsys, monkeypatch):
     assert checkpoint.load(out).meta["progress"]["updates"] == 6
 
 
+@pytest.mark.slow
 def test_several_seeds_are_one_program_and_the_best_is_exported(tmp_path, capsys):
     out, exported = tmp_path / "run", tmp_path / "best.npz"
     assert train("--out", out, "--seeds", 3, "--export", exported, *SMALL) == 0

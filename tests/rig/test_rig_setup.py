@@ -179,6 +179,7 @@ def test_a_simulated_setup_leaves_the_device_of_an_existing_file_alone(at, capsy
         assert sim.server.requests == 0
 
 
+@pytest.mark.slow
 def test_a_simulated_check_of_the_axes_corrects_no_file(at, capsys):
     """It wrote what a reversed simulated axis is into the file of a real device."""
     (at / "rig.toml").write_text(fast_text())

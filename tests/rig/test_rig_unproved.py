@@ -60,6 +60,7 @@ def axes_of(text: str, values: dict[str, object]) -> str:
     return text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [10, pytest.param(100, marks=pytest.mark.slow)])
 def test_a_reduction_that_is_too_high_moves_nothing_far_or_fast(slow, factor, capsys):
     """B: the joint went to 7 (50) degrees at 50 (500) degrees a second."""
@@ -89,6 +90,7 @@ def test_a_jog_before_the_check_stops_where_the_phone_has_turned(slow, capsys):
     assert watch.fast.max() < 8.0
 
 
+@pytest.mark.slow
 def test_three_ratios_near_a_radian_name_the_unit(slow, capsys):
     """A: `reduction = 573 (is 10)` was proposed, and joints went to 172 degrees."""
     with device(speedup=1.0, faults=[parse_fault("imu_radians")]) as (sim, bus, port):
