@@ -4,6 +4,8 @@
 
 Arms whose errors are drawn from the default prior, each sensor alone and in pairs, 60
 readings of each or more: how many 95 % intervals of the parameters hold the truth.
+Then positions of a UR5 whose errors are 0.2 to 10 times the tolerances: the error
+elsewhere of a fit with the right tolerances over that with sizes from the readings.
 """
 
 from __future__ import annotations
@@ -107,6 +109,28 @@ def covered(joints: int, names: tuple[str, ...], draws: int) -> tuple[float, flo
     return float(np.mean(shares)), float(np.std(shares) / np.sqrt(draws))
 
 
+def sized(factor: float, count: int, draws: int) -> float:
+    """Mean error elsewhere with the right prior over that with a sized one."""
+    model = arm(6, Position())
+    prior = model.default_prior()
+    std = np.asarray(prior.std, dtype=np.float64)
+    std[: model.table.size] *= factor
+    noise = float(np.asarray(model.default_noise().std)[0])
+    errors: dict[str, list[float]] = {"right": [], "sized": []}
+    for draw in range(draws):
+        rng = np.random.default_rng(draw)
+        truth = model.nominal + std * rng.normal(size=len(std))
+        joints, elsewhere = (rng.uniform(-120.0, 120.0, (n, 6)) for n in (count, 100))
+        measured = model.predict(joints, truth) + noise * rng.normal(size=(count, 3))
+        for name, known in (("right", jaxcal.Prior(std)), ("sized", prior)):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)
+                found = jaxcal.identify(joints, measured, model=model, prior=known)
+            off = found.predict(elsewhere) - model.predict(elsewhere, truth)
+            errors[name].append(float(np.linalg.norm(off, axis=1).mean()))
+    return float(np.mean(errors["right"]) / np.mean(errors["sized"]))
+
+
 def main(draws: int) -> None:
     """Print the table."""
     print(f"| sensor | 6 axes | 7 axes |  ({draws} draws)\n| --- | --- | --- |")
@@ -114,6 +138,12 @@ def main(draws: int) -> None:
         cells = [covered(joints, names, draws) for joints in (6, 7)]
         row = " | ".join(f"{share:.1%} ({error:.1%})" for share, error in cells)
         print(f"| {' and '.join(names)} | {row} |", flush=True)
+    counts = (8, 12, 20)
+    print("| errors | " + " | ".join(map(str, counts)) + " poses |")
+    print("| --- " * (1 + len(counts)) + "|")
+    for factor in (0.2, 1.0, 3.0, 10.0):
+        row = " | ".join(f"{sized(factor, count, draws):.0%}" for count in counts)
+        print(f"| {factor:g} times | {row} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -109,7 +109,7 @@ def choose(rule: str, model: SerialChain, offered: Array, used: Array) -> Array:
         return spread(offered)
     found = jaxcal.select(
         offered, COUNT, "exchange", model=model, noise=NOISE, criterion=rule,
-        region=used if rule == "I" else None,
+        prior=common.tolerances(model), region=used if rule == "I" else None,
     )  # fmt: skip
     return offered[found.indices]
 
@@ -129,7 +129,12 @@ def study(full: bool) -> dict[str, Array]:
             measured = model.predict(chosen, true)
             measured += rng.normal(0.0, float(NOISE.std), measured.shape)
             fit = jaxcal.identify(
-                chosen, measured, model=model, noise=NOISE, loss="gaussian"
+                chosen,
+                measured,
+                model=model,
+                noise=NOISE,
+                prior=common.tolerances(model),
+                loss="gaussian",
             )
             error = fit.predict(held) - model.predict(held, true)
             found[rule].append(

@@ -71,7 +71,7 @@ def choose(rule: str, candidates: Array, k: int, rng: np.random.Generator) -> Ar
     criterion, _, method = rule.partition(" ")
     return jaxcal.select(
         candidates, k, method or "exchange", model=arm(), noise=NOISE,
-        criterion=criterion,
+        prior=common.tolerances(arm()), criterion=criterion,
     ).indices  # fmt: skip
 
 
@@ -98,7 +98,11 @@ def study(full: bool) -> dict[tuple[str, int], Array]:
                 chosen = members[choose(rule, angles[members], k, rng)]
                 rest = np.setdiff1d(np.arange(len(angles)), chosen)
                 fit = jaxcal.identify(
-                    angles[chosen], reached[chosen], model=arm(), noise=NOISE
+                    angles[chosen],
+                    reached[chosen],
+                    model=arm(),
+                    noise=NOISE,
+                    prior=common.tolerances(arm()),
                 )
                 error = distances(fit, angles[rest], reached[rest])
                 test = distances(fit, *tests)
@@ -112,10 +116,10 @@ def priors(pools: int) -> dict[str, list[float]]:
     """Mean error on the test poses, mm, for K = 12, 20, 40 by what is known before."""
     angles, reached = load("ur5_grid_1000.csv")
     tests = load("ur5_random_20.csv")
-    loose = np.asarray(arm().default_prior().std, dtype=np.float64)
+    loose = np.asarray(common.tolerances(arm()).std, dtype=np.float64)
     known = {
-        "a third of the default": jaxcal.Prior(loose / 3.0),
-        "default": jaxcal.Prior(loose),
+        "a third of it": jaxcal.Prior(loose / 3.0),
+        "that of the tables": jaxcal.Prior(loose),
         "none": jaxcal.Prior(np.inf),
     }
     errors: dict[str, list[float]] = {name: [] for name in known}
@@ -153,7 +157,12 @@ def outliers(pools: int) -> dict[str, float]:
         spoilt[rng.integers(12)] += 5.0 * direction / np.linalg.norm(direction)
         for loss, found in errors.items():
             fit = jaxcal.identify(
-                angles[chosen], spoilt, model=arm(), noise=NOISE, loss=loss
+                angles[chosen],
+                spoilt,
+                model=arm(),
+                noise=NOISE,
+                prior=common.tolerances(arm()),
+                loss=loss,
             )
             found.append(float(distances(fit, *tests).mean()))
     return {loss: float(np.mean(found)) for loss, found in errors.items()}

@@ -135,6 +135,7 @@ def test_the_first_answers_load_no_package_of_scipy():
     """Its packages take 0.3 to 1 s to load; kernels call BLAS all the same."""
     code = """
 import sys
+import numpy as np
 from jaxcal import select
 candidates = np.random.default_rng(0).random((50, 3))
 for arguments in ((4,), (6,), (6, "exchange"), (4, "policy")):

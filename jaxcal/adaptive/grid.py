@@ -254,24 +254,23 @@ class GridTask:
             raise ValueError(
                 f"groups must hold {count} whole numbers from 0, got {in_words(alike)}"
             )
-        single, whole = jnp.float32, jnp.int32
         lengths = _grid(grid)
         parts, order = _split(table, lengths)
         return GridTask(
-            theta=jnp.asarray(grid, single),
-            prior=jnp.asarray(weights / weights.sum(), single),
-            designs=jnp.asarray(at, single),
-            likelihood=jnp.asarray(table, single),
+            theta=_single(grid),
+            prior=_single(weights / weights.sum()),
+            designs=_single(at),
+            likelihood=_single(table),
             parts=parts,
-            order=jnp.asarray(order, whole),
-            travel=jnp.asarray(roads, single),
-            place_after=jnp.asarray(after, whole),
-            extra=jnp.asarray(more, single),
-            uses=jnp.asarray(used, whole),
-            seconds=jnp.asarray(budget, single),
-            num_uses=jnp.asarray(ends, whole),
-            place=jnp.asarray(first, whole),
-            groups=jnp.asarray(alike, whole),
+            order=_whole(order),
+            travel=_single(roads),
+            place_after=_whole(after),
+            extra=_single(more),
+            uses=_whole(used),
+            seconds=_single(budget),
+            num_uses=_whole(ends),
+            place=_whole(first),
+            groups=_whole(alike),
             num_groups=int(alike.max()) + 1,
             shape=lengths,
             horizon=whole_number("horizon", horizon, 1),
@@ -380,12 +379,21 @@ def _split(
         product = mine * np.log(np.where(mine > 0.0, mine, 1.0))
         parts.append(
             Part(
-                likelihood=jnp.asarray(mine, jnp.float32),
-                p_log_p=jnp.asarray(product, jnp.float32),
+                likelihood=_single(mine),
+                p_log_p=_single(product),
                 axes=axes,
             )
         )
     return tuple(parts), np.argsort(np.concatenate(list(members.values())))
+
+
+def _single(values: ArrayLike) -> jax.Array:
+    # ``jnp.asarray`` compiles a program for every shape.
+    return jax.device_put(np.asarray(values, np.float32))
+
+
+def _whole(values: ArrayLike) -> jax.Array:
+    return jax.device_put(np.asarray(values, np.int32))
 
 
 def _columns(name: str, values: ArrayLike) -> Array:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcal.adaptive.rules import Scored, best, log_score, shortlist
+from jaxcal.adaptive.rules import Rule, best, log_score, shortlist
 from jaxcal.adaptive.session import Options, Session
 
 __all__ = ["Rollouts", "TwoStep"]
@@ -23,7 +23,7 @@ class TwoStep:
     information gain.
     """
 
-    base: Scored
+    base: Rule
     per_group: int = struct.field(pytree_node=False, default=8)
 
     def __call__(
@@ -71,7 +71,7 @@ class Rollouts:
     some noisy means is mostly the noisiest, and taking it is worse than the base rule.
     """
 
-    base: Scored
+    base: Rule
     rollouts: int = struct.field(pytree_node=False, default=16)
     depth: int = struct.field(pytree_node=False, default=16)
     per_group: int = struct.field(pytree_node=False, default=4)

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.history import (
     History,
     StepKeys,
@@ -22,7 +23,7 @@ from jaxcal.adaptive.history import (
     step_keys,
 )
 from jaxcal.adaptive.journal import Journal, fingerprint
-from jaxcal.adaptive.rules import Gain, GainRate
+from jaxcal.adaptive.rules import SHARES, Gain
 from jaxcal.adaptive.session import Decider, Session, Task
 
 __all__ = ["Finished", "Proposal", "next_measurement", "run"]
@@ -66,7 +67,8 @@ def next_measurement(
         task: what is unknown and what may be measured.
         history: (design, outcome) of each measurement in order. A design is an index of
             ``task.designs`` (a whole number) or its coordinates.
-        decider: the largest expected gain when not given, a second where time counts.
+        decider: when not given, the largest expected gain, and where time or uses count
+            the largest per share of what is left (``rules.SHARES``).
         seconds: budget of the whole session; the task's when not given.
         uses: likewise of what is countable.
         seed: of deciders and beliefs that draw. The same arguments, the same proposal.
@@ -75,7 +77,7 @@ def next_measurement(
         ValueError: an entry of the history that cannot be, by its number.
     """
     belief, session = begin(task, seconds, uses, seed)
-    decider = _default(session) if decider is None else decider
+    decider = _default(task, session) if decider is None else decider
     belief, session, _ = replay(task, history, belief, session, seed)
     return _proposal(task, decider, belief, session, seed)
 
@@ -106,7 +108,7 @@ def run(
             none, or cannot follow what was measured before.
     """
     belief, session = begin(task, seconds, uses, seed)
-    decider = _default(session) if decider is None else decider
+    decider = _default(task, session) if decider is None else decider
     header = {
         "task": fingerprint(task),
         "decider": fingerprint(decider),
@@ -139,8 +141,9 @@ def run(
             file.close()
 
 
-def _default(session: Session) -> Decider:
-    return GainRate() if math.isfinite(session.seconds) else Gain()
+def _default(task: Task, session: Session) -> Decider:
+    counted = isinstance(task, GridTask) and bool((task.uses > 0).any())
+    return SHARES if math.isfinite(session.seconds) or counted else Gain()
 
 
 def _proposal(

@@ -13,10 +13,12 @@ from flax import struct
 from jaxcal.adaptive.session import Options, Session
 
 __all__ = [
+    "SHARES",
     "Gain",
     "GainRate",
     "Priced",
     "Random",
+    "Shares",
     "StateRule",
     "best",
     "groups_of",
@@ -99,7 +101,7 @@ class GainRate:
         return best(gains / jnp.maximum(seconds, 1e-9), options)
 
 
-class Scored(abc.ABC):
+class Rule(abc.ABC):
     """A rule by a price: the largest log (gain / price)."""
 
     num_free: ClassVar[int]  # constants that can be tuned; the price's unit is free
@@ -111,10 +113,73 @@ class Scored(abc.ABC):
         Prices are multiplied by ``exp(by)``, exponents are added to.
         """
 
+    @abc.abstractmethod
     def judged(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """(A,) gains in nats and (A,) prices."""
+
+    def __call__(
+        self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
+    ) -> jax.Array:
+        judged = self.judged(task, belief, session, options, key)
+        return best(log_score(*judged), options)
+
+
+@struct.dataclass
+class Shares(Rule):
+    """A price in shares of what is left, with constants that serve any task.
+
+    ``1 / n + time s / t + use (u / e) N^a e^b``: a measurement takes s of the t seconds
+    and u of the e uses left (no share counts as more than 1), n measurements may still
+    be made, and N of those that gain most a second. No unit of time matters.
+    """
+
+    time: Any = 1.0
+    use: Any = 1.0
+    a: Any = 0.0
+    b: Any = 0.0
+    num_free: ClassVar[int] = 4
+
+    def moved(self, by: Any) -> Shares:
+        return Shares(
+            self.time * np.exp(by[0]), self.use * np.exp(by[1]),
+            self.a + by[2], self.b + by[3],
+        )  # fmt: skip
+
+    def judged(
+        self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        gains = belief.gains(task, options, key)
+        s, u = task.expected(belief, session, options)
+        e = jnp.maximum(session.uses.astype(gains.dtype), 1.0)
+        # Uses that every measurement takes limit the number of measurements.
+        always = jnp.where(options.allowed, u, jnp.inf).min()
+        n = jnp.maximum(task.horizon - session.made, 1).astype(gains.dtype)
+        n = jnp.minimum(n, jnp.maximum(e / jnp.maximum(always, 1e-6), 1.0))
+        t = jnp.maximum(session.seconds, 1e-9)
+        each = jnp.maximum(s[best(log_score(gains, s), options)], 1e-9)
+        number = jnp.minimum(n, jnp.maximum(t / each, 0.1))
+        price = (
+            1.0 / n
+            + self.time * jnp.minimum(s / t, 1.0)
+            + self.use * jnp.clip((u - always) / e, 0.0, 1.0)
+            * number**self.a * e**self.b
+        )  # fmt: skip
+        return gains, price
+
+
+SHARES = Shares(1.4, 1.8, 0.2, -0.7)
+"""Rounded from a search over tasks of the family such as ``benchmarks/families.py
+--tune`` makes."""
+
+
+class Scored(Rule):
+    """A price by seconds and uses alone."""
+
+    def judged(
+        self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         gains = belief.gains(task, options, key)
         seconds, uses = task.expected(belief, session, options)
         return gains, self.price(session, seconds, uses)
@@ -122,12 +187,6 @@ class Scored(abc.ABC):
     @abc.abstractmethod
     def price(self, session: Session, seconds: jax.Array, uses: jax.Array) -> jax.Array:
         """(A,) what the measurements are taken to cost."""
-
-    def __call__(
-        self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
-    ) -> jax.Array:
-        judged = self.judged(task, belief, session, options, key)
-        return best(log_score(*judged), options)
 
 
 @struct.dataclass

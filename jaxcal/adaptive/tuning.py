@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.adaptive.episodes import play
-from jaxcal.adaptive.rules import Scored
+from jaxcal.adaptive.rules import Rule
 from jaxcal.adaptive.session import Task
 from jaxcal.checks import whole_number
 
 __all__ = ["tune"]
 
-Rule = TypeVar("Rule", bound=Scored)
+R = TypeVar("R", bound=Rule)
 
 _SPREAD = 0.7  # of the first generation, in units of ``Scored.moved``
 _SMOOTH = 0.7  # share of the elite's mean in the next one
@@ -24,15 +24,16 @@ _SMOOTH = 0.7  # share of the elite's mean in the next one
 
 def tune(
     task: Task,
-    rule: Rule,
+    rule: R,
     *,
     episodes: int = 2048,
     generations: int = 20,
     population: int = 24,
     elite: int = 6,
     seed: int = 0,
-    report: Callable[[int, float, Rule], None] = lambda number, nats, rule: None,
-) -> Rule:
+    nats_of: Callable[[Any, R, jax.Array], float] | None = None,
+    report: Callable[[int, float, R], None] = lambda number, nats, rule: None,
+) -> R:
     """The rule with the constants that gain most on a task's sessions.
 
     Every set of constants plays the same sessions, others in each generation, so that
@@ -45,6 +46,7 @@ def tune(
         episodes: sessions a generation.
         generations, population, elite: of the cross-entropy method.
         seed: of the sessions and of the search.
+        nats_of: what is maximised, of task, rule and keys; the mean of nats when None.
         report: called after each generation with its number, the elite's mean of nats
             and the rule at its centre.
     """
@@ -63,7 +65,7 @@ def tune(
         )
         tried = centre + spread * rng.standard_normal((population, rule.num_free))
         tried[0] = centre
-        nats = np.array([_nats(task, rule.moved(x), keys) for x in tried])
+        nats = np.array([(nats_of or _nats)(task, rule.moved(x), keys) for x in tried])
         best = np.argsort(-nats)[:elite]
         centre = (1 - _SMOOTH) * centre + _SMOOTH * tried[best].mean(axis=0)
         spread = (1 - _SMOOTH) * spread + _SMOOTH * tried[best].std(axis=0)
@@ -71,6 +73,6 @@ def tune(
     return rule.moved(centre)
 
 
-def _nats(task: Task, rule: Scored, keys: jax.Array) -> float:
+def _nats(task: Task, rule: Rule, keys: jax.Array) -> float:
     rule = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), rule)
     return float(play(task, rule, keys).gain.mean())

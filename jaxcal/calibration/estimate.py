@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 
 _BEYOND = 2.0  # degrees beyond a limit, or percent of a slide's stroke
 _NOMINAL = 0.5  # of its length: no arm, and no tip, is so far off before it is fitted
+_APART = 0.2  # of it: what two sockets may seem to be off their distance
 
 
 def require_model(model: Any, commands: Array, measured: Array) -> None:
@@ -202,7 +203,7 @@ def _require_sockets(arm: SerialChain, commands: Array, measured: Array) -> None
     for one, other, distance, _ in arm.sensor.distances:
         if {int(one), int(other)} <= set(middles):
             found = float(np.linalg.norm(middles[int(one)] - middles[int(other)]))
-            if abs(found - distance) > most:
+            if abs(found - distance) > _APART * arm.length:
                 raise ValueError(
                     f"sockets {int(one)} and {int(other)} must be {distance:g} apart, "
                     f"but the arm as described puts them {found:.3g} apart: "

@@ -15,7 +15,8 @@ from jaxcal.files import require_writable_folder, write_text
 __all__ = ["main", "require_outputs"]
 
 EXIT_INTERRUPTED = 130
-_METHODS = "random,gain,rate,priced,state,two_step,policy"
+_METHODS = "random,gain,rate,shares,two_step,policy"
+_TUNED = "priced,state"  # where the task brings their constants
 
 _EPILOG = """\
 methods:
@@ -66,7 +67,8 @@ def _parser(prog: str, typed: str) -> Parser:
     add("--with", dest="options", nargs="+", default=[], metavar="OPTION=VALUE",
         help="options of the task")  # fmt: skip
     add("--methods", type=several(str, "names"), metavar="LIST",
-        help=f"comma separated; {_METHODS}, or the task's own")  # fmt: skip
+        help=f"comma separated; {_METHODS}, with {_TUNED} where the task has their "
+        "constants, or the task's own")  # fmt: skip
     add("--checkpoint", metavar="DIR", help="of the policy; the shipped one")
     add("--episodes", type=at_least(2), metavar="N",
         help="sessions; 4096, fewer where a task takes long")  # fmt: skip
@@ -104,7 +106,11 @@ def _run(options: argparse.Namespace, command: list[str]) -> None:
 
     require_outputs(options)
     entry = registry.load(options.task)
-    methods = options.methods or list(entry.methods) or _METHODS.split(",")
+    methods = options.methods or list(entry.methods)
+    if not methods:
+        known = [m for m in _TUNED.split(",") if m in entry.rules or options.retune]
+        methods = _METHODS.split(",")
+        methods[4:4] = known
     if options.checkpoint is not None and "policy" not in methods:
         if options.methods:
             raise ValueError("--checkpoint is given, but policy is not among --methods")

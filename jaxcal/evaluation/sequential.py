@@ -18,7 +18,15 @@ from jaxcal.adaptive.episodes import Comparison, compare
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.lookahead import Rollouts, TwoStep
 from jaxcal.adaptive.policy import run as policies
-from jaxcal.adaptive.rules import Gain, GainRate, Priced, Random, Scored, StateRule
+from jaxcal.adaptive.rules import (
+    SHARES,
+    Gain,
+    GainRate,
+    Priced,
+    Random,
+    Scored,
+    StateRule,
+)
 from jaxcal.adaptive.tasks.registry import Entry
 from jaxcal.adaptive.tuning import tune
 
@@ -29,10 +37,11 @@ METHODS = {
     "static": "one sequence for all sessions, optimised over the prior",
     "gain": "the largest expected information gain (EIG)",
     "rate": "the largest EIG a second",
+    "shares": "EIG per share of time, uses and number left; its constants are fixed",
     "priced": "EIG per price of time and uses, its constants tuned",
     "state": "the same with prices that follow what is left, tuned",
-    "two_step": "the state rule over two measurements",
-    "rollouts": "simulation of the state rule to the end, common random numbers",
+    "two_step": "state, or shares where that is not tuned, over two measurements",
+    "rollouts": "simulation of the same rule to the end, common random numbers",
     "policy": "the network that corrects the state rule",
 }
 _GENERATIONS = 20  # of tuning
@@ -97,8 +106,8 @@ def evaluate(
         )
     trained = policies.load(checkpoint) if "policy" in methods else None
     needed = [m for m in ("priced", "state") if m in methods]
-    if {"two_step", "rollouts"} & set(methods) and "state" not in needed:
-        needed.append("state")
+    if {"two_step", "rollouts"} & set(methods) and (retune or "state" in entry.rules):
+        needed = sorted({*needed, "state"})
     rules = _rules(entry, task, needed, retune, seed, progress)
     found, seconds = [], []
     for method in methods:
@@ -133,7 +142,7 @@ def evaluate(
             for field in ("gain", "entropy_drop", "log_ratio", "choices")
         ),
     )
-    rivals = [m for m in ("state", "priced", "rate", "gain") if m in methods]
+    rivals = [m for m in ("state", "shares", "priced", "rate", "gain") if m in methods]
     return Result(
         task=name,
         options=options,
@@ -176,13 +185,13 @@ def _rules(
 
 
 def _decider(method: str, rules: Mapping[str, Scored], rollouts: int) -> Any:
-    simple = {"random": Random, "gain": Gain, "rate": GainRate}
+    simple = {"random": Random(), "gain": Gain(), "rate": GainRate(), "shares": SHARES}
     if method in simple:
-        return simple[method]()
+        return simple[method]
     if method == "two_step":
-        return TwoStep(rules["state"])
+        return TwoStep(rules.get("state", SHARES))
     if method == "rollouts":
-        return Rollouts(rules["state"], rollouts=rollouts)
+        return Rollouts(rules.get("state", SHARES), rollouts=rollouts)
     return rules[method]
 
 

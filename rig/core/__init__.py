@@ -1,5 +1,7 @@
-"""The core: from a posture to the Modbus write, to the phone's word, and to a stop.
+"""What moves, measures and stops a device. Begin with `session`; then, downwards:
 
-It imports ``rig.config`` and ``rig.journal`` and nothing else of rig. Signals, console,
-page and telemetry listen to it.
+`motion` and `measure` on `proof` (how far), `known` and `zero` (is it the device, where
+it was), `device` (drives, phone, guards), `stop`, `drive` and `bus` (Modbus), `phone`,
+`stream` and `attitude` (the IMU), `identify` (A and b), `faults` (how a session ends).
+It imports `rig.config` and `rig.journal` and nothing else of rig.
 """

@@ -53,7 +53,7 @@ def _piece(device: Device, goal: Pulses, label: str) -> bool:
     end = goal
     if steps > 1:
         end = config.to_pulses(config.to_deg(here) + way / steps)
-    end = proof.begin(config.imu, attitude, here, end)
+    end = proof.begin(device.imu, attitude, here, end)
     if faults := list(outside(config, end)):
         raise LimitError("; ".join(faults))
     for index, drive in enumerate(device.drives):

@@ -25,6 +25,7 @@ from rig.config.axis import Axis, Pulses
 from rig.config.settings import ImuSettings
 from rig.core.attitude import Array, angle_between_deg, matrix_to_euler
 from rig.core.faults import MotionFault
+from rig.core.phone import Imu
 
 FIRST_MOTOR_DEG = 0.36
 UNSEEN_MOTOR_DEG = 36.0
@@ -37,7 +38,6 @@ ALLOWED_DEG = 9.0  # that the phone may turn from where an unproved device began
 TOO_FAR = 2.0  # times what checked axes are moved, and MARGIN_DEG: more is a fault
 MARGIN_DEG = 1.0
 SEEN_SHARE = 0.1  # of a checked axis's move must be seen, or the moves do not grow
-ALL = np.eye(3), math.inf  # any attitude
 RADIANS = 180.0 / math.pi
 LARGEST_RAD = 2.0 * math.pi + 0.1  # no larger number is an angle in radians
 
@@ -151,7 +151,10 @@ class Proof:
         self._start: Pulses | None = None  # where the unproved axes began
         self._unit: bool | None = None  # the phone's is proved; None: to be looked at
         self._before = np.eye(3)  # (3, 3) attitude where the present piece began
-        self._most_deg = math.inf  # that the phone may turn in it
+        # Attitude where the piece before it began, degrees of the joints since, and in
+        # this piece: a phone that lags has not shown the whole of the last one yet.
+        self._last: tuple[Array, float, float] | None = None
+        self._connection, self._world = 0, self._before  # by which these hold
 
     def renew(self, index: int, unit_is_proved: bool = True) -> Reach:
         """Nothing is proved of an axis any more: it is to be checked."""
@@ -164,9 +167,7 @@ class Proof:
         self._near = attitude, allowed_deg
         self._start = None
 
-    def begin(
-        self, imu: ImuSettings, attitude: Array, here: Pulses, goal: Pulses
-    ) -> Pulses:
+    def begin(self, imu: Imu, attitude: Array, here: Pulses, goal: Pulses) -> Pulses:
         """The next piece of the way from here to a goal; it ends where it may end.
 
         Raises:
@@ -176,7 +177,7 @@ class Proof:
         if unproved and self._near is None:
             self.stay_near(attitude)
         if unproved and self._unit is None:
-            self._unit = unit_proved(imu, attitude)
+            self._unit = unit_proved(imu.settings, attitude)
             for reach in unproved:
                 reach.factor = 1.0 if self._unit else RADIANS
         self._start = self._start or here
@@ -196,11 +197,17 @@ class Proof:
                 p + round((q - p) * share) for p, q in zip(here, goal, strict=True)
             )
             goal = a, b, c
-        self._before, self._most_deg = attitude, math.inf
-        if not unproved:
-            each = zip(self.axes, here, goal, strict=True)
-            way = sum(abs(axis.to_deg(q - p)) for axis, p, q in each)
-            self._most_deg = TOO_FAR * way + MARGIN_DEG
+        each = zip(self.axes, here, goal, strict=True)
+        way = sum(abs(axis.to_deg(q - p)) for axis, p, q in each)
+        same = imu.connections == self._connection and imu.world is self._world
+        if unproved:
+            self._last = None
+        elif self._last is None or not same:  # or its heading is another one
+            self._last = attitude, way, way
+        else:
+            self._last = self._before, self._last[2] + way, way
+        self._before, self._connection = attitude, imu.connections
+        self._world = imu.world
         return goal
 
     def paced(self, index: int, pulses: int) -> Axis:
@@ -215,7 +222,10 @@ class Proof:
 
     def watch(self, attitude: Array) -> None:
         """At every poll of a move; MotionFault where the phone turns too far in it."""
-        for since, most in ((self._before, self._most_deg), self._near or ALL):
+        limits = [self._near] if self._near else []
+        if self._last:
+            limits.append((self._last[0], TOO_FAR * self._last[1] + MARGIN_DEG))
+        for since, most in limits:
             turned = angle_between_deg(since, attitude)
             if turned > most:
                 raise MotionFault(

@@ -47,7 +47,7 @@ examples:
 """
 _PARTS = (  # modules of exhibits, in the order in which they are computed
     *("training", "calibration", "selection", "variance", "pictures", "tables"),
-    *("accuracy", "ellipsoids", "recalibration", "recorded"),
+    *("accuracy", "ellipsoids", "recalibration"),
 )
 _ORDER = (  # of the exhibits, that of the paper
     *("robot", "table_1", "figure_1", "table_2", "table_3", "rank", "reward_range"),

@@ -76,11 +76,12 @@ def task(path):
     return registry.load(str(path)).make()
 
 
-def require_exact(values):
+def has_exact_mean(values):
+    """Whether a mean is what an option tells, known well enough to say so."""
     values = np.asarray(values, np.float64)
     error = values.std(ddof=1) / len(values) ** 0.5
-    assert error < 0.01  # the estimates that win are 0.06 too large
-    assert abs(values.mean() - EXACT) < 4.0 * error
+    # The estimates that win are 0.06 too large.
+    return error < 0.01 and abs(values.mean() - EXACT) < 4.0 * error
 
 
 def test_the_estimates_that_win_are_too_large(task):
@@ -95,14 +96,17 @@ def test_the_estimates_that_win_are_too_large(task):
 
     won = jnp.stack([largest(key) for key in jax.random.split(jax.random.key(0), 64)])
     assert won.mean() > EXACT + 0.04
+    assert not has_exact_mean(won)
 
 
 def test_play_credits_what_an_option_tells(task):
-    require_exact(play(task, Gain(), jax.random.split(jax.random.key(1), 256)).gain)
+    played = play(task, Gain(), jax.random.split(jax.random.key(1), 256))
+    assert has_exact_mean(played.gain)
 
 
 def test_a_proposal_states_what_it_tells(task):
-    require_exact([next_measurement(task, seed=seed).gain for seed in range(64)])
+    gains = [next_measurement(task, seed=seed).gain for seed in range(64)]
+    assert has_exact_mean(gains)
 
 
 def test_brax_is_rewarded_with_what_an_option_tells(task):
@@ -116,7 +120,7 @@ def test_brax_is_rewarded_with_what_an_option_tells(task):
     def reward(key):  # the first of the shortlist is the one of the largest gain
         return env.step(env.reset(key), jnp.int32(0)).reward
 
-    require_exact(reward(jax.random.split(jax.random.PRNGKey(2), 256)))
+    assert has_exact_mean(reward(jax.random.split(jax.random.PRNGKey(2), 256)))
 
 
 @pytest.mark.slow

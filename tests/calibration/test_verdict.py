@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import warnings
 
 import contacts
 import numpy as np
 import pytest
 
 import jaxcal
+from jaxcal.commands.main import main
 
 from ..models.arms import ur5
 
@@ -75,6 +77,79 @@ def test_rows_in_the_wrong_file_and_loose_contacts_are_named():
     assert "measurement 3 fits socket 0 instead" in verdict.reasons
     assert "measurement 40 fits socket 1 instead" in verdict.reasons
     assert any(why.startswith("measurement 20 is ") for why in verdict.reasons)
+
+
+def test_one_loose_contact_is_named_and_no_file_is_written(tmp_path, capsys):
+    joints = PLACE[0].copy()
+    joints[20, 3] += 0.3
+    with pytest.warns(UserWarning, match="some readings contradict the others"):
+        verdict = _fit("panda_1", joints, PLACE[1]).verdict
+    assert verdict.explains and verdict.helps and not verdict.clean
+    assert any(why.startswith("measurement 20 is ") for why in verdict.reasons)
+    names = [f"panda_joint{i + 1}" for i in range(7)]
+    table = tmp_path / "contacts.csv"
+    header = ",".join([*names, "socket"])
+    np.savetxt(
+        table,
+        np.column_stack([joints, PLACE[1]]),
+        "%.12g",
+        ",",
+        header=header,
+        comments="",
+    )
+    urdf = contacts.common.HERE / "contacts" / "panda.urdf"
+    out = tmp_path / "out.urdf"
+    flags = ["identify", str(table), "--model", str(urdf), "--tip", "ball_link"]
+    flags += ["--sensor", "socket", "--distance", "0,1,0.05,0.0001", "--out", str(out)]
+    assert main(flags) == 2
+    assert "measurement 20 is" in capsys.readouterr().err and not out.exists()
+
+
+def test_exchanged_sockets_are_named_where_their_places_were_given():
+    arm = contacts.arm("panda_1")
+    places = arm.located(np.column_stack(PLACE)).sensor.places
+    sensor = dataclasses.replace(arm.sensor, places=places)
+    for sockets, count in ((PLACE[1], 0), (1.0 - PLACE[1], 2)):
+        commands = np.column_stack([PLACE[0], sockets])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            found = jaxcal.identify(
+                commands, np.zeros((62, 3)), model=arm.measured_with(sensor)
+            )
+        said = [why for why in found.verdict.reasons if "are their rows" in why]
+        assert len(said) == count and found.verdict.clean == (count == 0)
+
+
+def test_contacts_that_no_such_arm_made_are_refused():
+    joints, sockets = PLACE
+    other = contacts.load("panda_1")["right"]
+    mixed = [
+        np.concatenate([each[sockets == 0], more[other[1] == 1]])
+        for each, more in zip(PLACE, other, strict=True)
+    ]
+    with pytest.raises(ValueError, match=r"sockets 0 and 1 must be 0\.05 apart, but"):
+        _fit("panda_1", *mixed)
+    twice = joints[sockets == 0]
+    labels = np.repeat([0.0, 1.0], len(twice))
+    with pytest.raises(ValueError, match="row 30 is row 0 with another socket"):
+        _fit("panda_1", np.vstack([twice, twice]), labels)
+    beyond = joints.copy()
+    beyond[7, 2] = contacts.arm("panda_1").limits[2, 1] + 2.5
+    with pytest.raises(ValueError, match=r"panda_joint3 must be .* in row 7"):
+        _fit("panda_1", beyond, sockets)
+
+
+def test_another_tip_within_the_prior_is_named():
+    arm = contacts.arm("panda_1")
+    tool = arm.tool.copy()
+    tool[0, 3] += 0.05
+    arm = dataclasses.replace(arm, tool=tool)
+    commands = np.column_stack(PLACE)
+    found = jaxcal.identify(commands, np.zeros((62, 3)), model=arm)
+    said = [why for why in found.verdict.reasons if "is it another tip?" in why]
+    assert len(said) == 1 and said[0].startswith("the tip is 0.05 from where")
+    clean = _fit("panda_1", *PLACE).verdict
+    assert not [why for why in clean.reasons if "another tip" in why]
 
 
 def test_a_wrong_tip_is_named():

@@ -105,7 +105,8 @@ def test_lessons_share_no_key_with_the_weights_and_the_updates():
         jax.random.key_data(jax.random.fold_in(key, 1)),
     )
     weights, played, _ = ppo.keys_of(key)
-    assert np.array_equal(ppo.begin(PPO, LEARNER, key).key, jax.random.key_data(played))
+    begun = jax.jit(lambda key: ppo.begin(PPO, LEARNER, key))(key)
+    assert np.array_equal(begun.key, jax.random.key_data(played))
     for index in range(3):
         drawn = imitation.draw(LEARNER, brute_force, key_of(index))
         for used in (weights, played):
@@ -116,7 +117,8 @@ def test_lessons_share_no_key_with_the_weights_and_the_updates():
 @jax.jit
 def measured(params, lesson):
     learner = imitation.Imitation(LEARNER)
-    attempt, _ = learner.gather(params, lesson, jax.random.key(0), lesson)
+    keys = jax.random.split(jax.random.key(0), len(lesson.best))
+    attempt, _ = learner.gather(params, keys, lesson)
     return learner.loss(params, attempt, jnp.int32(0))
 
 

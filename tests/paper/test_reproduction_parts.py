@@ -18,7 +18,6 @@ from jaxcal.evaluation.csv_rows import csv_text
 from jaxcal.evaluation.parameters import least_squares, predict
 from jaxcal.paper.datasets import make_dataset
 from jaxcal.plots import as_bytes
-from studies.paper import robot_pictures
 from studies.paper.exhibits import pictures
 from studies.paper.exhibits.devices import Device
 from studies.paper.exhibits.intervals import (
@@ -168,7 +167,7 @@ def test_a_report_without_opengl_says_why_it_has_no_picture(
     def fail(*_: object) -> None:
         raise ImportError("no EGL here")
 
-    monkeypatch.setattr(robot_pictures, "_renderer", fail)
+    monkeypatch.setattr(pictures, "_renderer", fail)
     chosen = SimpleNamespace(indices=np.arange(4).reshape(1, 1, 4))
     material = SimpleNamespace(
         settings=Settings(quick=True),

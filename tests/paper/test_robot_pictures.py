@@ -3,26 +3,28 @@
 from __future__ import annotations
 
 import ctypes.util
+import io
 import os
-import pathlib
 import subprocess
 import sys
-from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from jaxcal.paper.twin.robot import RobotConfig
-from studies.paper import robot_pictures
-from studies.paper.robot_pictures import animate, draw, main, render
+from studies.paper.exhibits import pictures
+from studies.paper.exhibits.pictures import draw, film_of, picture_of
 
 SIZE = (240, 180)
 CONFIG = RobotConfig(mechanism_order="YXZ", read_out_order="YXZ")
 
 
-def pixels(path: pathlib.Path) -> np.ndarray:
-    with Image.open(path) as image:
+POSTURE_DEG = (18.0, 14.0, -12.0)
+
+
+def pixels(file: bytes) -> np.ndarray:
+    with Image.open(io.BytesIO(file)) as image:
         return np.asarray(image.convert("RGB"), dtype=int)
 
 
@@ -37,56 +39,48 @@ def opengl() -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems bring OpenGL along")
 def test_a_machine_without_the_library_is_told_which(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(ctypes.util, "find_library", lambda _: None)
     with pytest.raises(RuntimeError, match=r"no EGL or OSMesa library \(Debian: libeg"):
-        render(CONFIG, tmp_path / "a.png")
+        picture_of(CONFIG, POSTURE_DEG)
 
 
-def test_the_picture_shows_the_posture(tmp_path: pathlib.Path, opengl: None) -> None:
+def test_the_picture_shows_the_posture(opengl: None) -> None:
     before = os.environ.get("PYOPENGL_PLATFORM")
-    render(CONFIG, tmp_path / "a.png", size=SIZE)
-    render(CONFIG, tmp_path / "b.png", (0, 0, 0), size=SIZE)
+    one, two = (pixels(picture_of(CONFIG, u, SIZE)) for u in (POSTURE_DEG, (0, 0, 0)))
     assert os.environ.get("PYOPENGL_PLATFORM") == before
-    one, two = pixels(tmp_path / "a.png"), pixels(tmp_path / "b.png")
     assert one.shape == two.shape == (180, 240, 3)
     assert (one != 255).any(axis=2).mean() > 0.1  # something is drawn
     assert (one != two).any(axis=2).mean() > 0.02  # and it moves
 
 
-def test_a_machine_that_cannot_draw_says_so(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_machine_that_cannot_draw_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise ImportError("no EGL here")
 
-    monkeypatch.setattr(robot_pictures, "_renderer", fail)
+    monkeypatch.setattr(pictures, "_renderer", fail)
     with pytest.raises(RuntimeError, match="MuJoCo cannot draw here: no EGL here"):
-        render(CONFIG, tmp_path / "c.png")
-    assert not (tmp_path / "c.png").exists()
+        picture_of(CONFIG, POSTURE_DEG)
 
 
-def test_the_film_moves_and_ends_where_it_began(
-    tmp_path: pathlib.Path, opengl: None
-) -> None:
-    told: list[tuple[str, int, int]] = []
-    animate(
+def test_the_film_moves_and_ends_where_it_began(opengl: None) -> None:
+    said: list[tuple[str, int, int]] = []
+    file = film_of(
         CONFIG,
-        tmp_path / "a.gif",
         [[15.0, 0.0, 0.0]],
         size=(120, 90),
-        progress=lambda *what: told.append(what),
+        progress=lambda *what: said.append(what),
     )
-    assert told[0] == ("draw the film", 0, len(told))
-    with Image.open(tmp_path / "a.gif") as film:
+    assert said[0] == ("draw the film", 0, len(said))
+    with Image.open(io.BytesIO(file)) as film:
         frames = []
         for number in range(film.n_frames):
             film.seek(number)
             frames.append(np.asarray(film.convert("RGB"), dtype=int))
         assert film.info["loop"] == 0
-    assert 5 <= len(frames) <= len(told)  # frames that repeat are merged
+    assert 5 <= len(frames) <= len(said)  # frames that repeat are merged
     apart = [np.abs(frame - frames[-1]).mean() for frame in frames]
     assert max(apart) > 1.0 and apart[0] < max(apart)
 
@@ -99,22 +93,6 @@ def test_the_closed_form_loads_neither_mujoco_nor_matplotlib() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"size": (5000, 10)}, r"size must be within 1280 x 960 pixels, got \(5000"),
-    ],
-)
-def test_bad_requests_are_refused(
-    tmp_path: pathlib.Path, fields: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(ValueError, match=message):
-        render(CONFIG, tmp_path / "a.png", **fields)
-
-
-def test_a_folder_that_is_a_file_is_refused(
-    tmp_path: pathlib.Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "file").touch()
-    assert main([str(tmp_path / "file")]) == 2
-    assert "robot_pictures: " in capsys.readouterr().err
+def test_a_size_that_is_too_large_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"size must be within 1280 x 960 pixels, got"):
+        picture_of(CONFIG, POSTURE_DEG, (5000, 10))

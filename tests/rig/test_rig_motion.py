@@ -13,6 +13,7 @@ from harness import HASTY, UNSETTLED, WATCHED, fast_config, fast_text, simulator
 
 from rig.config import parse_config
 from rig.core.device import Device, Posture, approach, check_plan
+from rig.core.drive import HOME
 from rig.core.faults import (
     LimitError,
     MotionFault,
@@ -25,6 +26,7 @@ from rig.core.motion import Standing, move
 from rig.core.proof import GROWTH, SHOWN_DEG
 from rig.signals import Signals
 from rig.simulator import Truth, parse_fault
+from rig.workbench.commission.home import unlimited
 
 
 @contextlib.contextmanager
@@ -109,6 +111,17 @@ def test_soft_limits_are_mirrored_in_drives_that_have_them():
         words = motion.device.bus.read_words(axis.unit, 0x2C, 4)
         low, high = (a << 16 | b for a, b in (words[:2], words[2:]))
         assert (low - 2**32, high) == (axis.min_pulses, axis.max_pulses)
+
+
+def test_before_home_is_set_the_drives_own_limits_leave_it_room():
+    """Those of before, about 0, would shut out a home at 2^30."""
+    changes = {'map = "leadshine_pr"': 'map = "generic"',
+               "[motion]": "[motion]\nmirror_limits = true"}  # fmt: skip
+    with bench(unlimited(parse_config(fast_text(changes)))) as motion:
+        unit = motion.config.axes[0].unit
+        words = motion.device.bus.read_words(unit, 0x2C, 4)
+        low, high = (a << 16 | b for a, b in (words[:2], words[2:]))
+        assert low - 2**32 <= 0 < HOME <= high
 
 
 def test_the_whole_plan_is_checked_before_the_first_move():

@@ -107,9 +107,18 @@ def test_the_zero_taken_here_is_approached_from_the_side_of_the_references(tmp_p
     records = [json.loads(line) for line in (tmp_path / "run" / "journal.jsonl").open()]
     (zero,) = (r for r in records if r["event"] == "zero")
     assert zero["pulses"] == start
-    moves = [r["pulses"] for r in records if r.get("label") == "zero"]
     below = config.to_pulses(config.to_deg(start) - 2.0)
-    assert moves == [*below, *start]
+    for axis, here, low in zip(config.axes, start, below, strict=True):
+        moves = [
+            r["pulses"]
+            for r in records
+            if r.get("label") == "zero" and r.get("axis") == axis.name
+        ]
+        turned = moves.index(low)  # in pieces there, and in pieces back
+        away = abs(np.array([here, *moves]) - low)
+        assert (np.diff(away[: turned + 2]) < 0).all()
+        assert (np.diff(away[turned + 1 :]) > 0).all()
+        assert moves[-1] == here
 
 
 def test_a_zero_that_cannot_be_approached_moves_nothing(tmp_path):

@@ -74,7 +74,8 @@ def initial(network: Network, key: jax.Array, m: int, n: int, k: int) -> Any:
     """Fresh parameters for M candidates of n inputs and K choices."""
     free = jnp.ones((1, m), bool)
     nothing = jnp.full((1, k), -1, jnp.int32)
-    return network.init(key, jnp.zeros((1, m, n)), free, nothing, free)["params"]
+    init = jax.jit(network.init)  # op by op it would be two hundred small programs
+    return init(key, jnp.zeros((1, m, n)), free, nothing, free)["params"]
 
 
 def encode(network: Network, params: Any, features: Any) -> jax.Array:

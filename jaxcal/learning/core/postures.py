@@ -215,13 +215,11 @@ class Postures:
             seen.append(decision)
             played.append(record | {"value": value * task.value_scale})
 
-        every = {name: jnp.stack([row[name] for row in played]) for name in played[0]}
+        every = _stacked(played)
         own = 1.0 - (num_random > 0)  # the policy made the first choice itself
         advantage, target = _advantages_and_targets(config, every, own)
         # The last choices, made by the look-ahead alone, are not learned from.
-        later = None
-        if learned > 1:
-            later = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seen[1:learned])
+        later = _stacked(seen[1:learned]) if learned > 1 else None
         batch = Batch(
             seen=Seen(features, seen[0], later),
             action=every["action"][:learned],
@@ -232,6 +230,10 @@ class Postures:
         )
         log_det = jax.vmap(task.outcome)(states)
         return batch, {"reward": every["reward"].sum(0), "log_det": log_det, "own": own}
+
+
+def _stacked(trees: list[Any]) -> Any:
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
 
 
 def _random_starts(task: Episode, number: int, key: jax.Array) -> jax.Array:

@@ -10,6 +10,7 @@ import contextlib
 import dataclasses
 import pathlib
 import time
+import types
 from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
@@ -73,29 +74,6 @@ def require_read(given: Collection[str]) -> None:
         raise ValueError(f"--trainer brax does not read {flags}: leave it out")
 
 
-class _Categorical:
-    """One batch of categorical distributions over candidates."""
-
-    def __init__(self, logits: jax.Array) -> None:
-        self.log_probs = jax.nn.log_softmax(logits)
-        # brax's loss logs ``loc`` and ``scale`` of every distribution; a categorical
-        # one has neither, so it is given its largest probability and its entropy.
-        self.loc, self.scale = jnp.exp(self.log_probs).max(-1), self.entropy()
-
-    def sample(self, seed: jax.Array) -> jax.Array:
-        return jax.random.categorical(seed, self.log_probs)
-
-    def mode(self) -> jax.Array:
-        return jnp.argmax(self.log_probs, axis=-1)
-
-    def log_prob(self, x: jax.Array) -> jax.Array:
-        index = x.astype(jnp.int32)[..., None]
-        return jnp.take_along_axis(self.log_probs, index, axis=-1)[..., 0]
-
-    def entropy(self) -> jax.Array:
-        return -(jnp.exp(self.log_probs) * self.log_probs).sum(-1)
-
-
 class MaskedCategorical(distribution.ParametricDistribution):
     """brax's distribution interface over logits that the network has masked."""
 
@@ -103,8 +81,24 @@ class MaskedCategorical(distribution.ParametricDistribution):
         identity = distribution.IdentityPostprocessor()
         super().__init__(num_actions, identity, event_ndims=0, reparametrizable=False)
 
-    def create_dist(self, parameters: jax.Array) -> _Categorical:
-        return _Categorical(parameters)
+    def create_dist(self, parameters: jax.Array) -> Any:
+        log_probs = jax.nn.log_softmax(parameters)
+        entropy = -(jnp.exp(log_probs) * log_probs).sum(-1)
+
+        def log_prob(x: jax.Array) -> jax.Array:
+            index = x.astype(jnp.int32)[..., None]
+            return jnp.take_along_axis(log_probs, index, axis=-1)[..., 0]
+
+        # brax's loss logs ``loc`` and ``scale`` of every distribution; a categorical
+        # one has neither, so it is given its largest probability and its entropy.
+        return types.SimpleNamespace(
+            sample=lambda seed: jax.random.categorical(seed, log_probs),
+            mode=lambda: jnp.argmax(log_probs, axis=-1),
+            log_prob=log_prob,
+            entropy=lambda: entropy,
+            loc=jnp.exp(log_probs).max(-1),
+            scale=entropy,
+        )
 
 
 def _networks(env: SelectionConfig, config: NetworkConfig) -> brax_networks.PPONetworks:
@@ -164,10 +158,12 @@ def train(
     task, ppo = config.tasks[0], config.ppo
     env, length = task.environment, task.environment.num_selected
     read = {name: getattr(ppo, name) for name in READ}
-    given = _FIXED | {READ[name]: value for name, value in read.items()}
-    given |= {"num_timesteps": ppo.num_episodes * length, "num_evals": num_evals}
-    given |= {"seed": config.seed}
-    given |= {"episode_length": length, "unroll_length": length}
+    given = {
+        **_FIXED,
+        **{READ[name]: value for name, value in read.items()},
+        **{"num_timesteps": ppo.num_episodes * length, "num_evals": num_evals},
+        **{"seed": config.seed, "episode_length": length, "unroll_length": length},
+    }
     begun = time.perf_counter()
 
     def progress(steps: int, metrics: dict[str, Any]) -> None:

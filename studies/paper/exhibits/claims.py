@@ -112,13 +112,11 @@ def _convergence_of_seeds(exhibit: Exhibit) -> str:
         return "no kept run in studies/paper/kept"
     if exhibit.verdict == "not comparable":
         return f"{min(numbers['episodes']):,} episodes run, not finished or too few"
-    text = (
+    return (
         f"within 5 % of its final level from episode "
         f"{numbers['plateau_episode']:,.0f}, {numbers['seeds']} seeds"
+        f"; det S / det S* {numbers['ratio_to_exact']:.4f}"
     )
-    if "ratio_to_exact" in numbers:
-        text += f"; det S / det S* {numbers['ratio_to_exact']:.4f}"
-    return text
 
 
 def _convergence_of_paper(exhibit: Exhibit) -> str:
@@ -128,13 +126,11 @@ def _convergence_of_paper(exhibit: Exhibit) -> str:
     text = f"{numbers['episodes']:,} episodes run"
     if exhibit.verdict == "not comparable":
         return f"{text}, {'too few' if numbers['finished'] else 'not finished'}"
-    text += (
-        f"; within 5 % of its final level from {numbers['episode']:,.0f}; the last "
-        f"tenth brings {numbers['last_tenth']:.1%} of the rise"
+    return (
+        f"{text}; within 5 % of its final level from {numbers['episode']:,.0f}; the "
+        f"last tenth brings {numbers['last_tenth']:.1%} of the rise; det S / det S* "
+        f"{numbers['dataset2']['ratio_to_exact']:.4f}"
     )
-    if numbers["dataset2"] is not None:
-        text += f"; det S / det S* {numbers['dataset2']['ratio_to_exact']:.4f}"
-    return text
 
 
 def _calibration(found: Found, recorded: str) -> Iterator[Claim]:

@@ -2,11 +2,13 @@
 
 The paper compares X_0, from an early session, with X_*, from the det-maximal postures
 of a later one. Two things differ: the age and the choice of postures. Here every choice
-is tried at every age, on devices whose bias takes a random step between sessions.
+is tried at every age, on devices whose bias takes a random step between sessions; and
+on the rig recordings, X_0 from dataset5 and X_* from dataset4.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,14 +17,22 @@ from numpy.typing import NDArray
 
 from jaxcal.candidates import uniform_candidates
 from jaxcal.evaluation.parameters import least_squares, predict
-from jaxcal.paper.constants import NOISE_STD_DEG, RANGES
-from jaxcal.plots.style import COLOURS, GREY, MARKERS, band, legend_right, panels
+from jaxcal.paper.constants import AXES, NOISE_STD_DEG, RANGES
+from jaxcal.plots.style import (
+    BLACK,
+    COLOURS,
+    GREY,
+    MARKERS,
+    band,
+    legend_below,
+    legend_right,
+    panels,
+)
 from jaxcal.selection import exact_batch
 from studies.paper.exhibits.devices import Device, pick, rms
-from studies.paper.exhibits.exhibit import Exhibit, from_rows, judge
-from studies.paper.exhibits.intervals import median_interval, paired
+from studies.paper.exhibits.exhibit import Exhibit, by_axis, from_rows, judge
+from studies.paper.exhibits.intervals import median_interval, paired, share_interval
 from studies.paper.exhibits.material import Material
-from studies.paper.exhibits.traces import POINTS, TRACED, trace_columns, traces
 
 __all__ = ["exhibits"]
 
@@ -39,10 +49,22 @@ COMPARED = {  # choice and session of the first calibration, then of the second
     "choice_alone_at_x0": (("random", 0), ("det-maximal", 0)),
     "choice_alone_at_x_star": (("random", LATER), ("det-maximal", LATER)),
 }
+POINTS = 8  # postures predicted in a session
+TRACED = 6  # sessions drawn point by point
+_LOOKS = {
+    "measured": ("measured", BLACK, "-", ""),
+    "x0_random": ("X$_0$, random postures", GREY, ":", "x"),
+    "x0_policy": ("X$_0$, policy's postures", COLOURS[1], "--", "s"),
+    "x_star": ("X$_*$", COLOURS[0], "-", "o"),
+}
 
 
 def exhibits(material: Material) -> list[Exhibit]:
-    """Figure 10 on devices that drift."""
+    """Figure 10 on devices that drift, and on the recordings."""
+    return [_drifting(material), _recorded(material)]
+
+
+def _drifting(material: Material) -> Exhibit:
     settings = material.settings
     count = min(settings.size("repeats"), 250)
     rng = settings.rng(20)
@@ -95,40 +117,36 @@ def exhibits(material: Material) -> list[Exhibit]:
         "x_star": parameters["det-maximal", LATER][0],
     }
     sessions = np.arange(SESSIONS)[later] + 1
-    trace = trace_columns(sessions, tested[0, later], seen[0, later], shown)
+    trace = _trace_columns(sessions, tested[0, later], seen[0, later], shown)
     ends = [ratios[f"{x}_x0_against_x_star"].high for x in ("policy", "random")]
     title = "one device that drifts, sessions after X$_*$"
-    return [
-        Exhibit.from_texts(
-            "figure_10",
-            {
-                **{"count": count, "sessions": SESSIONS, "later": LATER + 1},
-                **{"points": POINTS, "drift_deg": DRIFT_DEG, "noise": NOISE_STD_DEG},
+    return Exhibit.from_texts(
+        "figure_10",
+        {
+            **{"count": count, "sessions": SESSIONS, "later": LATER + 1},
+            **{"points": POINTS, "drift_deg": DRIFT_DEG, "noise": NOISE_STD_DEG},
+        },
+        verdict=judge(max(ends) < 1.0, True),
+        figures={
+            "figure_10a_predictions": _traces(trace, title),
+            "figure_10b_error_by_session": _by_age(age),
+        },
+        data={
+            "predictions": trace,
+            "error_by_session": age,
+            "error_by_device": {
+                "device": np.arange(1, count + 1),
+                **{f"{c}_session_{s + 1}_rms_deg": e for (c, s), e in after.items()},
             },
-            verdict=judge(max(ends) < 1.0, True),
-            figures={
-                "figure_10a_predictions": traces(trace, title),
-                "figure_10b_error_by_session": _by_age(age),
+        },
+        numbers={
+            "after_later": {names[k]: median_interval(e) for k, e in after.items()},
+            "other_sessions": {
+                names[key]: median_interval(e) for key, e in others.items()
             },
-            data={
-                "predictions": trace,
-                "error_by_session": age,
-                "error_by_device": {
-                    "device": np.arange(1, count + 1),
-                    **{
-                        f"{c}_session_{s + 1}_rms_deg": e for (c, s), e in after.items()
-                    },
-                },
-            },
-            numbers={
-                "after_later": {names[k]: median_interval(e) for k, e in after.items()},
-                "other_sessions": {
-                    names[key]: median_interval(e) for key, e in others.items()
-                },
-                "error_of_second_over_first": ratios,
-            },
-        )
-    ]
+            "error_of_second_over_first": ratios,
+        },
+    )
 
 
 def _choose(choice: str, sets: Array, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -165,4 +183,146 @@ def _by_age(columns: dict[str, Any]) -> Figure:
     axes.set_ylim(bottom=0.0)
     axes.set_xticks(np.unique(columns["session"])[:: LATER // 2])
     legend_right(axes)
+    return figure
+
+
+# -- on the recordings -----------------------------------------------------------------
+
+
+def _recorded(material: Material) -> Exhibit:
+    """Each calibration predicts eight postures of every other episode."""
+    from jaxcal.selection.policy import select_batch
+
+    settings = material.settings
+    rng = settings.rng(22)
+    (u0,), (y0,) = material.measured("dataset5")
+    u1, y1 = material.measured("dataset4")
+    repeats = settings.size("random_draws")
+    picks = np.argsort(rng.random((repeats, len(u0))), axis=1)[:, :4]
+    best = int(np.argmax(material.evaluation("dataset4").reference))
+    policy = np.asarray(select_batch(material.dataset("dataset5").candidates, 4))[0]
+    others = np.delete(np.arange(len(u1)), best)
+    # Postures that X_* was identified from are not predicted.
+    own = u1[best][material.result("dataset4", "exact").indices[best, 0]]
+    order = rng.random(u1.shape[:2])
+    order[(u1[:, :, None] == own).all(-1).any(-1)] = 2.0
+    points = np.argsort(order, axis=1)[others, :POINTS]
+    tested, seen = pick(u1[others], points), pick(y1[others], points)
+    random = least_squares(u0[picks], y0[picks])
+    found = {
+        "x0_policy": least_squares(u0[policy], y0[policy]),
+        "x_star": material.parameters("dataset4", "exact")[best, 0],
+    }
+    off = {name: predict(p, tested) - seen for name, p in found.items()}
+    error = {name: rms(errors) for name, errors in off.items()}
+    each = rms(predict(random[:, None], tested[None]) - seen[None])
+    error["x0_random"] = np.median(each, axis=0)
+    every = material.parameters("dataset4", "policy")[others]
+    peers = predict(every, tested[None]) - seen[None]
+    peer_error = np.sqrt((peers**2).mean(axis=(-3, -2, -1)))
+    ahead = share_interval(peer_error > np.sqrt((error["x_star"] ** 2).mean()))
+    lean = {name: errors.mean(axis=(0, 1)) for name, errors in off.items()}
+    shown = {"x0_random": random[0]} | found
+    first = slice(TRACED)
+    trace = _trace_columns(others[first] + 1, tested[first], seen[first], shown)
+    ratio = {
+        name: paired(
+            error["x_star"],
+            error[name],
+            settings.rng(23, i),
+            settings.size("resamples"),
+        ).ratio_of_medians
+        for i, name in enumerate(("x0_policy", "x0_random"))
+    }
+    caution = " The largest determinant alone does not single one out."
+    title = "recordings, dataset4's episodes"
+    return Exhibit.from_texts(
+        "figure_10_recorded",
+        {
+            **{"repeats": repeats, "best": best + 1, "points": POINTS},
+            **{"others": len(others), "traced": TRACED},
+            "recordings": settings.about_recordings,
+            "lean_star": _in_words(lean["x_star"]),
+            "lean_policy": _in_words(lean["x0_policy"]),
+            "caution": caution if ahead.low < 0.9 else "",
+        },
+        verdict=judge(
+            all(r.high < 1.0 for r in ratio.values()),
+            any(r.low <= 1.0 for r in ratio.values()),
+        ),
+        figures={"figure_10c_recordings": _traces(trace, title)},
+        data={
+            "predictions": trace,
+            "error_by_episode": {
+                "episode": others + 1,
+                **{f"{name}_rms_deg": values for name, values in error.items()},
+            },
+            "error_of_other_calibrations": {
+                "episode": others + 1,
+                "rms_deg": peer_error,
+            },
+        },
+        numbers={
+            "x_star_over": ratio,
+            "rms_deg": {name: median_interval(e) for name, e in error.items()},
+            "share_of_other_calibrations_behind_x_star": ahead,
+            "mean_error_deg": lean,
+        },
+    )
+
+
+def _in_words(mean_error_deg: Array) -> str:
+    pairs = zip(mean_error_deg, AXES, strict=True)
+    return ", ".join(f"{value:+.2f}° ({axis})" for value, axis in pairs)
+
+
+# -- predicted postures one by one -----------------------------------------------------
+
+
+def _trace_columns(
+    sessions: NDArray[np.int64],
+    commands: Array,
+    measured: Array,
+    parameters: Mapping[str, Array],
+) -> dict[str, Any]:
+    """Measured and predicted angles, a row per posture.
+
+    Of (S,) sessions, (S, POINTS, 3) commands and readings in degrees, and the (12,)
+    parameters of each calibration.
+    """
+    u = commands.reshape(-1, 3)
+    shown = {name: predict(found, u) for name, found in parameters.items()}
+    return {
+        "session": np.repeat(sessions, POINTS),
+        "point": np.tile(np.arange(1, POINTS + 1), len(sessions)),
+        **by_axis({"measured": measured.reshape(-1, 3)} | shown),
+    }
+
+
+def _traces(columns: Mapping[str, Any], title: str) -> Figure:
+    """The angles and the errors of each calibration, axis by axis."""
+    title = f"Predicted postures: {title}"
+    figure, axes = panels((11.0, 6.6), title, (3, 2), sharex=True)
+    x = np.arange(len(columns["session"])) + 1
+    edges = x[1:][np.diff(columns["session"]) != 0] - 0.5
+    for (left, right), name in zip(axes, AXES, strict=True):
+        measured = columns[f"measured_{name}_deg"]
+        for key, (label, colour, line, marker) in _LOOKS.items():
+            values = columns[f"{key}_{name}_deg"]
+            look: dict[str, Any] = {"color": colour, "linestyle": line}
+            look |= {"marker": marker, "linewidth": 1.0, "markersize": 3}
+            left.plot(x, values, label=label, **look)
+            right.plot(x, values - measured, **look)
+        left.set_ylabel(f"{name} (°)")
+        right.set_ylabel("error (°)")
+    for each in axes.flat:
+        for edge in edges:
+            each.axvline(edge, color="#BBBBBB", linewidth=0.8, zorder=0)
+        each.grid(False, axis="x")
+        each.margins(x=0.01)
+    axes[0, 0].set_title("angle", fontsize=9)
+    axes[0, 1].set_title("predicted less measured", fontsize=9)
+    for each in axes[-1]:
+        each.set_xlabel("posture (grey lines: next session)")
+    legend_below(figure, axes[0, 0])
     return figure

@@ -1,0 +1,162 @@
+"""A task of the family, drawn from a seed: structure, prior, noise, costs, budget."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.adaptive.family.structures import (
+    HELD_OUT,
+    TRAINED_ON,
+    Limits,
+    Questions,
+)
+from jaxcal.adaptive.grid import GridTask
+from jaxcal.checks import whole_number
+
+__all__ = ["BUDGETS", "draw"]
+
+Array = NDArray[np.float64]
+
+BUDGETS = (
+    "time", "uses", "number", "time+uses", "time+number", "uses+number",
+    "time+uses+number",
+)  # fmt: skip
+
+
+def draw(
+    seed: int,
+    structure: str | None = None,
+    budget: str | None = None,
+    limits: Limits = Limits(),  # noqa: B008  # frozen
+) -> GridTask:
+    """One task of the family. The same arguments, the same task.
+
+    Args:
+        seed: of everything that is drawn.
+        structure: of ``TRAINED_ON`` or ``HELD_OUT``; one of ``TRAINED_ON`` when None.
+        budget: of ``BUDGETS``; drawn when None, time and uses together most often.
+        limits: no size of the task is larger.
+
+    Raises:
+        ValueError: no such structure or budget.
+    """
+    rng = np.random.default_rng(whole_number("seed", seed, 0))
+    known = TRAINED_ON | HELD_OUT
+    own = rng.choice(sorted(TRAINED_ON))
+    if structure is not None and structure not in known:
+        raise ValueError(f"structure must be of {', '.join(known)}, got {structure!r}")
+    shares = [0.2, 0.08, 0.12, 0.3, 0.1, 0.1, 0.1]
+    drawn = rng.choice(BUDGETS, p=shares)
+    if budget is not None and budget not in BUDGETS:
+        raise ValueError(f"budget must be of {', '.join(BUDGETS)}, got {budget!r}")
+    counted = (budget or str(drawn)).split("+")
+    asked = _with_nothing_told(rng, known[structure or own](rng, limits))
+    count, num_outcomes = asked.likelihood.shape[:2]
+
+    base, travel = _travel(rng, asked)
+    extra = np.zeros((count, num_outcomes))
+    if rng.random() < 0.4:
+        extra += rng.choice([0.0, 1.0], num_outcomes) * rng.uniform(0.0, 4.0) * base
+    uses = _uses(rng, asked) if "uses" in counted else np.zeros_like(extra)
+    itself = np.arange(count)[:, None]
+    after = np.broadcast_to(itself, extra.shape)
+    if rng.random() < 0.3:  # an outcome that takes uses ends at the start
+        after = np.where(uses > 0, count, after)
+
+    horizon = limits.measurements
+    number = int(np.rint(np.exp(rng.uniform(np.log(2), np.log(min(horizon, 30))))))
+    if "number" in counted:
+        horizon = number
+    seconds: float | tuple[float, float] = np.inf
+    if "time" in counted:
+        typical = np.median(travel[:-1]) + extra.mean()
+        low = typical * np.exp(rng.uniform(np.log(1.5), np.log(14.0)))
+        seconds = (low, low * rng.choice([1.0, rng.uniform(1.0, 4.0)]))
+    ends = [1]
+    if "uses" in counted:
+        first = int(rng.integers(1, limits.uses + 1))
+        ends = list(range(first, int(rng.integers(first, limits.uses + 1)) + 1))
+    return GridTask.make(
+        asked.theta,
+        asked.designs,
+        asked.likelihood,
+        prior=_prior(rng, asked),
+        travel=travel,
+        place_after=after,
+        groups=asked.groups if rng.random() < 0.5 else None,
+        extra=extra,
+        uses=uses,
+        seconds=seconds,
+        num_uses=ends,
+        horizon=horizon,
+    )
+
+
+def _with_nothing_told(rng: np.random.Generator, asked: Questions) -> Questions:
+    """Sometimes a few designs tell nothing: their outcomes do not depend on theta."""
+    count, num_outcomes = asked.likelihood.shape[:2]
+    if rng.random() > 0.2:
+        return asked
+    number = int(rng.integers(1, max(count // 4, 1) + 1))
+    which = rng.choice(count, number, replace=False)
+    table = asked.likelihood.copy()
+    table[which] = rng.dirichlet(np.ones(num_outcomes), number)[:, :, None]
+    return Questions(asked.theta, asked.designs, table, asked.groups, asked.prior)
+
+
+def _prior(rng: np.random.Generator, asked: Questions) -> Array:
+    """Smooth hills, lumps, coordinates that go together; often none of them."""
+    theta = asked.theta
+    count, dim = theta.shape
+    log = np.zeros(count)
+    if rng.random() < 0.5:
+        rate = rng.uniform(1.0, 8.0) * rng.standard_normal((dim, 8))
+        waves = np.cos(theta @ rate + rng.uniform(0.0, 2.0 * np.pi, 8))
+        log += rng.uniform(0.2, 2.0) * waves @ rng.standard_normal(8) / 2.0
+    if rng.random() < 0.25:
+        log += rng.uniform(0.5, 3.0) * (rng.random(count) < rng.uniform(0.05, 0.5))
+    if dim > 1 and rng.random() < 0.5:
+        log -= (
+            0.5 * ((theta - theta[:, :1]) ** 2).sum(axis=1) / rng.uniform(0.1, 0.8) ** 2
+        )
+    weights = np.exp(log - log.max())
+    return weights if asked.prior is None else weights * asked.prior
+
+
+def _travel(rng: np.random.Generator, asked: Questions) -> tuple[float, Array]:
+    """Seconds of a measurement, and (A + 1, A) of going there; the last is the start.
+
+    The unit is drawn too: nothing may depend on it.
+    """
+    at = np.concatenate([asked.designs, asked.designs[:1] * 0.0])
+    group = np.append(asked.groups, 0)
+    base = float(np.exp(rng.uniform(-2.0, 3.0)))
+    away = np.abs(at[:, None] - at[None, :-1])
+    away = away.max(axis=-1) if rng.random() < 0.5 else away.sum(axis=-1)
+    speed = base * rng.choice([0.0, np.exp(rng.uniform(np.log(0.3), np.log(15.0)))])
+    change = base * rng.choice([0.0, rng.uniform(0.5, 6.0)])
+    own = np.ones(len(at) - 1)
+    if rng.random() < 0.25:  # some designs take longer than others
+        own = np.exp(rng.uniform(0.5, 2.0) * asked.designs[:, -1])
+    other = group[:, None] != group[None, :-1]
+    return base, base * own + speed * away + change * other
+
+
+def _uses(rng: np.random.Generator, asked: Questions) -> Array:
+    """(A, Y) uses that an outcome takes: of some outcomes, or of some designs."""
+    count, num_outcomes = asked.likelihood.shape[:2]
+    uses = np.zeros((count, num_outcomes))
+    kind = rng.random()
+    if kind < 0.75:  # the last outcomes, or the first
+        number = int(rng.integers(1, max(num_outcomes // 2, 1) + 1))
+        uses[:, -number:] = 1.0
+        if rng.random() < 0.3:
+            uses = uses[:, ::-1]
+    elif kind < 0.9:  # some designs, whatever they answer
+        uses[rng.random(count) < rng.uniform(0.2, 0.7)] = 1.0
+    else:  # outcomes of some designs alone
+        uses[rng.random(count) < rng.uniform(0.3, 0.8), -1] = 1.0
+    if rng.random() < 0.1:
+        uses[uses.sum(axis=1) > 0] *= rng.choice([1.0, 2.0])
+    return uses.copy()
