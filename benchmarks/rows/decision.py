@@ -52,7 +52,7 @@ _CASES = {
 
 def run(budget: Budget) -> Row:
     row = Row(NAME, TITLE)
-    rounds = budget.pick(5, 1)
+    rounds = budget.pick(3, 1)
     for case, (call, repeats, first_wanted, wanted) in _CASES.items():
         indented = call.strip().replace("\n", "\n    ")
         code = _CODE.replace("\nCALL", f"\n{call.strip()}").replace("CALL", indented)

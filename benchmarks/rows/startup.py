@@ -1,7 +1,8 @@
-"""From the command to the first result: with nothing compiled yet, and the second time.
+"""From the command to the first result: with empty caches, and the second time.
 
 ``train.py`` to its first update and ``evaluate.py`` to its first result, each as a new
-process, with empty caches and with those the first run left.
+process, with empty caches and with those the first run left. Training compiles and the
+second run must gain by it; evaluating the shipped policy compiles nothing.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from benchmarks.harness import ROOT, Budget, Line, Row, Verdict
 
 NAME = "startup"
 TITLE = "Start-up: the second run in a new process against the first"
-TARGET = 3.0
+TARGET = 3.0  # first run over second, of the command that compiles
+LIMIT = 1.0  # seconds of the first run, of the command that compiles nothing
 _COMMANDS = {
     "train.py to the first update": ["train.py", "--episodes", "2048", "--out", "OUT"],
     "evaluate.py to the first result": [
@@ -62,10 +64,14 @@ def run(budget: Budget) -> Row:
                 first.append(seconds_of(command, caches))
                 second.append(seconds_of(command, caches))
         row.lines += [
-            Line(name, "first run, nothing compiled", statistics.median(first), "s"),
+            Line(name, "first run, empty caches", statistics.median(first), "s"),
             Line(name, "second run", statistics.median(second), "s"),
         ]
-        ratio = statistics.median(a / b for a, b in zip(first, second, strict=True))
-        row.verdicts.append(Verdict(name, ratio, TARGET))
+        if name.startswith("train"):
+            ratio = statistics.median(a / b for a, b in zip(first, second, strict=True))
+            row.verdicts.append(Verdict(name, ratio, TARGET))
+        else:
+            taken = statistics.median(first)
+            row.verdicts.append(Verdict(name, taken, LIMIT, larger=False, unit="s"))
     row.notes.append("a whole command with one update, the final save included")
     return row
