@@ -368,7 +368,8 @@ def test_a_page_that_nobody_looks_at_ends_by_itself(tmp_path):
         "sock = socket.create_server(('127.0.0.1', 0));"
         f"serve(pathlib.Path({str(tmp_path)!r}), sock, None, linger_s=0.2)"
     )
-    subprocess.run([sys.executable, "-c", code], timeout=60, check=False)
+    ended = subprocess.run([sys.executable, "-c", code], timeout=60, check=False)
+    assert ended.returncode == -signal.SIGTERM  # which uvicorn raises again at its end
 
 
 def test_without_the_extra_a_session_says_so_in_one_line(tmp_path, monkeypatch):
