@@ -442,7 +442,7 @@ def _free_port() -> int:
 
 
 FIRST_CODES = {
-    "sigint": (4, 0),  # 0: in the last phase there is nothing left to pause
+    "sigint": (4, 130),  # 130: in the last phase, with nothing left to pause, it ends
     "sigint_twice": (130,),
     "sigterm": (143,),
     "sigkill": (-9,),
