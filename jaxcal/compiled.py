@@ -7,10 +7,13 @@ import importlib.util
 import os
 import pathlib
 import sys
+import threading
 from importlib.machinery import EXTENSION_SUFFIXES, PathFinder
 from typing import Any
 
 __all__ = ["check", "kernel"]
+
+_LOADING = threading.Lock()
 
 
 @functools.cache
@@ -22,16 +25,22 @@ def kernel(name: str) -> Any:
     loaded from their files here, and forgotten again: whoever imports them later gets
     the same modules in the usual way.
     """
+    with _LOADING:
+        return _load(name)
+
+
+def _load(name: str) -> Any:
     import scipy
 
     names = [f"scipy.linalg.cython_{each}" for each in ("blas", "lapack")]
     alone = [each for each in names if each not in sys.modules]
     try:
-        for each in alone:
+        for each in () if name in sys.modules else alone:
             spec = PathFinder.find_spec(each, [f"{scipy.__path__[0]}/linalg"])
             if spec is not None and spec.loader is not None:
-                sys.modules[each] = importlib.util.module_from_spec(spec)
-                spec.loader.exec_module(sys.modules[each])
+                module = importlib.util.module_from_spec(spec)
+                spec.loader.exec_module(module)
+                sys.modules[each] = module  # whole: another thread may look for it
         return importlib.import_module(name)
     finally:
         for each in alone:

@@ -148,3 +148,29 @@ print(callable(scipy.linalg.cython_blas.__pyx_capi__.get), scipy.linalg.det([[2.
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert done.stdout.splitlines() == ["[]", "True 2.0"]
+
+
+def test_several_threads_may_load_kernels_at_once():
+    """One took the modules of BLAS that another was about to load."""
+    code = """
+import sys, threading
+from jaxcal import compiled
+sys.setswitchinterval(1e-6)
+names = ["jaxcal.selection.exchange.kernel", "jaxcal.selection.exact.kernel"] * 8
+start = threading.Barrier(len(names))
+def load(name):
+    start.wait()
+    try:
+        compiled.kernel(name)
+    except Exception as error:
+        print(name, repr(error))
+threads = [threading.Thread(target=load, args=[name]) for name in names]
+for thread in threads:
+    thread.start()
+for thread in threads:
+    thread.join()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == ""
