@@ -14,8 +14,8 @@ parameters, log det of (C V C.T)^-1 is that of the information less that of the 
 parameters, whose inverse is X = V - V C.T (C V C.T)^-1 C V: the formula for det, once
 with V and once with X. What does not depend on i (D_jj, H_jj, K, and the gain of j
 alone) is kept until a swap is made. A swap is made only where phi, computed from the
-chosen blocks and not from the formulas above, has risen: two candidates that are equal
-but for rounding are not swapped for ever.
+chosen blocks and not from the formulas above, has risen, so rounding cannot
+make two equal candidates swap endlessly.
 
 Removing i never helps: the gain of a swap is at most that of j alone. For det, with t
 the trace of D_jj, Y <= I - D_ii / (1 + t), so det Y is at most the q-th power of the
@@ -467,7 +467,7 @@ class Climber:
                     gram[a * p + b] += row[a] * row[b]
 
     def _evaluate(self, size, into):
-        """phi of the first ``size`` chosen from sums made anew; V and X are filled."""
+        """phi of the first ``size`` chosen, summed from their blocks; fills V and X."""
         p = self.p
         self._sum(size, -1)
         inverse = into

@@ -201,7 +201,7 @@ class CommandScene:
         self._ellipsoid(state)
 
     def _mark(self, postures: list[Posture], place: Callable[[Any], Any]) -> None:
-        """A sphere for each posture, made anew where its state has changed."""
+        """A sphere for each posture, redrawn where its state has changed."""
         looks = {p.name: p.state for p in postures if p.commanded is not None}
         for name, (look, mark) in [*self._marks.items()]:
             if looks.get(name) != look:
