@@ -146,17 +146,17 @@ def report(args: argparse.Namespace) -> int:
 def export(args: argparse.Namespace) -> int:
     """Print or write the inverse map of a run's calibration."""
     from jaxcal.files import write_text
-    from rig.workbench.outputs.export import LANGUAGES, load_inverse
+    from rig.workbench.outputs.export import LANGUAGES, checksum, load_inverse
 
     inverse = load_inverse(args.run, records_of(args.run))
-    for text in inverse.warnings:
+    for text in inverse["warnings"]:
         print(f"WARNING: {text}", file=sys.stderr)
     text = LANGUAGES[args.to](inverse)
     if args.out is None:
         print(text, end="")
     else:
         write_text(args.out, text)
-        print(f"{args.out}: SHA-256 of the numbers {inverse.checksum}")
+        print(f"{args.out}: SHA-256 of the numbers {checksum(inverse)}")
     return EXIT_OK
 
 

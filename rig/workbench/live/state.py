@@ -10,11 +10,10 @@ import dataclasses
 from typing import Any
 
 from rig.config.axis import Scale
-from rig.workbench.outputs.console import event_lines
+from rig.workbench.outputs.console import ENDS, event_lines
 
 Record = dict[str, Any]
 Degrees = list[float]  # pitch, yaw, roll
-ENDS = ("end", "fault", "stopped", "paused", "refused")
 LOGGED = 200  # newest lines of what happened
 SESSIONS = ("calibrate", "collect", "verify", "goto")  # the others are commissioning
 LOST = ("unreachable", "withdrawn")
