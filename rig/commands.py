@@ -76,15 +76,15 @@ def simulate(args: argparse.Namespace) -> int:
 def watch(args: argparse.Namespace) -> int:
     """Serve the page of a run until Ctrl-C."""
     from jaxcal.extras import needs
-    from rig.workbench.live import launch
+    from rig.workbench.live import listen
 
     journal_of(args.run)
     with needs("live", "the live page"):
         from rig.workbench.live.server import serve
-    sock, token, url = launch.listen(args.live_host)
-    print(f"live page: {url}\nCtrl-C ends", flush=True)
+    sock, line = listen()
+    print(f"{line}\nCtrl-C ends", flush=True)
     with contextlib.suppress(KeyboardInterrupt):
-        serve(args.run, sock, token)
+        serve(args.run, sock)
     return EXIT_OK
 
 
