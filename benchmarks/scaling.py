@@ -1,12 +1,13 @@
 """Cost of sharing an update among devices and processes of this machine.
 
     XLA_FLAGS=--xla_force_host_platform_device_count=8 python benchmarks/scaling.py
-    python benchmarks/scaling.py --devices 1,2 --seeds 1,8
+    python benchmarks/scaling.py --devices 1 --seeds 1
+    python benchmarks/scaling.py --devices 2 --seeds 8
 
-prints, for 1, 2, 4 ... devices and for 1 and 8 seeds side by side, seconds of wall and
-processor time an update. Forced devices share the same cores, so for one seed this
-measures what sharding adds, not what it gains; of several seeds each core, where the
-second line finds it as a device, trains its own.
+prints, for 1, 2, 4 ... devices or for seeds side by side, seconds of wall and processor
+time an update. Forced devices share the same cores, so for one seed this measures what
+sharding adds, not what it gains; of several seeds each core, which is then a device,
+trains its own.
 """
 
 from __future__ import annotations
