@@ -36,6 +36,7 @@ def bench(config=None, arm=True, **options):
     with simulator(config, **options) as sim:
         served = sim.start()
         run = SimpleNamespace(
+            config=served,
             emit=lambda event, **fields: sim.hear({"event": event, **fields}),
             journal=SimpleNamespace(records=[]),
         )

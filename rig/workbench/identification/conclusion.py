@@ -11,10 +11,14 @@ from numpy.typing import ArrayLike
 from rig.config import AXIS_NAMES, RigConfig
 from rig.core.attitude import ORDERS, Frame, frame_at
 from rig.core.faults import MotionFault
-from rig.core.identify import identify, pairs
 from rig.journal import Record
 from rig.workbench.identification.drift import estimate_drift, without_drift
-from rig.workbench.identification.fit import held_out_errors, uncertainty
+from rig.workbench.identification.fit import (
+    held_out_errors,
+    identify,
+    pairs,
+    uncertainty,
+)
 from rig.workbench.identification.noise import (
     autocorrelation_time,
     correlation,
