@@ -131,7 +131,7 @@ class Arm:
 
     @functools.cached_property
     def _steps(self) -> tuple[NDArray[np.intp], Array]:
-        """(S,) kinds of the steps of the chain, and its constant rotations (2, 3, 3)."""
+        """(S,) kinds of the steps of the chain, and constant rotations (2, 3, 3)."""
         order = np.argsort(_ORDER[self.convention])
         rows = [*np.array(_ROW)[order]] * len(self.joints)
         kinds = np.array([*_BASE, *rows, *_TOOL], dtype=np.intp)

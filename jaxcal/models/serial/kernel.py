@@ -45,8 +45,8 @@ def _forward(
     axes: cython.double[:, :, ::1],
     origins: cython.double[:, :, ::1],
 ) -> cython.void:
-    at: cython.double[4][3]
-    old: cython.double[3][3]
+    at = cython.declare(cython.double[4][3])
+    old = cython.declare(cython.double[3][3])
     for n in range(values.shape[1]):
         for j in range(4):
             for c in range(3):

@@ -59,4 +59,6 @@ def torque(
 
 def cross(left: Array, right: Array) -> Array:
     """Cross products of (..., 3, N): over the axis before the last."""
-    return np.asarray(np.cross(left, right, axis=-2))
+    x, y, z = (left[..., k, :] for k in range(3))
+    u, v, w = (right[..., k, :] for k in range(3))
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-2)
