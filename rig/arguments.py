@@ -79,14 +79,7 @@ MOTION: Options = {
     "--reset-alarms": _flag("before arming"),
     "--zero": _flag("confirm that the device stands in its zero posture"),
 }
-LIVE_HOST: Options = {
-    "--live-host": {
-        "metavar": "ADDRESS",
-        "help": "show the page on this address of this computer (default loopback); "
-        "another than loopback needs the token that is printed",
-    },
-}
-LIVE: Options = {"--live": _flag("show it as a page in the browser")} | LIVE_HOST
+LIVE: Options = {"--live": _flag("show it as a page in the browser")}
 SIMULATOR: Options = {
     "--simulate": _flag("run against a simulated rig"),
     "--transport": {
@@ -248,7 +241,7 @@ COMMANDS: list[Row] = [
     ("resume", "go on with a run that was paused, stopped or killed",
      f"{OF_RUN}:resume", RUN | MOTION | LIVE, True),
     ("watch", "show a run, also a running one, as a page in the browser",
-     f"{RECORDED}:watch", FOLDER_OF | LIVE_HOST, False),
+     f"{RECORDED}:watch", FOLDER_OF, False),
     ("identify", "read identity and status of every drive; write nothing",
      f"{RECORDED}:identify", CONFIG, True),
     ("stop", "quick-stop every drive now, and verify",

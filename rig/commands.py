@@ -76,15 +76,15 @@ def simulate(args: argparse.Namespace) -> int:
 def watch(args: argparse.Namespace) -> int:
     """Serve the page of a run until Ctrl-C."""
     from jaxcal.extras import needs
-    from rig.workbench.live import launch
+    from rig.workbench.live import listen
 
     journal_of(args.run)
     with needs("live", "the live page"):
         from rig.workbench.live.server import serve
-    sock, token, url = launch.listen(args.live_host)
-    print(f"live page: {url}\nCtrl-C ends", flush=True)
+    sock, line = listen()
+    print(f"{line}\nCtrl-C ends", flush=True)
     with contextlib.suppress(KeyboardInterrupt):
-        serve(args.run, sock, token)
+        serve(args.run, sock)
     return EXIT_OK
 
 
@@ -146,17 +146,17 @@ def report(args: argparse.Namespace) -> int:
 def export(args: argparse.Namespace) -> int:
     """Print or write the inverse map of a run's calibration."""
     from jaxcal.files import write_text
-    from rig.workbench.outputs.export import LANGUAGES, load_inverse
+    from rig.workbench.outputs.export import LANGUAGES, checksum, load_inverse
 
     inverse = load_inverse(args.run, records_of(args.run))
-    for text in inverse.warnings:
+    for text in inverse["warnings"]:
         print(f"WARNING: {text}", file=sys.stderr)
     text = LANGUAGES[args.to](inverse)
     if args.out is None:
         print(text, end="")
     else:
         write_text(args.out, text)
-        print(f"{args.out}: SHA-256 of the numbers {inverse.checksum}")
+        print(f"{args.out}: SHA-256 of the numbers {checksum(inverse)}")
     return EXIT_OK
 
 

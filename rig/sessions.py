@@ -153,10 +153,10 @@ def _run(
             run.confirm = functools.partial(_confirm, args)
         else:
             run.listeners.append(simulator.hear)
-        if args.live or args.live_host:
-            from rig.workbench.live import launch
+        if args.live:
+            from rig.workbench import live
 
-            run.say(launch.start(folder, args.live_host))
+            run.say(live.start(folder))
         return run_safely(run, procedure)
 
 
