@@ -49,11 +49,6 @@ NamesKnown = Annotated[
     "every unit was seen to turn its own joint the right way; the phone may be placed "
     "in any way",
 ]
-Host = Annotated[
-    str,
-    "show the page on this address of this computer (default loopback); another than "
-    "loopback needs the token that is printed",
-]
 
 
 @dataclasses.dataclass
@@ -145,7 +140,6 @@ class Session(Target):
     reset_alarms: Annotated[bool, "before arming"] = False
     zero: Annotated[bool, "the device stands in its zero posture"] = False
     live: Annotated[bool, "show it as a page in the browser"] = False
-    live_host: Host | None = None
 
 
 # Commissioning
@@ -420,10 +414,10 @@ def _run(
             run.confirm = functools.partial(_confirm, given)
         else:
             run.listeners.append(simulator.hear)
-        if given.live or given.live_host:
-            from rig.workbench.live import launch
+        if given.live:
+            from rig.workbench import live
 
-            run.say(launch.start(folder, given.live_host))
+            run.say(live.start(folder))
         return run_safely(run, procedure)
 
 
@@ -514,18 +508,18 @@ def _records(run: Path) -> list[Record]:
 # Of the device, and of runs
 
 
-def watch(run: RunPath, *, live_host: Host | None = None) -> int:
+def watch(run: RunPath) -> int:
     """show a run, also a running one, as a page in the browser"""
     from jaxcal.extras import needs
-    from rig.workbench.live import launch
+    from rig.workbench.live import listen
 
     _journal(run)
     with needs("live", "the live page"):
         from rig.workbench.live.server import serve
-    sock, token, url = launch.listen(live_host)
-    print(f"live page: {url}\nCtrl-C ends", flush=True)
+    sock, line = listen()
+    print(f"{line}\nCtrl-C ends", flush=True)
     with contextlib.suppress(KeyboardInterrupt):
-        serve(run, sock, token)
+        serve(run, sock)
     return EXIT_OK
 
 
@@ -642,17 +636,17 @@ def export(
 ) -> int:
     """print the inverse map of a calibration for a controller"""
     from jaxcal.files import write_text
-    from rig.workbench.outputs.export import LANGUAGES, load_inverse
+    from rig.workbench.outputs.export import LANGUAGES, checksum, load_inverse
 
     inverse = load_inverse(run, _records(run))
-    for text in inverse.warnings:
+    for text in inverse["warnings"]:
         print(f"WARNING: {text}", file=sys.stderr)
     text = LANGUAGES[to](inverse)
     if out is None:
         print(text, end="")
     else:
         write_text(out, text)
-        print(f"{out}: SHA-256 of the numbers {inverse.checksum}")
+        print(f"{out}: SHA-256 of the numbers {checksum(inverse)}")
     return EXIT_OK
 
 
