@@ -10,7 +10,7 @@ import pathlib
 import sys
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from rig.arguments import parser_of
 from rig.core.faults import EXIT_FAULT, EXIT_OK, EXIT_RECALIBRATE, Refused
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 def _axes(text: str) -> list[str]:
     names = text.split(",")
-    if unknown := [name for name in names if name not in ("pitch", "yaw", "roll")]:
+    if unknown := [name for name in names if name not in NAMES]:
         raise argparse.ArgumentTypeError(f"no axis {unknown[0]!r}: pitch, yaw, roll")
     return names
 
@@ -34,6 +34,7 @@ def _axes(text: str) -> list[str]:
 Path = pathlib.Path
 FILE = Path("rig.toml")  # without --config
 Axis = Literal["pitch", "yaw", "roll"]
+NAMES = get_args(Axis)
 Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
 Angles = tuple[float, float, float]
 CIRCLE = (-360, 360)
@@ -225,7 +226,7 @@ def jog(
     given: Step,
 ) -> int:
     """move one axis by hand"""
-    return _step(given, "IDENTIFIED", "jog", axis, step)
+    return _step(given, "IDENTIFIED", "jog", NAMES.index(axis), step)
 
 
 def characterise(
@@ -239,7 +240,7 @@ def characterise(
 
     with needs("policy", "characterise"):
         import jax  # noqa: F401  # before anything moves
-    return _step(given, "SIGN_CHECKED", "characterise", axis, into)
+    return _step(given, "SIGN_CHECKED", "characterise", NAMES.index(axis), into)
 
 
 def home(
