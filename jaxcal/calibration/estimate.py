@@ -112,20 +112,21 @@ def fit_model(
         per_output=common_noise is False,
         student=loss == "student",
     )
-    found = solve(task)
-    sizes: Sizes | None = None
     beyond = extra.size or spread.any()  # what the sizes are not made for
+    sizes: Sizes | None = None
     if prior.by_data and (asked or not beyond):
         if not isinstance(model, SerialChain) or beyond:
             raise ValueError(
                 "Prior.sized() is of arms, without discrepancy and command_std"
             )
-        stated = task
-        for _ in range(2):
-            sizes = group_sizes(model, stated, found)
+        found, stated = solve(task, rough=True), task
+        for last in (False, True):
+            sizes = group_sizes(model, stated, found, sizes)
             scaled = stated.precision / sizes.factors**2
             task = dataclasses.replace(task, precision=scaled)
-            found = solve(task, found)
+            found = solve(task, found, rough=not last)
+    else:
+        found = solve(task)
     if common_noise is None and _levels_differ(task, found):
         task = dataclasses.replace(task, per_output=True)
         found = solve(task, found)

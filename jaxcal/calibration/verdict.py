@@ -242,14 +242,13 @@ def _swapped(calibration: Fit, model: SerialChain) -> dict[int, int]:
     if not (isinstance(sensor, Placed) and sensor.zeros and sensor.count > 1):
         return {}
     noise = np.asarray(calibration.noise_std)
+    at = np.array(list(calibration.outliers), dtype=np.intp)
     found: dict[int, int] = {}
-    for row in calibration.outliers:
-        command = calibration.commands[row]
-        for other in range(sensor.count):
-            trial = command.copy()
-            trial[model.num_joints] = other
-            predicted = model.predict(trial[None], calibration.parameters)[0]
-            there = other == command[model.num_joints]
-            if not there and np.abs(predicted / noise).max() < 4.0:
-                found[row] = other
-    return found
+    for other in range(sensor.count):
+        trial = calibration.commands[at]
+        there = trial[:, model.num_joints] == other
+        trial[:, model.num_joints] = other
+        off = model.predict(trial, calibration.parameters) / noise
+        fits = at[(np.abs(off).max(axis=1) < 4.0) & ~there]
+        found |= dict.fromkeys(fits.tolist(), other)
+    return dict(sorted(found.items()))

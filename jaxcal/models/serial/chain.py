@@ -25,7 +25,6 @@ from jaxcal.models.serial.arguments import (
     triple,
 )
 from jaxcal.models.serial.arm import Arm
-from jaxcal.models.serial.kinematics import forward
 from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["SerialChain"]
@@ -389,7 +388,7 @@ class SerialChain(Arm):
         """
         commands = as_commands(commands, self.num_inputs)
         read = None if measured is None else numbers("measured", measured)
-        frame = forward(len(commands), self._steps(commands, self.nominal))[0]
+        frame = self._chain(commands, self.nominal)[0]
         inputs = commands[:, self.num_joints :]
         sensor, new = self.sensor.located(self._tip_at(commands, frame), inputs, read)
         tool = self.tool if new is None else self.tool @ new
@@ -449,7 +448,7 @@ class SerialChain(Arm):
         """Readings (N, q)."""
         commands = as_commands(commands, self.num_inputs)
         parameters = as_parameters(self, parameters)
-        frame = forward(len(commands), self._steps(commands, parameters))[0]
+        frame = self._chain(commands, parameters)[0]
         tip, inputs = self._tip_at(commands, frame), commands[:, self.num_joints :]
         return self.sensor.read(tip, inputs, self._split(parameters)[2]).values
 
