@@ -103,7 +103,7 @@ def command(transport: str, dead: bool, folder: pathlib.Path) -> tuple[float, fl
         }))  # fmt: skip
         answer = simulator.server._answer
 
-        def noted(unit: int, pdu: bytes) -> list[tuple[bytes, bytes, bool]]:
+        def noted(unit: int, pdu: bytes) -> tuple[bytes, bytes, bool] | None:
             first.append(time.monotonic())
             return answer(unit, pdu)
 
