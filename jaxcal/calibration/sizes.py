@@ -28,7 +28,8 @@ Array = NDArray[np.float64]
 _THOUGHT = np.log(3.0)  # standard deviation of the logarithm of each factor
 _MOST = 5.0  # of a logarithm
 _SCORES = 100  # steps of Fisher's scoring, at most
-_GROUPS = 4  # lengths, turns of the axes, zeros of the joints, their compliance
+_GROUPS = 5  # lengths, turns of the axes, zeros of the joints, compliance, harmonics
+_WAVES = (" sin", " cos", " sin2", " cos2")
 
 
 class Sizes(NamedTuple):
@@ -55,6 +56,7 @@ def group_sizes(
     groups = np.full(p, -1)
     groups[: arm.table.size].reshape(-1, 5)[:] = [0, 1, 0, 2, 1]
     groups[np.array(arm.units) == "deg per torque"] = 3
+    groups[[name.endswith(_WAVES) for name in arm.names]] = 4
     rows, right = _reduced(arm, task, found)
     sized = groups[task.free[:p] & (task.precision[:p] > 0.0)]
     count, width = len(right), rows.shape[1]

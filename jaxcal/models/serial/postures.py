@@ -163,8 +163,11 @@ def _in_view(arm: Chain, commands: Array) -> tuple[Array, list[str]]:
     """The board before the camera and turned to it; ``seen`` as it is predicted."""
     commands = commands.copy()
     j = arm.num_joints
-    seen = arm.predict(commands)  # of a board seen at zero: its pose in the camera
-    commands[:, j:] = seen
+    posed = arm.measured_with(dataclasses.replace(arm.sensor, corners=None))
+    # Of a board seen at zero: its pose in the camera.
+    seen = posed.predict(np.hstack([commands[:, :j], np.zeros((len(commands), 6))]))
+    if arm.sensor.corners is None:
+        commands[:, j:] = seen
     from scipy.spatial.transform import Rotation
 
     face = Rotation.from_rotvec(seen[:, 3:], degrees=True).as_matrix()[:, :, 2]
