@@ -26,8 +26,8 @@ class Board(Sensor):
 
     Without ``corners`` a view is six zeros, the board's pose in the camera as predicted
     less seen. Commands have six more columns, that pose as it was seen: ``seen x``,
-    ``y``, ``z`` and its rotation vector ``seen rx``, ``ry``, ``rz`` in degrees (OpenCV's
-    tvec and rvec, that in degrees). Noise 0.1 % of the arm's length, 0.1 degrees, or
+    ``y``, ``z`` and its rotation vector ``seen rx``, ``ry``, ``rz`` in degrees (the
+    tvec and rvec of OpenCV). Noise 0.1 % of the arm's length, 0.1 degrees, or
     ``Noise(covariance=...)`` of the views.
 
     With ``corners`` it is their pixels, u and v of each, lens distortion taken out;
