@@ -65,7 +65,6 @@ def check(
     noise = calibration.noise_std
     if noise is None:
         raise ValueError("no check: the noise of the calibration is not known")
-    covariance = np.asarray(calibration.covariance)
     model, theta = calibration.model, calibration.parameters
     slopes = np.asarray(model.jacobian(commands, theta))
     p, q = slopes.shape[-1], slopes.shape[1]
@@ -73,7 +72,9 @@ def check(
         raise ValueError(f"measured must have {q} columns, got {measured.shape[1]}")
     off = (measured - calibration.predict(commands)).ravel()
     rows = slopes.reshape(-1, p)
-    whole = np.diag(np.tile(noise**2, len(commands))) + rows @ covariance @ rows.T
+    known, covariance = calibration.linear(commands)
+    known = known.reshape(len(rows), -1)
+    whole = np.diag(np.tile(noise**2, len(commands))) + known @ covariance @ known.T
     root = np.linalg.inv(np.linalg.cholesky(whole))
     white, by = root @ off, root @ rows
     names = calibration.names
@@ -105,9 +106,9 @@ def check(
     used = np.asarray(model.jacobian(calibration.commands, theta))
     per_unit = np.sqrt((used**2).mean(axis=(0, 1)) * q)
     moved = np.where(np.isnan(size), np.inf, np.nan_to_num(size)) * per_unit
-    hidden = free & (per_unit > 0.0) & (moved > matters)
-    known = free & (per_unit > 0.0)
-    shifts = (matters * seen[known] / per_unit[known]) ** 2
+    judged = free & (per_unit > 0.0)
+    hidden = judged & (moved > matters)
+    shifts = (matters * seen[judged] / per_unit[judged]) ** 2
     power = float(np.mean(1.0 - special.chndtr(limit, freedom, shifts)))
     if p_value < 0.05:
         says = "does not hold"
@@ -157,8 +158,8 @@ def verification(
         raise ValueError("no verification: the noise of the calibration is not known")
     model, theta = calibration.model, calibration.parameters
     slopes = np.asarray(model.jacobian(points, theta))
-    covariance = np.asarray(calibration.covariance)
-    spread = slopes @ covariance @ np.matrix_transpose(slopes) + np.diag(noise**2)
+    known, covariance = calibration.linear(points)
+    spread = known @ covariance @ np.matrix_transpose(known) + np.diag(noise**2)
     white = np.linalg.inv(np.linalg.cholesky(spread)) @ slopes
     seen = (white**2).sum(axis=1)  # (M, p) by a drift of one
     where = calibration.commands if region is None else table("region", region)

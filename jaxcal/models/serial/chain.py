@@ -239,6 +239,18 @@ class SerialChain(Arm):
         """The same arm with another sensor."""
         return dataclasses.replace(self, sensor=sensor)
 
+    def with_misfit(self) -> Self:
+        """This arm with harmonics of its joints, where its sensor asks for them.
+
+        They are no parameters of the arm: ``select`` and ``identify`` add them where no
+        prior is given, as what the parameters do not explain.
+        """
+        if self.harmonics or not self.sensor.harmonic:
+            return self
+        bent = tuple(i + 1 for i, kind in enumerate(self.joints) if kind == "R")
+        waves = np.zeros((len(bent), 4))
+        return dataclasses.replace(self, harmonics=bent, waves=waves)
+
     def postures(
         self,
         count: int,
@@ -271,6 +283,20 @@ class SerialChain(Arm):
         from jaxcal.models.serial.postures import postures
 
         return postures(self, count, seed, near, allowed)
+
+    def in_turn(self, commands: ArrayLike) -> NDArray[np.int64]:
+        """(N,) the commands' rows in an order of little travel, socket after socket."""
+        from jaxcal.models.serial.postures import in_turn
+
+        return in_turn(as_commands(commands, self.num_inputs), self.num_joints)
+
+    def skeleton(self, commands: ArrayLike) -> Array:
+        """(N, n + 2, 3) the base, each joint's origin and the tip, to be drawn."""
+        commands = as_commands(commands, self.num_inputs)
+        frame, _, origins = self._chain(commands, self.nominal)
+        at = np.concatenate([[0], self._steps_of_joints])
+        points = np.concatenate([origins[at], frame[None, 3]])
+        return np.asarray(points.transpose(2, 0, 1))
 
     def calibrated(self, parameters: ArrayLike, sensor: Sensor | None = None) -> Self:
         """The arm whose nominal is this one with ``parameters``.

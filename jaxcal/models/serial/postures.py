@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import numbers, whole_number
 from jaxcal.models.sensors import Board, Placed, Plane, Several, Socket
 
-__all__ = ["postures"]
+__all__ = ["in_turn", "postures"]
 
 Array = NDArray[np.float64]
 Chain = Any  # a SerialChain, whose module imports this one
@@ -69,7 +69,7 @@ def postures(
                 continue
             found = np.vstack([found, row])
             if len(found) == count:
-                return _in_turn(found, arm.num_joints)
+                return found[in_turn(found, arm.num_joints)]
     reasons = ", ".join(f"{number} {why}" for why, number in lost.most_common())
     raise ValueError(
         f"count must be at most {len(found)} here, got {count}: of {tried} postures "
@@ -182,8 +182,8 @@ def _in_view(arm: Chain, commands: Array) -> tuple[Array, list[str]]:
     return commands, reasons
 
 
-def _in_turn(found: Array, joints: int) -> Array:
-    """Socket after socket, and in each the nearest posture next."""
+def in_turn(found: Array, joints: int) -> NDArray[np.int64]:
+    """Socket after socket, and in each the nearest posture next: rows in that order."""
     order: list[int] = []
     left = list(range(len(found)))
     while left:
@@ -193,4 +193,4 @@ def _in_turn(found: Array, joints: int) -> Array:
         far = np.abs(found[left, :joints] - last[:joints]).max(axis=1)
         nearest = int(np.lexsort((far, other))[0])
         order.append(left.pop(nearest))
-    return found[order]
+    return np.array(order)
