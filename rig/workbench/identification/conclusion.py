@@ -11,13 +11,14 @@ from scipy.spatial.transform import Rotation
 from rig.config import AXIS_NAMES, RigConfig
 from rig.core.attitude import ORDERS, Array, Frame, frame_at
 from rig.core.faults import MotionFault
-from rig.core.identify import identify, pairs
 from rig.journal import Record, measured_postures
 from rig.workbench.identification.fit import (
     correlation,
     held_out_errors,
+    identify,
     mean_share,
     mean_variance,
+    pairs,
     uncertainty,
 )
 from rig.workbench.readings import angles

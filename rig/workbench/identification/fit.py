@@ -1,4 +1,4 @@
-"""How uncertain a fit is, and its errors at postures held out.
+"""A and b of ``y = A u + b``, how uncertain they are, and errors held out.
 
 A phone's fused attitude is filtered, so neighbouring readings err alike and n of them
 average out less than n independent ones. Their noise is taken for a first-order
@@ -9,6 +9,7 @@ time).
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,10 +17,50 @@ import numpy as np
 from scipy import special
 from scipy.optimize import brentq
 
-from rig.config import RigConfig
+from rig.config import AXIS_NAMES, RigConfig
 from rig.core.attitude import Array
-from rig.core.identify import pairs
 from rig.journal import Record
+
+
+def pairs(records: list[Record]) -> tuple[Array, Array]:
+    """(N, 3) commands and (N, 3) measurements in degrees of posture records."""
+    commands = np.array([r["commanded_deg"] for r in records]).reshape(-1, 3)
+    return commands, np.array([r["measured_deg"] for r in records]).reshape(-1, 3)
+
+
+def identify(
+    records: list[Record],
+    noise_std: Array | None = None,
+    notes: Record | None = None,
+    zero_variance: Array | float = 0.0,
+) -> Any:
+    """Slopes A and bias b of ``y = A u + b`` from posture records: a ``Calibration``.
+
+    Args:
+        records: chosen postures.
+        noise_std: (3,) degrees, of one recorded mean; from the scatter of its readings
+            when not given.
+        notes: stored in the calibration's file.
+        zero_variance: (3,) degrees squared, of the zero reference. It shifts every
+            posture equally, so it adds to the variance of the outputs' mean.
+    """
+    import jaxcal
+
+    if noise_std is None:
+        means = [np.array(r["std_deg"]) ** 2 / r["samples"] for r in records]
+        noise_std = np.sqrt(np.mean(means, axis=0))
+    fitted: Any = jaxcal.identify(
+        *pairs(records),
+        noise_std=np.maximum(1e-9, noise_std),
+        input_names=AXIS_NAMES,
+        output_names=AXIS_NAMES,
+        command_unit="deg",
+        measured_unit="deg",
+        notes=notes,
+    )
+    covariance = np.array(fitted.joint_covariance)
+    covariance[range(-3, 0), range(-3, 0)] += zero_variance
+    return dataclasses.replace(fitted, joint_covariance=covariance)
 
 
 def mean_share(phi: Any, samples: Any) -> Array:

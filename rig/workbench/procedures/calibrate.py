@@ -10,10 +10,10 @@ import numpy as np
 from rig.core.attitude import Array
 from rig.core.device import Device, Posture, check_plan
 from rig.core.faults import MotionFault
-from rig.core.identify import identify
 from rig.core.session import visit
 from rig.journal import SIGN_CHECKED, Record
 from rig.workbench.identification.conclusion import check_matrix, conclude
+from rig.workbench.identification.fit import identify
 from rig.workbench.outputs.console import plan_lines
 from rig.workbench.procedures.plan import (
     Choice,
@@ -96,8 +96,7 @@ def _visit_chosen(run: Run, device: Device, candidates: Array, choice: Choice) -
         queue = left[travel_order(config, degrees[left], here)].tolist()
         run.emit("queue", names=[f"select:{index}" for index in queue])
         for index in queue:
-            a, b, c = candidates[index].tolist()
-            posture = Posture(f"select:{index}", (a, b, c))
+            posture = Posture(f"select:{index}", tuple(candidates[index].tolist()))
             if visit(device, posture, role="select", index=index) is None:
                 break
             here = degrees[index]
@@ -172,9 +171,8 @@ def visit_pairs(run: Run, device: Device, held: list[Any]) -> None:
     queue = travel_order(run.config, points, start)
     run.emit("queue", names=[names[number] for number in queue])
     for number in queue:
-        a, b, c = targets[number]
         role = names[number].partition(":")[0]
-        visit(device, Posture(names[number], (a, b, c)), role=role)
+        visit(device, Posture(names[number], tuple(targets[number])), role=role)
 
 
 def _identify(run: Run) -> int:

@@ -15,11 +15,10 @@ from rig.config.config import differences
 from rig.core.attitude import Array, Frame
 from rig.core.device import Device, Posture
 from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
-from rig.core.identify import pairs
+from rig.core.known import KeptZero, unseen
 from rig.core.motion import move
 from rig.core.session import visit
-from rig.core.zero import KeptZero, unseen
-from rig.workbench.identification.fit import held_out_errors
+from rig.workbench.identification.fit import held_out_errors, pairs
 from rig.workbench.outputs.console import error_text, numbers
 from rig.workbench.procedures.calibrate import END, pair_names, visit_pairs
 from rig.workbench.procedures.plan import draw, draw_held_out
@@ -46,8 +45,8 @@ def collect(run: Run, count: int) -> int:
     names = [f"collect:{number}" for number in range(len(targets))]
     if run.lacks([*names, END]):
         with run.device() as device:
-            for name, (a, b, c) in zip(names, targets, strict=True):
-                visit(device, Posture(name, (a, b, c)), role="collect")
+            for name, target in zip(names, targets, strict=True):
+                visit(device, Posture(name, tuple(target)), role="collect")
             visit(device, Posture(END, run.zero_pulses), role="reference")
             run.emit("phase", phase="saving")
     closing = run.postures().get(END)
@@ -122,7 +121,7 @@ def load_calibration(
     zero, attitude = notes.get("zero_pulses"), notes.get("zero_attitude")
     kept = KeptZero(
         f"calibration {notes.get('run', path)}",
-        None if zero is None else (int(zero[0]), int(zero[1]), int(zero[2])),
+        None if zero is None else tuple(map(int, zero)),
         None if attitude is None else np.array(attitude, dtype=np.float64),
     )
     return Saved(calibration, kept, Play.of(notes))
