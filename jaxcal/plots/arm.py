@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,15 +12,11 @@ from jaxcal.plots.style import COLOURS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from jaxcal.models import SerialChain
-
 __all__ = ["postures"]
 
 
-def postures(
-    figure: Figure, arm: SerialChain, commands: ArrayLike, columns: int = 4
-) -> Figure:
-    """The arm at each row of ``commands`` (N, n), its tip marked, rows numbered from 1.
+def postures(figure: Figure, arm: Any, commands: ArrayLike, columns: int = 4) -> Figure:
+    """A ``SerialChain`` at each row of ``commands`` (N, n), its tip marked, from 1.
 
     A column of the sensor, such as the socket, stands beside the number.
     """
