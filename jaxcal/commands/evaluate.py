@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NoReturn
 
-from jaxcal.arguments import refused
+from jaxcal.arguments import Parser, refused
 from jaxcal.commands import evaluate_task
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder
@@ -36,35 +36,44 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
         The exit code.
     """
     given = list(sys.argv[1:] if argv is None else argv)
-    if any(word == "--task" or word.startswith("--task=") for word in given):
-        return evaluate_task.main(given, prog)
+    command = ["python", prog] if prog.endswith(".py") else prog.split()
+    of_task = any(word.partition("=")[0] == "--task" for word in given)
+
+    def alone() -> int:  # this process may be one of several
+        kept, before = "nothing was written", signal.signal(signal.SIGTERM, _terminate)
+        try:
+            options = _parser(of_task, prog, " ".join(command)).parse_args(given)
+            options.command = [*command, *given]
+            if of_task:
+                evaluate_task.run(options)
+                return 0
+            if options.stream is not None:
+                kept = "finished parts are kept; the same command goes on"
+            _run(options)
+        except KeyboardInterrupt as stop:
+            terminated = isinstance(stop, _Terminated)
+            how = "terminated" if terminated else "interrupted"
+            print(f"{prog}: {how}, {kept}", file=sys.stderr)
+            return EXIT_TERMINATED if terminated else EXIT_INTERRUPTED
+        except (ValueError, OSError, MissingExtraError) as error:
+            return refused(prog, error)
+        finally:
+            signal.signal(signal.SIGTERM, before)
+        return 0
+
+    if of_task:
+        return alone()
     advice = "finished parts stay: start every process again"
-    return processes.run_job(prog, given, lambda: _alone(given, prog), advice)
+    return processes.run_job(prog, given, alone, advice)
 
 
-def _alone(given: list[str], program: str) -> int:
-    """The command in this process, which may be one of several."""
+def _parser(of_task: bool, prog: str, typed: str) -> Parser:
+    if of_task:
+        with needs("policy", prog):
+            return evaluate_task.parser(prog, typed)
     from jaxcal.commands.evaluate_arguments import parser
 
-    command = ["python", program] if program.endswith(".py") else program.split()
-    options = parser(program, " ".join(command)).parse_args(given)
-    options.command = [*command, *given]
-    before = signal.signal(signal.SIGTERM, _terminate)
-    try:
-        _run(options)
-    except KeyboardInterrupt as stop:
-        terminated = isinstance(stop, _Terminated)
-        kept = "nothing was written"
-        if options.stream is not None:
-            kept = "finished parts are kept; the same command goes on"
-        how = "terminated" if terminated else "interrupted"
-        print(f"{program}: {how}, {kept}", file=sys.stderr)
-        return EXIT_TERMINATED if terminated else EXIT_INTERRUPTED
-    except (ValueError, OSError, MissingExtraError) as error:
-        return refused(program, error)
-    finally:
-        signal.signal(signal.SIGTERM, before)
-    return 0
+    return parser(prog, typed)
 
 
 class _Terminated(KeyboardInterrupt):
