@@ -2,63 +2,41 @@
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
-import pathlib
 import sys
 from collections.abc import Sequence
 
-from rig.arguments import make_parser
+from rig.arguments import call
+from rig.commands import make_parser
+from rig.core.faults import EXIT_BAD_INPUT, EXIT_FAULT, EXIT_INTERRUPTED
+from rig.journal.errors import JournalError
 
 # Looked for before any port opens; finding is quicker than importing.
 NEEDED = ("pydantic", "pymodbus")
-REPORTS = ("jinja2",)  # the report is written last
-CORRECTS = {"setup": ("tomlkit",), "imu": ("tomlkit",), "axes": ("tomlkit",)}
+OTHERS = ("jinja2", "tomlkit")  # not by `stop`; the report is written last
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
-    args = make_parser().parse_args(argv)
-    command = args.command
-    if command == "stop":
-        return stop(args.config)
-    from jaxcal.extras import MissingExtraError, needs
-    from rig.journal import JournalError
-
-    module, _, function = args.function.partition(":")
+    argv = sys.argv[1:] if argv is None else argv
+    args = make_parser(argv[0] if argv else None).parse_args(argv)
+    command, code = args.command, EXIT_BAD_INPUT
     try:
-        with needs("rig", "the rig"):
-            for name in (*NEEDED, *REPORTS, *CORRECTS.get(command, ())):
-                if importlib.util.find_spec(name) is None:
-                    raise ModuleNotFoundError(name, name=name)
-            run = getattr(importlib.import_module(module), function)
-        code: int = run(args)
-        return code
+        for name in NEEDED + OTHERS * (command != "stop"):
+            if importlib.util.find_spec(name) is None:
+                install = "which is not installed: pip install 'jaxcal[rig]'"
+                raise ModuleNotFoundError(f"{command} needs {name}, {install}")
+        code = EXIT_FAULT if command == "stop" else EXIT_BAD_INPUT
+        return call(args)
     except KeyboardInterrupt:
-        return 130
+        return EXIT_INTERRUPTED
     except BrokenPipeError:
         return 141  # the reader of our output went away, as `| head` does
-    except (ValueError, OSError, RuntimeError, MissingExtraError) as error:
-        print(f"jaxcal-rig: {error}", file=sys.stderr)
-        if isinstance(error, JournalError):
-            return 2 if command == "resume" else 3
-        return 3 if isinstance(error, RuntimeError) else 2
-
-
-def stop(path: pathlib.Path | None) -> int:
-    """Stop every drive; the session is asked before anything heavy is loaded."""
-    from rig.stopping import stop_device
-
-    for name in NEEDED:
-        if importlib.util.find_spec(name) is None:
-            text = f"jaxcal-rig: stop needs {name}: pip install 'jaxcal[rig]'"
-            print(text, file=sys.stderr)
-            return 2
-    try:
-        return stop_device(path or pathlib.Path("rig.toml"), path is not None)
     except (ValueError, OSError, RuntimeError, ImportError) as error:
         print(f"jaxcal-rig: {error}", file=sys.stderr)
-        return 3
+        if isinstance(error, JournalError) and command == "resume":
+            return EXIT_BAD_INPUT
+        return EXIT_FAULT if isinstance(error, RuntimeError) else code
 
 
 if __name__ == "__main__":

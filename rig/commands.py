@@ -1,178 +1,702 @@
-"""The commands besides sessions and commissioning; each loads what it needs."""
+"""The commands: what each takes, and what it does. Each loads what it needs."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
+import functools
+import pathlib
 import sys
 import time
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
-from rig.config import example_text, load_config
+from rig.arguments import parser_of
 from rig.core.faults import EXIT_FAULT, EXIT_OK, EXIT_RECALIBRATE, Refused
-from rig.sessions import FILE, journal_of, load, make_simulator, recorded, records_of
 
 if TYPE_CHECKING:
-    from rig.core.drive import Drive
+    from rig.config import RigConfig
+    from rig.core.known import KeptZero
+    from rig.journal import Record
+    from rig.simulator import Simulator
+    from rig.workbench.commission.steps import Place
+    from rig.workbench.run import Run
 
 
-def identify(args: argparse.Namespace) -> int:
-    """Print what every drive says of itself."""
+def _axes(text: str) -> list[str]:
+    names = text.split(",")
+    if unknown := [name for name in names if name not in NAMES]:
+        raise argparse.ArgumentTypeError(f"no axis {unknown[0]!r}: pitch, yaw, roll")
+    return names
+
+
+Path = pathlib.Path
+FILE = Path("rig.toml")  # without --config
+Axis = Literal["pitch", "yaw", "roll"]
+NAMES = get_args(Axis)
+Order = Literal["XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX"]
+Angles = tuple[float, float, float]
+CIRCLE = (-360, 360)
+RunPath = Annotated[Path, "the run's folder"]
+Saved = Annotated[Path, "its file, or its run's folder"]
+ConfigPath = Annotated[Path, "default: rig.toml here"]
+Faults = Annotated[list[str], "inject KIND[@PHASE|@Ns][,count=N]...; list: names them"]
+Postures = Annotated[int, "postures"]
+Units = Annotated[int, "ids 1 to N are asked", (1, 247)]
+BusName = Annotated[str, "rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT"]
+NamesKnown = Annotated[
+    bool,
+    "every unit was seen to turn its own joint the right way; the phone may be placed "
+    "in any way",
+]
+
+
+@dataclasses.dataclass
+class Simulation:
+    """What a simulated device is."""
+
+    transport: Annotated[
+        Literal["tcp", "rtu_tcp", "rtu"],
+        "of the simulated bus; rtu is a pseudo-terminal",
+    ] = "tcp"
+    noise: Annotated[float, "degrees", (0, 90)] = 0.02
+    backlash: Annotated[float, "degrees", (0, 90)] = 0.0
+    dead_zone: Annotated[float, "degrees", (0, 90)] = 0.0
+    breakaway: Annotated[float, "degrees until a joint at rest yields", (0, 90)] = 0.0
+    drift: Annotated[float, "degrees per minute", (-90, 90)] = 0.0
+    speedup: Annotated[float, "factor on the speed of the axes", (0.01, 100)] = 1.0
+    rate: Annotated[float, "of the phone, Hz", (0.1, 1000)] = 100.0
+    reversed: Annotated[list[str], "AXES that turn the other way", _axes] | None = None
+    swapped: Annotated[list[str], "A,B: two drives change cables", _axes] | None = None
+    gearing: Annotated[int, "pulses per turn, in the drives"] | None = None
+    lost_origin: Annotated[float, "degrees the counts are off", (-90, 90)] = 0.0
+    realistic: Annotated[bool, "slow replies and enabling, jitter, watchdog"] = False
+
+
+@dataclasses.dataclass
+class Target(Simulation):
+    """The device that a command is about."""
+
+    config: ConfigPath | None = None
+    simulate: Annotated[bool, "run against a simulated rig"] = False
+    fault: Faults | None = None
+
+    @property
+    def simulation(self) -> dict[str, Any]:
+        """The options of the simulated device."""
+        names = [field.name for field in dataclasses.fields(Simulation)]
+        return {name: getattr(self, name) for name in names}
+
+    def load(self, simulated: bool = False) -> RigConfig:
+        """The configuration given, the simulator's own, or that of rig.toml here."""
+        from rig.config import ConfigError, example_text, load_config, parse_config
+
+        if self.fault == ["list"]:
+            from rig.simulator.faults import KINDS
+
+            print(*(f"{kind:<16} {text}" for kind, text in KINDS.items()), sep="\n")
+            raise SystemExit
+        if self.config is None:
+            if self.simulate or simulated:
+                return parse_config(example_text("simulate"))
+            if not FILE.exists():
+                lack = "there is no rig.toml here: --config FILE is required, or "
+                raise ConfigError("configuration", [lack + "--simulate"])
+            self.config = FILE
+        return load_config(self.config)
+
+    def simulator(
+        self, config: RigConfig, options: dict[str, Any] | None = None
+    ) -> Simulator:
+        """A simulated rig as these options, or those of a run, describe it."""
+        from rig.simulator import Simulator, parse_fault, truth_of
+
+        options = options or self.simulation
+        return Simulator(
+            config,
+            truth_of(options, config.session.seed),
+            [parse_fault(text) for text in self.fault or ()],
+            transport=options["transport"],
+            rate_hz=options["rate"],
+            speedup=options["speedup"],
+        )
+
+
+@dataclasses.dataclass
+class Step(Target):
+    """How a step of commissioning is begun."""
+
+    yes: Annotated[bool, "confirm everything and take every default"] = False
+    reset_alarms: Annotated[bool, "before arming"] = False
+
+
+@dataclasses.dataclass
+class Session(Target):
+    """How a session is begun and shown."""
+
+    out: Annotated[Path, "folder for the run's folder"] | None = None
+    dry_run: Annotated[bool, "plan; open no port"] = False
+    arm: Annotated[bool, "arm without prompting"] = False
+    reset_alarms: Annotated[bool, "before arming"] = False
+    zero: Annotated[bool, "the device stands in its zero posture"] = False
+    live: Annotated[bool, "show it as a page in the browser"] = False
+
+
+# Commissioning
+
+
+def setup(
+    given: Step,
+    *,
+    bus: BusName = "",
+    units: Units = 16,
+    imu: Annotated[str, "APP[:PORT]: hyperimu, sensorlogger or lines"] = "",
+    home: Annotated[Literal["here", "drive"], "how"] = "here",
+    set: Annotated[list[str], "KEY=VALUE of the new rig.toml"] | None = None,
+    names_known: NamesKnown = False,
+) -> int:
+    """from cables to a device that may be calibrated; writes rig.toml"""
+    from rig.journal import DeviceRecord
+    from rig.workbench.commission import setup as wizard
+    from rig.workbench.commission import steps
+
+    path, operator = given.config or FILE, steps.Operator(given.yes, _say)
+    values = dict(map(wizard.setting, set or ()))
+    asked = wizard.Given(bus, imu, units, values, home, names_known)
+    with contextlib.ExitStack() as stack:
+        if given.simulate:
+            device = dataclasses.replace(given, config=None)
+            simulator = stack.enter_context(device.simulator(device.load()))
+            asked = wizard.simulated(simulator, asked)
+            path = given.config or steps.own_folder(simulator.config) / "rig.toml"
+            if path.exists():  # its bus may be that of a real device
+                raise Refused(
+                    f"{path} exists: --simulate writes a file of its own. Name a new "
+                    "one, or leave out --config or --simulate"
+                )
+        config = wizard.begin(path, asked, operator)
+        place = steps.Place(
+            config, DeviceRecord.load(config.device_path), operator, path,
+            reset_alarms=given.reset_alarms, full_speed=given.simulate,
+        )  # fmt: skip
+        return wizard.go(place, asked)
+
+
+def ports() -> int:
+    """list serial ports"""
+    from rig.workbench.commission.phone import serial_lines
+
+    print(*(serial_lines() or ["no serial port on this computer"]), sep="\n")
+    return EXIT_OK
+
+
+def scan(given: Target, *, bus: BusName = "", units: Units = 16) -> int:
+    """which units answer, and of which family; reads only"""
+    from rig.workbench.commission import scan as scanning
+    from rig.workbench.commission import steps
+
+    if bus and not given.simulate:
+        found = scanning.scan(scanning.parse_bus(bus), units, _say)
+    else:
+        with _place(given) as place:
+            maps = tuple(axis.map for axis in place.config.axes)
+            found = scanning.scan(place.config.bus, units, _say, maps)
+            if found:
+                steps.identify(place)
+    return EXIT_OK if found else EXIT_FAULT
+
+
+def imu(
+    given: Step, *, seconds: Annotated[float, "to look at it", (1, 600)] = 5.0
+) -> int:
+    """what to type into the phone, and what it sends"""
+    from rig.workbench.commission import setup, steps
+
+    with _place(given) as place:
+        setup.pin(place, steps.look_at_phone(place, seconds).sender)
+    return EXIT_OK
+
+
+def jog(
+    axis: Axis,
+    step: Annotated[float, "degrees; without it while a key is held", (-3, 3)]
+    | None = None,
+    *,
+    given: Step,
+) -> int:
+    """move one axis by hand"""
+    return _step(given, "IDENTIFIED", "jog", NAMES.index(axis), step)
+
+
+def characterise(
+    axis: Axis,
+    *,
+    into: Annotated[Path, "run whose calibration keeps what is found"] | None = None,
+    given: Step,
+) -> int:
+    """measure play, dead zone and breakaway of one axis"""
+    from jaxcal.extras import needs
+
+    with needs("policy", "characterise"):
+        import jax  # noqa: F401  # before anything moves
+    return _step(given, "SIGN_CHECKED", "characterise", NAMES.index(axis), into)
+
+
+def home(
+    given: Step, *, here: Annotated[bool, "as it stands; else by the drives"] = False
+) -> int:
+    """make the drives' counts mean a place"""
+    return _step(given, "IDENTIFIED", "go_home", here)
+
+
+def axes(given: Step, *, names_known: NamesKnown = False) -> int:
+    """check what turns, which way, how far; correct rig.toml"""
+    return _step(given, "HOMED", "axes", names_known)
+
+
+def zero(given: Step) -> int:
+    """measure the zero posture"""
+    return _step(given, "SIGN_CHECKED", "take_zero")
+
+
+def _step(given: Step, state: str, name: str, *options: Any) -> int:
+    """Run a function of ``steps`` at the device."""
+    from rig.workbench.commission import steps
+
+    with _place(given, state) as place:
+        code: int = getattr(steps, name)(place, *options)
+        return code
+
+
+@contextlib.contextmanager
+def _place(given: Target, state: str = "") -> Iterator[Place]:
+    """The device that a command is about.
+
+    A simulated one is first taken through the states before the command's own.
+    """
+    from rig.journal import DeviceRecord
+    from rig.workbench.commission import steps
+
+    config, yes = given.load(), getattr(given, "yes", False)
+    with contextlib.ExitStack() as stack:
+        if given.simulate:
+            simulator = given.simulator(config)
+            served = stack.enter_context(simulator).start()
+            record = DeviceRecord(steps.own_folder(served) / "device.json")
+            place = steps.simulated(simulator, served, record, _say)
+            steps.begin_simulated(place, state)
+            place.operator.yes = yes
+        else:
+            record = DeviceRecord.load(config.device_path)
+            operator = steps.Operator(yes, _say)
+            place = steps.Place(config, record, operator, given.config)
+        place.reset_alarms = getattr(given, "reset_alarms", False)
+        yield place
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)
+
+
+# Sessions
+
+
+def calibrate(given: Session) -> int:
+    """choose, visit, identify, verify and save"""
+    return _session(given, "calibrate")
+
+
+def collect(given: Session, *, count: Postures = 50) -> int:
+    """record random postures (Datasets 4 and 5)"""
+    return _session(given, "collect", count)
+
+
+def verify(calibration: Saved, *, count: Postures = 6, given: Session) -> int:
+    """compare a calibration with fresh measurements"""
+    return _session(given, "verify", count, calibration)
+
+
+def goto(
+    calibration: Saved,
+    *,
+    to: Annotated[Angles, "pitch, yaw, roll in degrees", CIRCLE],
+    given: Session,
+) -> int:
+    """move the end-effector to a posture, calibrated"""
+    return _session(given, "goto", None, calibration, to)
+
+
+def resume(run: RunPath, *, given: Session) -> int:
+    """go on with a run that was paused, stopped or killed"""
+    config, start = _recorded(run, given.config)
+    if given.simulate and start["simulated"] is None:
+        raise Refused(
+            f"{run} was made with a real device, and going on moves that. Leave out "
+            "--simulate, or begin a simulated run of its own"
+        )
+    return _run(given, "resume", config, start, run)
+
+
+def _session(
+    given: Session,
+    mode: str,
+    count: int | None = None,
+    calibration: Path | None = None,
+    to: tuple[float, ...] | None = None,
+) -> int:
+    """Run a new session; returns the exit code."""
+    if count is not None and count < 1:
+        raise Refused(f"--count must be at least 1, got {count}")
+    saved = None if calibration is None else str(calibration.resolve())
+    config = given.load()
+    start = {
+        "mode": mode,
+        "inputs": {"count": count, "to": to, "calibration": saved},
+        "simulated": given.simulation if given.simulate else None,
+        "maps_from": str((given.config or Path()).resolve().parent),
+    }
+    return _run(given, mode, config, start)
+
+
+def _run(
+    given: Session,
+    command: str,
+    config: RigConfig,
+    start: dict[str, Any],
+    folder: Path | None = None,
+) -> int:
+    from rig.journal import SIGN_CHECKED, BusLock, DeviceRecord, new_run_folder
+    from rig.workbench.commission import steps
+    from rig.workbench.outputs.console import listen
+    from rig.workbench.run import Run, run_safely
+
+    real = start["simulated"] is None
+    procedure, kept_zero = _procedure(start, config)
+    with contextlib.ExitStack() as stack:
+        simulator, text = None, config.text
+        if not real:
+            simulator = given.simulator(config, start["simulated"])
+            config = stack.enter_context(simulator).start()
+        lock = BusLock(config.bus)
+        if not given.dry_run:
+            stack.enter_context(lock.acquire(command))
+        record = DeviceRecord.load(config.device_path)
+        if real and not given.dry_run and (lack := record.missing(config)):
+            raise Refused(lack)
+        if folder is None:
+            folder = new_run_folder(given.out or Path(config.output), start["mode"])
+            (folder / "rig.toml").write_text(text, encoding="utf-8")
+        lock.tell(run=str(folder.resolve()))
+        if simulator is not None:
+            record = DeviceRecord(folder / "device.json")
+            if not given.dry_run:
+                place = steps.simulated(simulator, config, record, _say)
+                place.folder, place.locked = folder / "axes", True
+                place.folder.mkdir(exist_ok=True)
+                # Faults wait for the session's own phases.
+                place.listeners = (simulator.answer,)
+                steps.begin_simulated(place, SIGN_CHECKED)
+        run = Run(
+            config,
+            folder,
+            start["mode"],
+            _say,
+            start={key: start[key] for key in ("simulated", "inputs", "maps_from")},
+            reset_alarms=given.reset_alarms,
+            record=record,
+            # With --zero the operator put the device into its zero posture.
+            zero_at=kept_zero.pulses if kept_zero and not given.zero else None,
+            kept_zero=kept_zero,
+            dry_run=given.dry_run,
+        )
+        listen(run)
+        if simulator is None:
+            run.confirm = functools.partial(_confirm, given)
+        else:
+            run.listeners.append(simulator.hear)
+        if given.live:
+            from rig.workbench import live
+
+            run.say(live.start(folder))
+        return run_safely(run, procedure)
+
+
+def _procedure(
+    start: dict[str, Any], config: RigConfig
+) -> tuple[Callable[[Run], int], KeptZero | None]:
+    """What a session does, and the zero posture that it must find."""
+    import numpy as np
+
+    from rig.workbench.procedures import calibrate, checking
+
+    mode, inputs = start["mode"], start["inputs"]
+    if mode == "calibrate":
+        return calibrate.calibrate, None
+    if mode == "collect":
+        return lambda run: checking.collect(run, inputs["count"]), None
+    saved = checking.load_calibration(
+        Path(inputs["calibration"]), config, start["simulated"] is not None
+    )
+    found = saved.calibration
+    if mode == "verify":
+        return lambda run: checking.verify(run, found, inputs["count"]), saved.zero
+    to = np.array(inputs["to"], dtype=np.float64)
+    return lambda run: checking.goto(run, found, to, saved.play), saved.zero
+
+
+def _confirm(given: Session, session: Run) -> None:
+    """Ask for what --arm and --zero would have confirmed."""
+    takes_zero = not session.journal.events("zero") and session.zero_at is None
+    questions = {
+        "arm": "the device will move; nobody and nothing is in its way, no patient is "
+        "attached, the emergency stop is at hand"
+    }
+    if takes_zero and session.config.session.zero == "here":
+        questions["zero"] = "the device stands in its zero posture"
+    for word, text in questions.items():
+        if getattr(given, word):
+            continue
+        if not sys.stdin.isatty():
+            raise Refused(f"{text}: confirm with --{word}")
+        if input(f"{text}. Type {word} to confirm: ").strip() != word:
+            raise Refused("not confirmed; nothing was moved")
+
+
+def _recorded(run: Path, config: Path | None = None) -> tuple[RigConfig, Record]:
+    """Configuration and start of a run that is resumed or identified anew."""
+    from rig.config import load_config, parse_config
+
+    start = _records(run)[0]
+    if start["mode"] == "refit":
+        source = start["inputs"]["run"]
+        raise Refused(f"{run} is a refit of {source}; give that run instead")
+    if start["mode"] not in ("calibrate", "collect", "verify", "goto"):
+        raise Refused(f"{run} is a step of commissioning: run it again instead")
+    if config is not None:
+        return load_config(config), start
+    text = (run / "rig.toml").read_text(encoding="utf-8")
+    return parse_config(text, Path(start["maps_from"]), str(run)), start
+
+
+def _journal(run: Path) -> Path:
+    """The journal in a run's folder; Refused where there is none."""
+    from rig.journal import JOURNAL
+
+    if not (run / JOURNAL).is_file():
+        raise Refused(f"{run} holds no run: there is no {JOURNAL} in it")
+    return run / JOURNAL
+
+
+def _records(run: Path) -> list[Record]:
+    """The journal of a run; Refused where its folder holds none, or a damaged one."""
+    from rig.journal import JournalError, read_journal
+
+    try:
+        records = read_journal(_journal(run))
+    except JournalError as error:
+        raise Refused(str(error)) from None
+    if not records or records[0]["event"] != "start":
+        raise Refused(f"{run} holds no run: its journal has no start")
+    if "device" not in records[0]:
+        raise Refused(
+            f"{run} was written before jaxcal 0.1.0, whose runs are not read any more. "
+            "Make a new one"
+        )
+    return records
+
+
+# Of the device, and of runs
+
+
+def watch(run: RunPath) -> int:
+    """show a run, also a running one, as a page in the browser"""
+    from jaxcal.extras import needs
+    from rig.workbench.live import listen
+
+    _journal(run)
+    with needs("live", "the live page"):
+        from rig.workbench.live.server import serve
+    sock, line = listen()
+    print(f"{line}\nCtrl-C ends", flush=True)
+    with contextlib.suppress(KeyboardInterrupt):
+        serve(run, sock)
+    return EXIT_OK
+
+
+def identify(given: Target) -> int:
+    """read identity and status of every drive; write nothing"""
     from rig.core.bus import Bus, BusError
     from rig.core.drive import Drive
-    from rig.journal.lock import BusLock
+    from rig.journal import BusLock
 
-    config, code = load(args), EXIT_OK
+    config, code = given.load(), EXIT_OK
     with contextlib.ExitStack() as stack:
-        if args.simulate:
-            simulator = make_simulator(config, vars(args), args.fault)
-            config = stack.enter_context(simulator).start()
+        if given.simulate:
+            config = stack.enter_context(given.simulator(config)).start()
         # Its reads would delay those of a session that moves.
         stack.enter_context(BusLock(config.bus).acquire("identify"))
         bus = stack.enter_context(Bus(config.bus, config.silence_s))
         for axis in config.axes:
+            unit, drive = f"{axis.name} (unit {axis.unit}", Drive(bus, axis)
             try:
-                print(*_described(Drive(bus, axis)), sep="\n")
+                status, alarm, identity = (
+                    drive.status(),
+                    drive.alarm(),
+                    drive.identity(),
+                )
             except BusError as error:
                 code = EXIT_FAULT
-                print(f"{axis.name} (unit {axis.unit}): {error}")
+                print(f"{unit}): {error}")
+                continue
+            flags = axis.map.status.flags(status.word)
+            words = " ".join(name for name, on in flags.items() if on)
+            print(
+                f"{unit}, {axis.map.title}): status 0x{status.word:04X} {words}, "
+                f"position {status.position} pulses = "
+                f"{axis.to_deg(status.position):.4f} deg" + (alarm and f", {alarm}"),
+                *(f"    {name} = {value}" for name, value in identity.items()),
+                sep="\n",
+            )
     return code
 
 
-def _described(drive: Drive) -> list[str]:
-    axis, status, alarm = drive.axis, drive.status(), drive.alarm()
-    flags = axis.map.status.flags(status.word)
-    words = " ".join(name for name, on in flags.items() if on)
-    identity = [f"    {name} = {value}" for name, value in drive.identity().items()]
-    return [
-        f"{axis.name} (unit {axis.unit}, {axis.map.title}): status "
-        f"0x{status.word:04X} {words}, position {status.position} pulses = "
-        f"{axis.to_deg(status.position):.4f} deg" + (alarm and f", {alarm}"),
-        *identity,
-    ]
+def stop(*, config: ConfigPath | None = None) -> int:
+    """quick-stop every drive now, and verify"""
+    from rig.stopping import stop_device
+
+    return stop_device(config or FILE, config is not None)
 
 
-def simulate(args: argparse.Namespace) -> int:
-    """Serve simulated drives and a phone until Ctrl-C."""
-    config = load(args)
-    port = config.bus.port if args.bus_port is None else args.bus_port
-    with make_simulator(config, vars(args), args.fault) as simulator:
-        served = simulator.start(port)
-        phone = f"listens on 127.0.0.1:{served.imu.port}"
-        if config.imu.transport == "listen":
-            phone_port = config.imu.port or 2055
-            simulator.start_phone(phone_port)
-            phone = f"sends to 127.0.0.1:{phone_port}"
-        print(f"drives: {served.bus.where}; units {[a.unit for a in config.axes]}")
-        print(f"phone: {config.imu.format}, {phone}")
-        print("Ctrl-C ends", flush=True)
-        try:
-            while True:
-                time.sleep(3600)
-        except KeyboardInterrupt:
-            return EXIT_OK
+def check(file: ConfigPath | None = None, *, config: ConfigPath | None = None) -> int:
+    """check a configuration and list every fault"""
+    from rig.config import load_config
 
-
-def watch(args: argparse.Namespace) -> int:
-    """Serve the page of a run until Ctrl-C."""
-    from jaxcal.extras import needs
-    from rig.workbench.live import launch
-
-    journal_of(args.run)
-    with needs("live", "the live page"):
-        from rig.workbench.live.server import serve
-    sock, token, url = launch.listen(args.live_host)
-    print(f"live page: {url}\nCtrl-C ends", flush=True)
-    with contextlib.suppress(KeyboardInterrupt):
-        serve(args.run, sock, token)
-    return EXIT_OK
-
-
-def example(args: argparse.Namespace) -> int:
-    """Print an example, or the names of those there are."""
-    from rig.config.files import example_names
-
-    if args.name is None:
-        print("\n".join(example_names()))
-    else:
-        print(example_text(args.name), end="")
-    return EXIT_OK
-
-
-def check(args: argparse.Namespace) -> int:
-    """Say what a configuration comes to; ConfigError lists its faults."""
-    path = args.config or args.file or FILE
-    config = load_config(path)
+    path = config or file or FILE
+    found = load_config(path)
     print(f"{path}: valid")
-    for axis in config.axes:
+    for axis in found.axes:
         print(
             f"  {axis.name}: unit {axis.unit}, {axis.map.name}, "
             f"{axis.pulses_per_deg:.3f} pulses per degree, "
             f"{axis.min_pulses}..{axis.max_pulses} pulses"
         )
+    heartbeat, shortest = found.heartbeat_s, found.shortest_step_s
     late = ", LONGER than the shortest step: shorten bus.timeout_s or slow the axes"
     print(
-        f"  heartbeat {config.heartbeat_s:.3g} s, shortest step "
-        f"{config.shortest_step_s:.3g} s"
-        f"{late if config.heartbeat_s > config.shortest_step_s else ''}"
+        f"  heartbeat {heartbeat:.3g} s, shortest step {shortest:.3g} s"
+        + late * (heartbeat > shortest)
     )
     return EXIT_OK
 
 
-def refit(args: argparse.Namespace) -> int:
-    """Identify a recorded calibration anew, into a folder of its own."""
+def example(name: Annotated[str, "without it they are listed"] | None = None) -> int:
+    """print a commented example configuration"""
+    from rig.config.files import example_names, example_text
+
+    print((example_text(name) if name else "\n".join(example_names())).strip())
+    return EXIT_OK
+
+
+def refit(
+    run: RunPath,
+    *,
+    order: Annotated[Order, "mechanism.order: axes of the joints"] | None = None,
+    imu_order: Annotated[Order, "imu.order: of the phone's angles"] | None = None,
+    signs: Annotated[tuple[int, int, int], "imu.signs", (-1, 1)] | None = None,
+    mounting: Annotated[Angles, "imu.mounting_deg: Z, Y, X", CIRCLE] | None = None,
+) -> int:
+    """identify a recorded calibration anew"""
     from rig.workbench.identification.refit import refit as identify_anew
 
-    then, start = recorded(args)
+    then, start = _recorded(run)
     if start["mode"] != "calibrate":
-        raise Refused(f"{args.run} is a {start['mode']} run; refit takes a calibration")
+        raise Refused(f"{run} is a {start['mode']} run; refit takes a calibration")
     wanted = {
-        "mechanism.order": args.order,
-        "imu.order": args.imu_order,
-        "imu.signs": args.signs,
-        "imu.mounting_deg": args.mounting,
+        "mechanism.order": order,
+        "imu.order": imu_order,
+        "imu.signs": signs,
+        "imu.mounting_deg": mounting,
     }
-    return identify_anew(args.run, records_of(args.run), then, wanted, print)
+    return identify_anew(run, _records(run), then, wanted, print)
 
 
-def report(args: argparse.Namespace) -> int:
-    """Write report.html of a run of any kind, also of an unfinished one."""
+def report(run: RunPath) -> int:
+    """write report.html of any run, also unfinished"""
     from rig.workbench.outputs.report import write_report
 
-    print(write_report(args.run, records_of(args.run)))
+    print(write_report(run, _records(run)))
     return EXIT_OK
 
 
-def export(args: argparse.Namespace) -> int:
-    """Print or write the inverse map of a run's calibration."""
+def export(
+    run: RunPath,
+    *,
+    to: Literal["c", "st", "ros", "json", "csv"],
+    out: Annotated[Path, "file to write; without it it is printed"] | None = None,
+) -> int:
+    """print the inverse map of a calibration for a controller"""
     from jaxcal.files import write_text
-    from rig.workbench.outputs.export import LANGUAGES, load_inverse
+    from rig.workbench.outputs.export import LANGUAGES, checksum, load_inverse
 
-    inverse = load_inverse(args.run, records_of(args.run))
-    for text in inverse.warnings:
+    inverse = load_inverse(run, _records(run))
+    for text in inverse["warnings"]:
         print(f"WARNING: {text}", file=sys.stderr)
-    text = LANGUAGES[args.to](inverse)
-    if args.out is None:
+    text = LANGUAGES[to](inverse)
+    if out is None:
         print(text, end="")
     else:
-        write_text(args.out, text)
-        print(f"{args.out}: SHA-256 of the numbers {inverse.checksum}")
+        write_text(out, text)
+        print(f"{out}: SHA-256 of the numbers {checksum(inverse)}")
     return EXIT_OK
 
 
-def trend(args: argparse.Namespace) -> int:
-    """Compare the calibrations in a folder, device by device; also as trend.html."""
+def trend(folder: Annotated[Path, "of runs, searched with its subfolders"]) -> int:
+    """compare the calibrations of a device over time"""
     from rig.workbench.outputs.trend import read_runs, trend_lines, write_trend
 
-    if not args.folder.is_dir():
-        raise Refused(f"{args.folder} is no folder")
-    devices, skipped = read_runs(args.folder)
+    if not folder.is_dir():
+        raise Refused(f"{folder} is no folder")
+    devices, skipped = read_runs(folder)
     for text in skipped:
         print(f"left out: {text}", file=sys.stderr)
     if not devices:
-        raise Refused(f"{args.folder} holds no finished calibration or verification")
+        raise Refused(f"{folder} holds no finished calibration or verification")
     for device in devices:
         print(*trend_lines(device), sep="\n")
-    print(f"saved: {write_trend(args.folder, devices)}")
+    print(f"saved: {write_trend(folder, devices)}")
     again = any(device.reasons for device in devices)
     return EXIT_RECALIBRATE if again else EXIT_OK
+
+
+def simulate(
+    given: Target, *, bus_port: Annotated[int, "0: any free one"] | None = None
+) -> int:
+    """serve simulated drives and a phone on loopback"""
+    config = given.load(simulated=True)
+    with given.simulator(config) as simulator:
+        served = simulator.start(config.bus.port if bus_port is None else bus_port)
+        phone = f"listens on 127.0.0.1:{served.imu.port}"
+        if config.imu.transport == "listen":
+            port = config.imu.port or 2055
+            simulator.start_phone(port)
+            phone = f"sends to 127.0.0.1:{port}"
+        print(f"drives: {served.bus.where}; units {[a.unit for a in config.axes]}")
+        print(f"phone: {config.imu.format}, {phone}")
+        print("Ctrl-C ends", flush=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            while True:
+                time.sleep(3600)
+    return EXIT_OK
+
+
+COMMANDS = (
+    setup, ports, scan, imu, jog, characterise, home, axes, zero, calibrate, collect,
+    verify, goto, resume, watch, identify, stop, check, example, refit, report, export,
+    trend, simulate,
+)  # fmt: skip
+
+
+def make_parser(only: str | None = None) -> argparse.ArgumentParser:
+    """The parser of every command; with the options of one alone it is made quicker."""
+    return parser_of(COMMANDS, only)

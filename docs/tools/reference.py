@@ -16,7 +16,7 @@ ROOT = pathlib.Path(__file__).parents[2]
 def commands() -> str:
     """Every command of ``jaxcal`` and ``jaxcal-rig`` with its help."""
     from jaxcal.commands.main import COMMANDS, main
-    from rig.arguments import make_parser
+    from rig.commands import make_parser
 
     lines = ["# Commands", "", "What `--help` prints, from the parsers.", ""]
     for title, argv in (

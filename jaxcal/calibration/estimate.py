@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.discrepancy import WithDiscrepancy
+from jaxcal.calibration.discrepancy import WithDiscrepancy, WithHarmonics
 from jaxcal.calibration.sizes import Sizes, group_sizes, of_sizes
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
 from jaxcal.checks import in_words, one_of, whole_number
@@ -93,39 +93,44 @@ def fit_model(
     asked = prior is not None
     prior = prior or model.default_prior()
     resolved = prior.resolve(model)
-    whole, extra = model, np.zeros(0)
+    whole, extra = model, np.zeros(0)  # precision of what is added, 0: estimated
     if discrepancy is not None:
         features = whole_number("discrepancy", discrepancy, 1)
         whole = WithDiscrepancy.over(model, commands[used], features)  # type: ignore[assignment]  # as far as a fit needs it
         extra = np.zeros(features * measured.shape[1])
+    elif isinstance(model, SerialChain) and model.sensor.harmonic:
+        if not (asked or spread.any() or model.harmonics):
+            whole = WithHarmonics(model)  # type: ignore[assignment]  # likewise
+            extra = whole.std**-2.0  # type: ignore[attr-defined]  # see above
     task = Task(
         model=whole,
         commands=commands[used],
         measured=measured[used],
         white=white[used],
-        mean=np.concatenate([resolved.mean, extra]),
+        mean=np.concatenate([resolved.mean, 0.0 * extra]),
         precision=np.concatenate([np.diagonal(resolved.precision), extra]),
-        free=np.concatenate([resolved.free, extra == 0.0]),
+        free=np.concatenate([resolved.free, extra >= 0.0]),
         sized=np.concatenate([resolved.free & False, extra == 0.0]),
         command_std=spread,
         known=known,
         per_output=common_noise is False,
         student=loss == "student",
     )
-    found = solve(task)
+    beyond = discrepancy is not None or spread.any()  # what the sizes are not made for
     sizes: Sizes | None = None
-    beyond = extra.size or spread.any()  # what the sizes are not made for
     if prior.by_data and (asked or not beyond):
         if not isinstance(model, SerialChain) or beyond:
             raise ValueError(
                 "Prior.sized() is of arms, without discrepancy and command_std"
             )
-        stated = task
-        for _ in range(2):
-            sizes = group_sizes(model, stated, found)
+        found, stated = solve(task, rough=True), task
+        for last in (False, True):
+            sizes = group_sizes(model, stated, found, sizes)
             scaled = stated.precision / sizes.factors**2
             task = dataclasses.replace(task, precision=scaled)
-            found = solve(task, found)
+            found = solve(task, found, rough=not last)
+    else:
+        found = solve(task)
     if common_noise is None and _levels_differ(task, found):
         task = dataclasses.replace(task, per_output=True)
         found = solve(task, found)

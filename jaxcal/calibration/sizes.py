@@ -27,33 +27,38 @@ Array = NDArray[np.float64]
 
 _THOUGHT = np.log(3.0)  # standard deviation of the logarithm of each factor
 _MOST = 5.0  # of a logarithm
-_GROUPS = 4  # lengths, turns of the axes, zeros of the joints, their compliance
+_SCORES = 100  # steps of Fisher's scoring, at most
+_GROUPS = 5  # lengths, turns of the axes, zeros of the joints, compliance, harmonics
+_WAVES = (" sin", " cos", " sin2", " cos2")
 
 
 class Sizes(NamedTuple):
     """Factors of the prior's standard deviations."""
 
+    logs: Array  # (G + 1,) of the groups' factors and the level
     factors: Array  # (p,) 1 of parameters of no group
     groups: NDArray[np.int64]  # (p,) -1 of no group
     covariance: Array  # (G, G) of the logarithms of the groups' factors
 
 
-def group_sizes(arm: SerialChain, task: Task, found: Solution) -> Sizes:
+def group_sizes(
+    arm: SerialChain, task: Task, found: Solution, before: Sizes | None
+) -> Sizes:
     """The factors that make the readings most probable.
 
     Args:
         arm: whose parameters have the groups.
         task: with the prior that the factors are of.
         found: a fit with any such prior; the model is made linear there.
+        before: where the search begins; with factors of one where there is nothing.
     """
-    from scipy import optimize
-
-    p = len(arm.names)
+    p = len(task.mean)
     groups = np.full(p, -1)
     groups[: arm.table.size].reshape(-1, 5)[:] = [0, 1, 0, 2, 1]
-    groups[np.array(arm.units) == "deg per torque"] = 3
+    groups[np.flatnonzero(np.array(arm.units) == "deg per torque")] = 3
+    groups[[name.endswith(_WAVES) for name in task.model.names]] = 4
     rows, right = _reduced(arm, task, found)
-    sized = groups[task.free[:p] & (task.precision[:p] > 0.0)]
+    sized = groups[task.free & (task.precision > 0.0)]
     count, width = len(right), rows.shape[1]
     # All that the readings say is in a triangle; the rest of them is noise alone.
     triangle = np.asarray(np.linalg.qr(np.column_stack([rows, right]), mode="r"))
@@ -62,33 +67,51 @@ def group_sizes(arm: SerialChain, task: Task, found: Solution) -> Sizes:
     rows, right = triangle[:top, :width], triangle[:top, width]
     member = sized == np.arange(_GROUPS)[:, None]  # (groups, s)
 
-    def cost(logs: Array) -> tuple[float, Array]:
-        """-2 log marginal likelihood with what is thought of the factors; its slope."""
+    def cost(logs: Array) -> tuple[float, Array, Array]:
+        """-2 log marginal likelihood with what is thought of the factors.
+
+        Its slope and what its curvature is expected to be beside it.
+        """
         scaled = rows * np.exp(logs[:-1] @ member)
         level = np.exp(2.0 * logs[-1])
         inverse = np.linalg.inv(scaled @ scaled.T + level * np.eye(top))
-        white = inverse @ right
-        spread = member @ ((inverse @ scaled) * scaled).sum(axis=0)
+        white, seen = inverse @ right, inverse @ scaled
+        spread = member @ (seen * scaled).sum(axis=0)
         alone = (count - top) * 2.0 * logs[-1] + rest / level
         value = right @ white + alone - np.linalg.slogdet(inverse)[1]
         slope = np.append(
             spread - member @ (white @ scaled) ** 2,
             level * (np.trace(inverse) - white @ white) + count - top - rest / level,
         )
+        curve = np.eye(_GROUPS + 1) / _THOUGHT**2
+        curve[:-1, :-1] += 2.0 * member @ (scaled.T @ seen) ** 2 @ member.T
+        curve[-1, :-1] = curve[:-1, -1] = 2.0 * level * member @ (seen**2).sum(axis=0)
+        curve[-1, -1] += 2.0 * (level**2 * (inverse**2).sum() + count - top)
         thought = logs / _THOUGHT
-        return float(value + thought @ thought), 2.0 * (slope + thought / _THOUGHT)
+        value = float(value + thought @ thought)
+        return value, 2.0 * (slope + thought / _THOUGHT), 2.0 * curve
 
     # A level that is known floats too: misfit beyond it is no size of the errors.
-    start, bounds = np.zeros(_GROUPS + 1), [(-_MOST, _MOST)] * (_GROUPS + 1)
-    best = optimize.minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds)
+    best = np.zeros(_GROUPS + 1) if before is None else before.logs
+    least, slope, curve = cost(best)
+    for _ in range(_SCORES):
+        step = np.linalg.solve(curve, slope)
+        trial = np.clip(best - step, -_MOST, _MOST)
+        while (after := cost(trial))[0] > least + 1e-9:
+            step *= 0.5
+            trial = np.clip(best - step, -_MOST, _MOST)
+        gain, best = least - after[0], trial
+        least, slope, curve = after
+        if gain < 1e-6:
+            break
     factors = np.ones(p)
-    factors[groups >= 0] = np.exp(best.x[groups[groups >= 0]])
-    steps = 1e-3 * np.eye(len(start))
-    curve = [cost(best.x + step)[1] - cost(best.x - step)[1] for step in steps]
-    size, axes = np.linalg.eigh(np.array(curve) / 4e-3)  # of half the cost
+    factors[groups >= 0] = np.exp(best[groups[groups >= 0]])
+    steps = 1e-3 * np.eye(len(best))
+    curves = [cost(best + step)[1] - cost(best - step)[1] for step in steps]
+    size, axes = np.linalg.eigh(np.array(curves) / 4e-3)  # of half the cost
     size = np.maximum(size, _THOUGHT**-2.0)
     inside = (axes / size) @ axes.T
-    return Sizes(factors, groups, inside[:_GROUPS, :_GROUPS])
+    return Sizes(best, factors, groups, inside[:_GROUPS, :_GROUPS])
 
 
 def of_sizes(task: Task, found: Solution, sizes: Sizes) -> Array:
@@ -133,16 +156,15 @@ def _reduced(arm: SerialChain, task: Task, found: Solution) -> tuple[Array, Arra
     In units of the noise, the usual one where it is not known, and free of the
     parameters of which nothing is known.
     """
-    p = len(arm.names)
-    theta, free, precision = found.parameters[:p], task.free[:p], task.precision[:p]
+    theta, free, precision = found.parameters, task.free, task.precision
     white = task.white
     if not task.known:
         white = white / np.asarray(arm.default_noise().std)[:, None]
     white = white * np.sqrt(np.minimum(found.weights, 1.0))[:, None, None]
-    slopes = derivative(arm, task.commands, theta)
-    off = found.residuals[..., None] + slopes @ (theta - task.mean[:p])[:, None]
+    slopes = derivative(task.model, task.commands, theta)
+    off = found.residuals[..., None] + slopes @ (theta - task.mean)[:, None]
     right = (white @ off).ravel()
-    rows = (white @ slopes).reshape(len(right), p)
+    rows = (white @ slopes).reshape(len(right), -1)
     known = rows[:, free & (precision > 0.0)]
     known = known / np.sqrt(precision[free & (precision > 0.0)])
     flat = rows[:, free & (precision == 0.0)]

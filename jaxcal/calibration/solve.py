@@ -30,6 +30,7 @@ _LIMIT = 300  # iterations
 _PATIENCE = 20  # iterations whose gain together decides whether the search creeps
 _FLAT = 64.0 * float(np.finfo(np.float64).eps)  # of the largest derivative: rounding
 _WELL = 1e-6  # of the largest pivot: Cholesky's rounding is that of reflections
+_SHORT = 0.01  # gain of a step of a tenth of a standard deviation
 _LEAST_DAMPING = 1e-14  # keeps directions that nothing determines where they are
 
 
@@ -96,17 +97,21 @@ def student_weight(square: Array, q: int) -> Array:
     return np.asarray((NU + q) / (NU + q + square))
 
 
-def solve(task: Task, start: Solution | None = None) -> Solution:
+def solve(
+    task: Task, start: Solution | None = None, *, rough: bool = False
+) -> Solution:
     """The most probable parameters, from the prior's mean or from ``start``.
+
+    ``rough`` is to a hundredth of a standard deviation, for what another fit begins at.
 
     Raises:
         ValueError: the model fails at the start, a derivative is not finite, or the
             search does not converge.
     """
     if task.student and start is None:
-        start = solve(dataclasses.replace(task, student=False))
+        start = solve(dataclasses.replace(task, student=False), rough=True)
         start.weights = student_weight(start.deleted, start.left)
-    search = _Search(task, start)
+    search = _Search(task, start, rough)
     evidence: list[float] = []
     for _ in range(_LIMIT):
         evidence.append(search.evidence)
@@ -118,7 +123,8 @@ def solve(task: Task, start: Solution | None = None) -> Solution:
             gain = evidence[-_PATIENCE] - search.evidence
             asked = max(1e-3, 0.1 * (len(evidence) // 60))
             creeps = gain < max(asked, 1e-3 * search.cost)
-        if search.settle(100.0 if creeps else 1.0) and (done or creeps):
+        slack = 100.0 if rough or creeps else 1.0
+        if search.settle(slack) and (done or creeps):
             return search.solution()
     raise ValueError(
         f"identify did not converge in {_LIMIT} iterations: begin nearer, with "
@@ -134,8 +140,12 @@ def _times(matrices: Array, vectors: Array) -> Array:
 class _Search:
     """The state of a search, and its two moves: step (parameters), settle (levels)."""
 
-    def __init__(self, task: Task, start: Solution | None) -> None:
+    def __init__(self, task: Task, start: Solution | None, rough: bool) -> None:
         self.task = task
+        # 1e-6 standard deviations; 1e-5 where convergence is linear.
+        self.least = 1e-4 if rough else 1e-10 if task.student else 1e-12
+        self.linear = 0.0  # length of a step that did what its derivatives said
+        self.solved: tuple[Array, Array] | None = None  # hardly damped, in a step
         count, q = task.measured.shape
         self.uncertain = task.command_std > 0.0
         self.command_root = 1.0 / task.command_std[self.uncertain]  # 0: unknown
@@ -162,9 +172,12 @@ class _Search:
         task = self.task
         rows = derivative(task.model, self.commands, self.theta)
         rows = rows[..., task.free]
+        self.stale = False  # the residuals are those of the model at ``theta``
         largest = np.abs(rows).max(axis=(0, 1))
         flat = largest <= _FLAT * largest.max(initial=0.0)
-        self.by_theta = task.white @ np.where(flat, 0.0, rows)
+        self.known, self.more = facts(task.model, self.theta)
+        self.slopes = np.where(flat, 0.0, rows)
+        self.by_theta = task.white @ self.slopes
         if self.uncertain.any():
             inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
             rows = derivative(task.model, self.commands, self.theta, inputs)
@@ -183,16 +196,17 @@ class _Search:
     @property
     def cost(self) -> float:
         """Sum of squares of readings, commands and prior, weighted."""
-        return self._cost(self.residuals, self.theta, self.commands)
+        return self._cost(self.residuals, self.theta, self.commands, self.known)
 
     @property
     def evidence(self) -> float:
         """-2 log likelihood: the cost, and what a higher level of noise costs."""
         return self.cost + 2.0 * float(self.freedom @ np.log(self.level))
 
-    def _cost(self, residuals: Array, theta: Array, commands: Array) -> float:
-        off = (theta - self.task.mean) ** 2 @ self._precision()
-        off += (facts(self.task.model, theta)[0] ** 2).sum()
+    def _cost(
+        self, residuals: Array, theta: Array, commands: Array, known: Array
+    ) -> float:
+        off = (theta - self.task.mean) ** 2 @ self._precision() + known @ known
         return float(self.weights @ self._distance(residuals, commands) + off)
 
     def _reduce(self, damping: float) -> tuple[Array, Array]:
@@ -232,38 +246,60 @@ class _Search:
         weight = np.sqrt(self.weights)[:, None]
         rows, right = self._reduce(damping)
         rows = (weight[..., None] * rows).reshape(-1, len(root))
-        known, more = facts(self.task.model, self.theta)
-        rows = np.concatenate([rows, np.diag(root), more[:, free]])
+        rows = np.concatenate([rows, np.diag(root), self.more[:, free]])
         scale = np.sqrt((rows**2).sum(axis=0))
         scale = np.where(scale > 0.0, scale, 1.0)
         off = root * (self.task.mean - self.theta)[free]
         return (
             rows / scale,
-            np.concatenate([(weight * right).ravel(), off, known]),
+            np.concatenate([(weight * right).ravel(), off, self.known]),
             scale,
         )
 
     def step(self) -> bool:
-        """Move the parameters to a lower cost; True where they need not move."""
+        """Move the parameters to a lower cost; True where they need not move.
+
+        Short steps are taken on the last derivatives, where these held for the step
+        before; they are made anew before the search may end.
+        """
         task = self.task
         cost = self.cost
         while True:
             rows, right, scale = self._system(self.damping)
-            triangle, target = _triangle(rows, right, self.damping)
-            step = np.linalg.solve(triangle, target)
+            inverse, target = _factor(
+                rows, right, self.damping, 1 if self.linear else 2
+            )
+            self.solved = (rows, inverse) if self.damping < 1e-9 else None
+            step = inverse @ target
             rest = rows @ step - right
             gain = float(right @ right - rest @ rest)
-            # 1e-6 standard deviations; 1e-5 where convergence is linear.
-            if gain <= (1e-10 if task.student else 1e-12) + 1e-13 * cost:
-                return True
             theta = self.theta.copy()
             theta[task.free] += step / scale
+            if gain <= self.least + 1e-13 * cost:
+                if not self.stale:
+                    return True
+                self.theta = theta
+                self._refresh()
+                return False
+            if gain < _SHORT and np.linalg.norm(step) < self.linear:
+                self.residuals = self.residuals - self.slopes @ (step / scale)
+                self.known = self.known - self.more @ (theta - self.theta)
+                self.theta, self.stale = theta, True
+                self.damping = max(0.1 * self.damping, _LEAST_DAMPING)
+                return False
+            if self.stale:
+                self._refresh()
+                cost = self.cost
+                continue
             commands = self._moved(step / scale)
             residuals = task.measured - predict(
                 task.model, commands, theta, finite=False
             )
-            after = self._cost(residuals, theta, commands)
+            known, _ = facts(task.model, theta)
+            after = self._cost(residuals, theta, commands, known)
             ratio = (cost - after) / gain if np.isfinite(after) else -1.0
+            held = abs(ratio - 1.0) < 0.1 and not self.uncertain.any()
+            self.linear = held * float(np.linalg.norm(step))
             if ratio > 1e-4:
                 self.theta, self.commands, self.residuals = theta, commands, residuals
                 shrunk = self.damping * max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3)
@@ -280,6 +316,14 @@ class _Search:
                 return True
             self.damping *= self.grow
             self.grow *= 2.0
+
+    def _refresh(self) -> None:
+        """Residuals and derivatives of the model at the parameters reached."""
+        told = self.cost
+        predicted = predict(self.task.model, self.commands, self.theta)
+        self.residuals = self.task.measured - predicted
+        self.linear *= self.cost < told + _SHORT
+        self._linearise()
 
     def settle(self, slack: float) -> bool:
         """Weights and levels that follow from the residuals; True where they stay.
@@ -302,7 +346,7 @@ class _Search:
     def _estimate_levels(self) -> None:
         """Sums of squares over the degrees of freedom that they have."""
         task = self.task
-        readings, prior = self._leverage()
+        readings, prior = self._leverage(self.solved)
         if task.sized.any():
             left = (1.0 - (prior**2).sum(axis=1))[task.sized[task.free]].sum()
             found = np.sqrt(np.sum(self.theta[task.sized] ** 2) / max(left, 1e-6))
@@ -315,18 +359,27 @@ class _Search:
         square = self.weights @ _times(task.white, self.residuals) ** 2
         if not task.per_output or (freedom < 0.5).any():
             square, freedom = square.sum(), freedom.sum()
+        faster = 1.0
         if task.student:
             square = square / student_constants(self.left)[0]
-        level = np.maximum(np.sqrt(square / freedom), self.floor)
-        self.level = np.broadcast_to(level, self.level.shape)
+            # The weights follow the level: Newton's step takes both at once.
+            pulled = self.weights * self._distance(self.residuals, self.commands)
+            faster = pulled.sum() / max(pulled @ self.weights, 1e-300)
+        change = np.log(np.maximum(np.sqrt(square / freedom), self.floor) / self.level)
+        near = np.abs(change).max() < 0.3
+        self.level = self.level * np.exp(change * (faster if near else 1.0))
 
-    def _leverage(self) -> tuple[Array, Array]:
+    def _leverage(
+        self, solved: tuple[Array, Array] | None = None
+    ) -> tuple[Array, Array]:
         """Roots of the hat matrix: of the readings (N, R, F), the prior (F, F)."""
-        rows, right, _ = self._system(0.0)
-        triangle, _ = _triangle(rows, right, _LEAST_DAMPING)
-        root = np.asarray(np.linalg.solve(triangle.T, rows.T).T, dtype=np.float64)
+        if solved is None:
+            rows, right, _ = self._system(0.0)
+            solved = rows, _factor(rows, right, _LEAST_DAMPING, 2)[0]
+        rows, inverse = solved
+        root = rows @ inverse
         width, count = rows.shape[1], len(self.weights)
-        readings = len(root) - width - len(facts(self.task.model, self.theta)[0])
+        readings = len(root) - width - len(self.known)
         prior = root[readings : readings + width]
         return root[:readings].reshape(count, -1, width), prior
 
@@ -363,23 +416,27 @@ class _Search:
         )
 
 
-def _triangle(rows: Array, right: Array, damping: float) -> tuple[Array, Array]:
-    """R and ``Q.T right`` of the damped rows (R, F).
+def _factor(
+    rows: Array, right: Array, damping: float, passes: int
+) -> tuple[Array, Array]:
+    """The inverse of R and ``Q.T right`` of the damped rows (R, F).
 
     Cholesky twice (Yamamoto et al., 2015) is as exact as Householder's reflections
-    where it succeeds, and does not wait for BLAS's threads in every column.
+    where it succeeds, and does not wait for BLAS's threads in every column. Once is
+    enough where the next step makes good what rounding left.
     """
     width = rows.shape[1]
     whole = np.concatenate([rows, np.sqrt(damping) * np.eye(width)])
-    triangle, turned = np.eye(width), whole
+    inverse, turned = np.eye(width), whole
     try:
-        for _ in range(2):
+        for i in range(passes):
+            turned = whole @ inverse if i else whole
             root = np.linalg.cholesky(turned.T @ turned).T
             size = np.diagonal(root)
             if size.min(initial=np.inf) < _WELL * size.max(initial=0.0):
                 raise np.linalg.LinAlgError
-            turned = turned @ np.linalg.inv(root)
-            triangle = root @ triangle
+            inverse = inverse @ np.linalg.inv(root)
+        return inverse, inverse.T @ (rows.T @ right)
     except np.linalg.LinAlgError:
         turned, triangle = np.linalg.qr(whole)
-    return triangle, turned[: len(rows)].T @ right
+        return np.linalg.inv(triangle), turned[: len(rows)].T @ right

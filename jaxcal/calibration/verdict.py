@@ -70,8 +70,8 @@ def verdict(calibration: Fit) -> Verdict | None:
     commands, residuals = calibration.commands[used], calibration.residuals[used]
     usual = np.asarray(model.default_noise().std)
     size = usual / usual[0]  # readings of two units are compared in noise
-    errors = np.linalg.norm(_left_out(calibration, model, used) / size, axis=1)
-    measured = residuals + model.predict(commands, calibration.parameters)
+    errors = np.linalg.norm(_left_out(calibration, used) / size, axis=1)
+    measured = residuals + calibration.predict(commands)
     at = model.located(commands, measured)
     before = measured - at.predict(commands)
     for rows in _groups(at, commands):  # a socket's place is no merit of either
@@ -105,11 +105,11 @@ def verdict(calibration: Fit) -> Verdict | None:
     )
 
 
-def _left_out(calibration: Fit, model: SerialChain, used: NDArray[np.intp]) -> Array:
+def _left_out(calibration: Fit, used: NDArray[np.intp]) -> Array:
     """(N, q) residual of each measurement from the fit without it."""
     noise = np.diag(np.asarray(calibration.noise_std) ** 2)
-    slopes = model.jacobian(calibration.commands[used], calibration.parameters)
-    spread = slopes @ np.asarray(calibration.covariance) @ np.matrix_transpose(slopes)
+    slopes, covariance = calibration.linear(calibration.commands[used])
+    spread = slopes @ covariance @ np.matrix_transpose(slopes)
     # Of an outlier little was fitted: its weight says how much.
     share = np.minimum(calibration.loss_weights[used], 1.0)[:, None, None]
     root = np.linalg.inv(np.sqrt(noise))
@@ -242,14 +242,13 @@ def _swapped(calibration: Fit, model: SerialChain) -> dict[int, int]:
     if not (isinstance(sensor, Placed) and sensor.zeros and sensor.count > 1):
         return {}
     noise = np.asarray(calibration.noise_std)
+    at = np.array(list(calibration.outliers), dtype=np.intp)
     found: dict[int, int] = {}
-    for row in calibration.outliers:
-        command = calibration.commands[row]
-        for other in range(sensor.count):
-            trial = command.copy()
-            trial[model.num_joints] = other
-            predicted = model.predict(trial[None], calibration.parameters)[0]
-            there = other == command[model.num_joints]
-            if not there and np.abs(predicted / noise).max() < 4.0:
-                found[row] = other
-    return found
+    for other in range(sensor.count):
+        trial = calibration.commands[at]
+        there = trial[:, model.num_joints] == other
+        trial[:, model.num_joints] = other
+        off = calibration.predict(trial) / noise
+        fits = at[(np.abs(off).max(axis=1) < 4.0) & ~there]
+        found |= dict.fromkeys(fits.tolist(), other)
+    return dict(sorted(found.items()))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import pathlib
 import signal
 import sys
@@ -13,7 +14,6 @@ from jaxcal.arguments import Parser, refused
 from jaxcal.commands import evaluate_task
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder
-from jaxcal.learning.runtime import processes
 
 if TYPE_CHECKING:
     from jaxcal.evaluation.results import Evaluation, Summary
@@ -38,33 +38,23 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
     given = list(sys.argv[1:] if argv is None else argv)
     command = ["python", prog] if prog.endswith(".py") else prog.split()
     of_task = any(word.partition("=")[0] == "--task" for word in given)
-
-    def alone() -> int:  # this process may be one of several
-        kept, before = "nothing was written", signal.signal(signal.SIGTERM, _terminate)
-        try:
-            options = _parser(of_task, prog, " ".join(command)).parse_args(given)
-            options.command = [*command, *given]
-            if of_task:
-                evaluate_task.run(options)
-                return 0
-            if options.stream is not None:
-                kept = "finished parts are kept; the same command goes on"
-            _run(options)
-        except KeyboardInterrupt as stop:
-            terminated = isinstance(stop, _Terminated)
-            how = "terminated" if terminated else "interrupted"
-            print(f"{prog}: {how}, {kept}", file=sys.stderr)
-            return EXIT_TERMINATED if terminated else EXIT_INTERRUPTED
-        except (ValueError, OSError, MissingExtraError) as error:
-            return refused(prog, error)
-        finally:
-            signal.signal(signal.SIGTERM, before)
-        return 0
-
-    if of_task:
-        return alone()
-    advice = "finished parts stay: start every process again"
-    return processes.run_job(prog, given, alone, advice)
+    kept, before = "nothing was written", signal.signal(signal.SIGTERM, _terminate)
+    try:
+        options = _parser(of_task, prog, " ".join(command)).parse_args(given)
+        options.command = [*command, *given]
+        if not of_task and options.stream is not None:
+            kept = "finished parts are kept; the same command goes on"
+        (evaluate_task.run if of_task else _run)(options)
+    except KeyboardInterrupt as stop:
+        terminated = isinstance(stop, _Terminated)
+        how = "terminated" if terminated else "interrupted"
+        print(f"{prog}: {how}, {kept}", file=sys.stderr)
+        return EXIT_TERMINATED if terminated else EXIT_INTERRUPTED
+    except (ValueError, OSError, MissingExtraError) as error:
+        return refused(prog, error)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    return 0
 
 
 def _parser(of_task: bool, prog: str, typed: str) -> Parser:
@@ -138,8 +128,6 @@ def _whole(
     from jaxcal.evaluation.methods import evaluate
     from jaxcal.paper.datasets import catalogue
 
-    if _process()[1] > 1:
-        raise ValueError("several processes can share an evaluation with --stream only")
     datasets = [
         catalogue.load(
             name,
@@ -168,8 +156,8 @@ def _whole(
 def _streamed(
     options: argparse.Namespace, progress: Progress
 ) -> Iterator[tuple[Summary, None]]:
-    """One dataset in parts; of several processes the first has the totals."""
-    from jaxcal.evaluation.stream import Plan, evaluate_stream, open_folder
+    """One dataset in parts."""
+    from jaxcal.evaluation.stream import evaluate_stream
     from jaxcal.paper.datasets.datasets import drawn
 
     whole = {
@@ -185,46 +173,18 @@ def _streamed(
         )
     if options.episodes is None:
         raise ValueError("--stream needs --episodes")
-    plan = Plan(
-        options.dataset[0],
-        drawn,
-        seed=options.seed,
-        k=options.k,
-        methods=options.methods,
-        checkpoints=tuple(options.checkpoint),
-        num=options.num,
-        draws=options.draws,
-    )
-    process = _process()
-    if process[1] > 1:
-        from jaxcal.learning.runtime import devices
-
-        devices.on_first(lambda: open_folder(plan, options.stream))
-    else:
-        open_folder(plan, options.stream)
-    if not (options.stream / "stream.json").exists():
-        raise ValueError(
-            f"--stream {options.stream} must be a folder that all processes see; "
-            f"process {process[0]} does not"
-        )
-    found = evaluate_stream(
-        plan,
-        options.episodes,
-        options.stream,
-        workers=options.workers,
-        process=process,
-        progress=progress,
-    )
-    if process[0] == 0:
-        yield found, None
-
-
-def _process() -> tuple[int, int]:
-    """Which process this is, and of how many; one that holds no JAX is alone."""
-    jax = sys.modules.get("jax")
-    if jax is None or not jax.distributed.is_initialized():
-        return 0, 1
-    return jax.process_index(), jax.process_count()
+    (name,) = options.dataset
+    plan = {
+        "dataset": name,
+        "seed": options.seed,
+        "k": options.k,
+        "methods": options.methods,
+        "checkpoints": options.checkpoint,
+        "num": options.num,
+        "random_draws": options.draws,
+    }
+    draw = functools.partial(drawn, name, options.seed)
+    yield evaluate_stream(draw, options.episodes, options.stream, plan, progress), None
 
 
 def _check_outputs(options: argparse.Namespace) -> None:
@@ -232,8 +192,6 @@ def _check_outputs(options: argparse.Namespace) -> None:
     evaluate_task.require_outputs(options)
     if options.stream is not None:
         require_writable_folder(options.stream)
-    if options.workers is not None and options.stream is None:
-        raise ValueError("--workers needs --stream")
     for folder in options.run:
         if not (folder / "metrics.csv").is_file():
             raise ValueError(f"--run {folder} holds no metrics.csv")

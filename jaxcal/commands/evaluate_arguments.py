@@ -7,7 +7,6 @@ from typing import Any
 
 from jaxcal.arguments import Parser, at_least, flag, seconds, several
 from jaxcal.evaluation.methods import DEFAULT_METHODS
-from jaxcal.learning.runtime import processes
 
 __all__ = ["parser"]
 
@@ -57,7 +56,7 @@ examples:
       deciders of sequential measurement; {program} --task knee --help
   {program} --stream runs/ten_million --episodes 10000000
       any number of episodes in constant memory; the same command resumes where it
-      stopped; under srun, or with --coordinator, many processes share the work
+      stopped; started again beside it, on any machine, it shares the work
 """
 
 
@@ -82,15 +81,11 @@ _FLAGS = (
          "DIR", Path, **_MANY),
     flag("--stream", "evaluate in parts kept in DIR: any number of --episodes, "
          "resumable", "DIR", Path),
-    flag("--workers", "processes of --stream; one for each core", "N", at_least(1)),
     flag("--quiet", "no progress", on=True),
 )  # fmt: skip
 
 
 def parser(program: str, typed: str) -> Parser:
     """The parser: ``program`` begins a message, ``typed`` an example of the help."""
-    out = Parser(
-        prog=program, description=_DESCRIPTION, epilog=_EPILOG.format(program=typed)
-    )
-    processes.add_arguments(out.with_flags(_FLAGS))
-    return out
+    about, more = _DESCRIPTION, _EPILOG.format(program=typed)
+    return Parser(prog=program, description=about, epilog=more).with_flags(_FLAGS)

@@ -7,6 +7,7 @@ measurement of a task (``--task``); they differ in what is read from the flags.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import datetime
 import pathlib
@@ -66,6 +67,8 @@ def _run(arguments: argparse.Namespace) -> int:
     out = pathlib.Path(arguments.out or f"runs/{named}")
     if arguments.export and not arguments.export.endswith(".npz"):
         raise ValueError(f"--export must be a file NAME.npz, got {arguments.export}")
+    if (seeds := _num_seeds(arguments, out)) > 1:
+        devices.a_device_for_each_core(seeds)
     configuration = _task_configuration if arguments.task else _configuration
     config: Any = devices.on_first(lambda: configuration(arguments, out))
     stop = _stop_on_signals()
@@ -121,8 +124,8 @@ def _train(
         from jaxcal.learning.training import postures as trainer
         from jaxcal.selection.teacher import fixed_validation, teacher
 
-        mesh = devices.make_mesh(arguments.devices)
-        devices.require_divisible(config.ppo.rows_per_minibatch, mesh)
+        rows = config.ppo.rows_per_minibatch
+        mesh = devices.make_mesh(rows, arguments.devices, config.num_seeds)
         schema, unit, columns = checkpoint.SCHEMA, "episodes", _POSTURES
         told = _introduction(config, out, devices.describe(mesh))
         more = {"validation": None, "teacher": teacher}
@@ -143,6 +146,19 @@ def _train(
     if first:
         _compare_seeds(out, config, trainer.MEASURED, schema)
     return int(np.ravel(state.num_updates)[0])
+
+
+def _num_seeds(arguments: argparse.Namespace, out: pathlib.Path) -> int:
+    """Of the run to begin or to go on with; what is wrong is refused later."""
+    from jaxcal.adaptive.policy.run import SCHEMA
+    from jaxcal.learning.training import checkpoint
+
+    if not arguments.resume:
+        return arguments.num_seeds or 1
+    schema = SCHEMA if arguments.task else checkpoint.SCHEMA
+    with contextlib.suppress(checkpoint.CheckpointError):
+        return int(checkpoint.read_meta(out, schema)[1]["num_seeds"])
+    return 1
 
 
 # -- what to train ---------------------------------------------------------------------

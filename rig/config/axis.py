@@ -15,7 +15,7 @@ DEFAULT_ROTATES = {"pitch": "X", "yaw": "Z", "roll": "Y"}
 ROUNDING = 1e-9  # of a product that is a whole number of counts but for its last bits
 LOWEST, HIGHEST = -(2**31), 2**31 - 1
 
-Pulses = tuple[int, int, int]  # of pitch, yaw and roll
+Pulses = tuple[int, ...]  # (3,) of pitch, yaw and roll
 
 
 class Scale(Section):

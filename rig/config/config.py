@@ -37,7 +37,7 @@ UNMEASURED = {
     "imu": ("host", "port", "transport", "allow", "stale_s", "heading"),
     "motion": (
         "poll_s", "deadline_factor", "deadline_slack_s", "stall_s", "following_deg",
-        "envelope_margin_deg", "max_disagreement_deg", "heartbeat_s", "mirror_limits",
+        "envelope_margin_deg", "max_disagreement_deg", "mirror_limits",
     ),
     "settle": ("timeout_s",),
     "session": ("verify_limit_deg", "reference_tolerance_deg", "max_unreachable"),
@@ -119,10 +119,9 @@ class RigConfig(Section):
         return self._folder / self.device
 
     @property
-    def letters(self) -> tuple[str, str, str]:
+    def letters(self) -> tuple[str, ...]:
         """Axis letters of pitch, yaw and roll."""
-        a, b, c = (axis.rotates for axis in self.axes)
-        return a, b, c
+        return tuple(axis.rotates for axis in self.axes)
 
     @property
     def ranges(self) -> tuple[tuple[float, float], ...]:
@@ -159,8 +158,7 @@ class RigConfig(Section):
         first, and the pause between polls; POLLS of these are allowed for, and a
         computer that pauses for HICCUP_S.
         """
-        longest = max(POLLS * self.motion.poll_s, HICCUP_S) + 2.0 * self.bus.timeout_s
-        return self.motion.heartbeat_s or longest
+        return max(POLLS * self.motion.poll_s, HICCUP_S) + 2.0 * self.bus.timeout_s
 
     @property
     def comm_timeouts_s(self) -> dict[str, float]:
@@ -182,11 +180,8 @@ class RigConfig(Section):
 
     def to_pulses(self, angles_deg: Any) -> Pulses:
         """Whole pulses of (3,) degrees."""
-        a, b, c = (
-            axis.to_pulses(float(angle))
-            for axis, angle in zip(self.axes, angles_deg, strict=True)
-        )
-        return a, b, c
+        each = zip(self.axes, angles_deg, strict=True)
+        return tuple(axis.to_pulses(float(angle)) for axis, angle in each)
 
     def to_deg(self, pulses: Any) -> "NDArray[np.float64]":
         """(..., 3) degrees of (..., 3) pulses."""
@@ -244,13 +239,7 @@ class RigConfig(Section):
 
     def broken_rules(self) -> Iterator[str]:
         motion, session = self.motion, self.session
-        slowest, shortest = self._slowest_read_s, self.shortest_step_s
-        if motion.heartbeat_s is not None and motion.heartbeat_s > shortest:
-            yield (
-                "motion.heartbeat_s: must not exceed the shortest step, "
-                f"{shortest:.3g} s (max_step_deg at an axis's speed), got "
-                f"{motion.heartbeat_s:g}; leave it out to have it computed"
-            )
+        slowest = self._slowest_read_s
         overshoot = motion.approach_overshoot_deg
         if session.k >= session.candidates:
             yield f"session.k: must be under candidates ({session.candidates})"

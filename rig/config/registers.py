@@ -8,19 +8,24 @@ from pydantic import BeforeValidator, Field, PlainValidator, WithJsonSchema
 
 from rig.config.schema import Section, key
 
-FORMATS = {"u16": ">H", "i16": ">h", "u32": ">I", "i32": ">i"}  # of struct
-VALUES = ("position", "speed", "accel", "decel", "timeout", "min", "max", "home")
 Kind = Literal["u16", "i16", "u32", "i32"]
+FORMATS: dict[Kind, str] = {
+    "u16": ">H",
+    "i16": ">h",
+    "u32": ">I",
+    "i32": ">i",
+}  # of struct
+VALUES = ("position", "speed", "accel", "decel", "timeout", "min", "max", "home")
 
 
 class Word(NamedTuple):
     """What a frame has at one place: one or two registers."""
 
     value: int | str  # a constant, or one of VALUES
-    kind: str = "u16"
+    kind: Kind = "u16"
 
 
-def encode(value: int, kind: str, word_order: str) -> list[int]:
+def encode(value: int, kind: Kind, word_order: str) -> list[int]:
     """Registers of a value; ValueError where it does not fit the type."""
     try:
         data = struct.pack(FORMATS[kind], value)
@@ -30,13 +35,13 @@ def encode(value: int, kind: str, word_order: str) -> list[int]:
     return words if word_order == "big" else words[::-1]
 
 
-def decode(words: list[int], kind: str, word_order: str) -> int:
+def decode(words: list[int], kind: Kind, word_order: str) -> int:
     """Value of one or two registers."""
     ordered = words if word_order == "big" else words[::-1]
     return struct.unpack(FORMATS[kind], struct.pack(f">{len(words)}H", *ordered))[0]
 
 
-def registers_of(kind: str) -> int:
+def registers_of(kind: Kind) -> int:
     """Registers that a type takes."""
     return struct.calcsize(FORMATS[kind]) // 2
 
@@ -45,8 +50,9 @@ def _word(word: Any) -> Word:
     if type(word) is int and 0 <= word <= 0xFFFF:
         return Word(word)
     name, _, kind = str(word).partition(":")
-    if isinstance(word, str) and name in VALUES and kind in FORMATS:
-        return Word(name, kind)
+    known: dict[str, Kind] = {each: each for each in FORMATS}
+    if isinstance(word, str) and name in VALUES and kind in known:
+        return Word(name, known[kind])
     raise ValueError(
         f"must be 0..65535 or NAME:TYPE with NAME of {', '.join(VALUES)} and TYPE of "
         f"{', '.join(FORMATS)}, got {word!r}"
@@ -144,6 +150,14 @@ class Write(Section):
     def count(self) -> int:
         return _registers(self.words)
 
+    def registers(self, word_order: str, **values: int) -> list[int]:
+        """What the frame holds, with the values that its words name."""
+        found = []
+        for value, kind in self.words:
+            number = values[value] if isinstance(value, str) else value
+            found += encode(number, kind, word_order)
+        return found
+
     def places(self) -> Iterator[tuple[int, Word]]:
         """Every word with its address."""
         address = self.address
@@ -167,7 +181,7 @@ class Writes(Section):
 
     write: Annotated[tuple[Write, ...], Field(min_length=1)]
 
-    def place_of(self, name: str) -> tuple[int, str] | None:
+    def place_of(self, name: str) -> tuple[int, Kind] | None:
         """Address and type of a named value, or None where no frame holds it."""
         places = (place for frame in self.write for place in frame.places())
         return next(((a, w.kind) for a, w in places if w.value == name), None)

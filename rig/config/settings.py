@@ -162,10 +162,6 @@ class MotionSettings(Section):
     max_disagreement_deg: float = advanced(
         "between IMU and command at a posture", 45.0, 0.1, 180
     )
-    heartbeat_s: float | None = advanced(
-        "a motion loop silent for so long: stop; at most the shortest step",
-        "of [bus] and poll_s", 0.1, 60, by=lambda made: None,
-    )  # fmt: skip
     mirror_limits: bool = advanced("write the soft limits to the drives too", False)
 
 

@@ -69,7 +69,7 @@ class Frame:
     zero: Array  # (3, 3) R0, attitude of the phone in the zero posture
     mounting: Array  # (3, 3) R_EP, phone to end-effector
     order: str  # axes of the mechanism from the base outwards
-    letters: tuple[str, str, str]  # axis letter of pitch, yaw and roll
+    letters: tuple[str, ...]  # axis letter of pitch, yaw and roll
 
     def angles(self, matrix: ArrayLike, order: str | None = None) -> Array:
         """(..., 3) pitch, yaw and roll in degrees of phone attitudes (..., 3, 3)."""

@@ -24,11 +24,6 @@ from rig.core.faults import Fault
 
 METHODS = {3: "read_holding_registers", 6: "write_register", 16: "write_registers"}
 TURNAROUND_S = 0.05  # for the units to act on a broadcast, which none answers
-EXCEPTIONS = {
-    1: "illegal function", 2: "illegal address", 3: "illegal value",
-    4: "device failure", 5: "acknowledge", 6: "busy", 8: "CRC or parity",
-    10: "no gateway path", 11: "gateway target silent",
-}  # fmt: skip
 GATEWAY_CODES = (10, 11)  # the unit behind the gateway is silent
 PROBES = 6  # questions of another length to a unit whose replies come late
 LATEST_S = 10.0  # no gateway keeps a reply for so long
@@ -41,9 +36,15 @@ class BusError(Fault):
 class Rejected(BusError):
     """The drive answered with an exception."""
 
-    def __init__(self, text: str, code: int) -> None:
+    def __init__(self, unit: int, code: int, address: int) -> None:
+        from pymodbus.constants import ExcCodes
+
         self.code = code
-        super().__init__(text)
+        name = next((each.name for each in ExcCodes if each == code), "unknown")
+        name = name.lower().replace("_", " ")
+        super().__init__(
+            f"unit {unit} answered exception {code} ({name}) at 0x{address:04X}"
+        )
 
 
 class Bus:
@@ -78,29 +79,20 @@ class Bus:
 
         logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
         s = self.settings
-        if s.transport == "rtu":
-            return ModbusSerialClient(
-                s.device, framer=FramerType.RTU, baudrate=s.baudrate,
-                parity=s.parity, stopbits=s.stopbits, bytesize=s.bytesize,
-                timeout=s.timeout_s, retries=0,
-            )  # fmt: skip
-        framer = FramerType.SOCKET if s.transport == "tcp" else FramerType.RTU
-        return ModbusTcpClient(
-            s.host, port=s.port, framer=framer, timeout=s.timeout_s, retries=0
-        )
+        how: dict[str, Any] = {"timeout": s.timeout_s, "retries": 0}
+        how["framer"] = FramerType.SOCKET if s.transport == "tcp" else FramerType.RTU
+        if s.transport != "rtu":
+            return ModbusTcpClient(s.host, port=s.port, **how)
+        line = s.model_dump(include={"baudrate", "parity", "stopbits", "bytesize"})
+        return ModbusSerialClient(s.device, **line, **how)
 
     def open(self) -> Bus:
         """Open the port; BusError where it is absent, refused or held by another."""
         with self._lock:
-            hint = ""
-            try:
-                self._client = self._client or self._make_client()
-                if not self._client.connect():
-                    hint = _why_closed(self.settings)
-            except RuntimeError as error:  # pymodbus without pyserial
-                hint = " ".join(str(error).split())
-            if hint:
-                raise BusError(f"cannot open {self.settings.where}: {hint}")
+            self._client = self._client or self._make_client()
+            if not self._client.connect():
+                why = _why_closed(self.settings)
+                raise BusError(f"cannot open {self.settings.where}: {why}")
         return self
 
     def close(self) -> None:
@@ -146,23 +138,22 @@ class Bus:
             Rejected: the drive answered with an exception, every time.
         """
         tries = 1 + (self.settings.read_retries if retries is None else retries)
-        left = tries
-        while True:
-            left -= 1
+        for left in reversed(range(tries)):
             try:
                 self._catch_up(unit, address)
                 words = self._read(unit, address, count)
-                if len(words) != count:
-                    raise BusError(
-                        f"unit {unit}: asked for {count} registers at 0x{address:04X}, "
-                        f"got {len(words)}"
-                    )
-                self._readable[unit] = address
-                return words
+                if len(words) == count:
+                    self._readable[unit] = address
+                    return words
+                raise BusError(
+                    f"unit {unit}: asked for {count} registers at 0x{address:04X}, "
+                    f"got {len(words)}"
+                )
             except BusError as error:
                 if not left:
                     error.args = (f"{error} (tried {tries} times)",)
                     raise
+        raise AssertionError("unreachable")
 
     def write(self, unit: int, address: int, function: int, words: list[int]) -> None:
         """Write registers once. Never retried: a lost reply may hide a started move.
@@ -174,30 +165,21 @@ class Bus:
         self._emit(unit, address, words)
         if not self._urgent:  # an acknowledgement of a stop tells of a stop, also late
             self._catch_up(unit, self._readable.get(unit))
-        try:
-            if function == 6:
-                reply = self._exchange(6, unit, address, words[0])
-                echoed = list(getattr(reply, "registers", [])) == words
-            else:
-                reply = self._exchange(16, unit, address, words)
-                echoed = getattr(reply, "count", None) == len(words)
-            if not echoed or getattr(reply, "address", None) != address:
-                raise BusError(f"unit {unit}: the reply to a write does not echo it")
-        except BusError as error:
-            self._resynchronise(error, unit, 0)
-            raise
+        reply = self._exchange(function, unit, address, words)
+        echoed = (
+            list(reply.registers) == words
+            if function == 6
+            else reply.count == len(words)
+        )
+        if not echoed or reply.address != address:
+            self._resynchronise(unit, 0)
+            raise BusError(f"unit {unit}: the reply to a write does not echo it")
 
     def _read(self, unit: int, address: int, count: int) -> list[int]:
         """The registers of one reply, of any number."""
-        try:
-            words = list(
-                getattr(self._exchange(3, unit, address, count=count), "registers", [])
-            )
-        except BusError as error:
-            self._resynchronise(error, unit, count)
-            raise
+        words = list(self._exchange(3, unit, address, count).registers)
         if len(words) != count:  # of an earlier question: this one's may still come
-            self._resynchronise(BusError(), unit, count)
+            self._resynchronise(unit, count)
         return words
 
     def _catch_up(self, unit: int, address: int | None) -> None:
@@ -210,7 +192,9 @@ class Bus:
             BusError: it is silent, or what it says is always the answer to another.
         """
         address = self._readable.get(unit, address)
-        for _ in range(PROBES if address is not None else 0):
+        if address is None:
+            return
+        for _ in range(PROBES):
             recent = time.monotonic() - LATEST_S
             owed = [one for one in self._owed.get(unit, []) if one[1] > recent]
             self._owed[unit] = owed
@@ -219,7 +203,7 @@ class Bus:
             lengths = [length for length, _ in owed]
             count = next(n for n in range(1, 99) if n not in lengths)
             try:
-                found = len(self._read(unit, int(address or 0), count))
+                found = len(self._read(unit, address, count))
             except Rejected:  # or the oldest was answered like this
                 del owed[0]
                 owed.append((count, time.monotonic()))
@@ -228,15 +212,14 @@ class Bus:
                 owed.clear()
             elif found in lengths:
                 del owed[: lengths.index(found) + 1]
-        if self._owed.get(unit) and address is not None:
+        if self._owed.get(unit):
             raise BusError(f"unit {unit}: its replies come too late to be told apart")
 
     def broadcast(self, address: int, function: int, words: list[int]) -> None:
         """Write registers of every unit on a serial line; no unit answers."""
         self._emit(0, address, words)
-        value = words[0] if function == 6 else words
         with self._lock:
-            self._send(function, 0, address, value, no_response_expected=True)
+            self._send(function, 0, address, words, no_response_expected=True)
             self._quiet_until += TURNAROUND_S
 
     def _emit(self, unit: int, address: int, words: list[int]) -> None:
@@ -247,32 +230,43 @@ class Bus:
         else:
             self._tell("write", **fields)
 
-    def _exchange(
-        self, function: int, unit: int, address: int, *args: Any, **more: Any
-    ) -> Any:
+    def _exchange(self, function: int, unit: int, address: int, asked: Any) -> Any:
+        """The reply to one request, for a number of registers or with words to write.
+
+        Where none is valid, the line is emptied before BusError is raised.
+        """
         with self._lock:
             if not self._urgent:
                 self.check()  # holding the lock: nothing is sent after another's stop
             self.silent.add(unit)
-            reply = self._send(function, unit, address, *args, **more)
-            if reply is None or reply.dev_id != unit:
-                raise BusError(f"unit {unit}: the reply is from another unit")
-            code = int(getattr(reply, "exception_code", 0))
-            if code not in GATEWAY_CODES:
-                self.silent.discard(unit)
-        if reply.isError():
-            name = EXCEPTIONS.get(code, "unknown")
-            text = f"unit {unit} answered exception {code} ({name}) at 0x{address:04X}"
-            raise Rejected(text, code)
-        if reply.function_code != function:
-            raise BusError(f"unit {unit}: a reply of function {reply.function_code}")
-        return reply
+            try:
+                reply = self._send(function, unit, address, asked)
+                if reply is None or reply.dev_id != unit:
+                    raise BusError(f"unit {unit}: the reply is from another unit")
+                code = reply.exception_code if reply.isError() else 0
+                if code not in GATEWAY_CODES:
+                    self.silent.discard(unit)
+                if code:
+                    raise Rejected(unit, code, address)
+                if reply.function_code != function:
+                    given = reply.function_code
+                    raise BusError(f"unit {unit}: a reply of function {given}")
+            except Rejected:
+                raise  # a refusal is a whole reply
+            except BusError:
+                self._resynchronise(unit, asked if function == 3 else 0)
+                raise
+            return reply
 
     def _send(
-        self, function: int, unit: int, address: int, *args: Any, **more: Any
+        self, function: int, unit: int, address: int, asked: Any, **more: Any
     ) -> Any:
         if self._client is None:
             self.open()
+        if function == 3:
+            more["count"] = asked
+        else:
+            more |= {"value": asked[0]} if function == 6 else {"values": asked}
         time.sleep(max(0.0, self._quiet_until - time.monotonic()))
         try:
             # Connecting, where it is lost, may take as long as configured.
@@ -281,7 +275,7 @@ class Bus:
                 raise ConnectionError("cannot connect")
             self._client.comm_params.timeout_connect = self._timeout_s
             send = getattr(self._client, METHODS[function])
-            return send(address, *args, device_id=unit, **more)
+            return send(address, device_id=unit, **more)
         except Exception as error:
             # pymodbus lets struct, index and socket errors of mangled frames out.
             text = " ".join(f"{type(error).__name__}: {error}".split())
@@ -291,19 +285,17 @@ class Bus:
         finally:
             self._quiet_until = time.monotonic() + self.silence_s
 
-    def _resynchronise(self, error: BusError, unit: int, owed: int) -> None:
+    def _resynchronise(self, unit: int, owed: int) -> None:
         """Empty the line; a reply of ``owed`` registers of the unit may still come."""
         with self._lock:
-            if self._client is None or isinstance(error, Rejected):
-                return  # a refusal is a whole reply
+            if self._client is None:
+                return
             if self.settings.transport != "tcp":
                 known = self._owed.setdefault(unit, [])
                 known.append((owed, time.monotonic()))
-            if self.settings.transport != "rtu":
-                self._client.close()  # the next request connects again
-                return
             port = self._client.socket
-            if port is None:
+            if self.settings.transport != "rtu" or port is None:
+                self._client.close()  # the next request connects again
                 return
             gap = max(0.02, 20 * 11.0 / self.settings.baudrate, self.silence_s)
             end = time.monotonic() + 2 * self._timeout_s

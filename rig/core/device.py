@@ -11,22 +11,22 @@ import dataclasses
 import math
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
 
 import numpy as np
 
 from rig.config.axis import Pulses
 from rig.config.config import RigConfig
-from rig.config.registers import decode, registers_of
+from rig.config.registers import Read
 from rig.core.attitude import Array, Frame
 from rig.core.bus import Bus, BusError, Rejected
 from rig.core.drive import Drive, Status
 from rig.core.faults import LimitError, MotionFault, Requests, StopRequested
-from rig.core.phone import Imu, ImuError
+from rig.core.phone import Imu
 from rig.core.proof import Proof
 from rig.core.stop import Stopper
-from rig.journal import DeviceRecord, RunFolder
+from rig.journal import DeviceRecord, Record, RunFolder
 
 
 class Posture(NamedTuple):
@@ -34,22 +34,6 @@ class Posture(NamedTuple):
 
     name: str
     pulses: Pulses  # of pitch, yaw and roll
-
-
-def outside(config: RigConfig, target: Pulses) -> Iterator[str]:
-    """What of (3,) pulses leaves its limits, in words."""
-    for axis, pulses in zip(config.axes, target, strict=True):
-        angle = axis.to_deg(pulses)
-        rounding = 0.51 / abs(axis.pulses_per_deg)
-        if not (
-            axis.min_pulses <= pulses <= axis.max_pulses
-            and axis.min_deg - rounding <= angle <= axis.max_deg + rounding
-        ):
-            yield (
-                f"{axis.name} to {pulses} pulses ({angle:.3f} deg), limits "
-                f"{axis.min_pulses}..{axis.max_pulses} pulses and "
-                f"{axis.min_deg:g}..{axis.max_deg:g} deg"
-            )
 
 
 def approach(config: RigConfig, target: Pulses) -> list[Pulses]:
@@ -62,8 +46,19 @@ def approach(config: RigConfig, target: Pulses) -> list[Pulses]:
 
 def check_plan(config: RigConfig, targets: Iterable[Pulses]) -> None:
     """LimitError lists each target, or point it is approached from, that is outside."""
-    points = (point for target in targets for point in approach(config, target))
-    faults = [fault for point in points for fault in outside(config, point)]
+    faults = []
+    for point in (point for target in targets for point in approach(config, target)):
+        for axis, pulses in zip(config.axes, point, strict=True):
+            angle, rounding = axis.to_deg(pulses), 0.51 / abs(axis.pulses_per_deg)
+            if not (
+                axis.min_pulses <= pulses <= axis.max_pulses
+                and axis.min_deg - rounding <= angle <= axis.max_deg + rounding
+            ):
+                faults.append(
+                    f"{axis.name} to {pulses} pulses ({angle:.3f} deg), limits "
+                    f"{axis.min_pulses}..{axis.max_pulses} pulses and "
+                    f"{axis.min_deg:g}..{axis.max_deg:g} deg"
+                )
     if faults:
         raise LimitError("the plan leaves the limits: " + "; ".join(faults))
 
@@ -80,18 +75,12 @@ class Heartbeat(threading.Thread):
     plan computes or writes, when nothing moves.
     """
 
-    def __init__(
-        self,
-        stopper: Stopper,
-        requests: Requests,
-        silence_s: float,
-        keep_alive_s: float,
-    ) -> None:
+    def __init__(self, stopper: Stopper, requests: Requests, config: RigConfig) -> None:
         super().__init__(name="heartbeat", daemon=True)
         self._requests = requests
         self._stopper = stopper
-        self._silence_s = silence_s
-        self._keep_alive_s = keep_alive_s
+        self._silence_s = config.heartbeat_s
+        self._keep_alive_s = min(config.comm_timeouts_s.values(), default=math.inf) / 4
         self._moving = False
         self._fed = time.monotonic()
         self._closing = threading.Event()
@@ -116,7 +105,7 @@ class Heartbeat(threading.Thread):
             if self._moving and silence > self._silence_s:
                 self._stopper.stop(f"heartbeat lost for {silence:.2f} s while moving")
                 return
-            if not self._moving and self._keep_alive_s and silence > self._keep_alive_s:
+            if not self._moving and silence > self._keep_alive_s:
                 for drive in self._stopper.drives:
                     # The plan's own reads find what is wrong.
                     with contextlib.suppress(BusError, StopRequested):
@@ -131,17 +120,11 @@ class LineWatch:
     can put it back for one that was killed.
     """
 
-    def __init__(
-        self,
-        drives: list[Drive],
-        timeouts_s: Mapping[str, float],
-        emit: Callable[..., Any],
-        left: Mapping[str, Mapping[str, Any]],
-    ) -> None:
-        self._watched = [drive for drive in drives if drive.axis.name in timeouts_s]
-        self._timeouts_s = timeouts_s
-        self._emit = emit
-        self._left = left
+    def __init__(self, drives: list[Drive], run: RunFolder) -> None:
+        self._timeouts_s = run.config.comm_timeouts_s
+        self._drives = [d for d in drives if d.axis.name in self._timeouts_s]
+        self._emit = run.emit
+        self._left = timeouts_left(run.journal.records)
         self._before: dict[str, int] = {}
 
     def apply(self) -> None:
@@ -151,28 +134,25 @@ class LineWatch:
             MotionFault: a register cannot be read, so it could not be put back.
             BusError: no valid reply.
         """
-        for drive in self._watched:
-            axis, watch = drive.axis, drive.axis.map.comm_timeout
+        for drive in self._drives:
+            name, watch = drive.axis.name, drive.axis.map.comm_timeout
             assert watch is not None
-            address, kind = watch.place_of("timeout") or (watch.write[0].address, "u16")
-            order = axis.map.word_order
+            place = watch.place_of("timeout") or (watch.write[0].address, "u16")
             try:
-                words = drive.bus.read_words(axis.unit, address, registers_of(kind))
+                before = drive.read(Read(address=place[0], type=place[1]))
             except Rejected as error:
                 raise MotionFault(
-                    f"{axis.name}: its communication timeout cannot be read, so it "
-                    f"could not be put back: {error}. Correct [comm_timeout] of the "
-                    f"map {axis.map.name}, or leave it out"
+                    f"{name}: its communication timeout cannot be read, so it could "
+                    f"not be put back: {error}. Correct [comm_timeout] of the map "
+                    f"{drive.axis.map.name}, or leave it out"
                 ) from None
-            before = decode(words, kind, order)
-            counts = max(1, math.ceil(self._timeouts_s[axis.name] * watch.per_s - 1e-9))
-            left = self._left.get(axis.name)
+            counts = max(1, math.ceil(self._timeouts_s[name] * watch.per_s - 1e-9))
+            left = self._left.get(name)
             if left and before == left["counts"]:  # a killed session's, not the drive's
                 before = left["before"]
-            self._emit(
-                "comm_timeout", sync=True, axis=axis.name, before=before, counts=counts
-            )
-            self._before[axis.name] = before
+            lent = {"axis": name, "before": before, "counts": counts}
+            self._emit("comm_timeout", sync=True, **lent)
+            self._before[name] = before
             drive.write(watch, timeout=counts)
 
     def restore(self, standing: set[str]) -> None:
@@ -180,27 +160,23 @@ class LineWatch:
 
         A drive that was not seen to stand keeps its timeout: it stops itself.
         """
-        for drive in self._watched:
-            name = drive.axis.name
-            if name not in self._before:
+        for drive in self._drives:
+            name, error = drive.axis.name, "not seen standing"
+            if (counts := self._before.pop(name, None)) is None:
                 continue
-            error = "not seen standing"
             if name in standing:
                 try:
                     with drive.bus.urgent():
-                        drive.write(
-                            drive.axis.map.comm_timeout, timeout=self._before[name]
-                        )
+                        drive.write(drive.axis.map.comm_timeout, timeout=counts)
                     error = ""
                 except Exception as caught:
                     error = str(caught)
-            counts = self._before.pop(name)
             self._emit("comm_restored", axis=name, counts=counts, error=error)
 
 
-def timeouts_left(records: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+def timeouts_left(records: list[Record]) -> dict[str, Record]:
     """The ``comm_timeout`` records of a journal that no restoring has followed."""
-    left: dict[str, dict[str, Any]] = {}
+    left: dict[str, Record] = {}
     for record in records:
         if record["event"] == "comm_timeout":
             left[record["axis"]] = record
@@ -213,11 +189,9 @@ def timeouts_left(records: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
 class Seen:
     """What the phone has shown of the axes at postures, since the zero."""
 
-    commanded: Array = dataclasses.field(default_factory=lambda: np.zeros(3))  # deg
-    measured: Array = dataclasses.field(default_factory=lambda: np.zeros(3))
-    unproven: list[list[str]] = dataclasses.field(
-        default_factory=lambda: [[], [], []]
-    )  # names of postures since an axis was last seen to follow
+    commanded: Array  # (3,) degrees, at the last posture
+    measured: Array
+    unproven: list[list[str]]  # names of postures since each axis was seen to follow
 
 
 class Device:
@@ -242,8 +216,7 @@ class Device:
         self.drives = [Drive(self.bus, axis) for axis in config.axes]
         self.stopper = Stopper(self.drives, run.emit)
         self.requests = requests or Requests()
-        checked = record.missing(config) is None
-        self.proof = Proof(config.axes, checked, simulated)
+        self.proof = Proof(config.axes, record.missing(config) is None, simulated)
         self.armed = False
         self.moves = 0  # frames that moved a drive
         self.arrived = 0.0  # monotonic time of the last arrival
@@ -251,16 +224,9 @@ class Device:
         self.zero: Posture | None = None  # once it is taken,
         self.frame: Frame | None = None  # and what the phone reads against it
         self.heard = 0  # connection of the phone by which the frame holds
-        self.seen = Seen()
-        timeouts = config.comm_timeouts_s
-        left = timeouts_left(run.journal.records)
-        self.line_watch = LineWatch(self.drives, timeouts, run.emit, left)
-        self.heartbeat = Heartbeat(
-            self.stopper,
-            self.requests,
-            config.heartbeat_s,
-            min(timeouts.values(), default=0.0) / 4,
-        )
+        self.seen = Seen(np.zeros(3), np.zeros(3), [[], [], []])
+        self.line_watch = LineWatch(self.drives, run)
+        self.heartbeat = Heartbeat(self.stopper, self.requests, config)
         self.bus.check = self._before_exchange
 
     def arm(self, reset_alarms: bool = False) -> None:
@@ -268,17 +234,14 @@ class Device:
 
         Raises:
             MotionFault: an alarm, a moving or disabled drive, a position outside the
-                limits, no fresh IMU reading.
+                limits. ImuError: no fresh reading.
         """
         self.stopper.check()
         for drive in self.drives:
             self._check_fit(drive, reset_alarms)
             if self.config.motion.mirror_limits:
                 drive.mirror_limits()
-        try:
-            self.imu.latest()
-        except ImuError as error:
-            raise MotionFault(str(error)) from None
+        self.imu.latest()
         self.line_watch.apply()
         self.armed = True
         self.heartbeat.start()
@@ -297,12 +260,12 @@ class Device:
                 f"{axis.name} is already moving. Stop the other controller, then run "
                 "`jaxcal-rig stop`"
             )
-        if not status.enabled:
-            if not drive.bring(axis.map.enable, lambda s: s.enabled).enabled:
-                raise MotionFault(
-                    f"{axis.name} does not enable its power stage. Check its "
-                    "supply and its enable and STO inputs"
-                )
+        enable = axis.map.enable
+        if not (status.enabled or drive.bring(enable, lambda s: s.enabled).enabled):
+            raise MotionFault(
+                f"{axis.name} does not enable its power stage. Check its supply and "
+                "its enable and STO inputs"
+            )
         slack = axis.pulses_within(self.config.motion.position_tolerance_deg)
         if not axis.min_pulses - slack <= status.position <= axis.max_pulses + slack:
             raise MotionFault(
@@ -344,8 +307,7 @@ class Device:
 
     def positions(self) -> Pulses:
         """Where the drives stand, in pulses."""
-        a, b, c = (drive.status().position for drive in self.drives)
-        return a, b, c
+        return tuple(drive.status().position for drive in self.drives)
 
     def close(self) -> None:
         """Nothing more will move: close bus and phone."""

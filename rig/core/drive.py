@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Callable
 
 from rig.config.axis import HIGHEST, LOWEST, Axis
-from rig.config.registers import Read, Writes, decode, encode
+from rig.config.registers import Read, Writes, decode
 from rig.core.bus import Bus, BusError, Rejected
-from rig.core.faults import MotionFault
+from rig.core.faults import LimitError, MotionFault
 
 POLL_S = 0.05
 PASSING = (5, 6, 8, 10, 11)  # exceptions: acknowledge, busy, CRC; silence at a gateway
@@ -54,8 +55,7 @@ class Drive:
         """
         if self._origin is None:
             self.status()
-        assert self._origin is not None
-        return self._origin
+        return self._origin or 0
 
     def forget_origin(self) -> None:
         """The next reading tells the origin, as one does that was set anew."""
@@ -65,20 +65,14 @@ class Drive:
         """Read status and position.
 
         Args:
-            retries: of each read. Where not given they are as configured, and the whole
-                is asked for once more: spoilt frames now and then spoil all tries.
+            retries: of each read. Where not given they are twice those configured:
+                spoilt frames now and then spoil all of them.
         """
-        try:
-            return self._status(retries)
-        except BusError as error:
-            if retries is not None or refusal(error):
-                raise
-            return self._status(None)
-
-    def _status(self, retries: int | None) -> Status:
+        if retries is None:
+            retries = 2 * self.bus.settings.read_retries + 1
         status = self.axis.map.status
-        word = self._read(status, retries)
-        count = self._read(self.axis.map.position, retries)
+        word = self.read(status, retries)
+        count = self.read(self.axis.map.position, retries)
         if self._origin is None:
             self._origin = HOME if count > HOME // 2 else 0
         position, flags = count - self._origin, status.flags(word)
@@ -89,11 +83,10 @@ class Drive:
         """Status; MotionFault where the fault bit is set."""
         status = self.status()
         if status.fault:
-            text = "fault bit set"
-            try:
-                text = self.alarm() or text
-            except BusError:
-                pass  # the fault bit alone is reason enough to stop
+            text = ""
+            with contextlib.suppress(BusError):  # the bit alone is reason enough
+                text = self.alarm()
+            text = text or "fault bit set"
             raise MotionFault(
                 f"{self.axis.name}: {text}. The drive has stopped itself: find the "
                 "cause, in its manual too, before you go on with --reset-alarms"
@@ -102,9 +95,7 @@ class Drive:
 
     def alarm(self) -> str:
         """The alarm in words, empty where there is none or no register for it."""
-        read = self.axis.map.alarm
-        code = self._read(read) if read else 0
-        if not read or not code:
+        if not (read := self.axis.map.alarm) or not (code := self.read(read)):
             return ""
         name = read.names.get(code)
         return f"alarm 0x{code:X}" + (f" ({name})" if name else "")
@@ -113,12 +104,12 @@ class Drive:
         """Start an absolute move; every frame is sent exactly once.
 
         Raises:
-            ValueError: the target leaves the axis's limits.
+            LimitError: the target leaves the axis's limits.
             BusError: a frame was not acknowledged.
         """
         axis = self.axis
         if not axis.min_pulses <= pulses <= axis.max_pulses:
-            raise ValueError(
+            raise LimitError(
                 f"{axis.name}: {pulses} pulses leave the limits "
                 f"{axis.min_pulses}..{axis.max_pulses}"
             )
@@ -152,11 +143,10 @@ class Drive:
 
     def _target(self) -> int | None:
         """The target that the drive holds; None where it cannot be read."""
-        read = self.axis.map.target
-        try:
-            return None if read is None else self._read(read) - self.origin
-        except Rejected:
-            return None
+        if read := self.axis.map.target:
+            with contextlib.suppress(Rejected):
+                return self.read(read) - self.origin
+        return None
 
     def mirror_limits(self) -> None:
         """Write the axis's soft limits into the drive, as far as it can count."""
@@ -179,12 +169,11 @@ class Drive:
         m = self.axis.map
         once = any(table is each for each in (m.move, m.home, m.stop))
         tries = 1 if once else 1 + self.bus.settings.read_retries
-        while True:
-            tries -= 1
+        for left in reversed(range(tries)):
             try:
                 return self._write(table, values)
             except BusError as error:
-                if not tries or refusal(error):
+                if not left or refusal(error):
                     raise
 
     def bring(self, table: Writes | None, ready: Callable[[Status], bool]) -> Status:
@@ -202,12 +191,8 @@ class Drive:
             time.sleep(POLL_S)
 
     def _write(self, table: Writes | None, values: dict[str, int]) -> None:
-        order = self.axis.map.word_order
         for frame in table.write if table else ():
-            words: list[int] = []
-            for value, kind in frame.words:
-                number = values[value] if isinstance(value, str) else value
-                words += encode(number, kind, order)
+            words = frame.registers(self.axis.map.word_order, **values)
             self.bus.write(self.axis.unit, frame.address, frame.function, words)
 
     def identity(self) -> dict[str, int | str]:
@@ -215,18 +200,17 @@ class Drive:
         found: dict[str, int | str] = {}
         for name, read in self.axis.map.identity.items():
             try:
-                found[name] = self._read(read)
+                found[name] = self.read(read)
             except Rejected as error:
                 found[name] = f"exception {error.code}"
         return found
 
     def pulses_per_rev(self) -> int | None:
         """Pulses for one motor turn by the drive's own word; None where it has none."""
-        read = self.axis.map.pulses_per_rev
-        try:
-            return self._read(read) or None if read else None
-        except Rejected:  # a model of the family without this register
-            return None
+        if read := self.axis.map.pulses_per_rev:
+            with contextlib.suppress(Rejected):  # a model of the family without it
+                return self.read(read) or None
+        return None
 
     @property
     def says_homed(self) -> bool:
@@ -234,7 +218,8 @@ class Drive:
         bits = self.axis.map.homed
         return bits is not None and self.last is not None and bits.holds(self.last.word)
 
-    def _read(self, read: Read, retries: int | None = None) -> int:
+    def read(self, read: Read, retries: int | None = None) -> int:
+        """The value of one or two registers."""
         unit, order = self.axis.unit, self.axis.map.word_order
         words = self.bus.read_words(unit, read.address, read.count, retries)
         return decode(words, read.type, order)

@@ -101,12 +101,6 @@ class Requests:
         self._asked = 0.0
         self._told = False
 
-    def __enter__(self) -> Requests:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
     def request_stop(self, reason: str, exit_code: int) -> None:
         """Ask for a stop; the first request is the one that is kept."""
         if self._stop is None:

@@ -1,26 +1,45 @@
-"""Before arming: the drives are those of the record, and stand where they were."""
+"""Whether it is the device of the record, and stands where it stood.
+
+Before it is armed: its drives, and their counts. Once it is measured: the attitude of
+its zero posture against gravity, then and now. The phone's world stands upright (its Z
+axis is the vertical), so a change of tilt is seen whatever the phone calls north. Where
+it has a heading to be trusted (``imu.heading = "absolute"``) turns about the vertical
+are seen too.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
-from rig.config import RigConfig
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rig.config import AXIS_NAMES, RigConfig
+from rig.config.axis import Pulses
+from rig.core.attitude import Array, angle_between_deg, frame_at
 from rig.core.bus import BusError
 from rig.core.drive import Drive
-from rig.core.faults import Refused
+from rig.core.faults import MotionFault, Refused
 from rig.journal import HOMED, IDENTIFIED, DeviceRecord
+
+UNSEEN_DEG = 15.0  # an axis this near to the vertical hardly changes the tilt
+TOLD_SHARE = 0.2  # of the largest: an axis that moved less is left out of the words
 
 
 def check_drives(
-    config: RigConfig, drives: Sequence[Drive], record: DeviceRecord
+    config: RigConfig,
+    drives: Sequence[Drive],
+    record: DeviceRecord,
+    geared: bool = True,
 ) -> None:
-    """The drives are those of the record, geared as configured, and where they were.
+    """The drives are those of the record, where they were, and geared as configured.
 
     Raises:
         Refused: they are not. What no longer holds of the record is voided.
         BusError: a drive does not answer.
     """
-    for drive in drives:
+    for drive in drives if geared else ():
         axis, told = drive.axis, drive.pulses_per_rev()
         if told is not None and told != axis.pulses_per_rev:
             raise Refused(
@@ -28,24 +47,15 @@ def check_drives(
                 f"per turn, axes.{axis.name}.pulses_per_rev says {axis.pulses_per_rev}."
                 " Correct the one that is wrong; nothing was moved"
             )
-    check_record(config, drives, record)
-
-
-def check_record(
-    config: RigConfig, drives: Sequence[Drive], record: DeviceRecord
-) -> None:
-    """The drives are those of the record, and where they were; else Refused."""
-    for state, faults in (
-        (IDENTIFIED, [_exchanged(drive, record) for drive in drives]),
-        (HOMED, [_displaced(config, drive, record) for drive in drives]),
-    ):
-        if reason := "; ".join(filter(None, faults)):
+    for state, fault in ((IDENTIFIED, _exchanged), (HOMED, _displaced)):
+        reasons = [fault(config, drive, record) for drive in drives]
+        if reason := "; ".join(filter(None, reasons)):
             record.void(state, reason)
-        if record.missing(config, state):
-            raise Refused(record.missing(config))
+        if lack := record.missing(config, state):
+            raise Refused(lack)
 
 
-def _exchanged(drive: Drive, record: DeviceRecord) -> str:
+def _exchanged(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
     """What of a drive's identity differs from the record's."""
     name = drive.axis.name
     known = (record.state(IDENTIFIED) or {}).get("identity", {}).get(name, {})
@@ -112,3 +122,100 @@ def leave(drives: Sequence[Drive], record: DeviceRecord) -> None:
         if drive.says_homed:
             homed.append(drive.axis.name)
     record.left_at(positions, homed)
+
+
+# The zero posture
+
+
+class KeptZero(NamedTuple):
+    """The zero posture as a calibration keeps it; None where it does not."""
+
+    whose: str  # of messages
+    pulses: Pulses | None = None
+    attitude: Array | None = None  # (3, 3) phone to its world
+
+    def check(self, config: RigConfig, pulses: Pulses, attitude: Array) -> str:
+        """The zero posture taken now is this one; returns what was compared, in words.
+
+        Raises:
+            MotionFault: it is not, by more than ``session.reference_tolerance_deg``.
+        """
+        if self.pulses is not None:
+            off = config.to_deg(np.subtract(pulses, self.pulses))
+            if np.abs(off).max() > config.session.reference_tolerance_deg:
+                raise MotionFault(
+                    f"in its zero posture the device counts other pulses than for "
+                    f"{self.whose}: {axes_text(off)}. The drives have lost their "
+                    "origin, or this is not the zero posture"
+                )
+        if self.attitude is None:
+            return f"{self.whose} keeps no attitude of its zero posture: not compared"
+        return check_zero(config, self.attitude, attitude, self.whose)
+
+
+def moved(config: RigConfig, then: Array, now: Array) -> tuple[float, Array]:
+    """How far one attitude of the zero posture stands from another, (3, 3) each.
+
+    Returns:
+        The angle in degrees, and as (3,) joint angles. Without an absolute heading the
+        turn about the vertical that comes last is taken out of both.
+    """
+    now = heading_turn(config, then, now) @ now
+    return angle_between_deg(then, now), frame_at(config, then).angles(now)
+
+
+def heading_turn(config: RigConfig, then: Array, now: Array) -> Array:
+    """(3, 3) turn about the vertical that takes ``now`` nearest to ``then``, both
+    (3, 3); none where the heading can be trusted."""
+    if config.imu.heading == "absolute":
+        return np.eye(3)
+    _, _, z, w = Rotation.from_matrix(now @ then.T).as_quat()
+    return Rotation.from_quat([0.0, 0.0, -z, w] if z or w else [0, 0, 0, 1]).as_matrix()
+
+
+def unseen(config: RigConfig, zero: Array) -> list[str]:
+    """Names of the axes of which a turn at the zero posture cannot be seen."""
+    if config.imu.heading == "absolute":
+        return []
+    base = zero @ frame_at(config, zero).mounting.T
+    upright = np.abs(base[2, ["XYZ".index(letter) for letter in config.letters]])
+    return [
+        name
+        for name, cosine in zip(AXIS_NAMES, upright, strict=True)
+        if cosine > np.cos(np.radians(UNSEEN_DEG))
+    ]
+
+
+def check_zero(config: RigConfig, then: Array, now: Array, whose: str) -> str:
+    """The zero posture stands as it stood; returns what was compared, in words.
+
+    Args:
+        config: names tolerance, mounting and axes.
+        then, now: (3, 3) attitude of the phone, as kept and as measured.
+        whose: for the words.
+
+    Raises:
+        MotionFault: they differ by more than ``session.reference_tolerance_deg``.
+    """
+    limit = config.session.reference_tolerance_deg
+    angle, joints = moved(config, then, now)
+    blind = unseen(config, then)
+    but = f"; {', '.join(blind)} turns about the vertical and is not seen" * bool(blind)
+    if angle <= limit:
+        return f"zero posture stands {angle:.3f} deg from that of {whose}{but}"
+    raise MotionFault(
+        f"the zero posture is not that of {whose}: {axes_text(joints)} (limit "
+        f"session.reference_tolerance_deg = {limit:g}){but}. Drives that were without "
+        "power have lost their origin: home them. Where the phone or the base was "
+        "moved, calibrate again"
+    )
+
+
+def axes_text(joints: Sequence[float] | Array) -> str:
+    """(3,) degrees in words, of the axes that moved most."""
+    pairs = sorted(zip(np.abs(joints), AXIS_NAMES, joints, strict=True), reverse=True)
+    return ", ".join(
+        f"{name} stands {angle:+.2f} deg away from where it stood"
+        for size, name, angle in pairs
+        if size >= TOLD_SHARE * pairs[0][0]
+    )

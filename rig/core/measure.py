@@ -22,7 +22,8 @@ FOLLOW_LEADING = 0.3  # of axes that move at least this share of the largest mov
 def zeroed(device: Device, frame: Frame, zero: Posture) -> None:
     """Measure against this zero posture from now on."""
     device.frame, device.zero, device.heard = frame, zero, device.imu.connections
-    device.seen = Seen(device.config.to_deg(zero.pulses))
+    at_deg = device.config.to_deg(zero.pulses)
+    device.seen = Seen(at_deg, np.zeros(3), [[], [], []])
 
 
 def measure(standing: Standing, samples: int | None = None) -> dict[str, Any]:
@@ -42,25 +43,23 @@ def measure(standing: Standing, samples: int | None = None) -> dict[str, Any]:
         MotionFault: it does not settle in time, or the IMU disagrees with the drives.
         ImuError, BusError, StopRequested: stop everything.
     """
-    device, (name, target) = standing
-    settle = device.config.settle
+    (device, (name, target)), settle = standing, standing.device.config.settle
     deadline = time.monotonic() + settle.timeout_s
-    while True:
+    readings: list[Reading] = []
+    while not readings:  # the stream paused, or what was read was not quiet
         device.emit("phase", phase="settling")
         statuses = _settled(device, deadline)
         device.emit("phase", phase="measuring")
         readings = _collect(device, samples or settle.samples)
-        if not readings:  # the stream paused
-            continue
-        frame, matrices = _frame(device, readings), [r.matrix for r in readings]
-        raw = frame.angles(matrices)
-        std = raw.std(axis=0, ddof=1) if len(raw) > 1 else np.zeros(3)
-        if (std <= settle.std_deg).all():
-            break  # or settle again: the readings themselves were not quiet
+        if readings:
+            frame, matrices = _frame(device, readings), [r.matrix for r in readings]
+            raw = frame.angles(matrices)
+            std = raw.std(axis=0, ddof=1) if len(raw) > 1 else np.zeros(3)
+            if (std > settle.std_deg).any():
+                readings = []
     attitude = mean_rotation(matrices)
-    angles = frame.angles(attitude)
+    angles, commanded = frame.angles(attitude), device.config.to_deg(target)
     feedback = [status.position for status in statuses]
-    commanded = device.config.to_deg(target)
     _check_position(device, target, feedback)
     if device.oriented:
         _check_agreement(device, commanded, angles, name)
@@ -83,8 +82,7 @@ def _frame(device: Device, readings: list[Reading]) -> Frame:
 
 def _settled(device: Device, deadline: float) -> list[Status]:
     """Poll until drives and IMU are quiet; what the drives say then."""
-    settle, poll = device.config.settle, device.config.motion.poll_s
-    since = time.monotonic()
+    settle, since = device.config.settle, time.monotonic()
     while True:
         device.guard()
         statuses = device.statuses()
@@ -92,35 +90,27 @@ def _settled(device: Device, deadline: float) -> list[Status]:
         if any(status.moving for status in statuses):
             since = now
         device.imu.check_fault()
-        # The last window_s, or the last min_samples of a slow phone.
-        readings = device.imu.since(since)
-        recent = sum(reading.time >= now - settle.window_s for reading in readings)
-        readings = readings[-max(recent, settle.min_samples) :]
-        span = readings[-1].time - readings[0].time if readings else 0.0
-        hint = "Check the phone's app and its Wi-Fi"
-        if len(readings) < settle.min_samples or span < 0.8 * settle.window_s:
-            reason = f"{len(readings)} readings over {span:.2f} s of the window"
-        elif now - readings[-1].time > device.config.imu.stale_s:
-            reason = "the phone's readings are stale"
-        else:
-            reason = _unquiet(device, readings)
-            if not reason:
-                return statuses
-            hint = (
-                "The device or the phone still shakes, or the phone is noisier "
-                "than the limit: compare its scatter, `jaxcal-rig imu`, and raise "
-                "that key of [settle] above it"
-            )
+        if not (reason := _unquiet(device, device.imu.since(since), now)):
+            return statuses
         if now > deadline:
             raise MotionFault(
-                f"the device did not settle in {settle.timeout_s:g} s: {reason}. {hint}"
+                f"the device did not settle in {settle.timeout_s:g} s: {reason}"
             )
-        time.sleep(poll)
+        time.sleep(device.config.motion.poll_s)
 
 
-def _unquiet(device: Device, readings: list[Reading]) -> str:
-    """What of a window's readings is over its limit; empty where nothing is."""
+def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
+    """Why the last readings do not show a device at rest, and what to do."""
     settle = device.config.settle
+    # The last window_s, or the last min_samples of a slow phone.
+    recent = sum(reading.time >= now - settle.window_s for reading in readings)
+    readings = readings[-max(recent, settle.min_samples) :]
+    span = readings[-1].time - readings[0].time if readings else 0.0
+    hint = "Check the phone's app and its Wi-Fi"
+    if len(readings) < settle.min_samples or span < 0.8 * settle.window_s:
+        return f"{len(readings)} readings over {span:.2f} s of the window. {hint}"
+    if now - readings[-1].time > device.config.imu.stale_s:
+        return f"the phone's readings are stale. {hint}"
     angles = _frame(device, readings).angles([reading.matrix for reading in readings])
     times = np.array([reading.time for reading in readings])
     times = times - times.mean()
@@ -131,8 +121,12 @@ def _unquiet(device: Device, readings: list[Reading]) -> str:
     ):
         worst = int(np.argmax(found))
         if found[worst] > limit:
-            axis, value = AXIS_NAMES[worst], found[worst]
-            return f"{axis} reads {value:.3f} {unit} (settle.{what} = {limit:g})"
+            return (
+                f"{AXIS_NAMES[worst]} reads {found[worst]:.3f} {unit} (settle.{what} = "
+                f"{limit:g}). The device or the phone still shakes, or the phone is "
+                "noisier than the limit: compare its scatter, `jaxcal-rig imu`, and "
+                "raise that key of [settle] above it"
+            )
     return ""
 
 

@@ -6,11 +6,11 @@ import math
 import time
 from typing import NamedTuple
 
-from rig.config.axis import Pulses
+from rig.config.axis import Axis, Pulses
 from rig.core.bus import BusError, Rejected
-from rig.core.device import Device, Posture, approach, check_plan, outside
+from rig.core.device import Device, Posture, approach, check_plan
 from rig.core.drive import START_S, Drive, Status, refusal
-from rig.core.faults import LimitError, MotionFault, Unreachable
+from rig.core.faults import MotionFault, Unreachable
 from rig.core.stop import STILL_COUNTS
 
 LAG_S = 0.1  # of the phone behind a move that is longer than those before
@@ -47,15 +47,13 @@ def _piece(device: Device, goal: Pulses, label: str) -> bool:
     proof, config = device.proof, device.config
     connection, attitude = device.imu.connections, device.attitude(device.arrived)
     starts = device.statuses()
-    here = starts[0].position, starts[1].position, starts[2].position
+    here = tuple(start.position for start in starts)
     way = config.to_deg(goal) - config.to_deg(here)
     steps = math.ceil(float(abs(way).max()) / config.motion.max_step_deg - 1e-9)
     end = goal
     if steps > 1:
         end = config.to_pulses(config.to_deg(here) + way / steps)
     end = proof.begin(device.imu, attitude, here, end)
-    if faults := list(outside(config, end)):
-        raise LimitError("; ".join(faults))
     for index, drive in enumerate(device.drives):
         drive.axis = proof.paced(index, end[index] - here[index])
     device.heartbeat.feed(moving=True)
@@ -70,9 +68,7 @@ def _piece(device: Device, goal: Pulses, label: str) -> bool:
                 pulses=pulses,
             )  # fmt: skip
             _send(device, drive, start, pulses)
-        begun = time.monotonic()
-        deadline = begun + _deadline_s(device, starts, end)
-        _watch(device, starts, end, begun, deadline, connection)
+        _watch(device, here, end, connection)
     finally:
         device.heartbeat.feed(moving=False)
     device.arrived = time.monotonic()
@@ -88,57 +84,39 @@ def _send(device: Device, drive: Drive, start: Status, pulses: int) -> None:
     the same absolute target again, or that is unknown and everything stops.
     """
     motion, axis = device.config.motion, drive.axis
-    tries = 1 + device.config.bus.read_retries
-    while True:
-        tries -= 1
+    tolerance = axis.pulses_within(motion.position_tolerance_deg)
+    for left in reversed(range(1 + device.config.bus.read_retries)):
         try:
             return drive.move(pulses)
         except BusError as error:
+            if isinstance(error, Rejected) and error.code in (2, 3):
+                raise Unreachable(f"{axis.name} refused {pulses}: {error}") from None
             if refusal(error):
-                if isinstance(error, Rejected) and error.code in (2, 3):
-                    raise Unreachable(
-                        f"{axis.name} refused {pulses}: {error}"
-                    ) from None
                 drive.sound()  # an alarm says more than a refusal
                 raise
-            tolerance = axis.pulses_within(motion.position_tolerance_deg)
             took = drive.took(pulses, start, tolerance)
             found = {True: "obeyed", False: "not taken", None: "unknown"}[took]
             device.emit("lost_reply", axis=axis.name, pulses=pulses, outcome=found)
             if took:
                 return None
-            if took is None or not tries:
+            if took is None or not left:
                 raise
             device.guard(moving=True)  # no move once a stop was asked for
 
 
-def _deadline_s(device: Device, starts: list[Status], target: Pulses) -> float:
-    motion = device.config.motion
-    longest = 0.0
-    for drive, start, end in zip(device.drives, starts, target, strict=True):
-        axis = drive.axis
-        way = abs(axis.to_deg(end - start.position))
-        speed, accel = axis.drive_motion
-        longest = max(longest, way / speed + speed / accel)
-    return motion.deadline_factor * longest + motion.deadline_slack_s
-
-
-def _watch(
-    device: Device,
-    starts: list[Status],
-    target: Pulses,
-    begun: float,
-    deadline: float,
-    connection: int,
-) -> None:
+def _watch(device: Device, here: Pulses, target: Pulses, connection: int) -> None:
     """Poll until all three stand on their targets, or something is wrong."""
-    motion = device.config.motion
-    last = [(s.position, begun) for s in starts]
+    motion, begun, most_s = device.config.motion, time.monotonic(), 0.0
+    for drive, a, b in zip(device.drives, here, target, strict=True):
+        speed, accel = drive.axis.drive_motion
+        most_s = max(most_s, abs(drive.axis.to_deg(b - a)) / speed + speed / accel)
+    most_s = motion.deadline_factor * most_s + motion.deadline_slack_s
+    last = [(position, begun) for position in here]
     while True:
         device.guard(moving=True)
         arrived = 0
         for index, drive in enumerate(device.drives):
-            axis, goal, start = drive.axis, target[index], starts[index].position
+            axis, goal, start = drive.axis, target[index], here[index]
             status = drive.sound()
             tolerance = axis.pulses_within(motion.position_tolerance_deg)
             if abs(status.position - goal) <= tolerance:
@@ -147,7 +125,7 @@ def _watch(
                 begins = not half and status.time - begun < START_S
                 arrived += status.done and not status.moving and not begins
                 continue
-            _check_corridor(device, drive, start, goal, status.position)
+            _check_corridor(device, axis, start, goal, status.position)
             if abs(status.position - last[index][0]) > STILL_COUNTS:
                 last[index] = (status.position, status.time)
             elif (stood := status.time - last[index][1]) > motion.stall_s:
@@ -165,20 +143,19 @@ def _watch(
                 )
         if arrived == len(device.drives):
             return
-        if time.monotonic() > deadline:
+        if time.monotonic() > begun + most_s:
             raise MotionFault(
-                f"the move took longer than its deadline, {deadline - begun:.2f} s."
-                " Check the drives' speed, or raise motion.deadline_factor"
+                f"the move took longer than its deadline, {most_s:.2f} s. Check the "
+                "drives' speed, or raise motion.deadline_factor"
             )
         _check_attitude(device, connection)
         time.sleep(motion.poll_s)
 
 
-def _check_corridor(
-    device: Device, drive: Drive, start: int, goal: int, here: int
-) -> None:
-    axis, allowed = drive.axis, device.config.motion.following_deg
-    begin, end, angle = map(axis.to_deg, (start, goal, here))
+def _check_corridor(device: Device, axis: Axis, *pulses: int) -> None:
+    """The drive is between start and goal: the three counts."""
+    begin, end, angle = map(axis.to_deg, pulses)
+    allowed = device.config.motion.following_deg
     if not min(begin, end) - allowed <= angle <= max(begin, end) + allowed:
         raise MotionFault(
             f"{axis.name} is at {angle:.3f} deg on its way from {begin:.3f} to "
@@ -190,13 +167,13 @@ def _check_corridor(
 def _check_attitude(device: Device, connection: int) -> None:
     """The phone is fresh, turned as far as it may be, inside the limits' envelope."""
     device.meanwhile()
-    reading, frame = device.imu.latest(), device.frame
+    reading = device.imu.latest()
     if device.imu.connections == connection:  # its heading is another since
         device.proof.watch(reading.matrix)
-    if frame is None or not device.oriented:
+    if device.frame is None or not device.oriented:
         return
     margin = device.config.motion.envelope_margin_deg
-    angles = frame.angles(reading.matrix)
+    angles = device.frame.angles(reading.matrix)
     for axis, angle in zip(device.config.axes, angles, strict=True):
         low, high = axis.min_deg - margin, axis.max_deg + margin
         if not low <= angle <= high:

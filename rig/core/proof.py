@@ -38,6 +38,14 @@ ALLOWED_DEG = 9.0  # that the phone may turn from where an unproved device began
 TOO_FAR = 2.0  # times what checked axes are moved, and MARGIN_DEG: more is a fault
 MARGIN_DEG = 1.0
 SEEN_SHARE = 0.1  # of a checked axis's move must be seen, or the moves do not grow
+BLIND = (
+    "look for a loose coupling, a stream that does not change, or a reduction that is "
+    "far too small"
+)
+NO_UNIT = (
+    "no angle of the phone is over 6.3, so degrees are not told from radians. Turn the "
+    "base, or the phone's heading, by some degrees"
+)
 RADIANS = 180.0 / math.pi
 LARGEST_RAD = 2.0 * math.pi + 0.1  # no larger number is an angle in radians
 
@@ -57,15 +65,14 @@ def unit_proved(imu: ImuSettings, attitude: Array) -> bool:
 class Reach:
     """What one axis may be sent, in pulses, by the moves so far."""
 
-    def __init__(
-        self, axis: Axis, unit_is_proved: bool = True, checked: bool = False
-    ) -> None:
+    def __init__(self, axis: Axis, factor: float = 1.0, checked: bool = False) -> None:
         self.axis = axis
         self.checked = checked
-        self.factor = 1.0 if unit_is_proved else RADIANS
+        self.factor = factor  # RADIANS where the phone's unit is not proved
         self.seen = checked  # the phone has turned, in a unit that is proved
-        self.longest = 0.0  # pulses of the longest move so far
-        self.deg_per_pulse = 0.0  # that the phone turned at most, in that move
+        # Pulses of the longest move so far; degrees per pulse that the phone turned at
+        # most in that move.
+        self.longest = self.deg_per_pulse = 0.0
         if checked:
             self.deg_per_pulse = 1.0 / abs(axis.pulses_per_deg)
             self.longest = SHOWN_DEG / self.deg_per_pulse / GROWTH
@@ -115,26 +122,19 @@ class Reach:
             return abs(goal - here)
         if gone < most:
             return most - gone
-        why = "look for a loose coupling, a stream that does not change, or a reduction"
-        why += " that is far too small"
-        if self.factor != 1.0:
-            why = "no angle of the phone is over 6.3, so degrees are not told from "
-            why += "radians. Turn the base, or the phone's heading, by some degrees"
         raise MotionFault(
             f"unit {axis.unit} turned its motor by "
             f"{gone * 360 / axis.pulses_per_rev:.3g} deg for {axis.name}, and the "
-            f"phone shows nothing to go on by: {why}"
+            f"phone shows nothing to go on by: {BLIND if self.factor == 1 else NO_UNIT}"
         )
 
     def paced(self, pulses: float) -> Axis:
         """The axis at the speed of a move by so many pulses."""
         if self.checked:
             return self.axis
-        per_s = max(1.0, abs(pulses)) / LOOK_S
+        per_s = max(1.0, abs(pulses), self.longest * bool(self.deg_per_pulse)) / LOOK_S
         if self.deg_per_pulse:
-            per_s = min(
-                max(per_s, self.longest / LOOK_S), SLOW_DEG_S / self.deg_per_pulse
-            )
+            per_s = min(per_s, SLOW_DEG_S / self.deg_per_pulse)
         return slowed(self.axis, per_s / abs(self.axis.pulses_per_deg))
 
 
@@ -149,17 +149,18 @@ class Proof:
         self._paced = not simulated  # what is not real need not be slow
         self._near: tuple[Array, float] | None = None
         self._start: Pulses | None = None  # where the unproved axes began
-        self._unit: bool | None = None  # the phone's is proved; None: to be looked at
+        self._unit_seen = False  # whether the phone's is proved was looked at
         self._before = np.eye(3)  # (3, 3) attitude where the present piece began
         # Attitude where the piece before it began, degrees of the joints since, and in
         # this piece: a phone that lags has not shown the whole of the last one yet.
         self._last: tuple[Array, float, float] | None = None
-        self._connection, self._world = 0, self._before  # by which these hold
+        self._heading = 0, self._before  # connection and world by which these hold
 
     def renew(self, index: int, unit_is_proved: bool = True) -> Reach:
         """Nothing is proved of an axis any more: it is to be checked."""
-        self.reaches[index] = Reach(self.axes[index], unit_is_proved)
-        self._start, self._unit = None, unit_is_proved
+        factor = 1.0 if unit_is_proved else RADIANS
+        self.reaches[index] = Reach(self.axes[index], factor)
+        self._start, self._unit_seen = None, True
         return self.reaches[index]
 
     def stay_near(self, attitude: Array, allowed_deg: float = ALLOWED_DEG) -> None:
@@ -176,10 +177,10 @@ class Proof:
         unproved = [reach for reach in self.reaches if not reach.checked]
         if unproved and self._near is None:
             self.stay_near(attitude)
-        if unproved and self._unit is None:
-            self._unit = unit_proved(imu.settings, attitude)
-            for reach in unproved:
-                reach.factor = 1.0 if self._unit else RADIANS
+        if not self._unit_seen:
+            self._unit_seen = True
+            for reach in unproved if not unit_proved(imu.settings, attitude) else ():
+                reach.factor = RADIANS
         self._start = self._start or here
         most = math.inf if self._near is None else self._near[1]
         share = 1.0
@@ -193,21 +194,22 @@ class Proof:
                 # A pulse more, or a last one would be a move of its own.
                 share = min(share, (longest + 1) / abs(b - a))
         if share < 1.0:
-            a, b, c = (
-                p + round((q - p) * share) for p, q in zip(here, goal, strict=True)
-            )
-            goal = a, b, c
-        each = zip(self.axes, here, goal, strict=True)
-        way = sum(abs(axis.to_deg(q - p)) for axis, p, q in each)
-        same = imu.connections == self._connection and imu.world is self._world
+            each = zip(here, goal, strict=True)
+            goal = tuple(a + round((b - a) * share) for a, b in each)
+        ways = zip(self.axes, here, goal, strict=True)
+        way = sum(abs(axis.to_deg(b - a)) for axis, a, b in ways)
+        heading = imu.connections, imu.world
         if unproved:
             self._last = None
-        elif self._last is None or not same:  # or its heading is another one
-            self._last = attitude, way, way
-        else:
+        elif (
+            self._last
+            and heading[0] == self._heading[0]
+            and imu.world is self._heading[1]
+        ):
             self._last = self._before, self._last[2] + way, way
-        self._before, self._connection = attitude, imu.connections
-        self._world = imu.world
+        else:
+            self._last = attitude, way, way
+        self._before, self._heading = attitude, heading
         return goal
 
     def paced(self, index: int, pulses: int) -> Axis:

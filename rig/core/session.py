@@ -23,17 +23,17 @@ from rig.config.axis import Pulses
 from rig.core.attitude import Array, angle_between_deg, frame_at
 from rig.core.device import Device, Posture, check_plan
 from rig.core.drive import Drive
-from rig.core.faults import (
-    MotionFault,
-    NotFollowing,
-    Requests,
-    Unreachable,
-    ending,
+from rig.core.faults import MotionFault, NotFollowing, Requests, Unreachable, ending
+from rig.core.known import (
+    KeptZero,
+    axes_text,
+    check_drives,
+    check_zero,
+    heading_turn,
+    leave,
 )
-from rig.core.known import check_drives, leave
 from rig.core.measure import measure, zeroed
 from rig.core.motion import Standing, move
-from rig.core.zero import KeptZero, axes_text, check_zero, heading_turn
 from rig.journal import ZEROED, BusLock, DeviceRecord, Record, RunFolder
 
 STREAM_WAIT_S = 60.0  # time to start the app on the phone
@@ -69,9 +69,10 @@ def open_device(
         MotionFault, BusError, ImuError, Refused: not fit to move.
     """
     device = Device(config, run, record, requests, simulated=simulated)
+    requests, lock = device.requests, BusLock(config.bus)
     # A request that came while something was computed may have been raised in a
     # callback that drops exceptions, as those of a garbage collection are.
-    device.requests.check_stop()
+    requests.check_stop()
     with contextlib.ExitStack() as stack:
         stack.callback(_close, device)
         reason, latch = "", False
@@ -83,24 +84,24 @@ def open_device(
             for other in beside:
                 stack.enter_context(other(device))
             device.imu.wait_for_stream(STREAM_WAIT_S)
-            BusLock(config.bus).leave(config)
-            device.requests.armed = True
+            lock.leave(config)
+            requests.armed = True
             device.arm(reset_alarms)
             # Where they stand is not known until they do again.
             record.left_at(homed=[d.axis.name for d in device.drives if d.says_homed])
             device.emit("armed", drives=len(device.drives), where=config.bus.where)
             yield device
         except BaseException as error:
-            device.requests.ending = True
+            requests.ending = True
             _, event, reason = ending(error, run.folder)
             latch = event != "paused"
             raise
         finally:
-            if device.requests.armed:
+            if requests.armed:
                 results = device.stopper.stop(reason, latch)
                 if all(result.standing for result in results):  # `stop` waits for it
                     gone = run.journal.records[0].get("simulated") is not None
-                    BusLock(config.bus).stood(forget=gone)
+                    lock.stood(forget=gone)
 
 
 def _close(device: Device) -> None:
@@ -121,7 +122,7 @@ def _close(device: Device) -> None:
 
 def take_zero(
     device: Device, at: Pulses | None = None, kept: KeptZero | None = None
-) -> Posture:
+) -> None:
     """Measure the zero posture, that all others are measured against.
 
     Where postures were measured already, as in a run that is resumed, it must still
@@ -136,36 +137,30 @@ def take_zero(
         MotionFault: it is not where it was.
     """
     config, run = device.config, device.run
-    zeros = run.journal.events("zero")
-    if zeros:
-        a, b, c = zeros[-1]["pulses"]
-        before = Posture("reference", (a, b, c))
+    if zeros := run.journal.events("zero"):
+        before = Posture("reference", tuple(zeros[-1]["pulses"]))
         if run.postures():
             attitude = np.array(zeros[-1]["attitude"])
             zeroed(device, frame_at(config, attitude), before)
-            _check_reference(device, before)
-            return before
+            return _check_reference(device, before)
         at = at or before.pulses
-    device.emit("phase", phase="zeroing")
-    if at is None and config.session.zero == "drive":
+    elif at is None and config.session.zero == "drive":
         at = (0, 0, 0)
+    device.emit("phase", phase="zeroing")
     zero = Posture("zero", at or device.positions())
     standing = Standing(device, zero)
     if at is not None or config.motion.approach_overshoot_deg:
         standing = move(device, zero)  # from the side of all references
     check_plan(config, [zero.pulses])  # it is where a resumed run looks again
-    # Every posture is measured against this one, so its noise must be the smaller.
-    samples = ZERO_FACTOR * config.settle.samples
-    while True:
+    count, found = -1, {}
+    while device.imu.connections != count:
         count = device.imu.connections
-        found = measure(standing, samples)
-        if device.imu.connections == count:
-            break
+        # Every posture is measured against this one: its noise must be the smaller.
+        found = measure(standing, ZERO_FACTOR * config.settle.samples)
     attitude = np.array(found["attitude"])
     _compare_zero(device, zero.pulses, attitude, kept)
     device.emit("zero", sync=True, **found)
     zeroed(device, frame_at(config, attitude), zero)
-    return zero
 
 
 def _compare_zero(
@@ -177,9 +172,10 @@ def _compare_zero(
         device.emit("note", text=kept.check(config, pulses, attitude))
     elif known:
         then = np.array(known["attitude"])
-        last = KeptZero("the last session", known["pulses"], then)
         try:
-            last.check(config, pulses, attitude)
+            KeptZero("the last session", known["pulses"], then).check(
+                config, pulses, attitude
+            )
         except MotionFault as fault:  # a phone mounted anew is calibrated anew
             device.emit("note", text=f"WARNING: {fault}")
     zero = {"pulses": list(pulses), "attitude": attitude.tolist()}
@@ -240,19 +236,18 @@ def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
         posture: its name is the record's.
         fields: of the record, besides what is measured.
     """
-    run = device.run
-    if posture.name in (known := run.postures()):
-        return known[posture.name]
-    if any(r["name"] == posture.name for r in run.journal.events("unreachable")):
+    run, name = device.run, posture.name
+    if name in (known := run.postures()):
+        return known[name]
+    if any(record["name"] == name for record in run.journal.events("unreachable")):
         return None
     device.requests.check_pause()
-    device.emit("visit", name=posture.name, pulses=list(posture.pulses))
+    device.emit("visit", name=name, pulses=list(posture.pulses))
+    found = None
     try:
-        while True:
+        while found is None or not device.oriented:  # the phone came back in between
             _reorient(device)
             found = measure(move(device, posture))
-            if device.oriented:  # or the phone came back in between
-                break
     except NotFollowing as fault:
         if fault.suspects:
             device.emit("void", sync=True, names=fault.suspects)
@@ -261,9 +256,9 @@ def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
         results = device.stopper.stop(str(reason), latch=False)
         if not all(result.standing for result in results):
             raise MotionFault(f"{reason}, and not all drives stand") from None
-        device.emit("unreachable", sync=True, name=posture.name, reason=str(reason))
+        device.emit("unreachable", sync=True, name=name, reason=str(reason))
         return None
     device.emit("phase", phase="saving")
-    record = device.emit("posture", sync=True, name=posture.name, **found, **fields)
+    record = device.emit("posture", sync=True, name=name, **found, **fields)
     device.requests.check_pause()
     return record

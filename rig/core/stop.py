@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from rig.config.registers import encode
 from rig.core.bus import Bus
 from rig.core.drive import Drive
 from rig.core.faults import EXIT_FAULT, StopRequested
@@ -45,6 +44,9 @@ class UnitStop:
         return f"{self.axis} (unit {self.unit}): {state}, {rest}{detail}"
 
 
+Pairs = list[tuple[Drive, UnitStop]]
+
+
 def stop_all(drives: list[Drive]) -> list[UnitStop]:
     """Quick-stop every drive of one bus, and wait for them to come to rest.
 
@@ -69,9 +71,6 @@ def stop_all(drives: list[Drive]) -> list[UnitStop]:
     return results
 
 
-Pairs = list[tuple[Drive, UnitStop]]
-
-
 def _quick_s(bus: Bus) -> float:
     return QUICK_S + FRAME_BITS / bus.settings.baudrate
 
@@ -84,16 +83,11 @@ def _broadcast(drives: list[Drive]) -> None:
     """One frame for all of a serial line, where all are of a family that takes it."""
     bus, family = drives[0].bus, drives[0].axis.map
     alike = all(drive.axis.map.stop == family.stop for drive in drives)
-    if bus.settings.transport == "tcp" or not (alike and family.broadcast_stop):
-        return
-    with contextlib.suppress(Exception):  # an extra: each unit gets its own as well
-        for frame in family.stop.write:
-            words = [
-                word
-                for value, kind in frame.words
-                for word in encode(int(value), kind, family.word_order)
-            ]
-            bus.broadcast(frame.address, frame.function, words)
+    if bus.settings.transport != "tcp" and alike and family.broadcast_stop:
+        with contextlib.suppress(Exception):  # an extra: each gets its own as well
+            for frame in family.stop.write:
+                words = frame.registers(family.word_order)
+                bus.broadcast(frame.address, frame.function, words)
 
 
 def _round(pairs: Pairs) -> None:
@@ -105,8 +99,7 @@ def _round(pairs: Pairs) -> None:
 def _send(drive: Drive, result: UnitStop) -> None:
     try:
         drive.stop()
-        result.acknowledged = True
-        result.detail = ""
+        result.acknowledged, result.detail = True, ""
     except Exception as error:
         result.detail = str(error)
 
@@ -141,11 +134,7 @@ def _verify(pairs: Pairs) -> None:
 class Stopper:
     """The latch: after a stop for a fault nothing moves again."""
 
-    def __init__(
-        self,
-        drives: list[Drive],
-        emit: Callable[..., Any] = lambda event, **fields: None,
-    ) -> None:
+    def __init__(self, drives: list[Drive], emit: Callable[..., Any]) -> None:
         self.drives = drives
         self.reason = ""  # of the stop that has latched
         self.results: list[UnitStop] = []

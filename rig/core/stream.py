@@ -25,7 +25,6 @@ TOKEN = re.compile(r"[-+.:0-9A-Za-z_]{0,64}")
 RECOUNT = 3  # lines of one new width in a row that mean the phone's settings changed
 REJOIN = 5  # readings in a row that agree with each other after a jump
 ODD_STAMPS = 50  # stamps in a row out of line that mean the phone's clock was set
-ZEROS_S = 1.0  # all-zero records a new connection may begin with
 AHEAD_S = 1.0  # a stamp so far ahead of the clock is torn, not early
 ROUNDED = 1 + 1e-5  # full turns in radians are written a little too large
 CLOCK_CREEP = 2e-4  # the phone's clock may run this much faster or slower
@@ -85,11 +84,9 @@ class Parser:
         self._widths: deque[int] = deque(maxlen=RECOUNT)
         self._stamp: float | None = None
         self._odd = 0
-        self._offset: float | None = None
-        self._offset_at = 0.0
+        self._offset, self._offset_at = math.inf, 0.0  # of the clocks; inf: unknown
         self._last: Array | None = None
         self._far: deque[Array] = deque(maxlen=REJOIN)
-        self._zeros_from: float | None = None
 
     def lines(self, lines: list[bytes], now: float) -> list[Reading]:
         """Readings of CSV lines that arrived at ``now`` (monotonic s)."""
@@ -101,7 +98,7 @@ class Parser:
         self.foreign = False
         try:
             message = json.loads(body)
-            device = message.get("deviceId")
+            device, session = message.get("deviceId"), message.get("sessionId")
             entries = [
                 entry
                 for entry in message["payload"]
@@ -116,29 +113,24 @@ class Parser:
             return []
         readings = self._accept(entries, self._entry, now)
         if readings:
-            self._device = device
-            if not self.sessions or message.get("sessionId") != self._session:
-                self.sessions, self._session = (
-                    self.sessions + 1,
-                    message.get("sessionId"),
-                )
+            self.sessions += not self.sessions or session != self._session
+            self._device, self._session = device, session
         return readings
 
     def _accept(self, records: list[Any], parse: Any, now: float) -> list[Reading]:
         readings = []
         for record in records:
             try:
-                stamp, matrix = parse(record, now)
+                stamp, matrix = parse(record)
                 time = self._time(stamp, now)
                 self._gate(matrix)
+                readings.append(Reading(time, matrix))
             except _Dropped as reason:
                 self.counts[str(reason)] += 1
-                continue
-            self.counts["accepted"] += 1
-            readings.append(Reading(time, matrix))
+        self.counts["accepted"] += len(readings)
         return readings
 
-    def _line(self, line: bytes, now: float) -> tuple[float | None, Array]:
+    def _line(self, line: bytes) -> tuple[float | None, Array]:
         """Seconds on the phone's clock, and (3, 3) phone to its world."""
         s = self._settings
         try:
@@ -158,10 +150,7 @@ class Parser:
         stamp = values[s.stamp_column] / 1000.0 if s.stamp_column >= 0 else None
         if s.quaternion_columns:
             return stamp, _quaternion([values[c] for c in s.quaternion_columns])
-        angles = [values[c] for c in s.columns]
-        if not any(angles):
-            self._check_zeros(now)
-        return stamp, self._euler(angles)
+        return stamp, self._euler([values[c] for c in s.columns])
 
     def _check_width(self, fields: list[str], used: set[int]) -> None:
         width = len(fields)
@@ -182,13 +171,6 @@ class Parser:
             )
         raise _Dropped("wrong number of columns")
 
-    def _check_zeros(self, now: float) -> None:
-        """A sensor without a reading sends zeros; one that lies level goes on to."""
-        if self._zeros_from is None:
-            self._zeros_from = now
-        if self._last is None and now - self._zeros_from < ZEROS_S:
-            raise _Dropped("all zero, as sensors send before their first reading")
-
     def _euler(self, values: list[float]) -> Array:
         s = self._settings
         degrees = [*map(math.degrees, values)] if s.unit == "rad" else values
@@ -200,7 +182,7 @@ class Parser:
         signed = [v * sign for v, sign in zip(degrees, s.signs, strict=True)]
         return euler_to_matrix(signed, str(s.order))
 
-    def _entry(self, entry: dict[str, Any], now: float) -> tuple[float | None, Array]:
+    def _entry(self, entry: dict[str, Any]) -> tuple[float | None, Array]:
         values = entry.get("values")
         if not isinstance(values, dict):
             values = entry
@@ -222,34 +204,28 @@ class Parser:
             return now
         if not math.isfinite(stamp):
             raise _Dropped("not a number")
-        odd = ""
-        if self._stamp is not None and stamp < self._stamp:
-            odd = "older than the reading before"
-        elif self._offset is not None and stamp + self._offset - now > AHEAD_S:
-            odd = "from the future"
-        if odd:
+        delay = now - stamp
+        older = self._stamp is not None and stamp < self._stamp
+        if older or AHEAD_S < self._offset - delay < math.inf:
             self._odd += 1
             if self._odd < ODD_STAMPS:
-                raise _Dropped(odd)
-            self._offset = None
-        self._odd = 0
-        self._stamp = stamp
-        delay = now - stamp
-        if self._offset is None:
-            self._offset = delay
+                raise _Dropped(
+                    "older than the reading before" if older else "from the future"
+                )
+            self._offset = math.inf
+        self._odd, self._stamp = 0, stamp
         crept = self._offset + CLOCK_CREEP * max(0.0, now - self._offset_at)
         self._offset, self._offset_at = min(delay, crept), now
         return stamp + self._offset
 
     def _gate(self, matrix: Array) -> None:
-        if self._last is not None:
-            limit = self._settings.max_jump_deg
-            if angle_between_deg(self._last, matrix) > limit:
-                if self._far and angle_between_deg(self._far[-1], matrix) > limit:
-                    self._far.clear()
-                self._far.append(matrix)
-                if len(self._far) < REJOIN:
-                    raise _Dropped("an impossible jump")
+        limit = self._settings.max_jump_deg
+        if self._last is not None and angle_between_deg(self._last, matrix) > limit:
+            if self._far and angle_between_deg(self._far[-1], matrix) > limit:
+                self._far.clear()
+            self._far.append(matrix)
+            if len(self._far) < REJOIN:
+                raise _Dropped("an impossible jump")
         self._far.clear()
         self._last = matrix
 

@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterable, Iterator
 from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.core.device import Device
-from rig.core.faults import EXIT_FAULT, PlanOnly, Refused, Requests, ending
-from rig.core.known import check_drives
+from rig.core.faults import EXIT_FAULT, PlanOnly, Refused, ending
+from rig.core.known import KeptZero, check_drives
 from rig.core.session import Beside, Check, open_device, take_zero
-from rig.core.zero import KeptZero
 from rig.journal import DeviceRecord, JournalError, Record, RunFolder
+from rig.signals import Signals
 
 
 class Run(RunFolder):
@@ -21,6 +21,7 @@ class Run(RunFolder):
 
     check: Check = staticmethod(check_drives)  # of the drives, before they are armed
     simulated = False  # nothing real moves: it need not be slow
+    again = ""  # the command of a run that is not resumed, but begun again
 
     def __init__(
         self,
@@ -35,7 +36,7 @@ class Run(RunFolder):
         zero_at: Pulses | None = None,
         kept_zero: KeptZero | None = None,
         dry_run: bool = False,
-        signals: Requests | None = None,
+        signals: Signals | None = None,
     ) -> None:
         self._say = say
         self.confirm: Callable[[Run], None] = lambda run: None  # before ports open
@@ -45,7 +46,7 @@ class Run(RunFolder):
         self.kept_zero = kept_zero
         self.dry_run = dry_run
         self.reset_alarms = reset_alarms
-        self.signals = signals or Requests()
+        self.signals = signals or Signals()
         self.signals.report = self.emit
         self.planned = 0  # postures, as far as it is known
         super().__init__(config, folder, mode, start or {})
@@ -62,8 +63,7 @@ class Run(RunFolder):
     def zero_pulses(self) -> Pulses:
         """Where the zero posture was taken; where drives count 0 before it was."""
         zeros = self.journal.events("zero")
-        a, b, c = zeros[-1]["pulses"] if zeros else (0, 0, 0)
-        return a, b, c
+        return tuple(zeros[-1]["pulses"]) if zeros else (0, 0, 0)
 
     def lacks(self, names: Iterable[str]) -> bool:
         """Some of these postures are neither measured nor known to be out of reach."""
@@ -99,6 +99,8 @@ class Run(RunFolder):
     @property
     def to_go_on(self) -> str:
         """What goes on after a pause or a fault."""
+        if self.again:
+            return self.again
         resume = f"jaxcal-rig resume {self.folder}"
         if self.journal.records[0].get("simulated") is None:  # or it begins anew
             if lack := self.record.missing(self.config):

@@ -107,7 +107,7 @@ def parse(words: list[str]) -> None:
     from jaxcal.commands.evaluate_arguments import parser as evaluate_parser
     from jaxcal.commands.main import _parser
     from jaxcal.commands.train_arguments import parser as train_parser
-    from rig.arguments import make_parser
+    from rig.commands import make_parser
 
     ends = [i for i, word in enumerate(words) if word in ("|", ">", "&&")]
     words = words[: min(ends, default=len(words))]

@@ -5,11 +5,11 @@ import socket
 
 from harness import SPEEDUP, fast_config
 
-from rig import commissioning
 from rig.__main__ import main
 from rig.config import AXIS_NAMES
 from rig.simulator import Simulator, Truth
 from rig.workbench.commission.scan import parse_bus
+from rig.workbench.commission.setup import setting
 from rig.workbench.toml import set_values
 
 QUICK = (  # of the new rig.toml: short windows, quick axes
@@ -59,5 +59,5 @@ def quick_text(bus, port):
         for unit, (name, letter) in enumerate(zip(AXIS_NAMES, "XZY", strict=True), 1)
     ]  # fmt: skip
     text = new_text(parse_bus(bus), axes, "hyperimu", port)
-    values = dict(commissioning.setting(value) for value in QUICK)
+    values = dict(setting(value) for value in QUICK)
     return set_values(text, values | {"axes.yaw.direction": -1})

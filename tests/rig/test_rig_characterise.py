@@ -16,8 +16,8 @@ from test_rig_play import saved
 from rig.journal import read_journal
 from rig.simulator import Simulator, Truth
 from rig.workbench.commission import characterise, steps
+from rig.workbench.commission.characterise import ENOUGH_DEG
 from rig.workbench.commission.operator import Operator
-from rig.workbench.commission.probe import ENOUGH_DEG
 from rig.workbench.procedures.checking import load_calibration
 
 pytestmark = pytest.mark.slow  # minutes together; test_rig_play.py is the quick part

@@ -22,7 +22,7 @@ from harness import (
 
 import jaxcal
 from rig.__main__ import main
-from rig.arguments import make_parser
+from rig.commands import make_parser
 from rig.journal import read_journal
 from rig.simulator import Truth, parse_fault
 

@@ -21,7 +21,7 @@ from rig.core.known import check_drives
 from rig.journal import HOMED, SIGN_CHECKED, ZEROED, DeviceRecord
 from rig.simulator import Truth
 from rig.simulator.drive import SimDrive
-from rig.workbench.commission import bench, home, steps
+from rig.workbench.commission import home, steps
 from rig.workbench.commission.jog import FIRST_S, REPEAT_S, Held, Released
 from rig.workbench.commission.operator import Operator
 from rig.workbench.toml import edit
@@ -159,14 +159,14 @@ def test_a_held_key_moves_and_letting_go_stops(at):
 
 
 def test_sigterm_in_the_axis_check_stops_the_drives(commissioned, at, monkeypatch):
-    emit = bench.Bench.emit
+    emit = steps.Run.emit
 
     def struck(run, event, **fields):
         if event == "stand" and fields["name"] == "pitch:plus":
             os.kill(os.getpid(), signal.SIGTERM)
         return emit(run, event, **fields)
 
-    monkeypatch.setattr(bench.Bench, "emit", struck)
+    monkeypatch.setattr(steps.Run, "emit", struck)
     stops = [len(drive.stops) for drive in commissioned.drives]
     assert main(["axes", "--yes"]) == 128 + signal.SIGTERM
     after = [len(drive.stops) for drive in commissioned.drives]

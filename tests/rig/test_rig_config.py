@@ -118,7 +118,7 @@ def test_a_run_is_resumed_with_other_addresses_and_limits_and_nothing_else():
     for old, new in (
         ("port = 5020", "port = 5021"),
         ("timeout_s = 5\n", "timeout_s = 6\n"),
-        ("poll_s = 0.01", "poll_s = 0.02\nstall_s = 0.6\nheartbeat_s = 0.2"),
+        ("poll_s = 0.01", "poll_s = 0.02\nstall_s = 0.6"),
         ("[settle]", limits + "[settle]"),
     ):
         assert old in EXAMPLE_TEXT

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 from rig.config import AXIS_NAMES
 from rig.core.attitude import ORDERS, angle_between_deg, euler_to_matrix
 from rig.core.faults import MotionFault
-from rig.workbench.commission.findings import Stand, find
-from rig.workbench.commission.proposals import proposals
+from rig.workbench.commission.findings import Stand, find, proposals
 
 CONFIG = fast_config()
 START = (0, 0, 0)  # the zero posture: the axes are at right angles

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 import jaxcal
 from rig.core.attitude import ORDERS, Frame, Reading, euler_to_matrix, raw_fields
 from rig.simulator import Truth
-from rig.workbench.identification import noise
-from rig.workbench.identification.drift import estimate_drift, without_drift
+from rig.workbench.identification import fit
+from rig.workbench.identification.conclusion import estimate_drift, without_drift
 from rig.workbench.identification.fit import uncertainty
 from rig.workbench.outputs.console import drift_text, recalibrate
 from rig.workbench.readings import attitudes
@@ -34,7 +34,8 @@ def autoregression(rng, phi, n, size=3):
 def test_the_autocorrelation_time_of_an_autoregression_is_found(rng, phi):
     """Records far shorter than the correlation lasts: 25 readings where 39 are one."""
     series = [autoregression(rng, phi, n) for n in [25] * 600 + [100] * 60]
-    found = noise.autocorrelation_time(noise.correlation(series))
+    found = fit.correlation(series)
+    found = (1 + found) / (1 - found)
     np.testing.assert_allclose(found, (1 + phi) / (1 - phi), rtol=0.25)
 
 
@@ -44,11 +45,11 @@ def test_each_axis_has_its_own_correlation(rng):
         np.column_stack([autoregression(rng, phi, 50, 1) for phi in phis])
         for _ in range(200)
     ]
-    np.testing.assert_allclose(noise.correlation(series), phis, atol=0.05)
+    np.testing.assert_allclose(fit.correlation(series), phis, atol=0.05)
 
 
 def test_readings_that_do_not_vary_are_not_correlated():
-    assert noise.correlation([np.ones((25, 3)), np.zeros((1, 3))]).tolist() == [0] * 3
+    assert fit.correlation([np.ones((25, 3)), np.zeros((1, 3))]).tolist() == [0] * 3
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.7, 0.95])
@@ -56,12 +57,11 @@ def test_the_variance_of_a_mean_is_that_of_the_covariance_matrix(rng, phi):
     n = 25
     lags = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
     exact = (phi**lags).mean()  # of unit noise
-    assert noise.mean_share(np.array(phi), n) == pytest.approx(exact)
-    assert noise.effective_samples(np.array(phi), n) == pytest.approx(1 / exact)
+    assert fit.mean_share(phi, n) == pytest.approx(exact)
     drawn = [autoregression(rng, phi, n, 1) for _ in range(4000)]
     stated = np.mean(
         [
-            noise.mean_variance({"std_deg": x.std(0, ddof=1), "samples": n}, phi)
+            fit.mean_variance({"std_deg": x.std(0, ddof=1), "samples": n}, phi)
             for x in drawn
         ]
     )
@@ -92,7 +92,7 @@ def test_intervals_hold_as_often_as_they_say_under_correlated_noise(rng, held_ou
         zero = {"std_deg": off.std(axis=0, ddof=1), "samples": 100}
         made = [record(rng, x, off.mean(0), phi, sigma, 25, repeat) for x in u]
         records = [each for each, _ in made]
-        found = noise.correlation([off, *(y for _, y in made)])
+        found = fit.correlation([off, *(y for _, y in made)])
         fitted = jaxcal.identify(u[:4], [r["measured_deg"] for r in records[:4]])
         stated = uncertainty(fitted, records[:4], records[4:], zero, found)
         error = np.abs(np.column_stack([fitted.matrix, fitted.bias]) - TRUTH)
@@ -149,11 +149,11 @@ def test_a_linear_drift_of_the_phones_world_is_taken_out(order, rate, joints):
     """Of attitudes, so also where the joint angles do not shift by equal amounts."""
     frame, rate = a_frame(order), np.array(rate)
     visits = [visit(t, np.zeros(3), frame, rate * t) for t in (0.0, 0.6, 1.0)]
-    drift = estimate_drift(visits, np.zeros(3), 0.2)
-    assert drift.corrected and not drift.over
+    drift = estimate_drift(visits, frame, np.zeros(3), 0.2)
+    assert drift["corrected"] and not drift["over"]
     moved = visit(0.8, joints, frame, 0.8 * rate)
     assert np.abs(np.subtract(moved["measured_deg"], joints)).max() > 0.02
-    (mended,) = without_drift([moved], drift, visits[0], frame)
+    mended = without_drift(moved, drift["turn_deg_per_min"], visits[0], frame)
     np.testing.assert_allclose(mended["measured_deg"], joints, atol=2e-3)
 
 
@@ -164,13 +164,12 @@ def test_a_drift_that_is_not_linear_stays_and_is_judged():
         visit(t, np.zeros(3), frame, turn)
         for t, turn in zip((0, 0.5, 1), turns, strict=True)
     ]
-    drift = estimate_drift(visits, np.zeros(3), 0.2)
-    assert not drift.corrected and drift.over
-    assert without_drift(visits, drift, visits[0], frame) is visits
-    told = {"drift": vars(drift)}
+    drift = estimate_drift(visits, frame, np.zeros(3), 0.2)
+    assert not drift["corrected"] and drift["over"]
+    told = {"drift": drift}
     assert "session.drift_limit_deg (0.2)" in " ".join(recalibrate(told, 0.5))
-    assert "not linear" in drift_text(vars(drift))
-    assert not estimate_drift(visits, np.zeros(3), 0.6).over
+    assert "not linear" in drift_text(drift)
+    assert not estimate_drift(visits, frame, np.zeros(3), 0.6)["over"]
 
 
 def test_a_drift_within_the_noise_or_under_a_tenth_of_the_limit_is_left_alone():
@@ -179,24 +178,24 @@ def test_a_drift_within_the_noise_or_under_a_tenth_of_the_limit_is_left_alone():
         visits = [
             visit(t, np.zeros(3), frame, (0, 0, end * t), std) for t in (0, 0.5, 1)
         ]
-        drift = estimate_drift(visits, np.zeros(3), 0.2)
-        assert not drift.corrected and not drift.over
+        drift = estimate_drift(visits, frame, np.zeros(3), 0.2)
+        assert not drift["corrected"] and not drift["over"]
 
 
 def test_correlated_readings_make_a_drift_less_sure():
     frame = a_frame()
     visits = [visit(t, np.zeros(3), frame, (0, 0, 0.05 * t), 0.03) for t in (0, 0.5, 1)]
-    assert estimate_drift(visits, np.zeros(3), 0.2).corrected
-    assert not estimate_drift(visits, np.full(3, 0.9), 0.2).corrected
+    assert estimate_drift(visits, frame, np.zeros(3), 0.2)["corrected"]
+    assert not estimate_drift(visits, frame, np.full(3, 0.9), 0.2)["corrected"]
 
 
 def test_two_visits_say_how_far_and_not_whether_in_a_line():
     frame = a_frame()
     visits = [visit(t, np.zeros(3), frame, (0, 0, 0.5 * t)) for t in (0, 1)]
-    drift = estimate_drift(visits, np.zeros(3), 0.2)
-    assert drift.size_deg == pytest.approx(0.5, rel=0.3)
-    assert drift.bend_deg is None and not drift.corrected and drift.over
-    assert estimate_drift(visits[:1], np.zeros(3), 0.2) is None
+    drift = estimate_drift(visits, frame, np.zeros(3), 0.2)
+    assert drift["size_deg"] == pytest.approx(0.5, rel=0.3)
+    assert not drift["corrected"] and drift["over"]
+    assert estimate_drift(visits[:1], frame, np.zeros(3), 0.2) is None
 
 
 # Raw data

@@ -23,6 +23,7 @@ from rig.core.faults import (
 )
 from rig.core.measure import measure
 from rig.core.motion import Standing, move
+from rig.core.phone import ImuError
 from rig.core.proof import GROWTH, SHOWN_DEG
 from rig.signals import Signals
 from rig.simulator import Truth, parse_fault
@@ -36,6 +37,7 @@ def bench(config=None, arm=True, **options):
     with simulator(config, **options) as sim:
         served = sim.start()
         run = SimpleNamespace(
+            config=served,
             emit=lambda event, **fields: sim.hear({"event": event, **fields}),
             journal=SimpleNamespace(records=[]),
         )
@@ -91,7 +93,7 @@ def test_an_alarm_or_a_silent_phone_keeps_it_from_arming():
     with bench(fast_config(HASTY), arm=False) as motion:
         motion.sim.faults.add(parse_fault("imu_gap"))
         time.sleep(motion.config.imu.stale_s + 0.1)
-        with pytest.raises(MotionFault, match="reading is"):
+        with pytest.raises(ImuError, match="reading is"):
             motion.device.arm()
 
 

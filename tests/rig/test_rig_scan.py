@@ -1,10 +1,9 @@
 """What reads only: scan, ports; and how rig.toml is edited."""
 
 import shutil
-import socket
 
 import pytest
-from commission import device, free_port
+from commission import device
 from harness import fast_text
 
 from rig.__main__ import main
@@ -81,15 +80,6 @@ def test_an_empty_bus_is_said_with_what_to_check(at, capsys):
         sim.server._axis.clear()
         assert main(["scan", "--bus", bus, "--units", "2"]) == 3
     assert "baud rate" in capsys.readouterr().out
-
-
-def test_ports_tells_what_answers(capsys):
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
-        assert main(["ports", "--tcp", f"127.0.0.1:{port}"]) == 0
-    assert f"127.0.0.1:{port}: accepts connections" in capsys.readouterr().out
-    assert main(["ports", "--tcp", f"127.0.0.1:{free_port()}"]) == 3
-    assert main(["ports", "--tcp", "127.0.0.1:door"]) == 2
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,8 @@ def test_the_truth_lies_in_the_stated_intervals(finished):
     flat = np.concatenate([each[:, :3].ravel(), each[:, 3]])
     ratio = flat / wide  # t with 8 degrees of freedom, 2.31, and less than that
     assert 1.7 < ratio[:9].min() < ratio[:9].max() < 2.31
-    assert 1.2 < ratio[9:].min() < ratio[9:].max() < 4.0  # one ratio for three zeros
+    np.testing.assert_allclose(ratio[9:], ratio[9])  # one ratio for three zeros
+    assert 1.2 < ratio[9] < 4.0
     assert summary["after"]["rms"] < 0.1 < 1.0 < summary["before"]["rms"]
 
 
@@ -360,7 +361,7 @@ def test_the_wrong_euler_order_is_named(finished):
     config = fast_config()
     frame = Frame(np.array(zero["attitude"]), np.eye(3), "ZXY", config.letters)
     right = order_residuals(config, frame, records)
-    assert right["best"] == "ZXY" and not right["warning"]
+    assert min(right["rms"], key=right["rms"].get) == "ZXY" and not right["warning"]
     wrong_config = parse_config(fast_text({'order = "ZXY"': 'order = "XYZ"'}))
     wrong = order_residuals(wrong_config, frame, records)
     assert "the order ZXY leaves" in wrong["warning"]

@@ -10,7 +10,6 @@ import pytest
 from commission import QUICK, device, quick_text, set_up
 from harness import fast_text, no_figures
 
-from rig import commissioning
 from rig.__main__ import main
 from rig.config import load_config, parse_config
 from rig.config.files import EXAMPLES
@@ -119,7 +118,7 @@ def test_setup_asks_with_defaults_and_moves_nothing_without_a_yes(at):
 
     with device() as (sim, bus, port):
         operator = Operator(say=told.append, read=read)
-        values = dict(commissioning.setting(value) for value in QUICK)
+        values = dict(setup.setting(value) for value in QUICK)
         given = setup.Given(bus=bus, imu=f"hyperimu:{port}", units=4, values=values)
         config = setup.write_config(at / "rig.toml", given, operator)
         record = DeviceRecord.load(config.device_path)

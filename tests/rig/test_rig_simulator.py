@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from harness import fast_config, fast_text
 
-from rig.arguments import make_parser
+from rig.commands import make_parser
 from rig.config import parse_config
 from rig.core.bus import Bus
 from rig.core.drive import Drive

@@ -316,13 +316,12 @@ def test_the_page_says_stopped_from_the_word_of_the_drives(suspended, rig, tmp_p
         if suspended:
             child.send_signal(signal.SIGSTOP)
         (run,) = (tmp_path / "runs").iterdir()
-        watcher, since = Watcher(run), time.time()
-        watcher.ask(signal.SIGTERM)
+        watcher = Watcher(run)
         reader = threading.Thread(
             target=lambda: [watcher.poll() or time.sleep(0.02) for _ in range(100)]
         )
         reader.start()
-        units = watcher.stopped(since)
+        units = watcher.stop()
         assert [unit.axis for unit in units] == ["pitch", "yaw", "roll"]
         assert all(unit.acknowledged and unit.standing for unit in units)
         assert not any(drive.moving for drive in rig.drives)

@@ -3,6 +3,7 @@
 import json
 import threading
 import time
+import types
 
 import numpy as np
 import pytest
@@ -42,16 +43,20 @@ class Polled:
 
 
 def made(folder, imu, frame=None, positions=(None, None, None)):
+    """A device as the telemetry sees it."""
     config = fast_config()
     drives = [Polled(a, p) for a, p in zip(config.axes, positions, strict=True)]
-    return config, telemetry.Telemetry(folder, config, imu, drives, lambda: frame)
+    run = types.SimpleNamespace(folder=folder)
+    return types.SimpleNamespace(
+        run=run, config=config, imu=imu, drives=drives, frame=frame
+    )
 
 
 def test_a_sample_says_what_phone_and_drives_said_last(tmp_path):
     config = fast_config()
     frame = frame_at(config, np.eye(3))
-    _, thread = made(tmp_path, Phone(), frame, (2777, None, -2778))
-    sample = thread.sample()
+    device = made(tmp_path, Phone(), frame, (2777, None, -2778))
+    sample = telemetry.sample(device)
     ten = config.axes[0].to_deg(2777)
     assert sample["drives"] == [
         pytest.approx(ten, abs=1e-4),
@@ -67,26 +72,22 @@ def test_a_sample_says_what_phone_and_drives_said_last(tmp_path):
 
 
 def test_before_the_zero_and_without_a_phone_it_says_what_it_can(tmp_path):
-    _, thread = made(tmp_path, Phone())
-    assert thread.sample().keys() == {"time", "drives", "age", "rate"}
-    _, thread = made(tmp_path, Silent())
-    assert thread.sample().keys() == {"time", "drives"}
+    found = telemetry.sample(made(tmp_path, Phone()))
+    assert found.keys() == {"time", "drives", "age", "rate"}
+    assert telemetry.sample(made(tmp_path, Silent())).keys() == {"time", "drives"}
 
 
 def test_the_file_is_bounded(tmp_path, monkeypatch):
     monkeypatch.setattr(telemetry, "MAX_BYTES", 300)
     monkeypatch.setattr(telemetry, "PERIOD_S", 0.0005)
-    _, thread = made(tmp_path, Silent())
-    thread.start()
     older = tmp_path / telemetry.OLDER
     end = time.monotonic() + 20.0
     replaced = set()
-    while len(replaced) < 3 and time.monotonic() < end:
-        if older.exists():
-            replaced.add(older.stat().st_ino)
-        time.sleep(0.005)
-    thread.close()
-    thread.join(5.0)
+    with telemetry.telemetry(made(tmp_path, Silent())):
+        while len(replaced) < 3 and time.monotonic() < end:
+            if older.exists():
+                replaced.add(older.stat().st_ino)
+            time.sleep(0.005)
     assert len(replaced) >= 3
     sizes = {path.name: path.stat().st_size for path in tmp_path.iterdir()}
     assert set(sizes) <= {telemetry.TELEMETRY, telemetry.OLDER}
@@ -102,7 +103,7 @@ def test_its_failure_never_reaches_the_session(tmp_path, monkeypatch, failing):
     if failing == "full":
         (folder / telemetry.TELEMETRY).mkdir(parents=True)  # cannot be opened
     else:
-        monkeypatch.setattr(telemetry.Telemetry, "sample", lambda self: 1 / 0)
+        monkeypatch.setattr(telemetry, "sample", lambda device: 1 / 0)
     complaints = []
     monkeypatch.setattr(threading, "excepthook", complaints.append)
     with simulator(config) as sim:
@@ -116,11 +117,11 @@ def test_a_disk_that_hangs_does_not_keep_the_session_from_its_end(
 ):
     hung = threading.Event()
 
-    def hang(self):
+    def hang(device):
         hung.wait(60.0)
         return {}
 
-    monkeypatch.setattr(telemetry.Telemetry, "sample", hang)
+    monkeypatch.setattr(telemetry, "sample", hang)
     config, folder = fast_config(), tmp_path / "run"
     with simulator(config) as sim:
         assert session(sim.start(), folder, sim) == 0

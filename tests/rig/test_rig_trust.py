@@ -26,8 +26,8 @@ from rig.__main__ import main
 from rig.config import example_text, parse_config
 from rig.core.attitude import euler_to_matrix, frame_at
 from rig.core.faults import MotionFault, Refused
+from rig.core.known import KeptZero, check_zero, moved, unseen
 from rig.core.phone import Imu
-from rig.core.zero import KeptZero, check_zero, moved, unseen
 from rig.journal import (
     HOMED,
     IDENTIFIED,

@@ -11,7 +11,7 @@ import pytest
 from harness import HASTY, changed, fast_config, fast_text, session
 from test_rig_motion import bench
 
-from rig.config import ConfigError, load_config, parse_config
+from rig.config import load_config, parse_config
 from rig.config.files import EXAMPLES
 from rig.config.registers import decode
 from rig.core import stop
@@ -71,15 +71,6 @@ def test_the_heartbeat_ends_before_a_whole_step(name):
 def test_a_step_that_never_reaches_its_speed_is_timed_as_such():
     config = parse_config(fast_text({"accel_deg_s2 = 8000": "accel_deg_s2 = 100"}))
     assert config.shortest_step_s == pytest.approx(2 * math.sqrt(15 / 100), rel=0.01)
-
-
-def test_a_heartbeat_that_outlasts_a_step_is_refused():
-    text = (EXAMPLES / "leadshine_pr.toml").read_text()
-    assert "heartbeat_s" not in text
-    edited = text.replace("[motion]", "[motion]\nheartbeat_s = VALUE", 1)
-    assert parse_config(edited.replace("VALUE", "1.0")).heartbeat_s == 1.0
-    with pytest.raises(ConfigError, match=r"heartbeat_s: must not exceed the shortest"):
-        parse_config(edited.replace("VALUE", "3.0"))
 
 
 def test_every_frame_is_a_sign_of_life():

@@ -13,13 +13,17 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import numbers
 from jaxcal.models.model import as_commands
 from jaxcal.models.sensors import Sensor, Tip
-from jaxcal.models.serial.kinematics import OF_BASE, OF_ROW, Step, cross, forward
-from jaxcal.models.serial.torque import Load, torque
+from jaxcal.models.serial.kernel import forward
+from jaxcal.models.serial.torque import Load, cross, torque
 
 __all__ = ["Arm"]
 
 Array = NDArray[np.float64]
 
+# The steps of the base: three shifts, three turns, its nominal rotation; five of each
+# row of the table; the tool's three shifts, nominal rotation, three turns. A step is
+# 0, 1, 2, a shift along x, y, z, or 3, 4, 5, a turn about it, or 6 and on, a constant.
+_BASE, _ROW, _TOOL = (0, 1, 2, 3, 4, 5, 6), (0, 3, 2, 5, 4), (0, 1, 2, 7, 3, 4, 5)
 # Where a, alpha, d, theta and beta act among the five steps of a row.
 _ORDER = {"standard": (2, 3, 1, 0, 4), "modified": (0, 1, 4, 3, 2)}
 
@@ -37,6 +41,8 @@ class Arm:
     gears: tuple[int, ...]  # joints, from 1, whose gear ratio is a parameter
     compliance: tuple[int, ...]  # joints, from 1, whose compliance is one
     yields: Array  # (C,) what it is nominally, degrees per torque
+    harmonics: tuple[int, ...]  # joints, from 1, whose gears are eccentric
+    waves: Array  # (H, 4) nominally, degrees by sin, cos of the joint and of twice it
     loads: tuple[Load, ...]  # link, weight, its centre
     gravity: tuple[float, float, float]  # direction in the measuring frame
     joint_names: tuple[str, ...]  # J of them, the first columns of the commands
@@ -68,12 +74,13 @@ class Arm:
 
     @property
     def nominal(self) -> Array:
-        """(p,) table, gear ratios of 1, compliance, base, tool, the sensor's own."""
+        """(p,) table, gears, compliance, harmonics, base, tool, the sensor's own."""
         return np.concatenate(
             [
                 self.table.ravel(),
                 np.ones(len(self.gears)),
                 self.yields,
+                self.waves.ravel(),
                 self.base[:3, 3],
                 np.zeros(3),
                 np.concatenate([self.tool[:3, 3], np.zeros(3)])[self._tool],
@@ -117,32 +124,41 @@ class Arm:
 
     def _nominal_rotations(self, commands: Array) -> Array:
         """(N, 3, 3) from the tool to the measuring frame."""
-        steps = self._steps(commands, self.nominal)
-        return forward(len(commands), steps)[0][:3].transpose(2, 1, 0)
+        frame = self._chain(commands, self.nominal)[0]
+        return np.ascontiguousarray(frame[:3].transpose(2, 1, 0))
 
     @functools.cached_property
     def _tool(self) -> list[int]:
         """Which of the tool's shifts and turns are parameters."""
         return ["x y z rx ry rz".split().index(axis) for axis in self.sensor.tool]
 
-    @property
-    def _steps_of_joints(self) -> NDArray[np.int64]:
+    @functools.cached_property
+    def _steps(self) -> tuple[NDArray[np.intp], Array]:
+        """(S,) kinds of the steps of the chain, and constant rotations (2, 3, 3)."""
+        order = np.argsort(_ORDER[self.convention])
+        rows = [*np.array(_ROW)[order]] * len(self.joints)
+        kinds = np.array([*_BASE, *rows, *_TOOL], dtype=np.intp)
+        return kinds, np.stack([self.base[:3, :3], self.tool[:3, :3]])
+
+    @functools.cached_property
+    def _steps_of_joints(self) -> NDArray[np.intp]:
         """(n,) the step that moves each joint."""
         order = _ORDER[self.convention]
         moved = [order[3 if kind == "R" else 2] for kind in self.joints]
-        return OF_BASE + OF_ROW * np.arange(len(self.joints)) + moved
+        return len(_BASE) + len(_ROW) * np.arange(len(self.joints)) + moved
 
     @functools.cached_property
-    def _steps_of_parameters(self) -> NDArray[np.int64]:
+    def _steps_of_parameters(self) -> NDArray[np.intp]:
         """The step that each parameter moves; the sensor's own move none."""
         n = len(self.joints)
         moved = self._steps_of_joints
-        first = OF_BASE + OF_ROW * np.arange(n)
-        tool = OF_BASE + OF_ROW * n
+        first = len(_BASE) + len(_ROW) * np.arange(n)
+        tool = len(_BASE) + len(_ROW) * n
         return np.concatenate(
             [
                 (first[:, None] + _ORDER[self.convention]).ravel(),
                 moved[[i - 1 for i in (*self.gears, *self.compliance)]],
+                np.repeat(moved[[i - 1 for i in self.harmonics]], 4),
                 np.arange(6),
                 tool + np.array([0, 1, 2, 4, 5, 6])[self._tool],
             ]
@@ -156,43 +172,54 @@ class Arm:
         tool[self._tool] = parameters[first:last]
         return parameters[first - 6 : first], tool, parameters[last:]
 
-    def _drives(self, parameters: Array) -> tuple[Array, Array]:
-        """Gear ratio (n,) of all joints, and compliance of those that have one."""
+    def _drives(self, parameters: Array) -> tuple[Array, Array, Array]:
+        """Gear ratios (n,) of all joints, compliance (C,) and waves (H, 4)."""
         first = 5 * len(self.joints)
         last = first + len(self.gears)
+        end = last + len(self.compliance)
         ratios = np.ones(len(self.joints))
         ratios[[i - 1 for i in self.gears]] = parameters[first:last]
-        return ratios, parameters[last : last + len(self.compliance)]
+        waves = parameters[end : end + 4 * len(self.harmonics)].reshape(-1, 4)
+        return ratios, parameters[last:end], waves
+
+    def _swing(self, commands: Array) -> tuple[Array, Array]:
+        """(H, 4, N) sin, cos of the joints and of twice them, and their rates."""
+        turns = np.radians(self._moves(commands).T[[i - 1 for i in self.harmonics]])
+        angles = turns[:, None] * np.array([[1.0], [2.0]])
+        sine, cosine = np.sin(angles), np.cos(angles)
+        rate = np.radians([[[1.0]], [[2.0]]])
+        each = np.stack([sine, cosine], axis=2)
+        rates = rate * np.stack([cosine, -sine], axis=2)
+        shape = (len(turns), 4, len(commands))
+        return each.reshape(shape), rates.reshape(shape)
 
     def _moves(self, commands: Array) -> Array:
         """(N, n) how far each joint moves, before its gear."""
         return commands[:, : self.num_joints] @ self.drive.T + self.offset
 
-    def _steps(self, commands: Array, parameters: Array) -> list[Step]:
-        """The whole chain, from the measuring frame to the tool."""
+    def _chain(
+        self, commands: Array, parameters: Array, links: int | None = None
+    ) -> tuple[Array, Array, Array]:
+        """The tool's frame, or that after some links, axis and origin of each step."""
         n = len(self.joints)
-        gears, compliance = self._drives(parameters)
+        gears, compliance, waves = self._drives(parameters)
         moves = gears[:, None] * self._moves(commands).T
         if compliance.any():
             at = [i - 1 for i in self.compliance]
             moves[at] += compliance[:, None] * self._torque(commands)[0]
+        if waves.any():
+            at = [i - 1 for i in self.harmonics]
+            moves[at] += np.einsum("hk,hkn->hn", waves, self._swing(commands)[0])
         base, tool, _ = self._split(parameters)
-        steps = [Step(k > 2, k % 3, base[k]) for k in range(6)]
-        steps.append(Step(True, None, self.base[:3, :3]))
-        for row, move, kind in zip(
-            parameters[: 5 * n].reshape(n, 5), moves, self.joints, strict=True
-        ):
-            a, alpha, d, theta, beta = row
-            turn = Step(True, 2, theta + move if kind == "R" else theta)
-            slide = Step(False, 2, d + move if kind == "P" else d)
-            link = [Step(False, 0, a), Step(True, 0, alpha), Step(True, 1, beta)]
-            if self.convention == "standard":
-                steps += [turn, slide, *link]
-            else:
-                steps += [*link, turn, slide]
-        mounting = [Step(k > 2, k % 3, tool[k]) for k in range(6)]
-        steps += [*mounting[:3], Step(True, None, self.tool[:3, :3]), *mounting[3:]]
-        return steps
+        rows = parameters[: 5 * n].reshape(n, 5)
+        rows = rows[:, np.argsort(_ORDER[self.convention])]
+        one = np.concatenate([base, [0.0], rows.ravel(), tool[:3], [0.0], tool[3:]])
+        values = np.repeat(one[:, None], len(commands), axis=1)
+        values[self._steps_of_joints] += moves
+        kinds, fixed = self._steps
+        end = None if links is None else len(_BASE) + len(_ROW) * links
+        found: tuple[Array, Array, Array] = forward(kinds[:end], values[:end], fixed)
+        return found
 
     def _tip_at(self, commands: Array, frame: Array) -> Tip:
         return Tip(frame, lambda: self._nominal_rotations(commands), self.length)
@@ -204,15 +231,13 @@ class Arm:
 
         The second is by the sensor's own parameters.
         """
-        steps = self._steps(commands, parameters)
-        frame, axes, origins = forward(len(commands), steps)
+        frame, axes, origins = self._chain(commands, parameters)
         motion = np.zeros((len(at), 6, len(commands)))  # shift and turn of the tip
-        for k, i in enumerate(at):
-            if steps[i].turns:
-                cross(axes[i], np.radians(frame[3] - origins[i]), motion[k, :3])
-                motion[k, 3:] = np.radians(axes[i])
-            else:
-                motion[k, :3] = axes[i]
+        turns = self._steps[0][at] > 2
+        about = np.radians(axes[at[turns]])
+        motion[turns, :3] = cross(about, frame[3] - origins[at[turns]])
+        motion[turns, 3:] = about
+        motion[~turns, :3] = axes[at[~turns]]
         tip, inputs = self._tip_at(commands, frame), commands[:, self.num_joints :]
         found = self.sensor.read(tip, inputs, self._split(parameters)[2])
         return found.by_tip @ motion.transpose(2, 1, 0), found.by_own
@@ -227,13 +252,14 @@ class Arm:
             first = self.table.size + len(self.gears)
             stiff = self.nominal
             stiff[first : first + len(self.compliance)] = 0.0
+            _, axes, origins = self._chain(commands, stiff)
             found = torque(
-                len(commands),
-                self._steps(commands, stiff),
-                self._steps_of_joints,
+                axes[self._steps_of_joints],
+                origins[self._steps_of_joints],
                 np.array([kind == "R" for kind in self.joints]),
                 np.array(self.compliance) - 1,
                 self.loads,
+                lambda link: self._chain(commands, stiff, link)[0],
                 np.array(self.gravity),
             )
             kept = self.__dict__["_kept_torque"] = (commands.copy(), found)

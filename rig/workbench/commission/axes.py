@@ -14,14 +14,17 @@ from rig.core.measure import measure
 from rig.core.motion import move
 from rig.core.proof import FIRST_MOTOR_DEG, unit_proved
 from rig.journal import SIGN_CHECKED
-from rig.workbench.commission.findings import CLEAR, Stand, find, turn
-from rig.workbench.commission.proposals import (
+from rig.workbench.commission.findings import (
+    CLEAR,
     Change,
+    Stand,
+    find,
     lines,
     proposals,
     ratios_of,
     require_gearing,
     require_unit,
+    turn,
 )
 from rig.workbench.run import Run
 
@@ -50,7 +53,6 @@ def check_axes(run: Run, device: Device, names_known: bool) -> list[Change]:
     changes = proposals(run.config, found, told)
     evidence = {
         "ratio": dict(zip(AXIS_NAMES, np.round(ratios, 4).tolist(), strict=True)),
-        "off_deg": found.off_deg.round(2).tolist(),
         "backlash_deg": found.backlash_deg.round(4).tolist(),
         "phone_turned_deg": round(found.turned_deg, 2),
         "run": run.folder.name,
@@ -81,9 +83,8 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
         target = list(start)
         for axis, way in offset.items():
             target[axis] += way
-        pitch, yaw, roll = target
         run.signals.check_pause()
-        posture = Posture(name, (pitch, yaw, roll))
+        posture = Posture(name, tuple(target))
         measured = measure(move(device, posture), samples or None)
         run.emit("stand", sync=True, name=name, **measured)
         stands[name] = Stand.of(measured)
@@ -143,7 +144,8 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
                 "too small"
             )
         # Once more on the way up, where its play is taken up.
-        move(device, Posture(name, _moved(start, j, -far)))
+        down = tuple(p - far * (i == j) for i, p in enumerate(start))
+        move(device, Posture(name, down))
         visit(f"{name}:look", {j: look if 2 * abs(look) <= abs(far) else far // 4})
         visit(f"{name}:plus", {j: far})
         visit(f"{name}:back", {j: 0})
@@ -164,13 +166,6 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
             visit(label, {a: way_a, b: pair[b]}, samples)
     move(device, Posture("back", start))
     return stands
-
-
-def _moved(start: Pulses, axis: int, way: int) -> Pulses:
-    target = list(start)
-    target[axis] += way
-    a, b, c = target
-    return a, b, c
 
 
 def _room(run: Run, start: Pulses, axis: int) -> float:

@@ -6,26 +6,38 @@ that the play shifts all alike: the difference of the readings on its two sides.
 are repeated until their intervals are narrow. Then the breakaway: steps from rest, on
 in the direction in which the axis came, so that no play enters; there every step
 follows from the last, by a belief of :mod:`jaxcal.adaptive`.
+
+Ways are degrees of the axis's commands from where it stood, on the side that has room.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
-from typing import Any
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy import special
 
-from jaxcal.adaptive.estimates import Estimate
+from jaxcal.adaptive.estimates import Estimate, estimates
 from jaxcal.adaptive.grid import GridTask
+from jaxcal.adaptive.loop import next_measurement
 from jaxcal.adaptive.tasks.breakaway import Cautious, breakaway
+from rig.config import AXIS_NAMES
 from rig.core.attitude import mean_rotation
-from rig.core.device import Device
-from rig.core.faults import MotionFault
-from rig.workbench.commission.probe import ENOUGH_DEG, LEVEL, Probe, propose
+from rig.core.device import Device, Posture
+from rig.core.faults import MotionFault, Refused
+from rig.core.measure import measure
+from rig.core.motion import Standing, move
+from rig.core.proof import ALLOWED_DEG
+from rig.workbench.commission.axes import ROOM_DEG, SEEN_DEG
+from rig.workbench.commission.findings import Stand, turn
 from rig.workbench.run import Run
 
+LEVEL = 0.95
+ENOUGH_DEG = 0.02  # width of an interval
 MOST_DEG = 1.5  # of play
 FAR_DEG = 1.5 * MOST_DEG  # of a move after which play and friction are taken up
 ZONE_DEG = 0.8  # of the dead zone at most
@@ -39,6 +51,164 @@ RISK = 0.05  # that it exceeds it by more
 LEAST, MOST = 3, 20  # pairs of readings of the play, and of the dead zone
 MOST_STEPS = 40
 LEAST_SIGMA_DEG = 0.002  # of a reading: finer is not believed
+T = TypeVar("T")
+
+
+class Probe:
+    """The axis, where it began, and what its readings mean once that is known."""
+
+    def __init__(self, run: Run, device: Device, axis: int) -> None:
+        self.run, self.device = run, device
+        self.axis, self.name = axis, AXIS_NAMES[axis]
+        self.scale = run.config.axes[axis]
+        self.start = device.positions()
+        self.here_deg = here = self.scale.to_deg(self.start[axis])
+        low, high = self.scale.min_deg, self.scale.max_deg
+        above, below = high - here - ROOM_DEG, here - low - ROOM_DEG
+        up, down = BASE_DEG + FAR_DEG, REACH_DEG + FAR_DEG
+        self.side = 1 if above >= up and below >= down else -1
+        if self.side < 0 and (below < up or above < down):
+            raise Refused(
+                f"{self.name} stands at {here:.2f} deg, between its limits {low:g} and "
+                f"{high:g}; {up:g} deg of room one way and {down:g} the other are "
+                f"needed. Move it inwards: jaxcal-rig jog {self.name}"
+            )
+        self.count = 0  # measurements
+        self._base = device.attitude()  # (3, 3) that readings are from
+        self._line, self._rate = np.zeros(3), 1.0
+        device.proof.stay_near(self._base, max(ALLOWED_DEG, 2.0 * up))
+
+    def stand(self, label: str, *ways_deg: float) -> Stand:
+        """Go the ways one after the other, and measure at the last."""
+        for way in ways_deg:
+            standing = self.go(way, label)
+        measured = measure(standing)
+        self.run.emit("stand", sync=True, name=label, **measured)
+        self.count += 1
+        return Stand.of(measured)
+
+    def go(self, way_deg: float, label: str = "back") -> Standing:
+        """Move the axis."""
+        target = list(self.start)
+        target[self.axis] += self.scale.to_pulses(self.side * way_deg)
+        self.run.signals.check_pause()
+        return move(self.device, Posture(label, tuple(target)))
+
+    def way(self, found: Stand) -> float:
+        """Degrees commanded from where the axis stood."""
+        pulses = round(found.pulses[self.axis] - self.start[self.axis])
+        return self.side * self.scale.to_deg(pulses)
+
+    def read(self, found: Stand) -> float:
+        """Commanded degrees along the axis, by the phone."""
+        return float(turn(self._base, found.attitude) @ self._line / self._rate)
+
+    def off(self, found: Stand) -> float:
+        """Reading less command, degrees of the commands."""
+        return self.read(found) - self.way(found)
+
+    def play(self) -> tuple[Estimate, float]:
+        """The play, and the noise of a reading.
+
+        It begins with how far and about what the axis turns the phone, from two moves
+        of one length within which the direction does not change.
+        """
+        at, far = BASE_DEG, FAR_DEG
+        up = [self.stand("up", at - far, at), self.stand("top", at + far)]
+        down = [self.stand("down", at), self.stand("bottom", at - far)]
+        self._base = mean_rotation([up[0].attitude, down[0].attitude])
+        ends = [*up, *down[::-1]]
+        a, b, c, d = (turn(self._base, each.attitude) for each in ends)
+        ways = [self.way(each) for each in ends]
+        deg = abs(ways[1] - ways[0] + ways[3] - ways[2]) / 2.0
+        each = (b - a + d - c) / 2.0 / deg
+        self._rate = float(np.linalg.norm(each))
+        self._line = each / self._rate
+        if self._rate * deg < SEEN_DEG:
+            raise MotionFault(
+                f"{self.name} was moved by {deg:g} deg and the phone turned "
+                f"{self._rate * deg:.3f}. Check the axes first: jaxcal-rig axes"
+            )
+        first = self.read(down[0]) - self.read(up[0])
+        if first > 0.9 * MOST_DEG:
+            raise self.too_much("play", first, MOST_DEG)
+        noise = max(each.std_deg / each.samples**0.5 for each in ends) / self._rate
+        sigma = max(noise, LEAST_SIGMA_DEG)
+
+        def once(number: int) -> float:
+            above = self.stand(f"{self.name}:down:{number}", at + far, at)
+            below = self.stand(f"{self.name}:up:{number}", at - far, at)
+            return self.off(above) - self.off(below)
+
+        return _repeated(once, 2.0**0.5 * sigma), sigma
+
+    def zone(self, play: float, sigma: float) -> tuple[Estimate, float]:
+        """Width and centre of the dead zone; the play, taken up from below, is put
+        back."""
+
+        def off(label: str, command: float) -> float:
+            way = command + play / 2.0
+            return self.off(self.stand(f"{self.name}:{label}", way - FAR_DEG, way))
+
+        aboves: list[float] = []
+
+        def once(number: int) -> float:
+            aboves.append(off(f"above:{number}", REACH_DEG))
+            return off(f"below:{number}", -REACH_DEG) - aboves[-1]
+
+        width = _repeated(once, 2.0**0.5 * sigma)
+        if width.high > 0.98 * ZONE_DEG:
+            raise self.too_much("dead zone", width.mean, ZONE_DEG)
+        if width.low == 0.0:
+            return width, 0.0
+        # Across it the joint stays, so that a command there is off by its distance.
+        commands = np.linspace(-CENTRE_DEG, CENTRE_DEG, 5)
+        seen = [off(f"across:{i}", c) - np.mean(aboves) for i, c in enumerate(commands)]
+        centres = np.linspace(-CENTRE_DEG, CENTRE_DEG, 401)
+        told = np.clip(width.mean / 2 - (commands - centres[:, None]), 0.0, width.mean)
+        errors = ((told - seen) ** 2).sum(axis=1)
+        return width, float(np.mean(centres[errors <= errors.min() + sigma**2]))
+
+    def breakaway(self, sigma: float) -> tuple[Estimate, Estimate]:
+        """Steps up and down that the joint does not answer, on the probe's side."""
+        per_deg = abs(self.scale.pulses_per_deg)
+        least = math.ceil(STEP_DEG * per_deg) / per_deg
+        decider = Cautious(OVERSHOOT_DEG, RISK)
+        task = self.meanwhile(lambda: _step_task(2.0**0.5 * sigma, least))
+        history: list[tuple[int, int]] = []
+        while True:
+            proposal = self.meanwhile(lambda: next_measurement(task, history, decider))
+            found = estimates(task, proposal.belief, LEVEL)
+            up, down = found["up"], found["down"]
+            if proposal.design is None or max(up.width, down.width) <= ENOUGH_DEG:
+                break
+            label = f"{self.name}:up:{len(history) + 1}"
+            step, direction = (float(each) for each in proposal.coordinates)
+            before = self.stand(label, BASE_DEG - direction * FAR_DEG, BASE_DEG)
+            after = self.stand(f"{label}:on", BASE_DEG + direction * step)
+            way = (self.read(after) - self.read(before)) * direction
+            history.append((proposal.design, int(way > step / 2.0)))
+        for each in (up, down):
+            if each.high > (STEPS - 0.5) * least:
+                raise self.too_much("breakaway", each.mean, STEPS * least)
+        return up, down
+
+    def meanwhile(self, function: Callable[[], T]) -> T:
+        """What a function computes, while the standing device stays under guard."""
+        with ThreadPoolExecutor(1) as pool:
+            result = pool.submit(function)
+            while not result.done():
+                self.device.guard()
+                self.device.statuses()
+                time.sleep(self.run.config.motion.poll_s)
+            return result.result()
+
+    def too_much(self, what: str, deg: float, most: float) -> MotionFault:
+        """What says that more was found than is looked for."""
+        return MotionFault(
+            f"{self.name} has {deg:.2f} deg of {what}; at most {most:.3g} deg is "
+            "looked for. Look for a loose coupling, or a joint that binds"
+        )
 
 
 def characterise(run: Run, device: Device, axis: int) -> dict[str, Any]:
@@ -48,11 +218,11 @@ def characterise(run: Run, device: Device, axis: int) -> dict[str, Any]:
         Refused: the axis stands too near to a limit; nothing was moved.
         MotionFault: it does not turn the phone, or has more than is looked for.
     """
-    propose(_step_task(0.01, STEP_DEG), [(0, 0)], Cautious())  # compiles it
-    probe = Probe(run, device, axis, BASE_DEG + FAR_DEG, REACH_DEG + FAR_DEG)
-    play, sigma = _play(probe)
-    zone, centre = _zone(probe, play.mean, sigma)
-    up, down = _breakaway(probe, sigma)
+    next_measurement(_step_task(0.01, STEP_DEG), [(0, 0)], Cautious())  # compiles it
+    probe = Probe(run, device, axis)
+    play, sigma = probe.play()
+    zone, centre = probe.zone(play.mean, sigma)
+    up, down = probe.breakaway(sigma)
     probe.go(0.0)
     result = {
         "axis": probe.name,
@@ -64,29 +234,21 @@ def characterise(run: Run, device: Device, axis: int) -> dict[str, Any]:
         "measurements": probe.count,
     }
     run.emit("characterised", sync=True, **result)
-    told = (("play", play), ("dead zone", zone), ("breakaway up", up),
-            ("breakaway down", down))  # fmt: skip
-    run.say(
-        *(
+    told = {
+        "play": play, "dead zone": zone, "breakaway up": up, "breakaway down": down
+    }  # fmt: skip
+    for name, each in told.items():
+        run.say(
             f"{probe.name}: {name} {each.mean:.4f} deg of its commands, {LEVEL:.0%} in "
             f"{each.low:.4f}..{each.high:.4f}"
-            for name, each in told
-        ),
-        f"from {probe.count} measurements",
-    )
+        )
+    run.say(f"from {probe.count} measurements")
     return result
 
 
 def _kept(found: Estimate) -> dict[str, float]:
     each = {"value": found.mean, "low": found.low, "high": found.high}
     return {name: round(value, 5) for name, value in each.items()}
-
-
-def _too_much(probe: Probe, what: str, deg: float, most: float) -> MotionFault:
-    return MotionFault(
-        f"{probe.name} has {deg:.2f} deg of {what}; at most {most:.3g} deg is looked "
-        "for. Look for a loose coupling, or a joint that binds"
-    )
 
 
 def _repeated(measure: Callable[[int], float], sigma: float) -> Estimate:
@@ -99,86 +261,14 @@ def _repeated(measure: Callable[[int], float], sigma: float) -> Estimate:
         sigma: least standard deviation of one value.
     """
     values: list[float] = []
-    while len(values) < MOST:
+    half = math.inf
+    while len(values) < LEAST or (len(values) < MOST and half > ENOUGH_DEG / 2):
         values.append(measure(len(values) + 1))
-        count = len(values)
-        if count >= LEAST:
+        if (count := len(values)) >= LEAST:
             spread = max(sigma, float(np.std(values, ddof=1)))
             half = special.stdtrit(count - 1, 0.5 + LEVEL / 2) * spread / count**0.5
-            if half <= ENOUGH_DEG / 2:
-                break
     mean = max(0.0, float(np.mean(values)))
     return Estimate(mean, max(0.0, mean - half), mean + half)
-
-
-def _play(probe: Probe) -> tuple[Estimate, float]:
-    """The play, and the noise of a reading."""
-    at, far = BASE_DEG, FAR_DEG
-    up = [probe.stand("up", at - far, at), probe.stand("top", at + far)]
-    down = [probe.stand("down", at), probe.stand("bottom", at - far)]
-    middle = mean_rotation([up[0].attitude, down[0].attitude])
-    probe.learn(middle, [(up[0], up[1]), (down[1], down[0])])
-    first = probe.read(down[0]) - probe.read(up[0])
-    if first > 0.9 * MOST_DEG:
-        raise _too_much(probe, "play", first, MOST_DEG)
-    sigma = max(probe.noise(*up, *down), LEAST_SIGMA_DEG)
-
-    def measure(number: int) -> float:
-        above = probe.stand(f"{probe.name}:down:{number}", at + far, at)
-        below = probe.stand(f"{probe.name}:up:{number}", at - far, at)
-        return probe.off(above) - probe.off(below)
-
-    return _repeated(measure, 2.0**0.5 * sigma), sigma
-
-
-def _zone(probe: Probe, play: float, sigma: float) -> tuple[Estimate, float]:
-    """Width and centre of the dead zone; the play, taken up from below, is put back."""
-
-    def off(label: str, command: float) -> float:
-        """Reading less command."""
-        way = command + play / 2.0
-        return probe.off(probe.stand(f"{probe.name}:{label}", way - FAR_DEG, way))
-
-    aboves: list[float] = []
-
-    def measure(number: int) -> float:
-        aboves.append(off(f"above:{number}", REACH_DEG))
-        return off(f"below:{number}", -REACH_DEG) - aboves[-1]
-
-    width = _repeated(measure, 2.0**0.5 * sigma)
-    if width.high > 0.98 * ZONE_DEG:
-        raise _too_much(probe, "dead zone", width.mean, ZONE_DEG)
-    if width.low == 0.0:
-        return width, 0.0
-    # Across it the joint stays, so that a command there is off by its distance.
-    commands = np.linspace(-CENTRE_DEG, CENTRE_DEG, 5)
-    seen = [off(f"across:{i}", c) - np.mean(aboves) for i, c in enumerate(commands)]
-    centres = np.linspace(-CENTRE_DEG, CENTRE_DEG, 401)
-    told = np.clip(width.mean / 2 - (commands - centres[:, None]), 0.0, width.mean)
-    errors = ((told - seen) ** 2).sum(axis=1)
-    return width, float(np.mean(centres[errors <= errors.min() + sigma**2]))
-
-
-def _breakaway(probe: Probe, sigma: float) -> tuple[Estimate, Estimate]:
-    """Steps up and down that the joint does not answer, on the probe's side."""
-    per_deg = abs(probe.scale.pulses_per_deg)
-    least = math.ceil(STEP_DEG * per_deg) / per_deg
-
-    def measure(label: str, design: Any) -> int:
-        step, direction = design
-        before = probe.stand(label, BASE_DEG - direction * FAR_DEG, BASE_DEG)
-        after = probe.stand(f"{label}:on", BASE_DEG + direction * step)
-        return int((probe.read(after) - probe.read(before)) * direction > step / 2.0)
-
-    careful = Cautious(OVERSHOOT_DEG, RISK)
-    noise = 2.0**0.5 * sigma
-    found = probe.seek(
-        lambda: _step_task(noise, least), measure, ("up", "down"), careful
-    )
-    for name in ("up", "down"):
-        if found[name].high > (STEPS - 0.5) * least:
-            raise _too_much(probe, "breakaway", found[name].mean, STEPS * least)
-    return found["up"], found["down"]
 
 
 def _step_task(sigma: float, least: float) -> GridTask:

@@ -16,7 +16,7 @@ from rig.core.motion import Standing
 from rig.core.proof import NOISE_DEG
 from rig.core.session import ZERO_FACTOR
 from rig.journal import HOMED, ZEROED
-from rig.workbench.commission.bench import Bench
+from rig.workbench.run import Run
 
 HOME_S = 120.0  # for one axis on its own way home
 SET_S, SET_TRIES = 1.0, 3  # until a drive counts from its new zero
@@ -41,7 +41,7 @@ def can_home(config: RigConfig) -> bool:
     return all(axis.map.home is not None for axis in config.axes)
 
 
-def home(run: Bench, device: Device, here: bool) -> None:
+def home(run: Run, device: Device, here: bool) -> None:
     """Make the drives' counts mean a place; the device is HOMED.
 
     Args:
@@ -58,11 +58,11 @@ def home(run: Bench, device: Device, here: bool) -> None:
     how = "here" if here else "drive"
     run.emit("homed", sync=True, how=how, pulses=positions)
     origins = {drive.axis.name: drive.origin for drive in device.drives}
-    run.record.reach(HOMED, run.plain, how=how, pulses=positions, origins=origins)
+    run.record.reach(HOMED, run.config, how=how, pulses=positions, origins=origins)
     run.say(f"home: the drives count {positions} pulses")
 
 
-def _set_zero(run: Bench, device: Device, drive: Drive) -> None:
+def _set_zero(run: Run, device: Device, drive: Drive) -> None:
     if drive.axis.map.set_zero is None:
         run.say(
             f"  {drive.axis.name}: the map {drive.axis.map.name} has no register for "
@@ -105,7 +105,7 @@ def _counts_from(device: Device, drive: Drive, origin: int) -> str | None:
     )
 
 
-def _go_home(run: Bench, device: Device, drive: Drive) -> None:
+def _go_home(run: Run, device: Device, drive: Drive) -> None:
     """Let a drive home itself, as far and as fast as it is set to, under the phone.
 
     Raises:
@@ -166,14 +166,14 @@ def _check_homing(
         )
 
 
-def zero(run: Bench, device: Device) -> None:
+def zero(run: Run, device: Device) -> None:
     """Measure the attitude of the zero posture, where the device stands: ZEROED."""
     posture = Posture("zero", device.positions())
     samples = ZERO_FACTOR * run.config.settle.samples
     measured = measure(Standing(device, posture), samples)
     run.emit("zero", sync=True, **measured)
     zero = {"pulses": list(posture.pulses), "attitude": measured["attitude"]}
-    run.record.reach(ZEROED, run.plain, **zero)
+    run.record.reach(ZEROED, run.config, **zero)
 
 
 def identity(drives: list[Drive]) -> dict[str, dict[str, int | str]]:

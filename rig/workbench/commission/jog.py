@@ -101,10 +101,9 @@ def step(run: Run, device: Device, axis: int, way_deg: float) -> None:
         if turned > abs(way_deg) and not checked:
             raise Enough(f"{turned:.1f}")
 
-    pitch, yaw, roll = here
     device.meanwhile = look
     try:
-        move(device, Posture("jog", (pitch, yaw, roll)))
+        move(device, Posture("jog", tuple(here)))
     except Enough as turned:
         device.stopper.stop("the phone has turned far enough", latch=False)
         gone = abs(each.to_deg(device.positions()[axis] - start))

@@ -1,8 +1,10 @@
-"""What the phone sends: rate, gaps, what is dropped, and how it lies."""
+"""What this computer reaches: serial ports, and a phone's stream, told in figures."""
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import socket
 import time
 from collections.abc import Callable
 
@@ -11,7 +13,6 @@ import numpy as np
 from rig.config.settings import ImuSettings
 from rig.core.attitude import angle_between_deg, mean_rotation
 from rig.core.phone import Imu
-from rig.workbench.commission.ports import own_addresses
 
 LOOK_S = 1.0
 
@@ -24,7 +25,6 @@ class Stream:
     longest_gap_s: float
     scatter_deg: float  # about the mean attitude
     tilt_deg: float  # of the screen's normal from the vertical
-    accepted: int
     dropped: dict[str, int]  # records that were not used, by reason
     sender: str  # address
 
@@ -75,13 +75,41 @@ def _stream(imu: Imu, start: float) -> Stream:
     times = np.array([reading.time for reading in readings])
     mean = mean_rotation([reading.matrix for reading in readings[-500:]])
     apart = [angle_between_deg(mean, reading.matrix) for reading in readings[-500:]]
-    counts = dict(imu.counts)
+    dropped = imu.counts
+    dropped.pop("accepted", None)
     return Stream(
         rate_hz=len(readings) / spent,
         longest_gap_s=float(np.diff(times).max()) if len(times) > 1 else spent,
         scatter_deg=float(np.sqrt(np.mean(np.square(apart)) / 3.0)),
         tilt_deg=float(np.degrees(np.arccos(np.clip(mean[2, 2], -1.0, 1.0)))),
-        accepted=counts.pop("accepted", 0),
-        dropped=counts,
+        dropped=dropped,
         sender=imu.sender,
     )
+
+
+def serial_lines() -> list[str]:
+    """One line for each serial port: device, and what its adapter calls itself."""
+    from serial.tools import list_ports  # type: ignore[import-untyped]  # no stubs
+
+    lines = []
+    for port in sorted(list_ports.comports()):
+        usb = f", USB {port.vid:04x}:{port.pid:04x}" if port.vid is not None else ""
+        maker = f", {port.manufacturer}" if port.manufacturer else ""
+        lines.append(f"{port.device}: {port.description}{maker}{usb}")
+    return lines
+
+
+def own_addresses() -> list[str]:
+    """IPv4 addresses under which a phone can reach this computer."""
+    found: dict[str, None] = {}
+    # Connecting UDP sends nothing; it tells the address packets leave from.
+    with (
+        contextlib.suppress(OSError),
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe,
+    ):
+        probe.connect(("192.0.2.1", 9))
+        found[str(probe.getsockname()[0])] = None
+    with contextlib.suppress(OSError):
+        for *_, address in socket.getaddrinfo(socket.gethostname(), None):
+            found[str(address[0])] = None
+    return [a for a in found if ":" not in a and not a.startswith(("127.", "0."))]

@@ -12,6 +12,7 @@ from rig.config.registers import Read, decode
 from rig.config.schema import ConfigError, parse
 from rig.config.settings import BusSettings
 from rig.core.bus import Bus, BusError, Rejected
+from rig.journal import BusLock
 
 # For each absent unit, three times; a drive answers within 25 ms at 9600 baud.
 SCAN_TIMEOUT_S, RETRIES = 0.2, 2
@@ -85,7 +86,10 @@ def scan(
     say: Callable[[str], None],
     maps: tuple[RegisterMap, ...] = (),
 ) -> list[Found]:
-    """Ask units 1 to ``units`` for their identity; ``maps`` beside those that ship."""
+    """Ask units 1 to ``units`` for their identity; ``maps`` beside those that ship.
+
+    The bus is nobody else's meanwhile.
+    """
     known = [*maps, *(load_map(name) for name in available_maps())]
     known = list({each.name: each for each in known}.values())
     short = settings.model_copy(
@@ -95,7 +99,8 @@ def scan(
         }
     )
     found: list[Found] = []
-    with Bus(short, max(each.inter_frame_s for each in known)) as bus:
+    silence_s = max(each.inter_frame_s for each in known)
+    with BusLock(settings).acquire("scan"), Bus(short, silence_s) as bus:
         begun = time.monotonic()
         for unit in range(1, units + 1):
             if answer := _ask(bus, unit, known):
@@ -105,6 +110,11 @@ def scan(
                 spent = time.monotonic() - begun
                 left = spent / unit * (units - unit)
                 say(f"  {unit} of {units} units asked, about {left:.0f} s left")
+    if not found:
+        say(
+            "no unit answers. Check power, wiring, termination, the line format (baud "
+            "rate and parity) and the units' ids"
+        )
     return found
 
 

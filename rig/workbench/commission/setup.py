@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from typing import Any
+import socket
+import tomllib
+from typing import TYPE_CHECKING, Any
 
 from jaxcal.files import write_text
-from rig.config import AXIS_NAMES, RigConfig, parse_config
+from rig.config import AXIS_NAMES, RigConfig, load_config, parse_config
 from rig.config.axis import DEFAULT_ROTATES
 from rig.config.settings import BusSettings
 from rig.core.faults import EXIT_OK, Refused
 from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED
-from rig.journal.lock import BusLock
 from rig.workbench.commission import steps
 from rig.workbench.commission.home import can_home
 from rig.workbench.commission.operator import Operator
-from rig.workbench.commission.ports import serial_lines
+from rig.workbench.commission.phone import serial_lines
 from rig.workbench.commission.scan import Found, parse_bus, scan
 from rig.workbench.toml import edit, new_text, set_values
+
+if TYPE_CHECKING:
+    from rig.simulator import Simulator
 
 FORMATS = ["hyperimu", "sensorlogger", "lines"]
 UNITS = 16
@@ -40,6 +44,47 @@ class Given:
     names_known: bool = False
 
 
+def setting(text: str) -> tuple[str, Any]:
+    """A key of rig.toml and its value; what is no TOML is a text."""
+    key, equals, value = text.partition("=")
+    if not equals:
+        raise Refused(f"--set must be KEY=VALUE, got {text!r}")
+    try:
+        return key, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return key, value
+
+
+def simulated(simulator: Simulator, given: Given) -> Given:
+    """What an operator would answer of a simulated device, and its phone started."""
+    bus = simulator.start().bus
+    where = f"{bus.transport}:{bus.host}:{bus.port}"
+    if bus.transport == "rtu":
+        where = f"rtu:{bus.device},{bus.baudrate},N,8,1"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    simulator.start_phone(port)
+    imu = simulator.config.imu
+    values: dict[str, Any] = {"imu.host": "127.0.0.1", "imu.stale_s": imu.stale_s}
+    for axis in simulator.config.axes:
+        for name in ("reduction", "speed_deg_s", "accel_deg_s2"):
+            values[f"axes.{axis.name}.{name}"] = getattr(axis, name)
+    return dataclasses.replace(
+        given, bus=where, imu=f"{imu.format}:{port}", values=values | given.values
+    )
+
+
+def begin(path: pathlib.Path, given: Given, operator: Operator) -> RigConfig:
+    """The configuration of a file, which is written where there is none."""
+    operator.confirm(SAFETY, "setup")
+    if not path.exists():
+        return write_config(path, given, operator)
+    if given.values:
+        raise Refused(f"{path} exists: edit it, or leave out --set")
+    operator.say(f"{path} exists and is used; delete it to begin anew")
+    return load_config(path)
+
+
 def write_config(path: pathlib.Path, given: Given, operator: Operator) -> RigConfig:
     """Ask for bus, axes and phone, and write a new rig.toml."""
     say = operator.say
@@ -49,8 +94,7 @@ def write_config(path: pathlib.Path, given: Given, operator: Operator) -> RigCon
         say(f"  {line}")
     bus = _ask_bus(given, operator, lines)
     say(f"2 scan: units 1 to {given.units} on {bus.where}; reads only")
-    with BusLock(bus).acquire("setup"):
-        found = scan(bus, given.units, lambda text: say(f"  {text}"))
+    found = scan(bus, given.units, lambda text: say(f"  {text}"))
     say("3 axes: which unit drives which joint. Step 8 checks it by moving them")
     axes = _ask_axes(found, given, operator)
     say("4 phone")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import os
 import pathlib
 import sys
@@ -15,17 +16,27 @@ from rig.core.bus import Bus
 from rig.core.device import Device
 from rig.core.drive import Drive
 from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault, Refused
+from rig.core.known import check_drives
 from rig.core.phone import Imu
-from rig.core.session import STREAM_WAIT_S
-from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, STATES, DeviceRecord, Record
+from rig.core.proof import slowed
+from rig.core.session import STREAM_WAIT_S, Check
+from rig.journal import (
+    HOMED,
+    IDENTIFIED,
+    SIGN_CHECKED,
+    STATES,
+    DeviceRecord,
+    Record,
+    new_run_folder,
+)
 from rig.journal.lock import BusLock
 from rig.workbench.commission.axes import check_axes
-from rig.workbench.commission.bench import Bench
+from rig.workbench.commission.findings import Change
 from rig.workbench.commission.home import can_home, home, identity, unlimited, zero
 from rig.workbench.commission.jog import MOST_STEP_DEG, by_keyboard, step
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.phone import Stream, addresses_text, watch
-from rig.workbench.commission.proposals import Change
+from rig.workbench.outputs.console import listen
 from rig.workbench.run import Run, run_safely
 from rig.workbench.toml import edit
 
@@ -85,27 +96,42 @@ class Place:
     def run(
         self,
         name: str,
-        procedure: Callable[[Bench, Device], object],
+        procedure: Callable[[Run, Device], object],
         limits: bool = True,
         again: str = "",
     ) -> int:
         """Run a step that moves or writes; returns the exit code."""
-        config = self.config if limits else unlimited(self.config)
+        config, real = self.config, not self.full_speed
+        axes = tuple(slowed(axis) if real else axis for axis in config.axes)
+        # Every way to a place is straight, so that play is seen and not made a bias.
+        motion = config.motion.model_copy(update={"approach_overshoot_deg": 0.0})
+        config = config.model_copy(update={"axes": axes, "motion": motion})
+        # Homed drives are where they were left; the gearing is still to be checked.
+        check: Check = functools.partial(check_drives, geared=False)
         with self._lock(name) as lock:
-            bench = Bench(
-                config, name, self.record, self.say,
-                folder=self.folder, homed=limits, simulated=self.full_speed,
-                again=self.command(again or name), reset_alarms=self.reset_alarms,
+            run = Run(
+                config if limits else unlimited(config),
+                self.folder or new_run_folder(pathlib.Path(config.output), name),
+                name, self.say, record=self.record, reset_alarms=self.reset_alarms,
+                start={"simulated": None, "inputs": {}, "maps_from": ""},
             )  # fmt: skip
-            lock.tell(run=str(bench.folder.resolve()))
-            bench.listeners += self.listeners
+            run.check = check if limits else lambda *_: None
+            run.again, run.simulated = self.command(again or name), self.full_speed
+            listen(run)
+            run.listeners += self.listeners
+            lock.tell(run=str(run.folder.resolve()))
 
             def whole(run: Run) -> int:
                 with run.armed() as device:
-                    procedure(bench, device)
+                    procedure(run, device)
                 return EXIT_OK
 
-            return run_safely(bench, whole)
+            return run_safely(run, whole)
+
+
+def own_folder(config: RigConfig) -> pathlib.Path:
+    """A new one, of a simulated device."""
+    return new_run_folder(pathlib.Path(config.output), "simulated")
 
 
 def identify(place: Place) -> None:
@@ -173,7 +199,7 @@ def jog(place: Place, axis: int, way_deg: float | None) -> int:
     move = "while a key is held" if way_deg is None else f"by {way_deg:g} deg"
     place.operator.confirm(f"jog: {name} will move {move}, slowly", "jog")
 
-    def procedure(run: Bench, device: Device) -> None:
+    def procedure(run: Run, device: Device) -> None:
         if way_deg is None:
             by_keyboard(run, device, axis)
         else:
@@ -204,7 +230,7 @@ def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> i
         "characterise",
     )
 
-    def procedure(run: Bench, device: Device) -> None:
+    def procedure(run: Run, device: Device) -> None:
         found = measured.characterise(run, device, axis)
         if path is not None:
             keep(path, name, found | {"run": run.folder.name})
@@ -225,7 +251,7 @@ def axes(place: Place, names_known: bool = False) -> int:
     for again in (False, True):
         changes: list[Change] = []
 
-        def procedure(run: Bench, device: Device, to: list[Change] = changes) -> None:
+        def procedure(run: Run, device: Device, to: list[Change] = changes) -> None:
             to += check_axes(run, device, names_known)
 
         if code := place.run("axes", procedure):

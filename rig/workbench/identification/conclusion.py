@@ -2,73 +2,76 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from rig.config import AXIS_NAMES, RigConfig
-from rig.core.attitude import ORDERS, Frame, frame_at
+from rig.core.attitude import ORDERS, Array, Frame, frame_at
 from rig.core.faults import MotionFault
-from rig.core.identify import identify, pairs
-from rig.journal import Record
-from rig.workbench.identification.drift import estimate_drift, without_drift
-from rig.workbench.identification.fit import held_out_errors, uncertainty
-from rig.workbench.identification.noise import (
-    autocorrelation_time,
+from rig.journal import Record, measured_postures
+from rig.workbench.identification.fit import (
     correlation,
-    effective_samples,
+    held_out_errors,
+    identify,
+    mean_share,
+    mean_variance,
+    pairs,
+    uncertainty,
 )
 from rig.workbench.readings import angles
 
 USUAL = (1 / 3, 3.0)  # degrees of a joint for one commanded; outside it is told
-
-
-@dataclasses.dataclass(frozen=True)
-class Evidence:
-    """All that a calibration is identified from."""
-
-    zero: Record
-    chosen: list[Record]  # postures measured to identify from
-    held: list[Any]  # pairs of pulses held out, raw and compensated
-    held_out: list[Record]  # measured there
-    references: list[Record]  # later visits of the zero posture, in order of time
+SIGNIFICANT = 3.0  # standard deviations, of a drift
+LEAST = 0.1  # of session.drift_limit_deg: a smaller drift is left alone
+STRAIGHT = 0.25  # of a drift: what a line leaves of it, and it is still linear
 
 
 def conclude(
-    config: RigConfig, evidence: Evidence, notes: dict[str, Any]
+    config: RigConfig, records: list[Record], notes: dict[str, Any]
 ) -> tuple[Any, dict[str, Any]]:
-    """The calibration, with ``notes`` in its file, and what its summary says of it."""
-    zero = evidence.zero
+    """The calibration, with ``notes`` in its file, and what its summary says of it.
+
+    Args:
+        config: of the device.
+        records: of the run's journal: the zero, the pairs held out, the postures.
+        notes: for the calibration's file.
+    """
+    last = {record["event"]: record for record in records}
+    zero, held = last["zero"], last.get("held_out", {"pairs": []})["pairs"]
     frame = frame_at(config, np.array(zero["attitude"]))
-    measured = [zero, *evidence.chosen, *evidence.held_out, *evidence.references]
-    phi = correlation([angles(record, frame) for record in measured])
-    visits = [zero, *evidence.references]
-    drift = estimate_drift(visits, phi, config.session.drift_limit_deg)
-    chosen = without_drift(evidence.chosen, drift, zero, frame)
-    found = without_drift(evidence.held_out, drift, zero, frame)
-    held_out, off = held_out_errors(
-        config, evidence.held, {r["name"]: r for r in found}
-    )
-    limits = uncertainty(identify(chosen), chosen, held_out, zero, phi)
+    postures = measured_postures(records)
+    of_role: dict[str, list[Record]] = {"reference": []}
+    for record in postures.values():
+        of_role.setdefault(record["role"], []).append(record)
+    phi = correlation([angles(r, frame) for r in (zero, *postures.values())])
+    visits = sorted([zero, *of_role["reference"]], key=lambda record: record["time"])
+    drift = estimate_drift(visits, frame, phi, config.session.drift_limit_deg)
+    if drift and drift["corrected"]:
+        turn = drift["turn_deg_per_min"]
+        postures = {n: without_drift(r, turn, zero, frame) for n, r in postures.items()}
+    chosen = [postures[record["name"]] for record in of_role["select"]]
+    first = identify(chosen)
+    held_out, off = held_out_errors(config, held, postures, first)
+    limits = uncertainty(first, chosen, held_out, zero, phi)
     shared = {
         "zero_pulses": zero["pulses"],
         "zero_attitude": zero["attitude"],
         "device": config.device_fingerprint(),
         "postures": [record["name"] for record in chosen],
     }
-    notes = notes | shared
-    notes |= {
+    notes |= shared | {
         "mechanism_order": config.mechanism.order,
         "approach_overshoot_deg": config.motion.approach_overshoot_deg,
         "noise_from": limits["basis"],
-        "drift_corrected": drift is not None and drift.corrected,
+        "drift_corrected": bool(drift and drift["corrected"]),
     }
     noise = np.array(limits["noise_std_deg"])
     calibration = identify(chosen, noise, notes, np.array(limits["zero_std_deg"]) ** 2)
     count = config.settle.samples
-    summary = {
+    return calibration, {
         "schema": 1,
         "measured_at": zero["time"],
         "axes": list(AXIS_NAMES),
@@ -76,28 +79,74 @@ def conclude(
         "A": np.asarray(calibration.matrix).tolist(),
         "b": np.asarray(calibration.bias).tolist(),
         **limits,
-        "autocorrelation_readings": autocorrelation_time(phi).tolist(),
-        "effective_samples": effective_samples(phi, count).tolist(),
+        "effective_samples": (1.0 / mean_share(phi, count)).tolist(),
         "samples": count,
         **shared,
         "orders": order_residuals(config, frame, chosen + held_out),
         **off,
-        **(_predicted(calibration, held_out) if held_out else {}),
-        "drift": None if drift is None else dataclasses.asdict(drift),
-        "drift_deg": None,
+        "drift": drift,
     }
-    if evidence.references:
-        last = evidence.references[-1]["measured_deg"]
-        summary["drift_deg"] = float(np.abs(last).max())
-    return calibration, summary
 
 
-def _predicted(calibration: Any, held_out: list[Record]) -> dict[str, float]:
-    """Errors of the prediction at held-out postures, degrees."""
-    commands, measured = pairs(held_out)
-    off = measured - calibration.predict(commands)
-    rms, worst = np.sqrt((off**2).mean()), np.abs(off).max()
-    return {"prediction_rms": float(rms), "prediction_max": float(worst)}
+def estimate_drift(
+    visits: list[Record], frame: Frame, phi: Array, limit_deg: float
+) -> dict[str, Any] | None:
+    """How far the phone's zero drifted; None where it was visited once.
+
+    The zero posture is visited first, in the middle and last. A heading that drifts
+    turns the phone's world, so a linear drift is taken out of the attitudes, never of
+    angles: ``R' = exp(-w t) R`` with w (3,) in that world. Three visits tell a linear
+    drift from any other, which cannot be taken out.
+
+    Args:
+        visits: the zero, then postures measured there, in order of time.
+        frame: of the zero.
+        phi: (3,) correlation of readings, for the noise of a visit.
+        limit_deg: ``session.drift_limit_deg``.
+
+    Returns:
+        minutes (V,) and angles_deg (V, 3) of the visits; size_deg, the largest angle;
+        turn_deg_per_min (3,), w; corrected: it is linear and to be taken out; left_deg,
+        what is in the measurements then; limit_deg, and whether left is over it.
+    """
+    zero = visits[0]
+    if len(visits) < 2:
+        return None
+    minutes = np.array([visit["time"] - zero["time"] for visit in visits]) / 60.0
+    seen = np.array([np.zeros(3), *(visit["measured_deg"] for visit in visits[1:])])
+    attitudes = np.array([visit["attitude"] for visit in visits])
+    turns = Rotation.from_matrix(attitudes @ attitudes[0].T).as_rotvec(degrees=True)
+    away = minutes - minutes.mean()
+    turn = away @ turns / max(float(away @ away), 1e-12)
+    rest = [without_drift(visit, turn, zero, frame) for visit in visits[1:]]
+    bend = np.abs([visit["measured_deg"] for visit in rest]).max(axis=0)
+    noise = mean_variance(zero, phi) + mean_variance(visits[-1], phi)
+    least = np.maximum(SIGNIFICANT * np.sqrt(noise), LEAST * limit_deg)
+    size, end = float(np.abs(seen).max()), np.abs(seen[-1])
+    straight = bool((bend <= np.maximum(least, STRAIGHT * end.max())).all())
+    corrected = len(visits) == 3 and straight and bool((end > least).any())
+    left = float(bend.max()) if corrected else size
+    return {
+        "minutes": minutes.round(4).tolist(),
+        "angles_deg": seen.tolist(),
+        "size_deg": size,
+        "turn_deg_per_min": turn.tolist(),
+        "corrected": corrected,
+        "left_deg": left,
+        "limit_deg": limit_deg,
+        "over": left > limit_deg,
+    }
+
+
+def without_drift(
+    record: Record, turn: ArrayLike, zero: Record, frame: Frame
+) -> Record:
+    """A record without a turn of (3,) degrees a minute of the phone's world."""
+    minutes = (record["time"] - zero["time"]) / 60.0
+    back = Rotation.from_rotvec(-minutes * np.asarray(turn), degrees=True)
+    attitude = back.as_matrix() @ np.array(record["attitude"])
+    measured = frame.angles(attitude).tolist()
+    return {**record, "attitude": attitude.tolist(), "measured_deg": measured}
 
 
 def order_residuals(
@@ -109,7 +158,7 @@ def order_residuals(
     postures; with four every order fits exactly.
 
     Returns:
-        rms (order to degrees), configured, best, warning (empty where all is well).
+        rms (order to degrees), configured, warning (empty where all is well).
     """
     configured = config.mechanism.order
     if len(records) < 6:
@@ -136,7 +185,7 @@ def order_residuals(
             f"{configured}, far above the readings' scatter of {noise:.3f}: check the "
             "phone's order and signs ([imu] order), its mounting, and play"
         )
-    return {"rms": rms, "configured": configured, "best": best, "warning": warning}
+    return {"rms": rms, "configured": configured, "warning": warning}
 
 
 def check_matrix(matrix: ArrayLike) -> list[str]:

@@ -17,108 +17,64 @@ from scipy.spatial.transform import Rotation
 
 from jaxcal.files import write_text
 from rig.config import RigConfig, parse_config
-from rig.config.settings import ImuSettings
 from rig.core.attitude import (
     DIGITS,
-    Array,
-    Frame,
     euler_to_matrix,
     frame_at,
     matrix_to_euler,
     mean_rotation,
 )
-from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault, Refused
+from rig.core.faults import EXIT_OK, MotionFault, Refused
 from rig.journal import Record, RunFolder, measured_postures, new_run_folder
-from rig.workbench.identification.conclusion import Evidence, check_matrix, conclude
-from rig.workbench.outputs.console import recalibrate, summary_lines
-from rig.workbench.outputs.report import write_report
+from rig.workbench.identification.conclusion import check_matrix, conclude
+from rig.workbench.outputs.report import save_result
 from rig.workbench.readings import attitudes
 from rig.workbench.toml import set_values
 
 
-def require_angles(imu: ImuSettings, changes: dict[str, Any]) -> None:
-    """Refused where the phone sent quaternions, which have neither order nor signs."""
-    for name in changes.keys() & {"imu.order", "imu.signs"}:
-        if _quaternions(imu):
-            raise Refused(
-                f"{name} cannot be changed to {changes[name]}: this phone sent "
-                "quaternions, which have neither order nor signs. Look at "
-                "mechanism.order and imu.mounting_deg"
-            )
-
-
-def _quaternions(imu: ImuSettings) -> bool:
-    return imu.format == "sensorlogger" or imu.quaternion_columns is not None
-
-
-def reread(
-    records: list[Record], then: RigConfig, now: RigConfig
-) -> tuple[list[Record], Evidence]:
+def reread(records: list[Record], then: RigConfig, now: RigConfig) -> list[Record]:
     """Zero, postures and held-out pairs as another configuration reads them.
 
     Args:
-        records: of the journal of a calibration, of any version.
+        records: of the journal of a calibration.
         then: its configuration.
         now: the same but for orders, signs and mounting.
-
-    Returns:
-        The records for a new journal, and the evidence to conclude from.
 
     Raises:
         Refused: not enough was measured to identify from.
     """
-    kept = {"zero": [], "held_out": []}  # type: dict[str, list[Record]]
-    for record in records:
-        kept.get(record["event"], []).append(record)
     postures = measured_postures(records)
-    chosen = [r for r in postures.values() if r.get("role") == "select"]
-    if not kept["zero"] or len(chosen) < then.session.k:
+    chosen = [r for r in postures.values() if r["role"] == "select"]
+    zeros = [r for r in records if r["event"] == "zero"]
+    if not zeros or len(chosen) < then.session.k:
         raise Refused(
             f"the run holds {len(chosen)} of the {then.session.k} chosen postures that "
             "a calibration takes. Resume it first"
         )
-    zero = kept["zero"][-1]
-    turned = _turned(attitudes(zero), then.imu, now.imu)
-    new = frame_at(now, mean_rotation(turned))
-    zero = _remeasured(zero, turned, new)
-    zero["measured_deg"] = [0.0, 0.0, 0.0]
-    read = {
-        name: _remeasured(r, _turned(attitudes(r), then.imu, now.imu), new)
-        for name, r in postures.items()
-    }
-    of_role: dict[str, list[Record]] = {}
-    for record in read.values():
-        of_role.setdefault(record.get("role", ""), []).append(record)
-    held = kept["held_out"][-1:]
-    evidence = Evidence(
-        zero=zero,
-        chosen=of_role["select"],
-        held=held[0]["pairs"] if held else [],
-        held_out=of_role.get("before", []) + of_role.get("after", []),
-        references=sorted(of_role.get("reference", []), key=lambda r: r["time"]),
-    )
-    return [zero, *held, *read.values()], evidence
+    same = (then.imu.order, then.imu.signs) == (now.imu.order, now.imu.signs)
+    signs = np.array(then.imu.signs) * np.array(now.imu.signs)
+    frame = None
 
+    def read(record: Record) -> Record:
+        nonlocal frame
+        turned = attitudes(record)
+        if not same:
+            sent = matrix_to_euler(turned, str(then.imu.order))
+            turned = euler_to_matrix(sent * signs, str(now.imu.order))
+        attitude = mean_rotation(turned)
+        frame = frame or frame_at(now, attitude)  # of the zero, which comes first
+        spread = frame.angles(turned)
+        std = spread.std(axis=0, ddof=1) if len(spread) > 1 else np.zeros(3)
+        quaternions = Rotation.from_matrix(turned).as_quat(canonical=True)
+        return record | {
+            "measured_deg": frame.angles(attitude).round(9).tolist(),
+            "std_deg": std.round(6).tolist(),
+            "attitude": attitude.round(12).tolist(),
+            "quaternions": quaternions.round(DIGITS).tolist(),
+        }
 
-def _turned(matrices: Array, then: ImuSettings, now: ImuSettings) -> Array:
-    """(N, 3, 3) attitudes from the same phone angles under other order and signs."""
-    if (then.order, then.signs) == (now.order, now.signs) or _quaternions(then):
-        return matrices
-    sent = matrix_to_euler(matrices, str(then.order)) * np.array(then.signs)
-    return euler_to_matrix(sent * np.array(now.signs), str(now.order))
-
-
-def _remeasured(record: Record, matrices: Array, frame: Frame) -> Record:
-    attitude = mean_rotation(matrices)
-    spread = frame.angles(matrices)
-    std = spread.std(axis=0, ddof=1) if len(spread) > 1 else np.zeros(3)
-    quaternions = Rotation.from_matrix(matrices).as_quat(canonical=True)
-    return record | {
-        "measured_deg": frame.angles(attitude).round(9).tolist(),
-        "std_deg": std.round(6).tolist(),
-        "attitude": attitude.round(12).tolist(),
-        "quaternions": quaternions.round(DIGITS).tolist(),
-    }
+    held = [r for r in records if r["event"] == "held_out"][-1:]
+    return [read(zeros[-1]), *held, *map(read, postures.values())]
 
 
 def refit(
@@ -143,32 +99,39 @@ def refit(
     Raises:
         Refused: the run does not allow it; nothing was written.
     """
-    start = held[0]
+    start, imu = held[0], then.imu
     old = {
         "mechanism.order": then.mechanism.order,
-        "imu.order": then.imu.order,
-        "imu.signs": [*then.imu.signs],
-        "imu.mounting_deg": [*then.imu.mounting_deg],
+        "imu.order": imu.order,
+        "imu.signs": [*imu.signs],
+        "imu.mounting_deg": [*imu.mounting_deg],
     }
     new = {k: v for k, v in wanted.items() if v is not None and v != old[k]}
-    require_angles(then.imu, new)
+    quaternions = imu.format == "sensorlogger" or imu.quaternion_columns is not None
+    for name in new.keys() & {"imu.order", "imu.signs"} if quaternions else ():
+        raise Refused(
+            f"{name} cannot be changed to {new[name]}: this phone sent quaternions, "
+            "which have neither order nor signs. Look at mechanism.order and "
+            "imu.mounting_deg"
+        )
     text = set_values(then.text, new)
     now = parse_config(text, pathlib.Path(start["maps_from"]), str(folder))
     changed = {key: [old[key], value] for key, value in new.items()}
-    records, evidence = reread(held, then, now)
+    records = reread(held, then, now)
     notes = {"refit_of": folder.name, "simulated": start["simulated"] is not None}
-    calibration, summary = conclude(now, evidence, notes)
+    calibration, summary = conclude(now, records, notes)
     try:
         warnings = check_matrix(calibration.matrix)
     except MotionFault as fault:
         raise Refused(f"nothing was written: read like this, {fault}") from None
     if changed:
         summary.pop("after", None)  # compensated by another calibration than this
+    was = folder / "summary.json"
     summary |= {
         "mode": "refit",
         "refit_of": folder.name,
         "changed": changed,
-        "was": _saved(folder / "summary.json", "A", "b"),
+        "was": json.loads(was.read_text(encoding="utf-8")) if was.is_file() else None,
         "simulated": start["simulated"],
     }
     into = new_run_folder(folder.resolve().parent, "refit")
@@ -179,28 +142,14 @@ def refit(
         for record in records:
             fields = {k: v for k, v in record.items() if k not in ("seq", "event")}
             run.emit(record["event"], **fields)
-        calibration.save(into / "calibration.json")
-        run.save_pairs()
-        run.save_summary(summary)
         run.emit("end", sync=True, code=EXIT_OK, reason="")
-        write_report(into, run.journal.records)
+        chosen = len(summary["postures"])
+        say(f"{folder.name} identified anew from {chosen} postures:")
+        for key, (before, value) in changed.items():
+            say(f"  {key} = {json.dumps(value)}  # was {json.dumps(before)}")
+        say("  Set these in your rig.toml too" if changed else "  no key was changed")
+        for warning in warnings:
+            say(f"WARNING: {warning}")
+        return save_result(run, calibration, summary, say)
     finally:
         run.journal.close()
-    say(f"{folder.name} identified anew from {len(evidence.chosen)} postures:")
-    for key, (was, value) in changed.items():
-        say(f"  {key} = {json.dumps(value)}  # was {json.dumps(was)}")
-    say("  no key was changed" if not changed else "  Set these in your rig.toml too")
-    limit = now.session.verify_limit_deg
-    for line in summary_lines(summary, limit):
-        say(line)
-    for text in warnings:
-        say(f"WARNING: {text}")
-    say(f"saved: {into}/calibration.json, pairs.csv, summary.json, report.html")
-    return EXIT_RECALIBRATE if recalibrate(summary, limit) else EXIT_OK
-
-
-def _saved(path: pathlib.Path, *keys: str) -> dict[str, Any] | None:
-    if not path.is_file():
-        return None
-    summary = json.loads(path.read_text(encoding="utf-8"))
-    return {key: summary[key] for key in keys}

@@ -10,10 +10,11 @@ from typing import Any
 
 from nicegui import ui
 
-from rig.workbench.live import charts, words
-from rig.workbench.live.charts import DARK, LIGHT, Palette
+from rig.workbench.live import words
+from rig.workbench.live.charts import DARK, LIGHT, Palette, charts
 from rig.workbench.live.scene import CommandScene, DeviceScene
 from rig.workbench.live.watcher import Watcher
+from rig.workbench.live.words import draw
 
 TICK_S = 0.1
 ANSWER_S = 10.0  # for a browser to show what it was sent
@@ -22,29 +23,17 @@ HEAD = """
 <link rel="stylesheet" href="/page.css">
 <script src="/page.js" defer></script>
 """
-# Stands before anything is connected: STOP works from the first moment.
-BODY = """
-<header id="head">{head}</header>
-<div id="actions" {hidden}>
-  <p id="answer" role="status" aria-live="assertive"></p>
-  <button id="pause" type="button">PAUSE<small>after this posture</small></button>
-  <button id="stop" type="button">STOP<small>all drives, now</small></button>
-</div>
-"""
 DARK_QUERY = "matchMedia('(prefers-color-scheme: dark)').matches"
-
-
-def _card(title: str, note: str = "", kind: str = "") -> Any:
-    """A titled section; what is made inside it stands below the title."""
-    card = ui.element("section").classes(f"card {kind}")
-    with card:
-        head = f"<h2>{words.text(title)}</h2>"
-        ui.html(head + (f"<p class='note'>{words.text(note)}</p>" if note else ""))
-    return card
-
-
-def _clock(when: float) -> str:
-    return time.strftime("%H:%M:%S", time.localtime(when))
+NOTES = {  # of the cards, in their order: below the title
+    "Device": "Solid: as the phone measures. Ghost: as commanded. They differ by what "
+    "is calibrated.",
+    "Postures": "",
+    "Angles": "Solid: phone. Dashed: drives.",
+    "Settling": "Standard deviation over the settle window.",
+    "Commands": "The cube of the ranges with the candidates. Green: measured.",
+    "Drift": "The zero posture, read again; it should read zero.",
+    "What happened": "",
+}
 
 
 class LivePage:
@@ -54,41 +43,33 @@ class LivePage:
         self.watcher, self.palette = watcher, palette
         self._version = -1
         self._ticks = 0
+        self._parts: dict[str, Any] = {}  # HTML by the macro that draws it
+        self._charts: dict[str, Any] = {}
         with ui.element("div").classes("live"):
-            self._trouble = ui.html().classes("trouble")
-            self._verdict = ui.html().classes("card verdict")
-            with _card("Device", kind="first"):
-                ui.html(
-                    "<p class='note'>Solid: as the phone measures. <b class='ghost'>"
-                    "Ghost</b>: as commanded. They differ by what is calibrated.</p>"
-                )
-                self._device = DeviceScene(watcher.state, palette)
-                self._numbers = ui.html().classes("wide")
-                self._stream = ui.html(tag="p").classes("note")
-            with _card("Postures", kind="tall"):
-                self._queue = ui.html()
-            note = "Solid: phone. Dashed: drives. Bands: readings were taken."
-            with _card("Angles", note):
-                self._attitude = ui.echart({})
-            note = "Standard deviation over the settle window. Bands: readings."
-            with _card("Settling", note):
-                self._settling = ui.echart({})
-            note = (
-                "Cube: ranges of the commands with the candidates. Green: measured. "
-                "Ellipsoid: uncertainty of the slopes on a logarithmic scale; it fills "
-                "the cube along directions that no posture has measured."
-            )
-            with _card("What is known", note, "known"):
-                self._commands = CommandScene(palette)
-                self._uncertainty = ui.html()
-            with _card("Noise", "Scatter of the readings of each posture."):
-                self._noise = ui.echart({})
-            note = "The zero posture, read again; it should read zero."
-            with _card("Drift", note):
-                self._drift = ui.echart({})
-            with _card("What happened", kind="whole"):
-                self._log = ui.html()
+            for name in ("trouble", "verdict"):
+                self._parts[name] = ui.html().classes(f"card {name}")
+            for title, note in NOTES.items():
+                kind = title.lower().replace(" ", "-")
+                with ui.element("section").classes(f"card card-{kind}"):
+                    ui.html(f"<h2>{title}</h2><p class='note'>{note}</p>")
+                    self._fill(title)
         self.update()
+
+    def _fill(self, title: str) -> None:
+        match title:
+            case "Device":
+                config = self.watcher.state.start.get("config", {})
+                self._device = DeviceScene(config, self.palette)
+                self._parts["numbers"] = ui.html().classes("wide")
+                self._stream = ui.label().classes("note")
+            case "Commands":
+                self._commands = CommandScene(self.palette)
+            case "Postures":
+                self._parts["queue"] = ui.html()
+            case "What happened":
+                self._parts["log"] = ui.html()
+            case _:
+                self._charts[title] = ui.echart({})
 
     async def tick(self) -> None:
         """Ten times a second: turn the device; draw anew what has changed.
@@ -112,49 +93,51 @@ class LivePage:
         if not watcher.running and state.done:
             measured, commanded = state.done[-1].measured, state.done[-1].commanded
         self._device.show(measured, commanded)
-        table = words.numbers(state, sample, watcher.running)
-        self._numbers.set_content(table)
-        self._stream.set_content(words.stream(sample, watcher.running, time.time()))
+        rows = words.numbers(state, sample, watcher.running)
+        self._parts["numbers"].set_content(draw("numbers", rows=rows))
+        self._stream.set_text(words.stream(sample, watcher.running, time.time()))
 
     def _plot(self) -> None:
         watcher = self.watcher
         end = time.time() if watcher.running else watcher.state.time
-        data = (watcher.state, watcher.samples, end, self.palette)
-        _draw(self._attitude, charts.attitude(*data))
-        _draw(self._settling, charts.settling(*data))
+        drawn = charts(watcher.state, watcher.samples, end, self.palette)
+        for title, options in drawn.items():
+            chart = self._charts[title]
+            chart.options.clear()
+            chart.options.update(options)
+            chart.update()
 
     def update(self) -> None:
         """Draw everything that follows from the journal."""
         watcher, state = self.watcher, self.watcher.state
         self._version = watcher.version
+        head = json.dumps(_head(watcher))
+        ui.run_javascript(f"live.head({head}, {json.dumps(watcher.here)})")
+        lines = words.trouble(state, watcher.running, str(watcher.folder))
+        result = words.verdict(state, watcher.summary)
+        shown = {
+            "trouble": draw("trouble", lines=lines),
+            "verdict": draw("verdict", lines=result, report=watcher.report),
+            "queue": draw(
+                "queue", postures=words.queue(state), count=len(state.postures)
+            ),
+            "log": draw("log", lines=state.log),
+        }
         tone = words.headline(state, watcher.running)[0]
-        head = words.head(state, watcher.running, watcher.folder.name)
-        ui.run_javascript(f"live.head({json.dumps(head)}, {json.dumps(watcher.here)})")
-        self._show(self._trouble, words.trouble(
-            state, watcher.running, str(watcher.folder)
-        ))  # fmt: skip
-        report = watcher.report is not None
-        self._show(self._verdict, words.verdict(state, watcher.summary, report))
-        for card in (self._trouble, self._verdict):
-            card.classes(tone, remove="run good warn bad")
-        self._queue.set_content(words.queue(state))
-        self._uncertainty.set_content(words.uncertainty(state))
-        self._log.set_content(words.happened(state, _clock))
+        for name, content in shown.items():
+            part = self._parts[name]
+            part.set_content(content)
+            if name in ("trouble", "verdict"):
+                part.set_visibility(bool(content.strip()))
+                part.classes(tone, remove="run good warn bad")
         self._commands.show(state)
-        _draw(self._noise, charts.noise(state, self.palette))
-        _draw(self._drift, charts.drift(state, self.palette))
         self._plot()
 
-    @staticmethod
-    def _show(element: Any, content: str) -> None:
-        element.set_content(content)
-        element.set_visibility(bool(content))
 
-
-def _draw(chart: Any, options: dict[str, Any]) -> None:
-    chart.options.clear()
-    chart.options.update(options)
-    chart.update()
+def _head(watcher: Watcher) -> str:
+    state = watcher.state
+    now, said = words.headline(state, watcher.running), words.progress(state)
+    return draw("head", state=state, now=now, said=said, folder=watcher.folder.name)
 
 
 def make_page(watcher: Watcher) -> Any:
@@ -162,9 +145,8 @@ def make_page(watcher: Watcher) -> Any:
 
     async def page() -> None:
         ui.add_head_html(HEAD)
-        state, hidden = watcher.state, "" if watcher.here else "hidden"
-        head = words.head(state, watcher.running, watcher.folder.name)
-        ui.add_body_html(BODY.format(head=head, hidden=hidden))
+        # Stands before anything is connected: STOP works from the first moment.
+        ui.add_body_html(draw("body", head=_head(watcher), here=watcher.here))
         await ui.context.client.connected()
         dark = await ui.run_javascript(DARK_QUERY, timeout=20.0)
         while not watcher.state.start:  # the device's axes are drawn from it

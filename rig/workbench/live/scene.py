@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,11 +10,9 @@ from nicegui import ui
 
 from rig.config import AXIS_NAMES
 from rig.workbench.live.charts import AXIS_COLORS, Palette
-from rig.workbench.live.state import Degrees, Posture, RunState
-from rig.workbench.live.worth import ellipsoid
+from rig.workbench.live.state import Degrees, RunState
 
 RADII = (1.5, 1.2)  # of the two rings of the gimbal
-TUBE = 0.045
 ARCS = 12  # Bezier tubes of a ring
 UNIT = {"X": np.eye(3)[0], "Y": np.eye(3)[1], "Z": np.eye(3)[2]}
 FOOT = (  # outline of the sole, toes along +y
@@ -26,206 +23,135 @@ FOOT = (  # outline of the sole, toes along +y
 GHOST = "#e0568f"
 STATE_COLORS = {"done": "#1fae85", "waiting": "#8c98a6"}
 ACTIVE_COLOR = "#3b9de0"
-MARKED = 200  # postures of a kind; more would make the page slow
-UNKNOWN = 1.0  # drawn radius along directions that no posture has measured
-LEAST = 0.12  # drawn radius of a slope known to KNOWN
-KNOWN = 1e-4  # degrees per degree
+MARKED = 200  # newest postures; more would make the page slow
 
 
-def _tube(start: Any, end: Any, radius: float, color: str) -> Any:
-    middle = (np.asarray(start) + end) / 2
-    tube = ui.scene.quadratic_bezier_tube(
-        list(start), middle.tolist(), list(end), 1, radius, 10
-    )
-    return tube.material(color)
+def _view(palette: Palette, camera_at: Degrees, kind: str) -> Any:
+    camera = ui.scene.perspective_camera(fov=32)
+    camera.x, camera.y, camera.z = camera_at
+    made = ui.scene(grid=False, camera=camera, background_color=palette.scene)
+    return made.classes(kind)
 
 
-def _ring(normal: Any, radius: float, color: str) -> None:
-    """A ring about the origin, of tubes that each bend through one arc."""
-    first = UNIT["X"] if abs(normal[0]) < 0.5 else UNIT["Y"]
-    second = np.cross(normal, first)
-    turn, bulge = 2 * math.pi / ARCS, radius / math.cos(math.pi / ARCS)
-
-    def at(angle: float, r: float) -> list[float]:
-        return (r * (math.cos(angle) * first + math.sin(angle) * second)).tolist()
-
-    for arc in range(ARCS):
-        a = arc * turn
-        ui.scene.quadratic_bezier_tube(
-            at(a, radius), at(a + turn / 2, bulge), at(a + turn, radius), 6, TUBE, 8
-        ).material(color)
+def _tube(start: Any, bend: Any, end: Any, radius: float, color: str) -> None:
+    a, b, c = (np.asarray(point, float).tolist() for point in (start, bend, end))
+    ui.scene.quadratic_bezier_tube(a, b, c, 6, radius, 8).material(color)
 
 
-class Chain:
-    """Three nested groups that turn about the joints' axes, outermost first."""
+def _axle(to: Any, of: Any, color: str) -> None:
+    """Tubes on either side of the origin, between two points on one side."""
+    for side in (-1.0, 1.0):
+        a, b = side * np.asarray(to), side * np.asarray(of)
+        _tube(a, (a + b) / 2, b, 0.04, color)
 
-    def __init__(self, letters: list[str], order: str) -> None:
-        self._joints = [letters.index(letter) for letter in order]
-        self._order = order
-        self.groups: list[Any] = []
 
-    def add(self) -> Any:
-        """The next group, to be entered inside the one before."""
-        self.groups.append(ui.scene.group())
-        return self.groups[-1]
+def _ring(first: Any, second: Any, radius: float, color: str) -> None:
+    """A ring through two perpendicular units, of tubes that bend through one arc."""
+    half = math.pi / ARCS
 
-    def turn(self, angles: Degrees) -> None:
-        """Set pitch, yaw and roll in degrees."""
-        for group, joint, letter in zip(
-            self.groups, self._joints, self._order, strict=True
-        ):
-            euler = math.radians(angles[joint]) * UNIT[letter]
-            group.rotate(*euler.tolist())
+    def at(step: int, r: float) -> Any:
+        return r * (math.cos(step * half) * first + math.sin(step * half) * second)
+
+    for arc in range(0, 2 * ARCS, 2):
+        bend = at(arc + 1, radius / math.cos(half))
+        _tube(at(arc, radius), bend, at(arc + 2, radius), 0.045, color)
 
 
 class DeviceScene:
     """A gimbal and a foot plate as the phone says; a ghost plate as commanded."""
 
-    def __init__(self, state: RunState, palette: Palette) -> None:
-        axes = state.start.get("config", {}).get("axes", [])
-        letters = [axis["letter"] for axis in axes] or ["X", "Z", "Y"]
-        order = state.start.get("config", {}).get("mechanism_order", "ZXY")
-        self.device, self.ghost = Chain(letters, order), Chain(letters, order)
-        camera = ui.scene.perspective_camera(fov=32)
-        camera.x, camera.y, camera.z = 4.7, -5.3, 2.7
-        camera.look_at_z = -0.1
-        self.scene = ui.scene(
-            grid=False, camera=camera, background_color=palette.scene, fps=20
-        ).classes("device")
-        with self.scene:
-            self._build(letters, order, palette)
-        self._shown: list[Any] = [None, None]
-
-    def _build(self, letters: list[str], order: str, palette: Palette) -> None:
-        outer, inner = (UNIT[order[i]] for i in (0, 1))
-        colors = {
-            letter: AXIS_COLORS[letters.index(letter)] for letter in letters
-        }  # by axis letter
-        self._base(order, palette)
-        with self.device.add():
-            _ring(np.cross(outer, inner), RADII[0], colors[order[0]])
-            self._pins(order[1], RADII, colors[order[1]])
-            with self.device.add():
-                last = UNIT[order[2]]
-                _ring(np.cross(inner, last), RADII[1], colors[order[1]])
-                self._pins(order[2], (RADII[1], 0.3), colors[order[2]])
-                with self.device.add():
-                    self._plate(palette.plate, 1.0, phone=True)
-        with self.ghost.add(), self.ghost.add(), self.ghost.add():
-            self._plate(GHOST, 0.32, phone=False)
-        for index, name in enumerate(AXIS_NAMES):
-            at = 1.72 * UNIT[letters[index]]
-            style = f"color:{AXIS_COLORS[index]};font:600 12px system-ui"
-            ui.scene.text(name, style).move(*at.tolist())
-
-    def _base(self, order: str, palette: Palette) -> None:
-        ui.scene.cylinder(0.75, 0.85, 0.1, 48).rotate(math.pi / 2, 0, 0).move(
-            z=-1.98
-        ).material(palette.metal)
-        axis = UNIT[order[0]]
-        if order[0] == "Z":
-            _tube([0, 0, -1.95], [0, 0, -RADII[0]], 0.09, palette.metal)
-            return
-        for side in (-1.0, 1.0):
-            top = side * 1.62 * axis
-            foot = np.array([top[0], top[1], -1.95])
-            _tube(foot, top, 0.06, palette.metal)
-            _tube(top, side * RADII[0] * axis, 0.06, palette.metal)
-
-    def _pins(self, letter: str, radii: tuple[float, float], color: str) -> None:
-        for side in (-1.0, 1.0):
-            axis = side * UNIT[letter]
-            _tube((radii[0] * axis).tolist(), (radii[1] * axis).tolist(), 0.035, color)
-
-    def _plate(self, color: str, opacity: float, phone: bool) -> None:
-        outline = [list(point) for point in FOOT]
-        plate = ui.scene.extrusion(outline, 0.08).move(z=-0.04)
-        plate.material(color, opacity)
-        if phone:
-            ui.scene.box(0.30, 0.62, 0.05).move(0, 0.02, 0.065).material("#10151b")
-            ui.scene.box(0.26, 0.56, 0.01).move(0, 0.02, 0.092).material("#3b9de0")
+    def __init__(self, config: dict[str, Any], palette: Palette) -> None:
+        letters = [axis["letter"] for axis in config.get("axes", [])] or [*"XZY"]
+        self._order = config.get("mechanism_order", "ZXY")  # outermost joint first
+        self._joints = [letters.index(letter) for letter in self._order]
+        outer, inner, last = (UNIT[letter] for letter in self._order)
+        colors = [AXIS_COLORS[joint] for joint in self._joints]
+        self._shown: list[Degrees | None] = [None, None]
+        with _view(palette, [4.7, -5.3, 2.7], "device"):
+            _axle(1.95 * outer, RADII[0] * outer, palette.metal)
+            device, ghost = [], []
+            with ui.scene.group() as group:
+                device.append(group)
+                _ring(outer, inner, RADII[0], colors[0])
+                _axle(RADII[0] * inner, RADII[1] * inner, colors[1])
+                with ui.scene.group() as group:
+                    device.append(group)
+                    _ring(inner, last, RADII[1], colors[1])
+                    _axle(RADII[1] * last, 0.3 * last, colors[2])
+                    with ui.scene.group() as group:
+                        device.append(group)
+                        _plate(palette.plate, 1.0)
+                        ui.scene.box(0.3, 0.62, 0.05).move(z=0.065).material("#10151b")
+                        ui.scene.box(0.26, 0.56, 0.01).move(z=0.092).material("#3b9de0")
+            with ui.scene.group() as a, ui.scene.group() as b, ui.scene.group() as c:
+                ghost += [a, b, c]
+                _plate(GHOST, 0.32)
+            for letter, name, color in zip(
+                letters, AXIS_NAMES, AXIS_COLORS, strict=True
+            ):
+                _label(name, color, 1.72 * UNIT[letter])
+        self._chains = (device, ghost)
+        device[0].with_name("device")  # a browser makes them in any order
+        ghost[0].with_name("ghost")
 
     def show(self, measured: Degrees | None, commanded: Degrees | None) -> None:
         """Turn device and ghost, where they changed."""
-        chains = (self.device, self.ghost)
-        for index, (chain, angles) in enumerate(
-            zip(chains, (measured, commanded), strict=True)
-        ):
+        for index, angles in enumerate((measured, commanded)):
             if angles is not None and angles != self._shown[index]:
-                self._shown[index] = list(angles)
-                chain.turn(angles)
+                self._shown[index] = angles
+                chain = zip(self._chains[index], self._joints, self._order, strict=True)
+                for group, joint, letter in chain:
+                    euler = math.radians(angles[joint]) * UNIT[letter]
+                    group.rotate(*euler.tolist())
+
+
+def _plate(color: str, opacity: float) -> None:
+    outline = [list(point) for point in FOOT]
+    plate = ui.scene.extrusion(outline, 0.08).move(z=-0.04)
+    plate.material(color, opacity)
+
+
+def _label(name: str, color: str, at: Any) -> None:
+    style = f"color:{color};font:600 12px system-ui"
+    ui.scene.text(name, style).move(*np.asarray(at).tolist())
 
 
 class CommandScene:
-    """The candidates in the cube of their ranges, and the ellipsoid of uncertainty."""
+    """Candidates and postures in the cube of their ranges."""
 
     def __init__(self, palette: Palette) -> None:
-        camera = ui.scene.perspective_camera(fov=32)
-        camera.x, camera.y, camera.z = 3.9, -4.8, 2.6
-        self.scene = ui.scene(
-            grid=False, camera=camera, background_color=palette.scene, fps=10
-        ).classes("commands")
         self._palette = palette
-        self._marks: dict[str, tuple[str, Any]] = {}
+        self._marks: dict[str, tuple[str, Any]] = {}  # of postures, and their states
         self._cloud: Any = None
-        with self.scene:
+        self._scene = _view(palette, [3.9, -4.8, 2.6], "commands")
+        edges = ([0, -1, -1], [-1, -1, 0], [1, 0, -1])  # of pitch, yaw, roll
+        with self._scene:
             ui.scene.box(2, 2, 2, wireframe=True).material(palette.metal, 0.5)
-            self._body = ui.scene.sphere(1.0, 40, 24).material("#3b9de0", 0.28)
-            self._mesh = ui.scene.sphere(1.005, 20, 12, wireframe=True)
-            self._mesh.material("#3b9de0", 0.35)
-            for index, name in enumerate(AXIS_NAMES):
-                at = np.array([0.0, -1.0, -1.0])
-                if index:
-                    at = np.array([1.0, 0.0, -1.0] if index == 2 else [-1.0, -1.0, 0.0])
-                style = f"color:{AXIS_COLORS[index]};font:600 12px system-ui"
-                ui.scene.text(name, style).move(*(1.15 * at).tolist())
+            for name, color, at in zip(AXIS_NAMES, AXIS_COLORS, edges, strict=True):
+                _label(name, color, 1.15 * np.array(at))
 
     def show(self, state: RunState) -> None:
-        """Candidates, postures in the colour of their state, the ellipsoid."""
-        ranges = np.array(state.setting("session", "ranges", [[-1, 1]] * 3))
-        low, high = ranges.astype(np.float64).T
+        """Candidates, and postures in the colour of their state."""
+        ranges = np.array(state.setting("session", "ranges", [[-1, 1]] * 3), float)
+        middle, half = ranges.mean(axis=1), np.ptp(ranges, axis=1) / 2
 
-        def place(angles: Any) -> Any:
-            u = (2 * np.asarray(angles, float) - (low + high)) / (high - low)
-            return u[..., [0, 2, 1]]  # pitch along x, roll along y, yaw upwards
+        def place(angles: Any) -> Any:  # pitch along x, roll along y, yaw upwards
+            return ((np.asarray(angles, float) - middle) / half)[..., [0, 2, 1]]
 
-        with self.scene:
+        postures = [p for p in state.postures.values() if p.commanded][-MARKED:]
+        with self._scene:
             if self._cloud is None and state.candidates:
                 points = place(state.candidates).tolist()
-                shade = self._palette.metal.lstrip("#")
-                rgb = [int(shade[i : i + 2], 16) / 255 for i in (0, 2, 4)]
-                self._cloud = ui.scene.point_cloud(points, [rgb] * len(points), 0.07)
-            marked = state.by_role("select", "goto")[:MARKED]
-            marked += [p for p in state.done if p.role == "collect"][-MARKED:]
-            self._mark(marked, place)
-        self._ellipsoid(state)
-
-    def _mark(self, postures: list[Posture], place: Callable[[Any], Any]) -> None:
-        """A sphere for each posture, redrawn where its state has changed."""
-        looks = {p.name: p.state for p in postures if p.commanded is not None}
-        for name, (look, mark) in [*self._marks.items()]:
-            if looks.get(name) != look:
-                mark.delete()
-                del self._marks[name]
-        for posture in postures:
-            if posture.name in looks and posture.name not in self._marks:
-                mark = ui.scene.sphere(0.065 if posture.state == "done" else 0.05)
-                mark.material(STATE_COLORS.get(posture.state, ACTIVE_COLOR))
-                mark.move(*place(posture.commanded).tolist())
-                self._marks[posture.name] = (posture.state, mark)
-
-    def _ellipsoid(self, state: RunState) -> None:
-        chosen = [p for p in state.by_role("select") if p.state == "done"]
-        for body in (self._body, self._mesh):
-            body.visible(state.mode == "calibrate")
-        noise = state.noise_deg
-        std, directions = ellipsoid([p.commanded or [] for p in chosen], noise or KNOWN)
-        radii = np.full(3, UNKNOWN)
-        known = np.isfinite(std)
-        decades = np.log10(np.maximum(std[known], KNOWN) / KNOWN)
-        span = np.log10(1.0 / KNOWN)
-        radii[known] = LEAST + (UNKNOWN - LEAST) * np.minimum(1.0, decades / span)
-        turned = directions[[0, 2, 1]]
-        turned[:, 0] *= np.sign(np.linalg.det(turned))
-        for body in (self._body, self._mesh):
-            body.scale(*radii.tolist()).rotate_R(turned.tolist())
+                shade = bytes.fromhex(self._palette.metal.lstrip("#"))
+                colors = [[value / 255 for value in shade]] * len(points)
+                self._cloud = ui.scene.point_cloud(points, colors, 0.07)
+            looks = {posture.name: posture.state for posture in postures}
+            for name, (look, mark) in [*self._marks.items()]:
+                if looks.get(name) != look:
+                    mark.delete()
+                    del self._marks[name]
+            for posture in postures:
+                if posture.name not in self._marks:
+                    mark = ui.scene.sphere(0.065).move(*place(posture.commanded))
+                    mark.material(STATE_COLORS.get(posture.state, ACTIVE_COLOR))
+                    self._marks[posture.name] = (posture.state, mark)

@@ -1,4 +1,4 @@
-"""The page's web server: one run, any number of browsers.
+"""The page's web server: one run, any number of browsers of this computer.
 
 ``python -m rig.workbench.live.server FOLDER FD`` is the page as `--live` starts it, on
 a listening socket.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import os
 import pathlib
 import signal
 import socket
@@ -21,17 +20,55 @@ import uvicorn
 from fastapi import FastAPI, HTTPException
 from fastapi.responses import FileResponse, PlainTextResponse
 from nicegui import Client, ui
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from rig.core.faults import Fault, Refused
 from rig.signals import PAUSE
-from rig.workbench.live.guard import Guard
-from rig.workbench.live.launch import TOKEN
+from rig.workbench.live import HOST
 from rig.workbench.live.page import make_page
 from rig.workbench.live.watcher import Watcher
 
 HERE = pathlib.Path(__file__).parent
 POLL_S = 0.05
 LINGER_S = 600.0  # after the session's end and the last look of a browser
+HEADERS = {
+    "content-security-policy": "default-src 'self'; "
+    "script-src 'self' 'unsafe-inline' 'unsafe-eval'; "
+    "style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
+    "font-src 'self' data:; object-src 'none'; base-uri 'none'; form-action 'self'; "
+    "frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "same-origin",
+}
+
+
+def guarded(app: ASGIApp) -> ASGIApp:
+    """Only requests of the page itself reach it.
+
+    The name by which it is called defeats DNS rebinding. Browsers name the origin of
+    whatever changes anything, and of websockets: another site's are answered 403.
+    """
+
+    async def guard(scope: Scope, receive: Receive, send: Send) -> None:
+        async def sent(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(HEADERS)
+            await send(message)
+
+        if scope["type"] in ("http", "websocket"):
+            headers = Headers(scope=scope)
+            own = f"http://{headers['host']}"
+            reads = scope.get("method") in ("GET", "HEAD")
+            if headers.get("origin", own if reads else "").lower() != own.lower():
+                refusal = PlainTextResponse(
+                    "Refused: a request of another site.\n", 403
+                )
+                return await refusal(scope, receive, send)
+        await app(scope, receive, sent)
+
+    return TrustedHostMiddleware(guard, [HOST, "localhost"])
 
 
 def make_app(watcher: Watcher, linger_s: float | None = None) -> FastAPI:
@@ -51,31 +88,24 @@ def make_app(watcher: Watcher, linger_s: float | None = None) -> FastAPI:
 
     app = FastAPI(docs_url=None, redoc_url=None, openapi_url=None, lifespan=lifespan)
 
-    def ask(number: signal.Signals) -> PlainTextResponse:
-        try:
-            return PlainTextResponse(watcher.ask(number))
-        except Refused as error:
-            return PlainTextResponse(str(error), status_code=409)
+    @app.exception_handler(Refused)
+    @app.exception_handler(Fault)
+    async def failed(request: object, error: Exception) -> PlainTextResponse:
+        return PlainTextResponse(str(error), 409 if isinstance(error, Refused) else 503)
 
     @app.post("/stop")
     async def stop() -> PlainTextResponse:
-        since = time.time()
-        asked = ask(signal.SIGTERM)
-        if asked.status_code != 200:
-            return asked
-        try:
-            units = await asyncio.to_thread(watcher.stopped, since)
-        except Fault as fault:
-            return PlainTextResponse(str(fault), status_code=503)
+        units = await asyncio.to_thread(watcher.stop)
         lines = "; ".join(map(str, units)) or "nothing was armed"
         if all(unit.acknowledged and unit.standing for unit in units):
             return PlainTextResponse(f"STOPPED: {lines}")
-        text = f"NOT ALL DRIVES STAND: use the emergency stop. {lines}"
-        return PlainTextResponse(text, status_code=503)
+        raise Fault(f"NOT ALL DRIVES STAND: use the emergency stop. {lines}")
 
     @app.post("/pause")
     async def pause() -> PlainTextResponse:
-        return ask(PAUSE)
+        watcher.ask(PAUSE)
+        text = "pause asked for: the session finishes this posture first"
+        return PlainTextResponse(text)
 
     @app.get("/report")
     async def report() -> FileResponse:
@@ -85,9 +115,8 @@ def make_app(watcher: Watcher, linger_s: float | None = None) -> FastAPI:
 
     @app.get("/page.{kind}")
     async def file(kind: Literal["css", "js"]) -> FileResponse:
-        return FileResponse(
-            HERE / f"page.{kind}", headers={"Cache-Control": "no-cache"}
-        )
+        fresh = {"Cache-Control": "no-cache"}
+        return FileResponse(HERE / f"page.{kind}", headers=fresh)
 
     ui.run_with(
         app,
@@ -116,19 +145,13 @@ async def _watch(watcher: Watcher, linger_s: float | None) -> None:
 
 
 def serve(
-    folder: pathlib.Path,
-    sock: socket.socket,
-    token: str | None,
-    linger_s: float | None = None,
+    folder: pathlib.Path, sock: socket.socket, linger_s: float | None = None
 ) -> None:
     """Serve the page of a run on a listening socket until interrupted."""
     watcher = Watcher(folder)
     watcher.poll()
-    host, port = sock.getsockname()[:2]
-    app = make_app(watcher, linger_s)
-    names = (host, socket.gethostname())
     config = uvicorn.Config(
-        Guard(app, port, names, token),
+        guarded(make_app(watcher, linger_s)),
         log_level="warning",
         ws="wsproto",
         proxy_headers=False,
@@ -139,6 +162,4 @@ def serve(
 
 
 if __name__ == "__main__":
-    made = socket.socket(fileno=int(sys.argv[2]))
-    token = os.environ.pop(TOKEN, "") or None
-    serve(pathlib.Path(sys.argv[1]), made, token, LINGER_S)
+    serve(pathlib.Path(sys.argv[1]), socket.socket(fileno=int(sys.argv[2])), LINGER_S)

@@ -13,13 +13,14 @@ from typing import Any
 
 from rig.core.faults import Refused
 from rig.core.stop import UnitStop
-from rig.journal import is_written
+from rig.journal import JOURNAL, Record, is_written
 from rig.signals import PAUSE
 from rig.stopping import stop_run
+from rig.workbench.live.charts import SHOWN_S
 from rig.workbench.live.state import RunState
 from rig.workbench.outputs.telemetry import PERIOD_S, TELEMETRY
 
-Record = dict[str, Any]
+ASK_S = 0.5  # between two looks at the journal's lock; for a session to say it stopped
 
 
 class Tail:
@@ -29,21 +30,16 @@ class Tail:
     from its beginning.
     """
 
-    def __init__(self, path: pathlib.Path, last_bytes: int | None = None) -> None:
+    def __init__(self, path: pathlib.Path) -> None:
         self.path = path
-        self._inode: int | None = None
-        self._offset = 0
-        self._last_bytes = last_bytes  # of what stands there at first; None: all of it
+        self._inode, self._offset = -1, 0
 
     def read(self) -> list[Record]:
         """Records since the last call; a line that is not one is left out."""
         try:
             with self.path.open("rb") as file:
-                status = os.fstat(file.fileno())
-                if status.st_ino != self._inode or status.st_size < self._offset:
-                    first = self._inode is None and self._last_bytes is not None
-                    skip = status.st_size - (self._last_bytes or 0) if first else 0
-                    self._inode, self._offset = status.st_ino, max(0, skip)
+                if (inode := os.fstat(file.fileno()).st_ino) != self._inode:
+                    self._inode, self._offset = inode, 0
                 file.seek(self._offset)
                 data = file.read()
         except OSError:
@@ -53,18 +49,10 @@ class Tail:
         records = []
         for line in whole.splitlines():
             try:
-                record = json.loads(line)
-            except ValueError:  # cut in two by last_bytes, or torn by a kill
+                records.append(json.loads(line))
+            except ValueError:  # torn by a kill
                 continue
-            if isinstance(record, dict):
-                records.append(record)
-        return records
-
-
-JOURNAL = "journal.jsonl"
-SHOWN_S = 30.0  # of telemetry
-FIRST_BYTES = 200_000  # of telemetry that stood there before: more than SHOWN_S
-ASK_S = 0.5  # between two looks at the journal's lock
+        return [record for record in records if isinstance(record, dict)]
 
 
 class Watcher:
@@ -78,7 +66,7 @@ class Watcher:
         self.version = 0  # grows with every change that is not telemetry
         self.summary: dict[str, Any] = {}
         self._journal = Tail(folder / JOURNAL)
-        self._telemetry = Tail(folder / TELEMETRY, FIRST_BYTES)
+        self._telemetry = Tail(folder / TELEMETRY)
         self._asked = 0.0
 
     def poll(self) -> None:
@@ -90,11 +78,10 @@ class Watcher:
             except (KeyError, ValueError, TypeError, IndexError):
                 self.state.damaged = True  # of another version, or edited by hand
         self.samples.extend(self._telemetry.read())
-        running, now = self.running, time.monotonic()
+        before, now = self.running, time.monotonic()
         if records or now - self._asked > ASK_S:
-            self._asked, running = now, is_written(self.folder / JOURNAL)
-        if records or running != self.running:
-            self.running = running
+            self._asked, self.running = now, is_written(self.folder / JOURNAL)
+        if records or self.running != before:
             self.version += 1
             if self.state.ended is not None:
                 self.summary = self._read_summary()
@@ -117,11 +104,8 @@ class Watcher:
         """The session runs on this computer: a signal reaches it."""
         return self.running and self.state.host == platform.node()
 
-    def ask(self, number: signal.Signals) -> str:
+    def ask(self, number: signal.Signals) -> None:
         """Send the session SIGTERM (stop now) or PAUSE (after this posture).
-
-        Returns:
-            What was done, in words.
 
         Raises:
             Refused: nothing was sent, and why.
@@ -139,20 +123,18 @@ class Watcher:
                 f"NOT SENT to process {pid}: {error.strerror}. Press Ctrl-C twice in "
                 "its terminal, or use the emergency stop"
             ) from None
-        if number == PAUSE:
-            return "pause asked for: the session finishes this posture first"
-        return f"STOP sent to process {pid}"
 
-    def stopped(self, since: float) -> list[UnitStop]:
-        """What became of a stop that was asked for at ``since`` (Unix time).
+    def stop(self) -> list[UnitStop]:
+        """Ask the session to stop; what the drives say.
 
         It is waited for what the session says of its drives; where it says nothing,
         the session is ended and the drives are stopped from here.
 
         Raises:
-            Fault: no drive was told to stop.
+            Refused: nothing was sent. Fault: no drive was told to stop.
         """
-        end = time.monotonic() + ASK_S
+        since, end = time.time(), time.monotonic() + ASK_S
+        self.ask(signal.SIGTERM)
         while time.monotonic() < end:
             stop = self.state.stop
             if stop is not None and stop["time"] >= since:

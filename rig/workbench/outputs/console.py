@@ -2,20 +2,72 @@
 
 from __future__ import annotations
 
-import contextlib
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from rig.config import AXIS_NAMES, RigConfig
 from rig.core.attitude import Array
-from rig.core.device import Device
 from rig.core.stop import UnitStop
 from rig.journal import Record
-from rig.workbench.outputs.telemetry import Telemetry
+from rig.workbench.outputs.telemetry import telemetry
 from rig.workbench.run import Run
+
+ENDS = ("end", "fault", "stopped", "paused", "refused")
+REPLIES = {
+    "obeyed": "the drive obeys",
+    "not taken": "the drive did not take it, so it is sent again",
+    "unknown": "whether the drive took it is unknown, so all stop",
+}
+
+
+def _reference(record: Record) -> str:
+    worst = max(map(abs, record["angles"]))
+    good = f"reference posture reads {worst:.3f} deg from zero: going on"
+    return good if worst <= record["limit"] else ""
+
+
+def _comm_restored(record: Record) -> str:
+    return record["error"] and (
+        f"{record['axis']}: its communication timeout was not put back to "
+        f"{record['counts']} ({record['error']}); `jaxcal-rig resume` does it"
+    )
+
+
+def _stop(record: Record) -> str:
+    units = "".join(f"\n  {UnitStop(**unit)}" for unit in record["units"])
+    return f"stop: {record['reason'] or 'end of run'}{units}"
+
+
+# An event of the run in words, for console, page and report: its fields are put in.
+SENTENCES: dict[str, str | Callable[[Record], str]] = {
+    "listening": "IMU: waiting for the phone on port {port} ({format})",
+    "armed": "armed: {drives} drives on {where}",
+    "note": "{text}",
+    "reference": _reference,
+    "reoriented": "the phone came back, its heading turned {turned_deg:.3f} deg: "
+    "{told}",
+    "zero": "zero taken at pulses {pulses}",
+    "void": lambda r: f"  withdrawn, to be measured again: {', '.join(r['names'])}",
+    "pausing": "pausing after this posture; another Ctrl-C stops at once",
+    "lost_reply": lambda r: (
+        f"  the reply to a move of {r['axis']} was lost: {REPLIES[r['outcome']]}"
+    ),
+    "sender_refused": "WARNING: {reason}",
+    "unreachable": "  {name} is out of reach: {reason}",
+    "comm_restored": _comm_restored,
+    "stop": _stop,
+}
+
+
+def event_lines(record: Record) -> list[str]:
+    """What an event of the run comes to; most are silent."""
+    sentence = SENTENCES.get(record["event"], "")
+    if isinstance(sentence, str):
+        return sentence.format_map(record).splitlines()
+    return sentence(record).splitlines()
 
 
 def numbers(values: Any, width: int = 9, digits: int = 4) -> str:
@@ -24,102 +76,35 @@ def numbers(values: Any, width: int = 9, digits: int = 4) -> str:
     return " ".join(f"{value:{width}.{digits}f}" for value in rounded)
 
 
-class Console:
-    """Prints what happens in a run."""
-
-    def __init__(self, run: Run) -> None:
-        self._run = run
-        self._begun = 0.0  # time of the present visit
-        self._visits_s: list[float] = []
-
-    def hear(self, record: Record) -> None:
-        """Print what an event comes to."""
-        if record["event"] == "visit":
-            self._begun = record["time"]
-        if record["event"] != "posture":
-            return self._say(event_lines(record))
-        self._visits_s.append(record["time"] - self._begun)
-        visited, planned = len(self._run.postures()), self._run.planned
-        left = max(0, planned - visited) * float(np.mean(self._visits_s[-10:]))
-        self._run.say(
-            f"  [{visited:>3}/{planned}] {record['name']:<12} "
-            f"u [{numbers(record['commanded_deg'], 8, 3)}]  "
-            f"y [{numbers(record['measured_deg'], 8, 3)}]  {self._visits_s[-1]:5.2f} s,"
-            f" about {left:.0f} s left"
-        )
-
-    def _say(self, lines: list[str]) -> None:
-        if threading.current_thread() is threading.main_thread():
-            self._run.say(*lines)
-        elif lines:  # a terminal held by Ctrl-S must not hold the phone's thread too
-            threading.Thread(target=self._run.say, args=lines, daemon=True).start()
-
-
 def listen(run: Run) -> None:
     """Print what happens in a run, and append what phone and drives say to its files.
 
     A session neither waits for them nor needs them.
     """
-    run.listeners.append(Console(run).hear)
-    run.beside.append(_telemetry)
+    begun, visits_s = 0.0, []  # type: float, list[float]
 
-
-@contextlib.contextmanager
-def _telemetry(device: Device) -> Iterator[None]:
-    telemetry = Telemetry(
-        device.run.folder, device.config, device.imu, device.drives,
-        lambda: device.frame,
-    )  # fmt: skip
-    telemetry.start()
-    try:
-        yield
-    finally:
-        telemetry.close()
-
-
-def event_lines(record: dict[str, Any]) -> list[str]:
-    """What an event of the run comes to on the console; most are silent."""
-    match record["event"]:
-        case "listening":
-            port, form = record["port"], record["format"]
-            return [f"IMU: waiting for the phone on port {port} ({form})"]
-        case "armed":
-            return [f"armed: {record['drives']} drives on {record['where']}"]
-        case "note":
-            return [record["text"]]
-        case "reference":
-            worst = max(map(abs, record["angles"]))
-            good = [f"reference posture reads {worst:.3f} deg from zero: going on"]
-            return good if worst <= record["limit"] else []
-        case "reoriented":
-            turned, told = record["turned_deg"], record["told"]
-            return [f"the phone came back, its heading turned {turned:.3f} deg: {told}"]
-        case "zero":
-            return [f"zero taken at pulses {record['pulses']}"]
-        case "void":
-            return [f"  withdrawn, to be measured again: {', '.join(record['names'])}"]
-        case "pausing":
-            return ["pausing after this posture; another Ctrl-C stops at once"]
-        case "lost_reply":
-            found = {
-                "obeyed": "the drive obeys",
-                "not taken": "the drive did not take it, so it is sent again",
-                "unknown": "whether the drive took it is unknown, so all stop",
-            }[record["outcome"]]
-            return [f"  the reply to a move of {record['axis']} was lost: {found}"]
-        case "sender_refused":
-            return [f"WARNING: {record['reason']}"]
-        case "unreachable":
-            return [f"  {record['name']} is out of reach: {record['reason']}"]
-        case "comm_restored" if record["error"]:
-            return [
-                f"{record['axis']}: its communication timeout was not put back to "
-                f"{record['counts']} ({record['error']}); `jaxcal-rig resume` does it"
+    def hear(record: Record) -> None:
+        nonlocal begun
+        lines = event_lines(record)
+        if record["event"] == "visit":
+            begun = record["time"]
+        elif record["event"] == "posture":
+            visits_s.append(record["time"] - begun)
+            visited = len(run.postures())
+            left = max(0, run.planned - visited) * float(np.mean(visits_s[-10:]))
+            lines = [
+                f"  [{visited:>3}/{run.planned}] {record['name']:<12} "
+                f"u [{numbers(record['commanded_deg'], 8, 3)}]  "
+                f"y [{numbers(record['measured_deg'], 8, 3)}]  {visits_s[-1]:5.2f} s,"
+                f" about {left:.0f} s left"
             ]
-        case "stop":
-            units = [f"  {UnitStop(**unit)}" for unit in record["units"]]
-            return [f"stop: {record['reason'] or 'end of run'}", *units]
-    return []
+        if threading.current_thread() is threading.main_thread():
+            run.say(*lines)
+        elif lines:  # a terminal held by Ctrl-S must not hold the phone's thread too
+            threading.Thread(target=run.say, args=lines, daemon=True).start()
+
+    run.listeners.append(hear)
+    run.beside.append(telemetry)
 
 
 def plan_lines(
@@ -201,13 +186,13 @@ def drift_text(drift: dict[str, Any]) -> str:
         f"({AXIS_NAMES[worst]}) on later visits (limit {drift['limit_deg']:g})"
     )
     if drift["corrected"]:
-        rate = drift["rate_deg_per_min"][worst]
+        rate = drift["angles_deg"][-1][worst] / drift["minutes"][-1]
         text += (
             f"; linear, {rate:+.4f} deg/min, and taken out: {drift['left_deg']:.4f} "
             "deg are left"
         )
     if drift["over"]:
-        kind = "" if drift["bend_deg"] is None else "It is not linear. "
+        kind = "It is not linear. " if len(drift["minutes"]) == 3 else ""
         text += (
             f". {kind}Look for a loose phone, play, or a magnetic heading near the "
             "motors"
@@ -217,20 +202,13 @@ def drift_text(drift: dict[str, Any]) -> str:
 
 def noise_text(summary: dict[str, Any]) -> str:
     """How large the noise is, axis by axis, and where it was taken from."""
-    noise = (f"{name} {value:.4f}" for name, value in _named(summary["noise_std_deg"]))
-    text = (
-        f"noise of one posture {', '.join(noise)} deg, from {summary['basis']} "
-        f"({summary['dof']} degrees of freedom"
-    )
-    as_good = (f"{value:.1f}" for value in summary["effective_samples"])
+    as_good = ", ".join(f"{value:.1f}" for value in summary["effective_samples"])
+    std = zip(AXIS_NAMES, summary["noise_std_deg"], strict=True)
     return (
-        f"{text} each); {summary['samples']} readings are correlated and count as "
-        f"{', '.join(as_good)}"
+        f"noise of one posture {', '.join(f'{name} {v:.4f}' for name, v in std)} deg, "
+        f"from {summary['basis']} ({summary['dof']} degrees of freedom each); "
+        f"{summary['samples']} readings are correlated and count as {as_good}"
     )
-
-
-def _named(values: Any) -> Any:
-    return zip(AXIS_NAMES, values, strict=True)
 
 
 def choice_text(choice: dict[str, Any]) -> str:

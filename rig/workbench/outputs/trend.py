@@ -11,40 +11,26 @@ import numpy as np
 
 from jaxcal.pages import Badge, Block, Page, Section, Table, Text, write_page
 from rig.config import AXIS_NAMES
-from rig.core.attitude import Array
 from rig.journal import JournalError, Record, read_journal
 from rig.workbench.outputs.console import recalibrate
 from rig.workbench.outputs.report import draw_parameters, drawn
 
-NAMES = [f"A[{y}, {u}]" for y in AXIS_NAMES for u in AXIS_NAMES]
-NAMES = [*NAMES, *(f"b[{y}]" for y in AXIS_NAMES)]  # of the twelve parameters
 HEAD = ["measured", "run", "mode", "held-out error [deg]", "moved since the one before"]
+HOLDS = "the last calibration still holds"
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass
 class Device:
-    """The runs of one device fingerprint, oldest first, and their rows of a table."""
+    """What was found of one device fingerprint, the oldest first."""
 
     fingerprint: Record
-    runs: list[Record]  # time, name, mode, summary, limit_deg
-    rows: list[list[str]]
+    rows: list[list[str]]  # of a table under HEAD
+    calibrations: list[Record]  # summaries of those that identified, with their time
     reasons: list[str]  # to calibrate again; none where the last calibration holds
 
     @property
-    def calibrations(self) -> list[Record]:
-        """Summaries of those that identified, with their time."""
-        return [r["summary"] | {"time": r["time"]} for r in self.runs if _fitted(r)]
-
-    @property
     def verdict(self) -> str:
-        """In words."""
-        if self.reasons:
-            return f"RECALIBRATE: {'; '.join(self.reasons)}"
-        return "the last calibration still holds"
-
-
-def _fitted(run: Record) -> bool:
-    return "A" in run["summary"]
+        return f"RECALIBRATE: {'; '.join(self.reasons)}" if self.reasons else HOLDS
 
 
 def read_runs(folder: pathlib.Path) -> tuple[list[Device], list[str]]:
@@ -62,68 +48,53 @@ def read_runs(folder: pathlib.Path) -> tuple[list[Device], list[str]]:
         try:
             start = read_journal(path)[0]
             text = (path.parent / "summary.json").read_text(encoding="utf-8")
-            summary = json.loads(text)
             device = start["device"]
             if start.get("simulated"):  # never compared with a real one
                 device = {"simulated": True, **device}
-            limit = start["config"]["session"]["verify_limit_deg"]
+            run = json.loads(text) | {
+                "limit": start["config"]["session"]["verify_limit_deg"],
+                "name": path.parent.name, "mode": start["mode"], "device": device,
+            }  # fmt: skip
+            run["time"] = run.get("measured_at", start["time"])
         except FileNotFoundError:
             continue  # not finished, or of a kind without a summary
         except (OSError, JournalError, ValueError, KeyError, IndexError) as error:
             skipped.append(f"{path.parent}: {error}")
             continue
-        run = {
-            "time": summary.get("measured_at", start["time"]),
-            "name": path.parent.name, "mode": start["mode"], "summary": summary,
-            "limit_deg": limit, "fingerprint": device,
-        }  # fmt: skip
         found.setdefault(json.dumps(device, sort_keys=True), []).append(run)
     return [_device(runs) for runs in found.values()], skipped
 
 
 def _device(runs: list[Record]) -> Device:
-    runs = sorted(runs, key=lambda run: run["time"])
-    rows, last, reasons = [], None, []
-    for run in runs:
-        summary, moved = run["summary"], ""
-        if _fitted(run):
-            moved = "first" if last is None else ", ".join(_moved(last, summary))
-            moved, last = moved or "nothing", summary
-        when = datetime.datetime.fromtimestamp(run["time"])
-        error = "not measured"
-        if (worst := _worst(summary)) is not None:
-            error = f"{worst:.4f} (limit {run['limit_deg']:g})"
-            reasons = [
-                f"{run['name']}: {text}"
-                for text in recalibrate(summary, run["limit_deg"])
-            ]
-        rows.append([f"{when:%Y-%m-%d %H:%M}", run["name"], run["mode"], error, moved])
-    return Device(runs[0]["fingerprint"], runs, rows, reasons)
-
-
-def _worst(summary: Record) -> float | None:
-    """Largest error at held-out postures; compensated, or of a refit predicted."""
-    if "after" in summary:
-        return float(summary["after"]["max"])
-    return summary.get("prediction_max")
+    device = Device(runs[0]["device"], [], [], [])
+    for run in sorted(runs, key=lambda run: run["time"]):
+        moved, error = "", "not measured"
+        if "A" in run:
+            before = device.calibrations[-1:]
+            moved = (
+                (", ".join(_moved(before[0], run)) or "nothing") if before else "first"
+            )
+            device.calibrations.append(run)
+        if "after" in run or "prediction_max" in run:  # compensated, or of a refit
+            worst = run["after"]["max"] if "after" in run else run["prediction_max"]
+            error = f"{worst:.4f} (limit {run['limit']:g})"
+            reasons = recalibrate(run, run["limit"])
+            device.reasons = [f"{run['name']}: {reason}" for reason in reasons]
+        when = f"{datetime.datetime.fromtimestamp(run['time']):%Y-%m-%d %H:%M}"
+        device.rows.append([when, run["name"], run["mode"], error, moved])
+    return device
 
 
 def _moved(before: Record, now: Record) -> list[str]:
-    """Parameters that differ by more than their intervals allow."""
-    change = _flat(np.column_stack([now["A"], now["b"]])) - _flat(
-        np.column_stack([before["A"], before["b"]])
-    )
-    allowed = np.hypot(_flat(np.array(now["ci95"])), _flat(np.array(before["ci95"])))
+    """Parameters that differ by more than their intervals allow, A before b."""
+    then, new = (np.column_stack([run["A"], run["b"]]) for run in (before, now))
+    change, allowed = new - then, np.hypot(now["ci95"], before["ci95"])
+    names = [[f"A[{y}, {u}]" for u in AXIS_NAMES] + [f"b[{y}]"] for y in AXIS_NAMES]
     return [
-        f"{name} {value:+.4f} (interval {width:.4f})"
-        for name, value, width in zip(NAMES, change, allowed, strict=True)
-        if abs(value) > width
+        f"{names[i][j]} {change[i, j]:+.4f} (interval {allowed[i, j]:.4f})"
+        for i, j in sorted(np.ndindex(3, 4), key=lambda at: at[1] == 3)
+        if abs(change[i, j]) > allowed[i, j]
     ]
-
-
-def _flat(values: Array) -> Array:
-    """(3, 4) to twelve in the order of NAMES."""
-    return np.concatenate([values[:, :3].ravel(), values[:, 3]])
 
 
 def trend_lines(device: Device) -> list[str]:
@@ -133,30 +104,23 @@ def trend_lines(device: Device) -> list[str]:
         "  " + "  ".join(c.ljust(w) for c, w in zip(row, wide, strict=True)).rstrip()
         for row in [HEAD, *device.rows]
     ]
-    return [f"device {_label(device.fingerprint)}", *table, f"  {device.verdict}"]
-
-
-def _label(fingerprint: Record) -> str:
-    """What tells devices apart at a glance."""
-    keys = ("map", "unit", "pulses_per_rev", "reduction", "direction")
+    told, keys = device.fingerprint, ("map", "unit", "pulses_per_rev", "reduction")
     axes = (
-        f"{name} "
-        + " ".join(str(fingerprint.get(f"axes.{name}.{k}", "?")) for k in keys)
+        " ".join([name, *(str(told.get(f"axes.{name}.{k}", "?")) for k in keys)])
         for name in AXIS_NAMES
     )
-    simulated = "simulated: " if fingerprint.get("simulated") else ""
-    return f"{simulated}{'; '.join(axes)}; order {fingerprint['mechanism.order']}"
+    label = f"{'; '.join(axes)}; order {told['mechanism.order']}"
+    simulated = "simulated: " if told.get("simulated") else ""
+    return [f"device {simulated}{label}", *table, f"  {device.verdict}"]
 
 
 def write_trend(folder: pathlib.Path, devices: list[Device]) -> pathlib.Path:
     """Write ``trend.html``; returns its path."""
     sections = []
     for number, device in enumerate(devices):
-        badge = (
-            Badge("recalibrate", "bad") if device.reasons else Badge("holds", "good")
-        )
+        bad = bool(device.reasons)
         blocks: list[Block] = [
-            Text(device.verdict, "warning" if device.reasons else ""),
+            Text(device.verdict, "warning" if bad else ""),
             Table(HEAD, device.rows, numeric=False),
         ]
         if device.calibrations:
@@ -164,6 +128,7 @@ def write_trend(folder: pathlib.Path, devices: list[Device]) -> pathlib.Path:
             blocks.append(drawn(draw_parameters, device.calibrations, (11, 7), alt))
         rows = [[key, json.dumps(v)] for key, v in device.fingerprint.items()]
         blocks.append(Table(["fingerprint", ""], rows, numeric=False))
+        badge = Badge("recalibrate", "bad") if bad else Badge("holds", "good")
         sections.append(Section(f"Device {number + 1}", blocks, badge=badge))
     path = folder / "trend.html"
     write_page(path, Page(f"Calibrations in {folder.resolve().name}", sections))

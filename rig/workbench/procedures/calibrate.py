@@ -9,13 +9,12 @@ import numpy as np
 
 from rig.core.attitude import Array
 from rig.core.device import Device, Posture, check_plan
-from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault
-from rig.core.identify import identify
+from rig.core.faults import MotionFault
 from rig.core.session import visit
 from rig.journal import SIGN_CHECKED, Record
-from rig.workbench.identification.conclusion import Evidence, check_matrix, conclude
-from rig.workbench.identification.fit import held_out_errors
-from rig.workbench.outputs.console import plan_lines, recalibrate, summary_lines
+from rig.workbench.identification.conclusion import check_matrix, conclude
+from rig.workbench.identification.fit import identify
+from rig.workbench.outputs.console import plan_lines
 from rig.workbench.procedures.plan import (
     Choice,
     choose,
@@ -50,9 +49,7 @@ def calibrate(run: Run) -> int:
         run.say("drives at rest; identifying")
         run.emit("phase", phase="finishing")
         run.signals.check_stop()
-    summary = _identify(run)
-    summary["choice"] = _last_choice(run)
-    return _save(run, summary)
+    return _identify(run)
 
 
 def _plan(run: Run) -> tuple[Array, Choice]:
@@ -87,11 +84,6 @@ def _chosen(run: Run) -> list[Record]:
     return [record for record in run.postures().values() if record["role"] == "select"]
 
 
-def _last_choice(run: Run) -> dict[str, Any]:
-    """The choice that was measured: the last one that had to be made."""
-    return [*run.journal.events("plan"), *run.journal.events("replan")][-1]["choice"]
-
-
 def _visit_chosen(run: Run, device: Device, candidates: Array, choice: Choice) -> None:
     """Measure K postures; without one out of reach the rest are selected again."""
     config, degrees = run.config, run.config.to_deg(candidates)
@@ -104,8 +96,7 @@ def _visit_chosen(run: Run, device: Device, candidates: Array, choice: Choice) -
         queue = left[travel_order(config, degrees[left], here)].tolist()
         run.emit("queue", names=[f"select:{index}" for index in queue])
         for index in queue:
-            a, b, c = candidates[index].tolist()
-            posture = Posture(f"select:{index}", (a, b, c))
+            posture = Posture(f"select:{index}", tuple(candidates[index].tolist()))
             if visit(device, posture, role="select", index=index) is None:
                 break
             here = degrees[index]
@@ -180,37 +171,19 @@ def visit_pairs(run: Run, device: Device, held: list[Any]) -> None:
     queue = travel_order(run.config, points, start)
     run.emit("queue", names=[names[number] for number in queue])
     for number in queue:
-        a, b, c = targets[number]
         role = names[number].partition(":")[0]
-        visit(device, Posture(names[number], (a, b, c)), role=role)
+        visit(device, Posture(names[number], tuple(targets[number])), role=role)
 
 
-def _identify(run: Run) -> dict[str, Any]:
-    """Identify A and b, save calibration.json; what the summary says of them."""
-    postures = run.postures()
-    held = run.journal.events("held_out")[-1]["pairs"]
-    held_out, _ = held_out_errors(run.config, held, postures)
-    references = [postures[name] for name in (MIDDLE, END) if name in postures]
-    zero = run.journal.events("zero")[-1]
-    evidence = Evidence(zero, _chosen(run), held, held_out, references)
+def _identify(run: Run) -> int:
+    """Identify A and b, save them and what they come to; returns the exit code."""
+    from rig.workbench.outputs.report import save_result
+
     simulated = run.journal.records[0].get("simulated")
     notes = {"run": run.folder.name, "simulated": simulated is not None}
-    calibration, summary = conclude(run.config, evidence, notes)
-    calibration.save(run.folder / "calibration.json")
+    calibration, summary = conclude(run.config, run.journal.records, notes)
+    choice = [*run.journal.events("plan"), *run.journal.events("replan")][-1]["choice"]
+    told = {"mode": "calibrate", "simulated": simulated, "choice": choice}
+    code = save_result(run, calibration, summary | told, run.say)
     (run.folder / "calibration.partial.json").unlink(missing_ok=True)
-    return {"mode": "calibrate", **summary, "simulated": simulated}
-
-
-def _save(run: Run, summary: dict[str, Any]) -> int:
-    """Write pairs, summary and report, say what they hold; returns the exit code."""
-    from rig.workbench.outputs.report import write_report
-
-    run.save_pairs()
-    run.save_summary(summary)
-    write_report(run.folder, run.journal.records)
-    limit = run.config.session.verify_limit_deg
-    run.say(
-        *summary_lines(summary, limit),
-        f"saved: {run.folder}/calibration.json, pairs.csv, summary.json, report.html",
-    )
-    return EXIT_RECALIBRATE if recalibrate(summary, limit) else EXIT_OK
+    return code

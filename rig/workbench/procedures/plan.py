@@ -78,39 +78,38 @@ def choose(
             more["seed"] = session.seed
         return jaxcal.select(candidates_deg, session.k, method=method, **more)
 
-    exact = select("exact", time_limit=limit)
+    exact = chosen = select("exact", time_limit=limit)
+    note, more = "", {}
+    if session.method == "auto":
+        more = {"least_efficiency": session.min_efficiency, "time_limit": limit}
+    if session.method != "exact" and not replanning:
+        try:
+            chosen = select(session.method, **more)
+            note = getattr(chosen, "reason", "")
+        except Exception as error:
+            if session.method not in ("policy", "auto"):
+                raise
+            # A missing or foreign checkpoint must not keep a rig from being calibrated.
+            reason = " ".join(str(error).split())[:200]
+            note = f"no policy could be used ({reason}); exact is used instead"
 
     def rated(selection: Any, note: str) -> Choice:
-        log_det = float(selection.log_det)
         return Choice(
             indices=tuple(int(i) for i in selection.indices),
-            log_det=log_det,
-            best_log_det=max(float(exact.log_det), log_det),
+            log_det=float(selection.log_det),
+            best_log_det=float(max(exact.log_det, selection.log_det)),
             proven=bool(exact.proven),
             method=str(selection.method),
             note=note,
         )
 
-    if session.method == "exact" or replanning:
-        return rated(exact, "")
-    more: dict[str, Any] = {}
-    if session.method == "auto":
-        more = {"least_efficiency": session.min_efficiency, "time_limit": limit}
-    try:
-        chosen = select(session.method, **more)
-        choice = rated(chosen, getattr(chosen, "reason", ""))
-        if choice.efficiency >= session.min_efficiency:
-            return choice
-        note = (
-            f"{session.method} reached a D-efficiency of {choice.efficiency:.3f}, "
-            f"under session.min_efficiency = {session.min_efficiency:g}; using exact"
-        )
-    except Exception as error:
-        if session.method not in ("policy", "auto"):
-            raise
-        # A missing or foreign checkpoint must not keep a rig from being calibrated.
-        reason = " ".join(str(error).split())[:200]
-        note = f"no policy could be used ({reason}); exact is used instead"
+    choice = rated(chosen, note)
+    if choice.efficiency >= session.min_efficiency:
+        return choice
+    note = (
+        f"{session.method} reached a D-efficiency of {choice.efficiency:.3f}, under "
+        f"session.min_efficiency = {session.min_efficiency:g}; using exact"
+    )
     return rated(exact, note)
 
 
@@ -151,6 +150,5 @@ def draw_held_out(
             break
         command = calibration.command_for(config.to_deg(pulses))
         if ((command >= low) & (command <= high)).all():
-            a, b, c = pulses.tolist()
-            pairs.append(((a, b, c), config.to_pulses(command)))
+            pairs.append((tuple(pulses.tolist()), config.to_pulses(command)))
     return pairs

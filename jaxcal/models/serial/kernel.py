@@ -1,0 +1,84 @@
+"""Compiled: a chain of elementary rotations and translations at many postures.
+
+The derivative of the tool by one step of the chain is geometric: a rotation about ``w``
+through ``o`` turns the tool by ``w`` and moves its point ``t`` by ``w x (t - o)``; a
+translation along ``w`` moves it by ``w``.
+"""
+
+from __future__ import annotations
+
+import cython
+import numpy as np
+from cython.cimports.libc.math import M_PI, cos, sin
+
+__all__ = ["forward"]
+
+
+def forward(kinds, values, fixed):
+    """Frame after the last step, from the identity, and where each step acted.
+
+    Args:
+        kinds: (S,) int64: 0, 1, 2 a translation along x, y, z of the frame reached so
+            far, 3, 4, 5 a rotation about it; 6 and on a constant rotation.
+        values: (S, N) float64 lengths and degrees.
+        fixed: (F, 3, 3) float64, the constant rotation of step kind 6 + i.
+
+    Returns:
+        (4, 3, N) axes x, y, z of the frame and its origin; of each step the axis w
+        (S, 3, N) and the origin o (S, 3, N).
+    """
+    size, count = values.shape
+    frame = np.empty((4, 3, count))
+    axes, origins = np.empty((2, size, 3, count))
+    _forward(kinds, values, fixed, frame, axes, origins)
+    return frame, axes, origins
+
+
+@cython.cfunc
+@cython.nogil
+@cython.exceptval(check=False)
+def _forward(
+    kinds: cython.Py_ssize_t[::1],
+    values: cython.double[:, ::1],
+    fixed: cython.double[:, :, ::1],
+    frame: cython.double[:, :, ::1],
+    axes: cython.double[:, :, ::1],
+    origins: cython.double[:, :, ::1],
+) -> cython.void:
+    at = cython.declare(cython.double[4][3])
+    old = cython.declare(cython.double[3][3])
+    for n in range(values.shape[1]):
+        for j in range(4):
+            for c in range(3):
+                at[j][c] = j == c
+        for s in range(values.shape[0]):
+            kind: cython.Py_ssize_t = kinds[s]
+            axis = kind % 3 if kind < 6 else 0
+            for c in range(3):
+                axes[s, c, n] = at[axis][c]
+                origins[s, c, n] = at[3][c]
+            value = values[s, n]
+            if kind >= 6:
+                for j in range(3):
+                    for c in range(3):
+                        old[j][c] = at[j][c]
+                for j in range(3):
+                    for c in range(3):
+                        at[j][c] = 0.0
+                        for k in range(3):
+                            at[j][c] += old[k][c] * fixed[kind - 6, k, j]
+            elif value == 0.0:
+                continue
+            elif kind < 3:
+                for c in range(3):
+                    at[3][c] += value * at[axis][c]
+            else:
+                cosine, sine = cos(value * (M_PI / 180.0)), sin(value * (M_PI / 180.0))
+                one, two = (axis + 1) % 3, (axis + 2) % 3
+                for c in range(3):
+                    first, second = at[one][c], at[two][c]
+                    at[one][c] = cosine * first + sine * second
+                    at[two][c] = cosine * second - sine * first
+        for j in range(4):
+            for c in range(3):
+                frame[j, c, n] = at[j][c]
