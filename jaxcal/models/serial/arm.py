@@ -164,9 +164,14 @@ class Arm:
             ]
         )
 
+    @functools.cached_property
+    def _owned(self) -> int:
+        """s, the sensor's own parameters."""
+        return len(self.sensor.names)
+
     def _split(self, parameters: Array) -> tuple[Array, Array, Array]:
         """Base (6,), tool (6,) and the sensor's own (s,)."""
-        last = len(parameters) - len(self.sensor.names)
+        last = len(parameters) - self._owned
         first = last - len(self._tool)
         tool = np.concatenate([self.tool[:3, 3], np.zeros(3)])
         tool[self._tool] = parameters[first:last]

@@ -284,6 +284,29 @@ class SerialChain(Arm):
 
         return postures(self, count, seed, near, allowed)
 
+    def at_rest(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        seconds: float = 0.5,
+        within: float = 0.05,
+    ) -> Array:
+        """Postures (N, J) at which a recorded arm stood still, in their order.
+
+        Args:
+            path: rosbag2 folder (SQLite or MCAP) with joint states, joints by name in
+                any order. Needs the extra ``ros``.
+            seconds: of rest, at least.
+            within: degrees (or units of length) in which a resting joint stays.
+        """
+        from jaxcal.models.serial.bags import at_rest, joint_states
+
+        times, joints = joint_states(path, self.joint_names)
+        turns = np.array(self.command_units) == "deg"
+        return at_rest(
+            times, np.where(turns, np.degrees(joints), joints), seconds, within
+        )
+
     def in_turn(self, commands: ArrayLike) -> NDArray[np.int64]:
         """(N,) the commands' rows in an order of little travel, socket after socket."""
         from jaxcal.models.serial.postures import in_turn
