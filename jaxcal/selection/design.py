@@ -146,6 +146,7 @@ class Design(Planned, Travelled):
             return self._judged(problem, found, "score", start)
         optimum = solve_exact(problem, deadline=time.perf_counter() + limit)
         value = float(values(problem, found.indices[None])[0][0])
+        assert optimum.bound is not None
         near = abs(value - optimum.bound) <= _PROVEN * max(1.0, abs(optimum.bound))
         found = Found(
             found.indices, bound=optimum.bound, proven=optimum.proven and near

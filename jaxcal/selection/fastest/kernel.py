@@ -29,10 +29,14 @@ def best_order(times, start):
     k = len(start)
     if k <= MOST_EXACT:
         return _exact_order(times, start)
-    tours = np.empty((k, k), np.int64)
-    seconds = np.empty(k)
-    for first in range(k):
-        seconds[first] = _nearest_neighbours(times, start, first, tours[first])
+    # From every posture on to the nearest one left.
+    every, free = np.arange(k), ~np.eye(k, dtype=bool)
+    tours, seconds = np.repeat(every[:, None], k, axis=1), start.copy()
+    for place in range(1, k):
+        way = np.where(free, times[tours[:, place - 1]], np.inf)
+        tours[:, place] = way.argmin(axis=1)
+        seconds += way.min(axis=1)
+        free[every, tours[:, place]] = False
     best, least = tours[0], np.inf
     for first in np.argsort(seconds)[:_IMPROVED]:
         reached = _improve(times, start, tours[first], seconds[first])
@@ -110,30 +114,6 @@ def _extend(
     for last in range(depth + 1):
         least = min(least, tours[2 * bit - 1, last])
     return least
-
-
-def _nearest_neighbours(
-    times: cython.double[:, ::1],
-    start: cython.double[::1],
-    first: cython.Py_ssize_t,
-    order: cython.Py_ssize_t[::1],
-):
-    """Fill ``order`` (K,) from posture ``first`` on; returns its seconds."""
-    k = start.shape[0]
-    free: cython.uchar[::1] = np.ones(k, np.uint8)
-    here: cython.Py_ssize_t = first
-    seconds: cython.double = start[first]
-    for place in range(k):
-        if place:
-            nearest: cython.Py_ssize_t = -1
-            for j in range(k):
-                if free[j] and (nearest < 0 or times[here, j] < times[here, nearest]):
-                    nearest = j
-            seconds += times[here, nearest]
-            here = nearest
-        order[place] = here
-        free[here] = 0
-    return seconds
 
 
 @cython.cfunc

@@ -212,6 +212,7 @@ class _Search:
         m, scale = problem.multiplicity, problem.log_scale
         # Whitened. The optimum itself must meet its own value; a bound that is not the
         # optimum asks too much of a subset, never too little.
+        assert optimum.bound is not None
         wanted = optimum.bound / m - scale + problem.num_regressors * np.log(least)
         wanted -= 1e-12
         if above is not None:
@@ -256,7 +257,7 @@ class _Search:
         chosen = np.zeros(self.k, np.int64) if begun is None else np.sort(begun)
         best = np.array([travel, -np.inf if begun is None else self._log_det(chosen)])
         prior = np.array(self.problem.prior)
-        relaxed = self._information(self._positions(self.optimum.subsets[0])) - prior
+        relaxed = self._information(self._positions(self.optimum.indices)) - prior
         complete, nodes = fastest_subset(
             self.blocks, prior, self.times, self.start, self.fixed, relaxed, wanted,
             SAME_TIME, chosen, best, self.limit,
@@ -270,7 +271,7 @@ class _Search:
 
         None and infinity where no start has the log det ``wanted``.
         """
-        starts = [self.optimum.subsets[0]] + [
+        starts = [self.optimum.indices] + [
             exchange_indices(self.problem, 1, int(rng.integers(2**31)))
             for _ in range(_STARTS - 1)
         ]

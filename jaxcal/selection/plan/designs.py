@@ -85,7 +85,7 @@ def best_design(
     proven = False
     if design == "exact":
         found = solve_exact(problem, deadline=time.perf_counter() + time_limit)
-        optimal, proven = found.subsets[0], found.proven
+        optimal, proven = found.indices, found.proven
     else:
         optimal = exchange_indices(problem, _D_RESTARTS, seed)
     starts = [optimal, greedy_indices(problem)]
