@@ -142,6 +142,7 @@ def _proofs(row: Row, joints: Array, criterion: str, budget: Budget) -> None:
         pool = joints if count == 1000 else joints[rng.choice(1000, count, False)]
         call = functools.partial(
             select, pool, k, "exact", model=arm(), noise=Noise(_NOISE),
+            prior=arm().default_prior(),
             criterion=criterion,
         )  # fmt: skip
         call(time_limit=0.01)  # compiled
@@ -243,7 +244,13 @@ def _judged(
     rows = blocks[subset].reshape(-1, blocks.shape[2])
     log_det = float(np.linalg.slogdet(rows.T @ rows)[1])
     chosen = pool[subset]
-    found = identify(joints[chosen], measured[chosen], model=chain, noise_std=_NOISE)
+    found = identify(
+        joints[chosen],
+        measured[chosen],
+        model=chain,
+        noise_std=_NOISE,
+        prior=chain.default_prior(),
+    )
     rest = np.setdiff1d(np.arange(len(joints)), chosen)
     test_joints, test = poses("ur5_random_20.csv")
     error = np.linalg.norm(found.predict(joints[rest]) - measured[rest], axis=1)
