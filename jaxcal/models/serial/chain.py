@@ -242,8 +242,8 @@ class SerialChain(Arm):
     def with_misfit(self) -> Self:
         """This arm with harmonics of its joints, where its sensor asks for them.
 
-        They are no parameters of the arm: ``select`` and ``identify`` add them where no
-        prior is given, as what the parameters do not explain.
+        They are no parameters of the arm: ``identify``, and ``select`` for predictions,
+        add them where no prior is given, as what the parameters do not explain.
         """
         if self.harmonics or not self.sensor.harmonic:
             return self
