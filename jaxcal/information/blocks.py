@@ -168,27 +168,30 @@ def _stack(
     if usable is None:
         first = blocks[..., :1, :, :]
         same = blocks == first
-        mean = blocks.mean(axis=-3)
     else:
         weight = usable[..., None, None]
         blocks = blocks * weight
         at = usable.argmax(axis=-1)[..., None, None, None]
         first = np.take_along_axis(blocks, at, axis=-3)
         same = (blocks == first) | ~weight
-        mean = blocks.sum(axis=-3) / usable.sum(axis=-1)[..., None, None]
     same = same.all(axis=(-3, -2))[..., None, :]
     constant = first[..., 0, :, :] * same
-    if q == 1:
-        square = (constant * constant).sum(axis=-1, keepdims=True)
-        inverse = np.matrix_transpose(constant) / np.maximum(square, _TINY)
-    else:
-        inverse = np.linalg.pinv(constant)
-    shift = inverse @ (mean * ~same)
     rows = np.empty((*batch, count * q + len(root), p))
     centred = rows[..., : count * q, :].reshape(*batch, count, q, p)  # a view
-    np.subtract(blocks, (constant @ shift)[..., None, :, :], out=centred)
-    if usable is not None:
-        centred *= weight
+    if constant.any() and not same.all():
+        number = count if usable is None else usable.sum(axis=-1)[..., None, None]
+        if q == 1:
+            square = (constant * constant).sum(axis=-1, keepdims=True)
+            inverse = np.matrix_transpose(constant) / np.maximum(square, _TINY)
+        else:
+            inverse = np.linalg.pinv(constant)
+        shift = inverse @ (blocks.sum(axis=-3) / number * ~same)
+        np.subtract(blocks, (constant @ shift)[..., None, :, :], out=centred)
+        if usable is not None:
+            centred *= weight
+    else:
+        shift = np.zeros((*batch, p, p))
+        centred[...] = blocks
     largest = np.maximum(blocks.max(axis=(-3, -2)), -blocks.min(axis=(-3, -2)))
     if len(root):
         rows[..., count * q :, :] = root - root @ shift
@@ -224,6 +227,11 @@ def largest_rank(blocks: Array) -> int:
     if blocks.shape[1] == 1:
         return 1
     full, none = min(blocks.shape[1:]), np.zeros((0, blocks.shape[2]))
+    gram = blocks[0] @ blocks[0].T
+    scale = np.sqrt(np.diagonal(gram))
+    if len(gram) == full and scale.all():  # cheap, and enough where it is clear
+        if np.linalg.eigvalsh(gram / scale / scale[:, None])[0] > SINGULAR:
+            return full
     for some in (blocks[:1], blocks):
         rank = int(rank_of_blocks(some[:, None], none).max(initial=0))
         if rank == full:
