@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from jaxcal import Prior
 from jaxcal.models import (
     Board,
     Distance,
@@ -68,6 +67,25 @@ def _distance(tip, row, own):
     return [np.linalg.norm(tip[:3, 3] - [x, y, z]) - zero]
 
 
+CORNERS = np.array([[x, y, 0.0] for x in (0.0, 30.0, 60.0) for y in (0.0, 40.0)])
+CAMERA = (800.0, 820.0, 320.0, 240.0)
+
+
+def _pixels(moves, tip, own):
+    """Corner by corner, by matrices of OpenCV's pinhole."""
+    nowhere = np.zeros(6)
+    x, y, z, *turn = _board(moves, tip, nowhere, own)
+    turn = Rotation.from_rotvec(turn, degrees=True).as_matrix()
+    inside = np.array(
+        [[CAMERA[0], 0.0, CAMERA[2]], [0.0, CAMERA[1], CAMERA[3]], [0, 0, 1]]
+    )
+    found = []
+    for corner in CORNERS:
+        u, v, w = inside @ (turn @ corner + [x, y, z])
+        found += [u / w, v / w]
+    return found
+
+
 # Sensor, columns of the commands after the joints, readings (tip, columns, own).
 CASES = {
     "position": (Position(), np.zeros((6, 0)), lambda tip, row, own: tip[:3, 3]),
@@ -94,6 +112,16 @@ CASES = {
         Board("board", PLACE),
         SEEN,
         lambda tip, row, own: _board("board", tip, row, own),
+    ),
+    "pixels on the tip": (
+        Board("camera", PLACE, CORNERS, CAMERA),
+        np.zeros((6, 0)),
+        lambda tip, row, own: _pixels("camera", tip, own),
+    ),
+    "pixels from afar": (
+        Board("board", PLACE, CORNERS, CAMERA),
+        np.zeros((6, 0)),
+        lambda tip, row, own: _pixels("board", tip, own),
     ),
 }
 
@@ -231,6 +259,15 @@ def test_hand_and_eye_are_found_without_a_guess(moves):
     np.testing.assert_allclose(found.tool, tool, atol=1e-8)
     np.testing.assert_allclose(found.sensor.place, PLACE, atol=1e-8)
     np.testing.assert_allclose(found.predict(commands), 0.0, atol=1e-8)
+    ahead = np.array(seen)[:, 2] > 0.0  # of the camera: the others' pixels do not exist
+    wide = ur5(sensor=Board(moves, None, CORNERS, CAMERA))
+    pixels = found.measured_with(
+        Board(moves, found.sensor.place, CORNERS, CAMERA)
+    ).predict(JOINTS[ahead])
+    if ahead.sum() > 2:
+        again = wide.located(JOINTS[ahead], pixels)
+        np.testing.assert_allclose(again.tool, tool, atol=1e-5)
+        np.testing.assert_allclose(again.sensor.place, PLACE, atol=1e-5)
     with pytest.raises(ValueError, match="about two axes at least"):
         still = np.repeat(commands[:1], 5, axis=0)
         model.located(still)
@@ -295,22 +332,20 @@ def test_what_a_sensor_cannot_see_is_held_and_named():
 def test_gravity_finds_the_zeros_of_joints_from_twelve_postures():
     """Of an arm whose axes are where its table has them; 3 simulated arms."""
     arm = SerialChain.from_urdf(PANDA, tip="ball_link", sensor=Gravity())
-    stated = arm.default_prior()
-    axes = [name for name in arm.names if name.startswith(("alpha", "beta"))]
-    prior = Prior(stated.std, fixed=tuple({*stated.fixed, *axes}))
-    std = np.where(np.isin(arm.names, prior.fixed), 0.0, np.asarray(stated.std))
+    prior = arm.default_prior()
+    std = np.where(np.isin(arm.names, prior.fixed), 0.0, np.asarray(prior.std))
     low, high = np.clip(arm.limits, -150.0, 150.0).T
     offered = np.random.default_rng(0).uniform(low, high, (100, 7))
     names = [f"theta{i}" for i in range(2, 7)]  # not about the vertical, the tool's
     chosen = jaxcal.select(
-        offered, 12, "exchange", model=arm, prior=prior, criterion=jaxcal.As(names)
+        offered, 12, "exchange", model=arm, criterion=jaxcal.As(names)
     ).indices
     at = [arm.names.index(name) for name in names]
     for seed in range(3):
         rng = np.random.default_rng(seed)
         truth = arm.nominal + std * rng.normal(size=len(std))
         felt = arm.predict(offered[chosen], truth) + 0.00981 * rng.normal(size=(12, 3))
-        found = jaxcal.identify(offered[chosen], felt, model=arm, prior=prior)
+        found = jaxcal.identify(offered[chosen], felt, model=arm)
         assert np.sqrt(np.mean((found.parameters - truth)[at] ** 2)) < 0.05
 
 
@@ -350,6 +385,8 @@ def test_a_sensor_of_ones_own_needs_no_more_than_a_class():
         (lambda: Plane(1, [[0, 0, 0, 1]]), "must have normals other than zero"),
         (lambda: Gravity(up=(0, 0, 0)), "up must be a direction"),
         (lambda: Gravity(0.0), "magnitude must be positive"),
+        (lambda: Board(corners=np.eye(3)), "corners must be four or more rows"),
+        (lambda: Board(corners=CORNERS), "camera must be .fx, fy, cx, cy. in pixels"),
         (lambda: Board("hand"), "moves must be one of camera, board"),
         (lambda: Several((Position(),)), "sensors must hold two sensors or more"),
         (lambda: ur5(sensor=Socket(noise=-1.0)).default_noise(), "noise of the sensor"),

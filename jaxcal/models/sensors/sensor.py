@@ -90,6 +90,7 @@ class Sensor(abc.ABC):
     zeros: ClassVar[bool] = False  # what is measured is always zero
     sizes_prior: ClassVar[bool] = False  # shown to be better with Prior.sized()
     compliant: ClassVar[bool] = False  # shown to be better with joints that yield
+    harmonic: ClassVar[bool] = False  # and with their harmonics, as misfit
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -220,7 +221,9 @@ class Placed(Sensor):
 
     @property
     def nominal(self) -> Array:
-        return np.zeros(len(self.names)) if self.places is None else self.places.ravel()
+        if self.places is None:
+            return np.zeros(self.count * len(self.axes))
+        return self.places.ravel()
 
     def of_rows(self, inputs: Array) -> NDArray[np.int64]:
         """(N,) which one each row is of."""
