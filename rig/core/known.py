@@ -177,13 +177,10 @@ def unseen(config: RigConfig, zero: Array) -> list[str]:
     """Names of the axes of which a turn at the zero posture cannot be seen."""
     if config.imu.heading == "absolute":
         return []
-    base = zero @ frame_at(config, zero).mounting.T
-    upright = np.abs(base[2, ["XYZ".index(letter) for letter in config.letters]])
-    return [
-        name
-        for name, cosine in zip(AXIS_NAMES, upright, strict=True)
-        if cosine > np.cos(np.radians(UNSEEN_DEG))
-    ]
+    upright = np.abs((zero @ frame_at(config, zero).mounting.T)[2])
+    least = np.cos(np.radians(UNSEEN_DEG))
+    pairs = zip(AXIS_NAMES, config.letters, strict=True)
+    return [name for name, letter in pairs if upright["XYZ".index(letter)] > least]
 
 
 def check_zero(config: RigConfig, then: Array, now: Array, whose: str) -> str:

@@ -198,19 +198,14 @@ def _answer(code: int, stays: bool) -> bytes:
 
 
 class Imu:
-    """The attitude of the phone, now and over the last seconds.
-
-    Args:
-        settings: of the phone.
-        report: called with the event ``sender_refused``, its ``address`` and
-            ``reason``, once for each address, on the receiving thread.
-    """
+    """The attitude of the phone, now and over the last seconds."""
 
     def __init__(
         self,
         settings: ImuSettings,
         report: Callable[..., object] = lambda event, **fields: None,
     ) -> None:
+        """``report`` gets an event and its fields, on the receiving thread."""
         self.settings = settings
         self.connections = 0
         self.world = np.eye(3)  # (3, 3) by which readings are turned

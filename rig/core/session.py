@@ -24,14 +24,7 @@ from rig.core.attitude import Array, angle_between_deg, frame_at
 from rig.core.device import Device, Posture, check_plan
 from rig.core.drive import Drive
 from rig.core.faults import MotionFault, NotFollowing, Requests, Unreachable, ending
-from rig.core.known import (
-    KeptZero,
-    axes_text,
-    check_drives,
-    check_zero,
-    heading_turn,
-    leave,
-)
+from rig.core.known import KeptZero, check_drives, check_zero, heading_turn, leave
 from rig.core.measure import measure, zeroed
 from rig.core.motion import Standing, move
 from rig.journal import ZEROED, BusLock, DeviceRecord, Record, RunFolder
@@ -131,10 +124,7 @@ def take_zero(
     Args:
         device: armed.
         at: pulses of the zero; where it stands when not given, or 0 as configured.
-        kept: what a calibration keeps of it, to be found again.
-
-    Raises:
-        MotionFault: it is not where it was.
+        kept: what a calibration keeps of it, to be found again; else MotionFault.
     """
     config, run = device.config, device.run
     if zeros := run.journal.events("zero"):
@@ -178,8 +168,8 @@ def _compare_zero(
             )
         except MotionFault as fault:  # a phone mounted anew is calibrated anew
             device.emit("note", text=f"WARNING: {fault}")
-    zero = {"pulses": list(pulses), "attitude": attitude.tolist()}
-    device.record.reach(ZEROED, config, **zero)
+    found = {"pulses": list(pulses), "attitude": attitude.tolist()}
+    device.record.reach(ZEROED, config, **found)
 
 
 def _check_reference(device: Device, zero: Posture) -> None:
@@ -189,9 +179,9 @@ def _check_reference(device: Device, zero: Posture) -> None:
     device.emit("reference", sync=True, angles=angles, limit=limit)
     if max(map(abs, angles)) > limit:
         raise MotionFault(
-            f"the zero posture of this run has moved: {axes_text(angles)} (limit "
-            f"{limit:g}): the drives lost their origin, or the phone or the device "
-            "was moved. Start a new run"
+            f"the zero posture of this run has moved: it reads {np.round(angles, 2)} "
+            f"deg (limit {limit:g}): the drives lost their origin, or the phone or the "
+            "device was moved. Start a new run"
         )
 
 
@@ -231,10 +221,7 @@ def _reorient(device: Device) -> None:
 def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
     """Move, measure and record, once in the life of a run; None where out of reach.
 
-    Args:
-        device: armed, its zero taken.
-        posture: its name is the record's.
-        fields: of the record, besides what is measured.
+    The record has the posture's name, and ``fields`` besides what is measured.
     """
     run, name = device.run, posture.name
     if name in (known := run.postures()):
