@@ -262,7 +262,7 @@ def test_stop_ends_the_session_that_moves_and_then_stops_every_unit(
     assert all(len(drive.stops) >= 2 for drive in rig.drives)
 
 
-LOADS = "import rig.core.stop, rig.core.drive, rig.config.files"
+LOADS = "import rig.core.stop, rig.core.drive, rig.config.config"
 
 
 @pytest.mark.parametrize("transport", ["tcp", "rtu"])
