@@ -56,9 +56,9 @@ METHODS = (
     "rollouts64", "policy",
 )  # fmt: skip
 TUNED = ("priced", "state")
-BUDGETS = ("time+uses", "time", "uses+number", "time+uses+number", "number", "uses",
+BUDGETS = ("time+uses", "time", "uses", "time+uses+number", "uses+number", "time+uses",
            "time+number")  # fmt: skip
-STATES = (256, 1024, 4096)
+STATES = (256, 512, 1024)
 FEWER = {"rollouts16": 128, "rollouts64": 64}  # sessions at most
 BATCH = {"two_step": 64, "rollouts16": 16, "rollouts64": 16}
 _FIRST = 10**7  # seed
@@ -68,8 +68,7 @@ def family(number: int) -> tuple[str, GridTask]:
     """One of the twenty, and what it is."""
     structure = list(HELD_OUT)[number % len(HELD_OUT)]
     budget = BUDGETS[number % len(BUDGETS)]
-    limits = Limits(states=STATES[number % len(STATES)], designs=64, outcomes=8,
-                    measurements=32)  # fmt: skip
+    limits = Limits(STATES[number % len(STATES)], 48, 4, measurements=32)
     task = draw(_FIRST + number, structure, budget, limits)
     return f"{structure}, {budget}", task
 

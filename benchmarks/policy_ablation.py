@@ -66,7 +66,10 @@ class Unlearned(CompactNetwork):
 
     column: int = 3
 
-    num_unlearned = sys.maxsize  # every choice
+    @property
+    def num_unlearned(self) -> int:
+        """Every choice."""
+        return sys.maxsize
 
     def setup(self) -> None:
         """No parameters."""

@@ -1,11 +1,13 @@
 """Cost of sharing an update among devices and processes of this machine.
 
     XLA_FLAGS=--xla_force_host_platform_device_count=8 python benchmarks/scaling.py
-    python benchmarks/scaling.py --devices 1 --seeds 1,8
+    python benchmarks/scaling.py --devices 1 --seeds 1
+    python benchmarks/scaling.py --devices 2 --seeds 8
 
-prints, for 1, 2, 4 ... devices or for 1 and 8 seeds side by side, seconds of wall and
-processor time an update. Forced devices share the same cores, so this measures what
-sharding adds, not what it gains.
+prints, for 1, 2, 4 ... devices or for seeds side by side, seconds of wall and processor
+time an update. Forced devices share the same cores, so for one seed this measures what
+sharding adds, not what it gains; of several seeds each core, which is then a device,
+trains its own.
 """
 
 from __future__ import annotations
@@ -27,8 +29,7 @@ def measure(preset: str, number: int, seeds: int, num_updates: int) -> dict[str,
     """Seconds an update on so many devices of so many seeds, compilation left out."""
     config = presets.with_values(presets.load(preset), {"num_episodes": 10**8})
     learner = config.learners[0]
-    mesh = devices.make_mesh(number)
-    devices.require_divisible(config.ppo.rows_per_minibatch, mesh)
+    mesh = devices.make_mesh(config.ppo.rows_per_minibatch, number, seeds)
     keys = jax.vmap(jax.random.key)(jnp.arange(seeds))
     begin = jax.vmap(lambda key: ppo.begin(config.ppo, learner, key))
     state = devices.replicate(jax.jit(begin)(keys), mesh)
@@ -59,6 +60,7 @@ def main() -> None:
     parser.add_argument("--updates", type=int, default=10)
     arguments = parser.parse_args()
     cache.keep_compiled_programs()
+    devices.a_device_for_each_core(max(map(int, arguments.seeds.split(","))))
     for number in map(int, arguments.devices.split(",")):
         for seeds in map(int, arguments.seeds.split(",")):
             if number <= jax.device_count():

@@ -84,7 +84,7 @@ def test_the_pytorch_peer_has_the_same_network(rng, folded):
 
     @jax.jit
     def scored(key):
-        params = network.init(key, sets, everything, chosen, everything)["params"]
+        params = network.init(key, sets, everything, chosen)["params"]
         params = jax.tree.map(
             lambda leaf: leaf + 0.05 * jax.random.normal(key, leaf.shape), params
         )

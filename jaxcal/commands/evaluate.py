@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import pathlib
 import signal
 import sys
@@ -13,7 +14,6 @@ from jaxcal.arguments import refused
 from jaxcal.commands import evaluate_task
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder
-from jaxcal.learning.runtime import processes
 
 if TYPE_CHECKING:
     from jaxcal.evaluation.results import Evaluation, Summary
@@ -38,16 +38,10 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
     given = list(sys.argv[1:] if argv is None else argv)
     if any(word == "--task" or word.startswith("--task=") for word in given):
         return evaluate_task.main(given, prog)
-    advice = "finished parts stay: start every process again"
-    return processes.run_job(prog, given, lambda: _alone(given, prog), advice)
-
-
-def _alone(given: list[str], program: str) -> int:
-    """The command in this process, which may be one of several."""
     from jaxcal.commands.evaluate_arguments import parser
 
-    command = ["python", program] if program.endswith(".py") else program.split()
-    options = parser(program, " ".join(command)).parse_args(given)
+    command = ["python", prog] if prog.endswith(".py") else prog.split()
+    options = parser(prog, " ".join(command)).parse_args(given)
     options.command = [*command, *given]
     before = signal.signal(signal.SIGTERM, _terminate)
     try:
@@ -58,10 +52,10 @@ def _alone(given: list[str], program: str) -> int:
         if options.stream is not None:
             kept = "finished parts are kept; the same command goes on"
         how = "terminated" if terminated else "interrupted"
-        print(f"{program}: {how}, {kept}", file=sys.stderr)
+        print(f"{prog}: {how}, {kept}", file=sys.stderr)
         return EXIT_TERMINATED if terminated else EXIT_INTERRUPTED
     except (ValueError, OSError, MissingExtraError) as error:
-        return refused(program, error)
+        return refused(prog, error)
     finally:
         signal.signal(signal.SIGTERM, before)
     return 0
@@ -129,8 +123,6 @@ def _whole(
     from jaxcal.evaluation.methods import evaluate
     from jaxcal.paper.datasets import catalogue
 
-    if _process()[1] > 1:
-        raise ValueError("several processes can share an evaluation with --stream only")
     datasets = [
         catalogue.load(
             name,
@@ -159,8 +151,8 @@ def _whole(
 def _streamed(
     options: argparse.Namespace, progress: Progress
 ) -> Iterator[tuple[Summary, None]]:
-    """One dataset in parts; of several processes the first has the totals."""
-    from jaxcal.evaluation.stream import Plan, evaluate_stream, open_folder
+    """One dataset in parts."""
+    from jaxcal.evaluation.stream import evaluate_stream
     from jaxcal.paper.datasets.datasets import drawn
 
     whole = {
@@ -176,46 +168,18 @@ def _streamed(
         )
     if options.episodes is None:
         raise ValueError("--stream needs --episodes")
-    plan = Plan(
-        options.dataset[0],
-        drawn,
-        seed=options.seed,
-        k=options.k,
-        methods=options.methods,
-        checkpoints=tuple(options.checkpoint),
-        num=options.num,
-        draws=options.draws,
-    )
-    process = _process()
-    if process[1] > 1:
-        from jaxcal.learning.runtime import devices
-
-        devices.on_first(lambda: open_folder(plan, options.stream))
-    else:
-        open_folder(plan, options.stream)
-    if not (options.stream / "stream.json").exists():
-        raise ValueError(
-            f"--stream {options.stream} must be a folder that all processes see; "
-            f"process {process[0]} does not"
-        )
-    found = evaluate_stream(
-        plan,
-        options.episodes,
-        options.stream,
-        workers=options.workers,
-        process=process,
-        progress=progress,
-    )
-    if process[0] == 0:
-        yield found, None
-
-
-def _process() -> tuple[int, int]:
-    """Which process this is, and of how many; one that holds no JAX is alone."""
-    jax = sys.modules.get("jax")
-    if jax is None or not jax.distributed.is_initialized():
-        return 0, 1
-    return jax.process_index(), jax.process_count()
+    (name,) = options.dataset
+    plan = {
+        "dataset": name,
+        "seed": options.seed,
+        "k": options.k,
+        "methods": options.methods,
+        "checkpoints": options.checkpoint,
+        "num": options.num,
+        "random_draws": options.draws,
+    }
+    draw = functools.partial(drawn, name, options.seed)
+    yield evaluate_stream(draw, options.episodes, options.stream, plan, progress), None
 
 
 def _check_outputs(options: argparse.Namespace) -> None:
@@ -223,8 +187,6 @@ def _check_outputs(options: argparse.Namespace) -> None:
     evaluate_task.require_outputs(options)
     if options.stream is not None:
         require_writable_folder(options.stream)
-    if options.workers is not None and options.stream is None:
-        raise ValueError("--workers needs --stream")
     for folder in options.run:
         if not (folder / "metrics.csv").is_file():
             raise ValueError(f"--run {folder} holds no metrics.csv")

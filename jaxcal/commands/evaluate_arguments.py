@@ -7,7 +7,6 @@ from typing import Any
 
 from jaxcal.arguments import Parser, at_least, seconds, several
 from jaxcal.evaluation.methods import DEFAULT_METHODS
-from jaxcal.learning.runtime import processes
 
 __all__ = ["parser"]
 
@@ -57,7 +56,7 @@ examples:
       deciders of sequential measurement; {program} --task knee --help
   {program} --stream runs/ten_million --episodes 10000000
       any number of episodes in constant memory; the same command resumes where it
-      stopped; under srun, or with --coordinator, many processes share the work
+      stopped; started again beside it, on any machine, it shares the work
 """
 
 
@@ -95,8 +94,5 @@ def parser(program: str, typed: str) -> Parser:
     add("--run", help=runs, **many, **folder)
     parts = "evaluate in parts kept in DIR: any number of --episodes, resumable"
     add("--stream", help=parts, **folder)
-    cores = "processes of --stream; one for each core"
-    add("--workers", type=natural, metavar="N", help=cores)
     add("--quiet", action="store_true", help="no progress")
-    processes.add_arguments(out)
     return out

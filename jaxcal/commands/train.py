@@ -7,6 +7,7 @@ measurement of a task (``--task``); they differ in what is read from the flags.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import datetime
 import pathlib
@@ -64,6 +65,8 @@ def _run(arguments: argparse.Namespace) -> int:
     out = pathlib.Path(arguments.out or f"runs/{named}")
     if arguments.export and not arguments.export.endswith(".npz"):
         raise ValueError(f"--export must be a file NAME.npz, got {arguments.export}")
+    if (seeds := _num_seeds(arguments, out)) > 1:
+        devices.a_device_for_each_core(seeds)
     configuration = _task_configuration if arguments.task else _configuration
     config: Any = devices.on_first(lambda: configuration(arguments, out))
     stop = _stop_on_signals()
@@ -109,8 +112,8 @@ def _train_postures(
     from jaxcal.learning.training import checkpoint, postures
     from jaxcal.selection.teacher import fixed_validation, teacher
 
-    mesh = devices.make_mesh(arguments.devices)
-    devices.require_divisible(config.ppo.rows_per_minibatch, mesh)
+    rows = config.ppo.rows_per_minibatch
+    mesh = devices.make_mesh(rows, arguments.devices, config.num_seeds)
     validation = None
     if devices.is_first():
         _introduce(config, out, devices.describe(mesh))
@@ -157,6 +160,19 @@ def _train_task(
     if devices.is_first():
         _compare_seeds(out, config, run.MEASURED, run.SCHEMA)
     return _updates_of(state)
+
+
+def _num_seeds(arguments: argparse.Namespace, out: pathlib.Path) -> int:
+    """Of the run to begin or to go on with; what is wrong is refused later."""
+    from jaxcal.adaptive.policy.run import SCHEMA
+    from jaxcal.learning.training import checkpoint
+
+    if not arguments.resume:
+        return arguments.num_seeds or 1
+    schema = SCHEMA if arguments.task else checkpoint.SCHEMA
+    with contextlib.suppress(checkpoint.CheckpointError):
+        return int(checkpoint.read_meta(out, schema)[1]["num_seeds"])
+    return 1
 
 
 def _updates_of(state: Any) -> int:

@@ -9,8 +9,7 @@ from typing import Any
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.tasks import registry
 from jaxcal.arguments import Parser, at_least
-from jaxcal.learning.core.ppo import PPOConfig
-from jaxcal.learning.core.streams import StreamsConfig
+from jaxcal.learning.config import PPOConfig, StreamsConfig
 from jaxcal.learning.runtime import processes
 from jaxcal.learning.settings import Setting, settings_of
 from jaxcal.learning.training import presets

@@ -8,7 +8,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from jaxcal.learning.core.network import mask_logits
+from jaxcal.learning.core.network import Network, mask_logits
 from jaxcal.learning.environments.observation import context_features
 from jaxcal.learning.policies.networks import NetworkConfig
 
@@ -54,7 +54,7 @@ class _Keys(nn.Module):
         return jnp.einsum("...w,...mw->...m", query @ self.kernel.T, poses)
 
 
-class PaperNetwork(nn.Module):
+class PaperNetwork(Network):
     """The paper's attention policy: hidden 768, 3.5 M parameters, 71 % shared.
 
     Candidates are encoded one by one, a context encoder reads the ten numbers of the
@@ -63,8 +63,6 @@ class PaperNetwork(nn.Module):
     """
 
     config: NetworkConfig
-
-    num_unlearned = 0
 
     def setup(self) -> None:
         width = self.config.width
@@ -94,10 +92,6 @@ class PaperNetwork(nn.Module):
     ) -> Decision:
         return Decision(context_features(features.poses, chosen), available)
 
-    def shares_program(self, features: Candidates, k: int) -> range:
-        """None: every choice is written out, they are few."""
-        return range(0)
-
     def encode(self, features: Candidates) -> jax.Array:
         """The candidates (..., M, width), encoded one by one."""
         poses = nn.relu(self.pose_1(2.0 * features.poses - 1.0))
@@ -117,18 +111,6 @@ class PaperNetwork(nn.Module):
         logits = self.key.scores(self.actor(shared), memory) * scale
         value = self.critic_2(nn.relu(self.critic_1(shared)))[..., 0]
         return mask_logits(logits, decision.available), value
-
-    def __call__(
-        self,
-        candidates: jax.Array,
-        usable: jax.Array,
-        chosen: jax.Array,
-        available: jax.Array,
-    ) -> tuple[jax.Array, jax.Array]:
-        """The first decision; flax makes the parameters with it."""
-        features = self.candidate_features(candidates, usable)
-        decision = self.decision_features(features, chosen, available, 0)
-        return self.decode(self.encode(features), decision)
 
     def from_observation(
         self, observation: jax.Array, num_candidates: int, num_inputs: int

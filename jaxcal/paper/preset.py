@@ -7,7 +7,7 @@ schedule are the usual ones for a network of this size.
 
 from __future__ import annotations
 
-from jaxcal.learning.core.postures import EpisodesConfig
+from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training.config import TrainConfig
 

@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 import json
-import os
 import pathlib
-import subprocess
-import sys
-import time
 import tracemalloc
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import pytest
 
 from jaxcal.evaluation import stream
+from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.methods import evaluate
 from jaxcal.evaluation.report import json_document, text_table
-from jaxcal.evaluation.results import Summary
-from jaxcal.evaluation.stream import Plan, evaluate_stream, open_folder
+from jaxcal.evaluation.results import Row, Summary
+from jaxcal.evaluation.stream import evaluate_stream
 from jaxcal.information.regression import log_det_information
 from jaxcal.paper.datasets.datasets import drawn, make_dataset
 
-PLAN = Plan("dataset2", drawn, methods=("random", "greedy", "exact"), draws=3)
+PLAN: dict[str, Any] = {
+    **{"dataset": "dataset2", "seed": 0, "k": 4, "checkpoints": [None]},
+    **{"methods": ["random", "greedy", "exact"], "num": 16, "random_draws": 3},
+}
 
 
 def numbers_of(log_det: np.ndarray, best: np.ndarray) -> dict[str, object]:
@@ -78,10 +78,10 @@ def test_what_one_part_lacks_the_total_lacks(rng: np.random.Generator) -> None:
 
 
 def run(
-    folder: pathlib.Path, episodes: int, plan: Plan = PLAN, **options: object
+    folder: pathlib.Path, episodes: int, plan: dict[str, Any] = PLAN, **options: Any
 ) -> Summary:
-    open_folder(plan, folder)
-    return evaluate_stream(plan, episodes, folder, **{"workers": 1} | options)  # type: ignore[arg-type]  # a test's shorthand
+    draw = functools.partial(drawn, plan["dataset"], plan["seed"])
+    return evaluate_stream(draw, episodes, folder, plan, **options)
 
 
 def exact_numbers(found: Summary) -> list[dict[str, object]]:
@@ -96,7 +96,7 @@ def test_the_first_block_has_the_numbers_of_a_plain_evaluation(
 ) -> None:
     streamed = run(tmp_path, 300)
     plain = evaluate(
-        make_dataset("dataset2", episodes=300), 4, PLAN.methods, random_draws=3
+        make_dataset("dataset2", episodes=300), 4, PLAN["methods"], random_draws=3
     )
     for one, other in zip(streamed.rows, plain.summarise().rows, strict=True):
         row, expected = one.numbers, other.numbers
@@ -113,26 +113,32 @@ def test_the_first_block_has_the_numbers_of_a_plain_evaluation(
     assert entry["dataset"]["episodes"] == 300 and entry["proven"] == 1.0
 
 
-def quickly(plan: Plan, begin: int, end: int) -> dict[str, object]:
+class Quickly:
     """In place of the solvers: the first four and the next four postures."""
-    candidates = drawn(plan.dataset, plan.seed, begin, end).candidates
-    first, next_four = (
-        log_det_information(candidates[:, cut, :], 3)[:, None]
-        for cut in (slice(0, 4), slice(4, 8))
-    )
-    best = np.maximum(first, next_four)[:, 0]
-    rows = {
-        "random": numbers_of(np.hstack([first, next_four]), best),
-        "greedy": numbers_of(first, best),
-        "exact": numbers_of(best[:, None], best),
-    }
-    return {"proven": int((candidates[:, 8, 0] < 0.9).sum()), "rows": rows}
+
+    def __init__(self, dataset: Dataset, **options: Any) -> None:
+        self.dataset = dataset
+
+    def summarise(self) -> Summary:
+        candidates = self.dataset.candidates
+        first, next_four = (
+            log_det_information(candidates[:, cut, :], 3)[:, None]
+            for cut in (slice(0, 4), slice(4, 8))
+        )
+        best = np.maximum(first, next_four)[:, 0]
+        rows = (
+            Row("random", None, numbers_of(np.hstack([first, next_four]), best)),
+            Row("greedy", None, numbers_of(first, best)),
+            Row("exact", None, numbers_of(best[:, None], best)),
+        )
+        proven = int((candidates[:, 8, 0] < 0.9).sum())
+        return Summary(self.dataset.facts(), 4, 0, proven, rows)
 
 
 def test_stopping_and_sharing_do_not_change_a_digit(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stream, "_solved", quickly)
+    monkeypatch.setattr(stream, "evaluate", Quickly)
     large = exact_numbers(run(tmp_path / "large", 7_300))
     monkeypatch.setattr(stream, "PART", 1_000)
     whole = exact_numbers(run(tmp_path / "whole", 7_300))
@@ -142,7 +148,7 @@ def test_stopping_and_sharing_do_not_change_a_digit(
         assert row["det_s"]["mean"] == pytest.approx(other["det_s"]["mean"], rel=1e-13)  # type: ignore[index]  # a row
 
     def stop(task: str, done: int, total: int) -> None:
-        if done == 2_000:
+        if done == 2:
             raise KeyboardInterrupt
 
     stopped = tmp_path / "stopped"
@@ -154,88 +160,15 @@ def test_stopping_and_sharing_do_not_change_a_digit(
     for name, stamp in stamps.items():
         assert (stopped / name).stat().st_mtime_ns == stamp
 
-    # Three processes: each evaluates what the others have not.
-    def shared(number: int) -> Summary:
-        place = tmp_path / "shared"
-        return run(place, 7_300, process=(number, 3))
-
+    # Three at once: each evaluates what the others have not.
     with ThreadPoolExecutor(3) as threads:
-        for found in threads.map(shared, range(3)):
+        for found in threads.map(lambda _: run(tmp_path / "shared", 7_300), range(3)):
             assert exact_numbers(found) == whole
-
-    # Of three, two died before their first part: the third waits for nobody.
-    assert exact_numbers(run(tmp_path / "left", 7_300, process=(1, 3))) == whole
 
     # More episodes later go on from the whole parts that are there.
     grown = tmp_path / "grown"
     run(grown, 3_300)
     assert exact_numbers(run(grown, 7_300)) == whole
-
-
-@pytest.mark.slow
-def test_workers_do_not_change_a_digit(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    methods = ("random", "greedy", "exchange", "exact")
-    plan = Plan("dataset2", drawn, methods=methods, draws=3)
-    monkeypatch.setattr(stream, "PART", 1_000)
-    here = run(tmp_path / "here", 2_200, plan)
-    there = run(tmp_path / "there", 2_200, plan, workers=2)
-    assert exact_numbers(here) == exact_numbers(there)
-
-
-@pytest.mark.skipif(not pathlib.Path("/proc/self/task").exists(), reason="no /proc")
-def test_a_killed_stream_leaves_no_worker_and_loses_no_part(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    root = pathlib.Path(__file__).resolve().parents[2]
-    code = (
-        "import pathlib, sys; from jaxcal.evaluation import stream as s\n"
-        "from jaxcal.paper.datasets.datasets import drawn\n"
-        "if __name__ == '__main__':\n"
-        "    s.PART = 1_000\n"
-        f"    plan = s.Plan('dataset2', drawn, methods={PLAN.methods!r}, draws=3)\n"
-        "    folder = pathlib.Path(sys.argv[1]); s.open_folder(plan, folder)\n"
-        "    s.evaluate_stream(plan, 10**7, folder, workers=2)\n"
-    )
-    script = tmp_path / "stream.py"
-    script.write_text(code)
-    folder = tmp_path / "parts"
-    environment = {**os.environ, "PYTHONPATH": str(root)}
-    with subprocess.Popen(
-        [sys.executable, str(script), str(folder)], env=environment
-    ) as process:
-        try:
-            wait_for(lambda: len(list(folder.glob("part-*"))) >= 2)
-            children = children_of(process.pid)
-        finally:
-            process.kill()
-    assert len(children) >= 2
-    wait_for(lambda: not any(running(pid) for pid in children))
-    assert not [path for path in folder.iterdir() if path.suffix != ".json"]
-    monkeypatch.setattr(stream, "PART", 1_000)
-    done, whole = run(folder, 2_000), run(tmp_path / "whole", 2_000)
-    assert exact_numbers(done) == exact_numbers(whole)
-
-
-def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, "it did not happen in time"
-        time.sleep(0.05)
-
-
-def children_of(pid: int) -> list[int]:
-    found = pathlib.Path(f"/proc/{pid}/task/{pid}/children").read_text()
-    return [int(child) for child in found.split()]
-
-
-def running(pid: int) -> bool:
-    """Neither gone nor a corpse that nobody has fetched."""
-    try:
-        return "\nState:\tZ" not in pathlib.Path(f"/proc/{pid}/status").read_text()
-    except FileNotFoundError:
-        return False
 
 
 def test_a_stream_goes_on_where_the_dataset_ends() -> None:
@@ -251,7 +184,7 @@ def test_a_stream_goes_on_where_the_dataset_ends() -> None:
 def test_memory_does_not_grow_with_the_episodes(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stream, "_solved", quickly)
+    monkeypatch.setattr(stream, "evaluate", Quickly)
     monkeypatch.setattr(stream, "PART", 2_000)
     peaks = []
     for number, episodes in enumerate((2_000, 2_000, 12_000)):
@@ -268,54 +201,46 @@ def test_memory_does_not_grow_with_the_episodes(
     [
         ({"k": 5}, "its k is 4, not 5"),
         ({"seed": 1}, "its seed is 0, not 1"),
-        ({"methods": ("exact",)}, "its methods is"),
-        ({"draws": 4}, "its draws is 3, not 4"),
+        ({"methods": ["exact"]}, "its methods is"),
+        ({"random_draws": 4}, "its random_draws is 3, not 4"),
     ],
 )
 def test_another_plan_is_refused(
     tmp_path: pathlib.Path, change: dict[str, object], says: str
 ) -> None:
-    open_folder(PLAN, tmp_path)
-    open_folder(PLAN, tmp_path)
-    other = dataclasses.replace(PLAN, **change)  # type: ignore[arg-type]  # a test's shorthand
+    run(tmp_path, 2)
+    run(tmp_path, 3)
     with pytest.raises(ValueError, match=says):
-        open_folder(other, tmp_path)
+        run(tmp_path, 2, PLAN | change)
 
 
-def test_damage_is_named(tmp_path: pathlib.Path) -> None:
-    plan = Plan("dataset2", drawn, methods=("greedy",), draws=1)
-    run(tmp_path, 20, plan)
+def test_damage_and_other_versions_are_named(tmp_path: pathlib.Path) -> None:
+    run(tmp_path, 20)
     part = next(tmp_path.glob("part-*"))
     part.write_text(part.read_text()[:100])
     with pytest.raises(ValueError, match=r"part-.* is damaged .* delete it"):
-        run(tmp_path, 20, plan)
-    (tmp_path / "stream.json").write_text("[1")
-    with pytest.raises(ValueError, match=r"stream\.json is damaged"):
-        open_folder(plan, tmp_path)
-
-
-def test_a_folder_of_another_version_is_refused(tmp_path: pathlib.Path) -> None:
-    open_folder(PLAN, tmp_path)
+        run(tmp_path, 20)
     path = tmp_path / "stream.json"
     held = json.loads(path.read_text())
     path.write_text(json.dumps(held | {"version": 2, "seed": 5}))
-    with pytest.raises(ValueError, match=r"its version is 2, not 3; name another"):
-        open_folder(PLAN, tmp_path)
+    with pytest.raises(ValueError, match=r"its version is 2, not 4; name another"):
+        run(tmp_path, 20)
+    path.write_text("[1")
+    with pytest.raises(ValueError, match=r"stream\.json is damaged"):
+        run(tmp_path, 20)
 
 
 @pytest.mark.parametrize(
     ("values", "says"),
     [
         ({"dataset": "dataset4"}, "streamed dataset must be one of .* got 'dataset4'"),
-        ({"methods": ("auto",)}, "streamed method must be one of .* got 'auto'"),
-        ({"k": 3}, r"k must be in \[4, 50\), got 3"),
+        ({"methods": ["best"]}, "method must be one of .* got 'best'"),
+        ({"k": 3}, "dataset2: k must be at least 4"),
     ],
 )
-def test_bad_plans_are_named(values: dict[str, object], says: str) -> None:
+def test_bad_plans_are_named_and_leave_nothing(
+    tmp_path: pathlib.Path, values: dict[str, object], says: str
+) -> None:
     with pytest.raises(ValueError, match=says):
-        dataclasses.replace(PLAN, **values)  # type: ignore[arg-type]  # bad on purpose
-
-
-def test_bad_workers_are_named(tmp_path: pathlib.Path) -> None:
-    with pytest.raises(ValueError, match="workers must be at least 1, got 0"):
-        run(tmp_path, 10, workers=0)
+        run(tmp_path / "new", 10, PLAN | values)
+    assert not (tmp_path / "new").exists()

@@ -20,7 +20,8 @@ import json, sys
 import jax, jax.numpy as jnp, numpy as np
 from jaxcal.learning.runtime import devices
 from jaxcal.learning.core import ppo, postures
-from jaxcal.learning.core.postures import EpisodesConfig, Postures
+from jaxcal.learning.config import EpisodesConfig
+from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.training import presets, run as training
 from jaxcal.learning.environments.selection import SelectionConfig
@@ -35,7 +36,7 @@ def distance(one, other):
 
 TINY = """
 network = build(NetworkConfig(width=8, encoder_rounds=1))
-task = Task(SelectionConfig(6, 3, 1, 1), random_starts=0.3, masked=0.2)
+task = Task(SelectionConfig(6, 3, 1, 1), masked=0.2)
 config = EpisodesConfig(
     num_episodes=64 * 3, episodes_per_update=64, episodes_per_set=4,
     num_minibatches=1, num_epochs=1, warmup_updates=1,
@@ -60,7 +61,7 @@ def run(mesh, num_updates):
         moments = moments or jax.tree.map(np.asarray, state.opt_state)
     return state, rows, moments
 
-mesh = devices.make_mesh()
+mesh = devices.make_mesh(config.rows_per_minibatch)
 out["devices"] = mesh.size
 one, other = run(None, 3), run(mesh, 3)
 out["moments"] = distance(one[2], other[2])
@@ -134,24 +135,28 @@ def test_a_mesh_takes_the_devices_asked_for_and_names_what_does_not_divide() -> 
     out = python(
         BEGIN,
         """
-        out["some"] = devices.make_mesh(4).size
-        out["one"] = devices.make_mesh(1) is None
+        out["some"] = devices.make_mesh(64, 4).size
+        out["one"] = devices.make_mesh(64, 1) is None
         def error(call):
             try:
                 call()
             except ValueError as error:
                 return str(error)
-        out["many"] = error(lambda: devices.make_mesh(9))
-        out["odd"] = error(lambda: devices.require_divisible(12, devices.make_mesh()))
-        devices.require_divisible(16, devices.make_mesh())
-        paper = presets.load("paper").ppo
-        devices.require_divisible(paper.rows_per_minibatch, devices.make_mesh())
+        out["many"] = error(lambda: devices.make_mesh(64, 9))
+        out["odd"] = error(lambda: devices.make_mesh(12))
+        out["seeds"] = devices.make_mesh(7, num_seeds=16).axis_names
+        out["odd seeds"] = error(lambda: devices.make_mesh(16, num_seeds=6))
+        devices.make_mesh(presets.load("paper").ppo.rows_per_minibatch)
         """,
     )
     assert out["some"] == 4 and out["one"] is True
     assert out["many"] == "devices must be in [1, 8], got 9"
     assert "multiple of the 8 devices, got 12" in str(out["odd"])
-    assert "use 6 devices" in str(out["odd"])
+    assert "use 6 devices" in str(out["odd"]) and out["seeds"] == ["seeds"]
+    assert out["odd seeds"] == (
+        "--seeds must be a multiple of the 8 devices, got 6; use 6 devices "
+        "(--devices 6)"
+    )
 
 
 @pytest.mark.slow
@@ -194,3 +199,28 @@ def test_the_command_names_what_does_not_divide(tmp_path: pathlib.Path) -> None:
     assert "must be a multiple of the 8 devices, got 12" in done.stderr
     assert "--devices 6" in done.stderr
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_seeds_on_devices_of_their_own_are_what_they_are_side_by_side() -> None:
+    out = python(
+        BEGIN,
+        TINY,
+        """
+        learner = Postures(config, task, network)
+        keys = jax.random.split(jax.random.key(5), 4)
+        begin = jax.jit(jax.vmap(lambda key: ppo.begin(config, learner, key)))
+        ends = []
+        for mesh in (None, devices.make_mesh(16, num_devices=2, num_seeds=4)):
+            state = devices.replicate(begin(keys), mesh)
+            update = training.updates(config, learner, mesh, 2, 4)
+            ends.append(update(state, jnp.int32(2)))
+        one, other = (np.asarray(end[1]["rewards"]) for end in ends)
+        out["same"], out["shape"] = distance(one, other), one.shape
+        out["apart"] = min(distance(one[:, i - 1], one[:, i]) for i in range(4))
+        out["whole"] = ends[1][0].num_updates.sharding.is_fully_replicated
+        """,
+        flags=f"{EIGHT} {QUICK}",
+    )
+    assert out["same"] < 2e-5 and out["apart"] > 1e-2
+    assert out["shape"] == [2, 4, 64] and out["whole"]

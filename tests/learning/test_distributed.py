@@ -110,7 +110,7 @@ def work():
     assert given["own"] == 0 and given["text"] == "the first"
     assert given["some"].tolist() == [0, 1, 2]
     assert devices.any_process(own == 1) and not devices.any_process(False)
-    mesh = devices.make_mesh()
+    mesh = devices.make_mesh(8)
     tree = devices.replicate({"x": np.arange(8.0, dtype=np.float32)}, mesh)
     total = jax.jit(lambda tree: ppo.placed(tree, mesh, "sets")["x"].sum())(tree)
     assert float(total) == 28.0 and len(devices.local(tree)["x"].devices()) == 1
@@ -301,7 +301,7 @@ def test_a_run_goes_on_with_another_number_of_processes(tmp_path: pathlib.Path) 
 PART = """
 import pathlib, sys
 from jaxcal.learning.runtime import devices, processes
-from jaxcal.learning.core.postures import EpisodesConfig
+from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.training import postures as training
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies.networks import NetworkConfig

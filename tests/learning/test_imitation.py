@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.core import network as networks
 from jaxcal.learning.core import ppo
-from jaxcal.learning.core.postures import EpisodesConfig, Postures
+from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.build import build
@@ -47,7 +48,7 @@ CONFIG = TrainConfig(
 
 def key_of(index):
     """The key of a lesson, as a run derives it."""
-    return jax.random.fold_in(ppo.keys_of(jax.random.key(3))[2], index)
+    return jax.random.fold_in(jax.random.split(jax.random.key(3), 3)[2], index)
 
 
 def brute_force(candidates, available, given, k):
@@ -105,7 +106,7 @@ def test_lessons_share_no_key_with_the_weights_and_the_updates():
         jax.random.key_data(jax.random.split(key)[1]),
         jax.random.key_data(jax.random.fold_in(key, 1)),
     )
-    weights, played, _ = ppo.keys_of(key)
+    weights, played, _ = jax.random.split(key, 3)
     begun = jax.jit(lambda key: ppo.begin(PPO, LEARNER, key))(key)
     assert np.array_equal(begun.key, jax.random.key_data(played))
     for index in range(3):

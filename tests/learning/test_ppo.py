@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import NamedTuple
 
 import flax.linen as nn
@@ -13,10 +12,10 @@ import numpy as np
 import optax
 import pytest
 
+from jaxcal.learning.config import EpisodesConfig, StreamsConfig
+from jaxcal.learning.core import network as networks
 from jaxcal.learning.core import ppo
-from jaxcal.learning.core.network import mask_logits
-from jaxcal.learning.core.postures import EpisodesConfig, Postures
-from jaxcal.learning.core.streams import StreamsConfig
+from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.build import build
@@ -85,7 +84,7 @@ def test_the_loss_is_that_of_the_definition(rng):
     )
     logits, shape = rng.normal(size=(6, 2, 5)), (6, 2)
     value, target = rng.normal(size=shape), rng.normal(size=shape) * 6.0
-    action, counted = rng.integers(5, size=shape), rng.random(shape) < 0.7
+    action = rng.integers(5, size=shape)
     before, advantage = -np.abs(rng.normal(size=shape)) - 1.0, rng.normal(size=shape)
     assert (abs(value - target) > 3.0).any() and (abs(value - target) < 3.0).any()
     batch = ppo.Batch(
@@ -94,13 +93,12 @@ def test_the_loss_is_that_of_the_definition(rng):
         log_prob=jnp.asarray(before),
         advantage=jnp.asarray(advantage),
         target=jnp.asarray(target),
-        counted=jnp.asarray(counted, jnp.float32),
     )
     found, metrics = ppo.surrogate(
         config, jnp.asarray(logits), jnp.asarray(value), batch, jnp.int32(0)
     )
     gain = error = entropy = kl = 0.0
-    for at in zip(*np.nonzero(counted), strict=True):
+    for at in np.ndindex(shape):
         shares = np.exp(logits[at]) / np.exp(logits[at]).sum()
         ratio = shares[action[at]] / np.exp(before[at])
         gain += min(ratio * advantage[at], np.clip(ratio, 0.8, 1.2) * advantage[at])
@@ -108,7 +106,7 @@ def test_the_loss_is_that_of_the_definition(rng):
         error += wrong**2 if wrong <= 3.0 else 9.0 + 6.0 * (wrong - 3.0)
         entropy -= (shares * np.log(shares)).sum()
         kl += ratio - 1.0 - np.log(ratio)
-    number = counted.sum()
+    number = action.size
     np.testing.assert_allclose(metrics["policy_loss"], -gain / number, rtol=1e-5)
     np.testing.assert_allclose(metrics["value_loss"], error / number, rtol=1e-5)
     np.testing.assert_allclose(metrics["kl"], kl / number, rtol=1e-4)
@@ -139,9 +137,7 @@ def test_a_gradient_step_is_that_of_optax(rng, size):
     )
     state, theirs = chain.init(params), params
     for _ in range(2):
-        ours, _ = ppo.epochs(
-            config, ours, 4, lambda params, index: (grads, {}), jax.random.key(0)
-        )
+        ours = ppo.descend(config, ours, grads)
         changes, state = chain.update(grads, state, theirs)
         theirs = optax.apply_updates(theirs, changes)
     for name in params:
@@ -159,7 +155,7 @@ def test_a_gradient_step_is_that_of_optax(rng, size):
 def test_the_first_minibatch_sees_the_probabilities_that_played(kind, n, k):
     # Play and loss compute the same probabilities in differently compiled programs;
     # a difference here would silently make every gradient wrong.
-    task = Task(SelectionConfig(12, k, n, n), random_starts=0.5)
+    task = Task(SelectionConfig(12, k, n, n))
     config = dataclasses.replace(TINY, episodes_per_update=512)
     learner = Postures(config, task, build(dataclasses.replace(SMALL, kind=kind)))
     params = learner.init(jax.random.key(0))
@@ -186,9 +182,9 @@ class Shelf(NamedTuple):
 class Pick:
     """A probe environment: one decision, which pays the number that is chosen."""
 
-    random_starts: float = 0.0
     num_decisions: int = 1
     value_scale: float = 1.0
+    payment: float = 1.0
 
     def reset(self, key):
         return Shelf(
@@ -198,7 +194,7 @@ class Pick:
     def step(self, state, action):
         return (
             state._replace(chosen=action[None]),
-            state.candidates[action, 0],
+            self.payment * state.candidates[action, 0],
             jnp.array(True),
         )
 
@@ -209,10 +205,8 @@ class Pick:
         return state.candidates[state.chosen[0], 0]
 
 
-class Slope(nn.Module):
+class Slope(networks.Network):
     """Scores a number by a learned slope; its value is a learned constant."""
-
-    num_unlearned = 0
 
     def setup(self):
         self.slope = self.param("slope", nn.initializers.zeros, ())
@@ -228,11 +222,10 @@ class Slope(nn.Module):
         return self.slope * features
 
     def decode(self, memory, available):
-        logits = mask_logits(jnp.broadcast_to(memory, available.shape), available)
+        logits = networks.mask_logits(
+            jnp.broadcast_to(memory, available.shape), available
+        )
         return logits, jnp.broadcast_to(self.value, logits.shape[:-1])
-
-    def __call__(self, candidates, usable, chosen, available):
-        return self.decode(self.encode(candidates[..., 0]), available)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -272,7 +265,7 @@ def test_training_maps_over_seeds():
 
 def test_a_run_trains_what_the_pure_function_does(tmp_path):
     """Also where two tasks take turns."""
-    config = Probe(PROBE.ppo, (Pick(), Pick(random_starts=0.5)))
+    config = Probe(PROBE.ppo, (Pick(), Pick(payment=0.5)))
     average, metrics = jax.jit(ppo.make_train(config))(jax.random.key(3))
     recipe = Recipe(
         ppo=config.ppo,
@@ -296,30 +289,18 @@ def test_a_run_trains_what_the_pure_function_does(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_gradient_in_slices_is_that_of_the_whole():
-    """Also where slices count unequally; 8 rows in 7 become slices of 4."""
-    config = dataclasses.replace(TINY, episodes_per_update=32, num_minibatches=1)
-    task = Task(SelectionConfig(8, 4, 1, 1, reward_gain=True), random_starts=0.6)
-    learner = Postures(config, task, build(SMALL))
-    params = learner.init(jax.random.key(0))
-    keys = jax.random.split(jax.random.key(1), config.rows_per_update)
-    played, _ = jax.jit(learner.gather)(params, keys)
-    counted = np.asarray(played.counted).sum((1, 2))
-    assert counted[:4].sum() != counted[4:].sum()
-
-    @functools.partial(jax.jit, static_argnums=1)
-    def found(params, size):
-        one = jax.grad(
-            lambda p, rows: learner.loss(p, rows, jnp.int32(0)), has_aux=True
+@pytest.mark.parametrize("size", [1, 6])
+def test_an_update_in_slices_is_that_of_the_whole(size):
+    """8 rows in 6 become slices of 2."""
+    ends = []
+    for rows in (size, 8):
+        config = dataclasses.replace(
+            TINY, episodes_per_update=32, num_minibatches=1, slice_rows=rows
         )
-
-        def rows_of(index):
-            return jax.tree.map(lambda leaf: leaf[index], played)
-
-        return ppo.sliced(one, params, rows_of, jnp.arange(8), size)
-
-    whole, slices = found(params, 8), found(params, 7)
-    for a, b in zip(*map(jax.tree.leaves, (whole, slices)), strict=True):
+        learner = Postures(config, Task(SelectionConfig(8, 4, 1, 1)), build(SMALL))
+        state = ppo.begin(config, learner, jax.random.key(0))
+        ends.append(jax.jit(ppo.make_update(config, learner))(state))
+    for a, b in zip(*map(jax.tree.leaves, ends), strict=True):
         np.testing.assert_allclose(a, b, atol=2e-5)
 
 
@@ -378,19 +359,8 @@ def test_the_averaged_weights_owe_nothing_to_the_initial_ones(rng):
     )
     data, seen = jnp.asarray(rng.normal(size=(4, 3)), jnp.float32), []
     for _ in range(4):
-        state, _ = ppo.epochs(
-            config,
-            state,
-            4,
-            jax.grad(
-                lambda params, index: (
-                    ((params["w"][None] - data[index]) ** 2).sum(),
-                    {},
-                ),
-                has_aux=True,
-            ),
-            jax.random.key(1),
-        )
+        grads = jax.grad(lambda w: ((w[None] - data) ** 2).sum())(state.params["w"])
+        state = ppo.descend(config, state, {"w": grads})
         seen.append(np.asarray(state.params["w"], np.float64))
         ages = 0.9 ** np.arange(len(seen))[::-1]
         expected = ages @ np.stack(seen) / ages.sum()

@@ -20,8 +20,7 @@ import pytest
 
 from jaxcal.commands import train as command
 from jaxcal.commands import train_candidates
-from jaxcal.learning.core import ppo
-from jaxcal.learning.core.postures import EpisodesConfig
+from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.build import build
@@ -87,7 +86,7 @@ def test_resume_equals_an_uninterrupted_run_bit_for_bit(finished, tmp_path):
 def test_updates_compile_once_and_change_every_weight(finished):
     for learner in CONFIG.learners:
         assert updates(CONFIG.ppo, learner, None, 1, 0)._cache_size() == 1
-    begun = CONFIG.learners[0].init(ppo.keys_of(jax.random.key(3))[0])
+    begun = CONFIG.learners[0].init(jax.random.split(jax.random.key(3))[0])
     moved = jax.tree.map(lambda a, b: (a != b).any(), begun, finished[1].params)
     # The value reads every part of the network, the policy all but the critic.
     assert all(jax.tree.leaves(moved))

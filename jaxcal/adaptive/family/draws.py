@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from jaxcal.adaptive.family.structures import (
     HELD_OUT,
@@ -22,6 +25,11 @@ BUDGETS = (
     "time", "uses", "number", "time+uses", "time+number", "uses+number",
     "time+uses+number",
 )  # fmt: skip
+_PASSES = 8  # sessions by which budgets are set
+_MOST = 0.8  # of what such a session tells
+_SHARES = (0.25, 1.2)  # of what such a session takes: a budget
+_UNKNOWN = 1.5  # nats at the start, at least
+_LEAST = 3  # measurements that a budget is meant for
 
 
 def draw(
@@ -46,8 +54,8 @@ def draw(
     own = rng.choice(sorted(TRAINED_ON))
     if structure is not None and structure not in known:
         raise ValueError(f"structure must be of {', '.join(known)}, got {structure!r}")
-    shares = [0.2, 0.08, 0.12, 0.3, 0.1, 0.1, 0.1]
-    drawn = rng.choice(BUDGETS, p=shares)
+    chances = [0.12, 0.13, 0.03, 0.42, 0.05, 0.1, 0.15]
+    drawn = rng.choice(BUDGETS, p=chances)
     if budget is not None and budget not in BUDGETS:
         raise ValueError(f"budget must be of {', '.join(BUDGETS)}, got {budget!r}")
     counted = (budget or str(drawn)).split("+")
@@ -64,24 +72,30 @@ def draw(
     if rng.random() < 0.3:  # an outcome that takes uses ends at the start
         after = np.where(uses > 0, count, after)
 
-    horizon = limits.measurements
-    number = int(np.rint(np.exp(rng.uniform(np.log(2), np.log(min(horizon, 30))))))
+    prior = _prior(rng, asked)
+    need = _needed(
+        rng, asked.likelihood, prior, travel, extra, uses, after, limits.measurements
+    )
+    low_share = np.clip(_LEAST / need["number"], *_SHARES)
+    shares = np.log(low_share), np.log(_SHARES[1])
+    number = limits.measurements
     if "number" in counted:
-        horizon = number
+        share = np.exp(rng.uniform(*shares))
+        number = int(np.clip(np.rint(share * need["number"]), _LEAST, number))
     seconds: float | tuple[float, float] = np.inf
     if "time" in counted:
-        typical = np.median(travel[:-1]) + extra.mean()
-        low = typical * np.exp(rng.uniform(np.log(1.5), np.log(14.0)))
-        seconds = (low, low * rng.choice([1.0, rng.uniform(1.0, 4.0)]))
+        low = need["seconds"] * np.exp(rng.uniform(*shares))
+        seconds = (low, low * rng.choice([1.0, rng.uniform(1.0, 3.0)]))
     ends = [1]
     if "uses" in counted:
-        first = int(rng.integers(1, limits.uses + 1))
-        ends = list(range(first, int(rng.integers(first, limits.uses + 1)) + 1))
+        most = int(np.clip(np.rint(need["uses"]), 1, limits.uses))
+        first = int(rng.integers(1, most + 1))
+        ends = list(range(first, int(rng.integers(first, most + 1)) + 1))
     return GridTask.make(
         asked.theta,
         asked.designs,
         asked.likelihood,
-        prior=_prior(rng, asked),
+        prior=prior,
         travel=travel,
         place_after=after,
         groups=asked.groups if rng.random() < 0.5 else None,
@@ -89,8 +103,46 @@ def draw(
         uses=uses,
         seconds=seconds,
         num_uses=ends,
-        horizon=horizon,
+        horizon=number,
     )
+
+
+def _needed(
+    rng: np.random.Generator,
+    table: Array,
+    prior: Array,
+    travel: Array,
+    extra: Array,
+    uses: Array,
+    after: NDArray[Any],
+    most: int,
+) -> dict[str, float]:
+    """What the largest gain a second takes to tell most of what it tells in the end."""
+    count, num_outcomes, num_states = table.shape
+    flat = table.reshape(-1, num_states)
+    noise = special.entr(table).sum(axis=1)
+    truth = rng.choice(num_states, _PASSES, p=prior)
+    belief = np.repeat(prior[:, None], _PASSES, axis=1)
+    place = np.full(_PASSES, len(travel) - 1)
+    told, spent = np.zeros(most), np.zeros((most, 2))
+    each = np.arange(_PASSES)
+    for number in range(most):
+        p = (flat @ belief).reshape(count, num_outcomes, _PASSES)
+        gains = special.entr(p).sum(axis=1) - noise @ belief
+        seconds = travel[place].T + (p * extra[..., None]).sum(axis=1)
+        chosen = (gains / seconds).argmax(axis=0)
+        below = table[chosen, :, truth].cumsum(axis=1)[:, :-1]
+        outcome = (rng.random((_PASSES, 1)) >= below).sum(axis=1)
+        told[number] = gains[chosen, each].mean()
+        took = travel[place, chosen] + extra[chosen, outcome]
+        spent[number] = took.mean(), uses[chosen, outcome].mean()
+        belief = belief * table[chosen, outcome].T
+        belief /= belief.sum(axis=0)
+        place = after[chosen, outcome]
+    told = told.cumsum()
+    enough = int(np.argmax(told >= _MOST * told[-1])) + 1
+    seconds, used = spent[:enough].sum(axis=0)
+    return {"number": enough, "seconds": float(seconds), "uses": float(used)}
 
 
 def _with_nothing_told(rng: np.random.Generator, asked: Questions) -> Questions:
@@ -121,7 +173,14 @@ def _prior(rng: np.random.Generator, asked: Questions) -> Array:
             0.5 * ((theta - theta[:, :1]) ** 2).sum(axis=1) / rng.uniform(0.1, 0.8) ** 2
         )
     weights = np.exp(log - log.max())
-    return weights if asked.prior is None else weights * asked.prior
+    if asked.prior is not None:
+        weights = weights * asked.prior
+    weights = weights / weights.sum()
+    least = min(_UNKNOWN, 0.9 * np.log((weights > 0.0).sum()))
+    while special.entr(weights).sum() < least:
+        weights = weights**0.7
+        weights = weights / weights.sum()
+    return weights
 
 
 def _travel(rng: np.random.Generator, asked: Questions) -> tuple[float, Array]:
@@ -134,7 +193,8 @@ def _travel(rng: np.random.Generator, asked: Questions) -> tuple[float, Array]:
     base = float(np.exp(rng.uniform(-2.0, 3.0)))
     away = np.abs(at[:, None] - at[None, :-1])
     away = away.max(axis=-1) if rng.random() < 0.5 else away.sum(axis=-1)
-    speed = base * rng.choice([0.0, np.exp(rng.uniform(np.log(0.3), np.log(15.0)))])
+    speed = np.exp(rng.uniform(np.log(0.3), np.log(15.0)))
+    speed *= base * (rng.random() < 0.75)
     change = base * rng.choice([0.0, rng.uniform(0.5, 6.0)])
     own = np.ones(len(at) - 1)
     if rng.random() < 0.25:  # some designs take longer than others

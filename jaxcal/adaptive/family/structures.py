@@ -244,9 +244,9 @@ def two_ways(rng: np.random.Generator, limits: Limits) -> Questions:
 
 
 def ranking(rng: np.random.Generator, limits: Limits) -> Questions:
-    """An order of three to six things; two of them are compared at a time."""
+    """An order of up to six things; two of them are compared at a time."""
     most = max(n for n in (3, 4, 5, 6) if special.factorial(n) <= limits.states)
-    count = int(rng.integers(3, most + 1))
+    count = int(rng.integers(min(4, most), most + 1))
     orders = np.array(list(itertools.permutations(range(count))), float)
     pairs = np.array(list(itertools.combinations(range(count), 2)))[: limits.designs]
     ahead = (orders[:, pairs[:, 0]] - orders[:, pairs[:, 1]]).T / count
@@ -258,7 +258,7 @@ def ranking(rng: np.random.Generator, limits: Limits) -> Questions:
 
 def stops(rng: np.random.Generator, limits: Limits) -> Questions:
     """Three end stops, each above the one before; a push on one of them."""
-    side = int(rng.integers(5, 15))
+    side = int(rng.integers(7, 15))
     while special.comb(side, 3) > limits.states:
         side -= 1
     cells = np.array(list(itertools.combinations(range(side), 3)), float)
@@ -270,13 +270,14 @@ def stops(rng: np.random.Generator, limits: Limits) -> Questions:
 
 def pools(rng: np.random.Generator, limits: Limits) -> Questions:
     """Which of several parts are faulty; some of them are tested together."""
-    parts = int(rng.integers(4, min(10, int(np.log2(limits.states))) + 1))
+    most = min(10, int(np.log2(limits.states)))
+    parts = int(rng.integers(min(6, most), most + 1))
     theta = _grid(*[np.arange(2.0)] * parts)
     number = int(rng.integers(parts, min(limits.designs, 40) + 1))
     pool = rng.random((number, parts)) < rng.uniform(0.15, 0.5, number)[:, None]
     pool[np.arange(number), rng.integers(0, parts, number)] = True
     hit = (pool.astype(float) @ theta.T) > 0.5
-    rate = rng.uniform(0.05, 0.4, parts)
+    rate = rng.uniform(0.1, 0.5, parts)
     prior = np.where(theta > 0.5, rate, 1.0 - rate).prod(axis=1)
     table = _yes_no(_below(rng, hit - 0.5))
     return Questions(theta, pool.astype(float), table, _ungrouped(pool), prior)

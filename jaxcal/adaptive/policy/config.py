@@ -10,7 +10,8 @@ from jaxcal.adaptive import rules
 from jaxcal.adaptive.policy.network import Network
 from jaxcal.adaptive.policy.sessions import Sessions
 from jaxcal.adaptive.rules import Scored
-from jaxcal.learning.core.streams import Streams, StreamsConfig
+from jaxcal.learning.config import StreamsConfig
+from jaxcal.learning.core.streams import Streams
 from jaxcal.learning.settings import require, setting
 
 __all__ = ["PPO", "PolicyConfig"]

@@ -98,8 +98,8 @@ def train(
             share a minibatch evenly.
         OSError: the folder cannot be written.
     """
-    mesh = devices.make_mesh(num_devices)
-    devices.require_divisible(config.ppo.rows_per_minibatch, mesh)
+    rows = config.ppo.rows_per_minibatch
+    mesh = devices.make_mesh(rows, num_devices, config.num_seeds)
     given = exercises(config)
     keys = jax.random.split(jax.random.key(_FRESH), _VALIDATED)
     task, base = given[0].task, given[0].base

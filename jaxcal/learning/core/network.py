@@ -1,4 +1,4 @@
-"""What a network that chooses postures is, and how its parts are applied.
+"""What a network that chooses postures is.
 
 What needs no parameters is kept apart from what does, so that training computes it once
 for a decision and not in every epoch:
@@ -8,31 +8,32 @@ for a decision and not in every epoch:
     memory        = encode(features)                              once for a set
     logits, value = decode(memory, decision)                      once for a decision
 
-``value`` is the expected final log det(Z.T Z), unscaled.
+``value`` is the expected final log det(Z.T Z), unscaled. M candidates of n inputs, K
+choices; leading axes ``...``.
 """
 
 from __future__ import annotations
 
-from typing import Any, Protocol, cast
+from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 __all__ = ["Network", "decode", "encode", "initial", "mask_logits"]
 
 
-class Network(Protocol):
-    """A flax module that scores candidates; features are trees of arrays."""
-
-    def __hash__(self) -> int:
-        """It is static to ``jit``."""
+class Network(nn.Module):
+    """Scores candidates; features are trees of arrays."""
 
     @property
     def num_unlearned(self) -> int:
         """Choices at the end of an episode that need no parameters."""
+        return 0
 
     def candidate_features(self, candidates: jax.Array, usable: jax.Array) -> Any:
         """Of sets (..., M, n) of which (..., M) are usable: available or chosen."""
+        raise NotImplementedError
 
     def decision_features(
         self,
@@ -49,46 +50,49 @@ class Network(Protocol):
             available: (..., M) bool.
             count: traced only where it is in ``shares_program``.
         """
+        raise NotImplementedError
 
     def shares_program(self, features: Any, k: int) -> range:
         """Numbers of choices made, out of K, at which the next choice compiles to the
-        same program; ``decision_features`` takes them traced."""
+        same program; ``decision_features`` takes them traced. None by default."""
+        return range(0)
 
     def encode(self, features: Any) -> jax.Array:
         """(..., M, width) memory of a set."""
+        raise NotImplementedError
 
     def decode(self, memory: jax.Array, decision: Any) -> tuple[jax.Array, jax.Array]:
         """(..., M) logits, masked, and (...,) value."""
+        raise NotImplementedError
 
     def lookahead_logits(self, decision: Any) -> tuple[jax.Array, jax.Array]:
-        """As ``decode``, of a choice that needs no parameters."""
+        """As ``decode``, of one of the last ``num_unlearned`` choices."""
+        raise NotImplementedError
 
-    def init(self, *arguments: Any) -> Any:
-        """flax's: fresh parameters."""
-
-    def apply(self, *arguments: Any, **options: Any) -> Any:
-        """flax's: a method with given parameters."""
+    def __call__(
+        self, candidates: jax.Array, available: jax.Array, chosen: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """The first decision; flax makes the parameters with it."""
+        features = self.candidate_features(candidates, available)
+        decision = self.decision_features(features, chosen, available, 0)
+        return self.decode(self.encode(features), decision)
 
 
 def initial(network: Network, key: jax.Array, m: int, n: int, k: int) -> Any:
     """Fresh parameters for M candidates of n inputs and K choices."""
-    free = jnp.ones((1, m), bool)
-    nothing = jnp.full((1, k), -1, jnp.int32)
     init = jax.jit(network.init)  # op by op it would be two hundred small programs
-    return init(key, jnp.zeros((1, m, n)), free, nothing, free)["params"]
+    blank = jnp.zeros((1, m, n)), jnp.ones((1, m), bool), jnp.full((1, k), -1)
+    return init(key, *blank)["params"]
 
 
-def encode(network: Network, params: Any, features: Any) -> jax.Array:
+def encode(network: Network, params: Any, features: Any) -> Any:
     """Apply ``network.encode`` with given parameters."""
-    return cast(jax.Array, network.apply({"params": params}, features, method="encode"))
+    return network.apply({"params": params}, features, method="encode")
 
 
-def decode(
-    network: Network, params: Any, memory: jax.Array, decision: Any
-) -> tuple[jax.Array, jax.Array]:
+def decode(network: Network, params: Any, memory: jax.Array, decision: Any) -> Any:
     """Apply ``network.decode`` with given parameters: logits and value."""
-    scored: Any = network.apply({"params": params}, memory, decision, method="decode")
-    return scored
+    return network.apply({"params": params}, memory, decision, method="decode")
 
 
 def mask_logits(logits: jax.Array, available: jax.Array) -> jax.Array:

@@ -3,7 +3,7 @@
 A row is a fresh candidate set and several whole episodes on it: they share its
 geometry, its encoding and its first decision, and are each other's baseline. All are
 equally long, so they are played step by step; the network's last, unlearned choices are
-made by its look-ahead.
+made by its look-ahead. G episodes on a set, T decisions of them learned.
 """
 
 from __future__ import annotations
@@ -16,53 +16,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcal.learning.core.network import Network, decode, encode, initial, mask_logits
-from jaxcal.learning.core.ppo import (
-    Batch,
-    Metrics,
-    PPOConfig,
-    advantages,
-    normalised,
-    surrogate,
-)
-from jaxcal.learning.settings import require, setting
+from jaxcal.learning.config import EpisodesConfig
+from jaxcal.learning.core.network import Network, decode, encode, initial
+from jaxcal.learning.core.ppo import Batch, Metrics, advantages, normalised, surrogate
 
-__all__ = ["Episode", "EpisodesConfig", "Postures"]
-
-
-@dataclasses.dataclass(frozen=True)
-class EpisodesConfig(PPOConfig):
-    """How much is played, in episodes."""
-
-    num_episodes: int = setting(200_000, "training budget")
-    episodes_per_update: int = setting(2048, "fresh episodes in an update")
-    episodes_per_set: int = setting(
-        8, "episodes on the same candidates, which share a baseline"
-    )
-    normalise_per_decision: bool = setting(
-        True, "advantages: own mean and scale for each decision of an episode"
-    )
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        counts = ("num_episodes", "episodes_per_update", "episodes_per_set")
-        require(self, "at least 1", lambda v: v >= 1, *counts)
-        whole = self.episodes_per_set * self.num_minibatches
-        if self.episodes_per_update % whole:
-            raise ValueError(
-                "episodes_per_update must be a multiple of episodes_per_set x "
-                f"num_minibatches = {whole}, got {self.episodes_per_update}"
-            )
-
-    @property
-    def num_updates(self) -> int:
-        """Updates that cover the budget, rounded up."""
-        return -(-self.num_episodes // self.episodes_per_update)
-
-    @property
-    def rows_per_update(self) -> int:
-        """Candidate sets of an update."""
-        return self.episodes_per_update // self.episodes_per_set
+__all__ = ["Episode", "Postures"]
 
 
 class Episode(Protocol):
@@ -71,10 +29,6 @@ class Episode(Protocol):
     A state is a tree of arrays; three of its leaves are ``candidates`` (M, n),
     ``available`` (M,) bool and ``chosen`` (K,) int, -1 where nothing is chosen yet.
     """
-
-    @property
-    def random_starts(self) -> float:
-        """Share of episodes begun with random choices."""
 
     @property
     def num_decisions(self) -> int:
@@ -126,14 +80,13 @@ class Postures:
             What was played, rows of decisions (T, G); metrics: scalars, and ``rewards``
             (B G,).
         """
-        batch, outcome = jax.vmap(self._play, in_axes=(None, 0))(params, keys)
-        reward, own = outcome["reward"], outcome["own"]  # (B, G)
-        log_det = (outcome["log_det"] * own).sum() / jnp.maximum(own.sum(), 1.0)
+        play = jax.vmap(self._play, in_axes=(None, 0))
+        batch, reward, log_det = play(params, keys)  # (B, G) each
         metrics = {
             "rewards": reward.ravel(),
             "reward_mean": reward.mean(),
             "reward_std": reward.std(),
-            "log_det_mean": log_det,
+            "log_det_mean": log_det.mean(),
         }
         return normalised(self.config, batch), metrics
 
@@ -142,8 +95,7 @@ class Postures:
     ) -> tuple[jax.Array, Metrics]:
         """PPO's, of whole episodes."""
         score = jax.vmap(functools.partial(self._score, params))
-        logits, value = score(experience.seen)
-        return surrogate(self.config, logits, value, experience, done)
+        return surrogate(self.config, *score(experience.seen), experience, done)
 
     def _score(self, params: Any, seen: Seen) -> tuple[jax.Array, jax.Array]:
         """(T, G, M) logits and (T, G) values in reward units of a row's decisions.
@@ -160,112 +112,79 @@ class Postures:
         logits, value = scored
         return logits, value * self.task.value_scale
 
-    def _play(self, params: Any, key: jax.Array) -> tuple[Batch, Metrics]:
-        """One row; what it came to of each episode, (G,)."""
-        config, task, network = self.config, self.task, self.network
-        num_episodes = config.episodes_per_set
+    def _play(self, params: Any, key: jax.Array) -> tuple[Batch, jax.Array, jax.Array]:
+        """One row; (G,) rewards, (G,) outcomes."""
+        task, network = self.task, self.network
         learned = task.num_decisions - network.num_unlearned
-        key_set, key_starts, key_actions = jax.random.split(key, 3)
+        key_set, key_actions = jax.random.split(key)
         start = task.reset(key_set)
         features = network.candidate_features(start.candidates, start.available)
         memory = encode(network, params, features)
-        num_random = _random_starts(task, num_episodes, key_starts)
 
-        def score(state: Any, step: int) -> tuple[Any, jax.Array, jax.Array]:
+        def score(state: Any, count: int) -> tuple[Any, jax.Array, jax.Array]:
             decision = network.decision_features(
-                features, state.chosen, state.available, step
+                features, state.chosen, state.available, count
             )
-            if step < learned:
+            if count < learned:
                 return decision, *decode(network, params, memory, decision)
             return decision, *network.lookahead_logits(decision)
 
         def act(
-            state: Any, logits: jax.Array, key: jax.Array, given: jax.Array
+            state: Any, logits: jax.Array, value: jax.Array, key: jax.Array
         ) -> tuple[Any, Metrics]:
-            key_policy, key_random = jax.random.split(key)
-            action = jax.random.categorical(key_policy, logits)
-            if task.random_starts > 0.0:
-                blind = mask_logits(jnp.zeros_like(logits), state.available)
-                random = jax.random.categorical(key_random, blind)
-                action = jnp.where(given, random, action)
+            action = jax.random.categorical(key, logits).astype(jnp.int32)
             after, reward, _ = task.step(state, action)
             return after, {
-                "action": action.astype(jnp.int32),
+                "action": action,
                 "log_prob": jax.nn.log_softmax(logits)[action],
+                "value": value * task.value_scale,
                 "paid": task.paid(state),
                 "reward": reward,
-                "counted": 1.0 - given.astype(logits.dtype),
             }
 
-        def of_every_episode(leaf: jax.Array) -> jax.Array:
-            return jnp.broadcast_to(leaf, (num_episodes, *leaf.shape))
+        state, decisions, records = start, [], []
+        shape = (task.num_decisions, self.config.episodes_per_set)
+        for count, keys in enumerate(jax.random.split(key_actions, shape)):
+            decide, axis = functools.partial(score, count=count), None
+            if count > 0:  # the first decision is the same for every episode
+                decide, axis = jax.vmap(decide), 0
+            decision, logits, value = decide(state)
+            each = jax.vmap(act, in_axes=(axis, axis, axis, 0))
+            state, record = each(state, logits, value, keys)
+            decisions.append(decision)
+            records.append(record)
 
-        states = jax.tree.map(of_every_episode, start)
-        seen, played = [], []
-        keys = jax.random.split(key_actions, (task.num_decisions, num_episodes))
-        for step in range(task.num_decisions):
-            if step == 0:  # the same for every episode
-                decision, *scored = score(start, step)
-                logits, value = map(of_every_episode, scored)
-            else:
-                of_each = jax.vmap(functools.partial(score, step=step))
-                decision, logits, value = of_each(states)
-            random = step < num_random
-            states, record = jax.vmap(act)(states, logits, keys[step], random)
-            seen.append(decision)
-            played.append(record | {"value": value * task.value_scale})
-
-        every = _stacked(played)
-        own = 1.0 - (num_random > 0)  # the policy made the first choice itself
-        advantage, target = _advantages_and_targets(config, every, own)
+        played = _stacked(records)  # leaves (K, G)
+        advantage, target = self._advantages_and_targets(played)
         # The last choices, made by the look-ahead alone, are not learned from.
-        later = _stacked(seen[1:learned]) if learned > 1 else None
+        later = _stacked(decisions[1:learned]) if learned > 1 else None
         batch = Batch(
-            seen=Seen(features, seen[0], later),
-            action=every["action"][:learned],
-            log_prob=every["log_prob"][:learned],
+            seen=Seen(features, decisions[0], later),
+            action=played["action"][:learned],
+            log_prob=played["log_prob"][:learned],
             advantage=advantage[:learned],
             target=target[:learned],
-            counted=every["counted"][:learned],
         )
-        log_det = jax.vmap(task.outcome)(states)
-        return batch, {"reward": every["reward"].sum(0), "log_det": log_det, "own": own}
+        return batch, played["reward"].sum(0), jax.vmap(task.outcome)(state)
+
+    def _advantages_and_targets(self, played: Metrics) -> tuple[jax.Array, jax.Array]:
+        """Advantages and value targets of every decision, (K, G) each.
+
+        ``played`` holds (K, G) values, rewards, and what was paid before.
+        """
+        # What was paid already is not to come: the baseline is the value of the rest.
+        rest = played["value"] - played["paid"]
+        following = jnp.concatenate([rest[1:], jnp.zeros_like(rest[:1])])
+        goes_on = jnp.ones_like(rest).at[-1].set(0.0)
+        advantage = advantages(self.config, played["reward"], rest, following, goes_on)
+        target = advantage + played["value"]
+        others = self.config.episodes_per_set - 1
+        if others:
+            # On the first decision the other episodes are the better baseline.
+            baseline = (target[0].sum() - target[0]) / others
+            advantage = advantage.at[0].set(target[0] - baseline)
+        return advantage, target
 
 
 def _stacked(trees: list[Any]) -> Any:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
-
-
-def _random_starts(task: Episode, number: int, key: jax.Array) -> jax.Array:
-    """(number,) random choices that each episode begins with; mostly 0."""
-    key_share, key_length = jax.random.split(key)
-    most = max(task.num_decisions - 1, 2)
-    begun = jax.random.uniform(key_share, (number,)) < task.random_starts
-    length = jax.random.randint(key_length, (number,), 1, most)
-    return jnp.where(begun, length, 0)
-
-
-def _advantages_and_targets(
-    config: EpisodesConfig, played: Metrics, own: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Advantages and value targets of every decision, (K, G) each.
-
-    Args:
-        config: discount, lambda, episodes for each set.
-        played: (K, G) values, rewards, and what was paid before.
-        own: (G,) 1 where the policy made the first choice itself.
-    """
-    # What was paid already is not to come: the baseline is the value of the rest.
-    rest = played["value"] - played["paid"]
-    following = jnp.concatenate([rest[1:], jnp.zeros_like(rest[:1])])
-    goes_on = jnp.ones_like(rest).at[-1].set(0.0)
-    advantage = advantages(config, played["reward"], rest, following, goes_on)
-    target = advantage + played["value"]
-    if config.episodes_per_set > 1:
-        # On the first decision the set's other episodes are the better baseline: those
-        # that the policy began itself.
-        counts = own.sum() - own
-        others = (target[0] * own).sum() - target[0] * own
-        baseline = jnp.where(counts > 0, others / jnp.maximum(counts, 1.0), rest[0])
-        advantage = advantage.at[0].set(target[0] - baseline)
-    return advantage, target

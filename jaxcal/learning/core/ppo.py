@@ -13,8 +13,8 @@ Sources: Schulman et al. 2017 (clipped surrogate), 2016 (advantages).
 
 from __future__ import annotations
 
-import abc
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -24,27 +24,20 @@ import optax
 from flax import struct
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jaxcal.learning.settings import require, setting
+from jaxcal.learning.config import PPOConfig
 
 __all__ = [
     "Batch",
-    "Config",
     "Learner",
     "Metrics",
-    "PPOConfig",
     "TrainState",
-    "Update",
     "advantages",
     "begin",
-    "epochs",
-    "keys_of",
     "make_train",
     "make_update",
     "normalised",
-    "optimiser",
     "placed",
     "schedule",
-    "sliced",
     "squared_error",
     "surrogate",
 ]
@@ -52,90 +45,26 @@ __all__ = [
 Metrics = dict[str, jax.Array]
 
 
-@dataclasses.dataclass(frozen=True)
-class PPOConfig(abc.ABC):
-    """Every number of the optimisation; what is played adds its sizes."""
-
-    num_epochs: int = setting(2, "passes over what an update has played")
-    num_minibatches: int = setting(4, "gradient steps per pass")
-    learning_rate: float = setting(2e-3, "of Adam, after the warm-up")
-    final_learning_rate: float = setting(3e-5, "at the end; a cosine leads there")
-    warmup_updates: int = setting(5, "updates in which the learning rate rises")
-    clip_range: float = setting(0.2, "most that a probability ratio counts beyond 1")
-    value_coefficient: float = setting(0.5, "weight of the value's error")
-    value_error_limit: float = setting(
-        3.0, "reward units; beyond, the value's error counts linearly (Huber)"
-    )
-    entropy_start: float = setting(0.02, "entropy bonus at the beginning")
-    entropy_end: float = setting(0.0, "entropy bonus at the end; linear between")
-    discount: float = setting(1.0, "of a reward one decision later")
-    gae_lambda: float = setting(1.0, "of the advantages; 1 is return less value")
-    normalise_per_decision: bool = False
-    advantage_limit: float = setting(
-        6.0, "standard deviations; a larger advantage (a singular pick) is clipped"
-    )
-    max_grad_norm: float = setting(0.5, "global norm at which gradients are clipped")
-    average_decay: float = setting(
-        0.99, "for each gradient step, of the averaged weights, which are what is kept"
-    )
-    slice_rows: int = setting(
-        8, "rows of a minibatch whose gradient is computed at once on a CPU: its cache"
-    )
-
-    def __post_init__(self) -> None:
-        counts = ("num_epochs", "num_minibatches", "slice_rows")
-        require(self, "at least 1", lambda v: v >= 1, *counts)
-        positive = ("learning_rate", "clip_range", "max_grad_norm", "value_error_limit")
-        require(self, "positive", lambda v: v > 0, *positive)
-        require(self, "in [0, 1]", lambda v: 0.0 <= v <= 1.0, "discount", "gae_lambda")
-        require(self, "in [0, 1)", lambda v: 0.0 <= v < 1.0, "average_decay")
-
-    @property
-    @abc.abstractmethod
-    def num_updates(self) -> int:
-        """Updates that a run makes."""
-
-    @property
-    @abc.abstractmethod
-    def rows_per_update(self) -> int:
-        """Rows of experience that an update plays and cuts into minibatches."""
-
-    @property
-    def steps_per_update(self) -> int:
-        """Gradient steps in an update."""
-        return self.num_epochs * self.num_minibatches
-
-    @property
-    def rows_per_minibatch(self) -> int:
-        """What devices share among them."""
-        return self.rows_per_update // self.num_minibatches
-
-
 class Learner(Protocol):
-    """What is trained: it plays and it scores. Hashable, since it is static to ``jit``.
+    """What is trained: it plays and it scores.
 
     ``given`` are arrays that the caller passes through ``train`` or an update, such as
     a task's tables: arguments, so that other values compile nothing.
     """
 
     def __hash__(self) -> int:
-        """Of its configuration."""
+        """It is static to ``jit``."""
 
     def init(self, key: jax.Array, *given: Any) -> Any:
         """Parameters before training."""
 
     def gather(self, params: Any, keys: jax.Array, *given: Any) -> tuple[Any, Metrics]:
-        """Play a row of experience with each of the keys (B,).
-
-        Returns:
-            Experience with B leading rows, and metrics. Its ``counted`` (B, ...) is 1
-            where ``loss`` counts, which is a mean over that.
-        """
+        """Play a row of experience, (B, ...) leaves, with each of the keys (B,)."""
 
     def loss(
         self, params: Any, experience: Any, done: jax.Array
     ) -> tuple[jax.Array, Metrics]:
-        """Loss and metrics of some rows of experience, after ``done`` updates."""
+        """Mean loss and metrics of some rows of experience, after ``done`` updates."""
 
 
 @struct.dataclass
@@ -147,10 +76,6 @@ class Batch:
     log_prob: jax.Array  # (B, T, ...) of the action when it was taken
     advantage: jax.Array  # (B, T, ...)
     target: jax.Array  # (B, T, ...) of the value, reward units
-    counted: jax.Array  # (B, T, ...) 1 where the policy chose, 0 where it was given
-
-
-# -- advantages and the loss -----------------------------------------------------------
 
 
 def advantages(
@@ -161,6 +86,9 @@ def advantages(
     goes_on: jax.Array,
 ) -> jax.Array:
     """(T, ...) generalised advantage estimates.
+
+    ``A_t = d_t + discount lambda goes_on_t A_(t+1)``, where ``d_t = reward_t + discount
+    following_t - value_t``.
 
     Args:
         config: discount and lambda.
@@ -181,16 +109,11 @@ def advantages(
 
 
 def normalised(config: PPOConfig, batch: Batch) -> Batch:
-    """Advantages with mean 0 and scale 1 over what counts, then clipped."""
-    axes = [a for a in range(batch.counted.ndim) if a != 1]
-    over = tuple(axes) if config.normalise_per_decision else None
-    number = jnp.maximum(batch.counted.sum(over, keepdims=True), 1.0)
-
-    def mean(array: jax.Array) -> jax.Array:
-        return (array * batch.counted).sum(over, keepdims=True) / number
-
-    centred = batch.advantage - mean(batch.advantage)
-    scaled = centred / (jnp.sqrt(mean(centred**2)) + 1e-6)
+    """Advantages with mean 0 and scale 1 over the batch, then clipped."""
+    axes = tuple(axis for axis in range(batch.advantage.ndim) if axis != 1)
+    over = axes if config.normalise_per_decision else None
+    centred = batch.advantage - batch.advantage.mean(over, keepdims=True)
+    scaled = centred / (jnp.sqrt((centred**2).mean(over, keepdims=True)) + 1e-6)
     limit = config.advantage_limit
     return dataclasses.replace(batch, advantage=jnp.clip(scaled, -limit, limit))
 
@@ -217,23 +140,18 @@ def surrogate(
     log_ratio = taken - batch.log_prob
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1.0 - config.clip_range, 1.0 + config.clip_range)
-    number = jnp.maximum(batch.counted.sum(), 1.0)
-
-    def mean(array: jax.Array) -> jax.Array:
-        return (array * batch.counted).sum() / number
-
-    policy_loss = -mean(jnp.minimum(ratio * batch.advantage, clipped * batch.advantage))
-    value_loss = mean(squared_error(value - batch.target, config.value_error_limit))
-    entropy = mean(-(jnp.exp(log_probs) * log_probs).sum(-1))
+    gain = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
+    error = squared_error(value - batch.target, config.value_error_limit)
+    metrics = {
+        "policy_loss": -gain.mean(),
+        "value_loss": error.mean(),
+        "entropy": -(jnp.exp(log_probs) * log_probs).sum(-1).mean(),
+        "kl": (ratio - 1.0 - log_ratio).mean(),
+    }
     share = jnp.minimum(done / config.num_updates, 1.0)
     bonus = (1.0 - share) * config.entropy_start + share * config.entropy_end
-    loss = policy_loss + config.value_coefficient * value_loss - bonus * entropy
-    return loss, {
-        "policy_loss": policy_loss,
-        "value_loss": value_loss,
-        "entropy": entropy,
-        "kl": mean(ratio - 1.0 - log_ratio),
-    }
+    loss = metrics["policy_loss"] + config.value_coefficient * metrics["value_loss"]
+    return loss - bonus * metrics["entropy"], metrics
 
 
 def squared_error(error: jax.Array, limit: float) -> jax.Array:
@@ -247,34 +165,22 @@ def squared_error(error: jax.Array, limit: float) -> jax.Array:
     return near * (2.0 * size - near)
 
 
-# -- the optimiser ---------------------------------------------------------------------
-
-
 @struct.dataclass
 class TrainState:
     """All that an uninterrupted run would need to go on, bit for bit."""
 
     params: Any  # network parameters
     average: Any  # exponential average of the parameters, what a checkpoint offers
-    opt_state: Any  # optax state
+    opt_state: Any  # of Adam
     key: jax.Array  # (2,) uint32, data of the PRNG key of the next update
     num_updates: jax.Array  # () int32, updates made
-
-
-def keys_of(key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Keys of the weights, the updates and what is imitated, from that of a run.
-
-    They are split apart first, since ``fold_in(key, i)`` would be ``split(key)[i]``.
-    """
-    weights, updates, imitated = jax.random.split(key, 3)
-    return weights, updates, imitated
 
 
 def begin(
     config: PPOConfig, learner: Learner, key: jax.Array, *given: Any
 ) -> TrainState:
     """The state before the first update, from the key of a run."""
-    key_weights, key_updates, _ = keys_of(key)
+    key_weights, key_updates = jax.random.split(key)
     params = learner.init(key_weights, *given)
     return TrainState(
         params=params,
@@ -298,98 +204,28 @@ def schedule(config: PPOConfig) -> optax.Schedule:
 
 
 def optimiser(config: PPOConfig) -> optax.GradientTransformation:
-    """Adam under the schedule; ``epochs`` clips the gradients."""
+    """Adam under the schedule; ``descend`` clips the gradients."""
     return optax.adam(schedule(config), eps=1e-5)
 
 
-def epochs(
-    config: PPOConfig,
-    state: TrainState,
-    num_rows: int,
-    gradient: Callable[[Any, jax.Array], tuple[Any, Metrics]],
-    key: jax.Array,
-) -> tuple[TrainState, Metrics]:
-    """Epochs of minibatches over what an update has gathered.
-
-    Args:
-        config: how to optimise.
-        state: before the update.
-        num_rows: gathered.
-        gradient: of parameters and the (S,) indices of a minibatch's rows.
-        key: orders the minibatches.
-
-    Returns:
-        The state after the update, its key as it was; the mean of each metric.
-    """
-    optimise = optimiser(config)
-
-    def step(carry: Any, index: jax.Array) -> tuple[Any, Metrics]:
-        params, average, opt_state, count = carry
-        grads, metrics = gradient(params, index)
-        # By one factor: optax divides every gradient by the norm, which XLA fuses into
-        # neither of Adam's moments (7 to 14 % of an update of the paper's network).
-        norm = jnp.sqrt(sum(jnp.vdot(grad, grad) for grad in jax.tree.leaves(grads)))
-        factor = jnp.minimum(1.0, config.max_grad_norm / jnp.maximum(norm, 1e-30))
-        grads = jax.tree.map(lambda grad: grad * factor, grads)
-        changes, opt_state = optimise.update(grads, opt_state, params)
-        params = optax.apply_updates(params, changes)
-        # The share of the newest weights in a mean whose weights decay and add up to
-        # one: 1 at the first step, so that nothing of the initial weights stays.
-        decay = config.average_decay
-        share = (1.0 - decay) / (1.0 - decay ** (count + 1))
-        average = optax.incremental_update(params, average, share)
-        return (params, average, opt_state, count + 1), metrics
-
-    def epoch(carry: Any, key: jax.Array) -> tuple[Any, Metrics]:
-        order = jax.random.permutation(key, num_rows)
-        return jax.lax.scan(step, carry, order.reshape(config.num_minibatches, -1))
-
-    count = state.num_updates * config.steps_per_update
-    carry = (state.params, state.average, state.opt_state, count)
-    keys = jax.random.split(key, config.num_epochs)
-    (params, average, opt_state, _), metrics = jax.lax.scan(epoch, carry, keys)
-    after = TrainState(params, average, opt_state, state.key, state.num_updates + 1)
-    return after, {name: value.mean() for name, value in metrics.items()}
-
-
-def sliced(
-    gradient: Callable[[Any, Any], tuple[Any, Metrics]],
-    params: Any,
-    rows_of: Callable[[jax.Array], Any],
-    index: jax.Array,
-    size: int,
-) -> tuple[Any, Metrics]:
-    """The gradient of a minibatch's mean loss, and its metrics, slice by slice.
-
-    A slice's arrays stay in a core's cache, which is faster than all rows at once.
-
-    Args:
-        gradient: of parameters and rows, of their mean loss over ``rows.counted``.
-        params: parameters.
-        rows_of: indices -> rows.
-        index: (S,) of the minibatch.
-        size: rows of a slice, at most; a divisor of S is taken.
-    """
-    size = max(part for part in range(1, size + 1) if len(index) % part == 0)
-
-    def add(total: Any, part: jax.Array) -> tuple[Any, Any]:
-        rows = rows_of(part)
-        number = rows.counted.sum()
-        grads, metrics = gradient(params, rows)
-        total = jax.tree.map(lambda t, g: t + number * g, total, grads)
-        return total, (number, metrics)
-
-    zero = jax.tree.map(jnp.zeros_like, params)
-    total, (number, metrics) = jax.lax.scan(add, zero, index.reshape(-1, size))
-    share = 1.0 / jnp.maximum(number.sum(), 1.0)
-    mean = {name: share * (number @ value) for name, value in metrics.items()}
-    return jax.tree.map(lambda t: share * t, total), mean
-
-
-# -- an update, and training -----------------------------------------------------------
-
-Update = Callable[..., tuple[TrainState, Metrics]]
-"""(state, *given) -> the next state and metrics."""
+def descend(config: PPOConfig, state: TrainState, grads: Any) -> TrainState:
+    """One gradient step: clipped by the global norm, Adam, averaged weights."""
+    # By one factor: optax divides every gradient by the norm, which XLA fuses into
+    # neither of Adam's moments (7 to 14 % of an update of the paper's network).
+    norm = jnp.sqrt(sum(jnp.vdot(grad, grad) for grad in jax.tree.leaves(grads)))
+    factor = jnp.minimum(1.0, config.max_grad_norm / jnp.maximum(norm, 1e-30))
+    grads = jax.tree.map(lambda grad: grad * factor, grads)
+    changes, opt_state = optimiser(config).update(grads, state.opt_state)
+    params = optax.apply_updates(state.params, changes)
+    # The share of the newest weights in a mean whose weights decay and add up to one:
+    # 1 at the first step, so that nothing of the initial weights stays.
+    decay, count = config.average_decay, opt_state[0].count
+    average = optax.incremental_update(
+        params, state.average, (1.0 - decay) / (1.0 - decay**count)
+    )
+    return dataclasses.replace(
+        state, params=params, average=average, opt_state=opt_state
+    )
 
 
 def placed(tree: Any, mesh: Mesh | None, *axes: str) -> Any:
@@ -402,8 +238,8 @@ def placed(tree: Any, mesh: Mesh | None, *axes: str) -> Any:
 
 def make_update(
     config: PPOConfig, learner: Learner, mesh: Mesh | None = None
-) -> Update:
-    """One update: play, then learn from it; pure, not compiled.
+) -> Callable[..., tuple[TrainState, Metrics]]:
+    """One update: play, then epochs of minibatches over it; pure, not compiled.
 
     On a mesh the rows are spread over its devices while they are played, what was
     played is then whole on every device, and each minibatch is spread again: it is any
@@ -413,6 +249,9 @@ def make_update(
         config: the optimisation.
         learner: what is trained.
         mesh: with the one axis ``sets``; None for one device, which places nothing.
+
+    Returns:
+        (state, *given) -> the next state and metrics.
     """
     whole = mesh is not None or jax.default_backend() != "cpu"
 
@@ -420,44 +259,43 @@ def make_update(
         key = jax.random.wrap_key_data(state.key)
         key, key_rows, key_epochs = jax.random.split(key, 3)
         keys = jax.random.split(key_rows, config.rows_per_update)
-        rows, metrics = learner.gather(state.params, placed(keys, mesh, "sets"), *given)
+        rows, played = learner.gather(state.params, placed(keys, mesh, "sets"), *given)
         rows = placed(rows, mesh)
+        num_rows = len(jax.tree.leaves(rows)[0])
 
-        def loss(params: Any, rows: Any) -> tuple[jax.Array, Metrics]:
-            return learner.loss(params, rows, state.num_updates)
+        def step(state: TrainState, index: jax.Array) -> tuple[TrainState, Metrics]:
+            def gradient(part: jax.Array) -> tuple[Any, Metrics]:
+                some = placed(jax.tree.map(lambda leaf: leaf[part], rows), mesh, "sets")
+                of_loss = jax.grad(learner.loss, has_aux=True)
+                return of_loss(state.params, some, state.num_updates)
 
-        def rows_of(index: jax.Array) -> Any:
-            return placed(jax.tree.map(lambda leaf: leaf[index], rows), mesh, "sets")
+            # A slice's arrays stay in a core's cache: faster than all rows at once.
+            size = len(index) if whole else math.gcd(len(index), config.slice_rows)
+            found = jax.lax.map(gradient, index.reshape(-1, size))
+            grads, metrics = jax.tree.map(lambda leaf: leaf.mean(0), found)
+            return descend(config, state, grads), metrics
 
-        def gradient(params: Any, index: jax.Array) -> tuple[Any, Metrics]:
-            size = len(index) if whole else min(config.slice_rows, len(index))
-            one = jax.grad(loss, has_aux=True)
-            return sliced(one, params, rows_of, index, size)
+        def epoch(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
+            order = jax.random.permutation(key, num_rows)
+            return jax.lax.scan(step, state, order.reshape(config.num_minibatches, -1))
 
-        after, losses = epochs(config, state, len(rows.counted), gradient, key_epochs)
-        after = dataclasses.replace(after, key=jax.random.key_data(key))
-        return placed((after, metrics | losses), mesh)
+        keys = jax.random.split(key_epochs, config.num_epochs)
+        state, losses = jax.lax.scan(epoch, state, keys)
+        state = dataclasses.replace(
+            state, key=jax.random.key_data(key), num_updates=state.num_updates + 1
+        )
+        metrics = played | {name: value.mean() for name, value in losses.items()}
+        return placed((state, metrics), mesh)
 
     return update
 
 
-class Config(Protocol):
-    """What ``make_train`` needs of a configuration."""
-
-    @property
-    def ppo(self) -> PPOConfig:
-        """The optimisation."""
-
-    @property
-    def learners(self) -> tuple[Learner, ...]:
-        """What update u trains on: number u modulo their number."""
-
-
-def make_train(config: Config) -> Callable[..., tuple[Any, Metrics]]:
+def make_train(config: Any) -> Callable[..., tuple[Any, Metrics]]:
     """A whole training as one pure function, to be jitted, scanned or vmapped.
 
     Args:
-        config: a ``TrainConfig`` of postures, or a ``PolicyConfig`` of tasks.
+        config: a ``TrainConfig`` of postures or a ``PolicyConfig`` of tasks, of which
+            it reads ``ppo`` and ``learners``: update u trains number u modulo theirs.
 
     Returns:
         (key; *given, what the learners are given: nothing for postures, the arrays of a

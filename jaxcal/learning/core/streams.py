@@ -12,49 +12,18 @@ shapes compiles nothing, and each stream may have a task of its own.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Protocol
+import functools
+from typing import Any, Protocol, cast
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcal.learning.core.ppo import (
-    Batch,
-    Metrics,
-    PPOConfig,
-    advantages,
-    normalised,
-    surrogate,
-)
-from jaxcal.learning.settings import require, setting
+from jaxcal.learning.config import StreamsConfig
+from jaxcal.learning.core.ppo import Batch, Metrics, advantages, normalised, surrogate
 
-__all__ = ["Environment", "Step", "Streams", "StreamsConfig"]
-
-
-@dataclasses.dataclass(frozen=True)
-class StreamsConfig(PPOConfig):
-    """How much is played, in decisions: sessions differ in length."""
-
-    num_updates: int = setting(300, "training budget")
-    decisions_per_update: int = setting(4096, "decisions in an update")
-    stream_length: int = setting(32, "decisions of one stream in an update")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        counts = ("num_updates", "decisions_per_update", "stream_length")
-        require(self, "at least 1", lambda v: v >= 1, *counts)
-        whole = self.stream_length * self.num_minibatches
-        if self.decisions_per_update % whole:
-            raise ValueError(
-                "decisions_per_update must be a multiple of stream_length x "
-                f"num_minibatches = {whole}, got {self.decisions_per_update}"
-            )
-
-    @property
-    def rows_per_update(self) -> int:
-        """Streams of an update."""
-        return self.decisions_per_update // self.stream_length
+__all__ = ["Environment", "Step", "Streams"]
 
 
 @struct.dataclass
@@ -97,19 +66,14 @@ class Streams:
         if self.task_per_stream:
             task = jax.tree.map(lambda leaf: leaf[0], task)
 
-        def observed(task: Any, key: jax.Array) -> Any:
-            state = self.environment.reset(task, key)
-            return self.environment.observe(task, state, key)
-
-        shapes = jax.eval_shape(observed, task, key)
-        blank = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-        return self.network.init(key, blank)
+        state = self.environment.reset(task, key)
+        return self.network.init(key, self.environment.observe(task, state, key))
 
     def gather(self, params: Any, keys: jax.Array, task: Any) -> tuple[Batch, Metrics]:
         """Play a stream with each of the keys (B,)."""
         axis = 0 if self.task_per_stream else None
         play = jax.vmap(self._play, in_axes=(None, 0, axis))
-        batch, (reward, ended) = play(params, keys, task)  # (B, T + 1)
+        batch, reward, ended = play(params, keys, task)  # (B, T + 1)
         metrics = {
             "reward_mean": reward.sum() / jnp.maximum(ended.sum(), 1.0),
             "choices": 1.0 / jnp.maximum(ended.mean(), 1e-6),
@@ -120,43 +84,39 @@ class Streams:
         self, params: Any, experience: Batch, done: jax.Array
     ) -> tuple[jax.Array, Metrics]:
         """PPO's."""
-        logits, value = self._score(params, experience.seen)
+        logits, value = cast(Any, self.network.apply(params, experience.seen))
         return surrogate(self.config, logits, value, experience, done)
-
-    def _score(self, params: Any, seen: Any) -> tuple[jax.Array, jax.Array]:
-        scored: Any = self.network.apply(params, seen)
-        return scored
 
     def _play(
         self, params: Any, key: jax.Array, task: Any
-    ) -> tuple[Batch, tuple[jax.Array, jax.Array]]:
-        """Sessions one after another: a row of T decisions, and of T + 1, of which the
+    ) -> tuple[Batch, jax.Array, jax.Array]:
+        """Sessions one after another: a row of T decisions; and of T + 1, of which the
         last closes the row, the rewards and where a session ended."""
         environment = self.environment
+        score: Any = functools.partial(self.network.apply, params)
 
         def decide(state: Any, key: jax.Array) -> tuple[Any, dict[str, Any]]:
             key_seen, key_action, key_step, key_next = jax.random.split(key, 4)
             seen = environment.observe(task, state, key_seen)
-            logits, value = self._score(params, seen)
+            logits, value = score(seen)
             action = jax.random.categorical(key_action, logits).astype(jnp.int32)
             step = environment.step(task, state, seen, action, key_step)
+            happened, number = step.happened, len(step.chance)
 
-            def value_of(state: Any) -> jax.Array:
-                seen = environment.observe(task, state, key_seen)
-                return self._score(params, seen)[1]
+            def value_of(state: Any) -> Any:
+                return score(environment.observe(task, state, key_seen))[1]
 
             # The value of what happened is the next decision's.
-            number = len(step.chance)
-            elsewhere = (step.happened + jnp.arange(1, number)) % number
             others = jnp.zeros(())
             if number > 1:
+                elsewhere = (happened + jnp.arange(1, number)) % number
                 states = jax.tree.map(lambda leaf: leaf[elsewhere], step.states)
                 values = jax.vmap(value_of)(states)
                 values = jnp.where(step.ended[elsewhere], 0.0, values)
                 others = step.chance[elsewhere] @ values
-            ended = step.ended[step.happened]
+            ended = step.ended[happened]
             state = jax.tree.map(
-                lambda new, old: jnp.where(ended, new, old[step.happened]),
+                lambda fresh, after: jnp.where(ended, fresh, after[happened]),
                 environment.reset(task, key_next),
                 step.states,
             )
@@ -167,7 +127,7 @@ class Streams:
                 "value": value,
                 "reward": step.reward,
                 "ended": ended.astype(value.dtype),
-                "chance": step.chance[step.happened],
+                "chance": step.chance[happened],
                 "others": others,
             }
 
@@ -186,6 +146,5 @@ class Streams:
             log_prob=row["log_prob"],
             advantage=advantage,
             target=advantage + row["value"],
-            counted=jnp.ones_like(advantage),
         )
-        return batch, (every["reward"], every["ended"])
+        return batch, every["reward"], every["ended"]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import cast
-
 from jaxcal.learning.core.network import Network
 from jaxcal.learning.policies.compact import CompactNetwork
 from jaxcal.learning.policies.networks import GROUP, NetworkConfig
@@ -15,5 +13,6 @@ __all__ = ["build"]
 def build(config: NetworkConfig) -> Network:
     """The network that a configuration names, as a flax module."""
     if config.kind == "compact":
-        return cast(Network, CompactNetwork(config))
-    return cast(Network, installed(GROUP)[config.kind].load()(config))
+        return CompactNetwork(config)
+    network: Network = installed(GROUP)[config.kind].load()(config)
+    return network

@@ -8,7 +8,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from jaxcal.learning.core.network import mask_logits
+from jaxcal.learning.core.network import Network, mask_logits
 from jaxcal.learning.policies import geometry
 from jaxcal.learning.policies.features import (
     CandidateFeatures,
@@ -78,7 +78,7 @@ class _Round(nn.Module):
         return h + out * active
 
 
-class CompactNetwork(nn.Module):
+class CompactNetwork(Network):
     """Permutation-equivariant, affine-invariant, for any M, K and n.
 
     It sees the candidates only through inner products of whitened regressors, so no
@@ -117,7 +117,7 @@ class CompactNetwork(nn.Module):
     def candidate_features(
         self, candidates: jax.Array, usable: jax.Array
     ) -> CandidateFeatures:
-        """The geometry of sets; see ``networks.Network`` for the arguments."""
+        """The geometry of sets; arguments as in ``Network``."""
         whitened, offset = geometry.whiten(candidates, usable)
         depth = min(self.config.lookahead, whitened.shape[-1])
         close_up = self.config.close_up
@@ -131,7 +131,7 @@ class CompactNetwork(nn.Module):
         available: jax.Array,
         count: int | jax.Array,
     ) -> DecisionFeatures:
-        """The geometry of a decision; see ``networks.Network`` for the arguments."""
+        """The geometry of a decision; arguments as in ``Network``."""
         left, depth = remaining(features, chosen, count), self.config.lookahead
         if isinstance(count, int):
             depth = min(depth, chosen.shape[-1] - count)
@@ -204,15 +204,3 @@ class CompactNetwork(nn.Module):
         vectors = decision.vectors
         logits = mask_logits(_SHARP * vectors.ahead[..., 3], vectors.active)
         return logits, decision.reached
-
-    def __call__(
-        self,
-        candidates: jax.Array,
-        usable: jax.Array,
-        chosen: jax.Array,
-        available: jax.Array,
-    ) -> tuple[jax.Array, jax.Array]:
-        """The first decision; flax makes the parameters with it."""
-        features = self.candidate_features(candidates, usable)
-        decision = self.decision_features(features, chosen, available, 0)
-        return self.decode(self.encode(features), decision)

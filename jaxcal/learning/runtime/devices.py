@@ -2,13 +2,16 @@
 
 The mesh has one axis, ``sets``. Keys are split for every set of the whole job before
 anything is placed, so an update draws the same numbers on one device and on many; only
-the order of sums differs. The weights are on every device. With one device there is no
-mesh and nothing here does anything. Process 0 alone reads and writes files: what it
-read goes to the others through ``on_first``.
+the order of sums differs. The weights are on every device. Of several seeds each device
+trains some instead: the axis is ``seeds``. With one device there is no mesh and nothing
+here does anything. Process 0 alone reads and writes files: what it read goes to the
+others through ``on_first``.
 """
 
 from __future__ import annotations
 
+import contextlib
+import os
 import pickle
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -21,6 +24,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxcal.learning.runtime.processes import collective
 
 __all__ = [
+    "a_device_for_each_core",
     "any_process",
     "describe",
     "is_first",
@@ -28,20 +32,25 @@ __all__ = [
     "make_mesh",
     "on_first",
     "replicate",
-    "require_divisible",
+    "spread",
 ]
 
 T = TypeVar("T")
 
 
-def make_mesh(num_devices: int | None = None) -> Mesh | None:
-    """All devices of the job along the axis ``sets``; None for a single one.
+def make_mesh(
+    rows: int, num_devices: int | None = None, num_seeds: int = 1
+) -> Mesh | None:
+    """All devices of the job along the axis ``sets``, of several seeds along ``seeds``;
+    None for a single one.
 
     Args:
+        rows: sets or streams of a minibatch.
         num_devices: as many of each process; all when None.
+        num_seeds: runs side by side.
 
     Raises:
-        ValueError: a process has fewer.
+        ValueError: a process has fewer, or they cannot share what there is.
     """
     have = jax.local_device_count()
     number = have if num_devices is None else num_devices
@@ -50,20 +59,36 @@ def make_mesh(num_devices: int | None = None) -> Mesh | None:
     chosen: list[jax.Device] = []
     for process in range(jax.process_count()):
         chosen += [d for d in jax.devices() if d.process_index == process][:number]
-    return Mesh(np.asarray(chosen), ("sets",)) if len(chosen) > 1 else None
-
-
-def require_divisible(rows: int, mesh: Mesh | None) -> None:
-    """Refuse a minibatch of ``rows`` sets or streams that the devices cannot share."""
-    if mesh is not None and rows % mesh.size:
-        fewer = max(n for n in range(1, mesh.size) if rows % n == 0)
+    if len(chosen) == 1:
+        return None
+    shared, change = rows, "change one of the three, or "
+    what = (
+        "episodes_per_update / (episodes_per_set x num_minibatches), the sets of a "
+        "minibatch (of a task decisions_per_update / (stream_length x num_minibatches))"
+    )
+    if num_seeds > 1:
+        shared, what, change = num_seeds, "--seeds", ""
+    if shared % len(chosen):
+        fewer = max(n for n in range(1, len(chosen)) if shared % n == 0)
         raise ValueError(
-            "episodes_per_update / (episodes_per_set x num_minibatches), the sets of a "
-            "minibatch (of a task decisions_per_update / (stream_length x "
-            f"num_minibatches)), must be a multiple of the {mesh.size} devices, got "
-            f"{rows}; change one of the three, or use {fewer} devices (--devices "
-            f"{fewer})"
+            f"{what} must be a multiple of the {len(chosen)} devices, got {shared}; "
+            f"{change}use {fewer} devices (--devices {fewer})"
         )
+    return Mesh(np.asarray(chosen), ("seeds" if num_seeds > 1 else "sets",))
+
+
+def a_device_for_each_core(num_seeds: int) -> None:
+    """Have JAX see the cores of a CPU as devices, as many as can share so many seeds.
+
+    Each trains its seeds by itself and waits for no other. It does nothing in a program
+    that has used JAX already, or that chose its devices.
+    """
+    if "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
+        return
+    cores = range(1, (os.cpu_count() or 1) + 1)
+    number = max(core for core in cores if num_seeds % core == 0)
+    with contextlib.suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", number)
 
 
 def describe(mesh: Mesh | None) -> str:
@@ -133,6 +158,12 @@ def replicate(tree: Any, mesh: Mesh | None, *axes: str) -> Any:
         )
 
     return jax.tree.map(put, tree)
+
+
+def spread(tree: Any, mesh: Mesh | None) -> Any:
+    """Put rows that every process holds alike on the devices that share them."""
+    sets = mesh is not None and "sets" in mesh.axis_names
+    return replicate(tree, mesh, *(["sets"] if sets else []))
 
 
 def local(tree: Any) -> Any:

@@ -6,7 +6,8 @@ import dataclasses
 from dataclasses import field
 from typing import Any
 
-from jaxcal.learning.core.postures import EpisodesConfig, Postures
+from jaxcal.learning.config import EpisodesConfig
+from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig

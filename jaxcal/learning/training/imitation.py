@@ -21,7 +21,7 @@ import numpy as np
 from flax import struct
 
 from jaxcal.learning.core.network import decode, encode, mask_logits
-from jaxcal.learning.core.postures import Episode, Postures
+from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.core.ppo import Metrics, squared_error
 
 __all__ = ["Imitation", "Lesson", "Lessons", "Teacher", "draw"]
@@ -47,7 +47,8 @@ class Lesson:
 
 def draw(learner: Postures, teacher: Teacher, key: jax.Array) -> Lesson:
     """The lesson of an update: the same whenever it is asked for with the same key."""
-    task, num_sets = learner.task, learner.config.episodes_per_update
+    task: Any = learner.task  # an ``environments.Task``
+    num_sets = learner.config.episodes_per_update
     key_sets, key_share, key_length, key_given = jax.random.split(key, 4)
     points, free = map(np.asarray, _drawn(key_sets, num_sets, task))
     learned = task.num_decisions - learner.network.num_unlearned
@@ -71,7 +72,7 @@ def draw(learner: Postures, teacher: Teacher, key: jax.Array) -> Lesson:
 
 
 @functools.partial(jax.jit, static_argnames=("num_sets", "task"))
-def _drawn(key: jax.Array, num_sets: int, task: Episode) -> tuple[jax.Array, jax.Array]:
+def _drawn(key: jax.Array, num_sets: int, task: Any) -> tuple[jax.Array, jax.Array]:
     sets = jax.vmap(task.reset)(jax.random.split(key, num_sets))
     return sets.candidates, sets.available
 
@@ -103,7 +104,7 @@ class Attempt:
     features: Any  # leaves (B, ...): of the candidate sets
     decisions: Any  # leaves (B, T, ...): of the decisions
     wanted: jax.Array  # (B, T, M) bool, what would be right
-    counted: jax.Array  # (B, T) 1 where the policy has the choice, 0 where it is given
+    weight: jax.Array  # (B, T) 0 where the choice is given; 1 on average
     best: jax.Array  # (B,) log det(Z.T Z) of what is wanted
 
 
@@ -132,19 +133,20 @@ class Imitation:
             logits, _ = decode(network, params, memory, seen)
             decisions.append(seen)
             wants.append(wanted)
-            counts.append((count >= lesson.length).astype(logits.dtype))
+            counts.append(count >= lesson.length)
             favourite = jnp.argmax(mask_logits(logits, wanted), axis=-1)
             action = jnp.where(count < lesson.length, lesson.given[:, count], favourite)
             chosen = chosen.at[:, count].set(action.astype(jnp.int32))
             taken = jax.nn.one_hot(action, free.shape[-1], dtype=bool)
             free, wanted = free & ~taken, wanted & ~taken
+        counted = jnp.stack(counts, axis=1).astype(memory.dtype)
         attempt = Attempt(
             features=features,
             decisions=jax.tree.map(
                 lambda *leaves: jnp.stack(leaves, axis=1), *decisions
             ),
             wanted=jnp.stack(wants, axis=1),
-            counted=jnp.stack(counts, axis=1),
+            weight=counted / jnp.maximum(counted.mean(), 1e-6),
             best=lesson.best,
         )
         return attempt, {}
@@ -165,10 +167,9 @@ class Imitation:
         logits, value = of_each(attempt.decisions)  # (B, T, M), (B, T)
         log_probs = jax.nn.log_softmax(logits)
         hopes = mask_logits(log_probs, attempt.wanted)
-        number = jnp.maximum(attempt.counted.sum(), 1.0)
 
         def mean(array: jax.Array) -> jax.Array:
-            return (array * attempt.counted).sum() / number
+            return (array * attempt.weight).mean()
 
         error = self.postures.task.value_scale * (value - attempt.best[:, None])
         metrics = {

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxcal.learning.core.network import Network
-from jaxcal.learning.core.ppo import Learner, TrainState, keys_of
+from jaxcal.learning.core.ppo import Learner, TrainState
 from jaxcal.learning.policies import decoding
 from jaxcal.learning.runtime import devices
 from jaxcal.learning.training import checkpoint, imitation
@@ -95,8 +95,8 @@ def train(
             where one is imitated, or nothing is left to learn.
         OSError: the folder cannot be written.
     """
-    mesh = devices.make_mesh(num_devices)
-    devices.require_divisible(config.ppo.rows_per_minibatch, mesh)
+    rows = config.ppo.rows_per_minibatch
+    mesh = devices.make_mesh(rows, num_devices, config.num_seeds)
     learners = config.learners
     network, k = learners[0].network, config.tasks[0].num_decisions
     last = config.ppo.num_updates if num_updates is None else num_updates
@@ -115,7 +115,8 @@ def train(
 
     def lesson(index: int) -> imitation.Lesson:
         assert teacher is not None  # checked above
-        _, _, key = keys_of(jax.random.key(config.seed))
+        # The first two are the run's own: weights and updates.
+        key = jax.random.split(jax.random.key(config.seed), 3)[2]
         learner = learners[index % len(learners)]
         return imitation.draw(learner, teacher, jax.random.fold_in(key, index))
 

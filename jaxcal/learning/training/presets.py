@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-from jaxcal.learning.core.postures import EpisodesConfig
+from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.environments.scenarios import SHAPES
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task

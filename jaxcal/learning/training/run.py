@@ -22,11 +22,12 @@ from typing import Any, TextIO
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
+from jax.sharding import Mesh, PartitionSpec
 
 from jaxcal.files import atomic_write, write_text
+from jaxcal.learning.config import PPOConfig
 from jaxcal.learning.core import ppo
-from jaxcal.learning.core.ppo import Learner, PPOConfig, TrainState
+from jaxcal.learning.core.ppo import Learner, TrainState
 from jaxcal.learning.runtime import devices
 from jaxcal.learning.runtime.processes import collective
 from jaxcal.learning.training import checkpoint
@@ -34,7 +35,7 @@ from jaxcal.learning.training import checkpoint
 __all__ = ["Recipe", "Report", "run", "updates"]
 
 _LAST = 1000  # episodes whose rewards are kept
-_MOST = 16  # updates in one call
+_UPDATES = 16  # updates in one call
 _CALL_SECONDS = 2.0  # of one call: what a signal waits for
 
 
@@ -94,26 +95,29 @@ def updates(
     config: PPOConfig,
     learner: Learner,
     mesh: Mesh | None = None,
-    most: int = 1,
+    at_most: int = 1,
     seeds: int = 0,
-) -> ppo.Update:
+) -> Callable[..., tuple[TrainState, ppo.Metrics]]:
     """Several updates in one compiled call; nothing is compiled for another seed.
 
     Args:
-        config, learner, mesh: as for ``ppo.make_update``.
-        most: updates of a call, at most.
+        config, learner: as for ``ppo.make_update``.
+        mesh: of the axis ``sets``, which an update shares, or of ``seeds``: every
+            device trains some of them by itself.
+        at_most: updates of a call.
         seeds: runs side by side, each leaf of the state with a leading axis of so many;
             0 for one run without that axis.
 
     Returns:
-        (state, given up; () number of updates to make, at most ``most``; *given) -> the
-        next state, and metrics with a leading axis ``most``, zero from that number on.
-        An update is the same program whatever the number, so cutting a run into calls
-        in another way changes no bit of it.
+        (state, given up; () number of updates to make, up to ``at_most``; *given) ->
+        the next state, and metrics with a leading axis ``at_most``, zero from that
+        number on. An update is the same program whatever the number, so cutting a run
+        into calls in another way changes no bit of it.
     """
-    one = ppo.make_update(config, learner, mesh)
+    spread = mesh is not None and mesh.axis_names == ("seeds",)
+    one = ppo.make_update(config, learner, None if spread else mesh)
 
-    def several(state: TrainState, count: jax.Array, *given: Any) -> Any:
+    def several(state: TrainState, count: jax.Array, given: tuple[Any, ...]) -> Any:
         def update(state: TrainState) -> tuple[TrainState, ppo.Metrics]:
             return one(state, *given)
 
@@ -126,10 +130,23 @@ def updates(
             return state, kept
 
         shapes = jax.eval_shape(each, state)[1]
-        kept = jax.tree.map(lambda m: jnp.zeros((most, *m.shape), m.dtype), shapes)
+        kept = jax.tree.map(lambda m: jnp.zeros((at_most, *m.shape), m.dtype), shapes)
         return jax.lax.fori_loop(0, count, step, (state, kept))
 
-    return jax.jit(several, donate_argnums=0)
+    def call(state: TrainState, count: jax.Array, *given: Any) -> Any:
+        if not spread:
+            return several(state, count, given)
+        own, all_of = PartitionSpec("seeds"), PartitionSpec()
+        on_each = jax.shard_map(
+            several,
+            mesh=mesh,
+            in_specs=(own, all_of, all_of),
+            out_specs=(own, PartitionSpec(None, "seeds")),
+            check_vma=False,
+        )
+        return ppo.placed(on_each(state, count, given), mesh)
+
+    return jax.jit(call, donate_argnums=0)
 
 
 def run(
@@ -172,16 +189,16 @@ def run(
             stack.enter_context(contextlib.closing(diary))
         while done < last and not devices.any_process(should_stop()):
             begun = time.perf_counter()
-            most, given = _MOST, recipe.given[done % len(recipe.given)]
+            at_most, given = _UPDATES, recipe.given[done % len(recipe.given)]
             learner = recipe.learners[done % len(recipe.learners)]
             if done < recipe.num_imitated:
                 assert recipe.imitate is not None  # there are updates that imitate
                 learner, shown = recipe.imitate(done)
-                most, given = 1, (devices.replicate(shown, mesh, "sets"),)
+                at_most, given = 1, (devices.spread(shown, mesh),)
             elif len(recipe.learners) > 1 or len(recipe.given) > 1:
-                most = 1  # the next update is of another program, or of other arrays
-            count = min(count, most, last - done)
-            update = updates(recipe.ppo, learner, mesh, most, seeds)
+                at_most = 1  # the next update is of another program, or of other arrays
+            count = min(count, at_most, last - done)
+            update = updates(recipe.ppo, learner, mesh, at_most, seeds)
             with collective():
                 state, found = update(state, np.int32(count), *given)
                 # One transfer for all that these updates measured.

@@ -1,0 +1,125 @@
+"""Every number of a training: of PPO, and of what an update plays."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+
+from jaxcal.learning.settings import require, setting
+
+__all__ = ["EpisodesConfig", "PPOConfig", "StreamsConfig"]
+
+
+@dataclasses.dataclass(frozen=True)
+class PPOConfig(abc.ABC):
+    """Every number of the optimisation; what is played adds its sizes."""
+
+    num_epochs: int = setting(2, "passes over what an update has played")
+    num_minibatches: int = setting(4, "gradient steps per pass")
+    learning_rate: float = setting(2e-3, "of Adam, after the warm-up")
+    final_learning_rate: float = setting(3e-5, "at the end; a cosine leads there")
+    warmup_updates: int = setting(5, "updates in which the learning rate rises")
+    clip_range: float = setting(0.2, "most that a probability ratio counts beyond 1")
+    value_coefficient: float = setting(0.5, "weight of the value's error")
+    value_error_limit: float = setting(
+        3.0, "reward units; beyond, the value's error counts linearly (Huber)"
+    )
+    entropy_start: float = setting(0.02, "entropy bonus at the beginning")
+    entropy_end: float = setting(0.0, "entropy bonus at the end; linear between")
+    discount: float = setting(1.0, "of a reward one decision later")
+    gae_lambda: float = setting(1.0, "of the advantages; 1 is return less value")
+    normalise_per_decision: bool = False
+    advantage_limit: float = setting(
+        6.0, "standard deviations; a larger advantage (a singular pick) is clipped"
+    )
+    max_grad_norm: float = setting(0.5, "global norm at which gradients are clipped")
+    average_decay: float = setting(
+        0.99, "for each gradient step, of the averaged weights, which are what is kept"
+    )
+    slice_rows: int = setting(
+        8, "rows of a minibatch whose gradient is computed at once on a CPU: its cache"
+    )
+
+    def __post_init__(self) -> None:
+        counts = ("num_epochs", "num_minibatches", "slice_rows")
+        require(self, "at least 1", lambda v: v >= 1, *counts)
+        positive = ("learning_rate", "clip_range", "max_grad_norm", "value_error_limit")
+        require(self, "positive", lambda v: v > 0, *positive)
+        require(self, "in [0, 1]", lambda v: 0.0 <= v <= 1.0, "discount", "gae_lambda")
+        require(self, "in [0, 1)", lambda v: 0.0 <= v < 1.0, "average_decay")
+
+    def require_whole(self, total: str, each: str) -> None:
+        """Refuse a ``total`` that is no whole number of minibatches of ``each``."""
+        whole = getattr(self, each) * self.num_minibatches
+        rule = f"a multiple of {each} x num_minibatches = {whole}"
+        require(self, rule, lambda v: v % whole == 0, total)
+
+    @property
+    @abc.abstractmethod
+    def num_updates(self) -> int:
+        """Updates that a run makes."""
+
+    @property
+    @abc.abstractmethod
+    def rows_per_update(self) -> int:
+        """Rows of experience that an update plays and cuts into minibatches."""
+
+    @property
+    def steps_per_update(self) -> int:
+        """Gradient steps in an update."""
+        return self.num_epochs * self.num_minibatches
+
+    @property
+    def rows_per_minibatch(self) -> int:
+        """What devices share among them."""
+        return self.rows_per_update // self.num_minibatches
+
+
+@dataclasses.dataclass(frozen=True)
+class EpisodesConfig(PPOConfig):
+    """How much is played, in episodes."""
+
+    num_episodes: int = setting(200_000, "training budget")
+    episodes_per_update: int = setting(2048, "fresh episodes in an update")
+    episodes_per_set: int = setting(
+        8, "episodes on the same candidates, which share a baseline"
+    )
+    normalise_per_decision: bool = setting(
+        True, "advantages: own mean and scale for each decision of an episode"
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        counts = ("num_episodes", "episodes_per_update", "episodes_per_set")
+        require(self, "at least 1", lambda v: v >= 1, *counts)
+        self.require_whole("episodes_per_update", "episodes_per_set")
+
+    @property
+    def num_updates(self) -> int:
+        """Updates that cover the budget, rounded up."""
+        return -(-self.num_episodes // self.episodes_per_update)
+
+    @property
+    def rows_per_update(self) -> int:
+        """Candidate sets of an update."""
+        return self.episodes_per_update // self.episodes_per_set
+
+
+@dataclasses.dataclass(frozen=True)
+class StreamsConfig(PPOConfig):
+    """How much is played, in decisions: sessions differ in length."""
+
+    num_updates: int = setting(300, "training budget")
+    decisions_per_update: int = setting(4096, "decisions in an update")
+    stream_length: int = setting(32, "decisions of one stream in an update")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        counts = ("num_updates", "decisions_per_update", "stream_length")
+        require(self, "at least 1", lambda v: v >= 1, *counts)
+        self.require_whole("decisions_per_update", "stream_length")
+
+    @property
+    def rows_per_update(self) -> int:
+        """Streams of an update."""
+        return self.decisions_per_update // self.stream_length
