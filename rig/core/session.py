@@ -20,11 +20,11 @@ import numpy as np
 
 from rig.config import RigConfig
 from rig.config.axis import Pulses
+from rig.core import known
 from rig.core.attitude import Array, angle_between_deg, frame_at
 from rig.core.device import Device, Posture, check_plan
 from rig.core.drive import Drive
 from rig.core.faults import MotionFault, NotFollowing, Requests, Unreachable, ending
-from rig.core.known import KeptZero, check_drives, check_zero, heading_turn, leave
 from rig.core.measure import measure, zeroed
 from rig.core.motion import Standing, move
 from rig.journal import ZEROED, BusLock, DeviceRecord, Record, RunFolder
@@ -43,7 +43,7 @@ def open_device(
     record: DeviceRecord,
     requests: Requests | None = None,
     *,
-    check: Check = check_drives,
+    check: Check = known.check_drives,
     beside: Sequence[Beside] = (),
     simulated: bool = False,
     reset_alarms: bool = False,
@@ -102,7 +102,7 @@ def _close(device: Device) -> None:
     if device.requests.armed:
         try:
             with device.bus.urgent():  # also after a stop that latched
-                leave(device.drives, device.record)
+                known.leave(device.drives, device.record)
         except OSError as error:
             text = f"{device.record.path} cannot be written: {error}"
             device.emit("note", text=text)
@@ -114,7 +114,7 @@ def _close(device: Device) -> None:
 
 
 def take_zero(
-    device: Device, at: Pulses | None = None, kept: KeptZero | None = None
+    device: Device, at: Pulses | None = None, kept: known.KeptZero | None = None
 ) -> None:
     """Measure the zero posture, that all others are measured against.
 
@@ -154,16 +154,16 @@ def take_zero(
 
 
 def _compare_zero(
-    device: Device, pulses: Pulses, attitude: Array, kept: KeptZero | None
+    device: Device, pulses: Pulses, attitude: Array, kept: known.KeptZero | None
 ) -> None:
     """With the calibration's zero posture, or else with the last one taken."""
-    config, known = device.config, device.record.state(ZEROED)
+    config, last = device.config, device.record.state(ZEROED)
     if kept is not None:
         device.emit("note", text=kept.check(config, pulses, attitude))
-    elif known:
-        then = np.array(known["attitude"])
+    elif last:
+        then = np.array(last["attitude"])
         try:
-            KeptZero("the last session", known["pulses"], then).check(
+            known.KeptZero("the last session", last["pulses"], then).check(
                 config, pulses, attitude
             )
         except MotionFault as fault:  # a phone mounted anew is calibrated anew
@@ -179,9 +179,9 @@ def _check_reference(device: Device, zero: Posture) -> None:
     device.emit("reference", sync=True, angles=angles, limit=limit)
     if max(map(abs, angles)) > limit:
         raise MotionFault(
-            f"the zero posture of this run has moved: it reads {np.round(angles, 2)} "
-            f"deg (limit {limit:g}): the drives lost their origin, or the phone or the "
-            "device was moved. Start a new run"
+            f"the zero posture of this run has moved: {known.axes_text(angles)} (limit "
+            f"{limit:g}): the drives lost their origin, or the phone or the device was "
+            "moved. Start a new run"
         )
 
 
@@ -204,8 +204,8 @@ def _reorient(device: Device) -> None:
         if device.imu.connections != count:
             continue
         now = np.array(found["attitude"])
-        told = check_zero(config, frame.zero, now, "this run")
-        turn = heading_turn(config, frame.zero, now)
+        told = known.check_zero(config, frame.zero, now, "this run")
+        turn = known.heading_turn(config, frame.zero, now)
         if (turned := angle_between_deg(np.eye(3), turn)) > LEAST_TURN_DEG:
             device.imu.turn(turn)
         zeroed(device, frame, zero)
@@ -224,8 +224,8 @@ def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
     The record has the posture's name, and ``fields`` besides what is measured.
     """
     run, name = device.run, posture.name
-    if name in (known := run.postures()):
-        return known[name]
+    if name in (measured := run.postures()):
+        return measured[name]
     if any(record["name"] == name for record in run.journal.events("unreachable")):
         return None
     device.requests.check_pause()

@@ -462,14 +462,15 @@ def test_a_reader_that_went_away_does_not_keep_it_from_stopping(rig):
 
 def test_a_handler_only_sets_a_flag_and_the_loop_says_it():
     said = []
-    with Signals() as signals:
-        signals.report = said.append
+    with Signals() as signals, bench() as motion:
+        motion.device.requests = signals
+        motion.device.emit = lambda event, **fields: said.append(event)
         signals.armed = True
         signal.raise_signal(signal.SIGINT)
         assert signals.pause and not said
-        signals.tell()
-        signals.tell()
-        assert len(said) == 1 and "pausing" in said[0]
+        motion.device.guard()
+        motion.device.guard()
+        assert said == ["pausing"]
         signals.armed, signals.ending = False, True
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.raise_signal(number)  # while the run ends: nothing is raised
