@@ -64,49 +64,38 @@ class SimDrive:
     ) -> None:
         self.map = register_map
         self.pulses_per_rev = pulses_per_rev
-        self.offset = 0
-        self._set_to = 0  # what it was told to count there
-        self.homed = False
         self.habits = habits or Habits()
         self.position = float(position)
-        self.velocity = 0.0
-        self.target = round(position)
-        self.moving = False
-        self.done = True
-        self.alarm = 0
-        self.enabled = not self.habits.enable_delay_s
         self.executions: list[int] = []  # target of each move that was run
         self.stops: list[float] = []
         self.comm_stops = 0
+        self.offset = 0
         self._travel = travel  # targets outside are answered with exception 3
         self._stuck = stuck
         self._random = random.Random(seed)
-        self._homing = False
-        self._enables = self._clears = math.inf  # when what was asked for is done
         self._speedup = speedup
         self._speed = self._accel = 1.0
-        self._stopping = False
-        self._comm_timeout = 0.0
         self._last_frame = self._now = time.monotonic()
-        self._registers = self._known()
+        self._switch_on()
 
-    def _known(self) -> dict[int, int]:
-        """Every register of the map."""
-        m = self.map
-        tables = (
-            m.move, m.stop, m.enable, m.alarm_reset, m.comm_timeout, m.limits, m.home,
-            m.set_zero,
-        )  # fmt: skip
-        reads = (m.status, m.position, m.alarm, m.target, m.pulses_per_rev)
-        places: list[Read | Write] = [*m.identity.values()]
-        places += [read for read in reads if read]
-        places += [frame for table in tables if table for frame in table.write]
-        known = {p.address + i: 0 for p in places for i in range(p.count)}
-        if read := m.pulses_per_rev:
-            shown = self.pulses_per_rev % (1 << 16 * read.count)
-            words = encode(shown, read.type, m.word_order)
-            known |= {read.address + i: word for i, word in enumerate(words)}
-        return known
+    def _switch_on(self) -> None:
+        self.target, self.velocity, self.alarm = round(self.position), 0.0, 0
+        self.moving = self._stopping = self._homing = self.homed = False
+        self.done, self.enabled = True, not self.habits.enable_delay_s
+        self._set_to = 0  # what it was told to count at its origin
+        self._enables = self._clears = math.inf  # when what was asked for is done
+        self._comm_timeout = math.inf
+        places: list[Read | Write] = [*self.map.identity.values()]
+        for _, value in self.map:
+            places += [value] if isinstance(value, Read) else []
+            places += value.write if isinstance(value, Writes) else []
+        self._registers = {p.address + i: 0 for p in places for i in range(p.count)}
+        if read := self.map.pulses_per_rev:
+            self._show(read, self.pulses_per_rev % (1 << 16 * read.count))
+
+    def _show(self, place: Read, value: int) -> None:
+        for i, word in enumerate(encode(value, place.type, self.map.word_order)):
+            self._registers[place.address + i] = word
 
     def advance(self) -> None:
         """Bring position and velocity up to the clock."""
@@ -116,7 +105,7 @@ class SimDrive:
         if now >= self._clears:
             self.alarm, self._clears = 0, math.inf
         watched = self.moving or self.habits.idle_watchdog
-        lost = self._last_frame + (self._comm_timeout or math.inf)
+        lost = self._last_frame + self._comm_timeout
         if watched and now > lost and not self._stopping and not self.alarm:
             self._integrate(lost)
             self.comm_stops += 1
@@ -132,44 +121,41 @@ class SimDrive:
         self._now = max(self._now, now)
 
     def _step(self, dt: float) -> None:
-        if self._stuck():
-            self.velocity = 0.0
-            if not self._stopping:
-                return
+        stuck = bool(self._stuck())
+        self.velocity = 0.0 if stuck else self.velocity
         if self._stopping:
             drop = QUICK_STOP_FACTOR * self._accel * dt
             if abs(self.velocity) <= drop:
                 self.velocity, self.moving, self._stopping = 0.0, False, False
                 self.position = float(round(self.position))
-                return
-            self.velocity -= math.copysign(drop, self.velocity)
-            self.position += self.velocity * dt
+            else:
+                self.velocity -= math.copysign(drop, self.velocity)
+                self.position += self.velocity * dt
+            return
+        if stuck:
             return
         error = self.target - self.position
         wanted = math.copysign(
             min(self._speed, math.sqrt(2.0 * self._accel * abs(error))), error
         )
-        change = max(-self._accel * dt, min(self._accel * dt, wanted - self.velocity))
-        self.velocity += change
+        most = self._accel * dt
+        self.velocity += max(-most, min(most, wanted - self.velocity))
         step = self.velocity * dt
         # The last step ends on the target, however short it is cut by a look at the
         # drive; only a drive sent back while it runs fast passes it.
-        near = abs(error) <= max(abs(step), 0.5)
-        whole = STEP_S * self._speedup
-        if near and abs(self.velocity) <= 20 * self._accel * whole + 1.0:
-            self.position, self.velocity = float(self.target), 0.0
-            self.moving, self.done = False, True
-            if self._homing:
-                self.find_origin()
+        slow = abs(self.velocity) <= 20 * self._accel * STEP_S * self._speedup + 1.0
+        if not (slow and abs(error) <= max(abs(step), 0.5)):
+            self.position += step
             return
-        self.position += step
+        self.position, self.velocity = float(self.target), 0.0
+        self.moving, self.done = False, True
+        if self._homing:
+            self.find_origin()
 
     def raise_alarm(self, code: int) -> None:
         """Fault: the drive stops itself and refuses to move until reset."""
         self.advance()
-        self.alarm = code
-        self.done = False
-        self._stopping = self.moving
+        self.alarm, self.done, self._stopping = code, False, self.moving
 
     def find_origin(self) -> None:
         """Count from the motor's origin again, as homing ends."""
@@ -181,36 +167,23 @@ class SimDrive:
         """Off and on again: its counter comes back ``offset`` pulses away."""
         self.advance()
         self.offset += offset
-        self._set_to = 0
         self.position = float(round(self.position) + offset)
-        self.target, self.velocity, self.alarm = round(self.position), 0.0, 0
-        self.moving = self._stopping = self._homing = self.homed = False
-        self.done = True
-        self.enabled = not self.habits.enable_delay_s
-        self._enables = self._clears = math.inf
-        self._comm_timeout = 0.0
-        self._registers = self._known()
+        self._switch_on()
 
     def read(self, address: int, count: int) -> list[int]:
         """Holding registers; raises DriveException where there are none."""
         self.advance()
         self._last_frame = time.monotonic()
-        m = self.map
-        values: list[tuple[Read, int]]
-        values = [(m.status, self._status()), (m.position, self._counter())]
-        values += [(m.alarm, self.alarm)] if m.alarm else []
-        for place, value in values:
-            for i, word in enumerate(encode(value, place.type, m.word_order)):
-                self._registers[place.address + i] = word
+        flicker = 0 if self.velocity else self.habits.jitter_counts
+        counter = round(self.position) + self._random.randint(-flicker, flicker)
+        self._show(self.map.status, self._status())
+        self._show(self.map.position, counter)
+        if self.map.alarm:
+            self._show(self.map.alarm, self.alarm)
         try:
             return [self._registers[address + i] for i in range(count)]
         except KeyError:
             raise DriveException(ILLEGAL_ADDRESS) from None
-
-    def _counter(self) -> int:
-        """The position as read: at rest it may flicker."""
-        most = 0 if self.velocity else self.habits.jitter_counts
-        return round(self.position) + self._random.randint(-most, most)
 
     def _status(self) -> int:
         resting = self.done and not self.moving and not self.alarm
@@ -228,36 +201,27 @@ class SimDrive:
             raise DriveException(ILLEGAL_ADDRESS)
         m, before = self.map, self._registers
         self._registers = before | at
+        obey = {
+            "stop": self._stop, "alarm_reset": self._reset, "enable": self._enable,
+            "home": self._home, "set_zero": self._set_zero,
+        }  # fmt: skip
         if at.get(m.move.trigger.address) == m.move.trigger.value:
             try:
                 self._start()
             except DriveException:
                 self._registers = before
                 raise
-        elif self._begins(m.stop, address, words):
-            self.stops.append(time.monotonic())
-            self._stopping = self.moving
-            self.target = round(self.position)
-        elif self._begins(m.alarm_reset, address, words):
-            self._clears = time.monotonic() + self.habits.reset_delay_s
+        elif table := next((n for n in obey if self._begins(n, address, words)), None):
+            obey[table]()
             self.advance()
-        elif self._begins(m.enable, address, words):
-            self._enables = time.monotonic() + self.habits.enable_delay_s
-            self.advance()
-        elif self._begins(m.home, address, words):
-            self._home()
-        elif m.set_zero and self._begins(m.set_zero, address, words):
-            home = self._value(m.set_zero, "home")
-            self.offset += home - round(self.position)
-            self._set_to = home
-            self.position, self.target, self.homed = float(home), home, True
         elif m.comm_timeout and address == m.comm_timeout.write[0].address:
             counts = self._value(m.comm_timeout, "timeout")
-            self._comm_timeout = counts / m.comm_timeout.per_s
+            self._comm_timeout = counts / m.comm_timeout.per_s or math.inf
 
-    def _begins(self, table: Writes | None, address: int, words: list[int]) -> bool:
+    def _begins(self, table: str, address: int, words: list[int]) -> bool:
         """Whether a frame is the table's first one that says something by itself."""
-        for frame in table.write if table else ():
+        writes = getattr(self.map, table)
+        for frame in writes.write if writes else ():
             constants = {a: w.value for a, w in frame.places() if w.value not in VALUES}
             if constants:
                 sent = {address + i: word for i, word in enumerate(words)}
@@ -274,29 +238,46 @@ class SimDrive:
         words = [self._registers[address + i] for i in range(registers_of(kind))]
         return decode(words, kind, self.map.word_order)
 
+    def _stop(self) -> None:
+        self.stops.append(time.monotonic())
+        self._stopping, self.target = self.moving, round(self.position)
+
+    def _reset(self) -> None:
+        self._clears = time.monotonic() + self.habits.reset_delay_s
+
+    def _enable(self) -> None:
+        self._enables = time.monotonic() + self.habits.enable_delay_s
+
+    def _set_zero(self) -> None:
+        assert self.map.set_zero is not None  # it was just written
+        home = self._value(self.map.set_zero, "home")
+        self.offset += home - round(self.position)
+        self.position, self.target, self._set_to = float(home), home, home
+        self.homed = True
+
     def _home(self) -> None:
         """Go to where the motor's origin is, and count from there."""
-        if self.alarm or not self.enabled:
-            raise DriveException(DEVICE_FAILURE)
-        self._speed, self._accel = self.pulses_per_rev, 10.0 * self.pulses_per_rev
-        self.target, self.moving, self.done = self.offset, True, False
-        self._stopping, self._homing = False, True
+        self._move(self.offset, self.pulses_per_rev, 10.0 * self.pulses_per_rev)
+        self._homing = True
 
     def _start(self) -> None:
-        m = self.map
-        if self.alarm or not self.enabled:
-            raise DriveException(DEVICE_FAILURE)
+        m, per_rev = self.map, float(self.pulses_per_rev)
+        speed = (self._value(m.move, "speed") or 1) / m.units.speed_per_unit
+        accel = (self._value(m.move, "accel") or 1) / m.units.accel_per_unit
+        if m.units.accel == "s_per_rev_per_s":
+            accel = 1.0 / accel
+        speed *= per_rev if m.units.speed == "rev_per_s" else 1.0
+        accel *= 1.0 if m.units.accel == "pulse_per_s2" else per_rev
         target = self._value(m.move, "position")
         way = target - self._set_to
         if self._travel and not self._travel[0] <= way <= self._travel[1]:
             raise DriveException(ILLEGAL_VALUE)
-        units, per_rev = m.units, float(self.pulses_per_rev)
-        speed = (self._value(m.move, "speed") or 1) / units.speed_per_unit
-        accel = (self._value(m.move, "accel") or 1) / units.accel_per_unit
-        if units.accel == "s_per_rev_per_s":
-            accel = 1.0 / accel
-        self._speed = speed * (per_rev if units.speed == "rev_per_s" else 1.0)
-        self._accel = accel * (1.0 if units.accel == "pulse_per_s2" else per_rev)
+        self._move(target, speed, accel)
         self.executions.append(target)
-        self.target, self.moving, self.done = target, True, False
+
+    def _move(self, target: int, speed: float, accel: float) -> None:
+        if self.alarm or not self.enabled:
+            raise DriveException(DEVICE_FAILURE)
+        self.target, self._speed, self._accel = target, speed, accel
+        self.moving, self.done = True, False
         self._stopping = self._homing = False

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import threading
 import time
-from collections.abc import Callable
 from typing import Any
 
 from rig.config.axis import AXIS_NAMES
@@ -45,6 +44,7 @@ class FaultSpec:
     axis: int | None = None  # None: any
     seconds: float | None = None  # length of a gap or delay
     share: float = 0.03  # of frames that are spoilt
+    begun: float | None = None  # by the monotonic clock; None: it waits
 
 
 def parse_fault(text: str) -> FaultSpec:
@@ -79,41 +79,46 @@ class FaultInjector:
     def __init__(self, specs: list[FaultSpec] | None = None) -> None:
         self._lock = threading.RLock()
         self._start = time.monotonic()
-        self._waiting = list(specs or [])
-        self._active: list[tuple[FaultSpec, float]] = []  # and since when
-        self._begin(lambda spec: spec.phase is None and spec.after_s is None)
+        self._specs: list[FaultSpec] = []
+        for spec in specs or []:
+            self.add(spec, waits=spec.phase is not None or spec.after_s is not None)
 
-    def add(self, spec: FaultSpec) -> None:
+    def add(self, spec: FaultSpec, waits: bool = False) -> None:
+        """Inject it now, or when it is due."""
+        begun = None if waits else time.monotonic()
         with self._lock:
-            self._active.append((dataclasses.replace(spec), time.monotonic()))
+            self._specs.append(dataclasses.replace(spec, begun=begun))
 
     def clear(self) -> None:
         """Repair everything; nothing more is injected."""
         with self._lock:
-            self._waiting.clear()
-            self._active.clear()
+            self._specs.clear()
 
     def enter(self, phase: str) -> None:
         """The session entered a phase."""
-        self._begin(lambda spec: spec.phase == phase)
-
-    def _begin(self, due: Callable[[FaultSpec], bool]) -> None:
         with self._lock:
-            for spec in [spec for spec in self._waiting if due(spec)]:
-                self._waiting.remove(spec)
-                self.add(spec)
+            for spec in self._specs:
+                if spec.begun is None and spec.phase == phase:
+                    spec.begun = time.monotonic()
 
     def take(self, kind: str, axis: int | None = None) -> FaultSpec | None:
         """The active fault of a kind that hits this axis; uses one of its count."""
         now = time.monotonic()
-        self._begin(lambda s: s.after_s is not None and now >= self._start + s.after_s)
         with self._lock:
-            for spec, since in self._active:
-                hits = spec.kind == kind and (axis is None or spec.axis in (None, axis))
+            for spec in self._specs:
+                if spec.kind != kind or (
+                    axis is not None and spec.axis not in (None, axis)
+                ):
+                    continue
+                if spec.begun is None and spec.after_s is not None:
+                    due = self._start + spec.after_s
+                    spec.begun = now if now >= due else None
                 # The seconds of a delayed reply are its delay.
                 lasts = spec.seconds if kind != "delayed_reply" else None
-                over = lasts is not None and now > since + lasts
-                if hits and spec.count > 0 and not over:
+                over = spec.begun is None or (
+                    lasts is not None and now > spec.begun + lasts
+                )
+                if spec.count > 0 and not over:
                     spec.count -= 1
                     return spec
         return None

@@ -26,13 +26,11 @@ def format_line(
     settings: ImuSettings, matrix: Array, stamp_s: float, order: str
 ) -> str:
     """One line as the configured app would send it, without its end."""
-    columns: tuple[int, ...]
+    columns: tuple[int, ...] = settings.quaternion_columns or settings.columns
     if settings.quaternion_columns:
-        columns, digits = settings.quaternion_columns, 9
-        numbers = Rotation.from_matrix(matrix).as_quat()
+        numbers, digits = Rotation.from_matrix(matrix).as_quat(), 9
     else:
-        columns, digits = settings.columns, 7
-        numbers = matrix_to_euler(matrix, order) * np.array(settings.signs)
+        numbers, digits = matrix_to_euler(matrix, order) * np.array(settings.signs), 7
         if settings.format == "hyperimu":
             numbers[0] %= 360.0  # the azimuth runs from 0 to 360
         if settings.unit == "rad":
@@ -58,28 +56,27 @@ class Phone:
         seed: int = 0,
     ) -> None:
         self.settings = settings
-        self.port = settings.port
         self._attitude = attitude
-        self._faults = faults
+        self._take = faults.take
         self._period = 1.0 / rate_hz
         self._random = random.Random(seed)
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
+        self._port = settings.port
         self._listener: socket.socket | None = None
         self._frozen = np.eye(3)
         self._session = 0  # of the app, counted
 
     def start(self, port: int) -> int:
         """Send to the port the rig listens on, or listen there; returns the port."""
-        self.port = port
-        if self._thread.is_alive():
-            return port
-        if self.settings.transport == "connect":
-            self._listener = socket.create_server(("127.0.0.1", port), backlog=1)
-            self._listener.settimeout(0.1)
-            self.port = int(self._listener.getsockname()[1])
-        self._thread.start()
-        return self.port
+        self._port = port
+        if not self._thread.is_alive():
+            if self.settings.transport == "connect":
+                self._listener = socket.create_server(("127.0.0.1", port), backlog=1)
+                self._listener.settimeout(0.1)
+                self._port = int(self._listener.getsockname()[1])
+            self._thread.start()
+        return self._port
 
     def close(self) -> None:
         self._closing.set()
@@ -94,98 +91,88 @@ class Phone:
                 if self.settings.format == "sensorlogger":
                     self._push()
                 elif self._listener is not None:
-                    connection, _ = self._listener.accept()
-                    self._stream(connection)
+                    self._stream(self._listener.accept()[0])
                 else:
-                    address = ("127.0.0.1", self.port)
+                    address = ("127.0.0.1", self._port)
                     self._stream(socket.create_connection(address, timeout=1.0))
             self._closing.wait(0.05)
 
     def _stream(self, connection: socket.socket) -> None:
-        with contextlib.closing(connection):
+        held = b""
+        next_time = time.monotonic()
+        with connection:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection.settimeout(1.0)
-            held: bytes | None = None
-            next_time = time.monotonic()
-            while not self._closing.is_set():
-                if self._faults.take("imu_disconnect"):
-                    return
-                if self._faults.take("imu_second_sender"):
+            while not self._closing.is_set() and not self._take("imu_disconnect"):
+                if self._take("imu_second_sender"):
                     connection.close()
-                    self._intrude()
-                    return
-                if not self._faults.take("imu_gap"):
+                    return self._intrude()
+                if not self._take("imu_gap"):
                     data = self._line()
-                    if self._faults.take("imu_reorder") and held is None:
+                    if self._take("imu_reorder") and not held:
                         held = data
                     else:
-                        connection.sendall(data + (held or b""))
-                        held = None
+                        connection.sendall(data + held)
+                        held = b""
                 next_time += self._period
                 self._closing.wait(max(0.0, next_time - time.monotonic()))
 
     def _intrude(self) -> None:
         """Angles of something else, from another address, for as long as it is let."""
         settings, other = self.settings, euler_to_matrix([40.0, 30.0, 20.0], "ZYX")
-        address, source = ("127.0.0.1", self.port), ("127.0.0.2", 0)
-        with (
-            contextlib.suppress(OSError),
-            socket.create_connection(address, 1.0, source) as connection,
-        ):
+        address, source = ("127.0.0.1", self._port), ("127.0.0.2", 0)
+        with socket.create_connection(address, 1.0, source) as connection:
             for _ in range(max(3, round(INTRUSION_S / self._period))):
                 line = format_line(settings, other, time.time(), str(settings.order))
                 connection.sendall(line.encode() + b"\r\n")
                 self._closing.wait(self._period)
 
     def _line(self) -> bytes:
-        s, faults = self.settings, self._faults
-        order = str(s.order)
-        if faults.take("imu_wrong_order"):
-            order = "XYZ" if s.order != "XYZ" else "ZYX"
-        matrix = self._attitude()
-        if not faults.take("imu_frozen"):
-            self._frozen = matrix
-        matrix = self._frozen
-        if faults.take("imu_radians"):
+        s, order = self.settings, str(self.settings.order)
+        if self._take("imu_wrong_order"):
+            order = "XYZ" if order != "XYZ" else "ZYX"
+        if not self._take("imu_frozen"):
+            self._frozen = self._attitude()
+        if self._take("imu_radians"):
             s = s.model_copy(update={"unit": "rad"})
-        text = format_line(s, matrix, time.time(), order)
-        if faults.take("imu_nan"):
-            fields = text.split(s.separator)
+        fields = format_line(s, self._frozen, time.time(), order).split(s.separator)
+        if self._take("imu_nan"):
             fields[(s.quaternion_columns or s.columns)[0]] = "NaN"
-            text = s.separator.join(fields)
-        if faults.take("imu_columns"):
-            text += f"{s.separator}1.0"
-        data = text.encode() + b"\r\n"
-        if faults.take("imu_garbage"):
-            cut = self._random.randrange(len(data))
-            noise = self._random.randbytes(self._random.randint(1, 40))
-            data = data[:cut] + noise + data[cut:]
-        return data
+        if self._take("imu_columns"):
+            fields.append("1.0")
+        return self._garbled(s.separator.join(fields).encode() + b"\r\n")
+
+    def _garbled(self, data: bytes) -> bytes:
+        if not self._take("imu_garbage"):
+            return data
+        cut = self._random.randrange(len(data))
+        return (
+            data[:cut]
+            + self._random.randbytes(self._random.randint(1, 40))
+            + data[cut:]
+        )
 
     def _push(self) -> None:
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=2.0)
+        connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=2.0)
         with contextlib.closing(connection):
             while not self._closing.is_set():
-                payload = []
-                if self._faults.take("imu_disconnect"):
+                if self._take("imu_disconnect"):
                     self._session += 1
                     return
+                payload = []
                 for _ in range(BATCH):
                     q = Rotation.from_matrix(self._attitude()).as_quat()
-                    if self._faults.take("imu_nan"):
-                        q = q * np.nan
+                    q = q * np.nan if self._take("imu_nan") else q
                     values = dict(
                         zip(("qx", "qy", "qz", "qw"), q.tolist(), strict=True)
                     )
-                    entry = {"name": "orientation", "time": time.time_ns()}
-                    payload.append(entry | {"values": values})
+                    stamped = {"name": "orientation", "time": time.time_ns()}
+                    payload.append(stamped | {"values": values})
                     self._closing.wait(self._period)
-                if self._faults.take("imu_gap"):
+                if self._take("imu_gap"):
                     continue
                 named = {"deviceId": "simulated", "sessionId": str(self._session)}
-                body = json.dumps(named | {"payload": payload})
-                if self._faults.take("imu_garbage"):
-                    body = body[: self._random.randrange(len(body))]
+                body = json.dumps(named | {"payload": payload}).encode()
                 headers = {"Content-Type": "application/json"}
-                connection.request("POST", "/", body, headers)
+                connection.request("POST", "/", self._garbled(body), headers)
                 connection.getresponse().read()

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 from rig.config.axis import AXIS_NAMES, Axis
 from rig.config.config import RigConfig
 from rig.core.attitude import Array, euler_to_matrix
-from rig.simulator.drive import SimDrive
+from rig.simulator.drive import Habits, SimDrive
 
 
 @dataclasses.dataclass(frozen=True)
-class Truth:
+class Truth(Habits):
     """What a calibration should find, and what disturbs it.
 
     The defaults are the set values of the paper's Table 1 (pitch, yaw, roll) with a
@@ -43,12 +43,7 @@ class Truth:
     swapped: tuple[int, ...] = (0, 1, 2)  # joint i is turned by drive swapped[i]
     drive_pulses_per_rev: tuple[int, ...] | None = None  # None: as configured
     lost_origin_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the counters
-    # What real drives and lines do:
     latency_s: float = 0.0  # of every reply
-    enable_delay_s: float = 0.0  # > 0: drives start disabled, and take so long
-    reset_delay_s: float = 0.0  # until an alarm is gone after its reset
-    jitter_counts: int = 0  # of the position read while a drive stands
-    idle_watchdog: bool = False  # the comm timeout also acts while a drive stands
 
     @property
     def jig_deg(self) -> Array:

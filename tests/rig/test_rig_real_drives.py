@@ -102,7 +102,8 @@ def test_the_zero_taken_here_is_approached_from_the_side_of_the_references(tmp_p
         start = [round(drive.position) for drive in sim.drives]
         assert session(sim.start(), tmp_path / "run", sim, said) == 0, said
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert summary["drift_deg"] < 0.01  # of the zero posture, at the end
+    last = summary["drift"]["angles_deg"][-1]  # of the zero posture
+    assert np.abs(last).max() < 0.01
     assert summary["after"]["max"] < 0.01
     records = [json.loads(line) for line in (tmp_path / "run" / "journal.jsonl").open()]
     (zero,) = (r for r in records if r["event"] == "zero")
