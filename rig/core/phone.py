@@ -113,6 +113,7 @@ class Receiver:
 
     async def _accept(self, listener: socket.socket) -> None:
         loop, tasks = asyncio.get_running_loop(), set[asyncio.Task[None]]()
+        leaving: list[socket.socket] = []
         with listener:
             while True:
                 try:
@@ -127,7 +128,8 @@ class Receiver:
                 else:  # it is still sending: closed at once, it would not see why
                     with contextlib.suppress(OSError):
                         made.send(_answer(403, False))
-                    loop.call_later(LOOK_S, made.close)
+                    leaving = [each for each in leaving if each.fileno() >= 0] + [made]
+                    loop.call_later(LOOK_S * (len(leaving) < BACKLOG), made.close)
 
     async def _hear(self, address: str, **how: Any) -> None:
         """Take what one connection sends, until it ends or says nothing."""
