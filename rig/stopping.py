@@ -14,7 +14,7 @@ import pathlib
 import signal
 import time
 import tomllib
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -106,14 +106,20 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
             target.ask()
         from rig.core import drive, stop  # noqa: F401  # while those asked have time
 
+        results: list[UnitStop] = []
+        faults: list[Fault] = []
         with ThreadPoolExecutor(len(found)) as pool:
             jobs = [pool.submit(_stop_units, target, path) for target in found]
-        faults = [fault for job in jobs if (fault := job.exception())]
+            for job in as_completed(jobs):
+                try:
+                    results += job.result()
+                    _say("\n".join(map(str, job.result())))
+                except Fault as error:
+                    faults.append(error)
         if len(faults) == len(jobs):
             raise faults[0]
-        results = [each for job in jobs if not job.exception() for each in job.result()]
-        for told in (*results, *faults):
-            _say(str(told))
+        for fault in faults:
+            _say(str(fault))
         good = all(each.acknowledged and each.standing for each in results)
         return EXIT_OK if good and not faults else EXIT_FAULT
 
