@@ -33,16 +33,15 @@ PHONE = (
 )  # fmt: skip
 # Where bus and phone are reached, and when a session gives up or says that it is good,
 # may change between a run and its resumption.
-UNMEASURED = {
-    "axes": ("comm_timeout_s",),
-    "imu": ("host", "port", "transport", "allow", "stale_s", "heading"),
-    "motion": (
-        "poll_s", "deadline_factor", "deadline_slack_s", "stall_s", "following_deg",
-        "envelope_margin_deg", "max_disagreement_deg", "mirror_limits",
-    ),
-    "settle": ("timeout_s",),
-    "session": ("verify_limit_deg", "reference_tolerance_deg", "max_unreachable"),
-}  # fmt: skip
+UNMEASURED = (
+    "bus.", "axes.pitch.comm_timeout_s", "axes.yaw.comm_timeout_s",
+    "axes.roll.comm_timeout_s", "imu.host", "imu.port", "imu.transport", "imu.allow",
+    "imu.stale_s", "imu.heading", "motion.poll_s", "motion.deadline_factor",
+    "motion.deadline_slack_s", "motion.stall_s", "motion.following_deg",
+    "motion.envelope_margin_deg", "motion.max_disagreement_deg", "motion.heartbeat_s",
+    "motion.mirror_limits", "settle.timeout_s", "session.verify_limit_deg",
+    "session.reference_tolerance_deg", "session.max_unreachable",
+)  # fmt: skip
 
 KEYS = {  # of rig.toml, where a description of it says otherwise
     "scale": "", "letter": "rotates", "mechanism_order": "mechanism.order",
@@ -57,20 +56,6 @@ def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
         for key in dict.fromkeys([*then, *now])
         if then.get(key) != now.get(key)
     ]
-
-
-def _without(data: dict[str, Any], left_out: dict[str, Any]) -> dict[str, Any]:
-    """A described configuration without its bus and some keys of its tables."""
-    found = {}
-    for name, table in data.items():
-        gone = left_out.get(name, ())
-        if isinstance(table, dict):
-            table = {key: table[key] for key in table if key not in gone}
-        elif name == "axes":
-            table = [{k: axis[k] for k in axis if k not in gone} for axis in table]
-        if name != "bus":
-            found[name] = table
-    return found
 
 
 def _flat(data: Any, at: str = "") -> dict[str, Any]:
@@ -218,8 +203,9 @@ class RigConfig(Section):
             described: ``described()`` when the run began, from its journal.
         """
         now = json.loads(json.dumps(self.described(), default=str))
-        then, now = (_flat(_without(each, UNMEASURED)) for each in (described, now))
+        then, now = _flat(described), _flat(now)
         # Keys that came after the run began had their defaults in it.
+        then = {key: then[key] for key in then if not key.startswith(UNMEASURED)}
         return differences(then, {key: now.get(key) for key in then})
 
     def device_fingerprint(self) -> dict[str, Any]:
