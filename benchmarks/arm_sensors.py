@@ -1,11 +1,14 @@
-"""Is each sensor's calibration of an arm as uncertain as it says?
+"""Is each sensor's calibration of an arm as uncertain as it says? Three tables more.
 
-    python -m benchmarks.arm_sensors [draws]
+    python -m benchmarks.arm_sensors [draws] [intervals sizes misfit checks]
 
-Arms whose errors are drawn from the default prior, each sensor alone and in pairs, 60
-readings of each or more: how many 95 % intervals of the parameters hold the truth.
-Then positions of a UR5 whose errors are 0.2 to 10 times the tolerances: the error
+``intervals``: arms whose errors are drawn from the default prior, each sensor alone and
+in pairs, 60 readings of each or more: how many 95 % intervals hold the truth.
+``sizes``: positions of a UR5 whose errors are 0.2 to 10 times the tolerances: the error
 elsewhere of a fit with the right tolerances over that with sizes from the readings.
+``misfit``: positions of arms that no table explains (cables, eccentric gears): the
+error elsewhere with and without harmonics of the joints. ``checks``: what a few chosen
+postures and random ones can tell of a drift.
 """
 
 from __future__ import annotations
@@ -131,13 +134,151 @@ def sized(factor: float, count: int, draws: int) -> float:
     return float(np.mean(errors["right"]) / np.mean(errors["sized"]))
 
 
-def main(draws: int) -> None:
-    """Print the table."""
+WAM = [  # a cable-driven arm, mm
+    (0, -90, 0, 0),
+    (0, 90, 0, 0),
+    (45, -90, 550, 0),
+    (-45, 90, 0, 0),
+    (0, -90, 300, 0),
+    (0, 90, 0, 0),
+    (0, 0, 60, 0),
+]
+SPAN = (150.0, 100.0, 150.0, 120.0, 120.0, 80.0, 150.0)
+
+
+def table_of(joints: int, **options: object) -> SerialChain:
+    """A UR5 or a WAM in mm."""
+    if joints == 7:
+        return SerialChain.from_dh(WAM, tool=(0.0, 0.0, 60.0), **options)
+    table = np.loadtxt(EXAMPLES / "ur5" / "dh.csv", delimiter=",", skiprows=1)
+    return SerialChain.from_dh(table, tool=(0.0, 0.0, 31.0), **options)
+
+
+def cable_driven(joints: int, misfit: float, draw: int) -> tuple[Array, Array]:
+    """Joints (400, n) and positions of an arm whose joints do not go where they say.
+
+    Drums are eccentric (three harmonics), cables stretch under the arm's weight and run
+    over the other joints, and friction leaves a joint on either side. ``misfit`` of 1
+    is some millimetres.
+    """
+    rng = np.random.default_rng(100 + draw)
+    every = range(1, joints + 1)
+    arm = table_of(joints, compliance=every, harmonics=every)
+    std = np.array(arm.default_prior().std, dtype=np.float64)
+    waves = [" sin" in name or " cos" in name for name in arm.names]
+    std[waves] = 0.1 * misfit
+    std[np.array(arm.units) == "deg per torque"] *= 0.6 * misfit
+    truth = arm.nominal + std * rng.normal(size=len(std))
+    span = np.array(SPAN) if joints == 7 else 120.0
+    asked = span * rng.uniform(-1.0, 1.0, (400, joints))
+    angles = np.radians(asked)
+    over = np.tril(np.ones((joints, joints)), 1) * rng.normal(size=(joints, joints))
+    off = 0.06 * np.sin(angles) @ over.T
+    off += 0.04 * np.cos(angles) @ rng.normal(size=(joints, joints)).T
+    off += 0.06 * np.sin(3.0 * angles + rng.uniform(0.0, 6.0, joints))
+    off += 0.04 * rng.choice([-1.0, 1.0], asked.shape)
+    reached = arm.predict(asked + misfit * off, truth)
+    return asked, reached + 0.1 * rng.normal(size=reached.shape)
+
+
+def tracked(draw: int) -> tuple[Array, Array]:
+    """400 of the poses of a real UR5 and its measured positions."""
+    path = EXAMPLES / "ur5" / "ur5_grid_1000.csv"
+    data = np.genfromtxt(path, delimiter=",", names=True)
+    joints = np.stack([data[f"joint_{i}"] for i in range(1, 7)], axis=1)
+    places = [data[f"{axis}_t"] + data[f"{axis}_dif"] for axis in "xyz"]
+    rows = np.random.default_rng(draw).permutation(1000)[:400]
+    return joints[rows], np.stack(places, axis=1)[rows]
+
+
+def misfit(draws: int) -> None:
+    """Chosen of 150 poses and judged at 250, without and with harmonics."""
+    print("| arm | K | without: chosen, random, better | with them |")
+    print("| --- | --- | --- | --- |")
+    arms = {
+        "UR5, real": (6, tracked),
+        "UR5, no misfit": (6, lambda draw: cable_driven(6, 0.0, draw)),
+        "UR5, cables": (6, lambda draw: cable_driven(6, 1.0, draw)),
+        "WAM, cables": (7, lambda draw: cable_driven(7, 1.0, draw)),
+        "WAM, half of it": (7, lambda draw: cable_driven(7, 0.4, draw)),
+    }
+    for name, (joints, make) in arms.items():
+        model = table_of(joints)
+        for count in (8, 20):
+            # With a prior that is given there are no harmonics.
+            cells = []
+            for prior in (model.default_prior(), None):
+                lines = [
+                    _against_random(model, prior, count, *make(draw), draw)
+                    for draw in range(draws)
+                ]
+                one, other, share = np.mean(lines, axis=0)
+                cells.append(f"{one:.3g}, {other:.3g}, {share:.0%}")
+            print(f"| {name} | {count} | {cells[0]} | {cells[1]} |", flush=True)
+
+
+def _against_random(
+    model: SerialChain,
+    prior: jaxcal.Prior | None,
+    count: int,
+    joints: Array,
+    reached: Array,
+    seed: int,
+) -> tuple[float, float, float]:
+    """Error of the choice, mean of six random ones, share of these that is better."""
+
+    def error(rows: Array) -> float:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            found = jaxcal.identify(
+                joints[rows], reached[rows], model=model, prior=prior
+            )
+        off = found.predict(joints[150:]) - reached[150:]
+        return float(np.linalg.norm(off, axis=1).mean())
+
+    chosen = error(
+        jaxcal.select(joints[:150], count, "exchange", model=model, prior=prior).indices
+    )
+    rng = np.random.default_rng(seed)
+    random = [error(rng.choice(150, count, replace=False)) for _ in range(6)]
+    return chosen, float(np.mean(random)), float(np.mean(np.array(random) < chosen))
+
+
+def checks(draws: int) -> None:
+    """Power against a drift by 0.15 mm, and parameters whose drift could hide."""
+    model = table_of(6)
+    rng = np.random.default_rng(0)
+    std = np.asarray(model.default_prior().std)
+    joints = rng.uniform(-120.0, 120.0, (60, 6))
+    truth = model.nominal + 0.5 * std * rng.normal(size=len(std))
+    measured = model.predict(joints, truth) + 0.05 * rng.normal(size=(60, 3))
+    found = jaxcal.identify(joints, measured, model=model, noise_std=0.05)
+    offered = rng.uniform(-120.0, 120.0, (200, 6))
+    print("| postures | mean power | drifts that could hide |\n| --- | --- | --- |")
+    for rule, count in (("chosen", 2), ("chosen", 3), *(("random", k) for k in (3, 6))):
+        told = []
+        for _ in range(1 if rule == "chosen" else draws):
+            rows = rng.choice(200, count, replace=False)
+            if rule == "chosen":
+                rows = found.verification(offered, count)
+            there = offered[rows]
+            told.append(found.check(there, found.predict(there), tolerance=0.15))
+        power = np.mean([one.power for one in told])
+        hidden = np.mean([len(one.unseen) for one in told])
+        print(f"| {count} {rule} | {power:.0%} | {hidden:.1f} |", flush=True)
+
+
+def intervals(draws: int) -> None:
+    """How many of the 95 % intervals hold the truth."""
     print(f"| sensor | 6 axes | 7 axes |  ({draws} draws)\n| --- | --- | --- |")
     for names in [*((name,) for name in ALONE), *PAIRS]:
         cells = [covered(joints, names, draws) for joints in (6, 7)]
         row = " | ".join(f"{share:.1%} ({error:.1%})" for share, error in cells)
         print(f"| {' and '.join(names)} | {row} |", flush=True)
+
+
+def sizes(draws: int) -> None:
+    """What sizes from the readings reach of what the right ones do."""
     counts = (8, 12, 20)
     print("| errors | " + " | ".join(map(str, counts)) + " poses |")
     print("| --- " * (1 + len(counts)) + "|")
@@ -146,5 +287,10 @@ def main(draws: int) -> None:
         print(f"| {factor:g} times | {row} |", flush=True)
 
 
+TABLES = {each.__name__: each for each in (intervals, sizes, misfit, checks)}
+
 if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 200)
+    given = sys.argv[1:]
+    draws = int(given.pop(0)) if given and given[0].isdigit() else 200
+    for name in given or TABLES:
+        TABLES[name](draws)

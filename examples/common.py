@@ -23,8 +23,8 @@ from jaxcal.models import SerialChain
 
 HERE = pathlib.Path(__file__).parent
 NAMES = (
-    *("ankle", "ur5", "contacts", "force_sensor", "triad", "camera", "tcp"),
-    *("own_function", "backlash", "own_policy"),
+    *("ankle", "ur5", "contacts", "hand_eye", "drift", "force_sensor", "triad"),
+    *("camera", "tcp", "own_function", "backlash", "own_policy"),
 )
 Rows = list[dict[str, str]]
 

@@ -113,7 +113,6 @@ class Figure:
     data: bytes | str  # an SVG, PNG or GIF file
     alt: str  # what it shows, for readers who do not see it
     caption: Content = ""
-    on_paper: bool = True  # False: left out when the page is printed, a film say
 
     @property
     def uri(self) -> str:

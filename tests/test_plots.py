@@ -7,6 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from jaxcal import plots
+from jaxcal.models import SerialChain, Socket
 
 
 def test_an_ellipse_lies_at_its_mahalanobis_distance():
@@ -67,3 +68,17 @@ def test_residuals_and_curves_hold_every_value(rng):
     np.testing.assert_array_equal(axes.lines[2].get_ydata(), values[:, 1])
     axes = plots.against_count(Figure().add_subplot(), [4, 5], {"D": [1.0, 2.0]})
     assert axes.lines[0].get_xydata().tolist() == [[4.0, 1.0], [5.0, 2.0]]
+
+
+def test_the_postures_of_an_arm_end_where_its_tip_is():
+    arm = SerialChain.from_dh([(0, 90, 100, 0), (300, 0, 0, 0)], sensor=Socket(2))
+    rows = np.array([[0.0, 0.0, 1.0], [90.0, 0.0, 0.0]])
+    figure = plots.postures(Figure(), arm, rows)
+    assert [axes.get_title() for axes in figure.axes] == ["1, socket 1", "2, socket 0"]
+    tips = [axes.lines[1].get_data_3d() for axes in figure.axes]
+    np.testing.assert_allclose(np.array(tips)[..., 0], [[300, 0, 100], [0, 300, 100]],
+                               atol=1e-9)  # fmt: skip
+    whole = arm.skeleton(rows)
+    assert whole.shape == (2, 4, 3)
+    np.testing.assert_allclose(whole[:, 2], [[0, 0, 100]] * 2, atol=1e-9)
+    assert list(arm.in_turn(rows[[0, 1, 0]])) == [0, 2, 1]

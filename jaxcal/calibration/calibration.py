@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration import file
 from jaxcal.calibration.check import Check, check, verification
+from jaxcal.calibration.discrepancy import WithHarmonics
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.inverse import Carry, limits_of, reach, solve_affine
 from jaxcal.calibration.summary import columns_of, summary
@@ -174,6 +175,8 @@ class Calibration(Fit):
     @property
     def arm(self) -> SerialChain:
         """The arm as calibrated, its parameters nominal, with Position()."""
+        if isinstance(self.whole, WithHarmonics):
+            return self.whole.calibrated(self.estimate)
         return self._chain().calibrated(self.parameters)
 
     def to_urdf(self, path: str | os.PathLike[str], *, force: bool = False) -> str:

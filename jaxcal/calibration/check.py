@@ -26,6 +26,7 @@ class Check:
 
     says: str  # "holds", "does not hold" or "cannot be told"
     p_value: float  # of readings at least this far off while it holds
+    power: float  # of a change of one parameter by ``tolerance``, mean of them all
     drift: dict[str, float]  # smallest change of each parameter seen with power 0.8
     unseen: tuple[str, ...]  # parameters whose drift by ``tolerance`` could hide
     tolerance: float  # root mean square of the outputs' change that matters
@@ -36,12 +37,12 @@ class Check:
             if self.says != "cannot be told"
             else ("whether the calibration holds cannot be told")
         )
-        text += f" (p = {self.p_value:.3g}, false alarms 5 %)"
+        text += (
+            f" (p = {self.p_value:.3g}, false alarms 5 %); a change by "
+            f"{self.tolerance:.3g} is seen with {self.power:.0%} on average"
+        )
         if self.says == "cannot be told":
-            text += (
-                f"; a drift by {self.tolerance:.3g} could hide in "
-                f"{', '.join(self.unseen)}"
-            )
+            text += f", and could hide in {', '.join(self.unseen)}"
         return text
 
 
@@ -64,7 +65,6 @@ def check(
     noise = calibration.noise_std
     if noise is None:
         raise ValueError("no check: the noise of the calibration is not known")
-    covariance = np.asarray(calibration.covariance)
     model, theta = calibration.model, calibration.parameters
     slopes = np.asarray(model.jacobian(commands, theta))
     p, q = slopes.shape[-1], slopes.shape[1]
@@ -72,7 +72,9 @@ def check(
         raise ValueError(f"measured must have {q} columns, got {measured.shape[1]}")
     off = (measured - calibration.predict(commands)).ravel()
     rows = slopes.reshape(-1, p)
-    whole = np.diag(np.tile(noise**2, len(commands))) + rows @ covariance @ rows.T
+    known, covariance = calibration.linear(commands)
+    known = known.reshape(len(rows), -1)
+    whole = np.diag(np.tile(noise**2, len(commands))) + known @ covariance @ known.T
     root = np.linalg.inv(np.linalg.cholesky(whole))
     white, by = root @ off, root @ rows
     names = calibration.names
@@ -91,7 +93,8 @@ def check(
         p_value = float(special.chdtrc(freedom, square))
     else:
         p_value = float(special.fdtrc(freedom, calibration.noise_dof, square / freedom))
-    needed = _noncentrality(freedom)
+    limit = float(special.chdtri(freedom, 0.05))
+    needed = _noncentrality(freedom, limit)
     free = (calibration.free[:p] > 0.0) & ~own
     seen = np.sqrt((by**2).sum(axis=0))
     size = np.sqrt(needed) / np.where(seen > 0.0, seen, np.nan)
@@ -103,7 +106,10 @@ def check(
     used = np.asarray(model.jacobian(calibration.commands, theta))
     per_unit = np.sqrt((used**2).mean(axis=(0, 1)) * q)
     moved = np.where(np.isnan(size), np.inf, np.nan_to_num(size)) * per_unit
-    hidden = free & (per_unit > 0.0) & (moved > matters)
+    judged = free & (per_unit > 0.0)
+    hidden = judged & (moved > matters)
+    shifts = (matters * seen[judged] / per_unit[judged]) ** 2
+    power = float(np.mean(1.0 - special.chndtr(limit, freedom, shifts)))
     if p_value < 0.05:
         says = "does not hold"
     else:
@@ -111,6 +117,7 @@ def check(
     return Check(
         says=says,
         p_value=p_value,
+        power=power,
         drift={
             name: float(value) if np.isfinite(value) else np.inf
             for name, value, is_free in zip(names, size, free, strict=True)
@@ -121,11 +128,10 @@ def check(
     )
 
 
-def _noncentrality(freedom: int) -> float:
-    """Of a chi-square that exceeds the 5 % limit with the power that is asked for."""
+def _noncentrality(freedom: int, limit: float) -> float:
+    """Of a chi-square that exceeds ``limit`` with the power that is asked for."""
     from scipy import optimize, special
 
-    limit = special.chdtri(freedom, 0.05)
     return float(
         optimize.brentq(
             lambda size: 1.0 - special.chndtr(limit, freedom, size) - _POWER, 1e-3, 1e4
@@ -152,8 +158,8 @@ def verification(
         raise ValueError("no verification: the noise of the calibration is not known")
     model, theta = calibration.model, calibration.parameters
     slopes = np.asarray(model.jacobian(points, theta))
-    covariance = np.asarray(calibration.covariance)
-    spread = slopes @ covariance @ np.matrix_transpose(slopes) + np.diag(noise**2)
+    known, covariance = calibration.linear(points)
+    spread = known @ covariance @ np.matrix_transpose(known) + np.diag(noise**2)
     white = np.linalg.inv(np.linalg.cholesky(spread)) @ slopes
     seen = (white**2).sum(axis=1)  # (M, p) by a drift of one
     where = calibration.commands if region is None else table("region", region)

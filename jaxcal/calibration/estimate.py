@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.discrepancy import WithDiscrepancy
+from jaxcal.calibration.discrepancy import WithDiscrepancy, WithHarmonics
 from jaxcal.calibration.sizes import Sizes, group_sizes, of_sizes
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
 from jaxcal.checks import in_words, one_of, whole_number
@@ -93,26 +93,30 @@ def fit_model(
     asked = prior is not None
     prior = prior or model.default_prior()
     resolved = prior.resolve(model)
-    whole, extra = model, np.zeros(0)
+    whole, extra = model, np.zeros(0)  # precision of what is added, 0: estimated
     if discrepancy is not None:
         features = whole_number("discrepancy", discrepancy, 1)
         whole = WithDiscrepancy.over(model, commands[used], features)  # type: ignore[assignment]  # as far as a fit needs it
         extra = np.zeros(features * measured.shape[1])
+    elif isinstance(model, SerialChain) and model.sensor.harmonic:
+        if not (asked or spread.any() or model.harmonics):
+            whole = WithHarmonics(model)  # type: ignore[assignment]  # likewise
+            extra = whole.std**-2.0  # type: ignore[attr-defined]  # see above
     task = Task(
         model=whole,
         commands=commands[used],
         measured=measured[used],
         white=white[used],
-        mean=np.concatenate([resolved.mean, extra]),
+        mean=np.concatenate([resolved.mean, 0.0 * extra]),
         precision=np.concatenate([np.diagonal(resolved.precision), extra]),
-        free=np.concatenate([resolved.free, extra == 0.0]),
+        free=np.concatenate([resolved.free, extra >= 0.0]),
         sized=np.concatenate([resolved.free & False, extra == 0.0]),
         command_std=spread,
         known=known,
         per_output=common_noise is False,
         student=loss == "student",
     )
-    beyond = extra.size or spread.any()  # what the sizes are not made for
+    beyond = discrepancy is not None or spread.any()  # what the sizes are not made for
     sizes: Sizes | None = None
     if prior.by_data and (asked or not beyond):
         if not isinstance(model, SerialChain) or beyond:

@@ -13,9 +13,10 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from jaxcal.calibration.discrepancy import WithHarmonics
 from jaxcal.calibration.fit import Fit
 from jaxcal.files import write_text
-from jaxcal.models import Affine, Model, from_dict
+from jaxcal.models import Affine, Model, SerialChain, from_dict
 
 __all__ = ["content_of", "fields", "read", "write"]
 
@@ -164,6 +165,9 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
         )
     features = 0 if found["phases"] is None else len(found["phases"])
     expected = len(names) + features * len(found["output_names"])
+    if isinstance(model, SerialChain) and not features:
+        whole = len(WithHarmonics(model).names)
+        expected = whole if len(found["estimate"]) == whole else expected
     if len(found["estimate"]) != expected:
         raise ValueError(f'"estimate" must have shape ({expected},)')
     if (found["noise_std"] is None) != (found["joint_covariance"] is None):

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration.discrepancy import WithDiscrepancy
+from jaxcal.calibration.discrepancy import WithDiscrepancy, WithHarmonics
 from jaxcal.checks import numbers
-from jaxcal.models import Affine, Model, Prior, identifiability
+from jaxcal.models import Affine, Model, Prior, SerialChain, identifiability
 from jaxcal.models.checked import derivative, predict
 from jaxcal.models.identifiability import Identifiability
 
@@ -223,11 +223,7 @@ class Fit:
         """
         points = self.points("commands", commands, self.num_inputs)
         noise = self._require_noise("prediction uncertainty")
-        rows = points.reshape(-1, self.num_inputs)
-        if self.centre is not None:
-            rows = rows - self.centre
-        slopes = derivative(self.whole, rows, self.estimate)
-        covariance = np.asarray(self.joint_covariance)
+        slopes, covariance = self.linear(points.reshape(-1, self.num_inputs))
         variance = ((slopes @ covariance) * slopes).sum(axis=-1)
         std = np.sqrt(np.maximum(variance, 0.0) + float(new_measurement) * noise**2)
         if self.unidentified is not None:
@@ -238,9 +234,22 @@ class Fit:
 
     # -- inside ------------------------------------------------------------------------
 
+    def linear(self, rows: Array) -> tuple[Array, Array]:
+        """(N, m, P) derivatives of predictions at ``rows`` (N, n), and what varies.
+
+        The latter is the covariance (P, P) of all parameters.
+        """
+        if self.centre is not None:
+            rows = rows - self.centre
+        slopes = derivative(self.whole, rows, self.estimate)
+        return slopes, np.asarray(self.joint_covariance)
+
     @property
     def whole(self) -> Model:
         """The model with its discrepancy."""
+        more = len(self.estimate) > len(self.names)
+        if more and self.phases is None and isinstance(self.model, SerialChain):
+            return WithHarmonics(self.model)  # type: ignore[return-value]  # likewise
         if self.frequencies is None or self.phases is None:
             return self.model
         return WithDiscrepancy(self.model, self.frequencies, self.phases)  # type: ignore[return-value]  # no prior, no file of its own

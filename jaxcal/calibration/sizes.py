@@ -28,7 +28,8 @@ Array = NDArray[np.float64]
 _THOUGHT = np.log(3.0)  # standard deviation of the logarithm of each factor
 _MOST = 5.0  # of a logarithm
 _SCORES = 100  # steps of Fisher's scoring, at most
-_GROUPS = 4  # lengths, turns of the axes, zeros of the joints, their compliance
+_GROUPS = 5  # lengths, turns of the axes, zeros of the joints, compliance, harmonics
+_WAVES = (" sin", " cos", " sin2", " cos2")
 
 
 class Sizes(NamedTuple):
@@ -51,12 +52,13 @@ def group_sizes(
         found: a fit with any such prior; the model is made linear there.
         before: where the search begins; with factors of one where there is nothing.
     """
-    p = len(arm.names)
+    p = len(task.mean)
     groups = np.full(p, -1)
     groups[: arm.table.size].reshape(-1, 5)[:] = [0, 1, 0, 2, 1]
-    groups[np.array(arm.units) == "deg per torque"] = 3
+    groups[np.flatnonzero(np.array(arm.units) == "deg per torque")] = 3
+    groups[[name.endswith(_WAVES) for name in task.model.names]] = 4
     rows, right = _reduced(arm, task, found)
-    sized = groups[task.free[:p] & (task.precision[:p] > 0.0)]
+    sized = groups[task.free & (task.precision > 0.0)]
     count, width = len(right), rows.shape[1]
     # All that the readings say is in a triangle; the rest of them is noise alone.
     triangle = np.asarray(np.linalg.qr(np.column_stack([rows, right]), mode="r"))
@@ -154,16 +156,15 @@ def _reduced(arm: SerialChain, task: Task, found: Solution) -> tuple[Array, Arra
     In units of the noise, the usual one where it is not known, and free of the
     parameters of which nothing is known.
     """
-    p = len(arm.names)
-    theta, free, precision = found.parameters[:p], task.free[:p], task.precision[:p]
+    theta, free, precision = found.parameters, task.free, task.precision
     white = task.white
     if not task.known:
         white = white / np.asarray(arm.default_noise().std)[:, None]
     white = white * np.sqrt(np.minimum(found.weights, 1.0))[:, None, None]
-    slopes = derivative(arm, task.commands, theta)
-    off = found.residuals[..., None] + slopes @ (theta - task.mean[:p])[:, None]
+    slopes = derivative(task.model, task.commands, theta)
+    off = found.residuals[..., None] + slopes @ (theta - task.mean)[:, None]
     right = (white @ off).ravel()
-    rows = (white @ slopes).reshape(len(right), p)
+    rows = (white @ slopes).reshape(len(right), -1)
     known = rows[:, free & (precision > 0.0)]
     known = known / np.sqrt(precision[free & (precision > 0.0)])
     flat = rows[:, free & (precision == 0.0)]

@@ -70,8 +70,8 @@ def verdict(calibration: Fit) -> Verdict | None:
     commands, residuals = calibration.commands[used], calibration.residuals[used]
     usual = np.asarray(model.default_noise().std)
     size = usual / usual[0]  # readings of two units are compared in noise
-    errors = np.linalg.norm(_left_out(calibration, model, used) / size, axis=1)
-    measured = residuals + model.predict(commands, calibration.parameters)
+    errors = np.linalg.norm(_left_out(calibration, used) / size, axis=1)
+    measured = residuals + calibration.predict(commands)
     at = model.located(commands, measured)
     before = measured - at.predict(commands)
     for rows in _groups(at, commands):  # a socket's place is no merit of either
@@ -105,11 +105,11 @@ def verdict(calibration: Fit) -> Verdict | None:
     )
 
 
-def _left_out(calibration: Fit, model: SerialChain, used: NDArray[np.intp]) -> Array:
+def _left_out(calibration: Fit, used: NDArray[np.intp]) -> Array:
     """(N, q) residual of each measurement from the fit without it."""
     noise = np.diag(np.asarray(calibration.noise_std) ** 2)
-    slopes = model.jacobian(calibration.commands[used], calibration.parameters)
-    spread = slopes @ np.asarray(calibration.covariance) @ np.matrix_transpose(slopes)
+    slopes, covariance = calibration.linear(calibration.commands[used])
+    spread = slopes @ covariance @ np.matrix_transpose(slopes)
     # Of an outlier little was fitted: its weight says how much.
     share = np.minimum(calibration.loss_weights[used], 1.0)[:, None, None]
     root = np.linalg.inv(np.sqrt(noise))
@@ -248,7 +248,7 @@ def _swapped(calibration: Fit, model: SerialChain) -> dict[int, int]:
         trial = calibration.commands[at]
         there = trial[:, model.num_joints] == other
         trial[:, model.num_joints] = other
-        off = model.predict(trial, calibration.parameters) / noise
+        off = calibration.predict(trial) / noise
         fits = at[(np.abs(off).max(axis=1) < 4.0) & ~there]
         found |= dict.fromkeys(fits.tolist(), other)
     return dict(sorted(found.items()))

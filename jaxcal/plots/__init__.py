@@ -3,6 +3,7 @@
 ``figure, axes = matplotlib.pyplot.subplots()``, then ``plots.selection(axes, ...)``.
 """
 
+from jaxcal.plots.arm import postures
 from jaxcal.plots.curves import against_count, pareto, plan
 from jaxcal.plots.errors import before_after, residuals
 from jaxcal.plots.scatter import ellipsoid, selection
@@ -15,6 +16,7 @@ __all__ = [
     "ellipsoid",
     "pareto",
     "plan",
+    "postures",
     "residuals",
     "selection",
 ]

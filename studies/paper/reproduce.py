@@ -26,7 +26,7 @@ states, and judge its claims one by one. Writes into --out:
 
   index.html            the report: one file, opens offline, prints
   reproduction.json     every number in it
-  figures/*.png, *.svg  each figure; robot.png and robot.gif, the robot moving
+  figures/*.png, *.svg  each figure
   data/*.csv            what each figure is drawn from
 
 The policy is the one that ships (checkpoints/default). Training curves are read from
@@ -46,7 +46,7 @@ examples:
       other candidate sets, draws and devices: how much of it is luck?
 """
 _PARTS = (  # modules of exhibits, in the order in which they are computed
-    *("training", "calibration", "selection", "variance", "pictures", "tables"),
+    *("training", "calibration", "selection", "variance", "tables"),
     *("accuracy", "ellipsoids", "recalibration"),
 )
 _ORDER = (  # of the exhibits, that of the paper
@@ -91,13 +91,9 @@ def _run(options: argparse.Namespace, progress: Progress) -> None:
     progress.clear()
     for claim in judged:
         print(f"{claim.verdict:>15}  {claim.claim}: {claim.ours}")
-    for exhibit in exhibits:
-        if exhibit.notice:
-            print(f"note: {exhibit.notice}")
     print(
         f"saved: {options.out}/index.html, reproduction.json, "
-        f"{sum(len(e.figures) for e in exhibits)} figures, "
-        f"{sum(len(e.pictures) for e in exhibits)} pictures and "
+        f"{sum(len(e.figures) for e in exhibits)} figures and "
         f"{sum(len(e.data) for e in exhibits)} tables in "
         f"{time.perf_counter() - begun:.0f} s"
     )
@@ -137,7 +133,6 @@ def _files(
         svg, png = as_files(figure, "svg", "png")
         files |= {f"figures/{name}.svg": svg, f"figures/{name}.png": png}
     for exhibit in exhibits:
-        files |= {f"figures/{name}": p for name, p in exhibit.pictures.items()}
         for name, columns in exhibit.tables.items():
             files[f"data/{name}"] = csv_text(columns).encode()
     images = {name: files[f"figures/{name}.svg"] for name in figures}
@@ -152,7 +147,7 @@ def _write(out: pathlib.Path, files: dict[str, bytes]) -> None:
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(out / name) as file:
             file.write(data)
-    for folder, kinds in (("figures", (".png", ".svg", ".gif")), ("data", (".csv",))):
+    for folder, kinds in (("figures", (".png", ".svg")), ("data", (".csv",))):
         for path in (out / folder).iterdir():
             if path.suffix in kinds and f"{folder}/{path.name}" not in files:
                 path.unlink()

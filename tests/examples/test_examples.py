@@ -84,6 +84,21 @@ def test_camera_fit_is_the_joint_fit_of_all_poses():
 
 
 @pytest.mark.slow
+def test_ten_chosen_views_find_hand_and_eye_better_than_forty_by_algebra(tmp_path):
+    found, _ = quick("hand_eye", tmp_path)
+    assert np.mean(found["chosen (I)", 10]) < 0.5  # 0.38 is the noise
+    assert np.mean(found["chosen (I)", 10]) < np.mean(found["random", 10])
+    assert np.mean(found["closed form, random", 20]) > 1.0
+
+
+@pytest.mark.slow
+def test_two_chosen_postures_see_a_change_of_a_quarter_of_a_millimetre(tmp_path):
+    found, _ = quick("drift", tmp_path)
+    assert found["2 chosen", 0.25] > 0.9
+    assert found["2 chosen", 0.0] < 0.25
+
+
+@pytest.mark.slow
 def test_tcp_error_is_lower_with_i_on_every_arm(tmp_path):
     found, rows = quick("tcp", tmp_path)
     assert [row["poses"] for row in rows] == list(found)

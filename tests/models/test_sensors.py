@@ -68,6 +68,25 @@ def _distance(tip, row, own):
     return [np.linalg.norm(tip[:3, 3] - [x, y, z]) - zero]
 
 
+CORNERS = np.array([[x, y, 0.0] for x in (0.0, 30.0, 60.0) for y in (0.0, 40.0)])
+CAMERA = (800.0, 820.0, 320.0, 240.0)
+
+
+def _pixels(moves, tip, own):
+    """Corner by corner, by matrices of OpenCV's pinhole."""
+    nowhere = np.zeros(6)
+    x, y, z, *turn = _board(moves, tip, nowhere, own)
+    turn = Rotation.from_rotvec(turn, degrees=True).as_matrix()
+    inside = np.array(
+        [[CAMERA[0], 0.0, CAMERA[2]], [0.0, CAMERA[1], CAMERA[3]], [0, 0, 1]]
+    )
+    found = []
+    for corner in CORNERS:
+        u, v, w = inside @ (turn @ corner + [x, y, z])
+        found += [u / w, v / w]
+    return found
+
+
 # Sensor, columns of the commands after the joints, readings (tip, columns, own).
 CASES = {
     "position": (Position(), np.zeros((6, 0)), lambda tip, row, own: tip[:3, 3]),
@@ -94,6 +113,16 @@ CASES = {
         Board("board", PLACE),
         SEEN,
         lambda tip, row, own: _board("board", tip, row, own),
+    ),
+    "pixels on the tip": (
+        Board("camera", PLACE, CORNERS, CAMERA),
+        np.zeros((6, 0)),
+        lambda tip, row, own: _pixels("camera", tip, own),
+    ),
+    "pixels from afar": (
+        Board("board", PLACE, CORNERS, CAMERA),
+        np.zeros((6, 0)),
+        lambda tip, row, own: _pixels("board", tip, own),
     ),
 }
 
@@ -231,6 +260,15 @@ def test_hand_and_eye_are_found_without_a_guess(moves):
     np.testing.assert_allclose(found.tool, tool, atol=1e-8)
     np.testing.assert_allclose(found.sensor.place, PLACE, atol=1e-8)
     np.testing.assert_allclose(found.predict(commands), 0.0, atol=1e-8)
+    ahead = np.array(seen)[:, 2] > 0.0  # of the camera: the others' pixels do not exist
+    wide = ur5(sensor=Board(moves, None, CORNERS, CAMERA))
+    pixels = found.measured_with(
+        Board(moves, found.sensor.place, CORNERS, CAMERA)
+    ).predict(JOINTS[ahead])
+    if ahead.sum() > 2:
+        again = wide.located(JOINTS[ahead], pixels)
+        np.testing.assert_allclose(again.tool, tool, atol=1e-5)
+        np.testing.assert_allclose(again.sensor.place, PLACE, atol=1e-5)
     with pytest.raises(ValueError, match="about two axes at least"):
         still = np.repeat(commands[:1], 5, axis=0)
         model.located(still)
@@ -350,6 +388,8 @@ def test_a_sensor_of_ones_own_needs_no_more_than_a_class():
         (lambda: Plane(1, [[0, 0, 0, 1]]), "must have normals other than zero"),
         (lambda: Gravity(up=(0, 0, 0)), "up must be a direction"),
         (lambda: Gravity(0.0), "magnitude must be positive"),
+        (lambda: Board(corners=np.eye(3)), "corners must be four or more rows"),
+        (lambda: Board(corners=CORNERS), "camera must be .fx, fy, cx, cy. in pixels"),
         (lambda: Board("hand"), "moves must be one of camera, board"),
         (lambda: Several((Position(),)), "sensors must hold two sensors or more"),
         (lambda: ur5(sensor=Socket(noise=-1.0)).default_noise(), "noise of the sensor"),

@@ -40,6 +40,10 @@ def tool_frame(model, command, values):
     ]
     for i, kind in enumerate(model.joints, start=1):
         move = values.get(f"gear{i}", 1.0) * command[i - 1]
+        for wave, times in (("sin", 1), ("cos", 1), ("sin2", 2), ("cos2", 2)):
+            shape = np.sin if wave.startswith("sin") else np.cos
+            amplitude = values.get(f"theta{i} {wave}", 0.0)
+            move += amplitude * shape(times * np.radians(command[i - 1]))
         theta, d = values[f"theta{i}"], values[f"d{i}"]
         joint = [
             _turn("z", theta + (move if kind == "R" else 0.0)),
@@ -255,3 +259,35 @@ def test_commands_and_parameters_of_other_shapes_are_refused():
         ur5().predict(np.zeros((3, 5)))
     with pytest.raises(ValueError, match=r"parameters must have shape \(39,\)"):
         ur5().jacobian(np.zeros((3, 6)), np.zeros(38))
+
+
+def test_harmonics_move_the_joints_and_have_derivatives():
+    model = ur5(harmonics=(2, 3, 5), gears=(3,))
+    rng = np.random.default_rng(0)
+    joints = rng.uniform(-120.0, 120.0, (5, 6))
+    theta = model.nominal + rng.normal(size=len(model.names))
+    theta[model.names.index("gear3")] = 1.01
+    values = dict(zip(model.names, theta, strict=True))
+    expected = [tool_frame(model, row, values)[:3, 3] for row in joints]
+    np.testing.assert_allclose(model.predict(joints, theta), expected, atol=1e-9)
+    numeric = differences(lambda at: model.predict(joints, at), theta)
+    np.testing.assert_allclose(model.jacobian(joints, theta), numeric, atol=1e-5)
+    rate = np.stack(
+        [
+            (model.predict(joints + by, theta) - model.predict(joints - by, theta))
+            / 2e-4
+            for by in 1e-4 * np.eye(6)
+        ],
+        axis=-1,
+    )
+    np.testing.assert_allclose(model.command_jacobian(joints, theta), rate, atol=1e-5)
+    again = model.calibrated(theta)
+    np.testing.assert_allclose(again.predict(joints), expected, atol=1e-9)
+    assert from_dict(model.to_dict()).to_dict() == model.to_dict()
+
+
+def test_harmonics_are_of_revolute_joints():
+    with pytest.raises(ValueError, match="harmonics must name revolute joints, joint"):
+        SerialChain.from_dh([(0, 0, 0, 0)], joints="P", harmonics=[1])
+    with pytest.raises(ValueError, match=r"waves must have shape \(1, 4\)"):
+        ur5(harmonics=[1], waves=[0.1])

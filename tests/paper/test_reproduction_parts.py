@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import pathlib
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,9 +14,7 @@ from scipy import stats
 from jaxcal.calibration.identify import identify
 from jaxcal.evaluation.csv_rows import csv_text
 from jaxcal.evaluation.parameters import least_squares, predict
-from jaxcal.paper.datasets import make_dataset
 from jaxcal.plots import as_bytes
-from studies.paper.exhibits import pictures
 from studies.paper.exhibits.devices import Device
 from studies.paper.exhibits.intervals import (
     bootstrap_interval,
@@ -159,26 +155,6 @@ def test_recordings_can_be_given(tmp_path: pathlib.Path) -> None:
     assert given.about_overlap("dataset4") == ""  # 5,000 are used as they stand
     assert str(tmp_path) in given.settings.about_recordings
     assert "500 postures" in Material(Settings()).about_overlap("dataset4")
-
-
-def test_a_report_without_opengl_says_why_it_has_no_picture(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def fail(*_: object) -> None:
-        raise ImportError("no EGL here")
-
-    monkeypatch.setattr(pictures, "_renderer", fail)
-    chosen = SimpleNamespace(indices=np.arange(4).reshape(1, 1, 4))
-    material = SimpleNamespace(
-        settings=Settings(quick=True),
-        dataset=functools.partial(make_dataset, seed=0, episodes=1),
-        result=lambda *_: chosen,
-        progress=lambda *_: None,
-    )
-    (found,) = pictures.exhibits(material)
-    assert found.notice.startswith("MuJoCo cannot draw here: no EGL here; ")
-    assert "\n" not in found.notice and found.notice in found.caption
-    assert found.pictures == {}
 
 
 # -- training --------------------------------------------------------------------------

@@ -127,7 +127,7 @@ def test_the_scores_are_those_of_jax_in_double_precision(rng, config, n, k, made
     else:
         points = jnp.zeros((1, 14, n)), jnp.ones((1, 14), bool)
         chosen = jnp.full((1, k), -1)
-        params = drawn_parameters(build(config), *points, chosen, points[1])
+        params = drawn_parameters(build(config), *points, chosen)
     network = build(config)
     chosen = np.full((5, k), -1)
     chosen[:, :made] = np.arange(made)
@@ -198,7 +198,7 @@ def test_samples_are_drawn_from_the_policy(rng):
     network = build(config)
     problems, _, available, _ = drawn(rng, 1, 6, 2, 3)
     begin = jnp.zeros((1, 6, 2)), jnp.ones((1, 6), bool), jnp.full((1, 3), -1)
-    params = drawn_parameters(network, *begin, begin[1])
+    params = drawn_parameters(network, *begin)
     policy = CompactNetwork(dataclasses.asdict(config), weights.flat(params))
     picks = policy(problems * 4000, "samples", 1, seed=1)
     x = np.ascontiguousarray(problems[0].rows.T)[None] * np.sqrt(6)
@@ -260,7 +260,7 @@ def papers(tmp_path_factory):
     config = NetworkConfig(kind="paper", width=16)
     network = build(config)
     points = jnp.zeros((1, 10, 3)), jnp.ones((1, 10), bool), jnp.full((1, 4), -1)
-    params = drawn_parameters(network, *points, points[1])
+    params = drawn_parameters(network, *points)
     environment = dataclasses.asdict(SelectionConfig(num_candidates=10))
     folder = tmp_path_factory.mktemp("paper")
     meta = {

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import pathlib
 import time
 import types
@@ -17,8 +18,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from brax.training import distribution
-from brax.training.agents.ppo import networks as brax_networks
 from brax.training.agents.ppo import train as brax_train
+from brax.training.agents.ppo.networks import PPONetworks
 from brax.training.networks import FeedForwardNetwork
 
 from jaxcal.learning.core.network import initial
@@ -30,9 +31,9 @@ from jaxcal.learning.settings import settings_of
 from jaxcal.learning.training import checkpoint
 from jaxcal.learning.training.config import TrainConfig
 
-__all__ = ["READ", "MaskedCategorical", "adapted", "require_read", "train"]
+__all__ = ["adapted", "require_read", "train"]
 
-READ = {
+_READ = {  # fields of the optimisation that brax is given, and its names of them
     "learning_rate": "learning_rate",
     "entropy_start": "entropy_cost",
     "discount": "discounting",
@@ -40,16 +41,10 @@ READ = {
     "clip_range": "clipping_epsilon",
     "max_grad_norm": "max_grad_norm",
 }
-"""Fields of PPOConfig that brax is given, and its names of them; beside them the number
-of episodes, the seed, the environment and the network's width."""
-_FIXED = {
-    "num_envs": 256,
-    "num_eval_envs": 256,
-    "batch_size": 64,
-    "num_minibatches": 16,
-    "num_updates_per_batch": 4,
-    "normalize_observations": False,
-}
+_FIXED = dict(
+    num_envs=256, num_eval_envs=256, batch_size=64, num_minibatches=16,
+    num_updates_per_batch=4, normalize_observations=False,
+)  # fmt: skip
 _WIDTH = 64  # of the network, where the preset has another kind
 _FASTEST = 1e-3  # learning rate; brax's updates diverge at the compact preset's 2e-3
 
@@ -58,23 +53,21 @@ def adapted(config: TrainConfig) -> TrainConfig:
     """A preset as brax trains it: another architecture, a learning rate it bears."""
     width = config.network.width if config.network.kind == "paper" else _WIDTH
     rate = min(config.ppo.learning_rate, _FASTEST)
-    return dataclasses.replace(
-        config,
-        network=NetworkConfig(kind="paper", width=width),
-        ppo=dataclasses.replace(config.ppo, learning_rate=rate),
-    )
+    ppo = dataclasses.replace(config.ppo, learning_rate=rate)
+    network = NetworkConfig(kind="paper", width=width)
+    return dataclasses.replace(config, network=network, ppo=ppo)
 
 
 def require_read(given: Collection[str]) -> None:
     """Refuse values of fields, by name, that brax's trainer would not read."""
-    read = {*READ, "num_episodes", "seed", "width"}
+    read = {*_READ, "num_episodes", "seed", "width"}
     read |= {field.name for field in settings_of(SelectionConfig)}
     if unread := sorted(set(given) - read):
         flags = ", ".join("--" + name.replace("_", "-") for name in unread)
         raise ValueError(f"--trainer brax does not read {flags}: leave it out")
 
 
-class MaskedCategorical(distribution.ParametricDistribution):
+class _MaskedCategorical(distribution.ParametricDistribution):
     """brax's distribution interface over logits that the network has masked."""
 
     def __init__(self, num_actions: int) -> None:
@@ -89,32 +82,30 @@ class MaskedCategorical(distribution.ParametricDistribution):
             index = x.astype(jnp.int32)[..., None]
             return jnp.take_along_axis(log_probs, index, axis=-1)[..., 0]
 
-        # brax's loss logs ``loc`` and ``scale`` of every distribution; a categorical
-        # one has neither, so it is given its largest probability and its entropy.
         return types.SimpleNamespace(
-            sample=lambda seed: jax.random.categorical(seed, log_probs),
+            sample=functools.partial(jax.random.categorical, logits=log_probs),
             mode=lambda: jnp.argmax(log_probs, axis=-1),
             log_prob=log_prob,
             entropy=lambda: entropy,
+            # brax's loss logs these two of every distribution.
             loc=jnp.exp(log_probs).max(-1),
             scale=entropy,
         )
 
 
-def _networks(env: SelectionConfig, config: NetworkConfig) -> brax_networks.PPONetworks:
+def _networks(env: SelectionConfig, config: NetworkConfig) -> PPONetworks:
     """A network read from the observation, for the policy and the value."""
-    network = build(config)
-    m, n = env.num_candidates, env.num_inputs
+    network, m, n = build(config), env.num_candidates, env.num_inputs
 
     def read(part: int) -> FeedForwardNetwork:
-        return FeedForwardNetwork(
-            init=lambda key: initial(network, key, m, n, env.num_selected),
-            apply=lambda _, params, observation: network.apply(
-                {"params": params}, observation, m, n, method="from_observation"
-            )[part],
-        )
+        def apply(_: Any, params: Any, observation: jax.Array) -> Any:
+            weights, method = {"params": params}, "from_observation"
+            return network.apply(weights, observation, m, n, method=method)[part]
 
-    return brax_networks.PPONetworks(read(0), read(1), MaskedCategorical(m))
+        begin = functools.partial(initial, network, m=m, n=n, k=env.num_selected)
+        return FeedForwardNetwork(init=begin, apply=apply)
+
+    return PPONetworks(read(0), read(1), _MaskedCategorical(m))
 
 
 @contextlib.contextmanager
@@ -124,11 +115,12 @@ def _repaired() -> Iterator[None]:
     It calls ``jax.device_put_replicated``, which jax removed (google/brax issue 671;
     its main branch is mended, its newest release is not), and promotes ranks.
     """
+
+    def replicated(tree: Any, devices: list[Any]) -> Any:
+        return jax.tree.map(lambda leaf: jnp.stack([leaf] * len(devices)), tree)
+
     missing = not hasattr(jax, "device_put_replicated")
-    if missing:
-        vars(jax)["device_put_replicated"] = lambda tree, devices: jax.tree.map(
-            lambda leaf: jnp.stack([leaf] * len(devices)), tree
-        )
+    vars(jax).setdefault("device_put_replicated", replicated)
     try:
         with jax.numpy_rank_promotion("allow"):
             yield
@@ -155,22 +147,17 @@ def train(
         num_evals: how often brax reports.
         watch: called with the step and the policy's parameters at every report.
     """
-    task, ppo = config.tasks[0], config.ppo
+    task, episodes = config.tasks[0], config.ppo.num_episodes
     env, length = task.environment, task.environment.num_selected
-    read = {name: getattr(ppo, name) for name in READ}
-    given = {
-        **_FIXED,
-        **{READ[name]: value for name, value in read.items()},
-        **{"num_timesteps": ppo.num_episodes * length, "num_evals": num_evals},
-        **{"seed": config.seed, "episode_length": length, "unroll_length": length},
-    }
+    read = {name: getattr(config.ppo, name) for name in _READ}
+    given = _FIXED | {_READ[name]: value for name, value in read.items()}
+    given |= {"num_timesteps": episodes * length, "num_evals": num_evals}
+    given |= {"episode_length": length, "unroll_length": length, "seed": config.seed}
     begun = time.perf_counter()
 
     def progress(steps: int, metrics: dict[str, Any]) -> None:
-        say(
-            f"{steps:10,d} decisions  {time.perf_counter() - begun:7.1f} s  "
-            f"mean log det S {metrics['eval/episode_log_det']:.3f}"
-        )
+        log_det, seconds = metrics["eval/episode_log_det"], time.perf_counter() - begun
+        say(f"{steps:10,d} decisions  {seconds:7.1f} s  mean log det S {log_det:.3f}")
 
     say("brax is compiling (about half a minute) ...")
     with _repaired():
@@ -184,15 +171,12 @@ def train(
         )
     meta = config.as_meta() | {
         "network": {"kind": config.network.kind, "width": config.network.width},
-        "ppo": read | {"num_episodes": ppo.num_episodes},
-        "trainer": "brax",
-        "brax": given,
+        "ppo": read | {"num_episodes": episodes},
+        **{"trainer": "brax", "brax": given},
         "progress": {
-            "episodes": ppo.num_episodes,
+            "episodes": episodes,
             "seconds": time.perf_counter() - begun,
             "device": jax.devices()[0].device_kind,
         },
     }
-    checkpoint.save(
-        pathlib.Path(folder) / "checkpoint", ppo.num_episodes, params[1], meta
-    )
+    checkpoint.save(pathlib.Path(folder) / "checkpoint", episodes, params[1], meta)

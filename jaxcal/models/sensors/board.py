@@ -19,25 +19,33 @@ Array = NDArray[np.float64]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Board(Sensor):
-    """Six zeros a view: the board's pose in the camera, predicted less seen.
+    """The board's pose in the camera, or the pixels of its corners.
 
-    Commands have six more columns, the board's pose in the camera as it was seen:
-    ``seen x``, ``y``, ``z`` and its rotation vector ``seen rx``, ``ry``, ``rz`` in
-    degrees (OpenCV's tvec and rvec, that in degrees). What is measured is zero. Where
-    the arm stands is not shown, so ``base`` is held; ``stand`` is the pose of what
-    stands still, ``tool`` of what moves, and both are found without a guess. Noise
-    0.1 % of the arm's length and 0.1 degrees.
+    Where the arm stands is not shown, so ``base`` is held; ``stand`` is the pose of
+    what stands still, ``tool`` of what moves, and both are found without a guess.
+
+    Without ``corners`` a view is six zeros, the board's pose in the camera as predicted
+    less seen. Commands have six more columns, that pose as it was seen: ``seen x``,
+    ``y``, ``z`` and its rotation vector ``seen rx``, ``ry``, ``rz`` in degrees (the
+    tvec and rvec of OpenCV). Noise 0.1 % of the arm's length, 0.1 degrees, or
+    ``Noise(covariance=...)`` of the views.
+
+    With ``corners`` it is their pixels, u and v of each, lens distortion taken out;
+    noise 0.3 pixels.
 
     Attributes:
         moves: "camera" or "board", which is on the tip.
         place: (4, 4) of the other in the measuring frame; found when not given.
+        corners: (C, 3) of the board in its own frame, in its plane z = 0.
+        camera: focal lengths and centre in pixels (fx, fy, cx, cy).
     """
 
     moves: str = "camera"
     place: Array | None = None
+    corners: Array | None = None
+    camera: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     kind = "board"
-    zeros = True
     tool = ("x", "y", "z", "rx", "ry", "rz")
     _seen: ClassVar[tuple[str, ...]] = tuple(f"seen {axis}" for axis in tool)
 
@@ -48,14 +56,37 @@ class Board(Sensor):
             if place.shape != (4, 4):
                 raise ValueError(f"place must have shape (4, 4), got {place.shape}")
             object.__setattr__(self, "place", place)
+        if self.corners is None:
+            return
+        corners = numbers("corners", self.corners)
+        flat = corners.ndim == 2 and corners.shape[1] == 3 and len(corners) > 3
+        if not flat or corners[:, 2].any():
+            raise ValueError(
+                "corners must be four or more rows (x, y, 0), got shape "
+                f"{corners.shape}"
+            )
+        camera = numbers("camera", self.camera)
+        if camera.shape != (4,) or not (camera[:2] > 0.0).all():
+            raise ValueError(
+                "camera must be (fx, fy, cx, cy) in pixels where corners are given, "
+                f"got {self.camera!r}"
+            )
+        object.__setattr__(self, "corners", corners)
+        object.__setattr__(self, "camera", tuple(camera.tolist()))
+
+    @property
+    def zeros(self) -> bool:  # type: ignore[override]  # of a pose
+        return self.corners is None
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        return self._seen
+        return self._seen if self.corners is None else ()
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        return tuple(f"off {axis}" for axis in self.tool)
+        if self.corners is None:
+            return tuple(f"off {axis}" for axis in self.tool)
+        return tuple(f"{a}{i + 1}" for i in range(len(self.corners)) for a in "uv")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -71,7 +102,7 @@ class Board(Sensor):
         return np.concatenate([place[:3, 3], np.zeros(3)])
 
     def usual_noise(self, length: float) -> ArrayLike:
-        return [1e-3 * length] * 3 + [0.1] * 3
+        return [1e-3 * length] * 3 + [0.1] * 3 if self.corners is None else 0.3
 
     def unseen(self, arm: Named) -> tuple[str, ...]:
         return BASE
@@ -88,30 +119,40 @@ class Board(Sensor):
         axes.append((turns[0] * turns[1]).apply(np.eye(3)[2]))
         turn = np.radians(np.stack(axes, axis=1))  # of the stand, by its angles
         count, moved = len(inputs), tip.position - own[:3]
-        seen = Rotation.from_rotvec(inputs[:, 3:], degrees=True).as_matrix()
+        # How the board shifts and turns in the camera, by the tip and by the stand.
+        by_tip, by_own = np.zeros((2, count, 6, 6))
         if self.moves == "board":  # its pose in a camera that stands
             eye = np.broadcast_to(stand.T, (count, 3, 3))
-            board, where = stand.T @ tip.rotation, moved @ stand
-            by_shift, sign = eye, 1.0
-            by_turn = -eye @ hats(moved)  # of the camera about its own place, reversed
+            board, where, sign = stand.T @ tip.rotation, moved @ stand, 1.0
+            by_own[:, :3, 3:] = eye @ hats(moved) @ turn
         else:  # the pose of a board that stands, in a camera on the tip
             eye = np.matrix_transpose(tip.rotation)
-            board, where = eye @ stand, -(eye @ moved[..., None])[..., 0]
-            by_shift, sign = -eye, -1.0
-            by_turn = -eye @ hats(moved)
-        off = np.asarray(
-            Rotation.from_matrix(board @ np.matrix_transpose(seen)).as_rotvec()
-        )
-        rate = np.degrees(rotation_vector_rate(off)) @ eye
-        by_tip, by_own = np.zeros((2, count, 6, 6))
-        by_tip[:, :3, :3], by_own[:, :3, :3] = by_shift, -by_shift
-        by_tip[:, 3:, 3:], by_own[:, 3:, 3:] = sign * rate, -sign * (rate @ turn)
-        if self.moves == "board":
-            by_own[:, :3, 3:] = -by_turn @ turn
-        else:
-            by_tip[:, :3, 3:] = by_turn
-        values = np.hstack([where - inputs[:, :3], np.degrees(off)])
-        return Reading(values, by_tip, by_own)
+            where, sign = -(eye @ moved[..., None])[..., 0], -1.0
+            board = eye @ stand
+            by_tip[:, :3, 3:] = -eye @ hats(moved)
+        by_tip[:, :3, :3], by_own[:, :3, :3] = sign * eye, -sign * eye
+        by_tip[:, 3:, 3:], by_own[:, 3:, 3:] = sign * eye, -sign * (eye @ turn)
+        if self.corners is None:
+            seen = Rotation.from_rotvec(inputs[:, 3:], degrees=True).as_matrix()
+            gap = Rotation.from_matrix(board @ np.matrix_transpose(seen))
+            off = np.asarray(gap.as_rotvec())
+            rate = np.degrees(rotation_vector_rate(off))
+            for each in (by_tip, by_own):
+                each[:, 3:] = rate @ each[:, 3:]
+            values = np.hstack([where - inputs[:, :3], np.degrees(off)])
+            return Reading(values, by_tip, by_own)
+        spokes = self.corners @ np.matrix_transpose(board)  # (N, C, 3)
+        points = spokes + where[:, None]
+        focal, centre = np.array(self.camera).reshape(2, 2)
+        deep = np.where(points[..., 2:] != 0.0, points[..., 2:], np.nan)
+        pixels = focal * points[..., :2] / deep + centre
+        rate = np.zeros((*points.shape[:2], 2, 3))
+        rate[..., [0, 1], [0, 1]] = focal / deep
+        rate[..., 2] = -focal * points[..., :2] / deep**2
+        motion = np.concatenate([rate, -rate @ hats(spokes)], axis=-1)
+        motion = motion.reshape(count, -1, 6)
+        values = pixels.reshape(count, -1)
+        return Reading(values, motion @ by_tip, motion @ by_own)
 
     def located(
         self, tip: Tip, inputs: Array, measured: Array | None
@@ -119,12 +160,15 @@ class Board(Sensor):
         """Tool X and place Z of ``A X = Z B`` in closed form (Shah, 2013)."""
         from scipy.spatial.transform import Rotation
 
-        if self.place is not None:
+        if self.place is not None or (self.corners is not None and measured is None):
             return self, None
         if len(inputs) < 3:
             raise ValueError(f"place must be given for {len(inputs)} views, 3 find it")
-        turn = Rotation.from_rotvec(inputs[:, 3:], degrees=True).as_matrix()
-        shift = inputs[:, :3]
+        if self.corners is None or measured is None:
+            turn = Rotation.from_rotvec(inputs[:, 3:], degrees=True).as_matrix()
+            shift = inputs[:, :3]
+        else:
+            turn, shift = self._poses(measured)
         if self.moves == "camera":
             turn = np.matrix_transpose(turn)
             shift = -(turn @ shift[..., None])[..., 0]
@@ -146,6 +190,30 @@ class Board(Sensor):
         new[:3, :3], new[:3, 3] = tool, shifts[:3]
         place[:3, :3], place[:3, 3] = stand, shifts[3:]
         return dataclasses.replace(self, place=place), new
+
+    def _poses(self, pixels: Array) -> tuple[Array, Array]:
+        """Rotations (N, 3, 3) and places (N, 3) of the board (Zhang, 2000)."""
+        flat = np.asarray(self.corners)[:, :2]
+        focal, centre = np.array(self.camera).reshape(2, 2)
+        seen = (pixels.reshape(len(pixels), -1, 2) - centre) / focal
+        size = np.abs(flat).max()
+        one = np.column_stack([flat / size, np.ones(len(flat))])
+        zero = np.zeros((len(pixels), *one.shape))
+        ones = zero + one
+        rows = np.concatenate(
+            [
+                np.concatenate([ones, zero, -seen[..., :1] * ones], axis=-1),
+                np.concatenate([zero, ones, -seen[..., 1:] * ones], axis=-1),
+            ],
+            axis=1,
+        )
+        plane = np.linalg.svd(rows)[2][:, -1].reshape(-1, 3, 3)
+        plane = plane * np.sign(plane[:, 2:, 2:])  # the board is before the camera
+        x, y = plane[..., 0] / size, plane[..., 1] / size
+        scale = np.sqrt(np.linalg.norm(x, axis=1) * np.linalg.norm(y, axis=1))
+        turn = np.stack([x, y, np.cross(x, y) / scale[:, None]], axis=-1)
+        left, _, right = np.linalg.svd(turn)
+        return left @ right, plane[..., 2] / scale[:, None]
 
 
 def _nearest(matrix: Array) -> Array:

@@ -20,6 +20,7 @@ class Position(Sensor):
 
     kind = "position"
     sizes_prior = True
+    harmonic = True
 
     @property
     def outputs(self) -> tuple[str, ...]:

@@ -90,6 +90,7 @@ class Sensor(abc.ABC):
     zeros: ClassVar[bool] = False  # what is measured is always zero
     sizes_prior: ClassVar[bool] = False  # shown to be better with Prior.sized()
     compliant: ClassVar[bool] = False  # shown to be better with joints that yield
+    harmonic: ClassVar[bool] = False  # and with their harmonics, as misfit
 
     @property
     def inputs(self) -> tuple[str, ...]:

@@ -41,6 +41,8 @@ class Arm:
     gears: tuple[int, ...]  # joints, from 1, whose gear ratio is a parameter
     compliance: tuple[int, ...]  # joints, from 1, whose compliance is one
     yields: Array  # (C,) what it is nominally, degrees per torque
+    harmonics: tuple[int, ...]  # joints, from 1, whose gears are eccentric
+    waves: Array  # (H, 4) nominally, degrees by sin, cos of the joint and of twice it
     loads: tuple[Load, ...]  # link, weight, its centre
     gravity: tuple[float, float, float]  # direction in the measuring frame
     joint_names: tuple[str, ...]  # J of them, the first columns of the commands
@@ -72,12 +74,13 @@ class Arm:
 
     @property
     def nominal(self) -> Array:
-        """(p,) table, gear ratios of 1, compliance, base, tool, the sensor's own."""
+        """(p,) table, gears, compliance, harmonics, base, tool, the sensor's own."""
         return np.concatenate(
             [
                 self.table.ravel(),
                 np.ones(len(self.gears)),
                 self.yields,
+                self.waves.ravel(),
                 self.base[:3, 3],
                 np.zeros(3),
                 np.concatenate([self.tool[:3, 3], np.zeros(3)])[self._tool],
@@ -155,6 +158,7 @@ class Arm:
             [
                 (first[:, None] + _ORDER[self.convention]).ravel(),
                 moved[[i - 1 for i in (*self.gears, *self.compliance)]],
+                np.repeat(moved[[i - 1 for i in self.harmonics]], 4),
                 np.arange(6),
                 tool + np.array([0, 1, 2, 4, 5, 6])[self._tool],
             ]
@@ -168,13 +172,26 @@ class Arm:
         tool[self._tool] = parameters[first:last]
         return parameters[first - 6 : first], tool, parameters[last:]
 
-    def _drives(self, parameters: Array) -> tuple[Array, Array]:
-        """Gear ratio (n,) of all joints, and compliance of those that have one."""
+    def _drives(self, parameters: Array) -> tuple[Array, Array, Array]:
+        """Gear ratios (n,) of all joints, compliance (C,) and waves (H, 4)."""
         first = 5 * len(self.joints)
         last = first + len(self.gears)
+        end = last + len(self.compliance)
         ratios = np.ones(len(self.joints))
         ratios[[i - 1 for i in self.gears]] = parameters[first:last]
-        return ratios, parameters[last : last + len(self.compliance)]
+        waves = parameters[end : end + 4 * len(self.harmonics)].reshape(-1, 4)
+        return ratios, parameters[last:end], waves
+
+    def _swing(self, commands: Array) -> tuple[Array, Array]:
+        """(H, 4, N) sin, cos of the joints and of twice them, and their rates."""
+        turns = np.radians(self._moves(commands).T[[i - 1 for i in self.harmonics]])
+        angles = turns[:, None] * np.array([[1.0], [2.0]])
+        sine, cosine = np.sin(angles), np.cos(angles)
+        rate = np.radians([[[1.0]], [[2.0]]])
+        each = np.stack([sine, cosine], axis=2)
+        rates = rate * np.stack([cosine, -sine], axis=2)
+        shape = (len(turns), 4, len(commands))
+        return each.reshape(shape), rates.reshape(shape)
 
     def _moves(self, commands: Array) -> Array:
         """(N, n) how far each joint moves, before its gear."""
@@ -185,11 +202,14 @@ class Arm:
     ) -> tuple[Array, Array, Array]:
         """The tool's frame, or that after some links, axis and origin of each step."""
         n = len(self.joints)
-        gears, compliance = self._drives(parameters)
+        gears, compliance, waves = self._drives(parameters)
         moves = gears[:, None] * self._moves(commands).T
         if compliance.any():
             at = [i - 1 for i in self.compliance]
             moves[at] += compliance[:, None] * self._torque(commands)[0]
+        if waves.any():
+            at = [i - 1 for i in self.harmonics]
+            moves[at] += np.einsum("hk,hkn->hn", waves, self._swing(commands)[0])
         base, tool, _ = self._split(parameters)
         rows = parameters[: 5 * n].reshape(n, 5)
         rows = rows[:, np.argsort(_ORDER[self.convention])]

@@ -37,6 +37,7 @@ _COLUMNS = ("a", "alpha", "d", "theta", "beta")
 # 1.7 degrees of the base and the tool.
 _LENGTH, _TWIST, _ZERO = 1.5e-3, 0.3, 0.5  # share of the links' length; degrees
 _GEAR, _SAG = 5e-3, 0.5  # ratio; degrees under the largest torque
+_WAVES, _WAVE = ("sin", "cos", "sin2", "cos2"), 0.05  # of gears; degrees
 _MOUNTING, _MOUNTING_ANGLE = 0.1, 1.7
 
 
@@ -51,7 +52,8 @@ class SerialChain(Arm):
     misalignment by small numbers (Hayati).
 
     Parameters, in this order: ``a1 alpha1 d1 theta1 beta1 a2 ...``; ``gear1 ...`` and
-    ``compliance1 ...`` of the joints asked for; ``base x``, ``y``, ``z``, ``rx``,
+    ``compliance1 ...`` and ``theta1 sin``, ``cos``, ``sin2``, ``cos2`` ... of those
+    asked for; ``base x``, ``y``, ``z``, ``rx``,
     ``ry``, ``rz``; what the sensor sees of ``tool x``, ``y``, ``z``, ``rx``, ``ry``,
     ``rz``; the sensor's own. The turns of base and tool are relative to their nominal
     rotation. Commands are the joints, then the columns that the sensor asks for.
@@ -72,6 +74,8 @@ class SerialChain(Arm):
         gears: Sequence[int] = (),
         compliance: Sequence[int] | None = None,
         yields: ArrayLike | None = None,
+        harmonics: Sequence[int] = (),
+        waves: ArrayLike | None = None,
         loads: Sequence[tuple[int, float, ArrayLike]] = (),
         gravity: Sequence[float] = (0.0, 0.0, -1.0),
         joint_names: Sequence[str] = (),
@@ -98,6 +102,9 @@ class SerialChain(Arm):
                 given all of them where contacts are measured, else none.
             yields: (C,) the compliance of these joints, as far as it is known; 0 when
                 not given.
+            harmonics: revolute joints, counted from 1, with eccentric gears: they move
+                by sin and cos of their angle, and of twice it, besides.
+            waves: (H, 4) these in degrees, as far as they are known; 0 when not given.
             loads: (link, weight, centre in the frame of that row); by default a weight
                 of one at the end of every link but the first, the last at the tool.
                 The torques are those of the nominal arm.
@@ -149,14 +156,20 @@ class SerialChain(Arm):
         if compliance is None:
             turning = [i + 1 for i in range(n) if joints[i] == "R"]
             compliance = turning if sensor.compliant else ()
-        for joint in (number := joint_numbers("compliance", compliance, n)):
-            if joints[joint - 1] == "P":
-                raise ValueError(
-                    f"compliance must name revolute joints, joint {joint} is prismatic"
-                )
+        number = joint_numbers("compliance", compliance, n)
+        bent = joint_numbers("harmonics", harmonics, n)
+        for what, named in (("compliance", number), ("harmonics", bent)):
+            for joint in named:
+                if joints[joint - 1] == "P":
+                    raise ValueError(
+                        f"{what} must name revolute joints, joint {joint} is prismatic"
+                    )
         known = np.zeros(len(number)) if yields is None else numbers("yields", yields)
         if known.shape != (len(number),):
             raise ValueError(f"yields must have shape ({len(number)},)")
+        swings = np.zeros((len(bent), 4)) if waves is None else numbers("waves", waves)
+        if swings.size != 4 * len(bent):
+            raise ValueError(f"waves must have shape ({len(bent)}, 4)")
         given = list(loads)
         if number and not given:
             given = [(i, 1.0, (0.0, 0.0, 0.0)) for i in range(2, n)]
@@ -171,6 +184,8 @@ class SerialChain(Arm):
             joint_numbers("gears", gears, n),
             number,
             known,
+            bent,
+            swings.reshape(-1, 4),
             tuple(load(each, n) for each in given),
             triple("gravity", gravity),
             tuple(joint_names) or _numbered(columns),
@@ -224,6 +239,18 @@ class SerialChain(Arm):
         """The same arm with another sensor."""
         return dataclasses.replace(self, sensor=sensor)
 
+    def with_misfit(self) -> Self:
+        """This arm with harmonics of its joints, where its sensor asks for them.
+
+        They are no parameters of the arm: ``select`` and ``identify`` add them where no
+        prior is given, as what the parameters do not explain.
+        """
+        if self.harmonics or not self.sensor.harmonic:
+            return self
+        bent = tuple(i + 1 for i, kind in enumerate(self.joints) if kind == "R")
+        waves = np.zeros((len(bent), 4))
+        return dataclasses.replace(self, harmonics=bent, waves=waves)
+
     def postures(
         self,
         count: int,
@@ -257,6 +284,43 @@ class SerialChain(Arm):
 
         return postures(self, count, seed, near, allowed)
 
+    def at_rest(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        seconds: float = 0.5,
+        within: float = 0.05,
+    ) -> Array:
+        """Postures (N, J) at which a recorded arm stood still, in their order.
+
+        Args:
+            path: rosbag2 folder (SQLite or MCAP) with joint states, joints by name in
+                any order. Needs the extra ``ros``.
+            seconds: of rest, at least.
+            within: degrees (or units of length) in which a resting joint stays.
+        """
+        from jaxcal.models.serial.bags import at_rest, joint_states
+
+        times, joints = joint_states(path, self.joint_names)
+        turns = np.array(self.command_units) == "deg"
+        return at_rest(
+            times, np.where(turns, np.degrees(joints), joints), seconds, within
+        )
+
+    def in_turn(self, commands: ArrayLike) -> NDArray[np.int64]:
+        """(N,) the commands' rows in an order of little travel, socket after socket."""
+        from jaxcal.models.serial.postures import in_turn
+
+        return in_turn(as_commands(commands, self.num_inputs), self.num_joints)
+
+    def skeleton(self, commands: ArrayLike) -> Array:
+        """(N, n + 2, 3) the base, each joint's origin and the tip, to be drawn."""
+        commands = as_commands(commands, self.num_inputs)
+        frame, _, origins = self._chain(commands, self.nominal)
+        at = np.concatenate([[0], self._steps_of_joints])
+        points = np.concatenate([origins[at], frame[None, 3]])
+        return np.asarray(points.transpose(2, 0, 1))
+
     def calibrated(self, parameters: ArrayLike, sensor: Sensor | None = None) -> Self:
         """The arm whose nominal is this one with ``parameters``.
 
@@ -265,7 +329,7 @@ class SerialChain(Arm):
             sensor: of the new arm; Position() when not given.
         """
         theta = as_parameters(self, parameters)
-        ratios, compliance = self._drives(theta)
+        ratios, compliance, waves = self._drives(theta)
         base, tool, _ = self._split(theta)
         turned = pose_matrix(base)
         turned[:3, :3] = turned[:3, :3] @ self.base[:3, :3]
@@ -279,21 +343,29 @@ class SerialChain(Arm):
             drive=ratios[:, None] * self.drive,
             offset=ratios * self.offset,
             yields=np.array(compliance),
+            waves=np.array(waves),
             sensor=sensor or Position(),
         )
 
     def _stiff(self, parameters: ArrayLike) -> Self:
-        """The calibrated arm without compliance, which no file of others holds."""
-        left = self._drives(as_parameters(self, parameters))[1]
-        if left.any():
-            lost = [str(i) for i, one in zip(self.compliance, left, strict=True) if one]
+        """The calibrated arm without what no file of others holds, which is said."""
+        _, yields, waves = self._drives(as_parameters(self, parameters))
+        lost = [f"compliance{i}" for i, one in zip(self.compliance, yields, strict=True)
+                if one]  # fmt: skip
+        lost += [f"harmonics of joint {i}" for i, one in
+                 zip(self.harmonics, waves, strict=True) if one.any()]  # fmt: skip
+        if lost:
             warnings.warn(
-                f"compliance of joints {', '.join(lost)} is left out of the file: its "
-                "joints are stiff",
+                f"{', '.join(lost)} left out of the file: its joints are stiff and "
+                "their gears round",
                 stacklevel=3,
             )
         return dataclasses.replace(
-            self.calibrated(parameters), compliance=(), yields=np.zeros(0)
+            self.calibrated(parameters),
+            compliance=(),
+            yields=np.zeros(0),
+            harmonics=(),
+            waves=np.zeros((0, 4)),
         )
 
     def to_urdf(
@@ -424,6 +496,7 @@ class SerialChain(Arm):
             *(f"{column}{i + 1}" for i in range(n) for column in _COLUMNS),
             *(f"gear{i}" for i in self.gears),
             *(f"compliance{i}" for i in self.compliance),
+            *(f"theta{i} {wave}" for i in self.harmonics for wave in _WAVES),
             *(f"base {axis}" for axis in mounting),
             *(f"tool {axis}" for axis in self.sensor.tool),
             *self.sensor.names,
@@ -437,6 +510,7 @@ class SerialChain(Arm):
             *["length", "deg", "length", "deg", "deg"] * len(self.joints),
             *["ratio"] * len(self.gears),
             *["deg per torque"] * len(self.compliance),
+            *["deg"] * 4 * len(self.harmonics),
             *mounting,
             *(mounting[i] for i in self._tool),
             *self.sensor.units,
@@ -466,6 +540,11 @@ class SerialChain(Arm):
         if self.compliance:
             torque = self._torque(commands)[0].T
             columns[..., last : last + len(self.compliance)] *= torque[:, None]
+        if self.harmonics:
+            first = last + len(self.compliance)
+            last = first + 4 * len(self.harmonics)
+            swing = self._swing(commands)[0].reshape(last - first, -1)
+            columns[..., first:last] *= swing.T[:, None]
         return np.concatenate([columns, own], axis=-1)
 
     def command_jacobian(
@@ -478,8 +557,12 @@ class SerialChain(Arm):
         commands = as_commands(commands, self.num_inputs)
         parameters = as_parameters(self, parameters)
         columns, _ = self._motion(commands, parameters, self._steps_of_joints)
-        gears, compliance = self._drives(parameters)
+        gears, compliance, waves = self._drives(parameters)
         result = columns * gears
+        if self.harmonics:
+            at = [i - 1 for i in self.harmonics]
+            swing = np.einsum("hk,hkn->nh", waves, self._swing(commands)[1])
+            result[..., at] += columns[..., at] * swing[:, None]
         if self.compliance:
             at = [i - 1 for i in self.compliance]
             rate = compliance[:, None, None] * self._torque(commands)[1]
@@ -518,6 +601,7 @@ class SerialChain(Arm):
                 *joint * len(self.joints),
                 *[_GEAR] * len(self.gears),
                 *[_SAG / torque if torque else np.inf] * len(self.compliance),
+                *[_WAVE] * 4 * len(self.harmonics),
                 *mounting,
                 *(mounting[i] for i in self._tool),
                 *self.sensor.prior_std(length),

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import numbers, whole_number
 from jaxcal.models.sensors import Board, Placed, Plane, Several, Socket
 
-__all__ = ["postures"]
+__all__ = ["in_turn", "postures"]
 
 Array = NDArray[np.float64]
 Chain = Any  # a SerialChain, whose module imports this one
@@ -69,7 +69,7 @@ def postures(
                 continue
             found = np.vstack([found, row])
             if len(found) == count:
-                return _in_turn(found, arm.num_joints)
+                return found[in_turn(found, arm.num_joints)]
     reasons = ", ".join(f"{number} {why}" for why, number in lost.most_common())
     raise ValueError(
         f"count must be at most {len(found)} here, got {count}: of {tried} postures "
@@ -163,8 +163,11 @@ def _in_view(arm: Chain, commands: Array) -> tuple[Array, list[str]]:
     """The board before the camera and turned to it; ``seen`` as it is predicted."""
     commands = commands.copy()
     j = arm.num_joints
-    seen = arm.predict(commands)  # of a board seen at zero: its pose in the camera
-    commands[:, j:] = seen
+    posed = arm.measured_with(dataclasses.replace(arm.sensor, corners=None))
+    # Of a board seen at zero: its pose in the camera.
+    seen = posed.predict(np.hstack([commands[:, :j], np.zeros((len(commands), 6))]))
+    if arm.sensor.corners is None:
+        commands[:, j:] = seen
     from scipy.spatial.transform import Rotation
 
     face = Rotation.from_rotvec(seen[:, 3:], degrees=True).as_matrix()[:, :, 2]
@@ -179,8 +182,8 @@ def _in_view(arm: Chain, commands: Array) -> tuple[Array, list[str]]:
     return commands, reasons
 
 
-def _in_turn(found: Array, joints: int) -> Array:
-    """Socket after socket, and in each the nearest posture next."""
+def in_turn(found: Array, joints: int) -> NDArray[np.int64]:
+    """Socket after socket, and in each the nearest posture next: rows in that order."""
     order: list[int] = []
     left = list(range(len(found)))
     while left:
@@ -190,4 +193,4 @@ def _in_turn(found: Array, joints: int) -> Array:
         far = np.abs(found[left, :joints] - last[:joints]).max(axis=1)
         nearest = int(np.lexsort((far, other))[0])
         order.append(left.pop(nearest))
-    return found[order]
+    return np.array(order)

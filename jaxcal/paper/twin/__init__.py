@@ -1,7 +1,7 @@
 """The paper's robot, simulated: in closed form and in MuJoCo, which loads on use."""
 
 from jaxcal.paper.twin.robot import RobotConfig, joint_angles, measure, read_out
-from jaxcal.paper.twin.robot_model import simulate, trajectory
+from jaxcal.paper.twin.robot_model import simulate
 
 __all__ = [
     "RobotConfig",
@@ -9,5 +9,4 @@ __all__ = [
     "measure",
     "read_out",
     "simulate",
-    "trajectory",
 ]

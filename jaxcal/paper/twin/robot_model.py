@@ -21,9 +21,8 @@ from scipy.spatial.transform import Rotation
 
 from jaxcal.checks import numbers
 from jaxcal.paper.twin.robot import GRAVITY, RobotConfig
-from jaxcal.paper.twin.robot_parts import add_parts
 
-__all__ = ["HOLD_S", "load_model", "pose", "simulate", "timestep_of", "trajectory"]
+__all__ = ["HOLD_S", "load_model", "simulate", "timestep_of"]
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
@@ -56,7 +55,6 @@ def load_model(config: RobotConfig, timestep_s: float | None = None) -> Any:
     spec.site("phone").quat = _mounting(config).as_quat()[[3, 0, 1, 2]]
     for axis, letter in enumerate("XYZ"):
         _add_servo(spec, axis, letter, config)
-    add_parts(bodies, config.mechanism_order)
     return spec.compile()
 
 
@@ -146,41 +144,6 @@ def simulate(
     order = config.read_out_order
     read = (_mounting(config).inv() * turned).as_euler(order, degrees=True)
     return read[:, [order.index(a) for a in "XYZ"]].reshape(commands.shape)
-
-
-def trajectory(
-    config: RobotConfig,
-    commands_deg: ArrayLike,
-    *,
-    hold_s: float = HOLD_S,
-    frames_per_s: float = 20.0,
-) -> Array:
-    """How the links turn while postures are held one after the other.
-
-    Args:
-        config: the robot.
-        commands_deg: (N, 3) degrees.
-        hold_s: seconds a command is held.
-        frames_per_s: of what is returned.
-
-    Returns:
-        (frames, 3) angles of the links about x, y and z in degrees, play included; the
-        first is where the command (0, 0, 0) leaves them.
-    """
-    import mujoco
-
-    commands = np.radians(numbers("commands", commands_deg)).reshape(-1, 3)
-    steps, model, data = _at_rest(config, 1.0 / frames_per_s, None)
-    joints = [model.joint(i) for i in range(model.njnt)]
-    parts = [[j.qposadr[0] for j in joints if j.name[0] == axis] for axis in "XYZ"]
-    frames = [data.qpos.copy()]
-    for command in commands:
-        data.ctrl[:] = command
-        for _ in range(max(1, round(hold_s * frames_per_s))):
-            mujoco.mj_step(model, data, nstep=steps)
-            frames.append(data.qpos.copy())
-    angles = np.degrees(frames)
-    return np.stack([angles[:, part].sum(axis=1) for part in parts], axis=1)
 
 
 def _at_rest(

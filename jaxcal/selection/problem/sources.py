@@ -135,6 +135,8 @@ class Modelled(Source):
         if hasattr(model, "located"):  # an arm whose sensor stands somewhere
             model = model.located(candidates[available])
             _warn_of_radians(model, candidates[available])
+        if prior is None and hasattr(model, "with_misfit"):
+            model = model.with_misfit()
         self._model, self._candidates, self._available = model, candidates, available
         self._noise = Noise() if noise is None else noise
         self._prior = model.default_prior() if prior is None else prior

@@ -10,6 +10,7 @@ import numpy as np
 
 from jaxcal.files import atomic_write
 from rig.config import RigConfig
+from rig.config.axis import Pulses
 from rig.config.config import differences
 from rig.core.attitude import Array, Frame
 from rig.core.device import Device, Posture
@@ -23,6 +24,8 @@ from rig.workbench.procedures.calibrate import END, pair_names, visit_pairs
 from rig.workbench.procedures.plan import draw, draw_held_out
 from rig.workbench.procedures.play import CHARACTERISED, Play
 from rig.workbench.run import Run
+
+_OFFERED = 10  # targets to choose each posture of a check from
 
 
 def collect(run: Run, count: int) -> int:
@@ -156,7 +159,7 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     """Fresh held-out postures against a saved calibration: is it still true?"""
     config = run.config
     held = run.remember(
-        "held_out", lambda: {"pairs": draw_held_out(config, calibration, count)}
+        "held_out", lambda: {"pairs": telling(config, calibration, count)}
     )["pairs"]
     if not held:
         raise Refused("no target in the ranges can be reached through this calibration")
@@ -168,7 +171,7 @@ def verify(run: Run, calibration: Any, count: int) -> int:
         with run.device() as device:
             visit_pairs(run, device, held)
             run.emit("phase", phase="saving")
-    _, found = held_out_errors(config, held, run.postures(), calibration)
+    records, found = held_out_errors(config, held, run.postures(), calibration)
     if not found:
         raise Refused("no held-out posture could be reached")
     limit = config.session.verify_limit_deg
@@ -176,8 +179,21 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     run.save_pairs()
     run.save_summary({**found, "limit_deg": limit, "recalibrate": again})
     run.say(f"{error_text(found)}, limit {limit:g}")
+    if calibration.noise_std is not None:
+        run.say(str(calibration.check(*pairs(records), tolerance=limit)))
     run.say("RECALIBRATE: over the limit" if again else "the calibration still holds")
     return EXIT_RECALIBRATE if again else EXIT_OK
+
+
+def telling(
+    config: RigConfig, calibration: Any, count: int
+) -> list[tuple[Pulses, Pulses]]:
+    """Of many held-out targets those that show best that the calibration is wrong."""
+    offered = draw_held_out(config, calibration, _OFFERED * count)
+    if calibration.noise_std is None or len(offered) <= count:
+        return offered[:count]
+    at = np.array([config.to_deg(command) for _, command in offered])
+    return [offered[i] for i in calibration.verification(at, count)]
 
 
 def goto(run: Run, calibration: Any, desired: Array, play: Play) -> int:

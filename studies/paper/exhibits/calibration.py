@@ -1,4 +1,4 @@
-"""Figures 1 and 6, Table 1 and the Euler orders: what the linear calibration does."""
+"""The robot, Table 1, Figures 1 and 6, Euler orders: what a linear calibration does."""
 
 from __future__ import annotations
 
@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from jaxcal.calibration.identify import identify
 from jaxcal.evaluation.parameters import least_squares, parameter_names, predict
 from jaxcal.paper.constants import AXES, BIAS_DEG, NOISE_STD_DEG, RANGES, SCALE
+from jaxcal.paper.datasets import dataset0_robot
 from jaxcal.paper.twin.robot import ORDERS, RobotConfig, read_out
+from jaxcal.paper.twin.robot_model import simulate
 from jaxcal.plots.style import BLACK, COLOURS, boxes, legend_right, panels
 from studies.paper.exhibits.exhibit import Exhibit, by_axis, judge
 from studies.paper.exhibits.intervals import mean_interval, share_interval
-from studies.paper.exhibits.material import Material
+from studies.paper.exhibits.material import Material, commands_deg
 
 __all__ = ["exhibits"]
 
@@ -23,14 +25,24 @@ Array = NDArray[np.float64]
 
 
 def exhibits(material: Material) -> list[Exhibit]:
-    """Table 1, Figures 1 and 6, and the residual under the six Euler orders."""
+    """The robot, Table 1, Figures 1 and 6, the residual under the six Euler orders."""
     recorded = material.settings.recorded
     return [
+        _robot(material),
         _table_1(material),
         _errors(material, "dataset0", "figure_1", "Figure 1", "simulation"),
         _errors(material, "dataset4", "figure_6", "Figure 6", recorded),
         _orders(material),
     ]
+
+
+def _robot(material: Material) -> Exhibit:
+    """Whether MuJoCo, which drives dataset0, and the closed form read the same."""
+    robot = dataset0_robot()
+    commands = commands_deg(material.dataset("dataset3"))[0]
+    apart = np.abs(simulate(robot, commands) - np.asarray(read_out(robot, commands)))
+    numbers = {"postures": len(commands), "largest_difference_deg": apart.max()}
+    return Exhibit.from_texts("robot", {}, numbers=numbers)
 
 
 def _errors(material: Material, name: str, key: str, title: str, where: str) -> Exhibit:

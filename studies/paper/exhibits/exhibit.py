@@ -36,8 +36,6 @@ class Exhibit:
     data: Mapping[str, Columns] = field(default_factory=dict)
     numbers: Mapping[str, Any] = field(default_factory=dict)
     rows: Sequence[Sequence[str]] = ()  # a table, its header first
-    pictures: Mapping[str, bytes] = field(default_factory=dict)  # PNG, GIF, by file
-    notice: str = ""  # for the terminal: what had to be done otherwise
 
     @classmethod
     def from_texts(

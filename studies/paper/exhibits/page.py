@@ -46,8 +46,8 @@ def page(
         *("Made by ", code(settings.command), f" (seed {settings.seed}). {about} "),
         "Intervals in brackets are 95 % confidence intervals. The data behind each ",
         *("figure is in ", code("data/"), ", every number in "),
-        *(code("reproduction.json"), ", each figure as PNG and SVG and the robot's "),
-        *("picture and film in ", code("figures/"), f". {made_with}."),
+        *(code("reproduction.json"), ", each figure as PNG and SVG in "),
+        *(code("figures/"), f". {made_with}."),
     ]
     rows = [
         (
@@ -79,13 +79,6 @@ def _section(exhibit: Exhibit, images: Mapping[str, bytes]) -> pages.Section:
     for name in exhibit.figures:
         alt = f"{exhibit.title}: {name.replace('_', ' ')}"
         blocks.append(pages.Figure(images[name], alt))
-    pictures = []
-    for name, data in exhibit.pictures.items():
-        still, link = name.endswith(".png"), pages.Link(name, f"figures/{name}")
-        alt = f"{exhibit.title}: {'picture' if still else 'film'}"
-        pictures.append(pages.Figure(data, alt, link, on_paper=still))
-    if pictures:
-        blocks.append(pages.Row(pictures))
     if exhibit.caption:
         blocks.append(pages.Text(_typeset(exhibit.caption), "note"))
     files: list[pages.Inline] = []
@@ -124,7 +117,6 @@ def json_document(
             exhibit.key: {
                 **{name: getattr(exhibit, name) for name in _AS_THEY_ARE},
                 "figures": list(exhibit.figures),
-                "pictures": list(exhibit.pictures),
                 "data": list(exhibit.tables),
                 "numbers": _plain(exhibit.numbers),
             }

@@ -1,0 +1,68 @@
+"""Harmonics of the joints as what an arm's parameters do not explain."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import jaxcal
+
+from ..models.arms import ur5
+
+ARM = ur5()
+WHOLE = ARM.with_misfit()
+RNG = np.random.default_rng(0)
+JOINTS, ELSEWHERE = RNG.uniform(-120.0, 120.0, (2, 40, 6))
+STD = np.asarray(WHOLE.default_prior().std)
+WAVES = [" sin" in name or " cos" in name for name in WHOLE.names]
+TRUTH = WHOLE.nominal + STD * RNG.normal(size=63) * np.where(WAVES, 3.0, 0.5)
+MEASURED = WHOLE.predict(JOINTS, TRUTH) + 0.1 * RNG.normal(size=(40, 3))
+
+
+@pytest.fixture(scope="module")
+def found():
+    return jaxcal.identify(JOINTS, MEASURED, model=ARM)
+
+
+def test_what_no_parameter_explains_is_found(found, tmp_path):
+    exact = WHOLE.predict(ELSEWHERE, TRUTH)
+    given = jaxcal.identify(JOINTS, MEASURED, model=ARM, prior=ARM.default_prior())
+    off = [np.linalg.norm(fit.predict(ELSEWHERE) - exact, axis=1).mean()
+           for fit in (found, given)]  # fmt: skip
+    assert off[0] < 0.5 * off[1]
+    assert len(given.estimate) == 39
+    assert found.names == ARM.names and len(found.estimate) == 63
+    np.testing.assert_allclose(found.arm.predict(JOINTS), found.predict(JOINTS))
+    found.save(tmp_path / "arm.json")
+    again = jaxcal.Calibration.load(tmp_path / "arm.json")
+    np.testing.assert_array_equal(again.predict(JOINTS), found.predict(JOINTS))
+    low, high = found.predict_interval(ELSEWHERE)
+    assert 0.85 < ((low <= exact) & (exact <= high)).mean() <= 1.0
+
+
+def test_it_is_the_fit_of_the_arm_that_has_them_as_parameters(found):
+    """The same prior and sizes, another order of the parameters."""
+    fit = jaxcal.identify(JOINTS, MEASURED, model=WHOLE, prior=WHOLE.default_prior())
+    own = [WHOLE.names.index(name) for name in ARM.names]
+    np.testing.assert_allclose(found.parameters, fit.parameters[own], atol=1e-4)
+    np.testing.assert_allclose(
+        found.standard_errors, fit.standard_errors[own], rtol=1e-3
+    )
+
+
+def test_the_choice_has_them_too_unless_a_prior_is_given():
+    candidates = RNG.uniform(-120.0, 120.0, (60, 6))
+    options = {"k": 8, "method": "exchange", "seed": 0}
+    chosen = jaxcal.select(candidates, model=ARM, **options)
+    same = jaxcal.select(candidates, model=WHOLE, **options)
+    assert list(chosen.indices) == list(same.indices)
+    assert chosen.value == pytest.approx(same.value)
+    plain = jaxcal.select(candidates, model=ARM, prior=ARM.default_prior(), **options)
+    slopes = ARM.jacobian(candidates) / 0.1
+    used = slopes[plain.indices].reshape(-1, 39)
+    noise = np.asarray(ARM.default_noise().std)[0] / 0.1
+    prior = np.diag(np.asarray(ARM.default_prior().std) ** -2.0)
+    inverse = np.linalg.inv(used.T @ used / noise**2 + prior)
+    rows = slopes.reshape(-1, 39) / noise
+    expected = np.einsum("ri,ij,rj->", rows, inverse, rows) / len(rows)
+    assert plain.value == pytest.approx(expected, rel=1e-6)
