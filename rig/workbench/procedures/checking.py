@@ -180,7 +180,8 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     run.save_summary({**found, "limit_deg": limit, "recalibrate": again})
     run.say(f"{error_text(found)}, limit {limit:g}")
     if calibration.noise_std is not None:
-        run.say(str(calibration.check(*pairs(records), tolerance=limit)))
+        told = calibration.check(*pairs(records), tolerance=limit)
+        run.say(f"a drift that moves it by {limit:g} is seen with {told.power:.0%}")
     run.say("RECALIBRATE: over the limit" if again else "the calibration still holds")
     return EXIT_RECALIBRATE if again else EXIT_OK
 
