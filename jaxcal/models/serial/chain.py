@@ -535,7 +535,11 @@ class SerialChain(Arm):
         columns, own = self._motion(commands, parameters, self._steps_of_parameters)
         first = 5 * len(self.joints)
         last = first + len(self.gears)
-        moves = self._moves(commands)[:, [i - 1 for i in self.gears]]
+        at = [i - 1 for i in self.gears]
+        moves = self._moves(commands)[:, at]
+        if self.harmonics:
+            swing, goes = self._swing(commands, parameters)
+            moves = moves * goes[at].T
         columns[..., first:last] *= moves[:, None]
         if self.compliance:
             torque = self._torque(commands)[0].T
@@ -543,8 +547,7 @@ class SerialChain(Arm):
         if self.harmonics:
             first = last + len(self.compliance)
             last = first + 4 * len(self.harmonics)
-            swing = self._swing(commands)[0].reshape(last - first, -1)
-            columns[..., first:last] *= swing.T[:, None]
+            columns[..., first:last] *= swing.reshape(last - first, -1).T[:, None]
         return np.concatenate([columns, own], axis=-1)
 
     def command_jacobian(
@@ -557,12 +560,10 @@ class SerialChain(Arm):
         commands = as_commands(commands, self.num_inputs)
         parameters = as_parameters(self, parameters)
         columns, _ = self._motion(commands, parameters, self._steps_of_joints)
-        gears, compliance, waves = self._drives(parameters)
+        gears, compliance, _ = self._drives(parameters)
         result = columns * gears
         if self.harmonics:
-            at = [i - 1 for i in self.harmonics]
-            swing = np.einsum("hk,hkn->nh", waves, self._swing(commands)[1])
-            result[..., at] += columns[..., at] * swing[:, None]
+            result *= self._swing(commands, parameters)[1].T[:, None]
         if self.compliance:
             at = [i - 1 for i in self.compliance]
             rate = compliance[:, None, None] * self._torque(commands)[1]
