@@ -171,7 +171,7 @@ def headroom(problem: Problem, shape: str) -> Case:
         deadline = time.perf_counter() + 0.5
         result = solve_exact(problem, deadline=deadline)
         case.proven = result.proven
-        case.best = max(case.best, float(result.values[0]))
+        case.best = max(case.best, float(result.value or 0.0))
     greedy = greedy_indices(problem)
     t_greedy = cpu_seconds(lambda: greedy_indices(problem))
     case.note("greedy", greedy, t_greedy)

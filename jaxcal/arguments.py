@@ -5,12 +5,32 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NoReturn, TypeVar
 
-__all__ = ["Parser", "at_least", "refused", "seconds", "several"]
+__all__ = ["Flag", "Parser", "at_least", "flag", "refused", "seconds", "several"]
 
 T = TypeVar("T")
+Flag = tuple[tuple[str, ...], dict[str, Any]]  # what ``add_argument`` takes
+
+
+def flag(
+    name: str,
+    help: str,
+    metavar: str = "FILE",
+    type: Callable[[str], Any] | None = None,
+    *,
+    long: str = "",
+    on: bool = False,
+    **more: Any,
+) -> Flag:
+    """A flag (``on``: without a value), or an argument where the name has no dash."""
+    given = {"help": help, **more}
+    if on:
+        given["action"] = "store_true"
+    elif "choices" not in more:
+        given |= {"metavar": metavar, "type": type or str}
+    return ((name, long) if long else (name,)), given
 
 
 class Parser(argparse.ArgumentParser):
@@ -19,6 +39,12 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, **fields: Any) -> None:
         fields.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         super().__init__(allow_abbrev=False, **fields)
+
+    def with_flags(self, flags: Iterable[Flag]) -> Parser:
+        """Itself, with these flags."""
+        for names, fields in flags:
+            self.add_argument(*names, **fields)
+        return self
 
     def error(self, message: str) -> NoReturn:
         if found := re.match(r"argument (?:.*/)?(--[\w-]+): expected one", message):

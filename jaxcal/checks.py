@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
+    "array_of",
     "axis_letter",
     "axis_names",
     "in_words",
@@ -18,6 +19,7 @@ __all__ = [
     "one_of",
     "relative_weights",
     "require_finite",
+    "require_none",
     "seconds",
     "share",
     "table",
@@ -51,11 +53,35 @@ def numbers(name: str, values: ArrayLike, *, finite: bool = True) -> Array:
     return array
 
 
+def array_of(
+    name: str,
+    values: ArrayLike,
+    *shape: int | str,
+    rule: str = "",
+    finite: bool = True,
+) -> Array:
+    """``values`` as float64 of a shape, in which letters stand for any size."""
+    array = numbers(name, values, finite=finite)
+    pairs = zip(shape, array.shape, strict=False)
+    fits = all(isinstance(want, str) or want == got for want, got in pairs)
+    if array.ndim != len(shape) or not fits:
+        comma = "," if len(shape) == 1 else ""
+        wanted = f"({', '.join(map(str, shape))}{comma})"
+        raise ValueError(f"{name} must have shape {wanted}{rule}, got {array.shape}")
+    return array
+
+
 def require_finite(name: str, array: Array) -> None:
     bad = ~np.isfinite(array)
     if bad.any():
         where = tuple(int(i) for i in np.argwhere(bad)[0])
         raise ValueError(f"{name} must be finite, got {array[where]} at {where}")
+
+
+def require_none(bad: NDArray[np.bool_], of: Any, rule: str, more: str = "") -> None:
+    """Refuse by ``rule`` the first of the values where ``bad`` holds."""
+    if bad.any():
+        raise ValueError(f"{rule}, got {of[bad][0]}{more}")
 
 
 def table(name: str, values: ArrayLike) -> Array:

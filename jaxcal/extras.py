@@ -17,7 +17,7 @@ def needs(extra: str, purpose: str) -> Iterator[None]:
     """Imports inside the block belong to an extra of jaxcal.
 
     Args:
-        extra: "live", "models", "policy", "rig" or "study".
+        extra: "live", "models", "policy", "rig", "ros" or "study".
         purpose: what needs it, as the subject of a sentence: ``'method="policy"'``.
 
     Raises:

@@ -82,7 +82,8 @@ def run(budget: Budget) -> Row:
 
 
 def _problem(joints: Array, k: int, criterion: str) -> Problem:
-    return Design(joints, arm(), noise=Noise(_NOISE)).problem(k, criterion)
+    prior = arm().default_prior()  # given: without harmonics of the joints
+    return Design(joints, arm(), prior, Noise(_NOISE)).problem(k, criterion)
 
 
 def _searches(row: Row, joints: Array, criterion: str, budget: Budget) -> None:
@@ -100,7 +101,7 @@ def _searches(row: Row, joints: Array, criterion: str, budget: Budget) -> None:
         for method, (solver, wanted) in alone.items():
             whole = functools.partial(
                 select, joints, k, method, model=arm(), noise=Noise(_NOISE),
-                criterion=criterion,
+                prior=arm().default_prior(), criterion=criterion,
             )  # fmt: skip
             seconds, all_of_it = (cpu_seconds(c, rounds) for c in (solver, whole))
             case = f"{criterion}, K = {k} of 1,000"
@@ -141,6 +142,7 @@ def _proofs(row: Row, joints: Array, criterion: str, budget: Budget) -> None:
         pool = joints if count == 1000 else joints[rng.choice(1000, count, False)]
         call = functools.partial(
             select, pool, k, "exact", model=arm(), noise=Noise(_NOISE),
+            prior=arm().default_prior(),
             criterion=criterion,
         )  # fmt: skip
         call(time_limit=0.01)  # compiled
@@ -183,6 +185,7 @@ def _against_figaroh(row: Row, joints: Array, measured: Array, budget: Budget) -
             sizes.append(k)
             gaps.append(gap)
             model: dict[str, Any] = {"model": chain, "noise": Noise(_NOISE)}
+            model["prior"] = chain.default_prior()
             plain = select(blocks=blocks, k=k, method="exchange", restarts=10)
             ways = {"FIGAROH's rule": [rule], "jaxcal exchange, D": [plain.indices]}
             for criterion in ("D", "I"):
@@ -241,7 +244,13 @@ def _judged(
     rows = blocks[subset].reshape(-1, blocks.shape[2])
     log_det = float(np.linalg.slogdet(rows.T @ rows)[1])
     chosen = pool[subset]
-    found = identify(joints[chosen], measured[chosen], model=chain, noise_std=_NOISE)
+    found = identify(
+        joints[chosen],
+        measured[chosen],
+        model=chain,
+        noise_std=_NOISE,
+        prior=chain.default_prior(),
+    )
     rest = np.setdiff1d(np.arange(len(joints)), chosen)
     test_joints, test = poses("ur5_random_20.csv")
     error = np.linalg.norm(found.predict(joints[rest]) - measured[rest], axis=1)

@@ -109,7 +109,8 @@ def check(
     judged = free & (per_unit > 0.0)
     hidden = judged & (moved > matters)
     shifts = (matters * seen[judged] / per_unit[judged]) ** 2
-    power = float(np.mean(1.0 - special.chndtr(limit, freedom, shifts)))
+    missed = special.chndtr(limit, freedom, shifts)  # NaN where far too large
+    power = float(np.mean(1.0 - np.nan_to_num(missed, nan=0.0)))
     if p_value < 0.05:
         says = "does not hold"
     else:

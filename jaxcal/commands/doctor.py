@@ -1,7 +1,4 @@
-"""``jaxcal doctor``: what is installed and what the machine offers, for a bug report.
-
-Nothing is changed and no port is opened.
-"""
+"""``jaxcal doctor``: what is installed, what the machine offers, for a bug report."""
 
 from __future__ import annotations
 
@@ -11,22 +8,25 @@ import importlib.util
 import json
 import os
 import platform
+import re
 import sys
 from collections.abc import Iterator
 from typing import Any
 
-__all__ = ["add_arguments", "report", "run"]
+from jaxcal.arguments import flag
 
+__all__ = ["FLAGS", "doctor", "report"]
+
+FLAGS = {"doctor": (flag("--json", "print JSON", on=True),)}
 _CORE = ("numpy", "scipy")
+_CACHE, _MISSING = "JAX_COMPILATION_CACHE_DIR", "not installed"
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Flags of the command."""
-    parser.add_argument("--json", action="store_true", help="print JSON")
+def doctor(arguments: argparse.Namespace) -> None:
+    """Print the report.
 
-
-def run(arguments: argparse.Namespace) -> None:
-    """Print the report."""
+    Nothing is changed and no port is opened.
+    """
     found = report()
     if arguments.json:
         print(json.dumps(found, indent=1))
@@ -50,7 +50,7 @@ def report() -> dict[str, dict[str, str]]:
         "packages": {name: _version(name) for name in _CORE},
         "extras": dict(_extras()),
         "devices": _devices(),
-        "caches": _caches(),
+        "caches": {_CACHE: os.environ.get(_CACHE, "not set")},
         "ports": _ports(),
     }
 
@@ -59,7 +59,7 @@ def _version(package: str) -> str:
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
-        return "not installed"
+        return _MISSING
 
 
 def _extras() -> Iterator[tuple[str, str]]:
@@ -70,13 +70,10 @@ def _extras() -> Iterator[tuple[str, str]]:
     except importlib.metadata.PackageNotFoundError:
         return
     for extra in about.get_all("Provides-Extra") or []:
-        named = [
-            _name(line)
-            for line in lines
-            if line.partition(";")[2].replace('"', "'").strip().endswith(f"'{extra}'")
-        ]
+        ours = re.compile(rf"([\w.-]+).*;.*extra == ['\"]{extra}['\"]")
+        named = [found[1] for line in lines if (found := ours.match(line))]
         versions = {name: _version(name) for name in named if name != "jaxcal"}
-        missing = [name for name, found in versions.items() if found == "not installed"]
+        missing = [name for name, found in versions.items() if found == _MISSING]
         text = ", ".join(f"{name} {found}" for name, found in versions.items())
         if missing:
             text = f"no {', '.join(missing)}: pip install 'jaxcal[{extra}]'"
@@ -84,27 +81,15 @@ def _extras() -> Iterator[tuple[str, str]]:
             yield extra, text
 
 
-def _name(requirement: str) -> str:
-    """The package of a requirement, without extras, versions and markers."""
-    end = next((i for i, c in enumerate(requirement) if c in "[<>=!~; ("), None)
-    return requirement[:end]
-
-
 def _devices() -> dict[str, str]:
     if importlib.util.find_spec("jax") is None:
-        return {"jax": "not installed"}
+        return {"jax": _MISSING}
     import jax
 
     try:
-        return {str(each.id): f"{each.platform} {each.device_kind}"
-                for each in jax.devices()}  # fmt: skip
+        return {str(d.id): f"{d.platform} {d.device_kind}" for d in jax.devices()}
     except RuntimeError as error:
         return {"jax": " ".join(str(error).split())}
-
-
-def _caches() -> dict[str, str]:
-    name = "JAX_COMPILATION_CACHE_DIR"
-    return {name: os.environ.get(name, "not set")}
 
 
 def _ports() -> dict[str, str]:

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NoReturn
 
-from jaxcal.arguments import refused
+from jaxcal.arguments import Parser, refused
 from jaxcal.commands import evaluate_task
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder
@@ -36,21 +36,17 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
         The exit code.
     """
     given = list(sys.argv[1:] if argv is None else argv)
-    if any(word == "--task" or word.startswith("--task=") for word in given):
-        return evaluate_task.main(given, prog)
-    from jaxcal.commands.evaluate_arguments import parser
-
     command = ["python", prog] if prog.endswith(".py") else prog.split()
-    options = parser(prog, " ".join(command)).parse_args(given)
-    options.command = [*command, *given]
-    before = signal.signal(signal.SIGTERM, _terminate)
+    of_task = any(word.partition("=")[0] == "--task" for word in given)
+    kept, before = "nothing was written", signal.signal(signal.SIGTERM, _terminate)
     try:
-        _run(options)
+        options = _parser(of_task, prog, " ".join(command)).parse_args(given)
+        options.command = [*command, *given]
+        if not of_task and options.stream is not None:
+            kept = "finished parts are kept; the same command goes on"
+        (evaluate_task.run if of_task else _run)(options)
     except KeyboardInterrupt as stop:
         terminated = isinstance(stop, _Terminated)
-        kept = "nothing was written"
-        if options.stream is not None:
-            kept = "finished parts are kept; the same command goes on"
         how = "terminated" if terminated else "interrupted"
         print(f"{prog}: {how}, {kept}", file=sys.stderr)
         return EXIT_TERMINATED if terminated else EXIT_INTERRUPTED
@@ -59,6 +55,15 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
     finally:
         signal.signal(signal.SIGTERM, before)
     return 0
+
+
+def _parser(of_task: bool, prog: str, typed: str) -> Parser:
+    if of_task:
+        with needs("policy", prog):
+            return evaluate_task.parser(prog, typed)
+    from jaxcal.commands.evaluate_arguments import parser
+
+    return parser(prog, typed)
 
 
 class _Terminated(KeyboardInterrupt):

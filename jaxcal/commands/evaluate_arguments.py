@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import pathlib
+from pathlib import Path
 from typing import Any
 
-from jaxcal.arguments import Parser, at_least, seconds, several
+from jaxcal.arguments import Parser, at_least, flag, seconds, several
 from jaxcal.evaluation.methods import DEFAULT_METHODS
 
 __all__ = ["parser"]
@@ -60,39 +60,32 @@ examples:
 """
 
 
+_MANY: dict[str, Any] = {"nargs": "+", "action": "extend", "default": []}
+_FLAGS = (
+    flag("--checkpoint", "trained policies; the shipped one", "DIR", **_MANY),
+    flag("--dataset", "datasets; dataset2", "NAME|FILE", **_MANY),
+    flag("--recordings", "of dataset4.csv and dataset5.csv, by the rig", "DIR", Path),
+    flag("--methods", "comma separated; all but auto", "LIST", several(str, "names"),
+         default=DEFAULT_METHODS),
+    flag("--k", "postures to choose; 4", "K", at_least(1), default=4),
+    flag("--episodes", "at most the first N of each", "N", at_least(1)),
+    flag("--seed", "of datasets and draws; 0", "S", at_least(0), default=0),
+    flag("--num", "tries of policy:samples and :first", "N", at_least(1), default=16),
+    flag("--draws", "random selections an episode; 100", "N", at_least(1), default=100),
+    flag("--time-limit", "of the exact solver, a dataset; what it cannot prove is "
+         "bounded", "SECONDS", seconds),
+    flag("--json", "write every number", type=Path),
+    flag("--indices", "and the postures chosen, in the JSON", on=True),
+    flag("--report", "write figures and index.html", "DIR", Path),
+    flag("--run", "training runs to draw curves of; those of --checkpoint are found",
+         "DIR", Path, **_MANY),
+    flag("--stream", "evaluate in parts kept in DIR: any number of --episodes, "
+         "resumable", "DIR", Path),
+    flag("--quiet", "no progress", on=True),
+)  # fmt: skip
+
+
 def parser(program: str, typed: str) -> Parser:
     """The parser: ``program`` begins a message, ``typed`` an example of the help."""
-    out = Parser(
-        prog=program, description=_DESCRIPTION, epilog=_EPILOG.format(program=typed)
-    )
-    add = out.add_argument
-    many: dict[str, Any] = {"nargs": "+", "action": "extend", "default": []}
-    folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
-    natural, index = at_least(1), at_least(0)
-    trained = "trained policies; the shipped one"
-    add("--checkpoint", metavar="DIR", help=trained, **many)
-    add("--dataset", metavar="NAME|FILE", help="datasets; dataset2", **many)
-    add("--recordings", help="of dataset4.csv and dataset5.csv, by the rig", **folder)
-    add(
-        "--methods",
-        type=several(str, "names"),
-        default=DEFAULT_METHODS,
-        metavar="LIST",
-        help="comma separated; all but auto",
-    )
-    add("--k", type=natural, default=4, help="postures to choose; 4")
-    add("--episodes", type=natural, metavar="N", help="at most the first N of each")
-    add("--seed", type=index, default=0, metavar="S", help="of datasets and draws; 0")
-    add("--num", type=natural, default=16, help="tries of policy:samples and :first")
-    add("--draws", type=natural, default=100, help="random selections an episode; 100")
-    limit = "of the exact solver, a dataset; what it cannot prove is bounded"
-    add("--time-limit", type=seconds, metavar="SECONDS", help=limit)
-    add("--json", type=pathlib.Path, metavar="FILE", help="write every number")
-    add("--indices", action="store_true", help="and the postures chosen, in the JSON")
-    add("--report", help="write figures and index.html", **folder)
-    runs = "training runs to draw curves of; those of --checkpoint are found"
-    add("--run", help=runs, **many, **folder)
-    parts = "evaluate in parts kept in DIR: any number of --episodes, resumable"
-    add("--stream", help=parts, **folder)
-    add("--quiet", action="store_true", help="no progress")
-    return out
+    about, more = _DESCRIPTION, _EPILOG.format(program=typed)
+    return Parser(prog=program, description=about, epilog=more).with_flags(_FLAGS)

@@ -5,16 +5,13 @@ from __future__ import annotations
 import argparse
 import importlib
 import pathlib
-import sys
-from collections.abc import Sequence
 
-from jaxcal.arguments import Parser, at_least, refused, several
-from jaxcal.extras import MissingExtraError, needs
+from jaxcal.arguments import Parser, at_least, flag, several
+from jaxcal.extras import needs
 from jaxcal.files import require_writable_folder, write_text
 
-__all__ = ["main", "require_outputs"]
+__all__ = ["parser", "require_outputs", "run"]
 
-EXIT_INTERRUPTED = 130
 _METHODS = "random,gain,rate,shares,two_step,policy"
 _TUNED = "priced,state"  # where the task brings their constants
 
@@ -33,22 +30,27 @@ examples:
 """
 
 
-def main(argv: Sequence[str], prog: str) -> int:
-    """Evaluate, print, write; the exit code."""
-    command = ["python", prog] if prog.endswith(".py") else prog.split()
-    try:
-        with needs("policy", prog):
-            options = _parser(prog, " ".join(command)).parse_args(argv)
-            _run(options, [*command, *argv])
-    except KeyboardInterrupt:
-        print(f"{prog}: interrupted, nothing was written", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    except (ValueError, OSError, MissingExtraError) as error:
-        return refused(prog, error)
-    return 0
+_FLAGS = (
+    flag("--task", "see below", "NAME", required=True),
+    flag("--with", "options of the task", "OPTION=VALUE", dest="options", nargs="+",
+         default=[]),
+    flag("--methods", f"comma separated; {_METHODS}, with {_TUNED} where the task has "
+         "their constants, or the task's own", "LIST", several(str, "names")),
+    flag("--checkpoint", "of the policy; the shipped one", "DIR"),
+    flag("--episodes", "sessions; 4096, fewer where a task takes long", "N",
+         at_least(2)),
+    flag("--seed", "of the sessions; 0", "S", at_least(0), default=0),
+    flag("--rollouts", "simulations of each candidate of the method rollouts; 16", "N",
+         at_least(1), default=16),
+    flag("--retune", "tune the rules on this task; else as they ship", on=True),
+    flag("--json", "write every number", type=pathlib.Path),
+    flag("--report", "write figure and index.html", "DIR", pathlib.Path),
+    flag("--quiet", "no progress", on=True),
+)  # fmt: skip
 
 
-def _parser(prog: str, typed: str) -> Parser:
+def parser(prog: str, typed: str) -> Parser:
+    """``prog`` begins a message, ``typed`` an example of the help."""
     from jaxcal.adaptive.tasks import registry
     from jaxcal.evaluation.sequential import METHODS
 
@@ -62,27 +64,7 @@ def _parser(prog: str, typed: str) -> Parser:
         "nats, each less the best rule in pairs, and the time of a choice.",
         epilog=_EPILOG.format(methods=methods, tasks=tasks, program=typed),
     )
-    add = out.add_argument
-    add("--task", required=True, metavar="NAME", help="see below")
-    add("--with", dest="options", nargs="+", default=[], metavar="OPTION=VALUE",
-        help="options of the task")  # fmt: skip
-    add("--methods", type=several(str, "names"), metavar="LIST",
-        help=f"comma separated; {_METHODS}, with {_TUNED} where the task has their "
-        "constants, or the task's own")  # fmt: skip
-    add("--checkpoint", metavar="DIR", help="of the policy; the shipped one")
-    add("--episodes", type=at_least(2), metavar="N",
-        help="sessions; 4096, fewer where a task takes long")  # fmt: skip
-    add("--seed", type=at_least(0), default=0, metavar="S", help="of the sessions; 0")
-    add("--rollouts", type=at_least(1), default=16, metavar="N",
-        help="simulations of each candidate of the method rollouts; 16")  # fmt: skip
-    add("--retune", action="store_true",
-        help="tune the rules on this task; else as they ship")  # fmt: skip
-    add("--json", type=pathlib.Path, metavar="FILE", help="write every number")
-    add(
-        "--report", type=pathlib.Path, metavar="DIR", help="write figure and index.html"
-    )
-    add("--quiet", action="store_true", help="no progress")
-    return out
+    return out.with_flags(_FLAGS)
 
 
 def require_outputs(options: argparse.Namespace) -> None:
@@ -98,7 +80,8 @@ def require_outputs(options: argparse.Namespace) -> None:
         require_writable_folder(options.report)
 
 
-def _run(options: argparse.Namespace, command: list[str]) -> None:
+def run(options: argparse.Namespace) -> None:
+    """Evaluate, print, write."""
     from jaxcal.adaptive.tasks import registry
     from jaxcal.evaluation import sequential, sequential_report
     from jaxcal.learning.runtime import cache
@@ -135,10 +118,10 @@ def _run(options: argparse.Namespace, command: list[str]) -> None:
         progress.clear()
     print(sequential_report.text_table(result))
     if options.report is not None:
-        sequential_report.write_report(options.report, result, command=command)
+        sequential_report.write_report(options.report, result, command=options.command)
         print(f"saved: {options.report}/index.html and 1 figure")
     if options.json is not None:
         options.json.parent.mkdir(parents=True, exist_ok=True)
-        document = sequential_report.json_document(result, command=command)
+        document = sequential_report.json_document(result, command=options.command)
         write_text(options.json, document)
         print(f"saved: {options.json}")

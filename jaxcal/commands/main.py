@@ -3,28 +3,36 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import logging
 import os
 import sys
 import warnings
+from typing import Any
 
 from jaxcal.arguments import Parser, refused
 from jaxcal.extras import MissingExtraError
 
 __all__ = ["COMMANDS", "main"]
 
-_HERE = {  # command: one line of help
-    "select": "choose the few rows of a table worth measuring",
-    "score": "judge a choice made elsewhere",
-    "plan": "how many measurements a wanted accuracy takes",
-    "identify": "fit y = A u + b, or a model, to measurements and save the calibration",
-    "predict": "where a calibrated machine goes for given commands",
-    "command": "what to command to reach given outputs",
-    "doctor": "versions, devices, caches, extras and ports, for a bug report",
+_HERE = {  # command: one line of help, and the module with its flags and function
+    "select": ("choose the few rows of a table worth measuring", "questions"),
+    "score": ("judge a choice made elsewhere", "questions"),
+    "plan": ("how many measurements a wanted accuracy takes", "questions"),
+    "identify": (
+        "fit y = A u + b, or a model, to measurements and save the calibration",
+        "calibrations",
+    ),
+    "predict": ("where a calibrated machine goes for given commands", "calibrations"),
+    "command": ("what to command to reach given outputs", "calibrations"),
+    "doctor": (
+        "versions, devices, caches, extras and ports, for a bug report",
+        "doctor",
+    ),
 }
 _WHOLE = {  # commands that parse their own arguments
-    "train": "train a policy (train.py)",
-    "evaluate": "compare methods with the proven optimum (evaluate.py)",
+    "train": ("train a policy (train.py)", "train"),
+    "evaluate": ("compare methods with the proven optimum (evaluate.py)", "evaluate"),
 }
 COMMANDS = (*_HERE, *_WHOLE)
 _EPILOG = """\
@@ -50,7 +58,7 @@ def main(argv: list[str] | None = None) -> int:
         module = importlib.import_module(f"jaxcal.commands.{given[0]}")
         return int(module.main(given[1:], prog=f"jaxcal {given[0]}"))
     arguments = _parser(given).parse_args(given)
-    module = importlib.import_module(f"jaxcal.commands.{arguments.command}")
+    run = getattr(_module(arguments.command), arguments.command)
     log, shown = logging.getLogger("jaxcal"), logging.StreamHandler()
     log.setLevel(logging.INFO)
     log.addHandler(shown)
@@ -62,7 +70,7 @@ def main(argv: list[str] | None = None) -> int:
                 "; ".join(str(warning).splitlines()),
                 file=sys.stderr,
             )
-            module.run(arguments)
+            run(arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of a pipe, such as head, has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -83,11 +91,15 @@ def _parser(given: list[str]) -> Parser:
     )
     parser.add_argument("--version", action="version", version=f"jaxcal {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    for name, line in (_HERE | _WHOLE).items():
+    for name, (line, _) in (_HERE | _WHOLE).items():
         about = line[0].upper() + line[1:] + "."
         command = commands.add_parser(name, help=line, description=about)
         if name in given and name in _HERE:  # only the one that runs is imported
-            module = importlib.import_module(f"jaxcal.commands.{name}")
-            command.epilog = (module.__doc__ or "").partition("\n\n")[2]
-            module.add_arguments(command)
+            told = inspect.getdoc(getattr(_module(name), name)) or ""
+            command.epilog = told.partition("\n\n")[2]
+            command.with_flags(_module(name).FLAGS[name])
     return parser
+
+
+def _module(command: str) -> Any:
+    return importlib.import_module(f"jaxcal.commands.{_HERE[command][1]}")

@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.arguments import flag
 from jaxcal.checks import axis_letter
 from jaxcal.files import write_text
 
 __all__ = [
+    "OUTPUT",
     "Frame",
     "Table",
-    "add_output",
     "read_table",
     "write_json",
     "write_rows",
@@ -166,45 +167,43 @@ def read_table(path: str) -> Table:
 def _from_csv(source: str, text: str) -> Table:
     first = text.partition("\n")[0]
     delimiter = max(",;\t", key=first.count)
-    lines = enumerate(csv.reader(io.StringIO(text), delimiter=delimiter), start=1)
-    rows = [(line, [cell.strip() for cell in row]) for line, row in lines]
-    rows = [(line, row) for line, row in rows if any(row)]
+    cells = enumerate(csv.reader(io.StringIO(text), delimiter=delimiter), start=1)
+    rows = [(line, [cell.strip() for cell in row]) for line, row in cells if any(row)]
     if not rows:
         raise ValueError(f"{source}: the table is empty")
     header = rows[0][1]
     if all(map(_is_number, header)):
         header = _letters("u", len(header))
-    else:
-        rows = rows[1:]
-    if not rows:
+    elif not (rows := rows[1:]):
         raise ValueError(f"{source}: there are no rows below the header")
-    twice = [name for name in header if header.count(name) > 1]
-    if twice:
-        raise ValueError(f"{source}: column {twice[0]!r} comes twice")
+    for name in header:
+        if header.count(name) > 1:
+            raise ValueError(f"{source}: column {name!r} comes twice")
     for line, row in rows:
         if len(row) != len(header):
             raise ValueError(
                 f"{source}: line {line} has {len(row)} cells, the first has "
                 f"{len(header)}"
             )
-    cells = {name: [row[i] for _, row in rows] for i, name in enumerate(header)}
-    numbers = {
-        name: [float(cell) if cell else np.nan for cell in column]
-        for name, column in cells.items()
-        if all(_is_number(cell) or not cell for cell in column)
-    }
-    labels = {name: column for name, column in cells.items() if name not in numbers}
-    for name, column in labels.items():
-        _require_text(source, name, column, [line for line, _ in rows])
+    lines = tuple(line for line, _ in rows)
+    numbers: dict[str, list[float]] = {}
+    labels: dict[str, list[str]] = {}
+    for i, name in enumerate(header):
+        column = [row[i] for _, row in rows]
+        if all(_is_number(cell) or not cell for cell in column):
+            numbers[name] = [float(cell) if cell else np.nan for cell in column]
+        else:
+            _require_text(source, name, column, lines)
+            labels[name] = column
     if not numbers:
         raise ValueError(f"{source}: no column holds numbers: {', '.join(header)}")
     values = np.array(list(numbers.values())).reshape(len(numbers), len(rows)).T
-    return Table(
-        source, tuple(numbers), values, labels, tuple(line for line, _ in rows)
-    )
+    return Table(source, tuple(numbers), values, labels, lines)
 
 
-def _require_text(source: str, name: str, column: list[str], lines: list[int]) -> None:
+def _require_text(
+    source: str, name: str, column: list[str], lines: Sequence[int]
+) -> None:
     """Refuse a column of numbers that one cell would turn into labels, by that cell."""
     spoilt = [cell for cell in column if cell and not _is_number(cell)]
     for line, cell in zip(lines, column, strict=True):
@@ -264,13 +263,11 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def add_output(parser: argparse.ArgumentParser) -> None:
-    """Where the answer goes and in which form."""
-    form = parser.add_mutually_exclusive_group()
-    form.add_argument("--json", action="store_true", help="print JSON")
-    form.add_argument("--csv", action="store_true", help="print CSV")
-    where = "write to FILE (.csv or .json) instead"
-    parser.add_argument("--out", metavar="FILE", help=where)
+OUTPUT = (  # where the answer goes and in which form
+    flag("--json", "print JSON", on=True),
+    flag("--csv", "print CSV", on=True),
+    flag("--out", "write to FILE (.csv or .json) instead"),
+)
 
 
 def written(
@@ -279,8 +276,10 @@ def written(
     rows: Sequence[Sequence[Any]],
     document: Any,
 ) -> bool:
-    """Write where ``add_output`` asks for a form or a file; False where neither is."""
+    """Write where ``OUTPUT`` asks for a form or a file; False where neither is."""
     out = arguments.out
+    if arguments.json and arguments.csv:
+        raise ValueError("one of --json and --csv must be left out")
     if arguments.json or (out and out.endswith(".json")):
         write_json(out, document)
     elif arguments.csv or out:
@@ -295,9 +294,7 @@ def write_rows(
 ) -> None:
     """Write rows as CSV to a file, atomically, or to standard output."""
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(names)
-    writer.writerows(rows)
+    csv.writer(text, lineterminator="\n").writerows([names, *rows])
     _emit(out, text.getvalue())
 
 

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
+Stop = Callable[[], bool]
+
 # Columns of progress: the reward of an update, and what is measured on fixed sets.
 _POSTURES = ("reward", "ratio to exact", "optima hit")
 _TASK = ("reward", "nats", "less the rule's")
@@ -76,8 +78,7 @@ def _run(arguments: argparse.Namespace) -> int:
         brax_ppo.train(config, out, lambda line: print(line, flush=True))
         done = config.ppo.num_updates
     else:
-        train = _train_task if arguments.task else _train_postures
-        done = train(config, arguments, out, stop)
+        done = _train(config, arguments, out, stop)
     if not devices.is_first():
         return 0
     task = f" --task {arguments.task}" if arguments.task else ""
@@ -101,65 +102,50 @@ def _run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _train_postures(
-    config: TrainConfig,
-    arguments: argparse.Namespace,
-    out: pathlib.Path,
-    stop: Callable[[], bool],
+def _train(
+    config: Any, arguments: argparse.Namespace, out: pathlib.Path, stop: Stop
 ) -> int:
     """Updates made."""
-    from jaxcal.learning.runtime import devices
-    from jaxcal.learning.training import checkpoint, postures
-    from jaxcal.selection.teacher import fixed_validation, teacher
+    import numpy as np
 
-    rows = config.ppo.rows_per_minibatch
-    mesh = devices.make_mesh(rows, arguments.devices, config.num_seeds)
-    validation = None
-    if devices.is_first():
-        _introduce(config, out, devices.describe(mesh))
-        if not arguments.no_validation:
-            validation = fixed_validation(config)
-        _begin_table("episodes", _POSTURES)
-    state = postures.train(
+    from jaxcal.learning.runtime import devices
+
+    trainer: Any
+    more: dict[str, Any] = {}
+    first = devices.is_first()
+    validates = first and not (arguments.task or arguments.no_validation)
+    if arguments.task:
+        from jaxcal.adaptive.policy import run as trainer
+
+        schema, unit, columns = trainer.SCHEMA, "decisions", _TASK
+        told = f"task {config.task}, seed {config.seed}; run folder {out}"
+    else:
+        from jaxcal.learning.training import checkpoint
+        from jaxcal.learning.training import postures as trainer
+        from jaxcal.selection.teacher import fixed_validation, teacher
+
+        rows = config.ppo.rows_per_minibatch
+        mesh = devices.make_mesh(rows, arguments.devices, config.num_seeds)
+        schema, unit, columns = checkpoint.SCHEMA, "episodes", _POSTURES
+        told = _introduction(config, out, devices.describe(mesh))
+        more = {"validation": None, "teacher": teacher}
+    if first:
+        print(f"{told}\nconfiguration: {config.as_meta()}")
+        if validates:
+            more["validation"] = fixed_validation(config)
+        _begin_table(unit, columns)
+    state = trainer.train(
         config,
         out,
         resume=arguments.resume,
-        validation=validation,
-        report=lambda report: _show(report, postures.MEASURED),
+        report=lambda report: _show(report, trainer.MEASURED),
         should_stop=stop,
         num_devices=arguments.devices,
-        teacher=teacher,
+        **more,
     )
-    if devices.is_first():
-        _compare_seeds(out, config, postures.MEASURED, checkpoint.SCHEMA)
-    return _updates_of(state)
-
-
-def _train_task(
-    config: PolicyConfig,
-    arguments: argparse.Namespace,
-    out: pathlib.Path,
-    stop: Callable[[], bool],
-) -> int:
-    """Updates made."""
-    from jaxcal.adaptive.policy import run
-    from jaxcal.learning.runtime import devices
-
-    if devices.is_first():
-        print(f"task {config.task}, seed {config.seed}; run folder {out}")
-        print(f"configuration: {config.as_meta()}")
-        _begin_table("decisions", _TASK)
-    state = run.train(
-        config,
-        out,
-        resume=arguments.resume,
-        report=lambda report: _show(report, run.MEASURED),
-        should_stop=stop,
-        num_devices=arguments.devices,
-    )
-    if devices.is_first():
-        _compare_seeds(out, config, run.MEASURED, run.SCHEMA)
-    return _updates_of(state)
+    if first:
+        _compare_seeds(out, config, trainer.MEASURED, schema)
+    return int(np.ravel(state.num_updates)[0])
 
 
 def _num_seeds(arguments: argparse.Namespace, out: pathlib.Path) -> int:
@@ -173,12 +159,6 @@ def _num_seeds(arguments: argparse.Namespace, out: pathlib.Path) -> int:
     with contextlib.suppress(checkpoint.CheckpointError):
         return int(checkpoint.read_meta(out, schema)[1]["num_seeds"])
     return 1
-
-
-def _updates_of(state: Any) -> int:
-    import numpy as np
-
-    return int(np.ravel(state.num_updates)[0])
 
 
 # -- what to train ---------------------------------------------------------------------
@@ -318,8 +298,8 @@ def _refuse_to_overwrite(out: pathlib.Path) -> None:
 # -- what is said ----------------------------------------------------------------------
 
 
-def _introduce(config: TrainConfig, out: pathlib.Path, devices: str) -> None:
-    """What will be trained, in one line and in every number."""
+def _introduction(config: TrainConfig, out: pathlib.Path, devices: str) -> str:
+    """What will be trained, in one line."""
     import jax
 
     shapes = jax.eval_shape(config.learners[0].init, jax.random.key(0))
@@ -328,17 +308,15 @@ def _introduce(config: TrainConfig, out: pathlib.Path, devices: str) -> None:
     if config.num_seeds > 1:
         seed = f"seeds {config.seed} to {config.seed + config.num_seeds - 1}"
     env = task.environment
-    print(
+    given = f" from {task.given.name}" if task.given else ""
+    return (
         f"preset {config.preset}: {config.network.kind} network, {size:,} parameters; "
-        f"choose {env.num_selected} of {env.num_candidates}"
-        + (f" from {task.given.name}" if task.given else "")
-        + f"; {config.ppo.num_episodes:,} episodes, {seed}, "
-        f"on {devices}; run folder {out}"
+        f"choose {env.num_selected} of {env.num_candidates}{given}; "
+        f"{config.ppo.num_episodes:,} episodes, {seed}, on {devices}; run folder {out}"
     )
-    print(f"configuration: {config.as_meta()}")
 
 
-def _stop_on_signals() -> Callable[[], bool]:
+def _stop_on_signals() -> Stop:
     """Whether Ctrl-C or SIGTERM asked to save and stop; a second Ctrl-C is at once."""
     asked: list[int] = []
 

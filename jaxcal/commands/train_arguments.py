@@ -8,7 +8,7 @@ from typing import Any
 
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.tasks import registry
-from jaxcal.arguments import Parser, at_least
+from jaxcal.arguments import Parser, at_least, flag
 from jaxcal.learning.config import PPOConfig, StreamsConfig
 from jaxcal.learning.runtime import processes
 from jaxcal.learning.settings import Setting, settings_of
@@ -69,34 +69,34 @@ def parser(prog: str) -> Parser:
         "postures, or with --task one that picks the next measurement.",
         epilog=_EPILOG.format(program=program, presets=_abouts(known), tasks=_tasks()),
     )
-    add = out.add_argument
-    preset = "of postures, see below [compact]"
-    add("--preset", choices=sorted(known), default="compact", help=preset)
-    add("--task", metavar="NAME", help="of sequential measurement, see below")
-    add("--with", dest="options", nargs="+", default=[], metavar="OPTION=VALUE",
-        help="options of the task")  # fmt: skip
-    budget = "training budget" + _held("num_episodes", known)
-    add("--episodes", type=int, metavar="N", dest="num_episodes", help=budget)
-    updates = f"of {PPO.decisions_per_update:,} decisions each [{PPO.num_updates}]"
-    add("--updates", type=at_least(1), metavar="N", dest="num_updates",
-        help="training budget of a task: updates " + updates)  # fmt: skip
-    add("--seed", type=int, metavar="S", help="of everything random [0]")
-    seeds = "runs side by side in one program: seeds S, S + 1, ... [1]"
-    add("--seeds", type=at_least(1), metavar="N", dest="num_seeds", help=seeds)
-    add("--out", metavar="DIR", help="run folder [runs/PRESET or runs/TASK]")
-    add("--resume", action="store_true", help="go on from the run folder's checkpoint")
-    own = (
-        "train on your own postures, .csv or .npz: one table is a pool that every "
-        "episode draws --num-candidates from; several episodes are candidate sets"
-    )
-    add("--candidates", metavar="FILE", help=own)
-    trainer = "jaxcal's own PPO, or brax's on the same environment [jaxcal]"
-    add("--trainer", choices=("jaxcal", "brax"), default="jaxcal", help=trainer)
-    export = "write the finished policy alone to one file, NAME.npz"
-    add("--export", metavar="FILE", help=export)
-    gap = "do not measure the gap to the proven optimum while training"
-    add("--no-validation", action="store_true", help=gap)
-    add("--devices", type=int, metavar="N", help="devices of each process [all]")
+    out.with_flags(
+        (
+            flag("--preset", "of postures, see below [compact]", default="compact",
+                 choices=sorted(known)),
+            flag("--task", "of sequential measurement, see below", "NAME"),
+            flag("--with", "options of the task", "OPTION=VALUE", dest="options",
+                 nargs="+", default=[]),
+            flag("--episodes", "training budget" + _held("num_episodes", known), "N",
+                 int, dest="num_episodes"),
+            flag("--updates", "training budget of a task: updates of "
+                 f"{PPO.decisions_per_update:,} decisions each [{PPO.num_updates}]",
+                 "N", at_least(1), dest="num_updates"),
+            flag("--seed", "of everything random [0]", "S", int),
+            flag("--seeds", "runs side by side in one program: seeds S, S + 1, ... [1]",
+                 "N", at_least(1), dest="num_seeds"),
+            flag("--out", "run folder [runs/PRESET or runs/TASK]", "DIR"),
+            flag("--resume", "go on from the run folder's checkpoint", on=True),
+            flag("--candidates", "train on your own postures, .csv or .npz: one table "
+                 "is a pool that every episode draws --num-candidates from; several "
+                 "episodes are candidate sets"),
+            flag("--trainer", "jaxcal's own PPO, or brax's on the same environment "
+                 "[jaxcal]", default="jaxcal", choices=("jaxcal", "brax")),
+            flag("--export", "write the finished policy alone to one file, NAME.npz"),
+            flag("--no-validation", "do not measure the gap to the proven optimum "
+                 "while training", on=True),
+            flag("--devices", "devices of each process [all]", "N", int),
+        )
+    )  # fmt: skip
     processes.add_arguments(out)
     common = {field.name for field in settings_of(PPOConfig)} | {"width"}
     parts = presets.PARTS

@@ -37,6 +37,7 @@ Mask = NDArray[np.bool_]
 SINGULAR = 1e-10  # share of the largest; derivatives are exact to about 1e-13 of it
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)
+_SURE = 1e5  # times the tolerance: pivots above it leave no doubt of the rank
 _LOSS = 1e-9  # of orthogonality that whitened rows may have
 _MENDED = 1e-3  # loss below which a second factor restores all of it
 
@@ -61,9 +62,17 @@ def rank_rule(
     norms, flat, rounding = _norms(columns, largest, count or num_rows)
     if flat.any():
         columns, norms = np.where(flat, 0.0, columns), np.where(flat, 1.0, norms)
-    singular = np.linalg.svd(columns / norms, compute_uv=False)
-    rank = (singular > rounding[..., None]).sum(axis=-1)
-    sizes = np.maximum(singular, _TINY)
+    unit, rounding = columns / norms, np.asarray(rounding)
+    if num_rows >= p:  # pivots first: they cost a third of the singular values
+        pivots = np.abs(np.diagonal(np.linalg.qr(unit, mode="r"), axis1=-2, axis2=-1))
+        rank = np.full(rounding.shape, p)
+    else:
+        pivots, rank = np.zeros((*rounding.shape, p)), np.zeros(rounding.shape, int)
+    doubtful = np.asarray(pivots.min(axis=-1) <= _SURE * rounding)
+    sizes = np.maximum(pivots, _TINY)
+    if doubtful.any():
+        singular = np.linalg.svd(unit[doubtful], compute_uv=False)
+        rank[doubtful] = (singular > rounding[doubtful, None]).sum(axis=-1)
     value = 2.0 * (np.log(sizes).sum(axis=-1) + np.log(norms[..., 0, :]).sum(axis=-1))
     return rank, np.where(rank == p, value, -np.inf)
 
@@ -159,27 +168,30 @@ def _stack(
     if usable is None:
         first = blocks[..., :1, :, :]
         same = blocks == first
-        mean = blocks.mean(axis=-3)
     else:
         weight = usable[..., None, None]
         blocks = blocks * weight
         at = usable.argmax(axis=-1)[..., None, None, None]
         first = np.take_along_axis(blocks, at, axis=-3)
         same = (blocks == first) | ~weight
-        mean = blocks.sum(axis=-3) / usable.sum(axis=-1)[..., None, None]
     same = same.all(axis=(-3, -2))[..., None, :]
     constant = first[..., 0, :, :] * same
-    if q == 1:
-        square = (constant * constant).sum(axis=-1, keepdims=True)
-        inverse = np.matrix_transpose(constant) / np.maximum(square, _TINY)
-    else:
-        inverse = np.linalg.pinv(constant)
-    shift = inverse @ (mean * ~same)
     rows = np.empty((*batch, count * q + len(root), p))
     centred = rows[..., : count * q, :].reshape(*batch, count, q, p)  # a view
-    np.subtract(blocks, (constant @ shift)[..., None, :, :], out=centred)
-    if usable is not None:
-        centred *= weight
+    if constant.any() and not same.all():
+        number = count if usable is None else usable.sum(axis=-1)[..., None, None]
+        if q == 1:
+            square = (constant * constant).sum(axis=-1, keepdims=True)
+            inverse = np.matrix_transpose(constant) / np.maximum(square, _TINY)
+        else:
+            inverse = np.linalg.pinv(constant)
+        shift = inverse @ (blocks.sum(axis=-3) / number * ~same)
+        np.subtract(blocks, (constant @ shift)[..., None, :, :], out=centred)
+        if usable is not None:
+            centred *= weight
+    else:
+        shift = np.zeros((*batch, p, p))
+        centred[...] = blocks
     largest = np.maximum(blocks.max(axis=(-3, -2)), -blocks.min(axis=(-3, -2)))
     if len(root):
         rows[..., count * q :, :] = root - root @ shift
@@ -215,6 +227,11 @@ def largest_rank(blocks: Array) -> int:
     if blocks.shape[1] == 1:
         return 1
     full, none = min(blocks.shape[1:]), np.zeros((0, blocks.shape[2]))
+    gram = blocks[0] @ blocks[0].T
+    scale = np.sqrt(np.diagonal(gram))
+    if len(gram) == full and scale.all():  # cheap, and enough where it is clear
+        if np.linalg.eigvalsh(gram / scale / scale[:, None])[0] > SINGULAR:
+            return full
     for some in (blocks[:1], blocks):
         rank = int(rank_of_blocks(some[:, None], none).max(initial=0))
         if rank == full:
@@ -244,7 +261,8 @@ class Whitened(NamedTuple):
     basis: Array  # (S, p, p): raw blocks times it are whitened
     log_scale: Array  # (S,) log det of unwhitened less whitened information
     singular: NDArray[np.int64]  # the sets whose information is; the rest is not theirs
-    rounding: Array  # (S, M) bound on the error of each whitened block, its norm
+    triangle: Array  # (S, p, p): whitened blocks times it are the centred raw ones
+    size: Array  # (S, p) of what the centred blocks are rounded by, beside themselves
 
 
 def whiten(
@@ -288,11 +306,6 @@ def whiten(
         log_scale = 2.0 * np.log(pivots * scale).sum(axis=1)
     basis = inverse / scale[:, :, None]
     white = rows @ basis
-    size = np.abs(rows[:, : count * q])
-    if computed:
-        size = size + largest[:, None]
-    error = (_EPS * p * (size @ np.abs(basis))).reshape(num_sets, count, q * p)
-    rounding = np.sqrt((error * error).sum(axis=2))
     of_prior = white[:, count * q :]
     return Whitened(
         white[:, : count * q].reshape(num_sets, count, q, p),
@@ -300,7 +313,8 @@ def whiten(
         basis - shift @ basis,
         log_scale,
         at,
-        rounding,
+        triangle * scale[:, None],
+        largest if computed else np.zeros_like(largest),
     )
 
 

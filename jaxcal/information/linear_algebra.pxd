@@ -1,5 +1,7 @@
 """Products and inverses of small matrices held by rows; the rule of what is singular.
 
+Of a symmetric matrix the lower triangle is read, and both are written.
+
 Nothing here starts a thread of BLAS: the threads of a few microseconds' work wait for a
 core where other work is done, a hundred times as long as the work. So a product is made
 in parts below the size where BLAS starts them, and factors are our own: LAPACK's start
@@ -9,6 +11,7 @@ them from 30 rows on. Of the smallest products a call of BLAS costs more than th
 from libc.math cimport INFINITY, log, sqrt
 from libc.string cimport memcpy
 from scipy.linalg.cython_blas cimport dgemm
+from scipy.linalg.cython_lapack cimport dsyevd
 
 cdef enum:
     UNTHREADED = 240_000  # multiplications up to which BLAS starts no threads
@@ -141,4 +144,50 @@ cdef inline double factor(
             return -INFINITY
         for b in range(a):
             inverse[b * p + a] = inverse[a * p + b]
+    return value
+
+cdef inline void add(
+    double* gram, double weight, const double* rows, int q, int p
+) noexcept nogil:
+    """``gram += weight rows.T @ rows`` of (p, p) and (q, p), in its lower triangle."""
+    cdef int a, b, r
+    cdef double scaled
+    for r in range(q):
+        for a in range(p):
+            scaled = weight * rows[r * p + a]
+            for b in range(a + 1):
+                gram[a * p + b] += scaled * rows[r * p + b]
+
+cdef inline void eigen(
+    double* matrix, double* values, double* room, int[::1] whole, int p
+) noexcept nogil:
+    """Eigenvalues of a symmetric matrix, smallest first, and eigenvectors in its rows.
+
+    ``room`` holds 1 + 6 p + 2 p^2 numbers, ``whole`` 3 + 5 p.
+    """
+    cdef int info = 0, size = 1 + 6 * p + 2 * p * p, wholes = whole.shape[0]
+    dsyevd(
+        b"V", b"L", &p, matrix, &p, values, room, &size, &whole[0], &wholes, &info
+    )
+
+cdef inline double covariance(
+    bint det, const double* root, double* inverse, int s, int p, double* half,
+    double* solved, double* small, double* other, double* lower, double* gradient,
+) noexcept nogil:
+    """-log det of V = C W C.T, or minus its trace, and G = W C.T V^-1 C W, or W C.T C W.
+
+    G is the gradient by the information, whose inverse is W. ``half`` (s, p) is filled
+    with C W; ``solved`` (s, p), ``small``, ``other``, ``lower`` (s, s) are room.
+    """
+    cdef double value
+    multiply(False, False, s, p, p, root, inverse, half)
+    if not det:
+        multiply(True, False, p, p, s, half, half, gradient)
+        return -dot(half, root, s * p)
+    multiply(False, True, s, s, p, half, root, small)
+    value = -factor(small, other, lower, s)
+    if not value < INFINITY:
+        return -INFINITY
+    multiply(False, False, s, p, s, other, half, solved)
+    multiply(True, False, p, p, s, half, solved, gradient)
     return value

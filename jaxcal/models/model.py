@@ -7,7 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers
+from jaxcal.checks import array_of
 from jaxcal.models.uncertainty import Prior
 
 __all__ = ["Model", "as_commands", "as_parameters", "by_name"]
@@ -66,26 +66,15 @@ class Model(Protocol):
 
 def as_commands(commands: ArrayLike, num_inputs: int) -> Array:
     """``commands`` as finite float64 (N, n)."""
-    array = numbers("commands", commands)
-    if array.ndim != 2 or array.shape[1] != num_inputs:
-        raise ValueError(
-            f"commands must have shape (N, {num_inputs}) for this model, "
-            f"got {array.shape}"
-        )
-    return array
+    return array_of("commands", commands, "N", num_inputs, rule=" for this model")
 
 
 def as_parameters(model: Model, parameters: ArrayLike | None) -> Array:
     """``parameters`` as finite float64 (p,); the nominal ones for None."""
     if parameters is None:
         return model.nominal
-    array = numbers("parameters", parameters)
-    if array.shape != (model.num_parameters,):
-        raise ValueError(
-            f"parameters must have shape ({model.num_parameters},) for this model, "
-            f"got {array.shape}"
-        )
-    return array
+    size = model.num_parameters
+    return array_of("parameters", parameters, size, rule=" for this model")
 
 
 def by_name(model: Any, commands: Any) -> Any:

@@ -8,6 +8,7 @@ here says which kind, and which combinations.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -73,8 +74,16 @@ class D(Wanted):
     name, kind, says = "D", "det", "log det S"
 
     def criterion(self, at: Coordinates) -> Criterion:
-        identity = np.eye(len(at.basis))
-        return Criterion(self.name, self.kind, identity, at.times, at.log_scale)
+        return Criterion(
+            self.name, self.kind, _identity(len(at.basis)), at.times, at.log_scale
+        )
+
+
+@functools.cache
+def _identity(size: int) -> Array:
+    identity = np.eye(size)
+    identity.flags.writeable = False
+    return identity
 
 
 class A(Wanted):

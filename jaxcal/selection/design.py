@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxcal.checks import one_of, seconds
+from jaxcal.checks import one_of, require_none, seconds
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.exact.exact import TIME_LIMIT, solve_exact
-from jaxcal.selection.fastest.motion import Motion
-from jaxcal.selection.plan import Plan, make_plan
-from jaxcal.selection.problem import Asked, Problem, values
+from jaxcal.selection.fastest.run import Travelled
+from jaxcal.selection.plan import Planned
+from jaxcal.selection.problem import Problem, values
 from jaxcal.selection.result import Selection, Subset
 from jaxcal.selection.solvers import SOLVERS, Found, checked_options
-
-if TYPE_CHECKING:
-    from jaxcal.selection.fastest.run import FastSelection, ParetoFront
 
 __all__ = ["Design", "select"]
 
@@ -27,7 +24,7 @@ _REFERENCES = ("bound", "exact")
 _PROVEN = 1e-9  # a value this near a proven optimum, relative above 1, is that optimum
 
 
-class Design(Asked):
+class Design(Planned, Travelled):
     """Which few of these candidates to measure: the problem, and its questions.
 
     Args:
@@ -125,25 +122,18 @@ class Design(Asked):
         one_of("reference", reference, _REFERENCES)
         limit = TIME_LIMIT if time_limit is None else seconds("time_limit", time_limit)
         start = time.perf_counter()
-        subset = np.asarray(indices)
+        subset, count = np.asarray(indices), len(self.available)
         if subset.ndim != 1 or not np.issubdtype(subset.dtype, np.integer):
             raise ValueError(
                 "indices must be a (k,) array of whole numbers, got shape "
                 f"{subset.shape} and dtype {subset.dtype}"
             )
-        if len(subset) == 0:
+        if not len(subset):
             raise ValueError("indices must name at least one candidate, got none")
-        count = len(self.available)
         outside = (subset < 0) | (subset >= count)
-        if outside.any():
-            raise ValueError(
-                f"indices must lie in [0, {count}), got {subset[outside][0]}"
-            )
-        if not self.available[subset].all():
-            masked = subset[~self.available[subset]][0]
-            raise ValueError(
-                f"indices must be available, got {masked}, which is masked"
-            )
+        require_none(outside, subset, f"indices must lie in [0, {count})")
+        masked = ~self.available[subset]
+        require_none(masked, subset, "indices must be available", ", which is masked")
         problem = self.problem(len(subset), criterion)
         repeats = int(np.unique(subset, return_counts=True)[1].max())
         if repeats > problem.max_replicates:
@@ -156,118 +146,12 @@ class Design(Asked):
             return self._judged(problem, found, "score", start)
         optimum = solve_exact(problem, deadline=time.perf_counter() + limit)
         value = float(values(problem, found.indices[None])[0][0])
+        assert optimum.bound is not None
         near = abs(value - optimum.bound) <= _PROVEN * max(1.0, abs(optimum.bound))
         found = Found(
             found.indices, bound=optimum.bound, proven=optimum.proven and near
         )
         return self._judged(problem, found, "score", start)
-
-    def plan(
-        self,
-        accuracy: ArrayLike,
-        noise_std: ArrayLike | None = None,
-        criterion: str = "G",
-        *,
-        parameters: Any = None,
-        region: ArrayLike | None = None,
-        max_k: int | None = None,
-        more: int = 0,
-        design: str = "exact",
-        time_limit: float = 1.0,
-        seed: int | np.random.Generator = 0,
-    ) -> Plan:
-        """The smallest number of measurements that predicts accurately enough.
-
-        Args:
-            accuracy: () or (m,) standard error a prediction may have, measured unit;
-                with "parameters" () or (s,), that of each parameter of interest.
-            noise_std: () or (m,) standard deviation of one measurement, measured unit;
-                the noise of the design when not given. With blocks it is 1. Noise is
-                taken as white: measuring a posture twice halves its variance.
-            criterion: "G", the largest standard error over the region, "I", the root
-                of the mean variance over it, or "parameters", the standard error of the
-                parameters themselves. It must hold for every output or parameter.
-            parameters: names or indices of the s parameters of interest; all when not
-                given.
-            region: (R, n) commands at which predictions are wanted, with blocks
-                (R, m, p) what is predicted, ``region @ theta``; what is available when
-                not given.
-            max_k: largest K allowed; what is available, up to 200, when not given.
-            more: rows of the table beyond the K that suffices.
-            design: the D-optimal selection to start from, "exact" or "exchange".
-            time_limit: seconds for the exact selection of each K.
-            seed: of the exchange.
-
-        Raises:
-            ValueError: naming the argument, the rule and the value; where no K up to
-                ``max_k`` suffices, with the accuracy that can be reached.
-        """
-        return make_plan(
-            self, accuracy, noise_std, criterion, parameters, region, max_k=max_k,
-            more=more, design=design, time_limit=time_limit, seed=seed,
-        )  # fmt: skip
-
-    def fastest(
-        self,
-        k: int | None,
-        motion: Motion,
-        *,
-        least_efficiency: float = 0.95,
-        start: ArrayLike | None = None,
-        method: str | None = None,
-        time_limit: float = 60.0,
-        seed: int | np.random.Generator = 0,
-    ) -> FastSelection:
-        """The subset and the order of least time with a D-efficiency.
-
-        Args:
-            k: postures to choose, distinct; the fewest that identify when None.
-            motion: speeds and accelerations in the candidates' unit, settle time.
-            least_efficiency: in (0, 1], against the proven D-optimum.
-            start: (n,) where the device stands; it begins at any posture by default.
-            method: "exact" (k up to 12, with a proof unless the time runs out) or
-                "heuristic" (local search); exact up to k = 8 when not given.
-            time_limit: seconds of the exact search and of the D-optimum behind both.
-            seed: of the heuristic's starts, from which exact starts too.
-
-        Returns:
-            The selection; among runs of equal time the one with the largest
-            determinant.
-        """
-        from jaxcal.selection.fastest.run import select_fastest  # loads a kernel
-
-        return select_fastest(
-            self, k, motion, least_efficiency, start, method, time_limit, seed
-        )
-
-    def pareto(
-        self,
-        k: int | None,
-        motion: Motion,
-        *,
-        least_efficiency: float = 0.7,
-        start: ArrayLike | None = None,
-        method: str | None = None,
-        max_points: int = 200,
-        time_limit: float = 60.0,
-        seed: int | np.random.Generator = 0,
-    ) -> ParetoFront:
-        """Time against D-efficiency, from ``least_efficiency`` up to the D-optimum.
-
-        Each point is the fastest run more efficient than the point before it.
-
-        Args:
-            k, motion, start, method, seed: as in :meth:`fastest`.
-            least_efficiency: where to cut the front off, in (0, 1].
-            max_points: points after which to stop; the front is then not proven.
-            time_limit: seconds for each point.
-        """
-        from jaxcal.selection.fastest.run import pareto_front  # loads a kernel
-
-        return pareto_front(
-            self, k, motion, least_efficiency, start, method, max_points, time_limit,
-            seed,
-        )  # fmt: skip
 
     def _judged(
         self, problem: Problem, found: Found, method: str, start: float
@@ -299,12 +183,8 @@ class Design(Asked):
         subsets = [Subset(indices, value, log_det)]
         if len(found.alternatives) > 1:
             others = np.stack([each for each, _ in found.alternatives])
-            subsets = [
-                Subset(each, float(worth), float(of_all))
-                for each, worth, of_all in zip(
-                    others, *values(problem, others), strict=True
-                )
-            ]
+            pairs = np.stack(values(problem, others), axis=1).tolist()
+            subsets = [Subset(i, *pair) for i, pair in zip(others, pairs, strict=True)]
         return Selection(
             indices=indices,
             value=value,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.information.blocks import SINGULAR
+from jaxcal.information.blocks import significant
 from jaxcal.selection.problem import Problem, log_dets
 from jaxcal.selection.solver import Found
 
@@ -56,27 +56,16 @@ def _drawn(problem: Problem, rng: np.random.Generator) -> Indices:
 
 def _independent_first(problem: Problem, rng: np.random.Generator) -> Indices:
     """The required, then in random order what extends the span, then the rest."""
-    order = _pool(problem, rng)
-    known = problem.known
-    outside = problem.blocks - problem.blocks @ known.T @ known
-    for i in problem.required:
-        outside = _deflate(outside, i)
-    chosen = list(problem.required)
-    taken: list[int] = []
-    # A direction not yet spanned holds 1/M of some block at least: whitened blocks have
-    # unit sum of squares along every direction.
-    least = 1e-3 / len(outside)
-    for position, i in enumerate(order):
-        if len(chosen) < problem.k and (outside[i] ** 2).sum() > least:
-            outside = _deflate(outside, i)
-            chosen.append(i)
-            taken.append(position)
-    rest = np.delete(order, taken)[: problem.k - len(chosen)]
-    return np.concatenate([np.asarray(chosen, dtype=np.int64), rest])
-
-
-def _deflate(outside: NDArray[np.float64], i: int | np.int64) -> NDArray[np.float64]:
-    """Project the rows of block i (q, p) out of all blocks (M, q, p)."""
-    _, size, right = np.linalg.svd(outside[i], full_matrices=False)
-    right = right[size > SINGULAR]  # of whitened blocks, whose largest is 1
-    return outside - outside @ right.T @ right
+    p, rank = problem.num_regressors, problem.held_rank
+    chosen: list[int] = problem.required.tolist()
+    later: list[int] = []
+    rows = problem.blocks[problem.required].reshape(-1, p)
+    rows = np.concatenate([problem.root @ problem.basis, rows])
+    for i in _pool(problem, rng).tolist():
+        more, found = np.concatenate([rows, problem.blocks[i]]), 0
+        if rank < p and len(chosen) < problem.k:
+            found = int(significant(np.linalg.svd(more, compute_uv=False)).sum())
+        if found > rank:
+            rows, rank = more, found
+        (chosen if rows is more else later).append(i)
+    return np.array([*chosen, *later][: problem.k], dtype=np.int64)

@@ -18,6 +18,7 @@ TRUTH = ARM.nominal + np.asarray(PRIOR.std) * RNG.normal(size=39) * 0.5
 NOISE = 0.05
 MEASURED = ARM.predict(JOINTS, TRUTH) + NOISE * RNG.normal(size=(60, 3))
 FOUND = jaxcal.identify(JOINTS, MEASURED, model=ARM, noise_std=NOISE)
+WHOLE = FOUND.whole  # with the harmonics of its joints
 
 
 def _new(theta, count, seed):
@@ -48,6 +49,27 @@ def test_a_drift_of_the_size_it_states_is_seen_four_times_in_five():
             measured = ARM.predict(joints, drifted) + NOISE * rng.normal(size=(4, 3))
             seen += FOUND.check(joints, measured).says == "does not hold"
         assert low <= seen <= high, (name, seen)
+
+
+def test_the_power_that_is_printed_is_that_of_simulated_changes():
+    """Mean over all parameters, each drawn as a change by the tolerance."""
+    joints, _ = _new(TRUTH, 3, 0)
+    tolerance = 0.12
+    said = FOUND.check(joints, FOUND.predict(joints), tolerance=tolerance)
+    assert f"is seen with {said.power:.0%}" in str(said)
+    rng = np.random.default_rng(1)
+    slopes = WHOLE.jacobian(JOINTS, FOUND.estimate)[..., :39]
+    moves = np.sqrt((slopes**2).sum(axis=1).mean(axis=0))
+    seen = []
+    truths = rng.multivariate_normal(FOUND.estimate, FOUND.joint_covariance, 300)
+    for k, truth in enumerate(truths):
+        at = [i for i in range(39) if moves[i] > 0.0][k % int((moves > 0.0).sum())]
+        drifted = truth.copy()
+        drifted[at] += tolerance / moves[at]
+        measured = WHOLE.predict(joints, drifted) + NOISE * rng.normal(size=(3, 3))
+        seen.append(FOUND.check(joints, measured).says == "does not hold")
+    low, high = stats.binom.interval(0.999, 300, said.power)
+    assert low <= sum(seen) <= high
 
 
 def test_what_one_posture_cannot_tell_is_said():

@@ -57,6 +57,10 @@ def test_the_choice_has_them_too_unless_a_prior_is_given():
     same = jaxcal.select(candidates, model=WHOLE, **options)
     assert list(chosen.indices) == list(same.indices)
     assert chosen.value == pytest.approx(same.value)
+    of_table = jaxcal.select(candidates, model=ARM, criterion="D", **options)
+    given = {"prior": ARM.default_prior(), "criterion": "D"}
+    again = jaxcal.select(candidates, model=ARM, **given, **options)
+    assert of_table.value == pytest.approx(again.value)
     plain = jaxcal.select(candidates, model=ARM, prior=ARM.default_prior(), **options)
     slopes = ARM.jacobian(candidates) / 0.1
     used = slopes[plain.indices].reshape(-1, 39)

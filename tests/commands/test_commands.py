@@ -15,7 +15,7 @@ import pytest
 
 import jaxcal
 from jaxcal.commands import main
-from jaxcal.commands.select import read_model
+from jaxcal.commands.questions import read_model
 from jaxcal.models import SerialChain
 
 MATRIX = np.array([[0.43, 0.02, 0.0], [0.0, 0.71, 0.01], [0.03, 0.0, 0.87]])

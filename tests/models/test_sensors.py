@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import jaxcal
-from jaxcal import Prior
 from jaxcal.models import (
     Board,
     Distance,
@@ -333,22 +332,20 @@ def test_what_a_sensor_cannot_see_is_held_and_named():
 def test_gravity_finds_the_zeros_of_joints_from_twelve_postures():
     """Of an arm whose axes are where its table has them; 3 simulated arms."""
     arm = SerialChain.from_urdf(PANDA, tip="ball_link", sensor=Gravity())
-    stated = arm.default_prior()
-    axes = [name for name in arm.names if name.startswith(("alpha", "beta"))]
-    prior = Prior(stated.std, fixed=tuple({*stated.fixed, *axes}))
-    std = np.where(np.isin(arm.names, prior.fixed), 0.0, np.asarray(stated.std))
+    prior = arm.default_prior()
+    std = np.where(np.isin(arm.names, prior.fixed), 0.0, np.asarray(prior.std))
     low, high = np.clip(arm.limits, -150.0, 150.0).T
     offered = np.random.default_rng(0).uniform(low, high, (100, 7))
     names = [f"theta{i}" for i in range(2, 7)]  # not about the vertical, the tool's
     chosen = jaxcal.select(
-        offered, 12, "exchange", model=arm, prior=prior, criterion=jaxcal.As(names)
+        offered, 12, "exchange", model=arm, criterion=jaxcal.As(names)
     ).indices
     at = [arm.names.index(name) for name in names]
     for seed in range(3):
         rng = np.random.default_rng(seed)
         truth = arm.nominal + std * rng.normal(size=len(std))
         felt = arm.predict(offered[chosen], truth) + 0.00981 * rng.normal(size=(12, 3))
-        found = jaxcal.identify(offered[chosen], felt, model=arm, prior=prior)
+        found = jaxcal.identify(offered[chosen], felt, model=arm)
         assert np.sqrt(np.mean((found.parameters - truth)[at] ** 2)) < 0.05
 
 

@@ -43,7 +43,8 @@ def tool_frame(model, command, values):
         for wave, times in (("sin", 1), ("cos", 1), ("sin2", 2), ("cos2", 2)):
             shape = np.sin if wave.startswith("sin") else np.cos
             amplitude = values.get(f"theta{i} {wave}", 0.0)
-            move += amplitude * shape(times * np.radians(command[i - 1]))
+            angle = values.get(f"gear{i}", 1.0) * np.radians(command[i - 1])
+            move += amplitude * shape(times * angle)
         theta, d = values[f"theta{i}"], values[f"d{i}"]
         joint = [
             _turn("z", theta + (move if kind == "R" else 0.0)),

@@ -115,7 +115,7 @@ def test_the_console_shows_what_the_library_logs(
 ) -> None:
     log = logging.getLogger("jaxcal.selection.exact")
     monkeypatch.setattr(
-        "jaxcal.commands.select.run", lambda arguments: log.info("said once")
+        "jaxcal.commands.questions.select", lambda arguments: log.info("said once")
     )
     for _ in range(2):
         assert main(["select", "-", "-k", "4"]) == 0

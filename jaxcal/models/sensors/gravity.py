@@ -19,8 +19,10 @@ Array = NDArray[np.float64]
 class Gravity(Sensor):
     """Acceleration x, y, z in the tip's frame at rest: up, as accelerometers read it.
 
-    Lengths, and a turn about the vertical, are not shown and held. The scale of the
-    sensor is known to 2 %, its bias to 5 %; noise 0.1 % of ``magnitude``.
+    Lengths, and a turn about the vertical, are not shown and held. So are the turns of
+    the axes, alpha and beta: a joint's zero cannot be told from its neighbours', which
+    are known better. The scale of the sensor is known to 2 %, its bias to 5 %; noise
+    0.1 % of ``magnitude``.
 
     Attributes:
         magnitude: what a level sensor reads, 9.81 for m/s^2 or 1 for g.
@@ -65,12 +67,12 @@ class Gravity(Sensor):
 
     def unseen(self, arm: Named) -> tuple[str, ...]:
         about = "xyz"[int(np.abs(self.up).argmax())]
-        lengths = [
+        hidden = [
             name
             for name, unit in zip(arm.names, arm.units, strict=True)
-            if unit == "length"
+            if unit == "length" or name.startswith(("alpha", "beta"))
         ]
-        return (*lengths, f"base r{about}")
+        return (*hidden, f"base r{about}")
 
     def read(self, tip: Tip, inputs: Array, own: Array) -> Reading:
         up = self.magnitude * np.array(self.up)

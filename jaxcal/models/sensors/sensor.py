@@ -221,7 +221,9 @@ class Placed(Sensor):
 
     @property
     def nominal(self) -> Array:
-        return np.zeros(len(self.names)) if self.places is None else self.places.ravel()
+        if self.places is None:
+            return np.zeros(self.count * len(self.axes))
+        return self.places.ravel()
 
     def of_rows(self, inputs: Array) -> NDArray[np.int64]:
         """(N,) which one each row is of."""

@@ -164,9 +164,14 @@ class Arm:
             ]
         )
 
+    @functools.cached_property
+    def _owned(self) -> int:
+        """s, the sensor's own parameters."""
+        return len(self.sensor.names)
+
     def _split(self, parameters: Array) -> tuple[Array, Array, Array]:
         """Base (6,), tool (6,) and the sensor's own (s,)."""
-        last = len(parameters) - len(self.sensor.names)
+        last = len(parameters) - self._owned
         first = last - len(self._tool)
         tool = np.concatenate([self.tool[:3, 3], np.zeros(3)])
         tool[self._tool] = parameters[first:last]
@@ -182,16 +187,23 @@ class Arm:
         waves = parameters[end : end + 4 * len(self.harmonics)].reshape(-1, 4)
         return ratios, parameters[last:end], waves
 
-    def _swing(self, commands: Array) -> tuple[Array, Array]:
-        """(H, 4, N) sin, cos of the joints and of twice them, and their rates."""
-        turns = np.radians(self._moves(commands).T[[i - 1 for i in self.harmonics]])
+    def _swing(self, commands: Array, parameters: Array) -> tuple[Array, Array]:
+        """(H, 4, N) sin, cos of the joints and of twice them; (n, N) what they add.
+
+        The latter is how far each joint goes for one degree behind its gear.
+        """
+        ratios, _, waves = self._drives(parameters)
+        at = [i - 1 for i in self.harmonics]
+        turns = np.radians((ratios * self._moves(commands)).T[at])
         angles = turns[:, None] * np.array([[1.0], [2.0]])
         sine, cosine = np.sin(angles), np.cos(angles)
         rate = np.radians([[[1.0]], [[2.0]]])
-        each = np.stack([sine, cosine], axis=2)
-        rates = rate * np.stack([cosine, -sine], axis=2)
-        shape = (len(turns), 4, len(commands))
-        return each.reshape(shape), rates.reshape(shape)
+        shape = (len(at), 4, len(commands))
+        each = np.stack([sine, cosine], axis=2).reshape(shape)
+        rates = (rate * np.stack([cosine, -sine], axis=2)).reshape(shape)
+        goes = np.ones((len(self.joints), len(commands)))
+        goes[at] += np.einsum("hk,hkn->hn", waves, rates)
+        return each, goes
 
     def _moves(self, commands: Array) -> Array:
         """(N, n) how far each joint moves, before its gear."""
@@ -209,7 +221,9 @@ class Arm:
             moves[at] += compliance[:, None] * self._torque(commands)[0]
         if waves.any():
             at = [i - 1 for i in self.harmonics]
-            moves[at] += np.einsum("hk,hkn->hn", waves, self._swing(commands)[0])
+            moves[at] += np.einsum(
+                "hk,hkn->hn", waves, self._swing(commands, parameters)[0]
+            )
         base, tool, _ = self._split(parameters)
         rows = parameters[: 5 * n].reshape(n, 5)
         rows = rows[:, np.argsort(_ORDER[self.convention])]

@@ -242,8 +242,8 @@ class SerialChain(Arm):
     def with_misfit(self) -> Self:
         """This arm with harmonics of its joints, where its sensor asks for them.
 
-        They are no parameters of the arm: ``select`` and ``identify`` add them where no
-        prior is given, as what the parameters do not explain.
+        They are no parameters of the arm: ``identify``, and ``select`` for predictions,
+        add them where no prior is given, as what the parameters do not explain.
         """
         if self.harmonics or not self.sensor.harmonic:
             return self
@@ -283,6 +283,29 @@ class SerialChain(Arm):
         from jaxcal.models.serial.postures import postures
 
         return postures(self, count, seed, near, allowed)
+
+    def at_rest(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        seconds: float = 0.5,
+        within: float = 0.05,
+    ) -> Array:
+        """Postures (N, J) at which a recorded arm stood still, in their order.
+
+        Args:
+            path: rosbag2 folder (SQLite or MCAP) with joint states, joints by name in
+                any order. Needs the extra ``ros``.
+            seconds: of rest, at least.
+            within: degrees (or units of length) in which a resting joint stays.
+        """
+        from jaxcal.models.serial.bags import at_rest, joint_states
+
+        times, joints = joint_states(path, self.joint_names)
+        turns = np.array(self.command_units) == "deg"
+        return at_rest(
+            times, np.where(turns, np.degrees(joints), joints), seconds, within
+        )
 
     def in_turn(self, commands: ArrayLike) -> NDArray[np.int64]:
         """(N,) the commands' rows in an order of little travel, socket after socket."""
@@ -512,7 +535,11 @@ class SerialChain(Arm):
         columns, own = self._motion(commands, parameters, self._steps_of_parameters)
         first = 5 * len(self.joints)
         last = first + len(self.gears)
-        moves = self._moves(commands)[:, [i - 1 for i in self.gears]]
+        at = [i - 1 for i in self.gears]
+        moves = self._moves(commands)[:, at]
+        if self.harmonics:
+            swing, goes = self._swing(commands, parameters)
+            moves = moves * goes[at].T
         columns[..., first:last] *= moves[:, None]
         if self.compliance:
             torque = self._torque(commands)[0].T
@@ -520,8 +547,7 @@ class SerialChain(Arm):
         if self.harmonics:
             first = last + len(self.compliance)
             last = first + 4 * len(self.harmonics)
-            swing = self._swing(commands)[0].reshape(last - first, -1)
-            columns[..., first:last] *= swing.T[:, None]
+            columns[..., first:last] *= swing.reshape(last - first, -1).T[:, None]
         return np.concatenate([columns, own], axis=-1)
 
     def command_jacobian(
@@ -534,12 +560,10 @@ class SerialChain(Arm):
         commands = as_commands(commands, self.num_inputs)
         parameters = as_parameters(self, parameters)
         columns, _ = self._motion(commands, parameters, self._steps_of_joints)
-        gears, compliance, waves = self._drives(parameters)
+        gears, compliance, _ = self._drives(parameters)
         result = columns * gears
         if self.harmonics:
-            at = [i - 1 for i in self.harmonics]
-            swing = np.einsum("hk,hkn->nh", waves, self._swing(commands)[1])
-            result[..., at] += columns[..., at] * swing[:, None]
+            result *= self._swing(commands, parameters)[1].T[:, None]
         if self.compliance:
             at = [i - 1 for i in self.compliance]
             rate = compliance[:, None, None] * self._torque(commands)[1]

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,12 +67,15 @@ def branch_and_bound(
             proof has had a fair try.
         root_only: stop at the bound of the relaxation.
     """
-    search, scale, shift = _search(blocks, prior, criterion, int(start.sum()), start)
     num_blocks, q, p = blocks.shape
     low, high, counts = np.array([lower, upper, start], dtype=np.float64)
-    best_counts = np.zeros((best, num_blocks))
-    best_values = np.full(best, -np.inf)
-    search.offer(low, high, counts, best_counts, best_values)
+    kind, root, scale, shift = _near_one(blocks, prior, criterion, start)
+    best_counts, best_values = np.zeros((best, num_blocks)), np.full(best, -np.inf)
+    search = compiled.kernel("jaxcal.selection.exact.kernel").Search(
+        kind, blocks, prior, root, start.sum(), largest_rank(blocks), best_counts,
+        best_values,
+    )  # fmt: skip
+    search.offer(low, high, counts)
     nodes, bounds = np.empty((64, 3, num_blocks)), np.full(64, np.inf)
     nodes[0] = low, high, counts
     good = (0.0, np.inf) if root_only else (0.0, -np.inf)
@@ -88,8 +90,8 @@ def branch_and_bound(
             bounds = np.concatenate([bounds, np.full(len(bounds), np.inf)])
         left = np.inf if deadline is None else deadline - time.perf_counter()
         size, more, going = search.run(
-            nodes, bounds, size, best_counts, best_values, TOLERANCE,
-            max(256, _MEMORY // (24 * num_blocks)), max(1, tries - done), left, *good,
+            nodes, bounds, size, TOLERANCE, max(256, _MEMORY // (24 * num_blocks)),
+            max(1, tries - done), left, *good,
         )  # fmt: skip
         done += more
     if size:
@@ -104,26 +106,21 @@ def branch_and_bound(
     )
 
 
-def _search(
-    blocks: Array, prior: Array, criterion: Criterion, k: int, start: Indices
-) -> tuple[Any, float, float]:
-    """The compiled search in numbers near 1, and unit and origin of its values."""
+def _near_one(
+    blocks: Array, prior: Array, criterion: Criterion, start: Indices
+) -> tuple[int, Array, float, float]:
+    """The kernel's criterion and C, with values near 1, and their unit and origin."""
     kernel = compiled.kernel("jaxcal.selection.exact.kernel")
-    root = criterion.root
-    rank = largest_rank(blocks)
-    p = len(prior)
-    scale, shift = 1.0, 0.0
+    root, p = criterion.root, len(prior)
     if criterion.kind == "det" and len(root) == p:
-        kind, shift = kernel.D, -2.0 * float(np.linalg.slogdet(root)[1])
-    elif criterion.kind == "det":
-        kind, lengths = kernel.DS, np.linalg.norm(root, axis=1)
-        root, shift = root / lengths[:, None], -2.0 * float(np.log(lengths).sum())
-    else:
-        chosen = np.repeat(blocks, start, axis=0).reshape(-1, p)
-        phi = abs(float(criterion.value(prior + chosen.T @ chosen)))
-        scale = phi if 0.0 < phi < np.inf else 1.0
-        trace = criterion.kind == "trace"
-        kind = kernel.TRACE if trace else kernel.E
-        root = root / np.sqrt(scale) if trace else root * np.sqrt(scale)
-    arrays = [np.array(each, order="C") for each in (blocks, prior, root)]
-    return kernel.Search(kind, *arrays, k, rank), scale, shift
+        return kernel.D, root, 1.0, -2.0 * float(np.linalg.slogdet(root)[1])
+    if criterion.kind == "det":
+        lengths = np.linalg.norm(root, axis=1)
+        shift = -2.0 * float(np.log(lengths).sum())
+        return kernel.DS, root / lengths[:, None], 1.0, shift
+    chosen = np.repeat(blocks, start, axis=0).reshape(-1, p)
+    scale = abs(float(criterion.value(prior + chosen.T @ chosen)))
+    scale = scale if 0.0 < scale < np.inf else 1.0
+    if criterion.kind == "trace":
+        return kernel.TRACE, root / np.sqrt(scale), scale, 0.0
+    return kernel.E, root * np.sqrt(scale), scale, 0.0

@@ -12,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +22,7 @@ from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
 from jaxcal.selection.problem import Problem, values
 from jaxcal.selection.solver import Found, in_threads
 
-__all__ = [
-    "STARTING_RESTARTS",
-    "ExactResult",
-    "solve",
-    "solve_auto",
-    "solve_exact",
-    "upper_bound",
-]
+__all__ = ["TIME_LIMIT", "solve", "solve_auto", "solve_exact", "upper_bound"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -45,18 +37,6 @@ _CHEAP = 5_000_000  # subsets: the largest volume is found within milliseconds
 _LARGEST_HULL_DIMENSION = 4  # qhull's facets grow as M^(n // 2)
 
 
-@dataclasses.dataclass(frozen=True)
-class ExactResult:
-    """The best selections and the proof."""
-
-    subsets: Indices  # (found, k), each sorted, best first; none of them singular
-    values: Array  # (found,) of the criterion, as reported
-    bound: float  # no selection has a better value; values[0] if proven
-    nodes: int  # branch-and-bound nodes, or those of the search for volumes
-    proven: bool
-    rounding: float = 0.0  # share that keeps a finished search from being a proof
-
-
 def solve(
     problem: Problem,
     *,
@@ -67,9 +47,7 @@ def solve(
 ) -> Found:
     """The solver "exact"; 10 s where no time limit is given."""
     deadline = time.perf_counter() + (time_limit or TIME_LIMIT)
-    restarts = restarts or STARTING_RESTARTS
-    found = solve_exact(problem, best, deadline, restarts, seed)
-    return as_found(found, seed=seed, restarts=restarts)
+    return solve_exact(problem, best, deadline, restarts or STARTING_RESTARTS, seed)
 
 
 def solve_many(
@@ -79,7 +57,7 @@ def solve_many(
     deadline = None if time_limit is None else time.perf_counter() + time_limit
 
     def solved(problem: Problem) -> Found:
-        return as_found(solve_exact(problem, deadline=deadline))
+        return solve_exact(problem, deadline=deadline)
 
     if problems[0].simplex:  # mostly the hull, which keeps other threads waiting
         return [solved(problem) for problem in problems]
@@ -105,50 +83,27 @@ def solve_auto(
     limit, "exchange" where the bound proved enough before.
     """
     limit = time_limit or (TIME_LIMIT if problem.rank_one else _BLOCKS_LIMIT)
-    restarts = restarts or STARTING_RESTARTS
     deadline = time.perf_counter() + limit
-    result = solve_exact(problem, 1, deadline, restarts, seed, least_efficiency)
+    restarts = restarts or STARTING_RESTARTS
+    found = solve_exact(problem, 1, deadline, restarts, seed, least_efficiency)
+    assert found.value is not None and found.bound is not None
+    if found.reason:  # rounding
+        return dataclasses.replace(found, method="exact")
     name = f"{problem.criterion.name}-efficiency"
-    proven_share = problem.criterion.efficiency(float(result.values[0]), result.bound)
-    close = proven_share >= least_efficiency
-    if result.proven:
-        reason = "the exact search proved this optimum"
-    elif close:
+    proven_share = problem.criterion.efficiency(found.value, found.bound)
+    method, reason = "exact", "the exact search proved this optimum"
+    if not found.proven and proven_share >= least_efficiency:
+        method = "exchange"
         reason = (
             f"the bound proves a {name} of at least {proven_share:.6f}, and "
             f"{least_efficiency:g} was asked for"
         )
-    else:
+    elif not found.proven:
         reason = (
             f"the exact search ran out of time after {limit:g} s with a {name} "
             f"of at least {proven_share:.6f} proven; {least_efficiency:g} was asked for"
         )
-    stopped = not result.proven and close and not result.rounding
-    return as_found(
-        result,
-        method="exchange" if stopped else "exact",
-        reason=reason,
-        seed=seed,
-        restarts=restarts,
-    )
-
-
-def as_found(result: ExactResult, **record: Any) -> Found:
-    """What the protocol wants to know."""
-    if result.rounding:
-        record["reason"] = (
-            "not proven in double precision: the search is complete, but rounding may "
-            f"change the variances by a share of {result.rounding:.1g}"
-        )
-    return Found(
-        indices=result.subsets[0],
-        value=float(result.values[0]),
-        bound=result.bound,
-        proven=result.proven,
-        nodes=result.nodes,
-        alternatives=tuple(zip(result.subsets, result.values.tolist(), strict=True)),
-        **record,
-    )
+    return dataclasses.replace(found, method=method, reason=reason)
 
 
 def solve_exact(
@@ -158,8 +113,10 @@ def solve_exact(
     restarts: int = STARTING_RESTARTS,
     seed: int = 0,
     enough: float | None = None,
-) -> ExactResult:
+) -> Found:
     """The ``best`` selections, or the best found by ``deadline`` and a true bound.
+
+    They are the ``alternatives``, best first; none of them is singular.
 
     Args:
         problem: what to choose from.
@@ -176,11 +133,12 @@ def solve_exact(
             if enough and not cheap:  # the relaxation may do without
                 start = np.sort(exchange_indices(problem, restarts, seed, deadline))
                 relaxed = _relaxed(problem, start)
-                result = _result(problem, [start], best, relaxed, 1)
-                value = float(result.values[0])
-                if problem.criterion.efficiency(value, result.bound) >= enough:
-                    return result
-            return _enumerate(problem, pool, best, deadline)
+                found = _found(problem, [start], best, relaxed, 1)
+                assert found.value is not None and found.bound is not None
+                if problem.criterion.efficiency(found.value, found.bound) >= enough:
+                    return dataclasses.replace(found, seed=seed, restarts=restarts)
+            found = _enumerate(problem, pool, best, deadline)
+            return dataclasses.replace(found, seed=seed, restarts=restarts)
     start = exchange_indices(problem, restarts, seed, deadline)
     keep, first = _groups(problem, merge=best == 1)
     counts = np.bincount(start, minlength=len(problem.blocks))
@@ -188,7 +146,7 @@ def solve_exact(
         np.add.reduceat(each[keep], first)
         for each in (problem.lower, problem.upper, counts)
     )
-    found = branch_and_bound(
+    searched = branch_and_bound(
         problem.blocks[keep[first]],
         problem.prior,
         problem.criterion,
@@ -199,9 +157,10 @@ def solve_exact(
         deadline,
         enough,
     )
-    subsets = [_expand(problem, keep, first, each) for each in found.counts]
-    bound = None if found.proven else found.bound
-    return _result(problem, subsets, best, bound, found.nodes)
+    subsets = [_expand(problem, keep, first, each) for each in searched.counts]
+    bound = None if searched.proven else searched.bound
+    found = _found(problem, subsets, best, bound, searched.nodes)
+    return dataclasses.replace(found, seed=seed, restarts=restarts)
 
 
 def upper_bound(problem: Problem) -> float:
@@ -213,7 +172,9 @@ def upper_bound(problem: Problem) -> float:
         pool = _pool(problem, hull=True)
         free = problem.k - len(problem.required)
         if math.comb(len(pool), free) <= _CHEAP:
-            return _enumerate(problem, pool, 1, None).bound
+            found = _enumerate(problem, pool, 1, None)
+            assert found.bound is not None
+            return found.bound
     relaxed = _relaxed(problem, greedy_indices(problem))
     return float(problem.criterion.reported(relaxed))
 
@@ -260,7 +221,7 @@ def _pool(problem: Problem, hull: bool) -> Indices:
 
 def _enumerate(
     problem: Problem, pool: Indices, best: int, deadline: float | None
-) -> ExactResult:
+) -> Found:
     """Largest volumes beside the required rows, in the space these leave free."""
     required = problem.rows[problem.required]
     vectors = problem.rows[pool]
@@ -273,22 +234,22 @@ def _enumerate(
         np.sort(np.concatenate([problem.required, pool[s]])) for s in found.subsets
     ]
     if found.complete:
-        return _result(problem, subsets, best, None, found.examined)
+        return _found(problem, subsets, best, None, found.examined)
     # Out of time: whatever greedy has, if that is better, and the sharper bound.
     greedy = np.sort(greedy_indices(problem))
     # log det(X_s.T X_s) is twice the log of the volume, beside that of ``required``.
     fixed = np.linalg.slogdet(required @ required.T)[1] if len(required) else 0.0
     bound = min(_relaxed(problem, greedy), fixed + 2.0 * float(np.log(found.bound)))
-    return _result(problem, [*subsets, greedy], best, bound, found.examined)
+    return _found(problem, [*subsets, greedy], best, bound, found.examined)
 
 
-def _result(
+def _found(
     problem: Problem,
     subsets: list[Indices],
     best: int,
     relaxed: float | None,
     nodes: int,
-) -> ExactResult:
+) -> Found:
     """Values in the caller's unit, singular subsets left out, best first.
 
     ``relaxed`` bounds phi from above; None where the first is proven.
@@ -303,15 +264,28 @@ def _result(
             f"{problem.subject} must allow an invertible selection, but the best, "
             f"{chosen[0].tolist()}, is singular"
         )
-    bound = float(value[order[0]])
+    subsets, worth = list(chosen[order]), value[order].tolist()
+    bound, proven, reason = worth[0], relaxed is None, ""
     if relaxed is not None:
         bound = better(bound, float(criterion.reported(relaxed)))
-    unsure = problem.uncertainty(chosen[order[0]])
-    if unsure <= TOLERATED:
-        return ExactResult(chosen[order], value[order], bound, nodes, relaxed is None)
-    bound = criterion.bettered(bound, unsure)
-    unsure = unsure if relaxed is None else 0.0
-    return ExactResult(chosen[order], value[order], bound, nodes, False, unsure)
+    unsure = problem.uncertainty(subsets[0])
+    if unsure > TOLERATED:
+        bound = criterion.bettered(bound, unsure)
+        if proven:
+            reason = (
+                "not proven in double precision: the search is complete, but rounding "
+                f"may change the variances by a share of {unsure:.1g}"
+            )
+        proven = False
+    return Found(
+        indices=subsets[0],
+        value=worth[0],
+        bound=bound,
+        proven=proven,
+        nodes=nodes,
+        alternatives=tuple(zip(subsets, worth, strict=True)),
+        reason=reason,
+    )
 
 
 def _groups(problem: Problem, merge: bool) -> tuple[Indices, Indices]:

@@ -50,15 +50,17 @@ from __future__ import annotations
 import cython
 import numpy as np
 from cython.cimports.jaxcal.information.linear_algebra import (
+    add,
     cholesky,
     copy,
+    covariance,
     dot,
+    eigen,
     factor,
     multiply,
 )
 from cython.cimports.jaxcal.watch import begin, late
 from cython.cimports.libc.math import INFINITY, exp, fabs, floor, log, log1p, sqrt
-from cython.cimports.scipy.linalg.cython_lapack import dsyevd
 
 __all__ = ["DS", "TRACE", "D", "E", "Search"]
 
@@ -81,9 +83,8 @@ _FRACTIONAL = cython.declare(cython.int, 400)  # counts that a Newton step moves
 _RIDGE = cython.declare(cython.double, 1e-10)  # share of the largest curvature
 _ROUNDING = cython.declare(cython.double, 1e-12)  # of a count that is whole
 _TUNES = cython.declare(cython.int, 2)  # of mu of RANK_TRACE in one node
-_SMOOTHING = cython.declare(
-    cython.double, 30.0
-)  # b of E at first, where phi is about 1
+# b of E at first, where phi is about 1, and at most
+_SMOOTHING = cython.declare(cython.double, 30.0)
 _SHARPEST = cython.declare(cython.double, 1e5)
 _TAKEN = cython.declare(cython.double, 1e-6)  # of a reading, in what eigenvectors take
 _WHOLE = cython.declare(cython.double, 1e-9)  # a count this near a whole number is it
@@ -96,279 +97,243 @@ class Search:
     ``kernel.pxd`` says what each attribute is.
     """
 
-    def __init__(self, kind, blocks, prior, root, k, rank):
-        # Arrays are C-contiguous float64. (A docstring here would be a global symbol of
-        # C, of which a module that holds its code twice has two.)
-        num_blocks, q, p = blocks.shape
-        self.kind, self.k, self.rank = kind, k, rank
-        self.blocks, self.prior, self.root = blocks, prior, root
-        square = np.zeros((11, p, p))
-        self.known, self.rest, self.gram, self.gradient = square[:4]
-        self.inverse, self.other, self.half, self.basis = square[4:8]
-        self.bend, self.lines, self.share = square[8:]
-        self.vectors, self.reach, self.scaled, self.small = np.zeros((4, p, p))
-        self.values, self.slopes, self.own, self.tail, self.weights = np.zeros((5, p))
-        self.lapack = np.empty(1 + 6 * p + 2 * p * p)
-        self.whole = np.empty(3 + 5 * p, dtype=np.intc)
-        self.leverage, self.wish = np.zeros((2, num_blocks))
-        m = min(num_blocks, _FRACTIONAL + 2 * p + 4)
-        self.which, self.free = np.empty((2, m), dtype=np.intp)
-        self.side = np.empty(m, dtype=np.intc)
-        self.picked, self.turned = np.empty((2, m * q, p))
-        crossed = max(m * q * m * q, m * p * (p + 1) // 2)
-        self.crossed, self.bent = np.empty((2, crossed))
-        self.curvature, self.face = np.empty((2, m * m))
-        self.ends, self.move, self.before, self.slope = np.empty((4, m))
-        self.least, self.most = np.empty((2, m))
-        self.right = np.empty(2 * m)
-        self.node = np.empty((3, num_blocks))
+    def __init__(self, kind, blocks, prior, root, k, rank, best_counts, best_values):
+        # Arrays are C-contiguous float64; the best (best, M) and (best,) are written.
+        # (A docstring here would be a global symbol of C, of which a module that holds
+        # its code twice has two.)
+        self.count, self.q, self.p = blocks.shape
+        self.kind, self.k, self.rank, self.s = kind, k, rank, len(root)
+        self.best_counts, self.best_values = best_counts, best_values
+        self.most_moved = min(self.count, _FRACTIONAL + 2 * self.p + 4)
+        self.whole = np.empty(3 + 5 * self.p, dtype=np.intc)
+        self.which, self.free = np.empty((2, self.most_moved), dtype=np.intp)
+        self.side = np.empty(self.most_moved, dtype=np.intc)
+        self._lay_out()
+        self.room = np.zeros(self.used)
+        self._lay_out()
+        given: cython.double[::1] = np.concatenate(
+            [blocks.ravel(), prior.ravel(), root.ravel()]
+        )
+        copy(self.blocks, cython.address(given[0]), given.shape[0])
+
+    def _take(self, count):
+        """Where the next ``count`` numbers of the room are."""
+        self.used += count
+        if self.room is None:
+            return cython.NULL
+        return cython.address(self.room[0]) + (self.used - count)
+
+    def _lay_out(self):
+        """Share the room out; before there is one, count how much is needed."""
+        p, m, square = self.p, self.most_moved, self.p * self.p
+        wide: cython.Py_ssize_t = m * self.q
+        crossed = max(wide * wide, m * p * (p + 1) // 2)
+        self.used = 0
+        self.blocks = self._take(self.count * self.q * p)  # as given, in this order
+        self.prior, self.root = self._take(square), self._take(self.s * p)
+        self.known, self.rest = self._take(square), self._take(square)
+        self.gram, self.gradient = self._take(square), self._take(square)
+        self.inverse, self.other = self._take(square), self._take(square)
+        self.half, self.basis = self._take(square), self._take(square)
+        self.bend, self.lines = self._take(square), self._take(square)
+        self.share, self.vectors = self._take(square), self._take(square)
+        self.reach, self.scaled = self._take(square), self._take(square)
+        self.small, self.spare = self._take(square), self._take(square)
+        self.values, self.slopes = self._take(p), self._take(p)
+        self.own, self.tail = self._take(p), self._take(p)
+        self.weights = self._take(p)
+        self.lapack = self._take(1 + 6 * p + 2 * square)
+        self.leverage, self.wish = self._take(self.count), self._take(self.count)
+        self.picked, self.turned = self._take(wide * p), self._take(wide * p)
+        self.crossed, self.bent = self._take(crossed), self._take(crossed)
+        self.curvature, self.face = self._take(m * m), self._take(m * m)
+        self.ends, self.move = self._take(m), self._take(m)
+        self.before, self.slope = self._take(m), self._take(m)
+        self.least, self.most = self._take(m), self._take(m)
+        self.right = self._take(2 * m)
+        self.node = self._take(3 * self.count)
 
     # --- the criterion at fractional counts -----------------------------------------
 
     def _sum(self, low, counts, start, gram):
-        """``gram = start + sum of (counts_i - low_i) B_i.T B_i``, of zeros if None."""
-        num_blocks, q, p = self.blocks.shape[0], self.blocks.shape[1], gram.shape[0]
-        for a in range(p):
-            for b in range(a + 1):
-                gram[a, b] = 0.0
-        for i in range(num_blocks):
+        """``gram = start + sum of (counts_i - low_i) B_i.T B_i``, of zeros if NULL."""
+        p, size = self.p, self.q * self.p
+        for a in range(p * p):
+            gram[a] = 0.0
+        for i in range(self.count):
             count = counts[i] if low is cython.NULL else counts[i] - low[i]
             if count != 0.0:
-                for r in range(q):
-                    for a in range(p):
-                        scaled = count * self.blocks[i, r, a]
-                        for b in range(a + 1):
-                            gram[a, b] += scaled * self.blocks[i, r, b]
+                add(gram, count, self.blocks + i * size, self.q, p)
         for a in range(p):
             for b in range(a + 1):
-                if start is not None:
-                    gram[a, b] += start[a, b]
-                gram[b, a] = gram[a, b]
+                if start is not cython.NULL:
+                    gram[a * p + b] += start[a * p + b]
+                gram[b * p + a] = gram[a * p + b]
 
     def _evaluate(self, kind):
         """Value to climb by at P, N and M, -inf where M is singular; sets ``base``.
 
         The base differs from it by rounding, and for E.
         """
-        p: cython.int = self.gram.shape[0]
+        p: cython.int = self.p
         value: cython.double = 0.0
         self.base = 0.0
         if kind != _RANK:
-            value = factor(
-                cython.address(self.gram[0, 0]), cython.address(self.inverse[0, 0]),
-                cython.address(self.vectors[0, 0]), p,
-            )  # fmt: skip
+            value = factor(self.gram, self.inverse, self.vectors, p)
             if not value > -INFINITY:
                 return value
         if kind == _D:
-            copy(cython.address(self.gradient[0, 0]),
-                 cython.address(self.inverse[0, 0]), p * p)  # fmt: skip
+            copy(self.gradient, self.inverse, p * p)
         elif kind == _DS or kind == _TRACE:
-            value = self._covariance(kind, self.root, self.root.shape[0], self.gradient)
+            value = self._covariance(kind == _DS, self.root, self.s, self.gradient)
         elif kind == _RANK_TRACE:
-            value = self._covariance(kind, self.share, self.size, self.other)
+            value = self._covariance(False, self.share, self.size, self.other)
         else:
             value = 0.0
         self.base = value
         if kind >= _E:
-            value += self._spectrum(kind)
+            value += self._weakest() if kind == _E else self._shared_out(kind)
+            self._bends()
             if kind == _RANK_TRACE:
-                for a in range(p):
-                    for b in range(p):
-                        self.gradient[a, b] += self.other[a, b]
+                for a in range(p * p):
+                    self.gradient[a] += self.other[a]
         return value
 
-    def _covariance(self, kind, root, s, gradient):
+    def _covariance(self, det, root, s, gradient):
         """Value of Ds and the traces by C (s, p), W being there, and their gradient."""
-        p: cython.int = gradient.shape[0]
-        value: cython.double = 0.0
-        reach = cython.address(self.reach[0, 0])  # C W
-        scaled = reach
-        multiply(False, False, s, p, p, cython.address(root[0, 0]),
-                  cython.address(self.inverse[0, 0]), reach)  # fmt: skip
-        if kind == _DS:
-            small = cython.address(self.small[0, 0])
-            multiply(False, True, s, s, p, reach, cython.address(root[0, 0]), small)
-            scaled = cython.address(self.scaled[0, 0])
-            value = -factor(small, scaled, cython.address(self.vectors[0, 0]), s)
-            for a in range(s * s):
-                small[a] = scaled[a]
-            if not value < INFINITY:
-                return -INFINITY
-            multiply(False, False, s, p, s, small, reach, scaled)
-        else:
-            for r in range(s):
-                for a in range(p):
-                    value -= root[r, a] * reach[r * p + a]
-        multiply(True, False, p, p, s, scaled, reach, cython.address(gradient[0, 0]))
-        return value
-
-    def _eigen(self):
-        """Eigenvalues of ``vectors``, smallest first, and eigenvectors in its rows."""
-        p: cython.int = self.vectors.shape[0]
-        room: cython.int = self.lapack.shape[0]
-        whole: cython.int = self.whole.shape[0]
-        info: cython.int = 0
-        dsyevd(b"V", b"L", cython.address(p), cython.address(self.vectors[0, 0]),
-               cython.address(p), cython.address(self.values[0]),
-               cython.address(self.lapack[0]), cython.address(room),
-               cython.address(self.whole[0]), cython.address(whole),
-               cython.address(info))  # fmt: skip
+        return covariance(
+            det, root, self.inverse, s, self.p, self.reach, self.scaled, self.small,
+            self.spare, self.vectors, gradient,
+        )  # fmt: skip
 
     def _weakest(self):
         """Set the reciprocals l, their y in ``basis``, slopes and base; the value of E.
 
         Eigenvalues of V below rounding have no slope, whatever they are.
         """
-        p: cython.int = self.gram.shape[0]
-        root = cython.address(self.root[0, 0])
-        inverse = cython.address(self.inverse[0, 0])
-        scaled = cython.address(self.scaled[0, 0])
-        basis = cython.address(self.basis[0, 0])
-        multiply(False, False, p, p, p, root, inverse, scaled)
-        multiply(False, True, p, p, p, scaled, root, cython.address(self.vectors[0, 0]))
-        self._eigen()
-        largest = self.values[p - 1]
+        p: cython.int = self.p
+        basis, reach, values, slopes = self.basis, self.reach, self.values, self.slopes
+        multiply(False, False, p, p, p, self.root, self.inverse, self.scaled)
+        multiply(False, True, p, p, p, self.scaled, self.root, self.vectors)
+        eigen(self.vectors, values, self.lapack, self.whole, p)
         for a in range(p):
-            self.own[a] = 1.0 / max(self.values[p - 1 - a], _EPS * largest)
-            for b in range(p):
-                self.reach[a, b] = self.vectors[p - 1 - a, b]
-        for a in range(p):
-            self.values[a] = self.own[a]
-        multiply(False, False, p, p, p, cython.address(self.reach[0, 0]), scaled, basis)
-        multiply(False, True, p, p, p, basis, root, cython.address(self.reach[0, 0]))
+            self.own[a] = 1.0 / max(values[p - 1 - a], _EPS * values[p - 1])
+            copy(reach + a * p, self.vectors + (p - 1 - a) * p, p)
+        copy(values, self.own, p)
+        multiply(False, False, p, p, p, reach, self.scaled, basis)
+        multiply(False, True, p, p, p, basis, self.root, reach)
         total: cython.double = 0.0
         for a in range(p):
-            length: cython.double = 0.0
+            length: cython.double = dot(reach + a * p, reach + a * p, p)
             for b in range(p):
-                length += self.reach[a, b] * self.reach[a, b]
-            scale = 1.0 / sqrt(length) if length > 0.0 else 0.0
-            for b in range(p):
-                self.basis[a, b] *= scale
-            apart = self.values[a] - self.values[0]
-            self.slopes[a] = exp(-self.smoothing * apart) if apart > 0.0 else 1.0
-            total += self.slopes[a]
-        multiply(False, False, p, p, p, basis, cython.address(self.gram[0, 0]),
-                  cython.address(self.reach[0, 0]))  # fmt: skip
+                basis[a * p + b] *= 1.0 / sqrt(length) if length > 0.0 else 0.0
+            apart = values[a] - values[0]
+            slopes[a] = exp(-self.smoothing * apart) if apart > 0.0 else 1.0
+            total += slopes[a]
+        multiply(False, False, p, p, p, basis, self.gram, reach)
         for a in range(p):
-            self.slopes[a] /= total
-            self.tail[a] = self.slopes[a]
-            self.own[a] = -self.smoothing * self.slopes[a]
-            if self.slopes[a] > 0.0:
-                for b in range(p):
-                    self.base += self.slopes[a] * self.reach[a, b] * self.basis[a, b]
+            slopes[a] /= total
+            self.tail[a] = slopes[a]
+            self.own[a] = -self.smoothing * slopes[a]
+            if slopes[a] > 0.0:
+                self.base += slopes[a] * dot(reach + a * p, basis + a * p, p)
         self.tail_weight = self.smoothing
-        return self.values[0] - log(total) / self.smoothing
+        return values[0] - log(total) / self.smoothing
 
     def _shared_out(self, kind):
         """The same of F at N in the metric of P; the f of A is ``-mu / (1 + l)``."""
-        p: cython.int = self.gram.shape[0]
-        half = cython.address(self.half[0, 0])
-        scaled = cython.address(self.scaled[0, 0])
-        vectors = cython.address(self.vectors[0, 0])
-        multiply(False, False, p, p, p, half, cython.address(self.rest[0, 0]), scaled)
-        multiply(False, True, p, p, p, scaled, half, vectors)
-        self._eigen()
-        multiply(False, False, p, p, p, vectors, half,
-                  cython.address(self.basis[0, 0]))  # fmt: skip
+        p: cython.int = self.p
+        values = self.values
+        multiply(False, False, p, p, p, self.half, self.rest, self.scaled)
+        multiply(False, True, p, p, p, self.scaled, self.half, self.vectors)
+        eigen(self.vectors, values, self.lapack, self.whole, p)
+        multiply(False, False, p, p, p, self.vectors, self.half, self.basis)
         kept: cython.int = 0
         places: cython.int = self.places
         rest: cython.double = 0.0
         shares: cython.double = 0.0
         logs: cython.double = 0.0
         for a in range(p):
-            self.values[a] = max(self.values[a], 0.0)
-            rest += self.values[a]
-        while kept < places - 1 and self.values[p - 1 - kept] * (places - kept) > rest:
-            rest -= self.values[p - 1 - kept]
-            logs += log1p(self.values[p - 1 - kept])
-            shares += 1.0 / (1.0 + self.values[p - 1 - kept])
+            values[a] = max(values[a], 0.0)
+            rest += values[a]
+        while kept < places - 1 and values[p - 1 - kept] * (places - kept) > rest:
+            rest -= values[p - 1 - kept]
+            logs += log1p(values[p - 1 - kept])
+            shares += 1.0 / (1.0 + values[p - 1 - kept])
             kept += 1
         rest /= places - kept
         logs += (places - kept) * log1p(rest)
-        shares += (places - kept) / (1.0 + rest)
-        mu = self.mu if kind == _RANK_TRACE else 1.0
+        self.shares = shares + (places - kept) / (1.0 + rest)
+        trace: cython.bint = kind == _RANK_TRACE
+        mu = self.mu if trace else 1.0
         for a in range(p):
             held: cython.bint = a >= p - kept
-            x = 1.0 / (1.0 + (self.values[a] if held else rest))
-            self.slopes[a] = mu * x * x if kind == _RANK_TRACE else x
-            self.own[a] = -(2.0 * mu * x if kind == _RANK_TRACE else 1.0) * x * x
+            x = 1.0 / (1.0 + (values[a] if held else rest))
+            self.slopes[a] = mu * x * x if trace else x
+            self.own[a] = -(2.0 * mu * x if trace else 1.0) * x * x
             self.tail[a] = 0.0 if held else 1.0
             if not held:
                 self.tail_weight = self.own[a] / (places - kept)
                 self.own[a] = 0.0
-        self.shares = shares
-        value = self.constant + (-mu * shares if kind == _RANK_TRACE else logs)
+        value = self.constant + (-mu * self.shares if trace else logs)
         # Eigenvalues are rounded by p eps of the largest.
-        self.base += value + mu * p * _EPS * self.values[p - 1]
+        self.base += value + mu * p * _EPS * values[p - 1]
         return value
 
-    def _spectrum(self, kind):
-        """Value of E or F; fills the gradient, and basis and bend of the Hessian."""
-        p: cython.int = self.gram.shape[0]
-        value = self._weakest() if kind == _E else self._shared_out(kind)
+    def _bends(self):
+        """Fill the gradient of E or F, and the bend of the Hessian."""
+        p: cython.int = self.p
+        values, slopes = self.values, self.slopes
         for a in range(p):
             for b in range(a):
-                apart = self.values[a] - self.values[b]
-                if apart > 1e-7 * self.values[a]:
-                    self.bend[a, b] = (self.slopes[a] - self.slopes[b]) / apart
-                else:
-                    self.bend[a, b] = 0.5 * (self.own[a] + self.own[b])
-            self.bend[a, a] = self.own[a]
+                apart = values[a] - values[b]
+                bend = 0.5 * (self.own[a] + self.own[b])
+                if apart > 1e-7 * values[a]:
+                    bend = (slopes[a] - slopes[b]) / apart
+                self.bend[a * p + b] = bend
+            self.bend[a * p + a] = self.own[a]
             for b in range(p):
-                self.scaled[a, b] = self.slopes[a] * self.basis[a, b]
-        multiply(True, False, p, p, p, cython.address(self.scaled[0, 0]),
-                  cython.address(self.basis[0, 0]),
-                  cython.address(self.gradient[0, 0]))  # fmt: skip
-        return value
+                self.scaled[a * p + b] = slopes[a] * self.basis[a * p + b]
+        multiply(True, False, p, p, p, self.scaled, self.basis, self.gradient)
 
     # --- the bounds by rank ---------------------------------------------------------
 
     def _kind_of(self, low):
         """Set P; RANK or RANK_TRACE where few readings are left to choose."""
-        p: cython.int = self.gram.shape[0]
         left = self.k
         self._sum(cython.NULL, low, self.prior, self.known)
         self.smoothing = _SMOOTHING
-        for i in range(low.shape[0]):
+        for i in range(self.count):
             left -= low[i]
         self.places = cython.cast(cython.int, left) * self.rank
         sharper: cython.bint = self.kind == _D or self.kind == _TRACE
-        if not sharper or self.places >= p or self.places == 0:
+        if not sharper or self.places >= self.p or self.places == 0:
             return self.kind
-        self.constant = factor(
-            cython.address(self.known[0, 0]), cython.address(self.inverse[0, 0]),
-            cython.address(self.half[0, 0]), p,
-        )  # fmt: skip
+        self.constant = factor(self.known, self.inverse, self.half, self.p)
         if not self.constant > -INFINITY:
             return self.kind
         if self.kind == _D:
             return _RANK
         self._weigh()
-        return _RANK_TRACE if self._choose_mu(p - 1 - self.places) else _TRACE
+        sharper = self._choose_mu(self.p - 1 - self.places)
+        return _RANK_TRACE if sharper else _TRACE
 
     def _weigh(self):
         """Fill ``weights`` and ``lines``: u and ``v.T inverse(H)``, by rows.
 
         Then ``C.T C`` is the sum of u times the outer product of a row with itself.
         """
-        p: cython.int = self.gram.shape[0]
-        s: cython.int = self.root.shape[0]
-        half = cython.address(self.half[0, 0])
-        root = cython.address(self.root[0, 0])
-        reach = cython.address(self.reach[0, 0])
-        vectors = cython.address(self.vectors[0, 0])
-        multiply(False, True, s, p, p, root, half, reach)
-        multiply(True, False, p, p, s, reach, reach, vectors)
-        self._eigen()
-        copy(cython.address(self.weights[0]), cython.address(self.values[0]), p)
-        multiply(False, False, p, p, p, vectors, half, reach)
-        multiply(False, False, p, p, p, reach, cython.address(self.known[0, 0]),
-                  cython.address(self.lines[0, 0]))  # fmt: skip
+        p: cython.int = self.p
+        s: cython.int = self.s
+        multiply(False, True, s, p, p, self.root, self.half, self.reach)
+        multiply(True, False, p, p, s, self.reach, self.reach, self.vectors)
+        eigen(self.vectors, self.weights, self.lapack, self.whole, p)
+        multiply(False, False, p, p, p, self.vectors, self.half, self.reach)
+        multiply(False, False, p, p, p, self.reach, self.known, self.lines)
 
     def _choose_mu(self, place):
         """Let mu be the eigenvalue ``place`` of U (-1: none); is the bound sharper?"""
-        p: cython.int = self.gram.shape[0]
+        p: cython.int = self.p
         rounding = p * _EPS * self.weights[p - 1]
         mu = self.weights[place] if place >= 0 else 0.0
         if not mu > rounding:
@@ -379,14 +344,12 @@ class Search:
         self.constant = (rounding + mu) * self.places
         for b in range(p):
             a = p - 1 - b
+            self.constant -= min(max(self.weights[a], 0.0), mu)
             if self.weights[a] > mu:
-                self.constant -= mu
                 scale = sqrt(self.weights[a] - mu)
                 for c in range(p):
-                    self.share[self.size, c] = scale * self.lines[a, c]
+                    self.share[self.size * p + c] = scale * self.lines[a * p + c]
                 self.size += 1
-            else:
-                self.constant -= max(self.weights[a], 0.0)
         return True
 
     def _best_place(self):
@@ -396,44 +359,33 @@ class Search:
         the eigenvectors above mu lose by N, plus what F allows the t readings to take.
         At a whole selection several are best, and the largest serves its neighbours.
         """
-        p: cython.int = self.gram.shape[0]
+        p: cython.int = self.p
         allowed = self.places - self.shares
         for d in range(p):
-            j = p - 1 - d
+            line = self.lines + (p - 1 - d) * p
             taken: cython.double = 1.0
             for a in range(p):
-                total: cython.double = 0.0
-                for b in range(p):
-                    total += self.inverse[a, b] * self.lines[j, b]
-                taken -= self.lines[j, a] * total
+                taken -= line[a] * dot(self.inverse + a * p, line, p)
             allowed -= taken
             if allowed < _TAKEN * self.places:
-                return cython.cast(cython.int, j)
+                return cython.cast(cython.int, p - 1 - d)
         return -1
 
     # --- a Newton step --------------------------------------------------------------
 
     def _turn(self, m, matrix, turn):
         """``turned = B_i @ matrix`` of the ``picked`` blocks, or ``matrix.T``."""
-        q: cython.int = self.blocks.shape[1]
-        p: cython.int = self.blocks.shape[2]
-        multiply(False, turn, m * q, p, p, cython.address(self.picked[0, 0]),
-                  cython.address(matrix[0, 0]),
-                  cython.address(self.turned[0, 0]))  # fmt: skip
+        p: cython.int = self.p
+        multiply(False, turn, m * self.q, p, p, self.picked, matrix, self.turned)
 
     def _hessian(self, kind, m):
         """Fill ``curvature`` (m, m): minus the Hessian over the counts of ``which``."""
-        q: cython.int = self.blocks.shape[1]
-        p: cython.int = self.blocks.shape[2]
+        q, p = self.q, self.p
         wide: cython.int = m * q
-        x = cython.address(self.crossed[0])
-        y = cython.address(self.bent[0])
-        out = cython.address(self.curvature[0])
-        picked = cython.address(self.picked[0, 0])
-        turned = cython.address(self.turned[0, 0])
+        x, y, out = self.crossed, self.bent, self.curvature
         for i in range(m):
-            copy(picked + i * q * p,
-                 cython.address(self.blocks[self.which[i], 0, 0]), q * p)  # fmt: skip
+            block = self.blocks + self.which[i] * q * p
+            copy(self.picked + i * q * p, block, q * p)
         for i in range(m * m):
             out[i] = 0.0
         if kind >= _E:
@@ -442,13 +394,10 @@ class Search:
             if kind != _RANK_TRACE:
                 return
         self._turn(m, self.inverse, False)
-        multiply(False, True, wide, wide, p, turned, picked, y)
+        multiply(False, True, wide, wide, p, self.turned, self.picked, y)
         if kind != _D:
-            if kind == _RANK_TRACE:
-                self._turn(m, self.other, False)
-            else:
-                self._turn(m, self.gradient, False)
-            multiply(False, True, wide, wide, p, turned, picked, x)
+            self._turn(m, self.other if kind == _RANK_TRACE else self.gradient, False)
+            multiply(False, True, wide, wide, p, self.turned, self.picked, x)
         for i in range(m):
             for j in range(m):
                 total: cython.double = 0.0
@@ -465,57 +414,49 @@ class Search:
 
     def _spectral_hessian(self, m):
         """Minus the Hessian of E or F, of blocks turned into the basis."""
-        q: cython.int = self.blocks.shape[1]
-        p: cython.int = self.blocks.shape[2]
+        q, p = self.q, self.p
         size: cython.int = p * (p + 1) // 2
-        plain = cython.address(self.crossed[0])
-        bent = cython.address(self.bent[0])
         at: cython.Py_ssize_t = 0
         for i in range(m):
             self.ends[i] = 0.0
             for a in range(p):
-                into, bend = plain + at, cython.address(self.bend[a, 0])
+                into, bend = self.crossed + at, self.bend + a * p
                 for b in range(a + 1):
                     into[b] = 0.0
                 for r in range(q):
-                    row = cython.address(self.turned[i * q + r, 0])
+                    row = self.turned + (i * q + r) * p
                     weight = row[a]
                     for b in range(a + 1):
                         into[b] += weight * row[b]
                 for b in range(a):
-                    bent[at + b] = -2.0 * into[b] * bend[b]
-                bent[at + a] = -into[a] * bend[a]
+                    self.bent[at + b] = -2.0 * into[b] * bend[b]
+                self.bent[at + a] = -into[a] * bend[a]
                 self.ends[i] += self.tail[a] * into[a]
                 at += a + 1
-        out = cython.address(self.curvature[0])
-        multiply(False, True, m, m, size, plain, bent, out)
+        out = self.curvature
+        multiply(False, True, m, m, size, self.crossed, self.bent, out)
         for i in range(m):
             for j in range(m):
                 out[i * m + j] -= self.tail_weight * self.ends[i] * self.ends[j]
 
     def _leverages(self, low, high):
         """``trace(B_i G B_i.T)`` where the count is not fixed."""
-        q: cython.int = self.blocks.shape[1]
-        p: cython.int = self.blocks.shape[2]
-        picked = cython.address(self.picked[0, 0])
-        turned = cython.address(self.turned[0, 0])
-        count: cython.Py_ssize_t = low.shape[0]
+        size: cython.int = self.q * self.p
         i: cython.Py_ssize_t = 0
-        while i < count:
+        while i < self.count:
             m: cython.int = 0
-            while i < count and m < self.which.shape[0]:
+            while i < self.count and m < self.most_moved:
                 self.leverage[i] = 0.0
                 if low[i] < high[i]:
-                    copy(
-                        picked + m * q * p, cython.address(self.blocks[i, 0, 0]), q * p
-                    )
+                    copy(self.picked + m * size, self.blocks + i * size, size)
                     self.which[m] = i
                     m += 1
                 i += 1
             self._turn(m, self.gradient, False)
             for f in range(m):
-                at = f * q * p
-                self.leverage[self.which[f]] = dot(picked + at, turned + at, q * p)
+                at = f * size
+                found = dot(self.picked + at, self.turned + at, size)
+                self.leverage[self.which[f]] = found
 
     def _linear_gain(self, low, high, c):
         """Largest ``sum of (c'_i - c_i) d_i`` within the bounds; sets the multiplier.
@@ -525,7 +466,7 @@ class Search:
         """
         least: cython.double = INFINITY
         most: cython.double = -INFINITY
-        for i in range(c.shape[0]):
+        for i in range(self.count):
             if c[i] < high[i]:
                 most = max(most, self.leverage[i])
             if c[i] > low[i]:
@@ -538,7 +479,7 @@ class Search:
             if most - least <= 1e-13 * fabs(most):
                 break
             room: cython.double = 0.0
-            for i in range(c.shape[0]):
+            for i in range(self.count):
                 room += high[i] if self.leverage[i] > cut else low[i]
             if room > self.k:
                 least = cut
@@ -549,7 +490,7 @@ class Search:
             cut = 0.5 * (least + most)
         gain: cython.double = 0.0
         total: cython.double = 0.0
-        for i in range(c.shape[0]):
+        for i in range(self.count):
             slope = self.leverage[i] - cut
             total += c[i]
             gain += ((high[i] if slope > 0.0 else low[i]) - c[i]) * slope
@@ -558,12 +499,11 @@ class Search:
 
     def _working_set(self, low, high, c):
         """Counts to move: the fractional ones and some of those that should move."""
-        num_blocks = c.shape[0]
-        extra: cython.int = 2 * self.gram.shape[0] + 4
+        extra: cython.int = 2 * self.p + 4
         fractional: cython.int = 0
         count: cython.int = 0
         largest: cython.double = 0.0
-        for i in range(num_blocks):
+        for i in range(self.count):
             slope = self.leverage[i] - self.cut
             self.wish[i] = 0.0
             if low[i] < c[i] and c[i] < high[i]:
@@ -572,7 +512,7 @@ class Search:
                 self.wish[i] = fabs(slope)
                 largest = max(largest, self.wish[i])
         if fractional <= _FRACTIONAL:
-            for i in range(num_blocks):
+            for i in range(self.count):
                 if low[i] < c[i] and c[i] < high[i]:
                     self.wish[i] = 0.0
         else:
@@ -580,14 +520,14 @@ class Search:
         least = largest
         for _ in range(40):
             count = 0
-            for i in range(num_blocks):
+            for i in range(self.count):
                 count += self.wish[i] > 0.5 * least
             if count > extra:
                 break
             least *= 0.5
         size: cython.int = 0
         room: cython.int = fractional + extra
-        for i in range(num_blocks):
+        for i in range(self.count):
             inside: cython.bint = fractional > 0 and low[i] < c[i] and c[i] < high[i]
             wanted: cython.bint = self.wish[i] > 0.0 and self.wish[i] >= least
             if inside or (wanted and size < room):
@@ -600,9 +540,7 @@ class Search:
 
         Solves by the curvature at ``free[:size]`` for the slope and for ones.
         """
-        face = cython.address(self.face[0])
-        right = cython.address(self.right[0])
-        ones = right + size
+        face, right, ones = self.face, self.right, self.right + size
         for f in range(size):
             right[f], ones[f] = self.slope[self.free[f]], 1.0
             row = self.free[f] * m
@@ -610,25 +548,23 @@ class Search:
                 face[f * size + g] = self.curvature[row + self.free[g]]
         cholesky(face, face, size, max(1e-3 * _RIDGE * self.curvature[0], 1e-300))
         for f in range(size):
-            for g in range(f):
-                right[f] -= face[f * size + g] * right[g]
-                ones[f] -= face[f * size + g] * ones[g]
-            right[f] *= face[f * size + f]
-            ones[f] *= face[f * size + f]
-        for b in range(size):
-            f = size - 1 - b
-            right[f] *= face[f * size + f]
-            ones[f] *= face[f * size + f]
-            for g in range(f):
-                right[g] -= face[f * size + g] * right[f]
-                ones[g] -= face[f * size + g] * ones[f]
+            row = f * size
+            right[f] = (right[f] - dot(face + row, right, f)) * face[row + f]
+            ones[f] = (ones[f] - dot(face + row, ones, f)) * face[row + f]
         total: cython.double = 0.0
         weight: cython.double = 0.0
+        for b in range(size):
+            f = size - 1 - b
+            row = f * size
+            right[f] *= face[row + f]
+            ones[f] *= face[row + f]
+            total += right[f]
+            weight += ones[f]
+            for g in range(f):
+                right[g] -= face[row + g] * right[f]
+                ones[g] -= face[row + g] * ones[f]
         for f in range(size):
-            total += self.right[f]
-            weight += self.right[size + f]
-        for f in range(size):
-            self.right[f] -= total / weight * self.right[size + f]
+            right[f] -= total / weight * ones[f]
         return total / weight
 
     def _quadratic_step(self, m):
@@ -636,7 +572,7 @@ class Search:
 
         ``move`` is filled with x, the slope changed to that at the solution.
         """
-        curvature = cython.address(self.curvature[0])
+        curvature = self.curvature
         largest: cython.double = 0.0
         for i in range(m):
             largest = max(largest, curvature[i * m + i])
@@ -651,29 +587,28 @@ class Search:
                     self.free[size] = i
                     size += 1
             cut: cython.double = 0.0
+            hit: cython.Py_ssize_t = -1
             if size:
                 cut = self._solve(m, size)
                 part: cython.double = 1.0
-                hit: cython.Py_ssize_t = -1
-                at: cython.int = 0
                 for f in range(size):
-                    i = self.free[f]
-                    up: cython.bint = self.right[f] > 0.0
-                    room = (self.most[i] if up else self.least[i]) - self.move[i]
-                    if fabs(self.right[f]) * part > fabs(room):
-                        part, hit, at = fabs(room / self.right[f]), f, 1 if up else -1
-                if size > 1:
-                    for f in range(size):
-                        weight = part * self.right[f]
-                        self.move[self.free[f]] += weight
-                        row = self.free[f] * m
-                        for i in range(m):
-                            self.slope[i] -= weight * curvature[row + i]
-                    if hit >= 0:
-                        i = self.free[hit]
-                        self.side[i] = at
-                        self.move[i] = self.most[i] if at > 0 else self.least[i]
-                        continue
+                    i, step = self.free[f], self.right[f]
+                    room = (self.most[i] if step > 0.0 else self.least[i]) - self.move[
+                        i
+                    ]
+                    if fabs(step) * part > fabs(room):
+                        part, hit = fabs(room / step), f
+                for f in range(size if size > 1 else 0):
+                    weight = part * self.right[f]
+                    self.move[self.free[f]] += weight
+                    row = curvature + self.free[f] * m
+                    for i in range(m):
+                        self.slope[i] -= weight * row[i]
+            if size > 1 and hit >= 0:
+                i = self.free[hit]
+                self.side[i] = 1 if self.right[hit] > 0.0 else -1
+                self.move[i] = self.most[i] if self.side[i] > 0 else self.least[i]
+                continue
             # At rest on this face: let go of the count that pulls most from its bound.
             pull: cython.double = 1e-9 * fabs(cut)
             best: cython.Py_ssize_t = -1
@@ -688,30 +623,27 @@ class Search:
                     highest, best = self.slope[i], i
                 if self.side[i] > 0 and self.slope[i] < lowest and size == 0:
                     lowest, other = self.slope[i], i
-            if size == 0:
-                if best < 0 or other < 0 or not highest > lowest:
-                    break
-                self.side[other] = 0
-            if best < 0:
+            if best < 0 or (size == 0 and not (other >= 0 and highest > lowest)):
                 break
             self.side[best] = 0
+            if size == 0:
+                self.side[other] = 0
 
     def _at(self, kind, low, c):
         """N and M of the counts, P being there, and the value."""
-        self._sum(cython.address(low[0]), c, None, self.rest)
-        for a in range(self.gram.shape[0]):
-            for b in range(self.gram.shape[0]):
-                self.gram[a, b] = self.known[a, b] + self.rest[a, b]
+        self._sum(low, c, cython.NULL, self.rest)
+        for a in range(self.p * self.p):
+            self.gram[a] = self.known[a] + self.rest[a]
         return self._evaluate(kind)
 
     def _spread(self, low, high, c):
         """Share what the lower bounds leave in proportion to the room of each count."""
         room: cython.double = 0.0
         fixed: cython.double = 0.0
-        for i in range(c.shape[0]):
+        for i in range(self.count):
             room += high[i] - low[i]
             fixed += low[i]
-        for i in range(c.shape[0]):
+        for i in range(self.count):
             c[i] = low[i] + (self.k - fixed) * (high[i] - low[i]) / max(room, 1.0)
 
     def _relax(self, kind, low, high, c, goal, share):
@@ -762,14 +694,14 @@ class Search:
             if solved:
                 break
             m = self._working_set(low, high, c)
+            promised: cython.double = 0.0
+            part: cython.double = 1.0
             for i in range(m):
                 j = self.which[i]
                 self.before[i], self.slope[i] = c[j], self.leverage[j]
                 self.least[i], self.most[i] = low[j] - c[j], high[j] - c[j]
             self._hessian(kind, m)
             self._quadratic_step(m)
-            promised: cython.double = 0.0
-            part: cython.double = 1.0
             for i in range(m):
                 promised += self.move[i] * self.leverage[self.which[i]]
             while True:
@@ -790,64 +722,63 @@ class Search:
 
     # --- branching ------------------------------------------------------------------
 
-    def _value_of(self, counts):
-        """The criterion of a selection, -inf where it is singular."""
+    def _offer(self, counts):
+        """Insert a selection into the sorted list of the best, once."""
+        best = self.best_values
+        place: cython.Py_ssize_t = best.shape[0] - 1
         self._sum(cython.NULL, counts, self.prior, self.gram)
         self.smoothing = INFINITY  # E itself
-        return self._evaluate(self.kind)
-
-    def _offer(self, counts, best_counts, best_values):
-        """Insert a selection into the sorted list of the best, once."""
-        size = best_values.shape[0]
-        value = self._value_of(counts)
-        if not value > best_values[size - 1]:
+        value = self._evaluate(self.kind)
+        if not value > best[place]:
             return
-        for r in range(size):
-            same: cython.bint = fabs(best_values[r] - value) < _SAME
-            for i in range(counts.shape[0]):
-                same = same and best_counts[r, i] == counts[i]
+        for r in range(best.shape[0]):
+            same: cython.bint = fabs(best[r] - value) < _SAME
+            for i in range(self.count):
+                same = same and self.best_counts[r, i] == counts[i]
             if same:
                 return
-        place: cython.Py_ssize_t = size - 1
-        while place > 0 and best_values[place - 1] < value:
-            best_values[place] = best_values[place - 1]
-            best_counts[place, :] = best_counts[place - 1]
+        while place > 0 and best[place - 1] < value:
+            best[place] = best[place - 1]
+            self.best_counts[place, :] = self.best_counts[place - 1]
             place -= 1
-        best_values[place] = value
-        best_counts[place, :] = counts
+        best[place] = value
+        copy(cython.address(self.best_counts[place, 0]), counts, self.count)
 
-    def offer(self, low, high, counts, best_counts, best_values):
+    def offer(
+        self,
+        low: cython.double[::1],
+        high: cython.double[::1],
+        counts: cython.double[::1],
+    ):
         """Offer a selection and, where several are wanted, all one swap away from it.
 
         Args:
-            low, high, counts: (M,) float64 bounds and counts.
-            best_counts, best_values: (best, M) and (best,) incumbents, changed.
+            low, high, counts: (M,) float64 bounds and counts, as they were afterwards.
         """
         self.watch = begin(INFINITY)
-        self._offer_near(low, high, counts.copy(), best_counts, best_values)
-
-    def _offer_near(self, low, high, counts, best_counts, best_values):
-        num_blocks = counts.shape[0]
-        self._offer(counts, best_counts, best_values)
-        for i in range(num_blocks if best_values.shape[0] > 1 else 0):
+        chosen = cython.address(counts[0])
+        self._offer(chosen)
+        i: cython.Py_ssize_t
+        j: cython.Py_ssize_t
+        for i in range(self.count if self.best_values.shape[0] > 1 else 0):
             late(cython.address(self.watch))
-            for j in range(num_blocks):
+            for j in range(self.count):
                 if i != j and counts[i] > low[i] and counts[j] < high[j]:
                     counts[i] -= 1.0
                     counts[j] += 1.0
-                    self._offer(counts, best_counts, best_values)
+                    self._offer(chosen)
                     counts[i] += 1.0
                     counts[j] -= 1.0
 
     def _balance(self, low, high, c):
         """Move c into its bounds and back to sum k, keeping it near where it was."""
         total: cython.double = 0.0
-        for i in range(c.shape[0]):
+        for i in range(self.count):
             c[i] = min(max(c[i], low[i]), high[i])
             total += c[i]
         while fabs(total - self.k) > 1e-12:
             best: cython.Py_ssize_t = -1
-            for i in range(c.shape[0]):
+            for i in range(self.count):
                 d = self.leverage[i]
                 if total < self.k:
                     if c[i] < high[i] and (best < 0 or d > self.leverage[best]):
@@ -861,7 +792,7 @@ class Search:
             total += c[best] - before
         return True
 
-    def _process(self, low, high, c, slack, share, best_counts, best_values, bound):
+    def _process(self, low, high, c, slack, share, bound):
         """Solve, tighten and, where settled, close one node.
 
         Forcing one count away from the side the multiplier puts it on costs the bound
@@ -871,42 +802,39 @@ class Search:
             low, high, c: (M,) bounds and starting counts, changed.
             slack: a bound this far above the incumbent still closes the node.
             share: see ``_relax``.
-            best_counts, best_values: incumbents, changed.
             bound: written.
 
         Returns:
             The candidate to branch on, -1 where the node is closed.
         """
-        last = best_values.shape[0] - 1
-        goal = best_values[last] + slack
+        last = self.best_values.shape[0] - 1
+        goal = self.best_values[last] + slack
         bound[0] = self._relax(self._kind_of(low), low, high, c, goal, share)
         if bound[0] <= goal:
             return -1
         room = bound[0] - goal
         total_low: cython.double = 0.0
         total_high: cython.double = 0.0
-        for i in range(c.shape[0]):
-            if low[i] < high[i]:
-                slope = self.leverage[i] - self.cut
-                if room < fabs(slope) * (high[i] - low[i]):
-                    units = floor(room / fabs(slope))
-                    if slope < 0.0:
-                        high[i] = low[i] + units
-                    else:
-                        low[i] = high[i] - units
+        for i in range(self.count):
+            slope = self.leverage[i] - self.cut
+            if low[i] < high[i] and room < fabs(slope) * (high[i] - low[i]):
+                units = floor(room / fabs(slope))
+                if slope < 0.0:
+                    high[i] = low[i] + units
+                else:
+                    low[i] = high[i] - units
             total_low += low[i]
             total_high += high[i]
         if total_low > self.k or total_high < self.k:
             return -1
         settled: cython.bint = total_low == self.k or total_high == self.k
         if settled:
-            for i in range(c.shape[0]):
-                c[i] = low[i] if total_low == self.k else high[i]
+            copy(c, low if total_low == self.k else high, self.count)
         whole: cython.bint = True
         branch: cython.Py_ssize_t = -1
         score: cython.double = -1.0
         total: cython.double = 0.0
-        for i in range(c.shape[0]):
+        for i in range(self.count):
             away = fabs(c[i] - floor(c[i] + 0.5))
             if away > _WHOLE:
                 whole = False
@@ -920,24 +848,31 @@ class Search:
                 if this > score:
                     score, branch = this, i
         if whole and total == self.k:
-            for i in range(c.shape[0]):
+            for i in range(self.count):
                 c[i] = floor(c[i] + 0.5)
-            self._offer(c, best_counts, best_values)
-        if settled or bound[0] <= best_values[last] + slack:
+            self._offer(c)
+        if settled or bound[0] <= self.best_values[last] + slack:
             return -1
         return branch
 
     def run(
-        self, nodes, bounds, size, best_counts, best_values, slack, widest, tries,
-        seconds, slope, shift
-    ):  # fmt: skip
+        self,
+        nodes: cython.double[:, :, ::1],
+        bounds: cython.double[::1],
+        size: cython.Py_ssize_t,
+        slack: cython.double,
+        widest: cython.Py_ssize_t,
+        tries: cython.Py_ssize_t,
+        seconds: cython.double,
+        slope: cython.double,
+        shift: cython.double,
+    ):
         """Branch until no open node is left, the room is full or the time is over.
 
         Args:
             nodes, bounds: (room, 3, M) and (room,) open nodes: lower and upper bounds
                 of the counts, and counts to start from.
             size: open nodes at the start.
-            best_counts, best_values: (best, M) and (best,) incumbents, changed.
             slack: a bound this far above the last incumbent still closes a node.
             widest: open nodes up to which the best bound goes first, then the newest.
             tries: nodes before which a bound that is good enough ends nothing; of the
@@ -949,57 +884,44 @@ class Search:
             Open nodes left, nodes processed, and whether to go on.
         """
         self.watch = begin(seconds)
-        done: cython.Py_ssize_t = 0
-        left: cython.Py_ssize_t = size
-        ended: cython.int = self._run(
-            nodes, bounds, cython.address(left), cython.address(done), best_counts,
-            best_values, slack, widest, tries, slope, shift,
-        )  # fmt: skip
-        return left, done, not ended
-
-    def _run(
-        self, nodes, bounds, size, done, best_counts, best_values, slack, widest, tries,
-        slope, shift
-    ):  # fmt: skip
-        last = best_values.shape[0] - 1
-        low, high, c = self.node[0], self.node[1], self.node[2]
+        values, m = self.best_values, self.count
+        low, high, c = self.node, self.node + m, self.node + 2 * m
         bound: cython.double = INFINITY
+        done: cython.Py_ssize_t = 0
+        going: cython.bint = True
         with cython.nogil:
-            while size[0] > 0 and size[0] + 2 <= bounds.shape[0]:
-                pick = size[0] - 1
-                if size[0] <= widest:
-                    for r in range(size[0]):
+            while size > 0 and size + 2 <= bounds.shape[0]:
+                pick = size - 1
+                if size <= widest:
+                    for r in range(size):
                         if bounds[r] > bounds[pick]:
                             pick = r
-                    enough = max(bounds[pick], best_values[0])
-                    if done[0] >= tries and enough <= slope * best_values[0] + shift:
-                        return 1
-                if done[0] and late(cython.address(self.watch)):
-                    return 1
+                    enough = max(bounds[pick], values[0])
+                    going = done < tries or enough > slope * values[0] + shift
+                if not going or (done and late(cython.address(self.watch))):
+                    going = False
+                    break
                 parent = bounds[pick]
-                self.node[:, :] = nodes[pick]
-                size[0] -= 1
-                if pick != size[0]:
-                    nodes[pick, :, :] = nodes[size[0]]
-                    bounds[pick] = bounds[size[0]]
-                if parent <= best_values[last] + slack:
+                copy(low, cython.address(nodes[pick, 0, 0]), 3 * m)
+                size -= 1
+                if pick != size:
+                    nodes[pick, :, :] = nodes[size]
+                    bounds[pick] = bounds[size]
+                if parent <= values[values.shape[0] - 1] + slack:
                     continue
-                done[0] += 1
+                done += 1
                 share = 0.0 if parent == INFINITY else _CLOSE
                 branch = self._process(
-                    low, high, c, slack, share, best_counts, best_values,
-                    cython.address(bound),
-                )  # fmt: skip
+                    low, high, c, slack, share, cython.address(bound)
+                )
                 if branch < 0:
                     continue
                 split = floor(c[branch] + _WHOLE)
                 split = min(max(split, low[branch]), high[branch] - 1.0)
                 for side in range(2):
-                    nodes[size[0], :, :] = self.node
-                    bounds[size[0]] = min(bound, parent)
-                    nodes[size[0], 1 - side, branch] = split + side
-                    if self._balance(
-                        nodes[size[0], 0], nodes[size[0], 1], nodes[size[0], 2]
-                    ):
-                        size[0] += 1
-        return 0
+                    begun = cython.address(nodes[size, 0, 0])
+                    copy(begun, low, 3 * m)
+                    bounds[size] = min(bound, parent)
+                    begun[(1 - side) * m + branch] = split + side
+                    size += self._balance(begun, begun + m, begun + 2 * m)
+        return size, done, going

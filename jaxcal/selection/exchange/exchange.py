@@ -1,9 +1,9 @@
 """Greedy selection, and Fedorov exchange with restarts: no proof, in milliseconds.
 
 Each chosen candidate in turn is swapped for the one that raises the criterion most,
-until no swap helps. The first starts are greedy selections, the others random ones that
-are rarely singular. Source: Fedorov, Theory of Optimal Experiments, 1972; Cook and
-Nachtsheim 1980 for one candidate at a time.
+until no swap helps. The first starts are greedy selections, the others random ones.
+Source: Fedorov, Theory of Optimal Experiments, 1972; Cook and Nachtsheim 1980 for one
+candidate at a time.
 
 E, the smallest eigenvalue, is climbed from local optima of A: the sum of the variances
 is at most p times the largest, and climbs from where the smallest eigenvalue stands
@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal import compiled
-from jaxcal.information.blocks import largest_rank
 from jaxcal.selection.problem import Problem, values
 from jaxcal.selection.solver import Found, in_threads
 
@@ -30,6 +29,7 @@ __all__ = [
     "greedy_indices",
     "solve",
     "solve_greedy",
+    "solve_many",
 ]
 
 Array = NDArray[np.float64]
@@ -78,21 +78,26 @@ def greedy_indices(problem: Problem) -> Indices:
     at most p times and at least once the largest: an incomplete selection has no least
     eigenvalue to raise.
     """
-    return Climbs(problem, 0, None).greedy()
+    climbs = Climbs(problem, 0, None)
+    for share, swaps in ((climbs.share, 0), (_RANK_FIRST, 0), (climbs.share, 1)):
+        chosen, phi = climbs.climbed(problem.required, share, swaps)
+        if phi > -np.inf:
+            return chosen
+    return climbs.best_of(1 + _MENDING)[0]
 
 
 def default_restarts(problem: Problem) -> int:
     """Starts that found the proven optimum of nearly all small problems tried.
 
     None of 12,000 distinct selections was missed (4, 8 or 12 of 50, three inputs) by
-    200; replicates leave more local optima, and 1 in 1,000 selections of 12 was by 400.
-    Large problems of blocks get fewer, so that they take 10 to 15 ms.
+    200; replicates leave more local optima, and 1 in 1,000 selections of 12 was by 400,
+    so they get more. Large problems of blocks get fewer, to take 10 to 15 ms.
     """
-    most = 200 if problem.max_replicates == 1 else 400
+    most = 200 if problem.max_replicates == 1 else 600
     if problem.rank_one:
         return most
     if problem.criterion.kind == "least":
-        most = 80
+        most = 100
     count, q, p = problem.blocks.shape
     work = _WORK.get(problem.criterion.name, _WORK["other"])
     return int(min(max(work / ((problem.k + 8) * count * q * q * p), 1.0), most))
@@ -101,96 +106,101 @@ def default_restarts(problem: Problem) -> int:
 class Climbs:
     """The available candidates of a problem as the compiled kernel takes them.
 
-    E is treated as A: an incomplete selection has no least eigenvalue to raise.
+    E is grown and climbed as A, but for ``swaps`` of 2.
     """
 
     def __init__(self, problem: Problem, seed: int, deadline: float | None) -> None:
         kernel = compiled.kernel("jaxcal.selection.exchange.kernel")
-        self._usable = np.flatnonzero(problem.available)
-        blocks, self._required = problem.blocks, problem.required
-        if len(self._usable) < len(blocks):
+        self._required, self._deadline = problem.required, deadline
+        self._usable: Indices | None = None  # where not all are
+        blocks = problem.blocks
+        if not problem.available.all():
+            self._usable = np.flatnonzero(problem.available)
             blocks = blocks[self._usable]
-            self._required = np.searchsorted(self._usable, problem.required)
-        self._blocks, self._full, self._deadline = blocks, 0, deadline
-        criterion, q, p = problem.criterion, blocks.shape[1], blocks.shape[2]
+        criterion, (_, q, p) = problem.criterion, blocks.shape
         kind, root = kernel.TRACE, criterion.root
         if criterion.name == "D":
             kind = kernel.DET
         elif criterion.kind == "det":  # variances near 1
             kind = kernel.SUBSET
             root = root / np.linalg.norm(root, axis=1, keepdims=True)
-        span = problem.known if len(problem.root) else problem.root
-        self._share = _SHARE * min(1.0, problem.k * q / p) ** 6
+        self.share = _SHARE * min(1.0, problem.k * q / p) ** 6
         self._climber = kernel.Climber(
-            kind, np.ascontiguousarray(blocks), np.ascontiguousarray(problem.prior),
-            np.ascontiguousarray(root), min(problem.max_replicates, problem.k),
-            self._required, np.ascontiguousarray(span), problem.k, seed,
-        )  # fmt: skip
+            kind,
+            *map(np.ascontiguousarray, (blocks, problem.prior, root)),
+            min(problem.max_replicates, problem.k),
+            self._inside(problem.required),
+            problem.k,
+            seed,
+        )
 
-    def seconds(self) -> float:
+    def _inside(self, indices: Indices) -> Indices:
+        """Candidates as the kernel counts them."""
+        if self._usable is None:
+            return indices
+        return np.searchsorted(self._usable, indices)
+
+    def _outside(self, indices: Indices) -> Indices:
+        """Candidates of the kernel as the caller counts them."""
+        return indices if self._usable is None else self._usable[indices]
+
+    def _seconds(self) -> float:
         """Left until the deadline."""
         if self._deadline is None:
             return np.inf
         return max(self._deadline - time.perf_counter(), 0.0)
 
-    def greedy(self) -> Indices:
-        """(k,) the required, then one at a time by the largest gain.
-
-        A selection that is singular is mended by swaps, as in the exchange.
-        """
-        for share, climbs in ((self._share, 0), (_RANK_FIRST, 0), (self._share, 1)):
-            chosen, phi = self._climber.climb_from(
-                self._required, share, climbs, self.seconds()
-            )
-            if phi > -np.inf:
-                return self._usable[chosen]
-        return self.best_of(1 + _MENDING)[0]
-
-    def climbed_least(self, start: Indices) -> tuple[Indices, float]:
-        """The local optimum of E that ``start`` (k,) climbs to, required first; E."""
-        chosen, value = self._climber.climb_least(
-            np.searchsorted(self._usable, start), self.seconds()
+    def climbed(
+        self, start: Indices, share: float = 0.0, swaps: int = 1
+    ) -> tuple[Indices, float]:
+        """``start`` completed and climbed, required first, and its phi (of 2: E)."""
+        chosen, phi = self._climber.climb(
+            self._inside(start), share, swaps, self._seconds()
         )
-        return self._usable[chosen], value
-
-    def climbed(self, start: Indices) -> tuple[Indices, float]:
-        """The local optimum that ``start`` (k,) climbs to, required first; its phi."""
-        chosen, phi = self._climber.climb_from(
-            np.searchsorted(self._usable, start), 0.0, True, self.seconds()
-        )
-        return self._usable[chosen], phi
-
-    def _rank(self) -> int:
-        """That a block can have, found where an exchange starts at random."""
-        self._full = self._full or largest_rank(self._blocks)
-        return self._full
+        return self._outside(chosen), phi
 
     def random_start(self) -> Indices:
-        """(k,) another random selection, rarely singular."""
-        return self._usable[self._climber.random_start(self._rank())]
-
-    def random_climb(self) -> tuple[Indices, float]:
-        """The local optimum of another random start, and its phi."""
-        return self.climbed(self.random_start())
+        """(k,) another random selection, the required first."""
+        return self._outside(self._climber.random_start())
 
     def best_of(self, restarts: int) -> tuple[Indices, float]:
         """The best local optimum from greedy selections and then random starts."""
         best, phi = self._required, -np.inf
-        shares = (self._share, *_FURTHER)[:restarts]
+        shares = (self.share, *_FURTHER)[:restarts]
         for share in shares:
-            chosen, found = self._climber.climb_from(
-                self._required, share, True, self.seconds()
-            )
+            chosen, found = self.climbed(self._required, share)
             if not phi > -np.inf or found > phi + 1e-10 * max(1.0, abs(phi)):
                 best, phi = chosen, found
-            if not self.seconds() and phi > -np.inf:
+            if not self._seconds() and phi > -np.inf:
                 break
         more = max(restarts - len(shares), 0 if phi > -np.inf else _MENDING)
         if more:
             best, phi = self._climber.random_climbs(
-                more, best, phi, self.seconds(), self._rank()
+                more, self._inside(best), phi, self._seconds()
             )
-        return self._usable[best], phi
+            best = self._outside(best)
+        return best, phi
+
+    def best_least(self, problem: Problem, restarts: int) -> tuple[Indices, float]:
+        """The best local optimum of E, and E.
+
+        From local optima of A, the best first, and from random selections as often: the
+        former come closer where there are many parameters, the latter where there are
+        few.
+        """
+        many = (restarts + 1) // 2
+        work = problem.k * problem.num_regressors**3
+        most = int(min(max(_CLIMBS / work, 1), many))
+        near = [self.best_of(1)]
+        near += [self.climbed(self.random_start()) for _ in range(many - 1)]
+        kept = {tuple(np.sort(start)): start for start, phi in near if phi > -np.inf}
+        if not kept:
+            return near[0]
+        starts = np.array(list(kept.values()))
+        order = np.argsort(-values(problem, starts)[0])[:most]
+        more = [self.random_start() for _ in range(min(most, restarts - many))]
+        found = [self.climbed(start, swaps=2) for start in (*starts[order], *more)]
+        return max(found, key=lambda each: each[1])
 
 
 def exchange_indices(
@@ -203,11 +213,10 @@ def exchange_indices(
 
     ``deadline`` is a ``time.perf_counter()`` after which no more swaps are made.
     """
-    if restarts is None:
-        restarts = default_restarts(problem)
+    restarts = restarts or default_restarts(problem)
     climbs = Climbs(problem, seed, deadline)
     if problem.criterion.kind == "least":
-        chosen, phi = _best_eigenvalue(problem, climbs, restarts)
+        chosen, phi = climbs.best_least(problem, restarts)
     else:
         chosen, phi = climbs.best_of(restarts)
     if not np.isfinite(phi):
@@ -228,45 +237,17 @@ def exchange_from(problem: Problem, indices: ArrayLike) -> Indices:
     Returns:
         (k,) the required candidates first.
     """
-    given = np.asarray(indices, dtype=np.int64)
-    for i in problem.required.tolist():
-        if i not in given:
-            raise ValueError(f"indices must hold every required candidate, got no {i}")
-    if np.isneginf(problem.log_det(given)):
+    start = np.asarray(indices, dtype=np.int64)
+    if np.isneginf(problem.log_det(start)):
         raise ValueError(
             "indices must give an invertible information matrix, but that of "
-            f"{given.tolist()} is singular"
+            f"{start.tolist()} is singular"
         )
-    start, climbs = _required_first(problem, given), Climbs(problem, 0, None)
-    if problem.criterion.kind == "least":
-        return climbs.climbed_least(start)[0]
-    return climbs.climbed(start)[0]
-
-
-def _required_first(problem: Problem, chosen: Indices) -> Indices:
-    rest = chosen.tolist()
-    for i in problem.required:
+    rest = start.tolist()
+    for i in problem.required.tolist():
+        if i not in rest:
+            raise ValueError(f"indices must hold every required candidate, got no {i}")
         rest.remove(i)
-    return np.array([*problem.required, *rest], dtype=np.int64)
-
-
-def _best_eigenvalue(
-    problem: Problem, climbs: Climbs, restarts: int
-) -> tuple[Indices, float]:
-    """The best local optimum of E and its value.
-
-    From local optima of A, the best first, and from random selections as often: the
-    former come closer where there are many parameters, the latter where there are few.
-    """
-    many = (restarts + 1) // 2
-    work = problem.k * problem.num_regressors**3
-    many_climbs = int(min(max(_CLIMBS / work, 1), many))
-    near = [climbs.best_of(1), *(climbs.random_climb() for _ in range(many - 1))]
-    starts = np.unique([np.sort(start) for start, phi in near if phi > -np.inf], axis=0)
-    if not len(starts):
-        return near[0]
-    order = np.argsort(-values(problem, starts)[0])[:many_climbs]
-    found = [climbs.climbed_least(_required_first(problem, starts[i])) for i in order]
-    for _ in range(min(many_climbs, restarts - many)):
-        found.append(climbs.climbed_least(climbs.random_start()))
-    return max(found, key=lambda each: each[1])
+    start = np.array([*problem.required, *rest], dtype=np.int64)
+    swaps = 2 if problem.criterion.kind == "least" else 1
+    return Climbs(problem, 0, None).climbed(start, swaps=swaps)[0]

@@ -7,6 +7,8 @@ cdef enum:
 @cython.final
 cdef class Climber:
     cdef int kind  # 0 DET, 1 SUBSET, 2 TRACE
+    cdef int parts  # 1 where V is enough, 2 with X
+    cdef int dets  # of which the determinant counts
     cdef bint rows  # one reading each, and DET
     cdef int k, q, p, s, fixed, groups
     cdef Py_ssize_t size  # q q WIDE
@@ -16,34 +18,34 @@ cdef class Climber:
     cdef double* columns  # (groups, q, p, WIDE), zeros after the M
     cdef const double[:, ::1] prior  # (p, p)
     cdef const double[:, ::1] root  # C (s, p)
-    cdef Py_ssize_t[::1] upper  # (groups WIDE,), 0 after the M
-    cdef Py_ssize_t[::1] counts  # (groups WIDE,)
+    cdef Py_ssize_t cap  # how often each may be chosen
+    cdef Py_ssize_t[::1] counts  # (M,)
     cdef double* closed  # (groups WIDE,), inf where it may not be chosen once more
     cdef Py_ssize_t[::1] chosen  # (k,), the required first
-    cdef Py_ssize_t[::1] best  # (k,)
     cdef double* known  # (p, p) what counts beside the chosen
     cdef double* gram
     cdef double* lower
     cdef double* now  # (2, p, p) V and X of the chosen
     cdef double* trial  # (2, p, p) of those after a swap
     cdef double* half  # (s, p) C V
-    cdef double* small  # (s, s)
     cdef double* solved  # (s, p)
+    cdef double* small  # (s, s)
+    cdef double* other  # (s, s)
     cdef double* grown  # (groups, 2, q, q, WIDE) D_jj and H_jj
     cdef double* kept  # (groups, 2, q, q, WIDE) K
     cdef double* alone  # (groups, WIDE)
     cdef double* tops  # (groups, 2) largest gain alone and trace of D_jj
     cdef double tallest  # trace of D_jj since they were last made anew
     cdef double* gain  # (WIDE,)
+    cdef double* det  # (WIDE,)
     cdef double* cross  # (2, 2 q, q, WIDE) D_ij and H_ij of a group
     cdef double* work  # (4, q, q, WIDE)
     cdef double* mixed  # (2 q, q, WIDE)
-    cdef double* middle  # (4, 2 q, 2 q)
+    cdef double* middle  # (3, 2 q, 2 q) P of both; of a trace P U A.T P the second
     cdef double* changed  # (2 q, p) blocks that came and went
     cdef double* at_out  # (2, q, q) D_ii and H_ii
     cdef double* tall  # (2, 2 q, p) B_i V and B_i X
-    cdef double* det  # (WIDE,)
-    cdef double* halved  # (2, p, p) V and X, with half their diagonals
+    cdef double* halved  # (p, p) V or X, with half its diagonal
     cdef double* part  # (p, WIDE)
     cdef double* rest  # (p, p) information of the chosen but one
     cdef double* metric  # (p, p) R
@@ -52,39 +54,29 @@ cdef class Climber:
     cdef double* values  # (p,) eigenvalues of C V C.T, the smallest first
     cdef double* lapack
     cdef int[::1] whole
-    cdef double* basis  # (p, p) orthonormal rows, for random starts
-    cdef const double[:, ::1] span  # (r, p) orthonormal directions that the prior informs
-    cdef Py_ssize_t[::1] order  # (M,) a permutation
     cdef unsigned long long state  # of the random numbers
-    cdef int full  # rank that a block can have
     cdef Watch watch
     cdef int looked  # groups since the clock was read
     cdef double* _take(self, Py_ssize_t count) noexcept
     cdef void _lay_out(self) noexcept
+    cdef void _clear(self) noexcept nogil
+    cdef void _count(self, Py_ssize_t i, int more) noexcept nogil
+    cdef Py_ssize_t _draw(self, Py_ssize_t below) noexcept nogil
+    cdef void _random_start(self) noexcept nogil
+    cdef int _late(self) except -1 nogil
     cdef void _set_known(self, double share, double ridge) noexcept nogil
     cdef void _sum(self, Py_ssize_t size, Py_ssize_t skipped) noexcept nogil
     cdef void _add(self, Py_ssize_t i) noexcept nogil
-    cdef double _climb_least(self) except? -2.0 nogil
-    cdef double _least(self) noexcept nogil
-    cdef Py_ssize_t _strongest(self, double* found) noexcept nogil
     cdef double _evaluate(self, Py_ssize_t size, double* into) noexcept nogil
-    cdef double _subset(self, double* into) noexcept nogil
     cdef void _refresh(self) noexcept nogil
     cdef void _keep(self, Py_ssize_t c) noexcept nogil
-    cdef void _invert_grown(self, Py_ssize_t c, int m, double* det) noexcept nogil
     cdef void _carry(self, Py_ssize_t came, Py_ssize_t went) noexcept nogil
-    cdef void _middles(self, int r) noexcept nogil
     cdef void _update(self, Py_ssize_t c, int r) noexcept nogil
+    cdef void _cross(self, Py_ssize_t c, int m, int r) noexcept nogil
     cdef void _swaps(self, Py_ssize_t c) noexcept nogil
-    cdef void _shrink(self, Py_ssize_t c, int m) noexcept nogil
-    cdef void _count(self, Py_ssize_t i, int more) noexcept nogil
-    cdef void _clear(self) noexcept nogil
-    cdef int _late(self) except -1 nogil
-    cdef Py_ssize_t _replacement(self, Py_ssize_t out, double least) noexcept nogil
     cdef int _grow(self, Py_ssize_t size, double share) except -1 nogil
-    cdef double _climb(self) except? -2.0 nogil
-    cdef double _finish(self, Py_ssize_t size, double share, bint climbs) except? -2.0 nogil
-    cdef Py_ssize_t _draw(self, Py_ssize_t below) noexcept nogil
-    cdef Py_ssize_t _random_start(self) noexcept nogil
-    cdef int _extend(self, Py_ssize_t i, int rank, double least) noexcept nogil
-    cdef double _random(self, Py_ssize_t count, double value) except? -2.0 nogil
+    cdef double _finish(self, bint climbs) except? -2.0 nogil
+    cdef double _climb(self, bint least) except? -2.0 nogil
+    cdef Py_ssize_t _replacement(self, Py_ssize_t out, double rise) noexcept nogil
+    cdef double _least(self) noexcept nogil
+    cdef Py_ssize_t _strongest(self, Py_ssize_t at, double* found) noexcept nogil

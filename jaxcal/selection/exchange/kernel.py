@@ -1,4 +1,4 @@
-"""Compiled greedy and exchange for log det and trace of any C M^-1 C.T.
+"""Compiled greedy and exchange for log det and trace of any C M^-1 C.T, and for E.
 
 V is the inverse information, D_jj = B_j V B_j.T. Of a candidate j that comes in and one
 i that goes out (or none), with K = (I + D_jj)^-1, Z = D_ij K,
@@ -39,15 +39,17 @@ from __future__ import annotations
 import cython
 import numpy as np
 from cython.cimports.jaxcal.information.linear_algebra import (
+    add,
     cholesky,
     copy,
+    covariance,
+    eigen,
     factor,
     multiply,
 )
 from cython.cimports.jaxcal.selection.exchange.kernel import WIDE
 from cython.cimports.jaxcal.watch import begin, late
-from cython.cimports.libc.math import INFINITY, fabs, sqrt
-from cython.cimports.scipy.linalg.cython_lapack import dsyevd
+from cython.cimports.libc.math import INFINITY, fabs
 
 __all__ = ["DET", "SUBSET", "TRACE", "Climber"]
 
@@ -95,7 +97,7 @@ def _weigh(
 @cython.nogil
 @cython.inline
 @cython.exceptval(check=False)
-def _lane_dots(
+def _dots(
     into: cython.p_double,
     left: cython.p_double,
     right: cython.p_double,
@@ -112,31 +114,6 @@ def _lane_dots(
                 total[j] += x[j] * y[j]
         for j in range(16):
             into[16 * b + j] = total[j]
-
-
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _fill(
-    columns: cython.p_double,
-    halved: cython.p_double,
-    part: cython.p_double,
-    grown: cython.p_double,
-    q: cython.int,
-    p: cython.int,
-) -> cython.void:
-    """``B_j (L + L.T) B_j.T`` (q, q, WIDE) of a lower triangle L; part (p, WIDE)."""
-    for s in range(q):
-        for a in range(p):
-            _weigh(part + a * WIDE, halved + a * p, columns + s * p * WIDE, a + 1)
-        for r in range(q):
-            _lane_dots(grown + (r * q + s) * WIDE, columns + r * p * WIDE, part, p)
-    for r in range(q):
-        for s in range(r + 1):
-            x, y = grown + (r * q + s) * WIDE, grown + (s * q + r) * WIDE
-            for j in range(WIDE):
-                x[j] += y[j]
-                y[j] = x[j]
 
 
 @cython.cfunc
@@ -163,71 +140,35 @@ def _times(
 
 @cython.cfunc
 @cython.nogil
-@cython.exceptval(check=False)
-def _dots(
-    into: cython.p_double,
-    weight: cython.double,
-    left: cython.p_double,
-    right: cython.p_double,
-    q: cython.int,
-) -> cython.void:
-    """``into_j += weight trace(left_j right_j.T)``, (WIDE,) of (q, q, WIDE)."""
-    for a in range(q * q):
-        x, y = left + a * WIDE, right + a * WIDE
-        for j in range(WIDE):
-            into[j] += weight * x[j] * y[j]
-
-
-@cython.cfunc
-@cython.nogil
+@cython.inline
 @cython.exceptval(check=False)
 def _invert(
-    matrices: cython.p_double, det: cython.p_double, q: cython.int
+    matrices: cython.p_double, det: cython.p_double, q: cython.int, wide: cython.int
 ) -> cython.void:
-    """Invert positive (q, q, WIDE) in place by sweeps; ``det`` (WIDE,) is filled."""
-    for j in range(WIDE):
+    """Invert (q, q, wide) in place by sweeps in the order of the rows; fill ``det``."""
+    for j in range(wide):
         det[j] = 1.0
     for a in range(q):
-        pivot = matrices + (a * q + a) * WIDE
-        for j in range(WIDE):
+        pivot = matrices + (a * q + a) * wide
+        for j in range(wide):
             det[j] *= pivot[j]
             pivot[j] = 1.0 / pivot[j]
         for r in range(q):
             if r != a:
-                side = matrices + (r * q + a) * WIDE
-                for j in range(WIDE):
+                side = matrices + (r * q + a) * wide
+                for j in range(wide):
                     side[j] *= pivot[j]
                 for s in range(q):
                     if s != a:
-                        into = matrices + (r * q + s) * WIDE
-                        over = matrices + (a * q + s) * WIDE
-                        for j in range(WIDE):
+                        into = matrices + (r * q + s) * wide
+                        over = matrices + (a * q + s) * wide
+                        for j in range(wide):
                             into[j] -= side[j] * over[j]
         for s in range(q):
             if s != a:
-                over = matrices + (a * q + s) * WIDE
-                for j in range(WIDE):
+                over = matrices + (a * q + s) * wide
+                for j in range(wide):
                     over[j] *= -pivot[j]
-
-
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _invert_small(matrix: cython.p_double, size: cython.int) -> cython.void:
-    """Invert (size, size) in place by sweeps, in the order of its rows."""
-    for a in range(size):
-        pivot = 1.0 / matrix[a * size + a]
-        matrix[a * size + a] = pivot
-        for r in range(size):
-            if r != a:
-                side = matrix[r * size + a] * pivot
-                matrix[r * size + a] = side
-                for s in range(size):
-                    if s != a:
-                        matrix[r * size + s] -= side * matrix[a * size + s]
-        for s in range(size):
-            if s != a:
-                matrix[a * size + s] *= -pivot
 
 
 @cython.cfunc
@@ -264,16 +205,14 @@ def _lower(
     """``grown_j -= left_j.T @ right_j + right_j.T @ left_j`` of (rows, q, WIDE)."""
     for s in range(q):
         for t in range(s + 1):
-            out = grown + (s * q + t) * WIDE
+            out, other = grown + (s * q + t) * WIDE, grown + (t * q + s) * WIDE
             for a in range(rows):
                 x, y = left + (a * q + s) * WIDE, right + (a * q + t) * WIDE
                 u, v = right + (a * q + s) * WIDE, left + (a * q + t) * WIDE
                 for j in range(WIDE):
                     out[j] -= x[j] * y[j] + u[j] * v[j]
-            other = grown + (t * q + s) * WIDE
             if t < s:
-                for j in range(WIDE):
-                    other[j] = out[j]
+                copy(other, out, WIDE)
 
 
 @cython.cfunc
@@ -286,10 +225,8 @@ def _largest(values: cython.p_double) -> cython.double:
         half[j] = values[j] if values[j] > values[j + 32] else values[j + 32]
     for j in range(16):
         half[j] = half[j] if half[j] > half[j + 16] else half[j + 16]
-    for j in range(8):
-        half[j] = half[j] if half[j] > half[j + 8] else half[j + 8]
     top = half[0]
-    for j in range(1, 8):
+    for j in range(1, 16):
         top = half[j] if half[j] > top else top
     return top
 
@@ -317,17 +254,16 @@ class Climber:
 
     Args:
         kind: DET, SUBSET or TRACE.
-        blocks: (M, q, p) available candidates, whitened.
+        blocks: (M, q, p) whitened.
         prior: (p, p).
         root: C (s, p).
         cap: how often each may be chosen.
         required: (r,) candidates that are chosen in any case.
-        span: (r, p) orthonormal directions that the prior informs.
         k: candidates to choose.
         seed: of the random starts.
     """
 
-    def __init__(self, kind, blocks, prior, root, cap, required, span, k, seed):
+    def __init__(self, kind, blocks, prior, root, cap, required, k, seed):
         count: cython.Py_ssize_t = blocks.shape[0]
         q: cython.Py_ssize_t = blocks.shape[1]
         p: cython.Py_ssize_t = blocks.shape[2]
@@ -335,32 +271,27 @@ class Climber:
         r: cython.Py_ssize_t
         a: cython.Py_ssize_t
         self.kind, self.k, self.q, self.p, self.s = kind, k, q, p, len(root)
+        self.parts, self.dets = 1 + (kind != DET), 1 + (kind == SUBSET)
         self.fixed, self.groups = len(required), (count + WIDE - 1) // WIDE
         self.size = q * q * WIDE
         self.rows = q == 1 and kind == DET
-        self.blocks, self.prior, self.root, self.span = blocks, prior, root, span
-        wide = self.groups * WIDE
-        self.upper = np.zeros(wide, dtype=np.intp)
-        self.counts = np.zeros(wide, dtype=np.intp)
-        self.chosen, self.best = np.zeros((2, k), dtype=np.intp)
+        self.blocks, self.prior, self.root = blocks, prior, root
+        self.cap, self.counts = cap, np.zeros(count, dtype=np.intp)
+        self.chosen = np.zeros(k, dtype=np.intp)
         for r in range(len(required)):
             self.chosen[r] = required[r]
-        for i in range(count):
-            self.upper[i] = cap
-        self.order = np.arange(count)
         self.whole = np.empty(3 + 5 * p, dtype=np.intc)
-        self.used = 0
         self._lay_out()
         self.room = np.zeros(self.used)
-        self.used = 0
         self._lay_out()
         for i in range(count):
             for r in range(q):
                 for a in range(p):
                     at = ((i // WIDE * q + r) * p + a) * WIDE + i % WIDE
                     self.columns[at] = self.blocks[i, r, a]
-        multiply(True, False, p, p, self.s, cython.address(self.root[0, 0]),
-                 cython.address(self.root[0, 0]), self.metric)  # fmt: skip
+        for i in range(count, self.groups * WIDE):
+            self.closed[i] = INFINITY
+        add(self.metric, 1.0, cython.address(self.root[0, 0]), self.s, p)
         # Any seed is a good start of a xorshift generator but zero.
         self.state = (seed * 2685821657736338717 + 88172645463325252) % 2**64 or 1
         for _ in range(8):
@@ -376,6 +307,7 @@ class Climber:
     def _lay_out(self):
         """Share the room out; before there is one, count how much is needed."""
         q, p, s, wide = self.q, self.p, self.s, self.groups * WIDE
+        self.used = 0
         self.columns = self._take(q * p * wide)
         self.grown = self._take(2 * self.groups * self.size)
         self.kept = self._take(2 * self.groups * self.size)
@@ -388,56 +320,110 @@ class Climber:
         self.at_out, self.changed = self._take(2 * q * q), self._take(2 * q * p)
         self.tall = self._take(4 * q * p)
         self.now, self.trial = self._take(2 * p * p), self._take(2 * p * p)
-        self.halved = self._take(2 * p * p)
+        self.halved = self._take(p * p)
         self.known, self.gram = self._take(p * p), self._take(p * p)
-        self.lower, self.basis = self._take(p * p), self._take(p * p)
-        self.rest, self.metric = self._take(p * p), self._take(p * p)
+        self.lower, self.metric = self._take(p * p), self._take(p * p)
+        self.rest = self._take(p * p)
         self.half, self.solved = self._take(s * p), self._take(s * p)
-        self.small, self.weakest = self._take(s * s), self._take(p)
-        self.values, self.lapack = self._take(p), self._take(1 + 6 * p + 2 * p * p)
+        self.small, self.other = self._take(s * s), self._take(s * s)
+        self.values, self.weakest = self._take(p), self._take(p)
+        self.lapack = self._take(1 + 6 * p + 2 * p * p)
 
-    def climb_from(self, start, share, climbs, seconds):
+    def climb(self, start, share, swaps, seconds):
         """Complete ``start`` (size,), required first, and swap while that helps.
 
         Args:
             share: of the information of k mean candidates, what stands in for those
                 not chosen yet while the selection grows.
-            climbs: whether to swap.
+            swaps: 0 none, 1 those that raise phi, 2 those that raise E.
             seconds: after which no more swaps are made.
 
         Returns:
-            (k,) chosen, and phi; -inf where that is singular.
+            (k,) chosen, and phi, or E; -inf where that is singular.
         """
         self.watch = begin(seconds)
         size: cython.Py_ssize_t = len(start)
         kept: cython.double = share
-        swaps: cython.bint = climbs
+        how: cython.int = swaps
+        value: cython.double = 0.0
         for r in range(size):
             self.chosen[r] = start[r]
         with cython.nogil:
-            phi = self._finish(size, kept, swaps)
-        return np.array(self.chosen), phi
+            self._clear()
+            for c in range(size):
+                self._count(self.chosen[c], 1)
+            if how == 2:
+                self._set_known(0.0, 0.0)
+                value = self._climb(True)
+            else:
+                self._grow(size, kept)
+                value = self._finish(how)
+        return np.array(self.chosen), value
 
-    def random_climbs(self, count, chosen, phi, seconds, full):
-        """The best of ``chosen`` (k,) with its phi, and ``count`` random starts.
-
-        ``full`` is the rank that a block can have.
-        """
-        self.full = full
+    def random_climbs(self, count, chosen, phi, seconds):
+        """The best of ``chosen`` (k,) with its phi, and ``count`` random starts."""
         self.watch = begin(seconds)
-        for r in range(len(chosen)):
-            self.best[r] = chosen[r]
-        starts: cython.int = count
-        found: cython.double = phi
+        best: cython.Py_ssize_t[::1] = np.array(chosen)
+        value: cython.double = phi
+        starts: cython.Py_ssize_t = count
         with cython.nogil:
-            found = self._random(starts, found)
-        return np.array(self.best), found
+            for _ in range(starts):
+                if self._late() and value > -INFINITY:
+                    break
+                self._random_start()
+                found = self._finish(1)
+                if found > value + 1e-10 * max(1.0, fabs(value)) or not (
+                    value > -INFINITY
+                ):
+                    value = found
+                    best[:] = self.chosen
+        return np.asarray(best), value
 
-    def random_start(self, full):
-        """(k,) required first, then at random, rarely singular; ``full`` as above."""
-        self.full = full
+    def random_start(self):
+        """(k,) the required, then others at random."""
         self._random_start()
         return np.array(self.chosen)
+
+    # --- what is chosen -------------------------------------------------------------
+
+    def _clear(self):
+        """Nothing is chosen."""
+        for i in range(self.counts.shape[0]):
+            self.counts[i] = 0
+            self.closed[i] = 0.0
+
+    def _count(self, i, more):
+        """Candidate i is chosen once more, or once less."""
+        self.counts[i] += more
+        self.closed[i] = 0.0 if self.counts[i] < self.cap else INFINITY
+
+    def _draw(self, below):
+        """A whole number in [0, below) from a xorshift generator."""
+        self.state ^= self.state << 13
+        self.state ^= self.state >> 7
+        self.state ^= self.state << 17
+        return ((self.state >> 32) * below) >> 32
+
+    def _random_start(self):
+        """Fill ``chosen`` at random, distinct where there are enough candidates."""
+        most = 1 if self.k <= self.blocks.shape[0] else self.cap
+        self._clear()
+        for c in range(self.k):
+            i = self.chosen[c] if c < self.fixed else self._draw(self.blocks.shape[0])
+            while c >= self.fixed and self.counts[i] >= most:
+                i = self._draw(self.blocks.shape[0])
+            self.chosen[c] = i
+            self._count(i, 1)
+
+    def _late(self):
+        """``late`` of the watch, asked after some work."""
+        self.looked += self.groups
+        if self.looked < _PATIENCE:
+            return 0
+        self.looked = 0
+        return late(cython.address(self.watch))
+
+    # --- phi ------------------------------------------------------------------------
 
     def _set_known(self, share, ridge):
         """Fill ``known``: prior, ``share`` of k mean candidates' information, ridge."""
@@ -450,83 +436,66 @@ class Climber:
 
     def _sum(self, size, skipped):
         """Information of the first ``size`` chosen but one, into ``gram``."""
-        p = self.p
-        copy(self.gram, self.known, p * p)
+        copy(self.gram, self.known, self.p * self.p)
         for c in range(size):
             if c != skipped:
                 self._add(self.chosen[c])
 
     def _add(self, i):
         """Add candidate i to ``gram``."""
-        p = self.p
-        gram = self.gram
-        for r in range(self.q):
-            row = cython.address(self.blocks[i, r, 0])
-            for a in range(p):
-                for b in range(p):
-                    gram[a * p + b] += row[a] * row[b]
+        add(self.gram, 1.0, cython.address(self.blocks[i, 0, 0]), self.q, self.p)
 
     def _evaluate(self, size, into):
         """phi of the first ``size`` chosen, summed from their blocks; fills V and X."""
         p = self.p
         self._sum(size, -1)
-        inverse = into
-        value: cython.double = factor(
-            self.gram, inverse,
-            self.lower, p,
-        )  # fmt: skip
+        value: cython.double = factor(self.gram, into, self.lower, p)
         if self.kind == _DET or not value > -INFINITY:
             return value
-        half = self.half
-        multiply(False, False, self.s, p, p, cython.address(self.root[0, 0]), inverse,
-                 half)  # fmt: skip
-        if self.kind == _SUBSET:
-            return self._subset(into)
-        multiply(True, False, p, p, self.s, half, half, into + p * p)
-        value = 0.0
-        for r in range(self.s):
-            for a in range(p):
-                value -= self.half[r * p + a] * self.root[r, a]
+        other = into + p * p
+        value = covariance(
+            self.kind == _SUBSET, cython.address(self.root[0, 0]), into, self.s, p,
+            self.half, self.solved, self.small, self.other, self.lower, other,
+        )  # fmt: skip
+        for a in range(p * p if self.kind == _SUBSET else 0):
+            other[a] = into[a] - other[a]
         return value
 
-    def _subset(self, into):
-        """The same for log det of some parameters; C V is there."""
-        s, p = self.s, self.p
-        half, small = self.half, self.small
-        solved, other = self.solved, into + p * p
-        # The covariance C V C.T in ``solved``, which has room for it, as s <= p.
-        multiply(False, True, s, s, p, half, cython.address(self.root[0, 0]), solved)
-        value = -factor(solved, small, self.lower, s)
-        multiply(False, False, s, p, s, small, half, solved)
-        multiply(True, False, p, p, s, half, solved, other)
-        for a in range(p):
-            for b in range(p):
-                into[(p + a) * p + b] = into[a * p + b] - into[(p + a) * p + b]
-        return value
+    # --- gains ----------------------------------------------------------------------
 
     def _refresh(self):
         """D_jj, H_jj, K and the gain of every candidate alone, of V and X."""
         q, p = self.q, self.p
         self.tallest = 0.0
-        for m in range(1 if self.kind == _DET else 2):
+        for m in range(self.parts):
             for a in range(p):
-                for b in range(a):
-                    self.halved[(m * p + a) * p + b] = self.now[(m * p + a) * p + b]
-                self.halved[(m * p + a) * p + a] = 0.5 * self.now[(m * p + a) * p + a]
+                copy(self.halved + a * p, self.now + (m * p + a) * p, a + 1)
+                self.halved[a * p + a] *= 0.5
+            for c in range(self.groups):
+                # B_j (L + L.T) B_j.T of a lower triangle L.
+                columns, part = self.columns + c * q * p * WIDE, self.part
+                grown = self.grown + (2 * c + m) * self.size
+                for s in range(q):
+                    for a in range(p):
+                        _weigh(part + a * WIDE, self.halved + a * p,
+                               columns + s * p * WIDE, a + 1)  # fmt: skip
+                    for r in range(q):
+                        into = grown + (r * q + s) * WIDE
+                        _dots(into, columns + r * p * WIDE, part, p)
+                for r in range(q):
+                    for s in range(r + 1):
+                        x, y = grown + (r * q + s) * WIDE, grown + (s * q + r) * WIDE
+                        for j in range(WIDE):
+                            x[j] += y[j]
+                            y[j] = x[j]
         for c in range(self.groups):
-            for m in range(1 if self.kind == _DET else 2):
-                _fill(self.columns + c * q * p * WIDE,
-                      self.halved + m * p * p,
-                      self.part,
-                      self.grown + (2 * c + m) * self.size,
-                      self.q, self.p)  # fmt: skip
             self._keep(c)
 
     def _keep(self, c):
         """K, and the gain of each alone: a factor, or the fall of a trace."""
         q = self.q
         alone, det = self.alone + c * WIDE, self.det
-        grown = self.grown + 2 * c * self.size
+        grown, kept = self.grown + 2 * c * self.size, self.kept + 2 * c * self.size
         if self.rows:
             for j in range(WIDE):
                 alone[j] = 1.0 + grown[j]
@@ -534,16 +503,17 @@ class Climber:
             self.tops[2 * c] = 1.0 + self.tops[2 * c + 1]
             self.tallest = max(self.tallest, self.tops[2 * c + 1])
             return
-        self._invert_grown(c, 0, alone)
-        if self.kind == _SUBSET:
-            self._invert_grown(c, 1, det)
+        copy(kept, grown, self.dets * self.size)
+        for m in range(self.dets):
+            for r in range(q):
+                diagonal = kept + m * self.size + (r * q + r) * WIDE
+                for j in range(WIDE):
+                    diagonal[j] += 1.0
+            _invert(kept + m * self.size, det, q, WIDE)
             for j in range(WIDE):
-                alone[j] /= det[j]
-        elif self.kind == _TRACE:
-            for j in range(WIDE):
-                alone[j] = 0.0
-            _dots(alone, 1.0, self.kept + 2 * c * self.size,
-                  self.grown + (2 * c + 1) * self.size, q)  # fmt: skip
+                alone[j] = alone[j] / det[j] if m else det[j]
+        if self.kind == _TRACE:
+            _dots(alone, kept, grown + self.size, q * q)
         for j in range(WIDE):
             det[j] = 0.0
         for r in range(q):
@@ -552,18 +522,6 @@ class Climber:
         self.tops[2 * c], self.tops[2 * c + 1] = _largest(alone), _largest(det)
         self.tallest = max(self.tallest, self.tops[2 * c + 1])
 
-    def _invert_grown(self, c, m, det):
-        """K of the group, and the determinant of what it inverts."""
-        q = self.q
-        grown = self.grown + (2 * c + m) * self.size
-        kept = self.kept + (2 * c + m) * self.size
-        for a in range(self.size):
-            kept[a] = grown[a]
-        for r in range(q):
-            for j in range(WIDE):
-                kept[(r * q + r) * WIDE + j] += 1.0
-        _invert(kept, det, q)
-
     def _carry(self, came, went):
         """What is kept, for V and X (``trial``) after a swap; -1: none went.
 
@@ -571,142 +529,102 @@ class Climber:
         -1, V falls by ``W.T P W``, P = inverse(S + W A.T). So does X of a subset, by U,
         and X of a trace by ``W.T P U + U.T P W - W.T P U A.T P W``.
         """
-        q, p = self.q, self.p
+        q, p, changed = self.q, self.p, self.changed
         r: cython.int = q if went < 0 else 2 * q
         peak = self.tallest
-        if 2 * p > 5 * r:
-            copy(self.changed,
-                 cython.address(self.blocks[came, 0, 0]), q * p)  # fmt: skip
+        updates: cython.bint = 2 * p > 5 * r
+        if updates:
+            copy(changed, cython.address(self.blocks[came, 0, 0]), q * p)
             if went >= 0:
-                copy(self.changed + q * p,
-                     cython.address(self.blocks[went, 0, 0]), q * p)  # fmt: skip
-            self._middles(r)
+                copy(changed + q * p, cython.address(self.blocks[went, 0, 0]), q * p)
+            for m in range(self.parts):
+                tall, middle = self.tall + 2 * m * q * p, self.middle + 4 * m * q * q
+                multiply(False, False, r, p, p, changed, self.now + m * p * p, tall)
+                multiply(False, True, r, r, p, tall, changed, middle)
+                if m < self.dets:
+                    for s in range(r):
+                        middle[s * r + s] += 1.0 if s < q else -1.0
+                    _invert(middle, self.det, r, 1)
+                else:  # P U A.T P
+                    part = self.middle + 8 * q * q
+                    multiply(False, False, r, r, r, self.middle, middle, part)
+                    multiply(False, False, r, r, r, part, self.middle, middle)
             self.tallest = 0.0
             for c in range(self.groups):
                 self._update(c, r)
                 self._keep(c)
-        copy(self.now, self.trial,
-             2 * p * p)  # fmt: skip
-        if 2 * p <= 5 * r or self.tallest < _CANCELLED * peak:
+        copy(self.now, self.trial, 2 * p * p)
+        if not updates or self.tallest < _CANCELLED * peak:
             self._refresh()
         self.tallest = max(self.tallest, peak)
 
-    def _middles(self, r):
-        """``tall`` W and U, and in ``middle`` P of both; of a trace P U A.T P / 2."""
-        q, p = self.q, self.p
-        changed = self.changed
-        for m in range(1 if self.kind == _DET else 2):
-            tall = self.tall + 2 * m * q * p
-            middle = self.middle + 4 * m * q * q
-            multiply(False, False, r, p, p, changed, self.now + m * p * p,
-                     tall)  # fmt: skip
-            multiply(False, True, r, r, p, tall, changed, middle)
-            if m == 1 and self.kind == _TRACE:
-                first = self.middle
-                part = self.middle + 8 * q * q
-                multiply(False, False, r, r, r, first, middle, part)
-                multiply(False, False, r, r, r, part, first, middle)
-                continue
-            for s in range(r):
-                middle[s * r + s] += 1.0 if s < q else -1.0
-            _invert_small(middle, r)
-
     def _update(self, c, r):
         """D_jj and H_jj of the group."""
-        q, p = self.q, self.p
-        mixed = self.mixed
-        cross = self.cross
-        for m in range(1 if self.kind == _DET else 2):
-            own = self.cross + 2 * m * self.size
-            for s in range(q):
-                for a in range(r):
-                    _weigh(own + (a * q + s) * WIDE, self.tall + (2 * m * q + a) * p,
-                           self.columns + (c * q + s) * p * WIDE, p)  # fmt: skip
+        q, mixed = self.q, self.mixed
+        for m in range(self.parts):
+            own, middle = self.cross + 2 * m * self.size, self.middle + 4 * m * q * q
+            self._cross(c, m, r)
             for a in range(r * q * WIDE):
                 mixed[a] = 0.0
-            if m == 1 and self.kind == _TRACE:
-                _mix(mixed, 1.0, self.middle, own, r, q)
-                _mix(mixed, -0.5, self.middle + 4 * q * q, cross, r, q)
-                own = cross
+            if m < self.dets:
+                _mix(mixed, 0.5, middle, own, r, q)
             else:
-                _mix(mixed, 0.5, self.middle + 4 * m * q * q, own, r, q)
+                _mix(mixed, 1.0, self.middle, own, r, q)
+                own = self.cross
+                _mix(mixed, -0.5, middle, own, r, q)
             _lower(self.grown + (2 * c + m) * self.size, own, mixed, r, q)
 
-    def _shrink(self, c, m):
-        """Z and Y^-1 into ``work``, det Y into ``det``; m = 1: of X in place of V."""
-        q = self.q
-        solved = self.work
-        middle = self.work + self.size
-        cross = self.cross + 2 * m * self.size
-        for a in range(self.size):
-            solved[a] = 0.0
-        _times(solved, 1.0, cross, self.kept + (2 * c + m) * self.size, False, q)
-        for r in range(q):
-            for s in range(q):
-                stays = (1.0 if r == s else 0.0) - self.at_out[(m * q + r) * q + s]
-                into = middle + (r * q + s) * WIDE
-                for j in range(WIDE):
-                    into[j] = stays
-        _times(middle, 1.0, solved, cross, True, q)
-        _invert(middle, self.det, q)
+    def _cross(self, c, m, r):
+        """``tall`` times the blocks of a group, (r, q, WIDE): V, or m = 1: X."""
+        q, p = self.q, self.p
+        for s in range(q):
+            for a in range(r):
+                _weigh(self.cross + 2 * m * self.size + (a * q + s) * WIDE,
+                       self.tall + (2 * m * q + a) * p,
+                       self.columns + (c * q + s) * p * WIDE, p)  # fmt: skip
 
     def _swaps(self, c):
         """Gains of the group when i, whose ``tall`` is there, goes out."""
-        q, p = self.q, self.p
-        gain, det = self.gain, self.det
-        alone = self.alone + c * WIDE
-        for m in range(1 if self.kind == _DET else 2):
-            for s in range(q):
-                for r in range(q):
-                    _weigh(self.cross + 2 * m * self.size + (r * q + s) * WIDE,
-                           self.tall + (2 * m * q + r) * p,
-                           self.columns + (c * q + s) * p * WIDE, p)  # fmt: skip
+        q = self.q
+        gain, det, alone = self.gain, self.det, self.alone + c * WIDE
+        solved, y, cross = self.work, self.work + self.size, self.cross
+        for m in range(self.parts):
+            self._cross(c, m, q)
         if self.rows:
-            cross = self.cross
             stays = 1.0 - self.at_out[0]
             for j in range(WIDE):
                 gain[j] = alone[j] * stays + cross[j] * cross[j]
             return
-        self._shrink(c, 0)
+        for m in range(self.dets):
+            for a in range(self.size):
+                solved[a] = 0.0
+            kept = self.kept + (2 * c + m) * self.size
+            _times(solved, 1.0, cross + 2 * m * self.size, kept, False, q)
+            for r in range(q):
+                for s in range(q):
+                    stays = (1.0 if r == s else 0.0) - self.at_out[(m * q + r) * q + s]
+                    for j in range(WIDE):
+                        y[(r * q + s) * WIDE + j] = stays
+            _times(y, 1.0, solved, cross + 2 * m * self.size, True, q)
+            _invert(y, det, q, WIDE)
+            for j in range(WIDE):
+                gain[j] = gain[j] / max(det[j], 1e-300) if m else alone[j] * det[j]
         if self.kind != _TRACE:
-            for j in range(WIDE):
-                gain[j] = alone[j] * det[j]
-            if self.kind == _SUBSET:
-                self._shrink(c, 1)
-                for j in range(WIDE):
-                    gain[j] /= max(det[j], 1e-300)
             return
-        solved = self.work
-        part = self.work + 2 * self.size
-        lost = self.work + 3 * self.size
-        other = self.cross + 2 * self.size
+        part, lost = self.work + 2 * self.size, self.work + 3 * self.size
         for a in range(self.size):
-            part[a] = -other[a]
-        _times(part, 0.5, solved, self.grown + (2 * c + 1) * self.size, False, q)
+            part[a] = -cross[2 * self.size + a]
+        grown = self.grown + (2 * c + 1) * self.size
+        _times(part, 0.5, solved, grown, False, q)
         for a in range(q * q):
-            constant = self.at_out[q * q + a]
             for j in range(WIDE):
-                lost[a * WIDE + j] = constant
+                lost[a * WIDE + j] = self.at_out[q * q + a]
         _times(lost, 2.0, part, solved, True, q)
-        for j in range(WIDE):
-            gain[j] = alone[j]
-        _dots(gain, -1.0, self.work + self.size, lost, q)
-        for j in range(WIDE):
-            if not det[j] > 1e-14:  # singular without i
-                gain[j] = -INFINITY
+        _dots(gain, y, lost, q * q)
+        for j in range(WIDE):  # none where it is singular without i
+            gain[j] = alone[j] - gain[j] if det[j] > 1e-14 else -INFINITY
 
-    def _count(self, i, more):
-        """Candidate i is chosen once more, or once less."""
-        self.counts[i] += more
-        self.closed[i] = 0.0 if self.counts[i] < self.upper[i] else INFINITY
-
-    def _late(self):
-        """``late`` of the watch, asked after some work."""
-        self.looked += self.groups
-        if self.looked < _PATIENCE:
-            return 0
-        self.looked = 0
-        return late(cython.address(self.watch))
+    # --- greedy and exchange --------------------------------------------------------
 
     def _grow(self, size, share):
         """Complete the first ``size`` chosen, the largest gain first."""
@@ -732,54 +650,82 @@ class Climber:
             self._evaluate(size, self.trial)
             self._carry(best, -1)
 
-    def _climb(self):
-        """Swap each chosen for its best replacement until none helps; phi."""
+    def _finish(self, climbs):
+        """phi of the chosen, climbed; swaps may mend a singular start.
+
+        The more surely the smaller the ridge that makes it regular.
+        """
+        value: cython.double = 0.0
+        for attempt in range(5):
+            ridge: cython.double = 0.0
+            if attempt % 2:
+                ridge = _RIDGE if attempt == 1 else 1e-4 * _RIDGE
+            self._set_known(0.0, ridge)
+            if not climbs:
+                return self._evaluate(self.k, self.now)
+            value = self._climb(False)
+            if ridge == 0.0 and value > -INFINITY:
+                break
+        return value
+
+    def _climb(self, least):
+        """Swap each chosen for its best replacement until none helps; phi, or E."""
         k = self.k
-        value = self._evaluate(k, self.now)
+        value: cython.double = 0.0
+        if least:
+            self._sum(k, -1)
+            value = self._least()
+        else:
+            value = self._evaluate(k, self.now)
         if k == self.fixed or not value > -INFINITY:
             return value
-        self._refresh()
+        if not least:
+            self._refresh()
         position, since, swaps = self.fixed, 0, 0
         while since < k - self.fixed and swaps < _MOST_SWAPS * k:
-            if self._late():
+            if late(cython.address(self.watch)) if least else self._late():
                 break
-            at, out = position, self.chosen[position]
+            at, out, after = position, self.chosen[position], value
             since += 1
             position = position + 1 if position + 1 < k else self.fixed
-            least = _IMPROVES * max(1.0, fabs(value))
-            best = self._replacement(out, least)
+            rise = _IMPROVES * max(1.0, fabs(value))
+            if least:
+                after *= 1.0 + _LIFTS
+                best = self._strongest(at, cython.address(after))
+            else:
+                best = self._replacement(out, rise)
             if best < 0:
                 continue
             self.chosen[at] = best
-            after = self._evaluate(k, self.trial)
-            if not after > value + least:  # the formulas promised more than there is
-                self.chosen[at] = out
-                continue
+            if not least:
+                after = self._evaluate(k, self.trial)
+                if not after > value + rise:  # the formulas promised more
+                    self.chosen[at] = out
+                    continue
             value, since = after, 0
             swaps += 1
             self._count(out, -1)
             self._count(best, 1)
-            self._carry(best, out)
+            if not least:
+                self._carry(best, out)
         return value
 
-    def _replacement(self, out, least):
-        """Who raises phi most in the place of ``out``, by over ``least``; -1: none."""
+    def _replacement(self, out, rise):
+        """Who raises phi most in the place of ``out``, by over ``rise``; -1: none."""
         q, p = self.q, self.p
         g, e = out // WIDE, out % WIDE
         taken: cython.double = 0.0
-        for m in range(1 if self.kind == _DET else 2):
+        for m in range(self.parts):
             multiply(False, False, q, p, p, cython.address(self.blocks[out, 0, 0]),
-                     self.now + m * p * p,
-                     self.tall + 2 * m * q * p)  # fmt: skip
-            of_out = self.grown + (2 * g + m) * self.size
-            for r in range(q):
-                for s in range(q):
-                    self.at_out[(m * q + r) * q + s] = of_out[(r * q + s) * WIDE + e]
+                     self.now + m * p * p, self.tall + 2 * m * q * p)  # fmt: skip
+            for a in range(q * q):
+                self.at_out[m * q * q + a] = self.grown[
+                    (2 * g + m) * self.size + a * WIDE + e
+                ]
         for r in range(q):
             taken += self.at_out[r * q + r] / q
-        most: cython.double = least if self.kind == _TRACE else 1.0 + least
+        most: cython.double = rise if self.kind == _TRACE else 1.0 + rise
         best: cython.Py_ssize_t = -1
-        gain = self.gain
         for c in range(self.groups):
             bound: cython.double = self.tops[2 * c]
             if self.kind == _DET:
@@ -789,105 +735,49 @@ class Climber:
             if bound <= most:
                 continue
             self._swaps(c)
-            j = _best_of(gain, self.closed + c * WIDE, most)
+            j = _best_of(self.gain, self.closed + c * WIDE, most)
             if j >= 0:
-                best, most = c * WIDE + j, gain[j]
+                best, most = c * WIDE + j, self.gain[j]
         return -1 if best == out else best
-
-    def _clear(self):
-        """Nothing is chosen."""
-        for i in range(self.counts.shape[0]):
-            self.counts[i] = 0
-            self.closed[i] = 0.0 if self.upper[i] else INFINITY
 
     # --- E --------------------------------------------------------------------------
 
-    def climb_least(self, start, seconds):
-        """The local optimum of E that ``start`` (k,), required first, climbs to.
-
-        Returns:
-            (k,) chosen, and E; -inf where that is singular.
-        """
-        self.watch = begin(seconds)
-        for r in range(self.k):
-            self.chosen[r] = start[r]
-        value: cython.double = 0.0
-        with cython.nogil:
-            value = self._climb_least()
-        return np.array(self.chosen), value
-
-    def _climb_least(self):
-        """Swap each chosen for its best replacement until none helps; E."""
-        k = self.k
-        self._clear()
-        for c in range(k):
-            self._count(self.chosen[c], 1)
-        self._set_known(0.0, 0.0)
-        self._sum(k, -1)
-        value = self._least()
-        position, since, swaps = self.fixed, 0, 0
-        while since < k - self.fixed and swaps < _MOST_SWAPS * k and value > 0.0:
-            if late(cython.address(self.watch)):
-                break
-            out = self.chosen[position]
-            self._sum(k, position)
-            since += 1
-            found: cython.double = (1.0 + _LIFTS) * value
-            best = self._strongest(cython.address(found))
-            if best >= 0:
-                value, since = found, 0
-                swaps += 1
-                self._count(out, -1)
-                self._count(best, 1)
-                self.chosen[position] = best
-            position = position + 1 if position + 1 < k else self.fixed
-        return value
-
     def _least(self):
-        """E of ``gram``; V, C V and what ``_eigen`` fills are there."""
-        p = self.p
-        inverse = self.now
-        half, root = self.half, cython.address(self.root[0, 0])
+        """E of ``gram``; C V and the eigenvectors of C V C.T are there."""
+        p, inverse = self.p, self.now
+        root = cython.address(self.root[0, 0])
         if not factor(self.gram, inverse, self.lower, p) > -INFINITY:
-            return -INFINITY  # fmt: skip
-        multiply(False, False, p, p, p, root, inverse, half)
-        multiply(False, True, p, p, p, half, root, self.small)
-        info: cython.int = 0
-        room: cython.int = 1 + 6 * p + 2 * p * p
-        whole: cython.int = self.whole.shape[0]
-        dsyevd(b"V", b"L", cython.address(p), self.small,
-               cython.address(p), self.values,
-               self.lapack, cython.address(room),
-               cython.address(self.whole[0]), cython.address(whole),
-               cython.address(info))  # fmt: skip
+            return -INFINITY
+        multiply(False, False, p, p, p, root, inverse, self.half)
+        multiply(False, True, p, p, p, self.half, root, self.small)
+        eigen(self.small, self.values, self.lapack, self.whole, p)
         return 1.0 / self.values[p - 1]
 
-    def _strongest(self, found):
-        """Who gives the largest E beside ``gram``, over ``found``; -1: none."""
+    def _strongest(self, at, found):
+        """Who in place ``at`` gives the largest E, over ``found``; -1: none."""
         p, q = self.p, self.q
         gram, rest = self.gram, self.rest
+        self._sum(self.k, at)
         copy(rest, gram, p * p)
         for a in range(p):
-            self.gram[a * p + a] += _SLIGHT
+            gram[a * p + a] += _SLIGHT
         value = self._least()
         if not value > -INFINITY:
             return -1
         # A block of q readings leaves the variances after the q largest no smaller.
         cap = 1.0 / self.values[p - 1 - q] if q < p else INFINITY
-        multiply(
-            False, False, 1, p, p, self.small + (p - 1) * p, self.half, self.weakest
-        )
+        strong = self.small + (p - 1) * p
+        multiply(False, False, 1, p, p, strong, self.half, self.weakest)
         for a in range(p):
             self.weakest[a] *= value
         part = self.part
         for c in range(self.groups):
-            bound = self.bounds + c * WIDE
-            closed = self.closed + c * WIDE
+            bound, closed = self.bounds + c * WIDE, self.closed + c * WIDE
             for j in range(WIDE):
                 bound[j] = value
             for s in range(q):
-                _weigh(part, self.weakest,
-                       self.columns + (c * q + s) * p * WIDE, p)  # fmt: skip
+                columns = self.columns + (c * q + s) * p * WIDE
+                _weigh(part, self.weakest, columns, p)
                 for j in range(WIDE):
                     bound[j] += part[j] * part[j]
             for j in range(WIDE):
@@ -909,127 +799,10 @@ class Climber:
             self.tops[2 * g] = _largest(bound)
             copy(gram, rest, p * p)
             self._add(g * WIDE + e)
-            for a in range(p):
-                for b in range(a + 1):
-                    self.lower[a * p + b] = (
-                        self.gram[a * p + b] - found[0] * self.metric[a * p + b]
-                    )
             lower = self.lower
+            for a in range(p * p):
+                lower[a] = gram[a] - found[0] * self.metric[a]
             if cholesky(lower, lower, p, 0.0) > -INFINITY:
                 value = self._least()
                 if value > found[0]:
                     best, found[0] = g * WIDE + e, value
-
-    # --------------------------------------------------------------------------------
-
-    def _finish(self, size, share, climbs):
-        """Grow and climb from the first ``size`` chosen; phi."""
-        self._clear()
-        for c in range(size):
-            self._count(self.chosen[c], 1)
-        self._grow(size, share)
-        value = 0.0
-        # Swaps may mend a singular start, the more surely the smaller the ridge.
-        for attempt in range(5):
-            ridge = 0.0
-            if attempt % 2:
-                ridge = _RIDGE if attempt == 1 else 1e-4 * _RIDGE
-            self._set_known(0.0, ridge)
-            if not climbs:
-                return self._evaluate(self.k, self.now)
-            value = self._climb()
-            if ridge == 0.0 and value > -INFINITY:
-                break
-        return value
-
-    # --- random starts --------------------------------------------------------------
-
-    def _draw(self, below):
-        """A whole number in [0, below) from a xorshift generator."""
-        self.state ^= self.state << 13
-        self.state ^= self.state >> 7
-        self.state ^= self.state << 17
-        return ((self.state >> 32) * below) >> 32
-
-    def _random_start(self):
-        """Fill ``chosen`` at random, rarely singular.
-
-        An orthonormal basis grows with what is chosen: first the required ones, then at
-        random what leaves the span by enough.
-        """
-        p = self.p
-        count: cython.Py_ssize_t = self.blocks.shape[0]
-        size: cython.Py_ssize_t = self.fixed
-        for i in range(count):
-            self.counts[i] = 0
-        rank: cython.int = self.span.shape[0]
-        for r in range(rank):
-            for a in range(p):
-                self.basis[r * p + a] = self.span[r, a]
-        for r in range(size):
-            self.counts[self.chosen[r]] += 1
-            rank = self._extend(self.chosen[r], rank, 1e-18)
-        for position in range(count):
-            if rank == p or size == self.k:
-                break
-            other = position + self._draw(count - position)
-            i = self.order[other]
-            self.order[other], self.order[position] = self.order[position], i
-            if self.counts[i] < self.upper[i]:
-                grown = self._extend(i, rank, 1e-6 / count)
-                if grown - rank >= min(self.full, p - rank):
-                    rank = grown
-                    self.chosen[size] = i
-                    self.counts[i] += 1
-                    size += 1
-        while size < self.k:
-            i = self.order[self._draw(count)]
-            if self.counts[i] < self.upper[i]:
-                self.chosen[size] = i
-                self.counts[i] += 1
-                size += 1
-        return size
-
-    def _extend(self, i, rank, least):
-        """Add to the basis the rows of block i that are new by over ``least``; rank."""
-        p = self.p
-        for s in range(self.q):
-            if rank == p:
-                break
-            row = self.basis + rank * p
-            square: cython.double = 0.0
-            for a in range(p):
-                row[a] = self.blocks[i, s, a]
-                square += row[a] * row[a]
-            for _ in range(2):  # twice is enough for orthogonality to rounding
-                before: cython.double = square
-                for r in range(rank):
-                    dot: cython.double = 0.0
-                    for a in range(p):
-                        dot += self.basis[r * p + a] * row[a]
-                    for a in range(p):
-                        row[a] -= dot * self.basis[r * p + a]
-                square = 0.0
-                for a in range(p):
-                    square += row[a] * row[a]
-                if square > 0.5 * before:
-                    break
-            if square > least:
-                scale = 1.0 / sqrt(square)
-                for a in range(p):
-                    row[a] *= scale
-                rank += 1
-        return rank
-
-    def _random(self, count, value):
-        """The best of ``best``, of phi value, and of random starts climbed."""
-        for _ in range(count):
-            if self._late() and value > -INFINITY:
-                break
-            self._random_start()
-            found = self._finish(self.k, 0.0, True)
-            if found > value + 1e-10 * max(1.0, fabs(value)) or not value > -INFINITY:
-                value = found
-                for r in range(self.k):
-                    self.best[r] = self.chosen[r]
-        return value

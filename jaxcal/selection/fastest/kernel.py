@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import cython
 import numpy as np
+from cython.cimports.jaxcal.information.linear_algebra import add, copy, dot, factor
 from cython.cimports.jaxcal.watch import Watch, begin, late
 from cython.cimports.libc.math import INFINITY, log
-from cython.cimports.scipy.linalg.cython_lapack import dpotrf, dpotri
 
 __all__ = ["MOST_EXACT", "best_order", "fastest_subset"]
 
@@ -14,7 +14,6 @@ MOST_EXACT = 12  # postures up to which the order is optimal (Held and Karp 1962
 
 _IMPROVED = 20  # shortest nearest-neighbour tours that are improved beyond that
 _SHORTER = cython.declare(cython.double, 1e-10)  # seconds that a change must save
-_SINGULAR = cython.declare(cython.double, 1e-14)  # pivot, relative to its diagonal
 
 
 def best_order(times, start):
@@ -30,10 +29,14 @@ def best_order(times, start):
     k = len(start)
     if k <= MOST_EXACT:
         return _exact_order(times, start)
-    tours = np.empty((k, k), np.int64)
-    seconds = np.empty(k)
-    for first in range(k):
-        seconds[first] = _nearest_neighbours(times, start, first, tours[first])
+    # From every posture on to the nearest one left.
+    every, free = np.arange(k), ~np.eye(k, dtype=bool)
+    tours, seconds = np.repeat(every[:, None], k, axis=1), start.copy()
+    for place in range(1, k):
+        way = np.where(free, times[tours[:, place - 1]], np.inf)
+        tours[:, place] = way.argmin(axis=1)
+        seconds += way.min(axis=1)
+        free[every, tours[:, place]] = False
     best, least = tours[0], np.inf
     for first in np.argsort(seconds)[:_IMPROVED]:
         reached = _improve(times, start, tours[first], seconds[first])
@@ -113,80 +116,45 @@ def _extend(
     return least
 
 
-def _nearest_neighbours(
-    times: cython.double[:, ::1],
-    start: cython.double[::1],
-    first: cython.Py_ssize_t,
-    order: cython.Py_ssize_t[::1],
-):
-    """Fill ``order`` (K,) from posture ``first`` on; returns its seconds."""
-    k = start.shape[0]
-    free: cython.uchar[::1] = np.ones(k, np.uint8)
-    here: cython.Py_ssize_t = first
-    seconds: cython.double = start[first]
-    for place in range(k):
-        if place:
-            nearest: cython.Py_ssize_t = -1
-            for j in range(k):
-                if free[j] and (nearest < 0 or times[here, j] < times[here, nearest]):
-                    nearest = j
-            seconds += times[here, nearest]
-            here = nearest
-        order[place] = here
-        free[here] = 0
-    return seconds
-
-
+@cython.cfunc
+@cython.exceptval(-1.0)
 def _improve(
     times: cython.double[:, ::1],
     start: cython.double[::1],
     order: cython.Py_ssize_t[::1],
     seconds: cython.double,
-):
-    """Reverse pieces and move single postures until neither shortens ``order`` (K,)."""
-    with cython.nogil:
-        while True:
-            saved = _pass(times, start, order)
-            if saved == 0.0:
-                break
-            seconds -= saved
-    return seconds
-
-
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(-1.0)
-def _pass(
-    times: cython.double[:, ::1],
-    start: cython.double[::1],
-    order: cython.Py_ssize_t[::1],
 ) -> cython.double:
-    """Seconds that one pass of ``_improve`` saves; 0 at the end."""
+    """Reverse pieces and move single postures until neither shortens ``order`` (K,)."""
     k = order.shape[0]
-    saved: cython.double = 0.0
+    saved: cython.double = 1.0
     watch: Watch = begin(INFINITY)
-    for i in range(k - 1):
-        late(cython.address(watch))
-        for j in range(i + 1, k):
-            a, b, after = order[i], order[j], order[i + 1]
-            into_a = times[order[i - 1], a] if i else start[a]
-            into_b = times[order[i - 1], b] if i else start[b]
-            into_after = times[order[i - 1], after] if i else start[after]
-            a_out = times[a, order[j + 1]] if j + 1 < k else 0.0
-            b_out = times[b, order[j + 1]] if j + 1 < k else 0.0
-            reverse = into_b - into_a + a_out - b_out
-            moved = into_after - into_a - times[a, after] + times[b, a]
-            later = moved + a_out - b_out
-            if reverse < -_SHORTER and reverse <= later:
-                for step in range((j - i + 1) // 2):
-                    order[i + step], order[j - step] = order[j - step], order[i + step]
-                saved -= reverse
-            elif later < -_SHORTER:
-                for step in range(i, j):
-                    order[step] = order[step + 1]
-                order[j] = a
-                saved -= later
-    return saved
+    while saved:
+        saved = 0.0
+        for i in range(k - 1):
+            late(cython.address(watch))
+            for j in range(i + 1, k):
+                a, b, after = order[i], order[j], order[i + 1]
+                into_a = times[order[i - 1], a] if i else start[a]
+                into_b = times[order[i - 1], b] if i else start[b]
+                into_after = times[order[i - 1], after] if i else start[after]
+                a_out = times[a, order[j + 1]] if j + 1 < k else 0.0
+                b_out = times[b, order[j + 1]] if j + 1 < k else 0.0
+                reverse = into_b - into_a + a_out - b_out
+                later = into_after - into_a - times[a, after] + times[b, a]
+                later += a_out - b_out
+                if min(reverse, later) >= -_SHORTER:
+                    continue
+                saved -= min(reverse, later)
+                if reverse <= later:
+                    for step in range((j - i + 1) // 2):
+                        one, other = i + step, j - step
+                        order[one], order[other] = order[other], order[one]
+                else:
+                    for step in range(i, j):
+                        order[step] = order[step + 1]
+                    order[j] = a
+        seconds -= saved
+    return seconds
 
 
 def fastest_subset(
@@ -225,8 +193,7 @@ def fastest_subset(
     m, k, p = blocks.shape[0], chosen.shape[0], blocks.shape[2]
     tours: cython.double[:, ::1] = np.full((1 << k, k), np.inf)
     held: cython.Py_ssize_t[::1] = np.zeros(k + 1, np.int64)
-    gram: cython.double[:, ::1] = np.empty((p, p))
-    inverse: cython.double[:, ::1] = np.empty((p, p))
+    room: cython.double[:, ::1] = np.empty((4, p * p))
     gains: cython.double[::1] = np.empty(k)
     depth: cython.Py_ssize_t
     nodes: cython.Py_ssize_t = 0
@@ -248,19 +215,14 @@ def fastest_subset(
             least = _extend(tours, times, start, held, depth)
             if least > best[0] + same:
                 continue
-            _sum(blocks, prior, held, depth + 1, gram)
+            bound = _bound(blocks, prior, held, depth + 1, k, relaxed, room, gains)
             if depth == k - 1:
-                log_det = _factor(gram, inverse)
-                if log_det >= wanted and (
-                    least < best[0] - same or log_det > best[1] + 1e-12
+                if bound >= wanted and (
+                    least < best[0] - same or bound > best[1] + 1e-12
                 ):
-                    best[0] = min(least, best[0])
-                    best[1] = log_det
+                    best[0], best[1] = min(least, best[0]), bound
                     chosen[:] = held[:k]
                 continue
-            bound = _bound(
-                blocks, held[depth] + 1, k - depth - 1, k, relaxed, gram, inverse, gains
-            )
             if bound < wanted or (least > best[0] - same and bound <= best[1]):
                 continue
             depth += 1
@@ -271,100 +233,51 @@ def fastest_subset(
 @cython.cfunc
 @cython.nogil
 @cython.exceptval(check=False)
-def _sum(
+def _bound(
     blocks: cython.const[cython.double][:, :, ::1],
     prior: cython.const[cython.double][:, ::1],
     held: cython.Py_ssize_t[::1],
     count: cython.Py_ssize_t,
-    gram: cython.double[:, ::1],
-) -> cython.void:
-    """``gram`` (p, p): prior and the first ``count`` of the held."""
-    p = gram.shape[0]
-    gram[:, :] = prior
-    for c in range(count):
-        i = held[c]
-        for r in range(blocks.shape[1]):
-            for a in range(p):
-                for b in range(p):
-                    gram[a, b] += blocks[i, r, a] * blocks[i, r, b]
-
-
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _factor(
-    gram: cython.double[:, ::1], inverse: cython.double[:, ::1]
-) -> cython.double:
-    """Log det of a positive definite matrix, and its inverse; -inf where singular."""
-    p: cython.int = gram.shape[0]
-    info: cython.int = 0
-    triangle: cython.char = b"L"
-    log_det: cython.double = 0.0
-    inverse[:, :] = gram
-    matrix = cython.address(inverse[0, 0])
-    size = cython.address(p)
-    done = cython.address(info)
-    dpotrf(cython.address(triangle), size, matrix, size, done)
-    if info:
-        return -INFINITY
-    for a in range(p):
-        square = inverse[a, a] * inverse[a, a]
-        if not square > _SINGULAR * gram[a, a]:
-            return -INFINITY
-        log_det += log(square)
-    dpotri(cython.address(triangle), size, matrix, size, done)
-    for a in range(p):  # LAPACK's lower triangle is the upper one of rows
-        for b in range(a):
-            inverse[a, b] = inverse[b, a]
-    return log_det
-
-
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _bound(
-    blocks: cython.const[cython.double][:, :, ::1],
-    first: cython.Py_ssize_t,
-    more: cython.Py_ssize_t,
     k: cython.Py_ssize_t,
     relaxed: cython.const[cython.double][:, ::1],
-    gram: cython.double[:, ::1],
-    inverse: cython.double[:, ::1],
+    room: cython.double[:, ::1],
     gains: cython.double[::1],
 ) -> cython.double:
-    """Upper bound on log det of the held with ``more`` from ``first`` on.
+    """Upper bound on log det of the first ``count`` held with k - count after them.
+
+    It is log det where all k are held, and infinite where it cannot be computed.
 
     Args:
-        blocks: (M, q, p).
-        first, more, k: see above.
-        relaxed: (p, p) information of the D-optimum without the prior.
-        gram: (p, p) of the held, with the prior; written over.
-        inverse: (p, p) room to work in.
+        blocks, prior, k, relaxed: see above.
+        room: (4, p p) to work in: the information of the held, what stands in for all
+            k of them, its inverse and its factor.
         gains: (k,) likewise.
     """
-    m, q, p = blocks.shape[0], blocks.shape[1], blocks.shape[2]
-    if m - first < more:
-        return -INFINITY
+    m, q, p = blocks.shape[0], blocks.shape[1], cython.cast(cython.int, blocks.shape[2])
+    more = k - count
     share = cython.cast(cython.double, more) / k
+    gram = cython.address(room[0, 0])
+    whole, inverse = gram + p * p, gram + 2 * p * p
+    copy(gram, cython.address(prior[0, 0]), p * p)
+    for c in range(count):
+        add(gram, 1.0, cython.address(blocks[held[c], 0, 0]), q, p)
     for a in range(p):
         for b in range(p):
-            gram[a, b] += share * relaxed[a, b]
-    log_det = _factor(gram, inverse)
+            gram[a * p + b] = gram[max(a, b) * p + min(a, b)]
+            whole[a * p + b] = gram[a * p + b] + share * relaxed[a, b]
+    log_det = factor(whole, inverse, gram + 3 * p * p, p)
+    if not more:
+        return log_det
     if log_det == -INFINITY:
         return INFINITY
-    total: cython.double = 0.0
-    for a in range(p):
-        for b in range(p):
-            total += inverse[a, b] * (gram[a, b] - share * relaxed[a, b])
+    total: cython.double = dot(inverse, gram, p * p)
     gains[:more] = -1.0  # the largest so far, ascending
-    for j in range(first, m):
+    for j in range(held[count - 1] + 1, m):
         gain: cython.double = 0.0
         for r in range(q):
+            row = cython.address(blocks[j, r, 0])
             for a in range(p):
-                inner: cython.double = 0.0
-                for b in range(p):
-                    inner += inverse[a, b] * blocks[j, r, b]
-                gain += blocks[j, r, a] * inner
+                gain += row[a] * dot(inverse + a * p, row, p)
         if gain <= gains[0]:
             continue
         place: cython.Py_ssize_t = 0

@@ -13,7 +13,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers
+from jaxcal.checks import array_of, numbers
 
 __all__ = ["Motion", "fastest_tour", "travel_times"]
 
@@ -106,9 +106,7 @@ def fastest_tour(
             "times must be symmetric, got "
             f"{between[i, j]:g} from {i} to {j} and {between[j, i]:g} back"
         )
-    begin = np.zeros(k) if start is None else numbers("start", start)
-    if begin.shape != (k,):
-        raise ValueError(f"start must have shape ({k},), got {begin.shape}")
+    begin = np.zeros(k) if start is None else array_of("start", start, k)
     from jaxcal.selection.fastest.kernel import best_order
 
     order, seconds = best_order(between, begin)

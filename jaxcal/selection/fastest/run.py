@@ -1,39 +1,61 @@
-"""Which postures, in which order, so that a run takes least time; the trade-off."""
+"""Which postures, in which order, so that a run takes least time; the trade-off.
+
+Both searches start from the D-optimum and local optima of the exchange. "heuristic"
+swaps one posture at a time where that keeps the determinant and shortens the tour.
+"exact" is a compiled depth-first search over subsets in the order of the pool; a level
+keeps the best open tours through its postures (Held and Karp), so going one deeper
+costs only the new ones. Two bounds close a branch. Time: travel times are a metric, so
+a tour through more postures takes no less than the best one through those already held.
+Determinant: for any positive definite W, ``log det M <= -log det W + p log(trace(W M) /
+p)``; W is taken as the inverse of what the held postures and the D-optimum's share of
+the rest give, and the trace is completed by the largest gains that are left. Source of
+the bound: Ponte, Fampa and Lee, arXiv 2302.07386.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import time
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import one_of, share, whole_number
-from jaxcal.selection.fastest import exact, heuristic
-from jaxcal.selection.fastest.motion import Motion
-from jaxcal.selection.fastest.task import SAME_TIME, Search, Task, make_task
+from jaxcal.checks import array_of, one_of, seconds, share, whole_number
+from jaxcal.selection.exact.exact import solve_exact
+from jaxcal.selection.exchange.exchange import exchange_indices
+from jaxcal.selection.fastest.motion import Motion, travel_times
 from jaxcal.selection.problem import Asked
 from jaxcal.selection.solvers import checked_seed
 
-__all__ = ["FastSelection", "ParetoFront", "pareto_front", "select_fastest"]
+__all__ = ["FastSelection", "ParetoFront", "Travelled"]
 
-_METHODS = {"exact": exact.search, "heuristic": heuristic.search}
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+SAME_TIME = 1e-9  # seconds: two runs this close take as long
+_METHODS = ("exact", "heuristic")
 _MOST_EXACT = 12  # postures that the exact search accepts
 _EXACT_BY_DEFAULT = 8
+_STARTS = 12  # the D-optimum and local optima of the exchange
+_KICKS = 20  # random changes of the best run found, from which to search again
+_KICK_TRIES = 50  # swaps drawn until one keeps the determinant
+_RIDGE = 1e-8  # of the whitened information of fewer postures than identify
+_TRIED = 8  # most promising swaps that are put in their best order
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FastSelection:
     """The postures in the order to visit, what the run takes, and what is proven."""
 
-    indices: NDArray[np.int64]  # (k,) in the order to visit
+    indices: Indices  # (k,) in the order to visit
     seconds: float  # of travel and settling
     travel_seconds: float
     log_det: float  # natural log det S, in the candidates' unit
     efficiency: float  # D-efficiency against ``bound``
     least_efficiency: float  # that was asked for
     proven: bool  # no subset and order with that efficiency takes less time
-    method: str  # as asked for; "exact" where only the D-optimum was efficient enough
+    method: str  # as asked for
     bound: float  # log det S of the D-optimum, an upper bound on it where not proven
     bound_proven: bool  # ``bound`` is the optimum
     nodes: int  # of the exact search
@@ -49,101 +71,304 @@ class ParetoFront:
     proven: bool  # every point is, and none is missing
 
 
-def select_fastest(
-    asked: Asked,
-    k: int | None,
-    motion: Motion,
-    least_efficiency: float,
-    start: ArrayLike | None,
-    method: str | None,
-    time_limit: float,
-    seed: int | np.random.Generator,
-) -> FastSelection:
-    """See :meth:`jaxcal.Design.fastest`."""
-    least = share("least_efficiency", least_efficiency)
-    task = make_task(asked, k, motion, start, time_limit)
-    found = _answer(task, _search(task, method, seed), least)
-    if found is None:
-        raise ValueError(
-            f"least_efficiency must be reachable, got {least:g}; the optimum is only "
-            "bounded within the time limit: give more time, or ask for less"
-        )
-    return found
+class Travelled(Asked):
+    """The questions about time."""
 
+    def fastest(
+        self,
+        k: int | None,
+        motion: Motion,
+        *,
+        least_efficiency: float = 0.95,
+        start: ArrayLike | None = None,
+        method: str | None = None,
+        time_limit: float = 60.0,
+        seed: int | np.random.Generator = 0,
+    ) -> FastSelection:
+        """The subset and the order of least time with a D-efficiency.
 
-def pareto_front(
-    asked: Asked,
-    k: int | None,
-    motion: Motion,
-    least_efficiency: float,
-    start: ArrayLike | None,
-    method: str | None,
-    max_points: int,
-    time_limit: float,
-    seed: int | np.random.Generator,
-) -> ParetoFront:
-    """See :meth:`jaxcal.Design.pareto`."""
-    least_efficiency = share("least_efficiency", least_efficiency)
-    max_points = whole_number("max_points", max_points, 1)
-    task = make_task(asked, k, motion, start, time_limit)
-    search = _search(task, method, seed)
-    points: list[FastSelection] = []
-    complete = False
-    while len(points) < max_points and not complete:
-        above = points[-1].log_det if points else None
-        point = _answer(task, search, least_efficiency, above)
-        if point is None:
-            complete = True
-        else:
+        Args:
+            k: postures to choose, distinct; the fewest that identify when None.
+            motion: speeds and accelerations in the candidates' unit, settle time.
+            least_efficiency: in (0, 1], against the proven D-optimum.
+            start: (n,) where the device stands; it begins at any posture by default.
+            method: "exact" (k up to 12, with a proof unless the time runs out) or
+                "heuristic" (local search); exact up to k = 8 when not given.
+            time_limit: seconds of the exact search and of the D-optimum behind both.
+            seed: of the heuristic's starts, from which exact starts too.
+
+        Returns:
+            The selection; among runs of equal time the one with the largest
+            determinant.
+        """
+        least = share("least_efficiency", least_efficiency)
+        search = _Search(self, k, motion, start, method, time_limit, seed)
+        found = search.answer(least, None)
+        if found is None:
+            raise ValueError(
+                f"least_efficiency must be reachable, got {least:g}; the optimum is "
+                "only bounded within the time limit: give more time, or ask for less"
+            )
+        return found
+
+    def pareto(
+        self,
+        k: int | None,
+        motion: Motion,
+        *,
+        least_efficiency: float = 0.7,
+        max_points: int = 200,
+        **options: Any,
+    ) -> ParetoFront:
+        """Time against D-efficiency, from ``least_efficiency`` up to the D-optimum.
+
+        Each point is the fastest run more efficient than the point before it.
+
+        Args:
+            k, motion: as in :meth:`fastest`.
+            least_efficiency: where to cut the front off, in (0, 1].
+            max_points: points after which to stop; the front is then not proven.
+            options: start, method, seed and time_limit (for each point) of
+                :meth:`fastest`.
+        """
+        least = share("least_efficiency", least_efficiency)
+        most = whole_number("max_points", max_points, 1)
+        asked = {"start": None, "method": None, "time_limit": 60.0, "seed": 0}
+        search = _Search(self, k, motion, **(asked | options))
+        points: list[FastSelection] = []
+        point = search.answer(least, None)
+        while point is not None and len(points) < most:
             points.append(point)
-    kept = tuple(
-        p
-        for p in points
-        if not any(
-            q.seconds <= p.seconds + SAME_TIME and q.log_det > p.log_det for q in points
+            point = search.answer(least, point.log_det)
+        kept = [
+            p
+            for p in points
+            if not any(
+                q.seconds <= p.seconds + SAME_TIME and q.log_det > p.log_det
+                for q in points
+            )
+        ]
+        proven = point is None and all(p.proven for p in points)
+        return ParetoFront(tuple(kept), least, proven)
+
+
+class _Search:
+    """One problem, cut down to the candidates that may be chosen: the pool."""
+
+    def __init__(
+        self,
+        asked: Asked,
+        k: int | None,
+        motion: Motion,
+        start: ArrayLike | None,
+        method: str | None,
+        time_limit: float,
+        seed: int | np.random.Generator,
+    ) -> None:
+        problem, points = asked.problem(k, "D"), asked.candidates
+        if points is None:
+            raise ValueError(
+                "commands must be given with blocks, Design.from_blocks(..., "
+                "commands=), for travel between them"
+            )
+        if not isinstance(motion, Motion):
+            raise ValueError(f"motion must be a Motion, got {motion!r}")
+        self.problem, self.k = problem, problem.k
+        if method is None:
+            method = "exact" if self.k <= _EXACT_BY_DEFAULT else "heuristic"
+        self.method = one_of("method", method, _METHODS)
+        if method == "exact" and self.k > _MOST_EXACT:
+            raise ValueError(
+                f"k must be at most {_MOST_EXACT} with exact, got {self.k}"
+            )
+        self.seed = checked_seed(seed)
+        # The required first, then by falling leverage.
+        self.pool = problem.required
+        if len(self.pool) < self.k:
+            free = np.setdiff1d(np.flatnonzero(problem.available), self.pool)
+            leverage = (problem.blocks[free] ** 2).sum(axis=(1, 2))
+            self.pool = np.concatenate([self.pool, free[np.argsort(-leverage)]])
+        # Held in every search; one is always left to choose: where all k are required
+        # the pool is just those.
+        self.fixed = min(len(problem.required), self.k - 1)
+        points = points[self.pool]
+        self.blocks = np.ascontiguousarray(problem.blocks[self.pool])
+        self.times = travel_times(points, points, motion)
+        self.start = np.zeros(len(points))
+        if start is not None:
+            where = array_of("start", start, *points.shape[1:])
+            self.start = travel_times(where[None], points, motion)[0]
+        self.settle = float(motion.settle) * self.k
+        self.limit = seconds("time_limit", time_limit)
+        deadline = time.perf_counter() + self.limit
+        self.optimum = solve_exact(problem, deadline=deadline)
+
+    def answer(self, least: float, above: float | None) -> FastSelection | None:
+        """The fastest run with efficiency ``least``, and log det S over ``above``.
+
+        None where the search finds no subset with that determinant.
+        """
+        begun, problem, optimum = time.perf_counter(), self.problem, self.optimum
+        m, scale = problem.multiplicity, problem.log_scale
+        # Whitened. The optimum itself must meet its own value; a bound that is not the
+        # optimum asks too much of a subset, never too little.
+        assert optimum.bound is not None
+        wanted = optimum.bound / m - scale + problem.num_regressors * np.log(least)
+        wanted -= 1e-12
+        if above is not None:
+            wanted = max(wanted, above / m - scale + SAME_TIME)
+        rng = np.random.default_rng(self.seed)
+        chosen, travel = self._local(wanted, rng)
+        proven, nodes = False, 0
+        if self.method == "exact":
+            chosen, proven, nodes = self._exact(wanted, chosen, travel)
+        elif chosen is not None:
+            for _ in range(_KICKS):
+                kicked = self._kicked(chosen, wanted, rng)
+                other, after = self._shortened(kicked, wanted)
+                if after < travel - SAME_TIME:
+                    chosen, travel = other, after
+        if chosen is None:
+            return None
+        tour, travel = self._tour(chosen)
+        log_det = problem.log_det(self.pool[tour])
+        bound = max(optimum.bound, log_det)
+        return FastSelection(
+            indices=self.pool[tour],
+            seconds=travel + self.settle,
+            travel_seconds=travel,
+            log_det=log_det,
+            efficiency=problem.criterion.efficiency(log_det, bound),
+            least_efficiency=least,
+            proven=proven and optimum.proven,
+            method=self.method,
+            bound=bound,
+            bound_proven=optimum.proven,
+            nodes=nodes,
+            search_seconds=time.perf_counter() - begun,
         )
-    )
-    proven = complete and all(point.proven for point in points)
-    return ParetoFront(kept, least_efficiency, proven)
 
+    def _exact(
+        self, wanted: float, begun: Indices | None, travel: float
+    ) -> tuple[Indices | None, bool, int]:
+        """The compiled search from a run known: subset, is it proven, nodes."""
+        from jaxcal.selection.fastest.kernel import fastest_subset
 
-def _search(task: Task, method: str | None, seed: int | np.random.Generator) -> Search:
-    """The search of ``method``, or of the one that suits k."""
-    if method is None:
-        method = "exact" if task.k <= _EXACT_BY_DEFAULT else "heuristic"
-    one_of("method", method, tuple(_METHODS))
-    if method == "exact" and task.k > _MOST_EXACT:
-        raise ValueError(f"k must be at most {_MOST_EXACT} with exact, got {task.k}")
-    return _METHODS[method](task, checked_seed(seed))
+        chosen = np.zeros(self.k, np.int64) if begun is None else np.sort(begun)
+        best = np.array([travel, -np.inf if begun is None else self._log_det(chosen)])
+        prior = np.array(self.problem.prior)
+        relaxed = self._information(self._positions(self.optimum.indices)) - prior
+        complete, nodes = fastest_subset(
+            self.blocks, prior, self.times, self.start, self.fixed, relaxed, wanted,
+            SAME_TIME, chosen, best, self.limit,
+        )  # fmt: skip
+        return (chosen if np.isfinite(best[0]) else None), complete, nodes
 
+    def _local(
+        self, wanted: float, rng: np.random.Generator
+    ) -> tuple[Indices | None, float]:
+        """The fastest subset (k,) found from near-optimal ones, and its travel.
 
-def _answer(
-    task: Task, search: Search, least: float, above: float | None = None
-) -> FastSelection | None:
-    """The fastest run with efficiency ``least``, and log det S over ``above``.
+        None and infinity where no start has the log det ``wanted``.
+        """
+        starts = [self.optimum.indices] + [
+            exchange_indices(self.problem, 1, int(rng.integers(2**31)))
+            for _ in range(_STARTS - 1)
+        ]
+        best, least = None, np.inf
+        for start in map(self._positions, starts):
+            if self._log_det(start) >= wanted:
+                chosen, travel = self._shortened(start, wanted)
+                if travel < least - SAME_TIME:
+                    best, least = chosen, travel
+        return best, least
 
-    None where the search finds no subset with that determinant.
-    """
-    begun = time.perf_counter()
-    found = search(task.wanted(least, above))
-    if found is None:
-        return None
-    problem = task.problem
-    tour, travel = task.tour(found.indices)
-    indices = task.pool[tour]
-    log_det = problem.log_det(indices)
-    bound = max(task.exact.bound, log_det)
-    return FastSelection(
-        indices=indices,
-        seconds=travel + task.settle,
-        travel_seconds=travel,
-        log_det=log_det,
-        efficiency=problem.criterion.efficiency(log_det, bound),
-        least_efficiency=least,
-        proven=found.proven and task.exact.proven,
-        method=str(found.method),
-        bound=bound,
-        bound_proven=task.exact.proven,
-        nodes=found.nodes or 0,
-        search_seconds=time.perf_counter() - begun,
-    )
+    def _kicked(
+        self, chosen: Indices, wanted: float, rng: np.random.Generator
+    ) -> Indices:
+        """Up to two random swaps that keep the determinant, off a local optimum."""
+        for _ in range(2):
+            free = np.flatnonzero(chosen >= self.fixed)
+            others = np.setdiff1d(np.arange(len(self.blocks)), chosen)
+            for _ in range(_KICK_TRIES if len(free) and len(others) else 0):
+                tried = chosen.copy()
+                tried[rng.choice(free)] = rng.choice(others)
+                if self._log_det(tried) >= wanted:
+                    chosen = tried
+                    break
+        return chosen
+
+    def _shortened(self, start: Indices, wanted: float) -> tuple[Indices, float]:
+        """Swap until none of the most promising swaps shortens the tour."""
+        tour, travel = self._tour(start)
+        for _ in range(10 * self.k):
+            swaps = [
+                swap
+                for i in np.flatnonzero(tour >= self.fixed)
+                for swap in self._refills(np.delete(tour, i), wanted)
+            ]
+            for _, tried in sorted(swaps, key=lambda swap: swap[0])[:_TRIED]:
+                if self._log_det(tried) >= wanted:
+                    shorter, reached = self._tour(tried)
+                    if reached < travel - SAME_TIME:
+                        tour, travel = shorter, reached
+                        break
+            else:
+                break
+        return tour, travel
+
+    def _refills(self, kept: Indices, wanted: float) -> list[tuple[float, Indices]]:
+        """Ways to complete k - 1 postures to k, by their estimated seconds of travel.
+
+        The estimate inserts the new posture where it adds least to the tour kept.
+
+        Args:
+            kept: (k - 1,) postures in the order visited.
+            wanted: least whitened log det, met to 1e-6.
+
+        Returns:
+            Seconds and (k,) subset of each, ascending.
+        """
+        times, begin = self.times, self.start
+        legs = np.concatenate([begin[kept[:1]], times[kept[:-1], kept[1:]], [0.0]])
+        others = np.setdiff1d(np.arange(len(self.blocks)), kept)
+        _, q, p = self.blocks.shape
+        lower = np.linalg.cholesky(self._information(kept) + _RIDGE * np.eye(p))
+        rows = self.blocks[others].reshape(-1, p)
+        y = np.linalg.solve(lower, rows.T).T.reshape(-1, q, p)
+        # Factor of the determinant.
+        factor = np.linalg.det(np.eye(q) + y @ np.matrix_transpose(y))
+        into = np.vstack([begin[others], times[np.ix_(kept, others)]])
+        onward = np.vstack([times[np.ix_(kept, others)], np.zeros(len(others))])
+        travel = (into + onward - legs[:, None]).min(axis=0)
+        value = np.log(np.maximum(factor, 1e-300)) + 2.0 * np.log(np.diag(lower)).sum()
+        travel = np.where(value >= wanted - 1e-6, travel + legs.sum(), np.inf)
+        best = np.argsort(travel, kind="stable")[: _TRIED + 1]
+        return [
+            (float(travel[i]), np.append(kept, others[i]))
+            for i in best[np.isfinite(travel[best])]
+        ]
+
+    def _positions(self, indices: Indices) -> Indices:
+        """Candidates as positions in the pool."""
+        place = np.argsort(self.pool)
+        return place[np.searchsorted(self.pool, indices, sorter=place)]
+
+    def _information(self, chosen: Indices) -> Array:
+        """(p, p) whitened information of postures of the pool, with the prior."""
+        rows = self.blocks[chosen].reshape(-1, self.blocks.shape[2])
+        return rows.T @ rows + self.problem.prior
+
+    def _log_det(self, chosen: Indices) -> float:
+        """log det of it; -inf where singular."""
+        sign, value = np.linalg.slogdet(self._information(chosen))
+        return float(value) if sign > 0 else -np.inf
+
+    def _tour(self, chosen: Indices) -> tuple[Indices, float]:
+        """``chosen`` (k,) in the best order found, and its seconds of travel."""
+        from jaxcal.selection.fastest.kernel import best_order
+
+        order, travel = best_order(
+            self.times[np.ix_(chosen, chosen)], self.start[chosen]
+        )
+        return chosen[order], float(travel)

@@ -1,5 +1,5 @@
 """How many postures a wanted accuracy needs."""
 
-from jaxcal.selection.plan.api import Plan, PlanRow, make_plan
+from jaxcal.selection.plan.api import Plan, Planned, PlanRow
 
-__all__ = ["Plan", "PlanRow", "make_plan"]
+__all__ = ["Plan", "PlanRow", "Planned"]

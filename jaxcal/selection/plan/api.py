@@ -20,19 +20,23 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import one_of, seconds, whole_number
+from jaxcal.checks import array_of, levels, one_of, seconds, whole_number
+from jaxcal.information.blocks import largest_rank
+from jaxcal.models.uncertainty import Noise
+from jaxcal.selection.criteria import positions
+from jaxcal.selection.exchange.exchange import greedy_indices
 from jaxcal.selection.plan.bound import lower_bound, region_weighting
-from jaxcal.selection.plan.designs import Design, best_design, variances_of
-from jaxcal.selection.plan.request import fewest, make_request
-from jaxcal.selection.problem import Asked
+from jaxcal.selection.plan.designs import Found, best_design, variances_of
+from jaxcal.selection.problem import Asked, Problem
+from jaxcal.selection.problem.sources import shares_regressor
 from jaxcal.selection.solvers import checked_seed
 
-__all__ = ["Plan", "PlanRow", "make_plan"]
+__all__ = ["Plan", "PlanRow", "Planned"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -41,6 +45,7 @@ DESIGNS = ("exact", "exchange")
 
 _SUMMARIES = {"G": "largest", "I": "average", "parameters": "largest"}
 _LARGEST_K = 200  # looked for where max_k is not given
+_ENOUGH = 1.0 + 1e-12  # variance that is accurate enough
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -122,94 +127,213 @@ class Plan:
         return "\n".join([*lines, f"K = {self.k} is {proof} the smallest"])
 
 
-def make_plan(
-    asked: Asked,
-    accuracy: ArrayLike,
-    noise_std: ArrayLike | None,
-    criterion: str,
-    parameters: Any,
-    region: ArrayLike | None,
-    *,
-    max_k: int | None,
-    more: int,
-    design: str,
-    time_limit: float,
-    seed: int | np.random.Generator,
-) -> Plan:
-    """See :meth:`jaxcal.Design.plan`."""
-    begun = time.perf_counter()
-    one_of("criterion", criterion, tuple(_SUMMARIES))
-    one_of("design", design, DESIGNS)
-    limit = seconds("time_limit", time_limit)
-    more, start = whole_number("more", more, 0), checked_seed(seed)
-    how = "I" if criterion == "I" else "G"
-    problem, points, unit, target, level, names = make_request(
-        asked, criterion, accuracy, noise_std, parameters, region
-    )
-    total, (identify, least_k) = problem.k, fewest(problem)
-    if max_k is None:
-        max_k = min(total, max(_LARGEST_K, least_k))
-    max_k = whole_number("max_k", max_k, least_k)
-    if max_k > total:
-        raise ValueError(
-            f"max_k must not exceed the {total} measurements allowed, got {max_k}"
-        )
-    weighting = region_weighting(points, how)
+class Planned(Asked):
+    """The question of how many."""
 
-    @functools.cache
-    def bound_of(k: int) -> float:
-        if k == total:  # there is one design only
-            every = np.repeat(np.arange(len(problem.blocks)), problem.upper)
-            return float(variances_of(problem, every, points, how).max())
-        return lower_bound(problem, weighting, k)
+    def plan(
+        self,
+        accuracy: ArrayLike,
+        noise_std: ArrayLike | None = None,
+        criterion: str = "G",
+        *,
+        parameters: Any = None,
+        region: ArrayLike | None = None,
+        max_k: int | None = None,
+        more: int = 0,
+        design: str = "exact",
+        time_limit: float = 1.0,
+        seed: int | np.random.Generator = 0,
+    ) -> Plan:
+        """The smallest number of measurements that predicts accurately enough.
 
-    def design_of(k: int, kind: str, previous: Indices | None) -> Design:
-        one = dataclasses.replace(problem, k=k)
-        return best_design(one, points, how, kind, limit, previous, start)
+        Args:
+            accuracy: () or (m,) standard error a prediction may have, measured unit;
+                with "parameters" () or (s,), that of each parameter of interest.
+            noise_std: () or (m,) standard deviation of one measurement, measured unit;
+                the noise of the design when not given. With blocks it is 1. Noise is
+                taken as white: measuring a posture twice halves its variance.
+            criterion: "G", the largest standard error over the region, "I", the root
+                of the mean variance over it, or "parameters", the standard error of the
+                parameters themselves. It must hold for every output or parameter.
+            parameters: names or indices of the s parameters of interest; all when not
+                given.
+            region: (R, n) commands at which predictions are wanted, with blocks
+                (R, m, p) what is predicted, ``region @ theta``; what is available when
+                not given.
+            max_k: largest K allowed; what is available, up to 200, when not given.
+            more: rows of the table beyond the K that suffices.
+            design: the D-optimal selection to start from, "exact" or "exchange".
+            time_limit: seconds for the exact selection of each K.
+            seed: of the exchange.
 
-    def enough(found: Design) -> bool:
-        return bool(found.variance.max() <= 1 + 1e-12)
-
-    rows: list[PlanRow] = []
-    chosen: PlanRow | None = None
-    last: Design | None = None
-    if bound_of(max_k) <= 1 + 1e-12:  # else no K allowed is enough
-        for k in range(least_k, max_k + 1):
-            last = design_of(k, design, None if last is None else last.indices)
-            rows.append(
-                PlanRow(
-                    k=k,
-                    indices=last.indices,
-                    standard_error=unit * np.sqrt(last.variance),
-                    least_error=unit * np.sqrt(min(bound_of(k), last.variance.max())),
-                    method=last.method,
-                    proven=last.proven,
-                    d_optimal_error=unit * np.sqrt(last.d_optimal),
-                )
+        Raises:
+            ValueError: naming the argument, the rule and the value; where no K up to
+                ``max_k`` suffices, with the accuracy that can be reached.
+        """
+        begun = time.perf_counter()
+        one_of("criterion", criterion, tuple(_SUMMARIES))
+        one_of("design", design, DESIGNS)
+        limit = seconds("time_limit", time_limit)
+        more, start = whole_number("more", more, 0), checked_seed(seed)
+        how = "I" if criterion == "I" else "G"
+        asked = _request(self, criterion, accuracy, noise_std, parameters, region)
+        problem, points, unit = asked.problem, asked.points, asked.unit
+        total, (identify, least_k) = problem.k, _fewest(problem)
+        if max_k is None:
+            max_k = min(total, max(_LARGEST_K, least_k))
+        max_k = whole_number("max_k", max_k, least_k)
+        if max_k > total:
+            raise ValueError(
+                f"max_k must not exceed the {total} measurements allowed, got {max_k}"
             )
-            if chosen is None and enough(last):
-                chosen = rows[-1]
+        weighting = region_weighting(points, how)
+
+        @functools.cache
+        def bound_of(k: int) -> float:
+            if k == total:  # there is one design only
+                every = np.repeat(np.arange(len(problem.blocks)), problem.upper)
+                return float(variances_of(problem, every, points, how).max())
+            return lower_bound(problem, weighting, k)
+
+        def best(k: int, kind: str, previous: Found | None) -> Found:
+            one = dataclasses.replace(problem, k=k)
+            before = None if previous is None else previous.indices
+            return best_design(one, points, how, kind, limit, before, start)
+
+        rows: list[PlanRow] = []
+        chosen: PlanRow | None = None
+        last: Found | None = None
+        ks = range(least_k, max_k + 1) if bound_of(max_k) <= _ENOUGH else ()
+        for k in ks:  # none where no K allowed is enough
+            last = best(k, design, last)
+            row = PlanRow(
+                k=k,
+                indices=last.indices,
+                standard_error=unit * np.sqrt(last.variance),
+                least_error=unit * np.sqrt(min(bound_of(k), last.variance.max())),
+                method=last.method,
+                proven=last.proven,
+                d_optimal_error=unit * np.sqrt(last.d_optimal),
+            )
+            rows.append(row)
+            if chosen is None and last.variance.max() <= _ENOUGH:
+                chosen = row
             if chosen is not None and k >= chosen.k + more:
                 break
-    if chosen is None:
-        last = last or design_of(max_k, "exchange", None)
-        one = int((unit * np.sqrt(last.variance) / target).argmax())
-        best, least = unit[one] * np.sqrt([last.variance.max(), bound_of(max_k)])
-        raise ValueError(
-            f"accuracy must be reachable with max_k = {max_k} measurements"
-            + (" (all that are allowed)" if max_k == total else "")
-            + f": the best design found has a {_SUMMARIES[criterion]} standard error "
-            f"of {best:.6g}, no design has less than {least:.6g}, got {target[one]:g}"
+        if chosen is None:
+            last = last or best(max_k, "exchange", None)
+            one = int((unit * np.sqrt(last.variance) / asked.target).argmax())
+            found, least = unit[one] * np.sqrt([last.variance.max(), bound_of(max_k)])
+            every = " (all that are allowed)" if max_k == total else ""
+            raise ValueError(
+                f"accuracy must be reachable with max_k = {max_k} measurements{every}: "
+                f"the best design found has a {_SUMMARIES[criterion]} standard error "
+                f"of {found:.6g}, no design has less than {least:.6g}, got "
+                f"{asked.target[one]:g}"
+            )
+        return Plan(
+            k=chosen.k,
+            indices=chosen.indices,
+            standard_error=chosen.standard_error,
+            accuracy=asked.target,
+            noise_std=asked.noise_std,
+            names=asked.names,
+            criterion=criterion,
+            smallest_proven=chosen.k == identify or bound_of(chosen.k - 1) > 1.0,
+            rows=tuple(rows),
+            seconds=time.perf_counter() - begun,
         )
-    return Plan(
-        k=chosen.k,
-        indices=chosen.indices,
-        standard_error=chosen.standard_error,
-        accuracy=target,
-        noise_std=level,
-        names=names,
-        criterion=criterion,
-        smallest_proven=chosen.k == identify or bound_of(chosen.k - 1) > 1.0,
-        rows=tuple(rows),
-        seconds=time.perf_counter() - begun,
-    )
+
+
+class _Request(NamedTuple):
+    """What a design is judged by: the errors of m outputs or parameters."""
+
+    problem: Problem  # measuring all that may be, as often as it may
+    points: Array  # (R, s, p) whitened rows; a variance of 1 there is accurate enough
+    unit: Array  # (m,) or (1,) standard error that is 1 at ``points``, measured unit
+    target: Array  # (m,) measured unit
+    noise_std: Array | None  # one an output, measured unit; None where Noise says more
+    names: tuple[str, ...]  # (m,)
+
+
+def _request(
+    asked: Asked,
+    criterion: str,
+    accuracy: ArrayLike,
+    noise_std: ArrayLike | None,
+    parameters: Any,
+    region: ArrayLike | None,
+) -> _Request:
+    """Check the arguments of ``plan``."""
+    of_parameters = criterion == "parameters"
+    if parameters is not None and not of_parameters:
+        raise ValueError("parameters must come with criterion parameters only")
+    cap = whole_number("max_replicates", asked.max_replicates, 1)
+    total = max(1, int(asked.available.sum()) * cap)
+    model, noise = asked.model, asked.noise
+    shared = False  # one regressor for all outputs?
+    if model is None:
+        if not (noise_std is noise is None):
+            raise ValueError(
+                "noise and noise_std must be left out with blocks, which are in units "
+                "of the noise"
+            )
+    else:
+        if noise_std is None:
+            if noise is None:
+                raise ValueError("noise_std must be given: the design has no noise")
+            if noise.covariance is noise.command_std is None:
+                std = 1.0 if noise.std is None else noise.std
+                noise_std = std if np.ndim(std) < 2 else None
+        if noise_std is not None:
+            noise_std = levels("noise_std", noise_std, model.num_outputs)
+            shared = not of_parameters and shares_regressor(model, asked.prior, None)
+            # Where outputs share a regressor the noise is in the targets.
+            asked = asked.with_noise(None if shared else Noise(noise_std))
+    problem = asked.problem(total, "D")
+    source = asked.with_noise(None).source(not shared)
+    names = source.names
+    if model is not None:
+        assert problem.candidates is not None
+        where = problem.candidates[problem.available] if region is None else region
+        rows = source.at("region", where, False)
+    elif region is None:
+        rows = problem.raw[problem.available]
+    else:
+        rows = array_of("region", region, "R", "m", len(names))
+    if of_parameters:
+        at = positions(names if parameters is None else parameters, names)
+        rows, names = np.eye(len(names))[None, at], tuple(names[i] for i in at)
+    if not len(rows):
+        raise ValueError("region must hold at least one row, got none")
+    m = model.num_outputs if shared and model is not None else rows.shape[1]
+    if not of_parameters:
+        names = tuple(f"output {i + 1}" for i in range(m))
+    target = levels("accuracy", accuracy, m)
+    scale = unit = target
+    if noise_std is not None and shared:
+        scale = (target / noise_std).min(keepdims=True)
+        unit = noise_std * scale
+    elif model is None:
+        noise_std = np.ones(m)
+    points = rows @ problem.basis / scale[:, None]
+    if criterion == "I" and len(points) > points.shape[2]:  # fewer rows, the same mean
+        root = np.linalg.qr(np.moveaxis(points, 1, 0))[1]
+        points = np.moveaxis(root, 0, 1) * np.sqrt(root.shape[1] / len(points))
+    return _Request(problem, points, unit, target, noise_std, names)
+
+
+def _fewest(problem: Problem) -> tuple[int, int]:
+    """Measurements below which none identify, and the fewest found that do.
+
+    The two differ only where blocks of several rows overlap in what they tell.
+    """
+    missing = problem.num_regressors - problem.held_rank
+    most = largest_rank(problem.blocks)
+    least = k = max(1, len(problem.required) - (-missing // most))
+    if problem.blocks.shape[1] > 1:
+        while k < problem.k and np.isneginf(
+            problem.log_det(greedy_indices(dataclasses.replace(problem, k=k)))
+        ):
+            k += 1
+    return least, k

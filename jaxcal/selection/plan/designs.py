@@ -20,20 +20,20 @@ from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
 from jaxcal.selection.problem import Problem
 
-__all__ = ["CRITERIA", "Design", "best_design", "variances_of"]
+__all__ = ["Found", "best_design", "variances_of"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 # Over the region, of the variances of an output; of several the worst counts.
-CRITERIA: dict[str, Callable[..., Any]] = {"G": np.max, "I": np.mean}
+_MEANS: dict[str, Callable[..., Any]] = {"G": np.max, "I": np.mean}
 
 _RANDOM_STARTS = 4  # where a candidate gives one reading: swaps of more take longer
 _D_RESTARTS = 50  # of the exchange that looks for the D-optimal selection
 
 
 @dataclasses.dataclass(frozen=True)
-class Design:
+class Found:
     """The best design of one K that was found."""
 
     indices: Indices  # (k,) sorted
@@ -59,7 +59,7 @@ def variances_of(problem: Problem, indices: Indices, points: Array, how: str) ->
     singular, right = np.linalg.svd(rows)[1:]
     if significant(singular).sum() < rows.shape[1]:
         return np.full(points.shape[1], np.inf)
-    return np.asarray(CRITERIA[how](((points @ (right.T / singular)) ** 2).sum(2), 0))
+    return np.asarray(_MEANS[how](((points @ (right.T / singular)) ** 2).sum(2), 0))
 
 
 def best_design(
@@ -70,7 +70,7 @@ def best_design(
     time_limit: float,
     previous: Indices | None,
     seed: int,
-) -> Design:
+) -> Found:
     """The best design of ``problem.k`` found.
 
     Args:
@@ -85,7 +85,7 @@ def best_design(
     proven = False
     if design == "exact":
         found = solve_exact(problem, deadline=time.perf_counter() + time_limit)
-        optimal, proven = found.subsets[0], found.proven
+        optimal, proven = found.indices, found.proven
     else:
         optimal = exchange_indices(problem, _D_RESTARTS, seed)
     starts = [optimal, greedy_indices(problem)]
@@ -105,7 +105,7 @@ def best_design(
             best, value = indices, reached
     best = np.sort(best)
     same = np.array_equal(best, np.sort(optimal))
-    return Design(
+    return Found(
         best,
         variances_of(problem, best, points, how),
         variances_of(problem, optimal, points, how),
@@ -174,7 +174,7 @@ def _after(
         along = scaled[sound] @ rows.T
         less = (along * np.linalg.solve(inner[sound], along)).sum(axis=1)
         after = (before - less).reshape(-1, regions, outputs)
-        values[row, sound] = CRITERIA[how](after, 1).max(axis=1)
+        values[row, sound] = _MEANS[how](after, 1).max(axis=1)
     return values
 
 

@@ -160,7 +160,7 @@ class Asked:
         """
         default = "I" if self.model and not isinstance(self.model, Affine) else "D"
         asked = wanted(criterion, region, default)
-        source = self.source(asked.by_name)
+        source = self.source(asked.by_name, asked.of_region)
         raw, root = source.blocks(), source.root
         if self._measured is not None:
             seen = source.at("measured", self._measured, True)
@@ -181,8 +181,11 @@ class Asked:
             model=self.model,
         )[0]  # fmt: skip
 
-    def source(self, of_parameters: bool) -> Source:
-        """What makes blocks; ``of_parameters``: of all parameters by name."""
+    def source(self, of_parameters: bool, of_predictions: bool = False) -> Source:
+        """What makes blocks; ``of_parameters``: of all parameters by name.
+
+        Predictions of an arm without a prior have what no parameter explains, too.
+        """
         if self._blocks is not None:
             return Given(self._blocks, self.prior, self.noise)
         model, candidates, prior = self.model, self.candidates, self.prior
@@ -190,6 +193,8 @@ class Asked:
         if not of_parameters and isinstance(model, Affine):
             if shares_regressor(model, prior, self.noise):
                 return Shared(model, candidates, self.noise)
+        if of_predictions and prior is None and hasattr(model, "with_misfit"):
+            model = model.with_misfit()
         return Modelled(model, candidates, self.available, prior, self.noise)
 
     def with_noise(self, noise: Noise | None) -> Self:

@@ -127,7 +127,7 @@ def whitened_problems(
                 used = candidates[b][mask[b]]
                 require_excited(used, names[:-1], "candidates", which, coarse)
         _refuse_blind(raw[b][mask[b]], root, names, coarse)
-    owned = [raw, root, *white[:3], mask, forced]
+    owned = [raw, root, *white[:3], *white[5:], mask, forced]
     for each in owned if candidates is None else [*owned, candidates]:
         each.flags.writeable = False
     problems = []
@@ -140,7 +140,8 @@ def whitened_problems(
             Problem(
                 white.blocks[b], white.prior[b], k, mask[b], forced[b], cap,
                 wanted.criterion(at), times, at.log_scale, raw[b], white.basis[b], root,
-                white.rounding[b], None if candidates is None else candidates[b], model,
+                white.triangle[b], white.size[b],
+                None if candidates is None else candidates[b], model,
             )
         )  # fmt: skip
     if forced.shape[1]:

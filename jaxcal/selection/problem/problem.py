@@ -25,7 +25,6 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 _EPS = float(np.finfo(np.float64).eps)
-_KNOWN = 1e-6  # share of all information along a direction
 _IN_PLANE = 1e-7  # of whitened rows of height one above the origin
 
 
@@ -48,7 +47,8 @@ class Problem:
     raw: Array  # (M, q, p) blocks in the caller's numbers
     basis: Array  # (p, p) raw blocks times it are whitened
     root: Array  # (r, p) root of the caller's prior precision, with what was measured
-    rounding: Array  # (M,) bound on the error of each whitened block, its norm
+    triangle: Array  # (p, p) whitened blocks times it are the centred raw ones
+    size: Array  # (p,) of what these are rounded by, beside themselves
     candidates: Array | None = None  # (M, n) in the caller's unit, where there are any
     model: Model | None = None  # what made blocks of the candidates
 
@@ -71,16 +71,6 @@ class Problem:
     def num_regressors(self) -> int:
         """p, n + 1 for the affine model."""
         return self.blocks.shape[2]
-
-    @property
-    def num_outputs(self) -> int:
-        """m of the affine model: its multiplicity."""
-        return self.multiplicity
-
-    @property
-    def num_parameters(self) -> int:
-        """Size of the whole information matrix S."""
-        return self.multiplicity * self.num_regressors
 
     @property
     def subject(self) -> str:
@@ -113,12 +103,6 @@ class Problem:
         return bool((np.abs(height - 1.0) <= _IN_PLANE)[self.available].all())
 
     @property
-    def known(self) -> Array:
-        """(s, p) orthonormal directions of which something is known beforehand."""
-        values, vectors = np.linalg.eigh(self.prior)
-        return np.ascontiguousarray(vectors.T[values > _KNOWN])
-
-    @property
     def held_rank(self) -> int:
         """Rank of what is known with the required candidates."""
         rows = self.blocks[self.required].reshape(-1, self.num_regressors)
@@ -134,11 +118,14 @@ class Problem:
         most 1 and the second |E| / sqrt(least eigenvalue of M); beside what sums are
         rounded by.
         """
-        rows = self.blocks[indices].reshape(-1, self.num_regressors)
+        p = self.num_regressors
+        rows = self.blocks[indices].reshape(-1, p)
         least, largest = np.linalg.eigvalsh(rows.T @ rows + self.prior)[[0, -1]]
         if not least > 0.0:
             return np.inf
-        of_blocks = 2.0 * np.linalg.norm(self.rounding[indices]) / np.sqrt(least)
+        size = np.abs(rows @ self.triangle) + self.size
+        error = _EPS * p * (size @ np.abs(np.linalg.inv(self.triangle)))
+        of_blocks = 2.0 * np.linalg.norm(error) / np.sqrt(least)
         return float(of_blocks + _EPS * len(rows) * largest / least)
 
     def log_det(self, indices: Indices) -> float:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import require_finite, whole_number
+from jaxcal.checks import require_finite, require_none, whole_number
 from jaxcal.information.blocks import SINGULAR, largest_rank, rank_of_blocks
 from jaxcal.selection.problem.problem import Problem
 
@@ -104,19 +104,14 @@ def _check_required(required: ArrayLike | None, mask: Mask, k: int) -> Indices:
             f"required must name at most k = {k} candidates, got {forced.shape[1]}"
         )
     outside = (forced < 0) | (forced >= num_candidates)
-    if outside.any():
-        raise ValueError(
-            f"required must lie in [0, {num_candidates}), got {forced[outside][0]}"
-        )
+    require_none(outside, forced, f"required must lie in [0, {num_candidates})")
     ordered = np.sort(forced, axis=1)
-    twice = ordered[:, 1:][ordered[:, 1:] == ordered[:, :-1]]
-    if twice.size:
-        raise ValueError(f"required must not repeat a candidate, got {twice[0]} twice")
+    twice = ordered[:, 1:] == ordered[:, :-1]
+    require_none(
+        twice, ordered[:, 1:], "required must not repeat a candidate", " twice"
+    )
     masked = ~np.take_along_axis(mask, forced, axis=1)
-    if masked.any():
-        raise ValueError(
-            f"required must be available, got {forced[masked][0]}, which is masked"
-        )
+    require_none(masked, forced, "required must be available", ", which is masked")
     return forced
 
 

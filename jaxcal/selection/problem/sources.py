@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers
+from jaxcal.checks import array_of, numbers
 from jaxcal.information.blocks import prior_root
 from jaxcal.models.affine import Affine
 from jaxcal.models.checked import derivative, facts
@@ -31,6 +31,8 @@ __all__ = ["Given", "Modelled", "Shared", "Source", "shares_regressor"]
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+
+_OF_MODEL = " for this model"
 
 
 class Source(Protocol):
@@ -80,7 +82,7 @@ class Shared(Source):
         return self._model.blocks(self._candidates) / self._std
 
     def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
-        points = _commands(argument, values, self._model.num_inputs)
+        points = array_of(argument, values, "N", self._model.num_inputs, rule=_OF_MODEL)
         return self._model.blocks(points) / self._std
 
 
@@ -107,13 +109,8 @@ class Given(Source):
         return self._white(self._blocks)
 
     def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
-        array, p = numbers(argument, values), len(self.names)
-        if array.ndim != 3 or array.shape[1:] != (self._q, p):
-            raise ValueError(
-                f"{argument} must have shape (N, {self._q}, {p}) as blocks have, got "
-                f"{array.shape}"
-            )
-        return self._white(array)
+        size = ("N", self._q, len(self.names))
+        return self._white(array_of(argument, values, *size, rule=" as blocks have"))
 
     def _white(self, blocks: Array) -> Array:
         if self._noise is None:
@@ -135,8 +132,6 @@ class Modelled(Source):
         if hasattr(model, "located"):  # an arm whose sensor stands somewhere
             model = model.located(candidates[available])
             _warn_of_radians(model, candidates[available])
-        if prior is None and hasattr(model, "with_misfit"):
-            model = model.with_misfit()
         self._model, self._candidates, self._available = model, candidates, available
         self._noise = Noise() if noise is None else noise
         self._prior = model.default_prior() if prior is None else prior
@@ -179,7 +174,7 @@ class Modelled(Source):
                     "noise must be the same for all candidates where "
                     f"{argument} is given, got {name} of shape {np.shape(given)}"
                 )
-        points = _commands(argument, values, self._model.num_inputs)
+        points = array_of(argument, values, "N", self._model.num_inputs, rule=_OF_MODEL)
         slopes = None
         if noise.command_std is not None and readings:
             slopes = self._model.command_jacobian(points, self._mean)
@@ -214,16 +209,6 @@ class Modelled(Source):
         """(N, q, p) derivative by the free parameters, checked."""
         jacobian = derivative(self._model, commands, self._mean)
         return jacobian if self._free.all() else jacobian[..., self._free]
-
-
-def _commands(argument: str, commands: ArrayLike, n: int) -> Array:
-    """``commands`` as finite float64 (N, n), or an error that names the argument."""
-    array = numbers(argument, commands)
-    if array.ndim != 2 or array.shape[1] != n:
-        raise ValueError(
-            f"{argument} must have shape (N, {n}) for this model, got {array.shape}"
-        )
-    return array
 
 
 def _weighted(white: Array, jacobian: Array) -> Array:

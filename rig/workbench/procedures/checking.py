@@ -180,7 +180,8 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     run.save_summary({**found, "limit_deg": limit, "recalibrate": again})
     run.say(f"{error_text(found)}, limit {limit:g}")
     if calibration.noise_std is not None:
-        run.say(str(calibration.check(*pairs(records), tolerance=limit)))
+        told = calibration.check(*pairs(records), tolerance=limit)
+        run.say(f"a drift that moves it by {limit:g} is seen with {told.power:.0%}")
     run.say("RECALIBRATE: over the limit" if again else "the calibration still holds")
     return EXIT_RECALIBRATE if again else EXIT_OK
 
@@ -214,11 +215,11 @@ def goto(run: Run, calibration: Any, desired: Array, play: Play) -> int:
                 * bool(most)
             )
     run.planned = 1
-    if run.dry_run or not play.known:
+    if run.dry_run or not play.axes:
         _tell(run, desired, command)
     if run.lacks(["goto"]):
         with run.device() as device:
-            if play.known:
+            if play.axes:
                 command = _with_play(run, device, command, play)
                 _tell(run, desired, command)
             visit(device, Posture("goto", config.to_pulses(command)), role="goto")
