@@ -23,7 +23,7 @@ import threading
 import time
 
 from rig.config import RigConfig, parse_config
-from rig.config.files import EXAMPLES
+from rig.config.config import EXAMPLES
 from rig.core.bus import Bus
 from rig.core.device import Device
 from rig.core.faults import Fault, StopRequested

@@ -40,8 +40,9 @@ def parser_of(
         name, text = function.__name__, function.__doc__
         command = added.add_parser(name, help=text, description=text)
         command.set_defaults(function=function)
-        for _, *argument in _arguments(function) if only in (None, name) else ():
-            _add(command, *argument)
+        if only in (None, name):  # its own come first
+            for _, *one in sorted(_arguments(function), key=lambda each: bool(each[0])):
+                _add(command, *one)
     return parser
 
 
