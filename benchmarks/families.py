@@ -1,18 +1,19 @@
-"""Rules without tuning, and tuned rules, on twenty families of tasks.
+"""``shares``, which is not tuned, and other rules on twenty families of tasks.
 
-    python benchmarks/families.py [--episodes 512] [--seed 0] [--families 0 1 ...]
-        [--methods NAME ...] [--checkpoint DIR] [--keep DIR] [--json FILE]
+    python benchmarks/families.py [--episodes 4096] [--seed 0] [--families 0 1 ...]
+        [--methods NAME ...] [--keep DIR] [--json FILE]
+    python benchmarks/families.py --optimum
     python benchmarks/families.py --tune
 
 A family is a task drawn by ``jaxcal.adaptive.family`` from a held-out structure: the
 constants of ``shares`` were found on other structures. Every method plays the same
 sessions of it; ``priced`` and ``state`` are tuned on it first, 20 generations each, on
-other sessions, and ``two_step`` and ``rollouts`` follow the tuned ``state``. Rollouts
-play fewer sessions. ``policy`` is the one that was trained on KNEE, with the seconds of
-a family scaled to those of KNEE: the medians of what measurements take are equal.
-Differences are in pairs with standard errors. With --keep what was played lies in DIR
-and is not played again. --tune finds the constants of ``shares`` on 128 tasks of the
-structures that are not held out.
+other sessions. ``two_step`` and ``rollouts`` follow ``shares`` and play fewer sessions.
+Differences are in pairs with standard errors; times are of one core, a choice in a
+batch. With --keep what was played lies in DIR and is not played again.
+--optimum plays small tasks of the same structures, their answers made certain and
+their costs whole, of which dynamic programming finds the optimum. --tune finds the
+constants of ``shares`` on 128 tasks of the structures that are not held out.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.adaptive_transfer import arrays, shown
+from jaxcal.adaptive.dynamic import solve
 from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.family.draws import draw
 from jaxcal.adaptive.family.padded import batch
 from jaxcal.adaptive.family.structures import HELD_OUT, Limits
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.lookahead import Rollouts, TwoStep
-from jaxcal.adaptive.policy import run
 from jaxcal.adaptive.rules import (
     SHARES,
     Gain,
@@ -46,20 +47,21 @@ from jaxcal.adaptive.rules import (
     Shares,
     StateRule,
 )
-from jaxcal.adaptive.tasks.knee import knee
 from jaxcal.adaptive.tuning import tune
+from jaxcal.evaluation.sequential import seconds_a_choice
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.learning.runtime import cache
 
 METHODS = (
     "random", "gain", "rate", "shares", "priced", "state", "two_step", "rollouts16",
-    "rollouts64", "policy",
+    "rollouts64",
 )  # fmt: skip
 TUNED = ("priced", "state")
+RULES = ("gain", "rate", *TUNED)
 BUDGETS = ("time+uses", "time", "uses", "time+uses+number", "uses+number", "time+uses",
            "time+number")  # fmt: skip
 STATES = (256, 512, 1024)
-FEWER = {"rollouts16": 128, "rollouts64": 64}  # sessions at most
+FEWER = {"two_step": 256, "rollouts16": 64, "rollouts64": 32}  # sessions at most
 BATCH = {"two_step": 64, "rollouts16": 16, "rollouts64": 16}
 _FIRST = 10**7  # seed
 
@@ -71,6 +73,47 @@ def family(number: int) -> tuple[str, GridTask]:
     limits = Limits(STATES[number % len(STATES)], 48, 4, measurements=32)
     task = draw(_FIRST + number, structure, budget, limits)
     return f"{structure}, {budget}", task
+
+
+def certain(number: int) -> tuple[str, GridTask, float]:
+    """A small task of certain outcomes and whole costs, and its tick in seconds."""
+    # The beliefs of pools are too many.
+    structures = [name for name in HELD_OUT if name != "pools"]
+    structure = structures[number % len(structures)]
+    budget = ("time+uses", "time")[number // len(structures)]
+    limits = Limits(36, 16, 2, 3, 64)
+    task = jax.device_get(draw(_FIRST + 100 + number, structure, budget, limits))
+    tick = float(task.seconds[1]) / 60.0
+    yes = task.likelihood[:, 1] > 0.5
+    names = ("prior", "place_after", "groups", "uses", "num_uses")
+    fields: dict[str, Any] = {name: getattr(task, name) for name in names}
+    fields["travel"] = np.maximum(np.rint(task.travel / tick), 1.0) * tick
+    fields["extra"] = np.rint(task.extra / tick) * tick
+    fields["seconds"] = tuple(task.seconds.tolist())
+    table = np.stack([~yes, yes], axis=1)
+    made = GridTask.make(task.theta, task.designs, table, horizon=64, **fields)
+    return f"{structure}, {budget}", made, tick
+
+
+def optimum(methods: list[str], options: argparse.Namespace) -> None:
+    """Shares of the optimum on small tasks."""
+    every = []
+    print(f"{'task':24}{'optimum':>9}" + "".join(f"{m:>12}" for m in methods))
+    for number in range(10):
+        name, task, tick = certain(number)
+        best = solve(task, tick)
+        task = arrays(task)
+        found: dict[str, Any] = {}
+        deciders = {m: decider_of(m, task, options.seed, found) for m in methods}
+        deciders = arrays({"optimum": best.decider} | deciders)
+        result = compare(task, deciders, options.episodes, options.seed)
+        every.append(
+            [1.0 + result.paired(m, "optimum")[0] / best.mean for m in methods]
+        )
+        print(f"{name:24}{best.mean:9.3f}" + "".join(f"{s:12.4f}" for s in every[-1]),
+              flush=True)  # fmt: skip
+    means = np.mean(every, axis=0)
+    print(f"{'mean':33}" + "".join(f"{share:12.4f}" for share in means))
 
 
 @jax.jit
@@ -100,15 +143,6 @@ def tuned_for_all(seed: int) -> Any:
     )  # fmt: skip
 
 
-def in_seconds_of_knee(task: GridTask) -> GridTask:
-    """The same task in another unit of time, which the trained policy counts in."""
-    factor = jnp.median(knee().travel) / jnp.maximum(jnp.median(task.travel), 1e-9)
-    return dataclasses.replace(
-        task, travel=task.travel * factor, extra=task.extra * factor,
-        seconds=task.seconds * factor,
-    )  # fmt: skip
-
-
 def decider_of(method: str, task: GridTask, seed: int, found: dict[str, Any]) -> Any:
     """``found`` holds the tuned rules, and takes them."""
     if method in TUNED and method not in found:
@@ -118,27 +152,24 @@ def decider_of(method: str, task: GridTask, seed: int, found: dict[str, Any]) ->
             "state": StateRule(0.1, 1.0 / each, 1.0, scale=10.0 * each),
         }
         found[method] = tune(
-            task, starts[method], episodes=256, generations=20, seed=seed + 1
+            task, starts[method], episodes=256, population=16, elite=5, seed=seed + 1
         )
-    if method in ("two_step", "rollouts16", "rollouts64") and "state" not in found:
-        decider_of("state", task, seed, found)
     return {
         "random": Random, "gain": Gain, "rate": GainRate, "shares": lambda: SHARES,
         "priced": lambda: found["priced"], "state": lambda: found["state"],
-        "two_step": lambda: TwoStep(found["state"]),
-        "rollouts16": lambda: Rollouts(found["state"], rollouts=16),
-        "rollouts64": lambda: Rollouts(found["state"], rollouts=64),
-        "policy": lambda: found["policy"],
+        "two_step": lambda: TwoStep(SHARES),
+        "rollouts16": lambda: Rollouts(SHARES, rollouts=16),
+        "rollouts64": lambda: Rollouts(SHARES, rollouts=64),
     }[method]()  # fmt: skip
 
 
 def played(
-    number: int, methods: list[str], policy: Any, options: argparse.Namespace
+    number: int, methods: list[str], options: argparse.Namespace
 ) -> dict[str, Any]:
-    """Nats of every session by method (B,), what is far, and constants."""
+    """Nats of every session by method (B,), and milliseconds a choice."""
     name, task = family(number)
     task = arrays(task)
-    found: dict[str, Any] = {"policy": policy}
+    found: dict[str, Any] = {}
     gains: dict[str, Any] = {}
     kept = None
     if options.keep is not None:
@@ -155,9 +186,9 @@ def played(
             begun = time.process_time()
             decider = arrays(decider_of(method, task, options.seed, found))
             batch = BATCH.get(method, 256)
-            where = in_seconds_of_knee(task) if method == "policy" else task
-            result = compare(where, {method: decider}, least, options.seed, batch)
+            result = compare(task, {method: decider}, least, options.seed, batch)
             gains[method] = result.gain[0]
+            gains[f"ms_{method}"] = 1e3 * seconds_a_choice(task, decider, 0)
             took = time.process_time() - begun
             print(f"  {number} {method} {took:.0f} s", file=sys.stderr, flush=True)
             for rule in TUNED:
@@ -170,6 +201,7 @@ def played(
         gains[method] = gains[method][:least]
     return {
         "name": name, "shape": task.likelihood.shape,
+        "ms": {m: float(gains[f"ms_{m}"]) for m in methods},
         "gains": {m: np.asarray(gains[m]) for m in methods},
     }  # fmt: skip
 
@@ -184,12 +216,12 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--episodes", type=int, default=512)
+    parser.add_argument("--episodes", type=int, default=4096)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--families", type=int, nargs="+", default=list(range(20)))
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
+    parser.add_argument("--optimum", action="store_true")
     parser.add_argument("--tune", action="store_true")
-    parser.add_argument("--checkpoint", help="the one that ships when not given")
     parser.add_argument("--keep", type=pathlib.Path)
     parser.add_argument("--json", type=pathlib.Path)
     options = parser.parse_args(argv)
@@ -201,53 +233,50 @@ def main(argv: list[str] | None = None) -> int:
     if options.tune:
         print(tuned_for_all(options.seed))
         return 0
-    policy = None
-    if "policy" in options.methods:
-        policy = run.load(options.checkpoint).decider
+    if options.optimum:
+        optimum([m for m in options.methods if m not in FEWER], options)
+        return 0
     rows = []
-    others = [m for m in options.methods if m != "shares"]
-    print(f"{'family':40}" + "".join(f"{m:>11}" for m in options.methods)
-          + f"{'shares less the best tuned':>28}")  # fmt: skip
+    print(f"{'family':34}" + "".join(f"{m:>11}" for m in options.methods)
+          + f"{'shares less best':>19}")  # fmt: skip
     for number in options.families:
-        row = played(number, options.methods, policy, options)
+        row = played(number, options.methods, options)
         gains = row.pop("gains")
         row["nats"] = {m: paired(g, 0.0 * g) for m, g in gains.items()}
-        line = f"{row['name']:40}" + "".join(
+        line = f"{row['name']:34}" + "".join(
             f"{row['nats'][m][0]:11.3f}" for m in options.methods
         )
-        rivals = [m for m in TUNED if m in gains]
+        rivals = [m for m in RULES if m in gains] or options.methods
+        best = max(rivals, key=lambda m: row["nats"][m][0])
+        gains["best"], row["nats"]["best"] = gains[best], row["nats"][best]
         if "shares" in gains:
-            row["shares_less"] = {m: paired(gains["shares"], gains[m]) for m in others}
-            if rivals:
-                row["best"] = max(rivals, key=lambda m: row["nats"][m][0])
-                line += shown(row["shares_less"][row["best"]], 28)
+            mine = gains.pop("shares")
+            row["less"] = {m: paired(mine, other) for m, other in gains.items()}
+            line += shown(row["less"]["best"], 19)
         rows.append(row)
         print(line, flush=True)
     if "shares" in options.methods:
-        _summary(rows, others)
+        _summary(rows)
     if options.json is not None:
         document = {"episodes": options.episodes, "seed": options.seed, "rows": rows}
         write_text(options.json, json.dumps(document, indent=1) + "\n")
     return 0
 
 
-def _summary(rows: list[dict[str, Any]], others: list[str]) -> None:
+def _summary(rows: list[dict[str, Any]]) -> None:
     """Means over the families, and in how many shares is clearly above or below."""
-    if all("best" in row for row in rows):
-        others = [*others, "best"]
-        for row in rows:
-            row["shares_less"]["best"] = row["shares_less"][row["best"]]
-            row["nats"]["best"] = row["nats"][row["best"]]
-    print(f"shares less, mean of {len(rows)} families:")
-    for method in others:
-        each = np.array([row["shares_less"][method] for row in rows])
+    print(f"shares less, mean of {len(rows)} families; best: of the four rules")
+    for method in rows[0]["less"]:
+        each = np.array([row["less"][method] for row in rows])
         error = np.sqrt((each[:, 1] ** 2).sum()) / len(each)
         above = (each[:, 0] > 2 * each[:, 1]).sum()
         below = (each[:, 0] < -2 * each[:, 1]).sum()
         mean = float(each[:, 0].mean())
         share = 100 * mean / np.mean([row["nats"][method][0] for row in rows])
+        times = [row["ms"][method] for row in rows if method in row["ms"]]
+        took = f", {np.mean(times):.3g} ms" if times else ""
         print(f"  {method:12}{shown((mean, error), 18)}  {share:+.1f} %, above in "
-              f"{above}, below in {below}")  # fmt: skip
+              f"{above}, below in {below}{took}")  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -592,7 +592,7 @@ def check(file: ConfigPath | None = None, *, config: ConfigPath | None = None) -
 
 def example(name: Annotated[str, "without it they are listed"] | None = None) -> int:
     """print a commented example configuration"""
-    from rig.config.files import example_names, example_text
+    from rig.config.config import example_names, example_text
 
     print((example_text(name) if name else "\n".join(example_names())).strip())
     return EXIT_OK

@@ -14,7 +14,7 @@ import pathlib
 import signal
 import time
 import tomllib
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -34,19 +34,14 @@ LAST_RESORT = "Use the emergency stop"
 class Target:
     """One bus: its lock, and what of it was armed last."""
 
-    def __init__(self, lock: BusLock, armed: dict[str, Any] | None) -> None:
-        self.lock = lock
-        self.armed = armed
-        self.since = time.monotonic()
-        self.holder: dict[str, Any] | None = None
-
-    @classmethod
-    def of(cls, bus: dict[str, Any]) -> Target:
-        """The bus of these settings."""
+    def __init__(self, bus: dict[str, Any]) -> None:
         known = {"transport": "", "host": "", "port": 502, "device": ""} | bus
         where = known["device"] or f"{known['host']}:{known['port']}"
-        lock = BusLock(SimpleNamespace(**known, where=where))  # type: ignore[arg-type] # light
-        return cls(lock, read_armed(lock.armed_path))
+        settings: Any = SimpleNamespace(**known, where=where)  # pydantic's are heavy
+        self.lock = BusLock(settings)
+        self.armed = read_armed(self.lock.armed_path)
+        self.since = time.monotonic()
+        self.holder: dict[str, Any] | None = None
 
     def ask(self) -> None:
         """Tell the holder to stop."""
@@ -111,14 +106,22 @@ def stop_device(path: pathlib.Path, given: bool = True) -> int:
             target.ask()
         from rig.core import drive, stop  # noqa: F401  # while those asked have time
 
+        results: list[UnitStop] = []
+        faults: list[Fault] = []
         with ThreadPoolExecutor(len(found)) as pool:
-            codes = list(pool.map(lambda target: _stop(target, path), found))
-        faults = [code for code in codes if isinstance(code, Fault)]
-        if len(faults) == len(codes):
+            jobs = [pool.submit(_stop_units, target, path) for target in found]
+            for job in as_completed(jobs):
+                try:
+                    results += job.result()
+                    _say("\n".join(map(str, job.result())))
+                except Fault as error:
+                    faults.append(error)
+        if len(faults) == len(jobs):
             raise faults[0]
         for fault in faults:
             _say(str(fault))
-        return EXIT_FAULT if faults or EXIT_FAULT in codes else EXIT_OK
+        good = all(each.acknowledged and each.standing for each in results)
+        return EXIT_OK if good and not faults else EXIT_FAULT
 
 
 def stop_run(run: pathlib.Path) -> list[UnitStop]:
@@ -132,12 +135,11 @@ def stop_run(run: pathlib.Path) -> list[UnitStop]:
     """
     for path in armed_files():
         armed = read_armed(path)
-        target = armed and Target.of(armed["bus"])
+        target = armed and Target(armed["bus"])
         if target:
             holder = target.lock.holder()
             if holder and holder.get("run") == str(run.resolve()):
                 target.ask()
-                target.end()
                 return _stop_units(target, None)
     raise Fault(f"{NOTHING}: no session of this computer moves {run.name}")
 
@@ -146,14 +148,14 @@ def _targets(path: pathlib.Path, given: bool) -> tuple[list[Target], str]:
     """The buses to stop, and what is wrong with the file."""
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
-        return [Target.of(data["bus"])], ""
+        return [Target(data["bus"])], ""
     except (OSError, ValueError, KeyError, TypeError) as error:
         fault = f"{path} names no bus: {' '.join(str(error).split())}"
         if isinstance(error, FileNotFoundError):
             fault = f"there is no {path}" + " here" * (not given)
     left = [armed for each in armed_files() if (armed := read_armed(each))]
     moving = [armed for armed in left if not armed["standing"]]
-    return [Target.of(armed["bus"]) for armed in moving or left], fault
+    return [Target(armed["bus"]) for armed in moving or left], fault
 
 
 def _say(text: str) -> None:
@@ -162,24 +164,16 @@ def _say(text: str) -> None:
         print(text, flush=True)
 
 
-def _stop(target: Target, path: pathlib.Path) -> int | Fault:
-    target.end()
-    try:
-        results = _stop_units(target, path)
-    except Fault as fault:
-        return fault
-    for result in results:
-        _say(str(result))
-    stopped = all(r.acknowledged and r.standing for r in results)
-    return EXIT_OK if stopped else EXIT_FAULT
-
-
 def _stop_units(target: Target, path: pathlib.Path | None) -> list[UnitStop]:
-    """Stop the drives that were armed last, else those of the configuration file."""
+    """Stop the drives that were armed last, else those of the configuration file.
+
+    Who was asked to is waited for first.
+    """
     from rig.core.bus import Bus, BusError
     from rig.core.drive import Drive
     from rig.core.stop import stop_all
 
+    target.end()
     settings, silence_s, axes = _drives(target.armed, path)
     with contextlib.ExitStack() as stack:
         try:
@@ -203,7 +197,7 @@ def _drives(
 ) -> tuple[Any, float, list[Any]]:
     """Bus, silence and axes: of what is armed, else of the file, else as armed last."""
     from rig.config.axis import Axis
-    from rig.config.files import load_config
+    from rig.config.config import load_config
     from rig.config.maps import RegisterMap
     from rig.config.schema import ConfigError, parse
     from rig.config.settings import BusSettings
@@ -218,11 +212,7 @@ def _drives(
             _say(f"{error}\nstopping the drives that were armed last instead")
     assert armed is not None
     axes = [
-        Axis.model_construct(
-            name=each["name"], unit=each["unit"],
-            map=parse(RegisterMap, each["map"], each["name"]),
-            rotates="X", min_pulses=0, max_pulses=0,  # of no use to a stop
-        )
+        Axis.unmoved(each["name"], each["unit"], parse(RegisterMap, each["map"], "map"))
         for each in armed["drives"]
-    ]  # fmt: skip
+    ]
     return BusSettings.model_validate(armed["bus"]), armed["silence_s"], axes

@@ -13,11 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.calibration import file
 from jaxcal.calibration.check import Check, check, verification
 from jaxcal.calibration.discrepancy import WithHarmonics
+from jaxcal.calibration.estimate import fit_model
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.inverse import Carry, limits_of, reach, solve_affine
 from jaxcal.calibration.summary import columns_of, summary
 from jaxcal.calibration.verdict import Verdict, verdict
-from jaxcal.models import Affine, Model, Pose, SerialChain
+from jaxcal.models import Affine, Model, Noise, Pose, SerialChain
 
 __all__ = ["Calibration"]
 
@@ -184,14 +185,31 @@ class Calibration(Fit):
         return self._chain().to_urdf(path, self.parameters, force=force)
 
     def to_dh(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """See :meth:`jaxcal.models.SerialChain.to_dh`."""
-        self._chain().to_dh(path, self.parameters, force=force)
+        """See :meth:`jaxcal.models.SerialChain.to_dh`; fitted without harmonics."""
+        self._chain().to_dh(path, self._of_table(), force=force)
 
     def to_ur_kinematics(
         self, path: str | os.PathLike[str], *, force: bool = False
     ) -> None:
         """See :meth:`jaxcal.models.SerialChain.to_ur_kinematics`."""
-        self._chain().to_ur_kinematics(path, self.parameters, force=force)
+        self._chain().to_ur_kinematics(path, self._of_table(), force=force)
+
+    def _of_table(self) -> Array:
+        """(p,) for a file, which holds no harmonics: fitted without them."""
+        if not isinstance(self.whole, WithHarmonics):
+            return self.parameters
+        found = fit_model(
+            self.commands,
+            self.residuals + self.predict(self.commands),
+            (self.loss_weights > 0.0).astype(np.float64),
+            model=self.model,
+            prior=self.model.default_prior(),
+            noise=Noise(std=self.noise_std) if self.noise_known else None,
+            loss=self.loss,
+            discrepancy=None,
+            common_noise=None,
+        )
+        return np.asarray(found["estimate"])
 
     def _chain(self) -> SerialChain:
         if not isinstance(self.model, SerialChain):

@@ -99,7 +99,9 @@ def fit_model(
         whole = WithDiscrepancy.over(model, commands[used], features)  # type: ignore[assignment]  # as far as a fit needs it
         extra = np.zeros(features * measured.shape[1])
     elif isinstance(model, SerialChain) and model.sensor.harmonic:
-        if not (asked or spread.any() or model.harmonics):
+        # Of a URDF file what is written back is what is predicted: it holds none.
+        plain = asked or spread.any() or model.harmonics or model.source is not None
+        if not plain:
             whole = WithHarmonics(model)  # type: ignore[assignment]  # likewise
             extra = whole.std**-2.0  # type: ignore[attr-defined]  # see above
     task = Task(

@@ -150,11 +150,11 @@ def _train(
 
 def _num_seeds(arguments: argparse.Namespace, out: pathlib.Path) -> int:
     """Of the run to begin or to go on with; what is wrong is refused later."""
+    if not arguments.resume:
+        return arguments.num_seeds or 1
     from jaxcal.adaptive.policy.run import SCHEMA
     from jaxcal.learning.training import checkpoint
 
-    if not arguments.resume:
-        return arguments.num_seeds or 1
     schema = SCHEMA if arguments.task else checkpoint.SCHEMA
     with contextlib.suppress(checkpoint.CheckpointError):
         return int(checkpoint.read_meta(out, schema)[1]["num_seeds"])

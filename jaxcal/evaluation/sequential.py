@@ -30,7 +30,7 @@ from jaxcal.adaptive.rules import (
 from jaxcal.adaptive.tasks.registry import Entry
 from jaxcal.adaptive.tuning import tune
 
-__all__ = ["METHODS", "Result", "evaluate"]
+__all__ = ["METHODS", "Result", "evaluate", "seconds_a_choice"]
 
 METHODS = {
     "random": "any measurement",
@@ -134,7 +134,7 @@ def evaluate(
             progress=lambda done, method=method: progress(method, done, episodes),  # type: ignore[misc]  # default binds the loop's value
         )
         found.append(played)
-        seconds.append(_seconds(task, decider, seed))
+        seconds.append(seconds_a_choice(task, decider, seed))
     whole = Comparison(
         tuple(methods),
         *(
@@ -233,7 +233,7 @@ def _choose(task: Any, decider: Any, belief: Any, session: Any, keys: Any) -> An
     return jax.vmap(one)(belief, session, keys)
 
 
-def _seconds(task: Any, decider: Any, seed: int) -> float:
+def seconds_a_choice(task: Any, decider: Any, seed: int) -> float:
     """Processor time of one choice, in a batch; that of all threads counts."""
     count = min(_TIMED, getattr(task, "batch", _TIMED))
     keys = jax.random.split(jax.random.key(seed), count)

@@ -14,9 +14,7 @@ kind      phi                          names   reported value               effi
 v is the value of a selection, b that of the optimum or a bound on it, s the rows of C.
 C is the identity for D, A and E, picks the parameters of interest for Ds and As, and
 for I ``C.T @ C`` is the mean of ``J.T @ J`` over a region: V's trace is then the mean
-variance of the predictions there. At any M0, with G the gradient,
-
-    phi(M) <= phi(M0) + trace(G (M - M0)).
+variance of the predictions there.
 
 Sources: Pukelsheim, Optimal Design of Experiments (concavity, subsets of parameters);
 Atkinson, Donev and Tobias, Optimum Experimental Designs.
@@ -25,7 +23,6 @@ Atkinson, Donev and Tobias, Optimum Experimental Designs.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,29 +59,6 @@ class Criterion:
         else:
             phi = -np.linalg.slogdet(half @ np.matrix_transpose(half))[1]
         return np.where(regular, phi, -np.inf)
-
-    def gradient(self, information: Array) -> Array:
-        """G (..., p, p), a supergradient of phi at nonsingular M (..., p, p)."""
-        solved: NDArray[Any] = np.linalg.solve(information, self.root.T)
-        if self.kind == "least":
-            solved = self._weakest(solved)
-            return solved @ np.matrix_transpose(solved)
-        inner = np.matrix_transpose(solved)
-        if self.kind == "det":
-            inner = np.linalg.solve(self.root @ solved, inner)
-        gradient = solved @ inner
-        return (gradient + np.matrix_transpose(gradient)) / 2.0
-
-    def _weakest(self, solved: Array) -> Array:
-        """(..., p, 1) y of the least ``y.T M y`` with ``|C y| = 1``, of ``M^-1 C.T``.
-
-        An eigenvector of the largest eigenvalue of V leads there. M in the coordinates
-        of the parameters, ``C^-T M C^-1``, is never made: where commands are far from
-        zero, double precision does not hold its smallest eigenvalue.
-        """
-        covariance = self.root @ solved
-        across = solved @ np.linalg.eigh(covariance)[1][..., -1:]
-        return across / np.linalg.norm(self.root @ across, axis=-2, keepdims=True)
 
     def reported(self, phi: Array | float) -> Array | float:
         """The value as the caller reads it."""

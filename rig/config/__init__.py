@@ -1,12 +1,11 @@
 """What rig.toml and a register map may say, and what is wrong with one that does not.
 
 ``settings`` and ``registers`` are the two schemas, one field a key; ``schema`` words
-the faults; ``files`` reads. (3,) arrays are in the order pitch, yaw, roll.
+the faults; ``config`` reads. (3,) arrays are in the order pitch, yaw, roll.
 """
 
 from rig.config.axis import AXIS_NAMES
-from rig.config.config import RigConfig
-from rig.config.files import example_text, load_config, parse_config
+from rig.config.config import RigConfig, example_text, load_config, parse_config
 from rig.config.schema import ConfigError
 
 __all__ = [

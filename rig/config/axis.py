@@ -85,6 +85,14 @@ class Axis(Scale):
         "of [bus], where the map has it", 0.01, 60, by=lambda made: None,
     )  # fmt: skip
 
+    @classmethod
+    def unmoved(cls, name: str, unit: int, register_map: RegisterMap) -> "Axis":
+        """A drive that is read or stopped and never moved: nothing else is known."""
+        return cls.model_construct(
+            name=name, unit=unit, map=register_map,
+            rotates="X", min_pulses=0, max_pulses=0,
+        )  # fmt: skip
+
     def pulses_within(self, angle_deg: float) -> int:
         """A tolerance in degrees as whole pulses, at least one."""
         return max(1, round(angle_deg * abs(self.pulses_per_deg)))

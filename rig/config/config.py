@@ -1,4 +1,4 @@
-"""The whole of rig.toml, and what follows from several of its tables."""
+"""The whole of rig.toml, what follows from several of its tables, and its reading."""
 
 import functools
 import hashlib
@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import PrivateAttr
 
-from rig.config.axis import AXIS_NAMES, Axis, Pulses, Scale
-from rig.config.schema import Section, key
+from rig.config.axis import AXIS_NAMES, DEFAULT_ROTATES, Axis, Pulses, Scale
+from rig.config.schema import ConfigError, Section, key, parse, read_text
 from rig.config.settings import (
     BusSettings,
     ImuSettings,
@@ -26,22 +26,22 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+EXAMPLES = pathlib.Path(__file__).parent.parent / "examples"
 POLLS, HICCUP_S = 4, 0.5  # of the motion loop's heartbeat
 PHONE = (
     "format", "columns", "quaternion_columns", "unit", "order", "signs", "mounting_deg"
 )  # fmt: skip
 # Where bus and phone are reached, and when a session gives up or says that it is good,
 # may change between a run and its resumption.
-UNMEASURED = {
-    "axes": ("comm_timeout_s",),
-    "imu": ("host", "port", "transport", "allow", "stale_s", "heading"),
-    "motion": (
-        "poll_s", "deadline_factor", "deadline_slack_s", "stall_s", "following_deg",
-        "envelope_margin_deg", "max_disagreement_deg", "mirror_limits",
-    ),
-    "settle": ("timeout_s",),
-    "session": ("verify_limit_deg", "reference_tolerance_deg", "max_unreachable"),
-}  # fmt: skip
+UNMEASURED = (
+    "bus.", "axes.pitch.comm_timeout_s", "axes.yaw.comm_timeout_s",
+    "axes.roll.comm_timeout_s", "imu.host", "imu.port", "imu.transport", "imu.allow",
+    "imu.stale_s", "imu.heading", "motion.poll_s", "motion.deadline_factor",
+    "motion.deadline_slack_s", "motion.stall_s", "motion.following_deg",
+    "motion.envelope_margin_deg", "motion.max_disagreement_deg", "motion.heartbeat_s",
+    "motion.mirror_limits", "settle.timeout_s", "session.verify_limit_deg",
+    "session.reference_tolerance_deg", "session.max_unreachable",
+)  # fmt: skip
 
 KEYS = {  # of rig.toml, where a description of it says otherwise
     "scale": "", "letter": "rotates", "mechanism_order": "mechanism.order",
@@ -56,20 +56,6 @@ def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
         for key in dict.fromkeys([*then, *now])
         if then.get(key) != now.get(key)
     ]
-
-
-def _without(data: dict[str, Any], left_out: dict[str, Any]) -> dict[str, Any]:
-    """A described configuration without its bus and some keys of its tables."""
-    found = {}
-    for name, table in data.items():
-        gone = left_out.get(name, ())
-        if isinstance(table, dict):
-            table = {key: table[key] for key in table if key not in gone}
-        elif name == "axes":
-            table = [{k: axis[k] for k in axis if k not in gone} for axis in table]
-        if name != "bus":
-            found[name] = table
-    return found
 
 
 def _flat(data: Any, at: str = "") -> dict[str, Any]:
@@ -217,8 +203,9 @@ class RigConfig(Section):
             described: ``described()`` when the run began, from its journal.
         """
         now = json.loads(json.dumps(self.described(), default=str))
-        then, now = (_flat(_without(each, UNMEASURED)) for each in (described, now))
+        then, now = _flat(described), _flat(now)
         # Keys that came after the run began had their defaults in it.
+        then = {key: then[key] for key in then if not key.startswith(UNMEASURED)}
         return differences(then, {key: now.get(key) for key in then})
 
     def device_fingerprint(self) -> dict[str, Any]:
@@ -266,3 +253,45 @@ class RigConfig(Section):
                     f"{span}: [{low}, {high}] with an overshoot of {overshoot} leaves "
                     f"the axis's limits {limits}"
                 )
+
+
+# Files
+
+
+def load_config(path: str | pathlib.Path) -> RigConfig:
+    """Read and check a configuration file; ConfigError lists every fault."""
+    return parse_config(read_text(path), pathlib.Path(path).parent, str(path))
+
+
+def parse_config(
+    text: str, folder: pathlib.Path | None = None, source: str = "configuration"
+) -> RigConfig:
+    """Check the text of a configuration; maps by path are relative to ``folder``."""
+    config = parse(RigConfig, text, source, {"folder": folder}, _repeated)
+    axes = sorted(config.axes, key=lambda axis: AXIS_NAMES.index(axis.name))
+    config = config.model_copy(update={"axes": tuple(axes)})
+    config._folder = folder or pathlib.Path()
+    return config
+
+
+def _repeated(data: dict[str, Any]) -> Iterator[str]:
+    """Names, units and letters that axes share; told even beside other faults."""
+    given = data.get("axes")
+    axes = [a for a in given if isinstance(a, dict)] if isinstance(given, list) else []
+    axes = [{"rotates": DEFAULT_ROTATES.get(str(a.get("name"))), **a} for a in axes]
+    for name in ("name", "unit", "rotates"):
+        values = [str(a[name]) for a in axes if a.get(name) is not None]
+        if len(set(values)) < len(values):
+            yield f"axes: {name} must differ between the three, got {', '.join(values)}"
+
+
+def example_names() -> list[str]:
+    """Names of the configurations that ship."""
+    return sorted(path.stem for path in EXAMPLES.glob("*.toml"))
+
+
+def example_text(name: str) -> str:
+    """Text of a configuration that ships; ConfigError where none has the name."""
+    if name not in example_names():
+        raise ConfigError(name, [f"no such example: have {', '.join(example_names())}"])
+    return (EXAMPLES / f"{name}.toml").read_text(encoding="utf-8")

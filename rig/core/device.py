@@ -217,7 +217,7 @@ class Device:
         self.stopper = Stopper(self.drives, run.emit)
         self.requests = requests or Requests()
         self.proof = Proof(config.axes, record.missing(config) is None, simulated)
-        self.armed = False
+        self.armed = self.pausing = False
         self.moves = 0  # frames that moved a drive
         self.arrived = 0.0  # monotonic time of the last arrival
         self.meanwhile: Callable[[], None] = lambda: None  # at every poll of a move
@@ -275,7 +275,9 @@ class Device:
 
     def guard(self, moving: bool = False) -> None:
         """The loop is alive; raise StopRequested where a stop was asked for."""
-        self.requests.tell()
+        if self.requests.pause and not self.pausing:
+            self.pausing = True
+            self.emit("pausing")
         self._before_exchange()
         self.heartbeat.feed(moving)
 
@@ -313,7 +315,6 @@ class Device:
         """Nothing more will move: close bus and phone."""
         self.heartbeat.close()
         self.armed = False
-        results = self.stopper.results
-        self.line_watch.restore({r.axis for r in results if r.standing})
+        self.line_watch.restore({r.axis for r in self.stopper.results if r.standing})
         self.bus.close()
         self.imu.close()

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import pathlib
 import time
-from collections.abc import Callable
 
 from rig.journal.errors import JournalError
 from rig.journal.errors import Refused as Refused
@@ -96,10 +95,8 @@ class Requests:
         self.armed = False
         self.ending = False  # the stop and the last lines of the journal are under way
         self.pause = False
-        self.report: Callable[[str], object] = lambda event: None
         self._stop: StopRequested | None = None
         self._asked = 0.0
-        self._told = False
 
     def request_stop(self, reason: str, exit_code: int) -> None:
         """Ask for a stop; the first request is the one that is kept."""
@@ -111,12 +108,6 @@ class Requests:
         """The reason of a stop that was asked for so long ago; empty where none was."""
         late = self._stop is not None and time.monotonic() - self._asked > seconds
         return str(self._stop) if late else ""
-
-    def tell(self) -> None:
-        """Report "pausing" from a loop, once, where a pause was asked for."""
-        if self.pause and not self._told:
-            self._told = True
-            self.report("pausing")
 
     def check_stop(self) -> None:
         """Raise StopRequested where one has been asked for."""

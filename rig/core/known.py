@@ -71,6 +71,7 @@ def _exchanged(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
 def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
     """Why the drive's pulses may no longer mean the place that they meant."""
     axis, status = drive.axis, drive.status()
+    left = record.left().get(axis.name, status.position)
     if axis.map.absolute_encoder:
         return ""
     if status.fault:
@@ -78,7 +79,7 @@ def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
     if axis.name in record.left_homed():
         if not drive.says_homed:
             return f"the homed bit of {axis.name} is gone: the drive was without power"
-    elif record.lost_sight(axis.name):
+    elif left is None:
         return (
             f"where {axis.name} was left is not known, as the last session could not "
             "read it any more, and its drive does not say that it kept its power"
@@ -89,9 +90,8 @@ def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
             f"{axis.name} counts from {drive.origin} and no more from "
             f"{origins[axis.name]}, where it was homed: it was without power"
         )
-    left = record.left().get(axis.name, status.position)
     tolerance = axis.pulses_within(config.motion.position_tolerance_deg)
-    if abs(status.position - left) <= tolerance:
+    if left is None or abs(status.position - left) <= tolerance:
         return ""
     return (
         f"{axis.name} stands at {status.position} pulses, "
@@ -177,13 +177,10 @@ def unseen(config: RigConfig, zero: Array) -> list[str]:
     """Names of the axes of which a turn at the zero posture cannot be seen."""
     if config.imu.heading == "absolute":
         return []
-    base = zero @ frame_at(config, zero).mounting.T
-    upright = np.abs(base[2, ["XYZ".index(letter) for letter in config.letters]])
-    return [
-        name
-        for name, cosine in zip(AXIS_NAMES, upright, strict=True)
-        if cosine > np.cos(np.radians(UNSEEN_DEG))
-    ]
+    upright = np.abs((zero @ frame_at(config, zero).mounting.T)[2])
+    least = np.cos(np.radians(UNSEEN_DEG))
+    pairs = zip(AXIS_NAMES, config.letters, strict=True)
+    return [name for name, letter in pairs if upright["XYZ".index(letter)] > least]
 
 
 def check_zero(config: RigConfig, then: Array, now: Array, whose: str) -> str:

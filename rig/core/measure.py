@@ -132,7 +132,7 @@ def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
 
 def _collect(device: Device, wanted: int) -> list[Reading]:
     """Fresh readings as wanted, or none where the stream paused or time is up."""
-    settle, imu = device.config.settle, device.imu
+    config, settle, imu = device.config, device.config.settle, device.imu
     start = polled = time.monotonic()
     deadline = start + settle.timeout_s * max(1.0, wanted / settle.samples)
     while True:
@@ -143,15 +143,13 @@ def _collect(device: Device, wanted: int) -> list[Reading]:
             return readings[:wanted]
         now = time.monotonic()
         newest = readings[-1].time if readings else start
-        if now - newest > device.config.imu.stale_s or now > deadline:
+        if now - newest > config.imu.stale_s or now > deadline:
             return []
-        if now - polled > device.config.motion.poll_s:
+        if now - polled > config.motion.poll_s:
             polled = now
             if any(status.moving for status in device.statuses()):
-                raise MotionFault(
-                    "a drive moves while the posture is measured. Stop the other "
-                    "controller"
-                )
+                why = "a drive moves while the posture is measured"
+                raise MotionFault(f"{why}. Stop the other controller")
         time.sleep(0.002)
 
 

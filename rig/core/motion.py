@@ -6,7 +6,7 @@ import math
 import time
 from typing import NamedTuple
 
-from rig.config.axis import Axis, Pulses
+from rig.config.axis import Pulses
 from rig.core.bus import BusError, Rejected
 from rig.core.device import Device, Posture, approach, check_plan
 from rig.core.drive import START_S, Drive, Status, refusal
@@ -125,11 +125,18 @@ def _watch(device: Device, here: Pulses, target: Pulses, connection: int) -> Non
                 begins = not half and status.time - begun < START_S
                 arrived += status.done and not status.moving and not begins
                 continue
-            _check_corridor(device, axis, start, goal, status.position)
+            begin, end, angle = map(axis.to_deg, (start, goal, status.position))
+            slack = motion.following_deg
+            if not min(begin, end) - slack <= angle <= max(begin, end) + slack:
+                raise MotionFault(
+                    f"{axis.name} is at {angle:.3f} deg on its way from {begin:.3f} to "
+                    f"{end:.3f}, more than motion.following_deg off it. Check gearing "
+                    "and direction, and that no other controller moves it"
+                )
             if abs(status.position - last[index][0]) > STILL_COUNTS:
                 last[index] = (status.position, status.time)
             elif (stood := status.time - last[index][1]) > motion.stall_s:
-                left = abs(axis.to_deg(goal - status.position))
+                left = abs(end - angle)
                 moved = abs(status.position - start) > tolerance
                 if status.done and not status.moving and moved:
                     raise Unreachable(
@@ -150,18 +157,6 @@ def _watch(device: Device, here: Pulses, target: Pulses, connection: int) -> Non
             )
         _check_attitude(device, connection)
         time.sleep(motion.poll_s)
-
-
-def _check_corridor(device: Device, axis: Axis, *pulses: int) -> None:
-    """The drive is between start and goal: the three counts."""
-    begin, end, angle = map(axis.to_deg, pulses)
-    allowed = device.config.motion.following_deg
-    if not min(begin, end) - allowed <= angle <= max(begin, end) + allowed:
-        raise MotionFault(
-            f"{axis.name} is at {angle:.3f} deg on its way from {begin:.3f} to "
-            f"{end:.3f}, more than motion.following_deg off it. Check gearing and "
-            "direction, and that no other controller moves it"
-        )
 
 
 def _check_attitude(device: Device, connection: int) -> None:

@@ -113,6 +113,7 @@ class Receiver:
 
     async def _accept(self, listener: socket.socket) -> None:
         loop, tasks = asyncio.get_running_loop(), set[asyncio.Task[None]]()
+        leaving: list[socket.socket] = []
         with listener:
             while True:
                 try:
@@ -127,7 +128,8 @@ class Receiver:
                 else:  # it is still sending: closed at once, it would not see why
                     with contextlib.suppress(OSError):
                         made.send(_answer(403, False))
-                    loop.call_later(LOOK_S, made.close)
+                    leaving = [each for each in leaving if each.fileno() >= 0] + [made]
+                    loop.call_later(LOOK_S * (len(leaving) < BACKLOG), made.close)
 
     async def _hear(self, address: str, **how: Any) -> None:
         """Take what one connection sends, until it ends or says nothing."""
@@ -198,19 +200,14 @@ def _answer(code: int, stays: bool) -> bytes:
 
 
 class Imu:
-    """The attitude of the phone, now and over the last seconds.
-
-    Args:
-        settings: of the phone.
-        report: called with the event ``sender_refused``, its ``address`` and
-            ``reason``, once for each address, on the receiving thread.
-    """
+    """The attitude of the phone, now and over the last seconds."""
 
     def __init__(
         self,
         settings: ImuSettings,
         report: Callable[..., object] = lambda event, **fields: None,
     ) -> None:
+        """``report`` gets an event and its fields, on the receiving thread."""
         self.settings = settings
         self.connections = 0
         self.world = np.eye(3)  # (3, 3) by which readings are turned

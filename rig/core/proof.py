@@ -43,8 +43,8 @@ BLIND = (
     "far too small"
 )
 NO_UNIT = (
-    "no angle of the phone is over 6.3, so degrees are not told from radians. Turn the "
-    "base, or the phone's heading, by some degrees"
+    "no angle of the phone is over 6.3, so it is not told whether imu.unit is right. "
+    "Turn the base, or the phone's heading, by some degrees"
 )
 RADIANS = 180.0 / math.pi
 LARGEST_RAD = 2.0 * math.pi + 0.1  # no larger number is an angle in radians
@@ -198,18 +198,15 @@ class Proof:
             goal = tuple(a + round((b - a) * share) for a, b in each)
         ways = zip(self.axes, here, goal, strict=True)
         way = sum(abs(axis.to_deg(b - a)) for axis, a, b in ways)
-        heading = imu.connections, imu.world
+        connection, world = self._heading
+        same = imu.connections == connection and imu.world is world
         if unproved:
             self._last = None
-        elif (
-            self._last
-            and heading[0] == self._heading[0]
-            and imu.world is self._heading[1]
-        ):
+        elif self._last and same:  # or its heading is another one
             self._last = self._before, self._last[2] + way, way
         else:
             self._last = attitude, way, way
-        self._before, self._heading = attitude, heading
+        self._before, self._heading = attitude, (imu.connections, imu.world)
         return goal
 
     def paced(self, index: int, pulses: int) -> Axis:

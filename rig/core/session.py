@@ -20,18 +20,11 @@ import numpy as np
 
 from rig.config import RigConfig
 from rig.config.axis import Pulses
+from rig.core import known
 from rig.core.attitude import Array, angle_between_deg, frame_at
 from rig.core.device import Device, Posture, check_plan
 from rig.core.drive import Drive
 from rig.core.faults import MotionFault, NotFollowing, Requests, Unreachable, ending
-from rig.core.known import (
-    KeptZero,
-    axes_text,
-    check_drives,
-    check_zero,
-    heading_turn,
-    leave,
-)
 from rig.core.measure import measure, zeroed
 from rig.core.motion import Standing, move
 from rig.journal import ZEROED, BusLock, DeviceRecord, Record, RunFolder
@@ -50,7 +43,7 @@ def open_device(
     record: DeviceRecord,
     requests: Requests | None = None,
     *,
-    check: Check = check_drives,
+    check: Check = known.check_drives,
     beside: Sequence[Beside] = (),
     simulated: bool = False,
     reset_alarms: bool = False,
@@ -109,7 +102,7 @@ def _close(device: Device) -> None:
     if device.requests.armed:
         try:
             with device.bus.urgent():  # also after a stop that latched
-                leave(device.drives, device.record)
+                known.leave(device.drives, device.record)
         except OSError as error:
             text = f"{device.record.path} cannot be written: {error}"
             device.emit("note", text=text)
@@ -121,7 +114,7 @@ def _close(device: Device) -> None:
 
 
 def take_zero(
-    device: Device, at: Pulses | None = None, kept: KeptZero | None = None
+    device: Device, at: Pulses | None = None, kept: known.KeptZero | None = None
 ) -> None:
     """Measure the zero posture, that all others are measured against.
 
@@ -131,10 +124,7 @@ def take_zero(
     Args:
         device: armed.
         at: pulses of the zero; where it stands when not given, or 0 as configured.
-        kept: what a calibration keeps of it, to be found again.
-
-    Raises:
-        MotionFault: it is not where it was.
+        kept: what a calibration keeps of it, to be found again; else MotionFault.
     """
     config, run = device.config, device.run
     if zeros := run.journal.events("zero"):
@@ -164,22 +154,22 @@ def take_zero(
 
 
 def _compare_zero(
-    device: Device, pulses: Pulses, attitude: Array, kept: KeptZero | None
+    device: Device, pulses: Pulses, attitude: Array, kept: known.KeptZero | None
 ) -> None:
     """With the calibration's zero posture, or else with the last one taken."""
-    config, known = device.config, device.record.state(ZEROED)
+    config, last = device.config, device.record.state(ZEROED)
     if kept is not None:
         device.emit("note", text=kept.check(config, pulses, attitude))
-    elif known:
-        then = np.array(known["attitude"])
+    elif last:
+        then = np.array(last["attitude"])
         try:
-            KeptZero("the last session", known["pulses"], then).check(
+            known.KeptZero("the last session", last["pulses"], then).check(
                 config, pulses, attitude
             )
         except MotionFault as fault:  # a phone mounted anew is calibrated anew
             device.emit("note", text=f"WARNING: {fault}")
-    zero = {"pulses": list(pulses), "attitude": attitude.tolist()}
-    device.record.reach(ZEROED, config, **zero)
+    found = {"pulses": list(pulses), "attitude": attitude.tolist()}
+    device.record.reach(ZEROED, config, **found)
 
 
 def _check_reference(device: Device, zero: Posture) -> None:
@@ -189,9 +179,9 @@ def _check_reference(device: Device, zero: Posture) -> None:
     device.emit("reference", sync=True, angles=angles, limit=limit)
     if max(map(abs, angles)) > limit:
         raise MotionFault(
-            f"the zero posture of this run has moved: {axes_text(angles)} (limit "
-            f"{limit:g}): the drives lost their origin, or the phone or the device "
-            "was moved. Start a new run"
+            f"the zero posture of this run has moved: {known.axes_text(angles)} (limit "
+            f"{limit:g}): the drives lost their origin, or the phone or the device was "
+            "moved. Start a new run"
         )
 
 
@@ -214,8 +204,8 @@ def _reorient(device: Device) -> None:
         if device.imu.connections != count:
             continue
         now = np.array(found["attitude"])
-        told = check_zero(config, frame.zero, now, "this run")
-        turn = heading_turn(config, frame.zero, now)
+        told = known.check_zero(config, frame.zero, now, "this run")
+        turn = known.heading_turn(config, frame.zero, now)
         if (turned := angle_between_deg(np.eye(3), turn)) > LEAST_TURN_DEG:
             device.imu.turn(turn)
         zeroed(device, frame, zero)
@@ -231,14 +221,11 @@ def _reorient(device: Device) -> None:
 def visit(device: Device, posture: Posture, **fields: Any) -> Record | None:
     """Move, measure and record, once in the life of a run; None where out of reach.
 
-    Args:
-        device: armed, its zero taken.
-        posture: its name is the record's.
-        fields: of the record, besides what is measured.
+    The record has the posture's name, and ``fields`` besides what is measured.
     """
     run, name = device.run, posture.name
-    if name in (known := run.postures()):
-        return known[name]
+    if name in (measured := run.postures()):
+        return measured[name]
     if any(record["name"] == name for record in run.journal.events("unreachable")):
         return None
     device.requests.check_pause()

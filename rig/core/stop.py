@@ -64,9 +64,9 @@ def stop_all(drives: list[Drive]) -> list[UnitStop]:
     with bus.urgent():
         with bus.urgent(_quick_s(bus)):
             _broadcast(drives)
-            _round(pairs)
+            _send(pairs)
         for _ in range(ROUNDS - 1):
-            _round(pairs)
+            _send(pairs)
         _verify(pairs)
     return results
 
@@ -90,18 +90,15 @@ def _broadcast(drives: list[Drive]) -> None:
                 bus.broadcast(frame.address, frame.function, words)
 
 
-def _round(pairs: Pairs) -> None:
+def _send(pairs: Pairs) -> None:
+    """Stop those that have not acknowledged one."""
     for drive, result in _responsive_first(pairs):
         if not result.acknowledged:
-            _send(drive, result)
-
-
-def _send(drive: Drive, result: UnitStop) -> None:
-    try:
-        drive.stop()
-        result.acknowledged, result.detail = True, ""
-    except Exception as error:
-        result.detail = str(error)
+            try:
+                drive.stop()
+                result.acknowledged, result.detail = True, ""
+            except Exception as error:
+                result.detail = str(error)
 
 
 def _verify(pairs: Pairs) -> None:
@@ -118,8 +115,7 @@ def _verify(pairs: Pairs) -> None:
             except Exception as error:
                 result.detail = str(error)
                 continue
-            if not result.acknowledged:
-                _send(drive, result)
+            _send([(drive, result)])
             last = before.get(result.axis)
             still = last is not None and abs(status.position - last) <= STILL_COUNTS
             result.standing = still and not status.moving

@@ -161,15 +161,10 @@ class DeviceRecord:
         self._left = {}
         self.save()
 
-    def lost_sight(self, name: str) -> bool:
-        """A session armed the axis and did not say afterwards where it stands."""
-        pulses = self._left.get("pulses", {})
-        return name in pulses and pulses[name] is None
-
-    def left(self) -> dict[str, int]:
-        """Pulses at which the last session left the axes of which that is known."""
-        pulses = self._left.get("pulses", {})
-        return {name: count for name, count in pulses.items() if count is not None}
+    def left(self) -> dict[str, int | None]:
+        """Pulses at which the last session left each axis; None where it armed the axis
+        and did not say afterwards where it stands."""
+        return self._left.get("pulses", {})
 
     def left_homed(self) -> list[str]:
         """Names of the axes whose drives said then that they are homed."""

@@ -241,20 +241,16 @@ class RunFolder:
 
     def save_pairs(self) -> None:
         """Write pairs.csv: role, commands, measurements, scatter of every posture."""
-        import csv
-        import io
-
         from rig.config import AXIS_NAMES
 
         of_axes = ("pulses", "u_deg", "y_deg", "std_deg")
         columns = [f"{what}_{axis}" for what in of_axes for axis in AXIS_NAMES]
-        text = io.StringIO()
-        table = csv.writer(text, lineterminator="\n")
-        table.writerow(["name", "role", *columns, "samples"])
+        rows: list[list[Any]] = [["name", "role", *columns, "samples"]]
         for r in self.postures().values():
             values = r["pulses"] + r["commanded_deg"] + r["measured_deg"] + r["std_deg"]
-            table.writerow([r["name"], r.get("role", ""), *values, r["samples"]])
-        write_text(self.folder / "pairs.csv", text.getvalue())
+            rows.append([r["name"], r.get("role", ""), *values, r["samples"]])
+        text = "".join(",".join(map(str, row)) + "\n" for row in rows)
+        write_text(self.folder / "pairs.csv", text)
 
     def save_summary(self, summary: dict[str, Any]) -> None:
         """Write summary.json."""

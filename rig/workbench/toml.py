@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import json
 import pathlib
 import shutil
 from collections.abc import Mapping, Sequence
@@ -56,45 +55,6 @@ def set_values(text: str, values: Mapping[str, Any]) -> str:
     return tomlkit.dumps(document)
 
 
-HEAD = """\
-# Written by `jaxcal-rig setup`. Every key is described in docs/rig.md.
-# Calibrate with no patient attached; a hardware emergency stop is required.
-output = "runs"       # every run makes its own folder in here
-device = "device.json" # what was proved of this device
-"""
-AXIS = """
-[[axes]]
-name = "{name}"
-unit = {unit}
-map = "{family}"
-pulses_per_rev = {pulses} # omega: pulses for one motor turn, as set in the drive
-reduction = 1.0 # kappa: motor turns for one joint turn
-direction = 1 # -1 where positive pulses turn the joint the negative way
-rotates = "{letter}" # axis of the joint in the device's frame
-min_deg = -20 # soft limits
-max_deg = 20
-speed_deg_s = 10 # slow: there is no emergency stop in software
-accel_deg_s2 = 40
-"""
-IMU = """
-[imu]
-format = "{form}"
-transport = "listen" # the phone connects to this computer
-host = "0.0.0.0" # every address of this computer
-port = {port}
-"""
-OF_FORMAT = {
-    "hyperimu": "column_count = 4 # stamp, azimuth, pitch, roll\n",
-    "lines": 'order = "ZYX" # of the three angles in a line\n',
-    "sensorlogger": "stale_s = 1.0 # messages come in batches\n",
-}
-TAIL = """
-[mechanism]
-order = "ZXY" # axes of the joints from the base outwards
-
-[session]
-zero = "here" # the device stands in its zero posture when a session begins
-"""
 OF_LINE = ("device", "baudrate", "parity", "stopbits", "bytesize")
 
 
@@ -109,12 +69,14 @@ def new_text(
         form: of the phone's app.
         port: that the phone connects to.
     """
+    import jinja2
+
     keys = OF_LINE if bus.transport == "rtu" else ("host", "port")
-    table = "".join(f"{key} = {json.dumps(getattr(bus, key))}\n" for key in keys)
-    return (
-        f'{HEAD}\n[bus]\ntransport = "{bus.transport}"\n{table}'
-        + "".join(AXIS.format_map(axis) for axis in axes)
-        + IMU.format(form=form, port=port)
-        + OF_FORMAT[form]
-        + TAIL
+    text = pathlib.Path(__file__).with_name("new.toml.j2").read_text(encoding="utf-8")
+    template = jinja2.Template(
+        text,
+        trim_blocks=True,
+        keep_trailing_newline=True,
+        undefined=jinja2.StrictUndefined,
     )
+    return template.render(bus=dict(bus), keys=keys, axes=axes, form=form, port=port)

@@ -62,15 +62,15 @@ def collect(run: pathlib.Path, out: pathlib.Path) -> dict[str, Any]:
     return summary
 
 
-def thinned(metrics: dict[str, Array], most: int = MAX_ROWS) -> dict[str, Array]:
-    """The same run in at most ``most`` rows, each the mean of a block of updates.
+def thinned(metrics: dict[str, Array], max_rows: int = MAX_ROWS) -> dict[str, Array]:
+    """The same run in at most ``max_rows`` rows, each the mean of a block of updates.
 
     ``reward_std`` stays that of single episodes: within and between the updates of a
     block. Counts and times are those at the end of the block; what is measured
     occasionally is the block's last value.
     """
     count = len(metrics["episodes"])
-    if count <= most:
+    if count <= max_rows:
         return metrics
 
     def row(name: str, values: Array, block: NDArray[np.int64]) -> float:
@@ -84,7 +84,7 @@ def thinned(metrics: dict[str, Array], most: int = MAX_ROWS) -> dict[str, Array]
             return np.sqrt((own**2).mean() + metrics["reward_mean"][block].var())
         return own.mean()
 
-    blocks = np.array_split(np.arange(count), most)
+    blocks = np.array_split(np.arange(count), max_rows)
     return {
         name: np.array([row(name, values, block) for block in blocks])
         for name, values in metrics.items()

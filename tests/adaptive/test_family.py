@@ -190,3 +190,23 @@ def test_the_default_is_the_largest_share_where_time_or_uses_count():
     assert mine.design == next_measurement(counted, [(5, 0)], SHARES, **budget).design
     mine = next_measurement(free, [])
     assert mine.design == next_measurement(free, [], Gain()).design
+
+
+@pytest.mark.slow
+def test_deciding_matters_in_every_structure():
+    tasks = [
+        pad(draw(900 + seed, structure, limits=SHAPE), SHAPE)
+        for structure in ALL
+        for seed in range(6)
+    ]
+    whole = jax.tree.map(jnp.asarray, stack(tasks))
+    keys = jax.random.split(jax.random.key(4), 32)
+
+    @jax.jit
+    def nats(tasks, rule):
+        return jax.vmap(lambda task: play(task, rule, keys).gain.mean())(tasks)
+
+    shares = jax.tree.map(jnp.asarray, SHARES)
+    share = (nats(whole, Random()) / nats(whole, shares)).reshape(len(ALL), -1)
+    assert share.mean() < 0.7
+    assert (share.mean(axis=1) < 0.9).all(), share.mean(axis=1)

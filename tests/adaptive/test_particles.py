@@ -18,7 +18,7 @@ from benchmarks.tasks.prey import make_prey
 from jaxcal.adaptive.bounds import sace, spce
 from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.particles import ParticleTask, systematic
-from jaxcal.adaptive.rules import Gain, GainRate, Random
+from jaxcal.adaptive.rules import SHARES, Gain, GainRate, Random
 
 
 @struct.dataclass
@@ -373,3 +373,24 @@ def test_an_answer_that_no_particle_expects_is_survived():
 
 
 pytestmark = pytest.mark.slow  # minutes together
+
+
+@jax.jit
+def looked(task, key):
+    keys = jax.random.split(key, 3)
+    belief, session = task.begin(keys[0])
+    options = task.options(belief, session, keys[1])
+    chosen = SHARES(task, belief, session, options, keys[2])
+    return options.designs, belief.gains(task, options, keys[2]), chosen
+
+
+def test_shares_prices_time_on_particles():
+    task = ParticleTask.make(
+        Line(), 6, seconds=5.0, particles=200, candidates=32, contrasts=40
+    )
+    for key in jax.random.split(jax.random.key(3), 4):
+        designs, gains, chosen = jax.tree.map(np.asarray, looked(task, key))
+        share = np.minimum(np.abs(designs.astype(float)).sum(axis=1) / 5.0, 1.0)
+        score = gains.astype(float) / (1.0 / 6.0 + 1.4 * share)
+        assert score[chosen] > (1.0 - 1e-5) * score.max()
+        assert chosen != gains.argmax()

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 import jaxcal
+from jaxcal.models import SerialChain
 
-from ..models.arms import ur5
+from ..models.arms import CONTACTS, ur5
 
 ARM = ur5()
 WHOLE = ARM.with_misfit()
@@ -40,6 +41,16 @@ def test_what_no_parameter_explains_is_found(found, tmp_path):
     assert 0.85 < ((low <= exact) & (exact <= high)).mean() <= 1.0
 
 
+def test_a_table_on_file_is_that_of_a_fit_without_them(found, tmp_path):
+    given = jaxcal.identify(JOINTS, MEASURED, model=ARM, prior=ARM.default_prior())
+    tables = []
+    for name, fit in (("found", found), ("given", given)):
+        fit.to_dh(tmp_path / name)
+        lines = (tmp_path / name).read_text().splitlines()[1:]
+        tables.append([[float(x) for x in line.split(",")[1:]] for line in lines])
+    np.testing.assert_allclose(tables[0], tables[1], atol=1e-4)
+
+
 def test_it_is_the_fit_of_the_arm_that_has_them_as_parameters(found):
     """The same prior and sizes, another order of the parameters."""
     fit = jaxcal.identify(JOINTS, MEASURED, model=WHOLE, prior=WHOLE.default_prior())
@@ -70,3 +81,15 @@ def test_the_choice_has_them_too_unless_a_prior_is_given():
     rows = slopes.reshape(-1, 39) / noise
     expected = np.einsum("ri,ij,rj->", rows, inverse, rows) / len(rows)
     assert plain.value == pytest.approx(expected, rel=1e-6)
+
+
+def test_what_is_written_to_a_urdf_file_is_what_is_predicted(tmp_path):
+    arm = SerialChain.from_urdf(CONTACTS / "panda.urdf", tip="ball_link")
+    joints = RNG.uniform(*np.clip(arm.limits, -60.0, 60.0).T, (30, 7))
+    std = np.asarray(arm.default_prior().std)
+    truth = arm.nominal + 0.3 * std * RNG.normal(size=len(std))
+    measured = arm.predict(joints, truth) + 1e-4 * RNG.normal(size=(30, 3))
+    fit = jaxcal.identify(joints, measured, model=arm)
+    tip = fit.to_urdf(tmp_path / "arm.urdf")
+    again = SerialChain.from_urdf(tmp_path / "arm.urdf", tip=tip)
+    np.testing.assert_allclose(again.predict(joints), fit.predict(joints), atol=1e-9)

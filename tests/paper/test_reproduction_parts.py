@@ -36,7 +36,7 @@ def test_mean_interval_is_students(rng: np.random.Generator) -> None:
     low, high = stats.t.interval(0.95, 16, loc=sample.mean(), scale=stats.sem(sample))
     found = mean_interval(sample)
     assert (found.low, found.high) == pytest.approx((low, high))
-    assert found.n == 17 and mean_interval(sample, most=3.1).high <= 3.1
+    assert found.n == 17 and mean_interval(sample, upper_limit=3.1).high <= 3.1
 
 
 @pytest.mark.parametrize(("hits", "count"), [(0, 20), (7, 20), (20, 20)])

@@ -239,7 +239,7 @@ def run_cell(
         imu = changed(served.imu, stale_s=hasty.imu.stale_s)
         spoilt = changed(served, bus=bus, imu=imu)
         code = first = session(spoilt, folder, sim, said, [listen])
-        assert done, f"the session never entered {phase}"
+        assert done, f"the session never entered {phase}: {code}, {said[-3:]}"
         reason = next((s for s in reversed(said) if s.startswith("fault:")), "")
         deaf = spec is not None and spec.kind in DEAF
         check_invariants(folder, sim, alive=True, deaf=deaf)

@@ -16,7 +16,7 @@ import time
 from unittest import mock
 
 from rig.config import RigConfig, parse_config
-from rig.config.files import EXAMPLES
+from rig.config.config import EXAMPLES
 from rig.core import stop
 from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord
 from rig.journal.lock import BusLock

@@ -63,7 +63,7 @@ def test_calibrate_simulate_takes_a_device_from_the_bus_to_its_calibration(
 )
 def test_every_example_calibrates_on_the_simulator(name, tmp_path):
     """Each map, and HyperIMU, Sensor Logger and a line stream in client mode."""
-    from rig.config.files import EXAMPLES
+    from rig.config.config import EXAMPLES
 
     code = main(["calibrate", "--simulate", "--speedup", "20", "--out", str(tmp_path),
                  "--config", str(EXAMPLES / f"{name}.toml")])  # fmt: skip

@@ -47,7 +47,8 @@ def joint_behind(path, width):
 @pytest.mark.parametrize("direction", [1.0, -1.0])
 def test_the_shift_brings_a_joint_to_where_the_calibration_means(below, direction):
     """For a calibration from below, 0 of the joint is a drive at half the play."""
-    play = Play({"yaw": found()}, from_below=below)
+    kept = {CHARACTERISED: {"yaw": found()}, "approach_overshoot_deg": float(below)}
+    play = Play.of(kept)
     meant = joint_behind([-9.0, 2.0], WIDTH) if below else 2.0
     command = 2.0 + play.shift(np.array([1.0, direction, 1.0]))
     assert joint_behind([-9.0 * direction, command[1]], WIDTH) == pytest.approx(meant)

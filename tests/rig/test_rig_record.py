@@ -98,9 +98,13 @@ def test_a_fingerprint_is_the_same_once_it_was_json():
 
 def test_where_the_drives_were_left(record):
     record.left_at((10, None, -3))
-    assert DeviceRecord.load(record.path).left() == {"pitch": 10, "roll": -3}
+    assert DeviceRecord.load(record.path).left() == {
+        "pitch": 10,
+        "yaw": None,
+        "roll": -3,
+    }
     record.left_at()
-    assert DeviceRecord.load(record.path).left() == {}
+    assert set(DeviceRecord.load(record.path).left().values()) == {None}
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"schema": 2}', "\x00"])

@@ -8,7 +8,7 @@ from harness import fast_text
 
 from rig.__main__ import main
 from rig.config import ConfigError, parse_config
-from rig.config.files import EXAMPLES
+from rig.config.config import EXAMPLES
 from rig.simulator.drive import DriveException
 from rig.workbench.commission.scan import parse_bus
 from rig.workbench.toml import edit, set_values

@@ -262,7 +262,7 @@ def test_stop_ends_the_session_that_moves_and_then_stops_every_unit(
     assert all(len(drive.stops) >= 2 for drive in rig.drives)
 
 
-LOADS = "import rig.core.stop, rig.core.drive, rig.config.files"
+LOADS = "import rig.core.stop, rig.core.drive, rig.config.config"
 
 
 @pytest.mark.parametrize("transport", ["tcp", "rtu"])
@@ -462,14 +462,15 @@ def test_a_reader_that_went_away_does_not_keep_it_from_stopping(rig):
 
 def test_a_handler_only_sets_a_flag_and_the_loop_says_it():
     said = []
-    with Signals() as signals:
-        signals.report = said.append
+    with Signals() as signals, bench() as motion:
+        motion.device.requests = signals
+        motion.device.emit = lambda event, **fields: said.append(event)
         signals.armed = True
         signal.raise_signal(signal.SIGINT)
         assert signals.pause and not said
-        signals.tell()
-        signals.tell()
-        assert len(said) == 1 and "pausing" in said[0]
+        motion.device.guard()
+        motion.device.guard()
+        assert said == ["pausing"]
         signals.armed, signals.ending = False, True
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.raise_signal(number)  # while the run ends: nothing is raised

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from rig.__main__ import main
 from rig.config import ConfigError, load_config, parse_config
-from rig.config.files import EXAMPLES
+from rig.config.config import EXAMPLES
 from rig.core import proof
 from rig.core.faults import MotionFault, Refused
 from rig.core.proof import GROWTH, Reach

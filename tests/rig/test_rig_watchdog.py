@@ -12,7 +12,7 @@ from harness import HASTY, changed, fast_config, fast_text, session
 from test_rig_motion import bench
 
 from rig.config import load_config, parse_config
-from rig.config.files import EXAMPLES
+from rig.config.config import EXAMPLES
 from rig.config.registers import decode
 from rig.core import stop
 from rig.core.device import timeouts_left

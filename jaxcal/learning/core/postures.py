@@ -154,10 +154,11 @@ class Postures:
             decisions.append(decision)
             records.append(record)
 
-        played = _stacked(records)  # leaves (K, G)
+        stack = functools.partial(jax.tree.map, lambda *leaves: jnp.stack(leaves))
+        played = stack(*records)  # leaves (K, G)
         advantage, target = self._advantages_and_targets(played)
         # The last choices, made by the look-ahead alone, are not learned from.
-        later = _stacked(decisions[1:learned]) if learned > 1 else None
+        later = stack(*decisions[1:learned]) if learned > 1 else None
         batch = Batch(
             seen=Seen(features, decisions[0], later),
             action=played["action"][:learned],
@@ -184,7 +185,3 @@ class Postures:
             baseline = (target[0].sum() - target[0]) / others
             advantage = advantage.at[0].set(target[0] - baseline)
         return advantage, target
-
-
-def _stacked(trees: list[Any]) -> Any:
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)

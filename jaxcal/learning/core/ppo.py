@@ -110,7 +110,7 @@ def advantages(
 
 def normalised(config: PPOConfig, batch: Batch) -> Batch:
     """Advantages with mean 0 and scale 1 over the batch, then clipped."""
-    axes = tuple(axis for axis in range(batch.advantage.ndim) if axis != 1)
+    axes = 0, *range(2, batch.advantage.ndim)
     over = axes if config.normalise_per_decision else None
     centred = batch.advantage - batch.advantage.mean(over, keepdims=True)
     scaled = centred / (jnp.sqrt((centred**2).mean(over, keepdims=True)) + 1e-6)
@@ -220,12 +220,9 @@ def descend(config: PPOConfig, state: TrainState, grads: Any) -> TrainState:
     # The share of the newest weights in a mean whose weights decay and add up to one:
     # 1 at the first step, so that nothing of the initial weights stays.
     decay, count = config.average_decay, opt_state[0].count
-    average = optax.incremental_update(
-        params, state.average, (1.0 - decay) / (1.0 - decay**count)
-    )
-    return dataclasses.replace(
-        state, params=params, average=average, opt_state=opt_state
-    )
+    share = (1.0 - decay) / (1.0 - decay**count)
+    average = optax.incremental_update(params, state.average, share)
+    return TrainState(params, average, opt_state, state.key, state.num_updates)
 
 
 def placed(tree: Any, mesh: Mesh | None, *axes: str) -> Any:
@@ -261,7 +258,6 @@ def make_update(
         keys = jax.random.split(key_rows, config.rows_per_update)
         rows, played = learner.gather(state.params, placed(keys, mesh, "sets"), *given)
         rows = placed(rows, mesh)
-        num_rows = len(jax.tree.leaves(rows)[0])
 
         def step(state: TrainState, index: jax.Array) -> tuple[TrainState, Metrics]:
             def gradient(part: jax.Array) -> tuple[Any, Metrics]:
@@ -276,16 +272,14 @@ def make_update(
             return descend(config, state, grads), metrics
 
         def epoch(state: TrainState, key: jax.Array) -> tuple[TrainState, Metrics]:
-            order = jax.random.permutation(key, num_rows)
+            order = jax.random.permutation(key, len(jax.tree.leaves(rows)[0]))
             return jax.lax.scan(step, state, order.reshape(config.num_minibatches, -1))
 
         keys = jax.random.split(key_epochs, config.num_epochs)
         state, losses = jax.lax.scan(epoch, state, keys)
-        state = dataclasses.replace(
-            state, key=jax.random.key_data(key), num_updates=state.num_updates + 1
-        )
-        metrics = played | {name: value.mean() for name, value in losses.items()}
-        return placed((state, metrics), mesh)
+        later = {"key": jax.random.key_data(key), "num_updates": state.num_updates + 1}
+        state = dataclasses.replace(state, **later)
+        return placed((state, played | jax.tree.map(jnp.mean, losses)), mesh)
 
     return update
 

@@ -137,14 +137,13 @@ class Streams:
         row = jax.tree.map(lambda leaf: leaf[:-1], every)
         goes_on = 1.0 - row["ended"]
         following = row["chance"] * goes_on * every["value"][1:] + row["others"]
-        advantage = advantages(
-            self.config, row["reward"], row["value"], following, goes_on
-        )
+        reward, value = row["reward"], row["value"]
+        advantage = advantages(self.config, reward, value, following, goes_on)
         batch = Batch(
             seen=row["seen"],
             action=row["action"],
             log_prob=row["log_prob"],
             advantage=advantage,
-            target=advantage + row["value"],
+            target=advantage + value,
         )
         return batch, every["reward"], every["ended"]

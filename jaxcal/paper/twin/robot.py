@@ -26,7 +26,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers, one_of
-from jaxcal.paper.twin.attitude import ORDERS, angles_of, rotation_of
 
 __all__ = ["ORDERS", "RobotConfig", "joint_angles", "measure", "play", "read_out"]
 
@@ -35,6 +34,7 @@ Triple = tuple[float, float, float]
 PerAxis = float | Triple
 """One number for all axes, or pitch, yaw and roll"""
 
+ORDERS = ("XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYX")  # of turns, the outermost first
 GRAVITY = 9.81  # m/s^2, along -y
 _NEWTON_STEPS = 6  # of the sag; it converges quadratically
 _PER_AXIS = (
@@ -197,6 +197,61 @@ def play(joints_deg: jax.Array, gap_deg: jax.Array, start_deg: jax.Array) -> jax
     return jax.lax.scan(drag, start_deg, joints_deg)[1]
 
 
+# -- rotations -------------------------------------------------------------------------
+# A matrix R is (3, 3) and takes vectors of the body to the fixed frame. An order such
+# as "YXZ" is intrinsic: R = Ry(a) Rx(b) Rz(c). Angles are kept by axis, whatever the
+# order of the turns; so an order never changes which number is pitch.
+
+
+def _rotation_of(angles_deg: jax.Array, order: str) -> jax.Array:
+    """Rotation of three angles.
+
+    Args:
+        angles_deg: (3,) degrees about x, y and z.
+        order: one of ``ORDERS``, outermost turn first.
+
+    Returns:
+        (3, 3).
+    """
+    first, second, third = (_about(axis, angles_deg[axis]) for axis in _axes(order))
+    return first @ second @ third
+
+
+def _angles_of(matrix: jax.Array, order: str) -> jax.Array:
+    """Angles of a rotation: the inverse of ``_rotation_of`` for a middle angle < 90.
+
+    Args:
+        matrix: (3, 3).
+        order: one of ``ORDERS``, outermost turn first.
+
+    Returns:
+        (3,) degrees about x, y and z; that of the middle turn lies in [-90, 90].
+    """
+    i, j, k = _axes(order)
+    sign = 1.0 if (j - i) % 3 == 1 else -1.0
+    outer = jnp.arctan2(-sign * matrix[j, k], matrix[k, k])
+    middle = jnp.arcsin(jnp.clip(sign * matrix[i, k], -1.0, 1.0))
+    inner = jnp.arctan2(-sign * matrix[i, j], matrix[i, i])
+    turns = {i: outer, j: middle, k: inner}
+    return jnp.rad2deg(jnp.stack([turns[axis] for axis in range(3)]))
+
+
+def _axes(order: str) -> tuple[int, int, int]:
+    i, j, k = ("XYZ".index(letter) for letter in order)
+    return i, j, k
+
+
+def _about(axis: int, angle_deg: jax.Array) -> jax.Array:
+    angle = jnp.deg2rad(angle_deg)
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    j, k = (axis + 1) % 3, (axis + 2) % 3
+    rows = [[jnp.zeros_like(angle)] * 3 for _ in range(3)]
+    rows[axis][axis] = jnp.ones_like(angle)
+    rows[j][j] = rows[k][k] = cos
+    rows[k][j], rows[j][k] = sin, -sin
+    return jnp.stack([jnp.stack(row) for row in rows])
+
+
 # -- one posture -----------------------------------------------------------------------
 
 
@@ -215,7 +270,7 @@ def _bent(config: RobotConfig, target_deg: jax.Array) -> jax.Array:
     offset = jnp.asarray(config.load_offset_m, dtype)
 
     def potential(joints: jax.Array) -> jax.Array:
-        turned = rotation_of(jnp.rad2deg(joints), config.mechanism_order)
+        turned = _rotation_of(jnp.rad2deg(joints), config.mechanism_order)
         return config.load_kg * GRAVITY * (turned[1] @ offset)
 
     target = jnp.deg2rad(target_deg)
@@ -231,11 +286,11 @@ def _bent(config: RobotConfig, target_deg: jax.Array) -> jax.Array:
 
 def _seen(config: RobotConfig, joints_deg: jax.Array) -> jax.Array:
     """(3,) angles that the phone reads at joints (3,)."""
-    turned = rotation_of(joints_deg, config.mechanism_order)
+    turned = _rotation_of(joints_deg, config.mechanism_order)
     if any(config.mounting_deg):
-        phone = rotation_of(jnp.asarray(config.mounting_deg, joints_deg.dtype), "XYZ")
+        phone = _rotation_of(jnp.asarray(config.mounting_deg, joints_deg.dtype), "XYZ")
         turned = phone.T @ turned @ phone
-    return angles_of(turned, config.read_out_order)
+    return _angles_of(turned, config.read_out_order)
 
 
 # -- many ------------------------------------------------------------------------------

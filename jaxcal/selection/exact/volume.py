@@ -14,6 +14,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal import compiled
 from jaxcal.selection.exact.volume_kernel import descend
 
 __all__ = ["Volumes", "largest_volumes"]
@@ -23,7 +24,8 @@ Indices = NDArray[np.int64]
 
 _PREPARED = 100_000_000  # subsets from which a known volume is worth its time
 _STEPS = 5  # towards the D-optimal weights
-_STARTS = 4  # climbs to a known volume
+_STARTS = 4  # random ones of climbs to a known volume, beside a greedy one, which
+_SHARE = 0.2  # counts this share of mean vectors for those not chosen yet
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,37 +94,18 @@ def largest_volumes(
 
 
 def _climbed(vectors: Array) -> Indices:
-    """(q,) vectors of large volume, by swapping one at a time from a few starts.
-
-    Row i of ``vectors @ inverse(chosen)`` holds the factors by which the volume grows
-    when vector i replaces each of the chosen (Goreinov et al., How to find a good
-    submatrix, 2010).
+    """(q,) vectors of large volume by exchange: its square is det of their information.
 
     Args:
         vectors: (h, q) of rank q, with orthonormal columns.
     """
-    h, q = vectors.shape
-    rng = np.random.default_rng(0)
-    farthest, rest = [], vectors
-    for _ in range(q):
-        farthest.append(int((rest * rest).sum(axis=1).argmax()))
-        axis = rest[farthest[-1]] / np.linalg.norm(rest[farthest[-1]])
-        rest = rest - np.outer(rest @ axis, axis)
-    found, largest = np.array(farthest), 0.0
-    for start in range(_STARTS):
-        chosen = rng.permutation(h)[:q] if start else found.copy()
-        if start and abs(np.linalg.det(vectors[chosen])) < 1e-6 * largest:
-            continue
-        for _ in range(10 * q):
-            factors = np.abs(np.linalg.solve(vectors[chosen].T, vectors.T))
-            out, new = divmod(int(factors.argmax()), h)
-            if factors[out, new] <= 1.0 + 1e-9:
-                break
-            chosen[out] = new
-        volume = float(abs(np.linalg.det(vectors[chosen])))
-        if volume > largest:
-            found, largest = chosen, volume
-    return found
+    kernel = compiled.kernel("jaxcal.selection.exchange.kernel")
+    q, none = vectors.shape[1], np.zeros(0, dtype=np.int64)
+    blocks = np.ascontiguousarray(vectors[:, None])
+    nothing, unit = np.zeros((q, q)), np.eye(q)
+    climber = kernel.Climber(kernel.DET, blocks, nothing, unit, 1, none, q, 0)
+    chosen, phi = climber.climb(none, _SHARE, 1, math.inf)
+    return np.asarray(climber.random_climbs(_STARTS, chosen, phi, math.inf)[0])
 
 
 def _evened(vectors: Array, kept: Indices) -> tuple[Array, float]:

@@ -13,7 +13,7 @@ import numpy as np
 from cython.cimports.jaxcal.watch import Watch, begin, late
 from cython.cimports.libc.math import INFINITY, exp, log, sqrt
 
-__all__ = ["CLOSE", "conditional", "describe", "look_ahead"]
+__all__ = ["CLOSE", "describe", "look_ahead"]
 
 CLOSE = (32.0, 256.0, 2048.0)  # scales at which near-equal look-aheads differ
 
@@ -161,24 +161,6 @@ def _features(
             features[j, d] = exp(max(_close[d - 13] * values[3, j], -80.0))
 
 
-def conditional(x, chosen, active, k):
-    """(p, M) what is left of every active candidate once some are chosen, 0 elsewhere.
-
-    With k = p every choice is a new direction, which leaves the other candidates. With
-    more, the result is in the metric of the chosen, ``|y_i|^2 = x_i.T G^-1 x_i`` with
-    ``G = C.T C + ridge I``: each choice shortens its direction.
-
-    Args:
-        x: (p, M).
-        chosen: (c,) int64.
-        active: (M,) bool.
-        k: choices in all.
-    """
-    y = np.empty_like(x)
-    _conditional(x, chosen, active.view(np.uint8), k, y, np.empty(x.shape[1]))
-    return y
-
-
 @cython.cfunc
 @cython.nogil
 @cython.exceptval(check=False)
@@ -190,7 +172,12 @@ def _conditional(
     y: cython.double[:, ::1],
     inner: cython.double[::1],
 ) -> cython.void:
-    """``conditional`` into y, with M numbers of work."""
+    """y (p, M): what is left of every active candidate after the choices, else 0.
+
+    With k = p every choice is a new direction, which leaves the other candidates. With
+    more, the result is in the metric of the chosen, ``|y_i|^2 = x_i.T G^-1 x_i`` with
+    ``G = C.T C + ridge I``: each choice shortens its direction. ``inner`` is (M,) room.
+    """
     p, m = x.shape[0], x.shape[1]
     least = _RIDGE if chosen.shape[0] < p else _LEAST_RIDGE
     shrink = 1.0 / sqrt(least) if k > p else 1.0

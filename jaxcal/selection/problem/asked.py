@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import numbers
+from jaxcal.checks import array_of, numbers
 from jaxcal.information.blocks import coarseness
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, by_name
@@ -22,6 +22,7 @@ from jaxcal.selection.problem.making import Rules, whitened_problems
 from jaxcal.selection.problem.problem import Problem
 from jaxcal.selection.problem.rules import (
     check_available,
+    filled,
     one_array,
     usable_numbers,
 )
@@ -69,12 +70,7 @@ class Asked:
             )
         _require_kind("prior", prior, Prior)
         candidates = by_name(model, candidates)
-        array = numbers("candidates", candidates, finite=False)
-        if array.ndim != 2 or 0 in array.shape:
-            raise ValueError(
-                f"candidates must have shape (M, n), neither of them 0, "
-                f"got {array.shape}"
-            )
+        array = filled("candidates", candidates, "M", "n")
         self.model = Affine(array.shape[1], array.shape[1]) if model is None else model
         if isinstance(model, Affine) and array.shape[1] != model.num_inputs:
             raise ValueError(
@@ -120,24 +116,17 @@ class Asked:
             raise ValueError(
                 "prior must be a (p, p) precision with blocks, got a Prior"
             )
-        array = numbers("blocks", blocks, finite=False)
-        if array.ndim != 3 or 0 in array.shape:
-            raise ValueError(
-                f"blocks must have shape (M, q, p) with none of them 0, got "
-                f"{array.shape}"
-            )
+        array = filled("blocks", blocks, "M", "q", "p")
         asked = object.__new__(cls)
         asked.model, asked.candidates = None, None
         asked.available = check_available(available, array.shape[:1])
         asked._blocks = usable_numbers("blocks", array, asked.available)
         asked._coarse = coarseness(blocks)
         if commands is not None:
-            asked.candidates = numbers("commands", commands)
-            if asked.candidates.ndim != 2 or len(asked.candidates) != len(array):
-                raise ValueError(
-                    f"commands must have shape ({len(array)}, n), one for each block, "
-                    f"got {asked.candidates.shape}"
-                )
+            rule = ", one for each block"
+            asked.candidates = array_of(
+                "commands", commands, len(array), "n", rule=rule
+            )
         asked._set_rules(prior, noise, measured, required, max_replicates)
         asked.names, asked.axes = _labels(array, names)
         return asked

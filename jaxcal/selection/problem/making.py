@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import axis_names, numbers, whole_number
+from jaxcal.checks import axis_names, whole_number
 from jaxcal.information.blocks import coarseness, missing_directions, whiten
 from jaxcal.information.excitation import directions_in_words, require_excited
 from jaxcal.models.affine import Affine
@@ -19,6 +19,7 @@ from jaxcal.selection.problem.rules import (
     check_counts,
     check_k,
     check_required_rank,
+    filled,
     in_set,
     usable_numbers,
 )
@@ -66,11 +67,7 @@ def make_problems(
     Raises:
         ValueError: naming the argument, the rule and the value.
     """
-    array = numbers("candidates", candidates, finite=False)
-    if array.ndim != 3 or 0 in array.shape:
-        raise ValueError(
-            f"candidates must have shape (B, M, n), none of them 0, got {array.shape}"
-        )
+    array = filled("candidates", candidates, "B", "M", "n")
     mask = check_available(available, array.shape[:2])
     array = usable_numbers("candidates", array, mask)
     m = array.shape[2] if num_outputs is None else num_outputs

@@ -73,16 +73,6 @@ class Problem:
         return self.blocks.shape[2]
 
     @property
-    def num_outputs(self) -> int:
-        """m of the affine model: its multiplicity."""
-        return self.multiplicity
-
-    @property
-    def num_parameters(self) -> int:
-        """Size of the whole information matrix S."""
-        return self.multiplicity * self.num_regressors
-
-    @property
     def subject(self) -> str:
         """The argument that errors are about."""
         return "blocks" if self.model is None else "candidates"

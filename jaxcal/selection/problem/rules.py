@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import require_finite, require_none, whole_number
+from jaxcal.checks import array_of, require_finite, require_none, whole_number
 from jaxcal.information.blocks import SINGULAR, largest_rank, rank_of_blocks
 from jaxcal.selection.problem.problem import Problem
 
@@ -16,6 +16,7 @@ __all__ = [
     "check_counts",
     "check_k",
     "check_required_rank",
+    "filled",
     "in_set",
     "one_array",
     "usable_numbers",
@@ -24,6 +25,18 @@ __all__ = [
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+
+_FILLED = ", none of them 0"
+
+
+def filled(name: str, values: ArrayLike, *letters: str) -> Array:
+    """``values`` as float64 with an axis for each letter, none of them empty."""
+    array = array_of(name, values, *letters, rule=_FILLED, finite=False)
+    if 0 in array.shape:
+        raise ValueError(
+            f"{name} must have shape ({', '.join(letters)}){_FILLED}, got {array.shape}"
+        )
+    return array
 
 
 def usable_numbers(name: str, array: Array, mask: Mask) -> Array:

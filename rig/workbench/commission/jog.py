@@ -42,7 +42,6 @@ class Keyboard:
 
 
 ARROWS = {"\x1b[A": "+", "\x1b[C": "+", "\x1b[B": "-", "\x1b[D": "-"}
-MOST_STEP_DEG = 3.0
 HOLD_DEG = 30.0  # a held key goes at most so far at a time
 FIRST_S = 0.7  # a keyboard repeats a held key after up to so long,
 REPEAT_S = 0.2  # and then at least so often: released when it is silent for longer

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import time
 from collections.abc import Callable
 
+from rig.config.axis import Axis
 from rig.config.maps import RegisterMap, available_maps, load_map
-from rig.config.registers import Read, decode
 from rig.config.schema import ConfigError, parse
 from rig.config.settings import BusSettings
 from rig.core.bus import Bus, BusError, Rejected
+from rig.core.drive import Drive
 from rig.journal import BusLock
 
 # For each absent unit, three times; a drive answers within 25 ms at 9600 baud.
@@ -48,35 +50,31 @@ def parse_bus(text: str) -> BusSettings:
         ConfigError: not such a text, or settings that cannot be.
     """
     transport, _, rest = text.partition(":")
-    lines = [f'transport = "{transport}"']
+    found: dict[str, str | int] = {"transport": transport}
     try:
         if transport == "rtu":
-            device, *line = rest.split(",")
-            lines.append(f'device = "{device}"')
-            parity = [word for word in line[1:] if word in PARITIES]
-            bits = [int(word) for word in line[1:] if word not in PARITIES]
-            data = [bit for bit in bits if bit > 2]
-            stop = [bit for bit in bits if bit <= 2]
-            if max(len(parity), len(data), len(stop)) > 1:
-                raise ValueError
-            lines += [f"baudrate = {int(line[0])}"] if line else []
-            lines += [f'parity = "{word}"' for word in parity]
-            lines += [f"bytesize = {bit}" for bit in data]
-            lines += [f"stopbits = {bit}" for bit in stop]
+            found["device"], *line = rest.split(",")
+            for place, word in enumerate(line):
+                value = word if word in PARITIES else int(word)
+                name = "baudrate" if place == 0 else "parity"
+                if place and isinstance(value, int):
+                    name = "stopbits" if value < 3 else "bytesize"
+                if name in found:
+                    raise ValueError
+                found[name] = value
         elif transport in ("tcp", "rtu_tcp"):
-            host, _, port = rest.rpartition(":") if ":" in rest else (rest, "", "")
-            lines.append(f'host = "{host}"')
-            lines += [f"port = {int(port)}"] if port else []
+            found["host"], _, port = rest.partition(":")
+            if port:
+                found["port"] = int(port)
         else:
             raise ValueError
     except ValueError:
-        raise ConfigError(
-            "--bus",
-            [
-                "must be tcp:HOST[:PORT], rtu_tcp:HOST[:PORT] or "
-                f"rtu:DEVICE[,BAUD[,PARITY[,BITS[,STOPBITS]]]], got {text!r}"
-            ],
-        ) from None
+        must = (
+            "must be tcp:HOST[:PORT], rtu_tcp:HOST[:PORT] or rtu:DEVICE[,BAUD[,PARITY"
+        )
+        fault = f"{must}[,BITS[,STOPBITS]]]], got {text!r}"
+        raise ConfigError("--bus", [fault]) from None
+    lines = (f"{name} = {json.dumps(value)}" for name, value in found.items())
     return parse(BusSettings, "\n".join(lines), "--bus")
 
 
@@ -121,11 +119,11 @@ def scan(
 def _ask(bus: Bus, unit: int, known: list[RegisterMap]) -> Found | None:
     """What a unit is; None where it is silent, or a gateway says that it is."""
     there = False
-    fitting: list[tuple[tuple[int, int], RegisterMap, dict[str, int]]] = []
+    fitting: list[tuple[tuple[int, int], Drive, dict[str, int]]] = []
     for each in known:
+        drive = Drive(bus, Axis.unmoved("", unit, each))
         try:
-            _read(bus, unit, each.status, each.word_order)
-            _read(bus, unit, each.position, each.word_order)
+            drive.status(RETRIES)
         except Rejected as refusal:
             there |= refusal.code not in ABSENT
             continue
@@ -134,43 +132,23 @@ def _ask(bus: Bus, unit: int, known: list[RegisterMap]) -> Found | None:
                 return None
             continue
         there = True
-        identity = _identity(bus, unit, each)
-        told = {name for name in each.recognise if name in identity}
-        if all(_within(each, name, identity[name]) for name in told):
+        identity: dict[str, int] = {}
+        with contextlib.suppress(BusError):  # registers that a model lacks are left out
+            told = drive.identity().items()
+            identity = {name: value for name, value in told if isinstance(value, int)}
+        proofs = [
+            (identity[n], *each.recognise[n]) for n in each.recognise if n in identity
+        ]
+        if all(low <= value <= high for value, low, high in proofs):
             # Registers that are not there read as 0 in some drives.
-            proved = sum(identity[name] != 0 for name in told)
-            fitting.append(((proved, len(identity)), each, identity))
+            proved = sum(value != 0 for value, *_ in proofs)
+            fitting.append(((proved, len(identity)), drive, identity))
     if not fitting:
         return Found(unit, (), {}) if there else None
     fitting.sort(key=lambda one: one[0], reverse=True)
     _, first, identity = fitting[0]
-    names = tuple(each.name for _, each, _ in fitting)
-    return Found(unit, names, identity, _told(bus, unit, first))
-
-
-def _within(each: RegisterMap, name: str, value: int) -> bool:
-    low, high = each.recognise[name]
-    return low <= value <= high
-
-
-def _identity(bus: Bus, unit: int, each: RegisterMap) -> dict[str, int]:
-    """Values of the identity registers; those that a model lacks are left out."""
-    values = {}
-    for name, read in each.identity.items():
-        with contextlib.suppress(BusError):
-            values[name] = _read(bus, unit, read, each.word_order)
-    return values
-
-
-def _told(bus: Bus, unit: int, each: RegisterMap) -> int | None:
-    """Pulses for one turn by the drive's own word."""
-    if each.pulses_per_rev is None:
-        return None
+    names = tuple(drive.axis.map.name for _, drive, _ in fitting)
+    pulses = None
     with contextlib.suppress(BusError):
-        return _read(bus, unit, each.pulses_per_rev, each.word_order) or None
-    return None
-
-
-def _read(bus: Bus, unit: int, read: Read, word_order: str) -> int:
-    words = bus.read_words(unit, read.address, read.count)
-    return decode(words, read.type, word_order)
+        pulses = first.pulses_per_rev()
+    return Found(unit, names, identity, pulses)

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 from jaxcal.files import write_text
 from rig.config import AXIS_NAMES, RigConfig, load_config, parse_config
 from rig.config.axis import DEFAULT_ROTATES
-from rig.config.settings import BusSettings
 from rig.core.faults import EXIT_OK, Refused
 from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, ZEROED
 from rig.workbench.commission import steps
@@ -92,7 +91,9 @@ def write_config(path: pathlib.Path, given: Given, operator: Operator) -> RigCon
     lines = serial_lines()
     for line in lines or ["no serial port on this computer"]:
         say(f"  {line}")
-    bus = _ask_bus(given, operator, lines)
+    default = f"rtu:{lines[0].partition(':')[0]},115200,N,8,1" if lines else ""
+    question = "bus, as rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT"
+    bus = parse_bus(given.bus or operator.ask(question, default))
     say(f"2 scan: units 1 to {given.units} on {bus.where}; reads only")
     found = scan(bus, given.units, lambda text: say(f"  {text}"))
     say("3 axes: which unit drives which joint. Step 8 checks it by moving them")
@@ -114,14 +115,6 @@ def write_config(path: pathlib.Path, given: Given, operator: Operator) -> RigCon
     operator.confirm(f"setup writes {path}", "write")
     write_text(path, text)
     return config
-
-
-def _ask_bus(given: Given, operator: Operator, lines: list[str]) -> BusSettings:
-    default = ""
-    if lines:
-        default = f"rtu:{lines[0].partition(':')[0]},115200,N,8,1"
-    question = "bus, as rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT"
-    return parse_bus(given.bus or operator.ask(question, default))
 
 
 def _ask_axes(
@@ -149,14 +142,9 @@ def _ask_axes(
         pulses = each.pulses_per_rev or int(
             operator.number(f"{name}: pulses for one motor turn", 10000)
         )
+        letter = DEFAULT_ROTATES[name]
         axes.append(
-            {
-                "name": name,
-                "letter": DEFAULT_ROTATES[name],
-                "unit": unit,
-                "family": family,
-                "pulses": pulses,
-            }
+            dict(name=name, letter=letter, unit=unit, family=family, pulses=pulses)
         )
     return axes
 

@@ -33,7 +33,7 @@ from rig.journal.lock import BusLock
 from rig.workbench.commission.axes import check_axes
 from rig.workbench.commission.findings import Change
 from rig.workbench.commission.home import can_home, home, identity, unlimited, zero
-from rig.workbench.commission.jog import MOST_STEP_DEG, by_keyboard, step
+from rig.workbench.commission.jog import by_keyboard, step
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.phone import Stream, addresses_text, watch
 from rig.workbench.outputs.console import listen
@@ -170,16 +170,15 @@ def go_home(place: Place, here: bool) -> int:
             f"the map {', '.join(sorted(without))} knows no homing. Put the device "
             "into its home posture and use --here"
         )
-    place.say(
-        "the drives are armed; keep out of the device's reach, hand on the emergency "
-        "stop"
-    )
+    what = "nothing moves; where the device stands becomes the origin of its counts"
+    if not here:
+        what = (
+            f"the drives run their own homing one after another, {', '.join(names)}, "
+        )
+        what += "as far and as fast as they are set to"
     place.operator.confirm(
-        "home: nothing moves; where the device stands now becomes the origin of its "
-        "counts"
-        if here
-        else "home: the drives run their own homing one after another, "
-        f"{', '.join(names)}, as far and as fast as they are set to",
+        "home: the drives are armed; keep out of the device's reach, hand on the "
+        f"emergency stop; {what}",
         "home",
     )
     return place.run("home", lambda run, dev: home(run, dev, here), limits=False)
@@ -191,8 +190,6 @@ def jog(place: Place, axis: int, way_deg: float | None) -> int:
     name = AXIS_NAMES[axis]
     if way_deg is None and (place.operator.yes or not sys.stdin.isatty()):
         raise Refused(f"jog {name}: holding a key needs a terminal; give a step in deg")
-    if way_deg is not None and abs(way_deg) > MOST_STEP_DEG:
-        raise Refused(f"STEP must be at most {MOST_STEP_DEG:g} deg, got {way_deg:g}")
     homed = place.record.missing(place.config, HOMED) is None
     if not homed:
         place.say("the device is not HOMED: the soft limits are not in force")
@@ -248,38 +245,33 @@ def axes(place: Place, names_known: bool = False) -> int:
         "that moves is the one that is named, and keep out of the device's reach",
         "axes",
     )
-    for again in (False, True):
-        changes: list[Change] = []
-
-        def procedure(run: Run, device: Device, to: list[Change] = changes) -> None:
-            to += check_axes(run, device, names_known)
-
-        if code := place.run("axes", procedure):
-            return code
-        if not changes:
-            return EXIT_OK
-        place.say("rig.toml does not say what the device does:")
-        for change in changes:
-            place.say(f"  {change}")
-        if again or place.path is None:
-            place.say("the device is NOT sign-checked")
-            return EXIT_RECALIBRATE
-        place.operator.confirm(
-            f"axes: write this to {place.path}, then move the axes again", "correct"
-        )
-        _correct(place, changes)
-    raise AssertionError("unreachable")
+    return _check_axes(place, names_known)
 
 
-def _correct(place: Place, changes: list[Change]) -> None:
-    """Write corrections; what was proved of the drives goes with their cables."""
-    assert place.path is not None
+def _check_axes(place: Place, names_known: bool, again: bool = False) -> int:
+    changes: list[Change] = []
+    code = place.run(
+        "axes", lambda run, dev: changes.extend(check_axes(run, dev, names_known))
+    )
+    if code or not changes:
+        return code
+    place.say("rig.toml does not say what the device does:")
+    for change in changes:
+        place.say(f"  {change}")
+    if again or place.path is None:
+        place.say("the device is NOT sign-checked")
+        return EXIT_RECALIBRATE
+    place.operator.confirm(
+        f"axes: write this to {place.path}, then move the axes again", "correct"
+    )
+    # What was proved of the drives goes with their cables.
     place.take(edit(place.path, {change.key: change.new for change in changes}))
     place.say(f"  written; the old file is kept beside {place.path}")
     homed = place.record.state(HOMED) or {}
     identify(place)
     place.record.reach(HOMED, place.config, **homed)
     place.record.forget_left()  # where each named axis stands is not what it was
+    return _check_axes(place, names_known, again=True)
 
 
 def take_zero(place: Place) -> int:
@@ -321,17 +313,9 @@ def begin_simulated(place: Place, through: str) -> None:
         with place.bus("home") as drives:
             pulses = [drive.status().position for drive in drives]
             origins = {drive.axis.name: drive.origin for drive in drives}
-        place.record.reach(
-            HOMED, place.config, how="as they stand", pulses=pulses, origins=origins
-        )
-    if SIGN_CHECKED not in states:
-        return
-    wrong: list[Change] = []
-    code = place.run("axes", lambda run, dev: wrong.extend(check_axes(run, dev, False)))
-    if wrong:
+        as_they_stand = {"how": "as they stand", "pulses": pulses, "origins": origins}
+        place.record.reach(HOMED, place.config, **as_they_stand)
+    if SIGN_CHECKED in states and _check_axes(place, names_known=False):
         raise MotionFault(
-            "the configuration does not say what the device does: "
-            + "; ".join(map(str, wrong))
+            "the simulated device's axes were not found to be as configured"
         )
-    if code:
-        raise MotionFault("the axis check of the simulated device did not end well")

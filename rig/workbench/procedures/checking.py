@@ -215,11 +215,11 @@ def goto(run: Run, calibration: Any, desired: Array, play: Play) -> int:
                 * bool(most)
             )
     run.planned = 1
-    if run.dry_run or not play.known:
+    if run.dry_run or not play.axes:
         _tell(run, desired, command)
     if run.lacks(["goto"]):
         with run.device() as device:
-            if play.known:
+            if play.axes:
                 command = _with_play(run, device, command, play)
                 _tell(run, desired, command)
             visit(device, Posture("goto", config.to_pulses(command)), role="goto")

@@ -9,9 +9,8 @@ added from below, and from above the command is the whole of w less.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,48 +21,30 @@ CHARACTERISED = "characterised"  # the calibration's note of it
 MARGIN_DEG = 0.5  # by which the last move exceeds what it has to take up
 
 
-@dataclasses.dataclass(frozen=True)
-class Play:
-    """Of pitch, yaw and roll, in degrees of commands; nothing where none was measured.
+class Play(NamedTuple):
+    """Of pitch, yaw and roll, in degrees of commands; 0 where none was measured."""
 
-    Attributes:
-        axes: what ``characterise`` found of an axis, by its name.
-        from_below: the calibration's postures were all reached from below.
-    """
-
-    axes: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    from_below: bool = False
+    axes: Mapping[str, Any]  # what ``characterise`` found of an axis, by its name
+    from_below: bool  # the calibration's postures were all reached from below
+    widths: Array  # (3,) the best values
+    run_up: Array  # (3,) length of a move that surely takes up play and friction
 
     @classmethod
     def of(cls, notes: Mapping[str, Any]) -> Play:
         """What a calibration's notes say."""
+        axes, widths, run_up = notes.get(CHARACTERISED, {}), np.zeros(3), np.zeros(3)
+        for i, name in enumerate(AXIS_NAMES):
+            if found := axes.get(name):
+                widths[i] = found["backlash_deg"]["value"]
+                most = max(each["high"] for each in found["breakaway_deg"])
+                run_up[i] = found["backlash_deg"]["high"] + most + MARGIN_DEG
         below = notes.get("approach_overshoot_deg", 0.0) > 0.0
-        return cls(notes.get(CHARACTERISED, {}), below)
-
-    @property
-    def known(self) -> bool:
-        return bool(self.axes)
-
-    @property
-    def widths(self) -> Array:
-        """(3,) the best values."""
-        return np.array([self._of(name, "value") for name in AXIS_NAMES])
+        return cls(axes, below, widths, run_up)
 
     @property
     def most(self) -> Array:
         """(3,) by which a command is changed at most."""
         return self.widths * (1.0 if self.from_below else 0.5)
-
-    @property
-    def run_up(self) -> Array:
-        """(3,) length of a move that surely takes up play and friction."""
-        known = np.array([name in self.axes for name in AXIS_NAMES])
-        breakaway = [
-            max((each["high"] for each in self._axis(name)["breakaway_deg"]), default=0)
-            for name in AXIS_NAMES
-        ]
-        high = np.array([self._of(name, "high") for name in AXIS_NAMES])
-        return np.where(known, high + breakaway + MARGIN_DEG, 0.0)
 
     def shift(self, direction: Array) -> Array:
         """(3,) what is added to a command that is reached in (3,) directions, +-1."""
@@ -71,25 +52,14 @@ class Play:
 
     def lines(self, command: Array, direction: Array) -> Iterator[str]:
         """What is done, and what is not, in words."""
-        shift = self.shift(direction)
         for i, name in enumerate(AXIS_NAMES):
-            if name not in self.axes:
+            if not (found := self.axes.get(name)):
                 continue
             yield (
                 f"  {name} has {self.widths[i]:.3f} deg of play and arrives "
                 f"{'upwards' if direction[i] > 0 else 'downwards'}: command "
-                f"{shift[i]:+.3f} deg"
+                f"{self.shift(direction)[i]:+.3f} deg"
             )
-            found = self.axes[name]
-            if abs(command[i] - found["dead_zone_at_deg"]) < (
-                found["dead_zone_deg"]["low"] / 2.0
-            ):
+            zone = found["dead_zone_deg"]["low"] / 2.0
+            if abs(command[i] - found["dead_zone_at_deg"]) < zone:
                 yield f"  NOTE: {name} does not answer there: its dead zone"
-
-    def _axis(self, name: str) -> Mapping[str, Any]:
-        none = {"backlash_deg": {"value": 0.0, "high": 0.0}, "breakaway_deg": []}
-        found: Mapping[str, Any] = self.axes.get(name, none)
-        return found
-
-    def _of(self, name: str, part: str) -> float:
-        return float(self._axis(name)["backlash_deg"][part])

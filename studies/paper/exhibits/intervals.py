@@ -41,12 +41,12 @@ class Interval:
         return f"{self.value:{spec}} [{self.low:{spec}}, {self.high:{spec}}]"
 
 
-def mean_interval(values: ArrayLike, most: float = np.inf) -> Interval:
-    """Mean of (E,) independent values, two or more; no end of it is above ``most``."""
+def mean_interval(values: ArrayLike, upper_limit: float = np.inf) -> Interval:
+    """Mean of (E,) independent values, two or more; no end above ``upper_limit``."""
     sample = np.asarray(values, dtype=np.float64)
     mean, count = float(sample.mean()), len(sample)
     half = float(stats.t.ppf(0.975, count - 1) * stats.sem(sample))
-    return Interval(mean, mean - half, min(mean + half, most), count)
+    return Interval(mean, mean - half, min(mean + half, upper_limit), count)
 
 
 def median_interval(values: ArrayLike) -> Interval:

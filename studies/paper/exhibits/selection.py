@@ -64,7 +64,9 @@ def _comparison(evaluation: Evaluation, settings: Settings) -> dict[str, Any]:
         entry: dict[str, Any] = {
             "mean_det_s": mean_interval(det.mean(axis=1)),
             **{name: of(result.log_det) for name, of in _SPREADS.items()},
-            "ratio_to_exact": mean_interval(np.exp(behind).mean(axis=1), most=1.0),
+            "ratio_to_exact": mean_interval(
+                np.exp(behind).mean(axis=1), upper_limit=1.0
+            ),
         }
         if result.method != "random":
             hit = behind[:, 0] >= -HIT_TOLERANCE * evaluation.dataset.num_outputs
@@ -139,7 +141,10 @@ def _gap(material: Material, name: str) -> Exhibit:
         log_det = material.result(name, method).log_det[:, 0]
         ratio = np.exp(np.minimum(log_det - evaluation.reference, 0.0))
         columns[f"ratio_{method}"] = ratio
-        numbers[method] = {"worst": ratio.min(), "mean": mean_interval(ratio, most=1.0)}
+        numbers[method] = {
+            "worst": ratio.min(),
+            "mean": mean_interval(ratio, upper_limit=1.0),
+        }
     proven = "proven" if evaluation.proven.all() else "proven or bounded"
     return Exhibit.from_texts(
         "gap_to_optimum",

@@ -148,7 +148,7 @@ def _seeds(runs: list[Run], paper: list[Run]) -> Exhibit:
     }
     for name in ("ratio_to_exact", "hit_rate"):
         reached = [run.summary["dataset2"][name] for run in runs]
-        numbers[name] = mean_interval(reached, most=1.0)
+        numbers[name] = mean_interval(reached, upper_limit=1.0)
     rewards = {f"seed {run.summary['seed']}": run.rewards for run in runs}
     if paper:
         rewards["paper's network"] = paper[0].rewards
