@@ -110,6 +110,10 @@ class _Build:
                 "the headers of this Python (on Debian and Ubuntu python3-dev)"
             )
         self.cc = [*(found or _zig()), "-I", str(headers)]
+        if (
+            self.zig
+        ):  # Debian's Python.h includes from the folder above, as cc looks it up
+            self.cc += ["-idirafter", str(headers.parent)]
         common = [ROOT / "hatch_build.py", *ROOT.glob("jaxcal/**/*.pxd")]
         self.changed = max(path.stat().st_mtime for path in common)
 

@@ -21,14 +21,14 @@ import sys
 import tempfile
 import threading
 import time
+from types import SimpleNamespace
+from typing import Any
 
 from rig.config import RigConfig, parse_config
 from rig.config.config import EXAMPLES
-from rig.core.bus import Bus
-from rig.core.device import Device
+from rig.core.device import Device, Posture
 from rig.core.faults import Fault, StopRequested
-from rig.core.motion import Motion
-from rig.core.phone import Imu
+from rig.core.motion import move
 from rig.signals import Signals
 from rig.simulator import Simulator, Truth, parse_fault
 
@@ -63,11 +63,17 @@ def session(transport: str, dead: bool, rng: random.Random) -> float:
     sent: list[float] = []
     with Simulator(config, Truth(noise_deg=0.0), transport=transport) as simulator:
         served = simulator.start()
-        with Imu(served.imu) as imu, Bus(served.bus) as bus:
-            simulator.start_phone(imu.port)
-            imu.wait_for_stream(10)
-            with Signals() as signals:
-                device = Device(served, bus, imu, signals, lambda event, **fields: None)
+        run: Any = SimpleNamespace(
+            config=served,
+            emit=lambda event, **fields: None,
+            journal=SimpleNamespace(records=[]),
+        )
+        checked: Any = SimpleNamespace(missing=lambda config: None)
+        with Signals() as signals:
+            device = Device(served, run, checked, signals)
+            with device.imu as imu, device.bus:
+                simulator.start_phone(imu.port)
+                imu.wait_for_stream(10)
                 device.arm()
                 signals.armed = True
                 main = threading.main_thread().ident
@@ -82,7 +88,7 @@ def session(transport: str, dead: bool, rng: random.Random) -> float:
 
                 threading.Timer(rng.uniform(0.1, 0.4), spoil).start()
                 try:
-                    Motion(device).move_to(config.to_pulses([15, 15, 15]), "far")
+                    move(device, Posture("far", config.to_pulses([15, 15, 15])))
                 except (StopRequested, Fault):
                     device.stopper.stop("benchmark")
                 device.close()
@@ -103,7 +109,7 @@ def command(transport: str, dead: bool, folder: pathlib.Path) -> tuple[float, fl
         }))  # fmt: skip
         answer = simulator.server._answer
 
-        def noted(unit: int, pdu: bytes) -> list[tuple[bytes, bytes, bool]]:
+        def noted(unit: int, pdu: bytes) -> tuple[bytes, bytes, bool] | None:
             first.append(time.monotonic())
             return answer(unit, pdu)
 

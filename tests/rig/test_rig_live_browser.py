@@ -221,6 +221,38 @@ def test_a_stop_without_an_answer_is_red_after_a_second(rig, browse):
     assert driver.find_element("id", "answer").get_attribute("class") == "good"
 
 
+# What the page answers, and when, in milliseconds since the click.
+ANSWERS = """
+const answer = document.getElementById("answer"), begun = performance.now();
+window.answers = [];
+new MutationObserver(() => window.answers.push(
+  [performance.now() - begun, answer.className, answer.textContent]
+)).observe(answer, { childList: true, attributes: true, subtree: true });
+document.getElementById("stop").click();
+"""
+
+
+@pytest.mark.parametrize("suspended", [False, True])
+def test_stopped_comes_from_the_drives_and_a_suspended_session_is_red_meanwhile(
+    rig, browse, suspended
+):
+    driver = browse(rig)
+    until(lambda: shown(driver, "#stop"))
+    if suspended:
+        rig.session.send_signal(signal.SIGSTOP)
+    driver.execute_script(ANSWERS)
+    until(lambda: words(driver, "#answer").startswith("STOPPED: pitch"))
+    seen = driver.execute_script("return window.answers")
+    red = [at for at, look, text in seen if look == "bad" and "NO ANSWER" in text]
+    last, look, _ = seen[-1]
+    assert look == "good"
+    assert red or last < 1500.0  # it answered before the page had to say so
+    assert not red or 950.0 < red[0] < 3000.0  # the browser draws in software, too
+    assert not any(drive.moving for drive in rig.sim.drives)
+    code = -signal.SIGKILL if suspended else 128 + signal.SIGTERM
+    assert rig.session.wait(PATIENT_S) == code
+
+
 def test_pause_lets_the_posture_be_finished(rig, browse):
     driver = browse(rig)
     until(lambda: shown(driver, "#pause"))

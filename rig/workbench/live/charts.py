@@ -95,7 +95,13 @@ def _plot(palette: Palette, x: Record, lines: Axes, **look: Any) -> dict[str, An
         "animation": False,
         "grid": {"left": 52, "right": 14, "top": 34, "bottom": 40},
         "legend": {**legend, "itemWidth": 14, "itemHeight": 8, "textStyle": label},
-        "xAxis": {**axis, "nameLocation": "middle", "nameGap": 24, **x},
+        "xAxis": {
+            **axis,
+            "nameLocation": "middle",
+            "nameGap": 24,
+            "nameTextStyle": label,
+            **x,
+        },
         "yAxis": {**axis, "name": "degrees", "scale": True, "nameTextStyle": above},
         "series": _series(lines, {"width": 1.8}, **look),
     }
