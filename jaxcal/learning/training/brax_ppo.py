@@ -83,7 +83,7 @@ class _MaskedCategorical(distribution.ParametricDistribution):
             return jnp.take_along_axis(log_probs, index, axis=-1)[..., 0]
 
         return types.SimpleNamespace(
-            sample=functools.partial(jax.random.categorical, logits=log_probs),
+            sample=lambda seed: jax.random.categorical(seed, log_probs),
             mode=lambda: jnp.argmax(log_probs, axis=-1),
             log_prob=log_prob,
             entropy=lambda: entropy,
