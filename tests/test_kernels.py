@@ -80,8 +80,8 @@ calls = {
         blocks=blocks, k=9, method="exact", criterion="E", time_limit=300
     ),
     "volumes": lambda: jaxcal.select(sphere, 10, "exact", time_limit=300),
-    "fastest": lambda: jaxcal.Design(rows[:60]).fastest(
-        8, jaxcal.Motion(1.0, 2.0), method="exact", time_limit=300
+    "fastest": lambda: jaxcal.Design(rows[:200]).fastest(
+        10, jaxcal.Motion(1, 2), least_efficiency=0.7, method="exact", time_limit=300
     ),
     "backwards": lambda: backwards(many, 0.5 * many, ones, ones, ones, ones, 400, 200),
     "look-ahead": lambda: look_ahead(

@@ -1,1 +1,18 @@
 """How close each way of choosing postures comes to the proven optimum."""
+
+from jaxcal.evaluation.dataset import Dataset
+from jaxcal.evaluation.dataset_files import load_dataset, save_csv, save_npz
+from jaxcal.evaluation.methods import evaluate
+from jaxcal.evaluation.report import text_table
+from jaxcal.evaluation.results import Evaluation, Summary
+
+__all__ = [
+    "Dataset",
+    "Evaluation",
+    "Summary",
+    "evaluate",
+    "load_dataset",
+    "save_csv",
+    "save_npz",
+    "text_table",
+]

@@ -277,8 +277,10 @@ def test_a_stopped_command_writes_nothing(
     assert done.returncode == code
     kept = "finished parts are kept; the same command goes on"
     assert done.stderr == f"evaluate.py: {says}, {kept}\n"
-    names = {path.name for path in folder.iterdir()}
-    assert names == {"stream.json", "part-000000000000-000000005000.json"}
+    parts = {f"part-{ends}.json" for ends in ("000000000000-000000005000",
+                                              "000000005000-000000009000")}  # fmt: skip
+    names = {path.name for path in folder.iterdir()} - {"stream.json"}
+    assert len(names) == 1 and names < parts  # either may come first
 
 
 @pytest.mark.slow  # the test before covers the path in this process

@@ -1,6 +1,6 @@
 """Hand and eye: chosen views against OpenCV's five methods on the same simulated arms.
 
-    python -m benchmarks.hand_eye [arms]
+    python -m benchmarks.hand_eye_methods [arms]
 
 Needs opencv-python-headless (the extra ``bench``). Views, pixels and the measure are
 those of examples/hand_eye.py: mean error of predicted corners in views that were not
