@@ -126,7 +126,7 @@ def measured(params, lesson):
 
 @pytest.mark.slow
 def test_the_loss_is_that_of_the_definition(lesson):
-    params = LEARNER.init(jax.random.key(0))
+    params = LEARNER.init(jax.random.key(1))  # with key 0 two logits are a tie
     total, metrics = measured(params, lesson)
     features = NETWORK.candidate_features(lesson.candidates, lesson.available)
     memory = networks.encode(NETWORK, params, features)
