@@ -38,7 +38,7 @@ def _frame(turn: Rotation, shift: list[float]) -> Array:
     return matrix
 
 
-# What nobody told the program: the camera is turned by 180 degrees on its flange.
+# The true mounting, which the fit does not know: turned by 180 degrees on its flange.
 MOUNT = _frame(Rotation.from_euler("zx", [180.0, 8.0], True), [20.0, -60.0, 45.0])
 PLACE = _frame(Rotation.from_euler("z", 25.0, True), [-550.0, 100.0, 0.0])
 

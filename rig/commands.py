@@ -449,8 +449,8 @@ def _confirm(given: Session, session: Run) -> None:
     """Ask for what --arm and --zero would have confirmed."""
     takes_zero = not session.journal.events("zero") and session.zero_at is None
     questions = {
-        "arm": "the device will move; nobody and nothing is in its way, no patient is "
-        "attached, the emergency stop is at hand"
+        "arm": "the device will move; its way is clear, no patient is attached, the "
+        "emergency stop is at hand"
     }
     if takes_zero and session.config.session.zero == "here":
         questions["zero"] = "the device stands in its zero posture"

@@ -259,8 +259,8 @@ class _Search:
     def step(self) -> bool:
         """Move the parameters to a lower cost; True where they need not move.
 
-        Short steps are taken on the last derivatives, where these held for the step
-        before; they are made anew before the search may end.
+        A short step reuses the last derivatives if they predicted the step before it;
+        they are recomputed before the search ends.
         """
         task = self.task
         cost = self.cost

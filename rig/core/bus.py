@@ -178,7 +178,8 @@ class Bus:
     def _read(self, unit: int, address: int, count: int) -> list[int]:
         """The registers of one reply, of any number."""
         words = list(self._exchange(3, unit, address, count).registers)
-        if len(words) != count:  # of an earlier question: this one's may still come
+        # Another length: an earlier request's reply; this one's may follow.
+        if len(words) != count:
             self._resynchronise(unit, count)
         return words
 

@@ -119,8 +119,8 @@ class BusLock:
     def signal_holder(self, number: int) -> dict[str, Any] | None:
         """Send SIGTERM (stop now) or SIGINT (pause) to the holder; who that is.
 
-        None where nobody holds the lock. A holder that has ended since, or is this
-        process, is sent nothing.
+        None where the lock is free. No signal goes to a holder that has ended since
+        or is this process.
         """
         told = self.holder()
         if told and told["pid"] != os.getpid():

@@ -22,6 +22,9 @@ import jax.numpy as jnp
 
 __all__ = ["Network", "decode", "encode", "initial", "mask_logits"]
 
+_OWN = "every Network defines this itself; this class only declares it"
+_LAST = "a Network with num_unlearned > 0 defines this itself"
+
 
 class Network(nn.Module):
     """Scores candidates; features are trees of arrays."""
@@ -33,7 +36,7 @@ class Network(nn.Module):
 
     def candidate_features(self, candidates: jax.Array, usable: jax.Array) -> Any:
         """Of sets (..., M, n) of which (..., M) are usable: available or chosen."""
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)
 
     def decision_features(
         self,
@@ -50,7 +53,7 @@ class Network(nn.Module):
             available: (..., M) bool.
             count: traced only where it is in ``shares_program``.
         """
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)
 
     def shares_program(self, features: Any, k: int) -> range:
         """Numbers of choices made, out of K, at which the next choice compiles to the
@@ -59,15 +62,15 @@ class Network(nn.Module):
 
     def encode(self, features: Any) -> jax.Array:
         """(..., M, width) memory of a set."""
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)
 
     def decode(self, memory: jax.Array, decision: Any) -> tuple[jax.Array, jax.Array]:
         """(..., M) logits, masked, and (...,) value."""
-        raise NotImplementedError
+        raise NotImplementedError(_OWN)
 
     def lookahead_logits(self, decision: Any) -> tuple[jax.Array, jax.Array]:
         """As ``decode``, of one of the last ``num_unlearned`` choices."""
-        raise NotImplementedError
+        raise NotImplementedError(_LAST)
 
     def __call__(
         self, candidates: jax.Array, available: jax.Array, chosen: jax.Array
