@@ -54,6 +54,10 @@ def test_a_kernel_that_was_never_compiled_is_an_error(package):
 
 # Calls that take minutes, each in another compiled loop.
 LONG = """
+# JAX has Python call it after every collection of garbage, and Python drops
+# whatever is raised there, a KeyboardInterrupt too.
+import gc
+gc.disable()
 import numpy as np
 import jaxcal
 from jaxcal.adaptive.kernel import backwards
