@@ -5,6 +5,7 @@ import json
 import pathlib
 import re
 import tempfile
+import time
 
 import numpy as np
 import pytest
@@ -248,6 +249,24 @@ def test_a_missing_record_is_told_and_a_foreign_one_harms_nothing(tmp_path):
     assert watcher.state.damaged
     assert watcher.state.current == "select:3"
     assert not watcher.running
+
+
+def test_the_last_word_of_a_session_that_ends_meanwhile_is_read(tmp_path, monkeypatch):
+    """It was taken for one that had armed nothing: STOPPED, of no drive."""
+    path = tmp_path / "journal.jsonl"
+    path.write_text("".join(json.dumps(r) + "\n" for r in numbered(begun())))
+    unit = {"axis": "yaw", "unit": 2, "acknowledged": True, "standing": True}
+
+    def ends(journal):
+        with path.open("a") as file:
+            record = {"event": "stop", "reason": "SIGTERM", "units": [unit]}
+            file.write(json.dumps(record | {"time": time.time()}) + "\n")
+        return False
+
+    watcher = Watcher(tmp_path)
+    monkeypatch.setattr(watcher, "ask", lambda number: None)
+    monkeypatch.setattr("rig.workbench.live.watcher.is_written", ends)
+    assert [each.axis for each in watcher.stop()] == ["yaw"]
 
 
 @settings(deadline=None)

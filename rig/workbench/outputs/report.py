@@ -163,7 +163,7 @@ def _checked(summary: Record) -> list[Section]:
     parts: list[Any] = [
         Table(["", *AXIS_NAMES, "rms", "max"], rows),
         drawn(draw_errors, each, (9, 3.4), "held-out errors, raw and compensated"),
-        f"Predicted by the calibration to {summary['prediction_rms']:.4f} deg rms.",
+        f"Predicted by the calibration to {summary['prediction']['rms']:.4f} deg rms.",
     ]
     return [Section("Held-out error, degrees", parts)]
 
