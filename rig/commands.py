@@ -632,12 +632,12 @@ def report(run: RunPath) -> int:
 def export(
     run: RunPath,
     *,
-    to: Literal["c", "st", "ros", "json", "csv"],
+    to: Literal["c", "st", "ros", "json"],
     out: Annotated[Path, "file to write; without it it is printed"] | None = None,
 ) -> int:
     """print the inverse map of a calibration for a controller"""
     from jaxcal.files import write_text
-    from rig.workbench.outputs.export import LANGUAGES, checksum, load_inverse
+    from rig.workbench.outputs.export import LANGUAGES, load_inverse
 
     inverse = load_inverse(run, _records(run))
     for text in inverse["warnings"]:
@@ -647,7 +647,7 @@ def export(
         print(text, end="")
     else:
         write_text(out, text)
-        print(f"{out}: SHA-256 of the numbers {checksum(inverse)}")
+        print(f"{out}: SHA-256 of the numbers {inverse['checksum']}")
     return EXIT_OK
 
 

@@ -102,13 +102,16 @@ def _settled(device: Device, deadline: float) -> list[Status]:
 def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
     """Why the last readings do not show a device at rest, and what to do."""
     settle = device.config.settle
-    # The last window_s, or the last min_samples of a slow phone.
-    recent = sum(reading.time >= now - settle.window_s for reading in readings)
-    readings = readings[-max(recent, settle.min_samples) :]
-    span = readings[-1].time - readings[0].time if readings else 0.0
+    # The last that span the window, as many as wanted: of a slow phone, or one whose
+    # readings come in bursts, they span more.
+    newest = readings[-1].time if readings else now
+    before = sum(reading.time <= newest - settle.window_s for reading in readings)
+    first = min(before - 1, len(readings) - settle.min_samples)
     hint = "Check the phone's app and its Wi-Fi"
-    if len(readings) < settle.min_samples or span < 0.8 * settle.window_s:
+    if first < 0:
+        span = newest - readings[0].time if readings else 0.0
         return f"{len(readings)} readings over {span:.2f} s of the window. {hint}"
+    readings = readings[first:]
     if now - readings[-1].time > device.config.imu.stale_s:
         return f"the phone's readings are stale. {hint}"
     angles = _frame(device, readings).angles([reading.matrix for reading in readings])

@@ -18,10 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.arguments import Parser
+from jaxcal.arguments import Parser, exit_code
 from jaxcal.evaluation.csv_rows import csv_text
 from jaxcal.files import require_writable_folder, write_text
-from jaxcal.paper import command
 
 __all__ = ["FORMAT", "MAX_ROWS", "collect", "main", "thinned"]
 
@@ -159,7 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 flush=True,
             )
 
-    return command.run(keep, "training_runs", "runs already named are kept")
+    return exit_code(keep, "training_runs", "runs already named are kept")
 
 
 if __name__ == "__main__":

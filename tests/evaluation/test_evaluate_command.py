@@ -232,7 +232,7 @@ def test_a_missing_extra_is_one_line_that_names_the_command(
         monkeypatch.delitem(sys.modules, name)
     importers = {
         "tqdm": "jaxcal.progress",
-        "mujoco": "jaxcal.paper.twin.robot_model",
+        "mujoco": "jaxcal.paper.twin",
     }
     if package in importers:  # which is imported again, in vain
         monkeypatch.delitem(sys.modules, importers[package], raising=False)

@@ -12,6 +12,7 @@ import pytest
 from harness import HASTY, UNSETTLED, WATCHED, fast_config, fast_text, simulator
 
 from rig.config import parse_config
+from rig.core.attitude import Reading, euler_to_matrix
 from rig.core.device import Device, Posture, approach, check_plan
 from rig.core.drive import HOME
 from rig.core.faults import (
@@ -21,7 +22,7 @@ from rig.core.faults import (
     StopRequested,
     Unreachable,
 )
-from rig.core.measure import measure
+from rig.core.measure import _unquiet, measure
 from rig.core.motion import Standing, move
 from rig.core.phone import ImuError
 from rig.core.proof import GROWTH, SHOWN_DEG
@@ -235,6 +236,20 @@ def test_settled_means_drives_done_and_imu_quiet():
         assert measured["samples"] == motion.config.settle.samples
         assert max(measured["std_deg"]) <= motion.config.settle.std_deg
         assert measured["feedback"] == list(target)
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_readings_that_come_in_bursts_settle_over_more_than_the_window(moves):
+    """Of a phone that saves power, or a busy computer: ten within 2 ms, then 0.1 s."""
+    config = fast_config()
+    times = [0.1 * burst + 2e-4 * number for burst in range(4) for number in range(10)]
+    turns = [[5.0 * moves * (time < 0.25), 0.0, 0.0] for time in times]
+    matrices = euler_to_matrix(turns, "ZYX")
+    readings = [Reading(*each) for each in zip(times, matrices, strict=True)]
+    device = SimpleNamespace(config=config, frame=None)
+    found = _unquiet(device, readings, now=0.35)
+    assert "std_deg" in found if moves else found == ""
+    assert "10 readings over 0.00 s" in _unquiet(device, readings[-10:], now=0.35)
 
 
 def test_a_shaking_device_never_settles():

@@ -39,6 +39,11 @@ SOUND_RATIO = (0.4, 1.5)
 NEAR_UNIT = (0.3, 2.0)
 UNPROVED_FACTOR = 2.0  # by which a gearing is corrected on the phone's word alone
 DIGITS = 4  # of a reduction that was measured
+# Signs of the moves of the three drives, one of them changed at a time.
+CORNERS = (
+    (-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1),
+    (-1, 1, 1), (1, 1, 1), (1, -1, 1), (-1, -1, 1),
+)  # fmt: skip
 OF_DRIVE = ("unit", "map", "pulses_per_rev", "comm_timeout_s")  # go with the cable
 
 
@@ -60,6 +65,12 @@ class Stand:
             float(np.max(record["std_deg"])),
             int(record["samples"]),
         )
+
+
+def corner_name(signs: Sequence[int]) -> str:
+    """Such as ``pitch+ yaw- roll+``."""
+    named = zip(AXIS_NAMES, signs, strict=True)
+    return " ".join(f"{name}{'+' if sign > 0 else '-'}" for name, sign in named)
 
 
 def turn(base: Array, attitude: Array) -> Array:
@@ -89,26 +100,28 @@ def _inner(stands: Mapping[str, Stand], rates: Array) -> list[int] | None:
 
     With A nearer to the base the phone turns by exp(a) exp(b), otherwise by exp(b)
     exp(a). The two differ by a x b: half of it, up or down, in the direction in which
-    neither turns alone. From A- to A+ at the same B that component changes by a x b.
-    Angles read in a wrong order or with wrong signs turn like a mirror image, and
-    combine like nothing. None: the phone is too noisy to tell.
+    neither turns alone. It changes its sign with either move, so its mean over the
+    eight corners, each with the product of the two signs, is free of what A or B turn
+    alone, of play and of a steady drift. Angles read in a wrong order or with wrong
+    signs turn like a mirror image, and combine like nothing. None: the phone is too
+    noisy to tell.
     """
-    base = stands["start"]
+    base, corners = stands["start"], [stands[corner_name(each)] for each in CORNERS]
+    turned = np.array([turn(base.attitude, each.attitude) for each in corners])
+    ways = np.array([each.pulses - base.pulses for each in corners])
+    noise = base.std_deg * np.sqrt(sum(1 / each.samples for each in corners)) / 8
     inner = [0, 0, 0]
     for a, b in itertools.combinations(range(3), 2):
-        high, low = (stands[f"{AXIS_NAMES[a]}{s}{AXIS_NAMES[b]}+"] for s in "+-")
+        product = ways[:, a] * ways[:, b]  # as large at each
         normal = np.cross(rates[:, a], rates[:, b])
         scale = np.linalg.norm(normal)
-        change = turn(base.attitude, high.attitude) - turn(base.attitude, low.attitude)
-        seen = change @ normal / scale
-        ways = (high.pulses - low.pulses)[a], (high.pulses - base.pulses)[b]
-        whole = np.radians(ways[0] * ways[1] * scale) / 2.0
-        noise = base.std_deg * np.sqrt(1 / high.samples + 1 / low.samples)
-        if CLEAR * noise > abs(whole) / 2:
+        seen = np.sign(product) @ turned @ normal / scale / 8
+        whole = np.radians(np.abs(product).mean() * scale) / 2
+        if CLEAR * noise > whole / 2:
             return None
-        if not abs(whole) / 2 < abs(seen) < 2 * abs(whole):
+        if not whole / 2 < abs(seen) < 2 * whole:
             return []
-        inner[a if seen * whole > 0 else b] += 1
+        inner[a if seen > 0 else b] += 1
     return inner if sorted(inner) == [0, 1, 2] else []
 
 
@@ -157,7 +170,7 @@ def find(
     Args:
         config: as the moves were made.
         stands: ``start``; of each axis NAME ``NAME:look``, ``:plus``, ``:back``,
-            ``:minus``, ``:up``; of each pair ``A+B+`` and ``A-B+``.
+            ``:minus``, ``:up``; of each of CORNERS its ``corner_name``.
         names_known: units and directions are as configured, and the phone may be placed
             in any way; otherwise the phone is placed about as configured.
 

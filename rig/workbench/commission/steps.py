@@ -241,8 +241,9 @@ def axes(place: Place, names_known: bool = False) -> int:
     place.require(HOMED)
     place.operator.confirm(
         "axes: the device stands in its zero posture. Each axis in turn will move a "
-        "little, then up to 3 deg either way; then two at a time. Watch that the joint "
-        "that moves is the one that is named, and keep out of the device's reach",
+        "little, then up to 3 deg either way; then all three by turns, up to 6 deg. "
+        "Watch that the joint that moves is the one that is named, and keep out of the "
+        "device's reach",
         "axes",
     )
     return _check_axes(place, names_known)

@@ -12,8 +12,7 @@ from jaxcal.calibration.identify import identify
 from jaxcal.evaluation.parameters import least_squares, parameter_names, predict
 from jaxcal.paper.constants import AXES, BIAS_DEG, NOISE_STD_DEG, RANGES, SCALE
 from jaxcal.paper.datasets import dataset0_robot
-from jaxcal.paper.twin.robot import ORDERS, RobotConfig, read_out
-from jaxcal.paper.twin.robot_model import simulate
+from jaxcal.paper.twin import ORDERS, RobotConfig, read_out, simulate
 from jaxcal.plots.style import BLACK, COLOURS, boxes, legend_right, panels
 from studies.paper.exhibits.exhibit import Exhibit, by_axis, judge
 from studies.paper.exhibits.intervals import mean_interval, share_interval
@@ -40,7 +39,7 @@ def _robot(material: Material) -> Exhibit:
     """Whether MuJoCo, which drives dataset0, and the closed form read the same."""
     robot = dataset0_robot()
     commands = commands_deg(material.dataset("dataset3"))[0]
-    apart = np.abs(simulate(robot, commands) - np.asarray(read_out(robot, commands)))
+    apart = np.abs(simulate(robot, commands) - read_out(robot, commands))
     numbers = {"postures": len(commands), "largest_difference_deg": apart.max()}
     return Exhibit.from_texts("robot", {}, numbers=numbers)
 
@@ -168,7 +167,7 @@ def _orders(material: Material) -> Exhibit:
     commands = RANGES.denormalise(material.settings.rng(6).random((count, 3)))
     left = []
     for order in ORDERS:
-        read = np.asarray(read_out(RobotConfig(read_out_order=order), commands))
+        read = read_out(RobotConfig(read_out_order=order), commands)
         left.append(read - predict(least_squares(commands, read), commands))
     rms, largest = (np.square(left).mean(axis=1) ** 0.5, np.abs(left).max(axis=1))
     columns: dict[str, Any] = {"read_out_order": list(ORDERS)}
