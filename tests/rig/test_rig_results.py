@@ -232,12 +232,12 @@ def test_a_report_says_what_there_is_of_an_unfinished_run(run, finished, kept):
     assert main(["report", str(run)]) == 0
     page = (run / "report.html").read_text()
     if kept < len(lines):
-        assert "it still runs, or it was killed" in page
+        assert "killed, or the power failed" in page
         assert "y = A u + b" not in page
     else:
-        assert "Ended with exit code 1" in page and "RECALIBRATE" in page
+        assert "Done: recalibrate" in page and "session.verify_limit_deg" in page
     own = (finished / "report.html").read_text()  # written before the last record
-    assert "All was measured" in own and "was killed" not in own
+    assert "All is measured" in own and "killed" not in own
     measured = sum('"event":"posture"' in line for line in lines[:kept])
     assert (f"{measured} measured" in page) == (measured > 0)
 
@@ -259,7 +259,7 @@ def test_reports_of_collect_verify_and_goto(run, tmp_path, capsys):
     for folder in folders:
         assert main(["report", str(folder)]) == 0
         page = (folder / "report.html").read_text()
-        assert "measured [deg]" in page and "Ended with exit code" in page
+        assert "measured [deg]" in page and "<p>Done" in page
         assert folder.name in page
         assert ("Held-out error" in page) == folder.name.startswith("verify")
 

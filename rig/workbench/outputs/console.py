@@ -44,6 +44,8 @@ def _stop(record: Record) -> str:
 
 # An event of the run in words, for console, page and report: its fields are put in.
 SENTENCES: dict[str, str | Callable[[Record], str]] = {
+    "start": "{mode} begun",
+    "resume": "gone on with after an interruption",
     "listening": "IMU: waiting for the phone on port {port} ({format})",
     "armed": "armed: {drives} drives on {where}",
     "note": "{text}",
@@ -52,6 +54,10 @@ SENTENCES: dict[str, str | Callable[[Record], str]] = {
     "{told}",
     "zero": "zero taken at pulses {pulses}",
     "void": lambda r: f"  withdrawn, to be measured again: {', '.join(r['names'])}",
+    "replan": lambda r: (
+        "  the postures that are left were selected again: log det "
+        f"{r['choice']['log_det']:.4f}"
+    ),
     "pausing": "pausing after this posture; another Ctrl-C stops at once",
     "lost_reply": lambda r: (
         f"  the reply to a move of {r['axis']} was lost: {REPLIES[r['outcome']]}"
