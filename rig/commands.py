@@ -447,6 +447,8 @@ def _procedure(
 
 def _confirm(given: Session, session: Run) -> None:
     """Ask for what --arm and --zero would have confirmed."""
+    from rig.workbench.commission.operator import Operator
+
     takes_zero = not session.journal.events("zero") and session.zero_at is None
     questions = {
         "arm": "the device will move; its way is clear, no patient is attached, the "
@@ -455,12 +457,8 @@ def _confirm(given: Session, session: Run) -> None:
     if takes_zero and session.config.session.zero == "here":
         questions["zero"] = "the device stands in its zero posture"
     for word, text in questions.items():
-        if getattr(given, word):
-            continue
-        if not sys.stdin.isatty():
-            raise Refused(f"{text}: confirm with --{word}")
-        if input(f"{text}. Type {word} to confirm: ").strip() != word:
-            raise Refused("not confirmed; nothing was moved")
+        if not getattr(given, word):
+            Operator(say=_say, option=f"--{word}").confirm(text, word)
 
 
 def _recorded(run: Path, config: Path | None = None) -> tuple[RigConfig, Record]:
@@ -540,11 +538,8 @@ def identify(given: Target) -> int:
         for axis in config.axes:
             unit, drive = f"{axis.name} (unit {axis.unit}", Drive(bus, axis)
             try:
-                status, alarm, identity = (
-                    drive.status(),
-                    drive.alarm(),
-                    drive.identity(),
-                )
+                status, alarm = drive.status(), drive.alarm()
+                identity = drive.identity()
             except BusError as error:
                 code = EXIT_FAULT
                 print(f"{unit}): {error}")
@@ -632,12 +627,12 @@ def report(run: RunPath) -> int:
 def export(
     run: RunPath,
     *,
-    to: Literal["c", "st", "ros", "json", "csv"],
+    to: Literal["c", "st", "ros", "json"],
     out: Annotated[Path, "file to write; without it it is printed"] | None = None,
 ) -> int:
     """print the inverse map of a calibration for a controller"""
     from jaxcal.files import write_text
-    from rig.workbench.outputs.export import LANGUAGES, checksum, load_inverse
+    from rig.workbench.outputs.export import LANGUAGES, load_inverse
 
     inverse = load_inverse(run, _records(run))
     for text in inverse["warnings"]:
@@ -647,7 +642,7 @@ def export(
         print(text, end="")
     else:
         write_text(out, text)
-        print(f"{out}: SHA-256 of the numbers {checksum(inverse)}")
+        print(f"{out}: SHA-256 of the numbers {inverse['checksum']}")
     return EXIT_OK
 
 

@@ -24,8 +24,7 @@ from harness import changed, fast_text, simulator
 from rig.config import parse_config
 from rig.journal import read_journal
 from rig.workbench import live
-from rig.workbench.live import SERVER
-from rig.workbench.live.words import draw
+from rig.workbench.live import SERVER, draw
 
 pytest.importorskip("nicegui")
 webdriver = pytest.importorskip("selenium.webdriver")

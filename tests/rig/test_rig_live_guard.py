@@ -17,8 +17,8 @@ from rig.core.faults import Refused
 from rig.journal import Journal
 from rig.signals import PAUSE
 from rig.workbench import live
-from rig.workbench.live import words
 from rig.workbench.live.watcher import Watcher
+from rig.workbench.outputs import words
 
 HOST = "127.0.0.1:8642"
 OWN = f"http://{HOST}"

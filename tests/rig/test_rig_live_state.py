@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 
 from rig.config import parse_config
 from rig.journal import Journal, is_written, read_journal
-from rig.workbench.live import charts, words
-from rig.workbench.live.state import RunState
+from rig.workbench import live
+from rig.workbench.live import charts
 from rig.workbench.live.watcher import Tail, Watcher
-
-PICTURE = charts.LIGHT
+from rig.workbench.outputs import words
+from rig.workbench.outputs.state import RunState
 
 
 @pytest.fixture(scope="module")
@@ -33,15 +33,15 @@ def run(tmp_path_factory):
 
 
 def queue(state):
-    return words.draw("queue", postures=words.queue(state), count=len(state.postures))
+    return live.draw("queue", postures=words.queue(state), count=len(state.postures))
 
 
 def trouble(state, running, folder):
-    return words.draw("trouble", lines=words.trouble(state, running, folder))
+    return live.draw("trouble", lines=words.trouble(state, running, folder))
 
 
-def numbers(state, live):
-    return words.draw("numbers", rows=words.numbers(state, {}, live))
+def numbers(state, running):
+    return live.draw("numbers", rows=words.numbers(state.present({}, running)))
 
 
 def waiting(state):
@@ -103,15 +103,15 @@ def test_every_moment_of_a_run_can_be_drawn(run):
         state.apply(record)
         now, said = words.headline(state, True), words.progress(state)
         for text in (
-            words.draw("head", state=state, now=now, said=said, folder="run"),
+            live.draw("head", state=state, now=now, said=said, folder="run"),
             queue(state),
-            words.draw("numbers", rows=words.numbers(state, {}, True)),
+            live.draw("numbers", rows=words.numbers(state.present({}, True))),
             trouble(state, True, "run"),
-            words.draw("log", lines=state.log),
+            live.draw("log", lines=state.log),
         ):
             assert "nan" not in text and "None" not in text
         samples = [{"time": state.time, "drives": [None] * 3, "deg": [1, 2, 3]}]
-        drawn = charts.charts(state, samples, state.time, PICTURE)
+        drawn = charts.charts(state, samples, state.time)
         json.dumps(drawn, allow_nan=False)
 
 
@@ -122,8 +122,8 @@ def test_places_of_a_commissioning_step_are_shown_and_what_goes_on_is_the_step()
     state = state_of(numbered([start, stand, fault]))
     assert "pitch:plus" in queue(state)
     commanded = words.angle(state.to_deg([100, 0, 0])[0])
-    for live in (True, False):
-        assert commanded in numbers(state, live)
+    for running in (True, False):
+        assert commanded in numbers(state, running)
     told = trouble(state, False, "runs/axes")
     assert "To go on: jaxcal-rig axes<" in told and "resume" not in told
     killed = trouble(state_of(numbered([start, stand])), False, "runs/axes")

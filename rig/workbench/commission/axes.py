@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 
 from rig.config import AXIS_NAMES
@@ -16,8 +14,10 @@ from rig.core.proof import FIRST_MOTOR_DEG, unit_proved
 from rig.journal import SIGN_CHECKED
 from rig.workbench.commission.findings import (
     CLEAR,
+    CORNERS,
     Change,
     Stand,
+    corner_name,
     find,
     lines,
     proposals,
@@ -31,8 +31,9 @@ from rig.workbench.run import Run
 REACH_DEG = 3.0  # each way
 FAR_ENOUGH = 1.1  # a move that would be no longer than that is not made
 SURE_SIGMA = 3.0
-PAIR_DEG = 6.0  # commanded at most, so that the phone turns about REACH_DEG
-PAIR_STD_DEG = 0.03  # two rotations of REACH_DEG in either order are 0.16 deg apart
+CORNER_DEG = 6.0  # commanded at most, so that the phone turns about REACH_DEG
+# Of the mean over the corners: two rotations of REACH_DEG make 0.08 deg there.
+CORNER_STD_DEG = 0.015
 ROOM_DEG = 0.2  # left to a limit
 SEEN_DEG = 0.03  # the phone must turn at least this much in a whole move
 SEEN_SIGMA = 6.0
@@ -76,7 +77,7 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
     config, start = run.config, device.positions()
     _check_room(run, start)
     stands: dict[str, Stand] = {}
-    run.planned = 1 + 8 * 3 + 2 * 3
+    run.planned = 1 + 8 * 3 + len(CORNERS)
 
     def visit(name: str, offset: dict[int, int], samples: int = 0) -> Stand:
         """Stand at pulses away from the start, and measure."""
@@ -130,7 +131,7 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
             ratios.append(geared * seen / abs(axis.to_deg(far)))
             visit(f"{AXIS_NAMES[j]}:back", {j: 0})
         require_unit(config, ratios)
-    pair = [0, 0, 0]
+    corner = [0, 0, 0]
     for j, name in enumerate(AXIS_NAMES):
         axis = config.axes[j]
         look, far = grow(j, True)
@@ -151,19 +152,17 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
         visit(f"{name}:back", {j: 0})
         visit(f"{name}:minus", {j: -far})
         visit(f"{name}:up", {j: 0})
-        most = min(PAIR_DEG, _room(run, start, j))
-        pair[j] = round(far * min(REACH_DEG / way, most / abs(axis.to_deg(far))))
+        most = min(CORNER_DEG, _room(run, start, j))
+        corner[j] = round(far * min(REACH_DEG / way, most / abs(axis.to_deg(far))))
         run.say(
             f"  {name}: {abs(axis.to_deg(far)):.2f} deg commanded, the phone turned "
             f"{way:.3f}"
         )
-    clear = int(np.ceil(2.0 * (CLEAR * base.std_deg / PAIR_STD_DEG) ** 2))
+    clear = int(np.ceil((CLEAR * base.std_deg / CORNER_STD_DEG) ** 2 / 8))
     samples = min(max(clear, config.settle.samples), 8 * config.settle.samples)
-    for a, b in itertools.combinations(range(3), 2):
-        for sign in "-+":
-            way_a = pair[a] if sign == "+" else -pair[a]
-            label = f"{AXIS_NAMES[a]}{sign}{AXIS_NAMES[b]}+"
-            visit(label, {a: way_a, b: pair[b]}, samples)
+    for signs in CORNERS:
+        ways = {j: sign * corner[j] for j, sign in enumerate(signs)}
+        visit(corner_name(signs), ways, samples)
     move(device, Posture("back", start))
     return stands
 

@@ -38,7 +38,16 @@ SOUND_RATIO = (0.4, 1.5)
 # The same where the phone sends radians for degrees, and those are allowed for.
 NEAR_UNIT = (0.3, 2.0)
 UNPROVED_FACTOR = 2.0  # by which a gearing is corrected on the phone's word alone
+BY_PLATE = (
+    "Nothing was corrected. Set pulses_per_rev and reduction as the drives and the "
+    "gearboxes' plates say, then run `jaxcal-rig axes` again"
+)
 DIGITS = 4  # of a reduction that was measured
+# Signs of the moves of the three drives, one of them changed at a time.
+CORNERS = (
+    (-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1),
+    (-1, 1, 1), (1, 1, 1), (1, -1, 1), (-1, -1, 1),
+)  # fmt: skip
 OF_DRIVE = ("unit", "map", "pulses_per_rev", "comm_timeout_s")  # go with the cable
 
 
@@ -60,6 +69,12 @@ class Stand:
             float(np.max(record["std_deg"])),
             int(record["samples"]),
         )
+
+
+def corner_name(signs: Sequence[int]) -> str:
+    """Such as ``pitch+ yaw- roll+``."""
+    named = zip(AXIS_NAMES, signs, strict=True)
+    return " ".join(f"{name}{'+' if sign > 0 else '-'}" for name, sign in named)
 
 
 def turn(base: Array, attitude: Array) -> Array:
@@ -89,26 +104,28 @@ def _inner(stands: Mapping[str, Stand], rates: Array) -> list[int] | None:
 
     With A nearer to the base the phone turns by exp(a) exp(b), otherwise by exp(b)
     exp(a). The two differ by a x b: half of it, up or down, in the direction in which
-    neither turns alone. From A- to A+ at the same B that component changes by a x b.
-    Angles read in a wrong order or with wrong signs turn like a mirror image, and
-    combine like nothing. None: the phone is too noisy to tell.
+    neither turns alone. It changes its sign with either move, so its mean over the
+    eight corners, each with the product of the two signs, is free of what A or B turn
+    alone, of play and of a steady drift. Angles read in a wrong order or with wrong
+    signs turn like a mirror image, and combine like nothing. None: the phone is too
+    noisy to tell.
     """
-    base = stands["start"]
+    base, corners = stands["start"], [stands[corner_name(each)] for each in CORNERS]
+    turned = np.array([turn(base.attitude, each.attitude) for each in corners])
+    ways = np.array([each.pulses - base.pulses for each in corners])
+    noise = base.std_deg * np.sqrt(sum(1 / each.samples for each in corners)) / 8
     inner = [0, 0, 0]
     for a, b in itertools.combinations(range(3), 2):
-        high, low = (stands[f"{AXIS_NAMES[a]}{s}{AXIS_NAMES[b]}+"] for s in "+-")
+        product = ways[:, a] * ways[:, b]  # as large at each
         normal = np.cross(rates[:, a], rates[:, b])
         scale = np.linalg.norm(normal)
-        change = turn(base.attitude, high.attitude) - turn(base.attitude, low.attitude)
-        seen = change @ normal / scale
-        ways = (high.pulses - low.pulses)[a], (high.pulses - base.pulses)[b]
-        whole = np.radians(ways[0] * ways[1] * scale) / 2.0
-        noise = base.std_deg * np.sqrt(1 / high.samples + 1 / low.samples)
-        if CLEAR * noise > abs(whole) / 2:
+        seen = np.sign(product) @ turned @ normal / scale / 8
+        whole = np.radians(np.abs(product).mean() * scale) / 2
+        if CLEAR * noise > whole / 2:
             return None
-        if not abs(whole) / 2 < abs(seen) < 2 * abs(whole):
+        if not whole / 2 < abs(seen) < 2 * whole:
             return []
-        inner[a if seen * whole > 0 else b] += 1
+        inner[a if seen > 0 else b] += 1
     return inner if sorted(inner) == [0, 1, 2] else []
 
 
@@ -157,7 +174,7 @@ def find(
     Args:
         config: as the moves were made.
         stands: ``start``; of each axis NAME ``NAME:look``, ``:plus``, ``:back``,
-            ``:minus``, ``:up``; of each pair ``A+B+`` and ``A-B+``.
+            ``:minus``, ``:up``; of each of CORNERS its ``corner_name``.
         names_known: units and directions are as configured, and the phone may be placed
             in any way; otherwise the phone is placed about as configured.
 
@@ -292,9 +309,7 @@ def require_unit(
     """
     unit = config.imu.unit
     other, factor = ("rad", RADIANS) if unit == "deg" else ("deg", 1.0 / RADIANS)
-    seen = ", ".join(f"{ratio:.3g}" for ratio in ratios)
-    seen = f"the phone turned {seen} of what pitch, yaw and roll were commanded"
-    low, high = NEAR_UNIT
+    seen, (low, high) = _seen(ratios), NEAR_UNIT
     if all(low <= ratio * factor <= high for ratio in ratios):
         raise MotionFault(
             f'{seen}, about {1 / factor:.3g}: rig.toml says imu.unit = "{unit}", and '
@@ -305,9 +320,7 @@ def require_unit(
     if not proved and sum(low <= ratio <= high for ratio in ratios) < 2:
         raise MotionFault(
             f"{seen}, and none of its angles is over 6.3: either imu.unit or the "
-            "gearings are wrong. Nothing was corrected. Set pulses_per_rev and "
-            "reduction as the drives and the gearboxes' plates say, then run "
-            "`jaxcal-rig axes` again"
+            f"gearings are wrong. {BY_PLATE}"
         )
 
 
@@ -331,14 +344,16 @@ def require_gearing(
         return
     for axis, ratio, register in zip(config.axes, ratios, told, strict=True):
         if register is None and max(ratio, 1.0 / ratio) > UNPROVED_FACTOR:
-            seen = ", ".join(f"{each:.3g}" for each in ratios)
             raise MotionFault(
-                f"the phone turned {seen} of what pitch, yaw and roll were commanded, "
-                f"and the drive of {axis.name} has no register that says its pulses "
-                "for a turn, so it is not known what is wrong. Nothing was corrected. "
-                "Set pulses_per_rev and reduction as the drives and the gearboxes' "
-                "plates say, then run `jaxcal-rig axes` again"
+                f"{_seen(ratios)}, and the drive of {axis.name} has no register that "
+                "says its pulses for a turn, so it is not known what is wrong. "
+                f"{BY_PLATE}"
             )
+
+
+def _seen(ratios: Sequence[float]) -> str:
+    text = ", ".join(f"{ratio:.3g}" for ratio in ratios)
+    return f"the phone turned {text} of what pitch, yaw and roll were commanded"
 
 
 def proposals(
@@ -401,7 +416,8 @@ def _of_joint(axis: Axis, deg_per_pulse: float, pulses_per_rev: int) -> list[Cha
     if direction != axis.direction:
         reason = f"positive pulses turn it the {_way(direction)} way"
         changes.append(Change(f"{at}.direction", axis.direction, direction, reason))
-    ratio = abs(deg_per_pulse) * pulses_per_rev * axis.reduction / 360.0
+    geared = axis.model_copy(update={"pulses_per_rev": pulses_per_rev})
+    ratio = abs(deg_per_pulse * geared.pulses_per_deg)
     low, high = SOUND_RATIO
     if not low <= ratio <= high:
         reduction = float(f"{axis.reduction / ratio:.{DIGITS}g}")
@@ -411,16 +427,16 @@ def _of_joint(axis: Axis, deg_per_pulse: float, pulses_per_rev: int) -> list[Cha
     return changes
 
 
-def _way(direction: float) -> str:
-    return "positive" if direction > 0 else "negative"
+def _way(rate: float) -> str:
+    return "positive" if rate > 0 else "negative"
 
 
 def lines(config: RigConfig, found: Findings) -> list[str]:
     """The findings in words, a line for each drive and each thing found."""
+    ratios = ratios_of(config, found)
     text = ["  unit  turns   sense     measured/commanded  play   cross-talk"]
     for drive, joint in enumerate(found.joints):
         axis, unit = config.axes[joint], config.axes[drive].unit
-        ratio = abs(found.deg_per_pulse[drive] * config.axes[drive].pulses_per_deg)
         cross = ", ".join(
             f"{AXIS_NAMES[i]} {100 * found.cross_talk[i, drive]:+.1f} %"
             for i in range(3)
@@ -428,7 +444,7 @@ def lines(config: RigConfig, found: Findings) -> list[str]:
         )
         text.append(
             f"  {unit:>4}  {axis.name:<6}  {_way(found.deg_per_pulse[drive]):<8}  "
-            f"{ratio:18.3f}  {max(0.0, found.backlash_deg[drive]):.3f}  {cross}"
+            f"{ratios[drive]:18.3f}  {max(0.0, found.backlash_deg[drive]):.3f}  {cross}"
         )
     angles = matrix_to_euler(found.mounting, "ZYX")
     text.append(

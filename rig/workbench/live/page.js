@@ -16,13 +16,13 @@ const live = {
       answer.textContent = text;
     };
     show("", "Asking the session to " + what + " …");
-    // Due a second after the click on the browser's own clock. The compositor shows it:
-    // neither the server nor a scene that keeps this thread busy can hold it up.
+    /* Due a second after the click on the browser's own clock. The compositor shows it:
+       neither the server nor a scene that keeps this thread busy can hold it up. */
     const silence = late.animate([{ opacity: 0 }, { opacity: 1 }], {
       delay: 1000, duration: 1, fill: "both",
     });
     silence.startTime = clicked;
-    silence.onfinish = () => show("bad", late.textContent); // said to screen readers
+    silence.onfinish = () => show("bad", late.textContent); /* for screen readers */
     try {
       const reply = await fetch("/" + what, { method: "POST" });
       show(reply.ok ? "good" : "bad", await reply.text());

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -43,6 +44,8 @@ def _stop(record: Record) -> str:
 
 # An event of the run in words, for console, page and report: its fields are put in.
 SENTENCES: dict[str, str | Callable[[Record], str]] = {
+    "start": "{mode} begun",
+    "resume": "gone on with after an interruption",
     "listening": "IMU: waiting for the phone on port {port} ({format})",
     "armed": "armed: {drives} drives on {where}",
     "note": "{text}",
@@ -51,6 +54,10 @@ SENTENCES: dict[str, str | Callable[[Record], str]] = {
     "{told}",
     "zero": "zero taken at pulses {pulses}",
     "void": lambda r: f"  withdrawn, to be measured again: {', '.join(r['names'])}",
+    "replan": lambda r: (
+        "  the postures that are left were selected again: log det "
+        f"{r['choice']['log_det']:.4f}"
+    ),
     "pausing": "pausing after this posture; another Ctrl-C stops at once",
     "lost_reply": lambda r: (
         f"  the reply to a move of {r['axis']} was lost: {REPLIES[r['outcome']]}"
@@ -146,10 +153,10 @@ def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
     lines.append(f"  {noise_text(summary)}")
     if "after" in summary:
         lines.append(f"held-out {error_text(summary)}")
-    elif "prediction_max" in summary:  # a refit: nothing was compensated by it
+    elif found := summary.get("prediction"):  # a refit: nothing was compensated by it
         lines.append(
-            f"held-out postures predicted to {summary['prediction_rms']:.4f} deg rms "
-            f"(max {summary['prediction_max']:.4f})"
+            f"held-out postures predicted to {found['rms']:.4f} deg rms "
+            f"(max {found['max']:.4f})"
         )
     if summary.get("drift"):
         lines.append(f"drift: {drift_text(summary['drift'])}")
@@ -163,12 +170,17 @@ def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
     return lines
 
 
+def held_out(summary: dict[str, Any]) -> tuple[str, float]:
+    """Which error at held-out targets a calibration is judged by, and the largest."""
+    if "after" in summary:
+        return "after compensation", summary["after"]["max"]
+    return "of the prediction", summary.get("prediction", {}).get("max", math.nan)
+
+
 def recalibrate(summary: dict[str, Any], limit_deg: float) -> list[str]:
     """Why a calibration is not to be used; nothing where all is well."""
     reasons = []
-    what, worst = "after compensation", summary.get("after", {}).get("max", 0.0)
-    if "after" not in summary:
-        what, worst = "of the prediction", summary.get("prediction_max", 0.0)
+    what, worst = held_out(summary)
     if worst > limit_deg:
         limit = f"session.verify_limit_deg ({limit_deg:g})"
         reasons.append(f"the error {what} exceeds {limit}")
@@ -202,12 +214,10 @@ def drift_text(drift: dict[str, Any]) -> str:
 
 def noise_text(summary: dict[str, Any]) -> str:
     """How large the noise is, axis by axis, and where it was taken from."""
-    as_good = ", ".join(f"{value:.1f}" for value in summary["effective_samples"])
     std = zip(AXIS_NAMES, summary["noise_std_deg"], strict=True)
     return (
         f"noise of one posture {', '.join(f'{name} {v:.4f}' for name, v in std)} deg, "
-        f"from {summary['basis']} ({summary['dof']} degrees of freedom each); "
-        f"{summary['samples']} readings are correlated and count as {as_good}"
+        f"from {summary['basis']} ({summary['dof']} degrees of freedom each)"
     )
 
 

@@ -14,28 +14,27 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.pages import Figure, Page, Section, Strong, Table, Text, write_page
+from jaxcal.pages import Figure, Page, Section, Table, Text, write_page
 from rig.config import AXIS_NAMES
 from rig.core.attitude import Array
 from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE
-from rig.journal import Record, RunFolder, measured_postures
+from rig.journal import JOURNAL, Record, RunFolder, is_written, measured_postures
 from rig.workbench.outputs.console import (
-    ENDS,
     choice_text,
     drift_text,
-    event_lines,
     noise_text,
     numbers,
     recalibrate,
     summary_lines,
 )
+from rig.workbench.outputs.state import RunState
+from rig.workbench.outputs.words import headline, trouble
 from rig.workbench.readings import angles, recorded_frame
 
 FOOTER = (
     "Research software, not a medical device. Calibrate with no patient attached; a "
     "hardware emergency stop is required."
 )
-TOLD = (*ENDS, "resume", "stop", "void", "unreachable", "replan", "sender_refused")
 MOST_ROWS = 60  # of the table of postures; more are in pairs.csv
 HEAD = [*(f"u {name}" for name in AXIS_NAMES), "b"]  # of the columns of [A | b]
 
@@ -57,55 +56,37 @@ def save_result(
 
 def write_report(folder: pathlib.Path, records: list[Record]) -> pathlib.Path:
     """Write ``report.html`` of a run, from the records of its journal."""
-    start, summary = records[0], {}
+    start, summary, state = records[0], {}, RunState()
+    for record in records:
+        state.apply(record)
     if (folder / "summary.json").is_file():
         text = (folder / "summary.json").read_text(encoding="utf-8")
         summary = json.loads(text)
     made = f"{start['started']} on {start['host']}, jaxcal {start['jaxcal']}"
-    intro = [Text([made, "."])]
-    if start.get("simulated"):
-        intro = [Text([made, ", ", Strong("simulated rig"), "."])]
-    intro.append(_ending(records))
-    if text := summary.get("orders", {}).get("warning"):
-        intro.append(Text(text, "warning"))
+    running = is_written(folder / JOURNAL)
     limit = start["config"]["session"]["verify_limit_deg"]
-    if reasons := recalibrate(summary, limit):
-        intro.append(Text(f"RECALIBRATE: {' and '.join(reasons)}.", "warning"))
+    told = [
+        "made on a simulated device" if start.get("simulated") else "",
+        *trouble(state, running, str(folder)),
+        summary.get("orders", {}).get("warning", ""),
+        " and ".join(recalibrate(summary, limit)),
+    ]
+    intro = [Text(f"{made}."), Text(f"{headline(state, running)[1]}.")]
+    intro += [Text(f"{text}.", "warning") for text in told if text]
     sections = [*_calibrated(summary), *_checked(summary), *_measured(records)]
-    if rows := [
-        [
-            f"{datetime.datetime.fromtimestamp(record['time']):%H:%M:%S}",
-            record["event"],
-            " ".join(event_lines(record)) or record.get("reason", ""),
-        ]
-        for record in records
-        if record["event"] in TOLD
-    ]:
-        table = Table(["", "event", ""], rows, numeric=False)
-        sections.append(Section("What happened", [table]))
+    rows = [
+        [f"{when:%H:%M:%S}", line]
+        for when, line in (
+            (datetime.datetime.fromtimestamp(at), line) for at, line in state.log
+        )
+    ]
+    table = Table(["", ""], rows, numeric=False)
+    sections.append(Section("What happened", [table]))
     path, kind = folder / "report.html", str(start["mode"])
     kind = "Calibration" if kind == "calibrate" else kind.capitalize()
     title = f"{kind} {folder.name}"
     write_page(path, Page(title, sections, intro=intro, footer=(FOOTER,)))
     return path
-
-
-def _ending(records: list[Record]) -> Text:
-    """How the run ended, or that it did not."""
-    last = next(
-        r
-        for r in reversed(records)
-        if r["event"] in (*ENDS, "start", "resume") or r.get("phase") == "finishing"
-    )
-    match last["event"]:
-        case "phase":  # a calibration writes its report before its end
-            return Text("All was measured, and every drive was stopped.")
-        case "start" | "resume":
-            text = "This run has no end: it still runs, or it was killed."
-            return Text(text, "warning")
-        case "end":
-            return Text(f"Ended with exit code {last['code']}.")
-    return Text(f"Ended: {last['event']}. {last['reason']}", "warning")
 
 
 def _calibrated(summary: Record) -> list[Section]:
@@ -163,7 +144,7 @@ def _checked(summary: Record) -> list[Section]:
     parts: list[Any] = [
         Table(["", *AXIS_NAMES, "rms", "max"], rows),
         drawn(draw_errors, each, (9, 3.4), "held-out errors, raw and compensated"),
-        f"Predicted by the calibration to {summary['prediction_rms']:.4f} deg rms.",
+        f"Predicted by the calibration to {summary['prediction']['rms']:.4f} deg rms.",
     ]
     return [Section("Held-out error, degrees", parts)]
 

@@ -115,10 +115,6 @@ def _visit_chosen(run: Run, device: Device, candidates: Array, choice: Choice) -
             choice = choose(config, degrees, available, tuple(done), replanning=True)
             plan = run.emit("replan", sync=True, choice=dataclasses.asdict(choice))
         choice = Choice(**plan["choice"])
-        run.say(
-            f"  selected again without {index}: log det {choice.log_det:.4f}, "
-            f"{len(done)} measured postures kept"
-        )
 
 
 def _check_gains(run: Run, matrix: Any) -> None:
