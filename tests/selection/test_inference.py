@@ -19,8 +19,7 @@ from jaxcal.information.regression import log_det_gram
 from jaxcal.learning.core import network as networks
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies import decoding
-from jaxcal.learning.policies.build import build
-from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.policies.networks import NetworkConfig, build
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.training import checkpoint
 from jaxcal.selection.policy import select_batch
