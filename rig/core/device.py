@@ -18,7 +18,7 @@ import numpy as np
 
 from rig.config.axis import Pulses
 from rig.config.config import RigConfig
-from rig.config.registers import Read
+from rig.config.maps import Read
 from rig.core.attitude import Array, Frame
 from rig.core.bus import Bus, BusError, Rejected
 from rig.core.drive import Drive, Status
