@@ -29,6 +29,11 @@ from rig.core.stop import Stopper
 from rig.journal import DeviceRecord, Record, RunFolder
 
 
+LOOK_S = 0.002  # between two looks for a reading
+OVERDUE_S = 0.3  # of a stop that was asked for and that no loop has answered
+TICK_S = 0.05  # of the heartbeat
+
+
 class Posture(NamedTuple):
     """Where to stand, by name."""
 
@@ -63,10 +68,6 @@ def check_plan(config: RigConfig, targets: Iterable[Pulses]) -> None:
         raise LimitError("the plan leaves the limits: " + "; ".join(faults))
 
 
-LOOK_S = 0.002  # between two looks for a reading
-OVERDUE_S = 0.3  # of a stop that was asked for and that no loop has answered
-
-
 class Heartbeat(threading.Thread):
     """A thread that stops the drives when the motion loop is silent for too long, or
     does not answer to a stop.
@@ -97,7 +98,7 @@ class Heartbeat(threading.Thread):
             self.join(2.0)
 
     def run(self) -> None:
-        while not self._closing.wait(0.05):
+        while not self._closing.wait(TICK_S):
             silence = time.monotonic() - self._fed
             if not self._stopper.reason and (late := self._requests.overdue(OVERDUE_S)):
                 self._stopper.stop(f"{late}, which the session did not answer")
