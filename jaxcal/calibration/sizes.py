@@ -25,7 +25,8 @@ __all__ = ["Sizes", "group_sizes", "of_sizes"]
 
 Array = NDArray[np.float64]
 
-_THOUGHT = np.log(3.0)  # standard deviation of the logarithm of each factor
+_MIDDLE = np.log([1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
+_SPREAD = np.log([3.0, 3.0, 3.0, 3.0, 3.0, 3.0])
 _MOST = 5.0  # of a logarithm
 _SCORES = 100  # steps of Fisher's scoring, at most
 _GROUPS = 5  # lengths, turns of the axes, zeros of the joints, compliance, harmonics
@@ -83,16 +84,16 @@ def group_sizes(
             spread - member @ (white @ scaled) ** 2,
             level * (np.trace(inverse) - white @ white) + count - top - rest / level,
         )
-        curve = np.eye(_GROUPS + 1) / _THOUGHT**2
+        curve = np.diag(_SPREAD**-2.0)
         curve[:-1, :-1] += 2.0 * member @ (scaled.T @ seen) ** 2 @ member.T
         curve[-1, :-1] = curve[:-1, -1] = 2.0 * level * member @ (seen**2).sum(axis=0)
         curve[-1, -1] += 2.0 * (level**2 * (inverse**2).sum() + count - top)
-        thought = logs / _THOUGHT
+        thought = (logs - _MIDDLE) / _SPREAD
         value = float(value + thought @ thought)
-        return value, 2.0 * (slope + thought / _THOUGHT), 2.0 * curve
+        return value, 2.0 * (slope + thought / _SPREAD), 2.0 * curve
 
     # A level that is known floats too: misfit beyond it is no size of the errors.
-    best = np.zeros(_GROUPS + 1) if before is None else before.logs
+    best = _MIDDLE if before is None else before.logs
     least, slope, curve = cost(best)
     for _ in range(_SCORES):
         step = np.linalg.solve(curve, slope)
@@ -109,7 +110,7 @@ def group_sizes(
     steps = 1e-3 * np.eye(len(best))
     curves = [cost(best + step)[1] - cost(best - step)[1] for step in steps]
     size, axes = np.linalg.eigh(np.array(curves) / 4e-3)  # of half the cost
-    size = np.maximum(size, _THOUGHT**-2.0)
+    size = np.maximum(size, _SPREAD.max() ** -2.0)
     inside = (axes / size) @ axes.T
     return Sizes(best, factors, groups, inside[:_GROUPS, :_GROUPS])
 

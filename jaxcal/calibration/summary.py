@@ -26,7 +26,6 @@ def summary(fit: Fit, verdict: Verdict | None) -> str:
         f"({', '.join(fit.output_names)}), {fit.num_measurements} measurements, "
         f"{len(fit.parameters)} parameters"
         + (f" ({fixed} fixed)" if fixed else "")
-        + (", with discrepancy" if fit.phases is not None else "")
         + f", {fit.loss} loss"
     ]
     cells = {"": columns["parameter"]}

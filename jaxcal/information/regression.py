@@ -20,9 +20,6 @@ from jaxcal.checks import numbers, require_finite, whole_number
 from jaxcal.information.blocks import rank_rule
 
 __all__ = [
-    "hat_matrix",
-    "information_matrix",
-    "leverages",
     "log_det_gram",
     "log_det_information",
     "regression_matrix",
@@ -83,20 +80,6 @@ def regression_matrix(commands: ArrayLike, num_outputs: int | None = None) -> Ar
     return rows.reshape(*batch, num_postures * m, m * (num_inputs + 1))
 
 
-def information_matrix(commands: ArrayLike, num_outputs: int | None = None) -> Array:
-    """Information matrix ``S = A.T @ A`` for unit noise.
-
-    Args:
-        commands: (..., N, n).
-        num_outputs: m; as many as inputs when not given.
-
-    Returns:
-        (..., m (n + 1), m (n + 1)), 12 x 12 for three inputs and three outputs.
-    """
-    a = regression_matrix(commands, num_outputs)
-    return np.matrix_transpose(a) @ a
-
-
 def log_det_gram(commands: ArrayLike) -> Array:
     """Log-determinant of ``Z.T @ Z``, computed about the centroid.
 
@@ -137,32 +120,3 @@ def log_det_information(
     m = commands.shape[-1] if num_outputs is None else num_outputs
     value = m * log_det_gram(commands)
     return float(value) if value.ndim == 0 else value
-
-
-def hat_matrix(commands: ArrayLike) -> Array:
-    """Hat matrix ``H = Z (Z.T Z)^-1 Z.T`` of a whole candidate set.
-
-    H does not change under any invertible affine map of the commands, and for a subset
-    s of n + 1 postures ``det(Z_s.T Z_s) = det(Z.T Z) det(H_ss)``: it holds all there is
-    to know for D-optimal selection.
-
-    Args:
-        commands: (..., M, n), not all in one plane.
-
-    Returns:
-        (..., M, M), symmetric, idempotent, trace n + 1.
-
-    Raises:
-        ValueError: the postures lie in one plane, so ``Z.T @ Z`` has no inverse.
-    """
-    commands = _as_commands(commands)
-    if np.any(np.isneginf(log_det_gram(commands))):
-        raise ValueError("commands must not all lie in one plane: Z.T @ Z is singular")
-    centred = commands - commands.mean(axis=-2, keepdims=True)
-    q = np.linalg.qr(regressors(centred / np.abs(centred).max(-2, keepdims=True)))[0]
-    return q @ np.matrix_transpose(q)
-
-
-def leverages(commands: ArrayLike) -> Array:
-    """(..., M) diagonal of the hat matrix; each in (0, 1], summing to n + 1."""
-    return np.diagonal(hat_matrix(commands), axis1=-2, axis2=-1)
