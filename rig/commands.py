@@ -447,6 +447,8 @@ def _procedure(
 
 def _confirm(given: Session, session: Run) -> None:
     """Ask for what --arm and --zero would have confirmed."""
+    from rig.workbench.commission.operator import Operator
+
     takes_zero = not session.journal.events("zero") and session.zero_at is None
     questions = {
         "arm": "the device will move; its way is clear, no patient is attached, the "
@@ -455,12 +457,8 @@ def _confirm(given: Session, session: Run) -> None:
     if takes_zero and session.config.session.zero == "here":
         questions["zero"] = "the device stands in its zero posture"
     for word, text in questions.items():
-        if getattr(given, word):
-            continue
-        if not sys.stdin.isatty():
-            raise Refused(f"{text}: confirm with --{word}")
-        if input(f"{text}. Type {word} to confirm: ").strip() != word:
-            raise Refused("not confirmed; nothing was moved")
+        if not getattr(given, word):
+            Operator(say=_say, option=f"--{word}").confirm(text, word)
 
 
 def _recorded(run: Path, config: Path | None = None) -> tuple[RigConfig, Record]:
@@ -540,11 +538,8 @@ def identify(given: Target) -> int:
         for axis in config.axes:
             unit, drive = f"{axis.name} (unit {axis.unit}", Drive(bus, axis)
             try:
-                status, alarm, identity = (
-                    drive.status(),
-                    drive.alarm(),
-                    drive.identity(),
-                )
+                status, alarm = drive.status(), drive.alarm()
+                identity = drive.identity()
             except BusError as error:
                 code = EXIT_FAULT
                 print(f"{unit}): {error}")

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from jaxcal.calibration.solve import Solution, Task
 from jaxcal.information.blocks import without
 from jaxcal.models import SerialChain
-from jaxcal.models.checked import derivative, facts
+from jaxcal.models.model import derivative, facts
 
 __all__ = ["Sizes", "group_sizes", "of_sizes"]
 

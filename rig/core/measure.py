@@ -14,6 +14,7 @@ from rig.core.drive import Status
 from rig.core.faults import MotionFault, NotFollowing
 from rig.core.motion import Standing
 
+DISAGREEMENT_DEG = 45.0  # between IMU and command at a posture, at most
 FOLLOW_MIN_DEG = 3.0  # a commanded change this large must be seen by the IMU
 FOLLOW_SHARE = 0.1  # at least this share of it
 FOLLOW_LEADING = 0.3  # of axes that move at least this share of the largest move
@@ -173,12 +174,12 @@ def _check_agreement(
 ) -> None:
     """The joints are where the drives say, roughly, and moved when they moved."""
     apart = np.abs(measured - commanded)
-    if (apart > device.config.motion.max_disagreement_deg).any():
+    if (apart > DISAGREEMENT_DEG).any():
         worst = int(np.argmax(apart))
         raise MotionFault(
             f"the IMU reads {AXIS_NAMES[worst]} {apart[worst]:.1f} deg away from "
-            "the command, more than motion.max_disagreement_deg. Check zero, axis "
-            "order and signs"
+            f"the command (limit {DISAGREEMENT_DEG:g}). Check zero, axis order and "
+            "signs"
         )
     seen = device.seen
     way = commanded - seen.commanded

@@ -500,28 +500,6 @@ def test_to_dict_is_the_file_and_from_dict_its_inverse(tmp_path: pathlib.Path) -
         Calibration.from_dict({k: v for k, v in found.to_dict().items() if k != "free"})
 
 
-def test_to_frame_has_a_row_for_each_parameter() -> None:
-    pandas = pytest.importorskip("pandas")
-    commands, measured = problem(6, n=2, m=3)
-    found = identify(commands, measured, measured_unit="mm")
-    frame = found.to_frame()
-    assert isinstance(frame, pandas.DataFrame)
-    assert tuple(frame.index) == found.names
-    np.testing.assert_array_equal(frame["value"], found.parameters)
-    np.testing.assert_array_equal(frame[["low", "high"]], found.confidence_intervals())
-    assert frame.loc["a32", ["meaning", "unit"]].tolist() == ["y_z per u_2", "mm"]
-    assert frame.loc["by", ["meaning", "unit"]].tolist() == ["y_y at u = 0", "mm"]
-    assert "low" not in identify(commands[:3], measured[:3]).to_frame()
-
-
-def test_to_frame_without_pandas_names_the_command(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ImportError, match="pip install pandas"):
-        identify(*problem(6)).to_frame()
-
-
 # -- bad input -------------------------------------------------------------------------
 
 

@@ -12,6 +12,7 @@ import pytest
 from harness import HASTY, UNSETTLED, WATCHED, fast_config, fast_text, simulator
 
 from rig.config import parse_config
+from rig.core import motion as moving
 from rig.core.attitude import Reading, euler_to_matrix
 from rig.core.device import Device, Posture, approach, check_plan
 from rig.core.drive import HOME
@@ -292,9 +293,9 @@ def test_trouble_on_the_way_is_noticed(fault, error):
             motion.move_to((0, 0, 0), "after a fault")
 
 
-def test_a_missed_deadline_stops():
-    text = fast_text({"stall_s = 0.3": "stall_s = 0.3\ndeadline_slack_s = 0.05"})
-    with bench(parse_config(text), speedup=0.05) as motion:
+def test_a_missed_deadline_stops(monkeypatch):
+    monkeypatch.setattr(moving, "DEADLINE_SLACK_S", 0.05)
+    with bench(speedup=0.05) as motion:
         with pytest.raises(MotionFault, match="deadline"):
             motion.move_to(motion.config.to_pulses([10, 10, 10]), "x")
 

@@ -38,6 +38,10 @@ SOUND_RATIO = (0.4, 1.5)
 # The same where the phone sends radians for degrees, and those are allowed for.
 NEAR_UNIT = (0.3, 2.0)
 UNPROVED_FACTOR = 2.0  # by which a gearing is corrected on the phone's word alone
+BY_PLATE = (
+    "Nothing was corrected. Set pulses_per_rev and reduction as the drives and the "
+    "gearboxes' plates say, then run `jaxcal-rig axes` again"
+)
 DIGITS = 4  # of a reduction that was measured
 # Signs of the moves of the three drives, one of them changed at a time.
 CORNERS = (
@@ -305,9 +309,7 @@ def require_unit(
     """
     unit = config.imu.unit
     other, factor = ("rad", RADIANS) if unit == "deg" else ("deg", 1.0 / RADIANS)
-    seen = ", ".join(f"{ratio:.3g}" for ratio in ratios)
-    seen = f"the phone turned {seen} of what pitch, yaw and roll were commanded"
-    low, high = NEAR_UNIT
+    seen, (low, high) = _seen(ratios), NEAR_UNIT
     if all(low <= ratio * factor <= high for ratio in ratios):
         raise MotionFault(
             f'{seen}, about {1 / factor:.3g}: rig.toml says imu.unit = "{unit}", and '
@@ -318,9 +320,7 @@ def require_unit(
     if not proved and sum(low <= ratio <= high for ratio in ratios) < 2:
         raise MotionFault(
             f"{seen}, and none of its angles is over 6.3: either imu.unit or the "
-            "gearings are wrong. Nothing was corrected. Set pulses_per_rev and "
-            "reduction as the drives and the gearboxes' plates say, then run "
-            "`jaxcal-rig axes` again"
+            f"gearings are wrong. {BY_PLATE}"
         )
 
 
@@ -344,14 +344,16 @@ def require_gearing(
         return
     for axis, ratio, register in zip(config.axes, ratios, told, strict=True):
         if register is None and max(ratio, 1.0 / ratio) > UNPROVED_FACTOR:
-            seen = ", ".join(f"{each:.3g}" for each in ratios)
             raise MotionFault(
-                f"the phone turned {seen} of what pitch, yaw and roll were commanded, "
-                f"and the drive of {axis.name} has no register that says its pulses "
-                "for a turn, so it is not known what is wrong. Nothing was corrected. "
-                "Set pulses_per_rev and reduction as the drives and the gearboxes' "
-                "plates say, then run `jaxcal-rig axes` again"
+                f"{_seen(ratios)}, and the drive of {axis.name} has no register that "
+                "says its pulses for a turn, so it is not known what is wrong. "
+                f"{BY_PLATE}"
             )
+
+
+def _seen(ratios: Sequence[float]) -> str:
+    text = ", ".join(f"{ratio:.3g}" for ratio in ratios)
+    return f"the phone turned {text} of what pitch, yaw and roll were commanded"
 
 
 def proposals(
@@ -414,7 +416,8 @@ def _of_joint(axis: Axis, deg_per_pulse: float, pulses_per_rev: int) -> list[Cha
     if direction != axis.direction:
         reason = f"positive pulses turn it the {_way(direction)} way"
         changes.append(Change(f"{at}.direction", axis.direction, direction, reason))
-    ratio = abs(deg_per_pulse) * pulses_per_rev * axis.reduction / 360.0
+    geared = axis.model_copy(update={"pulses_per_rev": pulses_per_rev})
+    ratio = abs(deg_per_pulse * geared.pulses_per_deg)
     low, high = SOUND_RATIO
     if not low <= ratio <= high:
         reduction = float(f"{axis.reduction / ratio:.{DIGITS}g}")
@@ -424,16 +427,16 @@ def _of_joint(axis: Axis, deg_per_pulse: float, pulses_per_rev: int) -> list[Cha
     return changes
 
 
-def _way(direction: float) -> str:
-    return "positive" if direction > 0 else "negative"
+def _way(rate: float) -> str:
+    return "positive" if rate > 0 else "negative"
 
 
 def lines(config: RigConfig, found: Findings) -> list[str]:
     """The findings in words, a line for each drive and each thing found."""
+    ratios = ratios_of(config, found)
     text = ["  unit  turns   sense     measured/commanded  play   cross-talk"]
     for drive, joint in enumerate(found.joints):
         axis, unit = config.axes[joint], config.axes[drive].unit
-        ratio = abs(found.deg_per_pulse[drive] * config.axes[drive].pulses_per_deg)
         cross = ", ".join(
             f"{AXIS_NAMES[i]} {100 * found.cross_talk[i, drive]:+.1f} %"
             for i in range(3)
@@ -441,7 +444,7 @@ def lines(config: RigConfig, found: Findings) -> list[str]:
         )
         text.append(
             f"  {unit:>4}  {axis.name:<6}  {_way(found.deg_per_pulse[drive]):<8}  "
-            f"{ratio:18.3f}  {max(0.0, found.backlash_deg[drive]):.3f}  {cross}"
+            f"{ratios[drive]:18.3f}  {max(0.0, found.backlash_deg[drive]):.3f}  {cross}"
         )
     angles = matrix_to_euler(found.mounting, "ZYX")
     text.append(

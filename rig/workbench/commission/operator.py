@@ -16,10 +16,12 @@ class Operator:
         yes: bool = False,
         say: Callable[[str], None] = print,
         read: Callable[[str], str] = input,
+        option: str = "--yes",  # that confirms
     ) -> None:
         self.yes = yes
         self.say = say
         self._read = read
+        self._option = option
 
     def ask(self, question: str, default: str = "") -> str:
         """An answer, or the default where none is given.
@@ -36,7 +38,9 @@ class Operator:
 
     def _answer(self, prompt: str) -> str:
         if self._read is input and not sys.stdin.isatty():
-            raise Refused(f"{prompt}no terminal to answer on; use --yes")
+            raise Refused(
+                f"{prompt}no terminal to answer on; confirm with {self._option}"
+            )
         try:
             return self._read(prompt).strip()
         except EOFError:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 from rig.config import AXIS_NAMES, RigConfig
+from rig.core import session
 from rig.core.bus import Bus
 from rig.core.device import Device
 from rig.core.drive import Drive
@@ -19,7 +20,6 @@ from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault, Refused
 from rig.core.known import check_drives
 from rig.core.phone import Imu
 from rig.core.proof import slowed
-from rig.core.session import STREAM_WAIT_S, Check
 from rig.journal import (
     HOMED,
     IDENTIFIED,
@@ -32,7 +32,7 @@ from rig.journal import (
 from rig.journal.lock import BusLock
 from rig.workbench.commission.axes import check_axes
 from rig.workbench.commission.findings import Change
-from rig.workbench.commission.home import can_home, home, identity, unlimited, zero
+from rig.workbench.commission.home import can_home, home, identity, unlimited
 from rig.workbench.commission.jog import by_keyboard, step
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.phone import Stream, addresses_text, watch
@@ -107,7 +107,7 @@ class Place:
         motion = config.motion.model_copy(update={"approach_overshoot_deg": 0.0})
         config = config.model_copy(update={"axes": axes, "motion": motion})
         # Homed drives are where they were left; the gearing is still to be checked.
-        check: Check = functools.partial(check_drives, geared=False)
+        check: session.Check = functools.partial(check_drives, geared=False)
         with self._lock(name) as lock:
             run = Run(
                 config if limits else unlimited(config),
@@ -150,7 +150,7 @@ def look_at_phone(place: Place, seconds: float | None = None) -> Stream:
         place.say(f"imu: {addresses_text(settings, imu.port)}; then start its stream")
         for listener in place.listeners:
             listener({"event": "listening", "port": imu.port})
-        stream = watch(imu, seconds or WATCH_S, STREAM_WAIT_S, place.say)
+        stream = watch(imu, seconds or WATCH_S, session.STREAM_WAIT_S, place.say)
     if stream.rate_hz < SLOW_HZ or stream.longest_gap_s > LONG_GAP_S:
         place.say(
             f"  note: sessions want {SLOW_HZ:g} readings per s without gaps over "
@@ -279,11 +279,11 @@ def take_zero(place: Place) -> int:
     """Measure the zero posture: ZEROED."""
     place.require(SIGN_CHECKED)
     place.operator.confirm(
-        "zero: nothing moves; the device stands in its zero posture (jig, level), and "
-        "the phone's attitude there is measured",
+        "zero: the device stands in its zero posture (jig, level), or moves to pulse 0 "
+        'with session.zero = "drive"; the phone\'s attitude there is measured',
         "zero",
     )
-    return place.run("zero", zero)
+    return place.run("zero", lambda run, device: session.take_zero(device))
 
 
 def simulated(

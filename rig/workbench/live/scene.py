@@ -48,8 +48,9 @@ class DeviceScene:
     """The device as the phone says, and a ghost of its plate as commanded."""
 
     def __init__(self, config: dict[str, Any]) -> None:
-        letters = [axis["letter"] for axis in config.get("axes", [])] or [*"XZY"]
-        self._order = config.get("mechanism_order", "ZXY")  # outermost joint first
+        letters = [axis["rotates"] for axis in config.get("axes", [])] or [*"XZY"]
+        # Outermost joint first.
+        self._order = config.get("mechanism", {}).get("order", "ZXY")
         self._joints = [letters.index(letter) for letter in self._order]
         outer, inner, last = (UNIT[letter] for letter in self._order)
         colors = [AXIS_COLORS[joint] for joint in self._joints]

@@ -63,7 +63,7 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
         "offset_deg": at_zero.tolist(),
         "min_deg": [float(axis["min_deg"]) for axis in axes],
         "max_deg": [float(axis["max_deg"]) for axis in axes],
-        "pulses_per_deg": [Scale(**axis["scale"]).pulses_per_deg for axis in axes],
+        "pulses_per_deg": [Scale.of(axis).pulses_per_deg for axis in axes],
         "min_pulses": [axis["min_pulses"] for axis in axes],
         "max_pulses": [axis["max_pulses"] for axis in axes],
         "forward": np.column_stack([calibration.matrix, calibration.bias]).tolist(),

@@ -169,7 +169,7 @@ class RunState:
 
     def to_deg(self, pulses: Any) -> Degrees:
         """Degrees of (3,) pulses, by the scales in the journal's configuration."""
-        scales = [Scale(**axis["scale"]) for axis in self.start["config"]["axes"]]
+        scales = [Scale.of(axis) for axis in self.start["config"]["axes"]]
         pairs = zip(scales, pulses, strict=True)
         return [round(scale.to_deg(count), 6) for scale, count in pairs]
 
