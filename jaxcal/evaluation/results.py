@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import platform
-from importlib import metadata
 from typing import Any
 
 import numpy as np
@@ -22,7 +19,6 @@ __all__ = [
     "Row",
     "Summary",
     "log_mean",
-    "versions",
 ]
 
 Array = NDArray[np.float64]
@@ -144,15 +140,6 @@ class Evaluation:
         if result.parameters is None:
             raise ValueError(f"{self.dataset.name} holds no measured outputs")
         return np.median(result.parameters.var(axis=0), axis=0)
-
-
-def versions() -> dict[str, str]:
-    """What computed the numbers: Python and the packages that matter."""
-    found = {"python": platform.python_version()}
-    for name in ("jaxcal", "numpy", "scipy", "jax", "flax"):
-        with contextlib.suppress(metadata.PackageNotFoundError):
-            found[name] = metadata.version(name)
-    return found
 
 
 def log_mean(log_values: Array) -> float:

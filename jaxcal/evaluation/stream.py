@@ -19,7 +19,8 @@ import numpy as np
 
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.methods import POLICIES, evaluate
-from jaxcal.evaluation.results import Row, Summary, versions
+from jaxcal.evaluation.results import Row, Summary
+from jaxcal.extras import versions
 from jaxcal.files import write_text
 
 __all__ = ["PART", "evaluate_stream", "total"]
@@ -124,9 +125,10 @@ def _open(folder: pathlib.Path, plan: Mapping[str, Any]) -> None:
     """Make sure that the parts in a folder add up with those of this plan."""
     weights = {}
     if set(plan["methods"]) & set(POLICIES):
-        from jaxcal.learning.training.checkpoint import fingerprint
+        from jaxcal.learning.training.checkpoint import load
 
-        weights = {c or "default": fingerprint(c) for c in plan["checkpoints"]}
+        for given in plan["checkpoints"]:
+            weights[given or "default"] = load(given).weights.fingerprint
     head = {"format": "jaxcal-evaluation-stream", "version": 4, "part": PART}
     whole = {**head, **plan, "weights": weights, "versions": versions()}
     wanted, path = json.loads(json.dumps(whole)), folder / "stream.json"

@@ -113,7 +113,7 @@ def test_a_checkpoint_gives_back_the_policy_and_its_configuration(finished, tmp_
     assert trained.config == CONFIG
     for one, other in zip(leaves(trained.params), leaves(state.average), strict=True):
         np.testing.assert_array_equal(one, other)
-    checkpoint.export(trained.weights, tmp_path / "alone.npz")
+    weights.write(tmp_path / "alone.npz", trained.weights)
     alone = run.load(tmp_path / "alone.npz")
     assert alone.config == CONFIG
     for one, other in zip(leaves(trained.params), leaves(alone.params), strict=True):

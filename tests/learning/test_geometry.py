@@ -152,25 +152,6 @@ def test_log_det_gram_is_that_of_the_regressors(rng):
     assert np.isfinite(np.asarray(small_matrices.log_det_gram(flat))).all()
 
 
-@pytest.mark.parametrize("spanned", [False, True])
-def test_looking_ahead_from_the_largest_gains_keeps_the_pick(rng, monkeypatch, spanned):
-    m = 120
-    points = jnp.asarray(rng.uniform(size=(2, m, 3)), jnp.float32)
-    active = jnp.ones((2, m), bool).at[:, :10].set(False)
-    x, _ = geometry.whiten(points, active)
-    full = geometry.lookahead(x, spanned, active, 4)
-    monkeypatch.setattr(geometry, "_ALL_START", 100)
-    monkeypatch.setattr(geometry, "_STARTS", 40)
-    few = geometry.lookahead(x, spanned, active, 4)
-    for some, every in zip(few[1:], full[1:], strict=True):
-        looked = np.asarray(some) > -30.0
-        assert (looked.sum(-1) == 40).all()
-        assert not looked[:, :10].any()
-        np.testing.assert_allclose(some[looked], every[looked], atol=1e-5)
-    assert (few[0] == full[0]).all()
-    assert (few[-1].argmax(-1) == full[-1].argmax(-1)).all()
-
-
 @pytest.mark.parametrize("k", [5, 20])
 def test_log_det_gram_counts_only_the_rows_present(rng, k):
     postures = rng.uniform(size=(3, k, 3))

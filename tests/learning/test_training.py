@@ -25,6 +25,7 @@ from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
 from jaxcal.learning.policies.build import build
 from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.runtime import weights
 from jaxcal.learning.training import checkpoint, presets
 from jaxcal.learning.training import postures as training
 from jaxcal.learning.training.checkpoint import CheckpointError
@@ -215,7 +216,7 @@ def test_a_save_writes_nothing_twice(finished):
 def test_exporting_writes_the_policy_to_one_file(finished, tmp_path):
     path = tmp_path / "policy.npz"
     for _ in range(2):  # the second replaces the first
-        checkpoint.export(checkpoint.load(finished[0]).weights, path)
+        weights.write(path, checkpoint.load(finished[0]).weights)
     assert [p.name for p in tmp_path.iterdir()] == ["policy.npz"]
     one, other = checkpoint.load(finished[0]), checkpoint.load(path)
     assert one.weights.fingerprint == other.weights.fingerprint
@@ -227,7 +228,7 @@ def test_exporting_writes_the_policy_to_one_file(finished, tmp_path):
     with pytest.raises(CheckpointError, match="no training state"):
         checkpoint.restore(path, finished[1])
     with pytest.raises(ValueError, match=r"one file NAME\.npz, got .*folder"):
-        checkpoint.export(one.weights, tmp_path / "folder")
+        weights.write(tmp_path / "folder", one.weights)
 
 
 def test_a_state_of_another_configuration_is_refused(finished, tmp_path):

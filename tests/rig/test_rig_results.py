@@ -261,7 +261,7 @@ def test_reports_of_collect_verify_and_goto(run, tmp_path, capsys):
         page = (folder / "report.html").read_text()
         assert "measured [deg]" in page and "<p>Done" in page
         assert folder.name in page
-        assert ("Held-out error" in page) == folder.name.startswith("verify")
+        assert ("error before" in page) == folder.name.startswith("verify")
 
 
 def test_a_refused_sender_is_in_the_journal_and_in_the_report(run):

@@ -228,7 +228,7 @@ def choice_text(choice: dict[str, Any]) -> str:
     return (
         f"{choice['method']}: log det {choice['log_det']:.4f} (commands in degrees), "
         f"{rank} {choice['best_log_det']:.4f}, gap {gap:.4f}, D-efficiency "
-        f"{np.exp(-gap / 12.0):.4f}"
+        f"{choice['efficiency']:.4f}"
     )
 
 

@@ -132,14 +132,14 @@ def queue(state: RunState) -> list[Posture]:
 
 
 def verdict(state: RunState, summary: dict[str, Any]) -> list[str]:
-    """The result at the end of a run, as on the console; empty before."""
-    if state.ended is None or state.ended["event"] != "end":
-        return []
+    """The result of a run, as on the console; empty before there is one."""
     limit = state.setting("session", "verify_limit_deg", math.nan)
     if "A" in summary:
         return summary_lines(summary, limit)
     if "before" in summary:
         return [f"{error_text(summary)}, limit {limit:g}"]
+    if state.ended is None or state.ended["event"] != "end":
+        return []
     if state.mode == "goto" and state.done:
         return ["Reached " + " ".join(map(angle, state.done[-1].measured or [])) + "°"]
     return [f"{len(state.done)} postures recorded"] * (state.mode == "collect")

@@ -117,7 +117,15 @@ def load_calibration(
             f"{path}: made with a real device: what is found of a simulated one says "
             "nothing of it. Leave out --simulate, or name a simulated calibration"
         )
-    _check_device(path, notes, config)
+    if "device" not in notes:
+        raise Refused(
+            f"{path}: does not say with which device it was made. Calibrate this device"
+        )
+    if changed := differences(notes["device"], config.device_fingerprint()):
+        raise Refused(
+            f"{path}: made with another device: {'; '.join(changed)}. Correct "
+            "rig.toml, or calibrate this device"
+        )
     zero, attitude = notes.get("zero_pulses"), notes.get("zero_attitude")
     kept = KeptZero(
         f"calibration {notes.get('run', path)}",
@@ -140,19 +148,6 @@ def keep(path: pathlib.Path, axis: str, found: dict[str, Any]) -> None:
     notes = content["provenance"].setdefault("notes", {})
     notes[CHARACTERISED] = notes.get(CHARACTERISED, {}) | {axis: found}
     file.write(path, content)
-
-
-def _check_device(path: pathlib.Path, notes: dict[str, Any], config: RigConfig) -> None:
-    """Refused where a calibration is of another device."""
-    if "device" not in notes:
-        raise Refused(
-            f"{path}: does not say with which device it was made. Calibrate this device"
-        )
-    if changed := differences(notes["device"], config.device_fingerprint()):
-        raise Refused(
-            f"{path}: made with another device: {'; '.join(changed)}. Correct "
-            "rig.toml, or calibrate this device"
-        )
 
 
 def verify(run: Run, calibration: Any, count: int) -> int:

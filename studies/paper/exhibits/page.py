@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxcal import pages
-from jaxcal.evaluation.results import versions
+from jaxcal.extras import versions
 from studies.paper.exhibits.exhibit import Claim, Exhibit, Verdict
 from studies.paper.exhibits.material import Settings
 
