@@ -28,7 +28,6 @@ from rig.core.proof import Proof
 from rig.core.stop import Stopper
 from rig.journal import DeviceRecord, Record, RunFolder
 
-
 LOOK_S = 0.002  # between two looks for a reading
 OVERDUE_S = 0.3  # of a stop that was asked for and that no loop has answered
 TICK_S = 0.05  # of the heartbeat
