@@ -22,7 +22,7 @@ from jaxcal.models import (
     SerialChain,
     Socket,
 )
-from jaxcal.models.checked import facts
+from jaxcal.models.model import facts
 
 __all__ = ["fit_model", "require_model"]
 

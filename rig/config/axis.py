@@ -6,8 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
 
-from rig.config.maps import RegisterMap, load_map
-from rig.config.registers import encode
+from rig.config.maps import RegisterMap, encode, load_map
 from rig.config.schema import Section, advanced, key
 
 AXIS_NAMES = ("pitch", "yaw", "roll")  # the order of every (3,) in this package

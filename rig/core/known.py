@@ -71,12 +71,13 @@ def _exchanged(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
 def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
     """Why the drive's pulses may no longer mean the place that they meant."""
     axis, status = drive.axis, drive.status()
-    left = record.left().get(axis.name, status.position)
+    pulses, homed = record.left()
+    left = pulses.get(axis.name, status.position)
     if axis.map.absolute_encoder:
         return ""
     if status.fault:
         return f"{axis.name} is in alarm: {drive.alarm() or 'no code given'}"
-    if axis.name in record.left_homed():
+    if axis.name in homed:
         if not drive.says_homed:
             return f"the homed bit of {axis.name} is gone: the drive was without power"
     elif left is None:

@@ -8,11 +8,11 @@ import random
 import time
 from collections.abc import Callable, Sequence
 
-from rig.config.maps import RegisterMap
-from rig.config.registers import (
+from rig.config.maps import (
     FLAGS,
     VALUES,
     Read,
+    RegisterMap,
     Write,
     Writes,
     decode,

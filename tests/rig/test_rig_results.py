@@ -455,6 +455,11 @@ def test_trend_tells_what_moved_and_separates_devices(run, capsys):
             else r
         ),
     )
+    unreal = shutil.copytree(run, run.parent / "unreal")
+    rewritten(
+        unreal,
+        lambda r: r | {"simulated": {"noise": 0.02}} if r["event"] == "start" else r,
+    )
     unfinished = shutil.copytree(run, run.parent / "unfinished")
     (unfinished / "summary.json").unlink()
     broken = shutil.copytree(run, run.parent / "broken")
@@ -462,13 +467,15 @@ def test_trend_tells_what_moved_and_separates_devices(run, capsys):
     assert main(["trend", str(run.parent)]) == 1  # the other device: recalibrate
     said = capsys.readouterr()
     assert said.out.count("device pitch") == 2
+    assert said.out.count("device simulated: pitch") == 1
     assert "b[yaw] +10.0000" in said.out and "b[pitch]" not in said.out
     assert "the last calibration still holds" in said.out
     assert "RECALIBRATE: other" in said.out and "unfinished" not in said.out
     assert "broken" in said.err
     page = (run.parent / "trend.html").read_text()
-    assert page.count("no figure") == 2 and "recalibrate" in page
+    assert page.count("no figure") == 3 and "recalibrate" in page
     shutil.rmtree(other)
+    shutil.rmtree(unreal)
     assert main(["trend", str(run.parent)]) == 0
     assert main(["trend", str(unfinished)]) == 2
     assert main(["trend", str(run.parent / "none")]) == 2
