@@ -33,10 +33,10 @@ from rig.journal import read_journal
 from rig.simulator import Simulator, Truth
 from rig.workbench.identification.refit import reread
 from rig.workbench.outputs import trend
-from rig.workbench.outputs.console import numbers
 from rig.workbench.outputs.export import LANGUAGES, load_inverse
 from rig.workbench.outputs.export import checksum as checksum_of
 from rig.workbench.outputs.report import write_report
+from rig.workbench.outputs.words import numbers
 from rig.workbench.readings import attitudes
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])

@@ -85,7 +85,6 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
                 f"check moves it {REACH_DEG:g} deg either way. Move it inwards: "
                 f"jaxcal-rig jog {axis.name}"
             )
-    run.planned = 1 + 8 * 3 + len(CORNERS)
 
     def visit(name: str, offset: dict[int, int], samples: int = 0) -> Stand:
         """Stand at pulses away from the start, and measure."""
@@ -100,9 +99,9 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
         return stands[name]
 
     run.say(
-        f"axes: about {run.planned} places; each axis first by {FIRST_MOTOR_DEG:g} deg "
-        f"of its motor, then as far as the phone's turn allows, {REACH_DEG:g} deg at "
-        "most either way"
+        f"axes: about {25 + len(CORNERS)} places; each axis first by "
+        f"{FIRST_MOTOR_DEG:g} deg of its motor, then as far as the phone's turn "
+        f"allows, {REACH_DEG:g} deg at most either way"
     )
     base = visit("start", {}, 4 * config.settle.samples)
     device.proof.stay_near(base.attitude)
