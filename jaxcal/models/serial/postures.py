@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 Chain = Any  # a SerialChain, whose module imports this one
 
 _ROUNDS, _STEPS = 40, 80  # batches of starts; steps of the inverse kinematics
+_VAIN = 8  # batches in which nothing is found: there is nothing
 _REACHED = 1e-7  # of the arm's length
 _APART = 2.0  # degrees (of a slide: percent of its stroke) between two postures
 _VIEW = np.cos(np.radians(25.0))  # of the board from the camera's axis, and its face
@@ -48,7 +49,9 @@ def postures(
     found = np.zeros((0, arm.num_inputs))
     lost: Counter[str] = Counter()
     tried = 0
-    for _ in range(_ROUNDS):
+    for batch in range(_ROUNDS):
+        if batch == _VAIN and not len(found):
+            break
         size = max(2 * (count - len(found)), 64)
         tried += size
         starts = rng.uniform(low, high, (size, arm.num_joints))
