@@ -211,9 +211,9 @@ def check_zero(config: RigConfig, then: Array, now: Array, whose: str) -> str:
 
 def axes_text(joints: Sequence[float] | Array) -> str:
     """(3,) degrees in words, of the axes that moved most."""
-    pairs = sorted(zip(np.abs(joints), AXIS_NAMES, joints, strict=True), reverse=True)
+    told = TOLD_SHARE * np.abs(joints).max()
     return ", ".join(
         f"{name} stands {angle:+.2f} deg away from where it stood"
-        for size, name, angle in pairs
-        if size >= TOLD_SHARE * pairs[0][0]
+        for name, angle in zip(AXIS_NAMES, joints, strict=True)
+        if abs(angle) >= told
     )

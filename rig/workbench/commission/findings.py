@@ -157,10 +157,8 @@ class Findings:
     joints: tuple[int, ...]  # for each drive: the axis that it turns
     deg_per_pulse: Array  # (3,) of the phone, > 0 where pulses turn the joint positive
     backlash_deg: Array  # (3,) at the phone
-    cross_talk: Array  # (3, 3) rotation about joint i, a share of drive j's own
     mounting: Array  # (3, 3) phone to end-effector, nearest to the three axes
     turned_deg: float  # that from the configured one
-    mirrored: bool  # the axes are a mirror image of those configured
     order: str | None  # axes of the mechanism from the base outwards; None: not clear
 
 
@@ -205,19 +203,7 @@ def find(
         )
     told = euler_to_matrix(config.imu.mounting_deg, "ZYX")
     turned = float(np.linalg.norm(turn(told, mounting)))
-    kept = told if turned <= MOUNTING_DEG else mounting
-    share = _expected(config).T @ kept @ rates
-    own = share[list(joints), range(3)]
-    return Findings(
-        joints=joints,
-        deg_per_pulse=signs * size,
-        backlash_deg=backlash,
-        cross_talk=share / own,
-        mounting=mounting,
-        turned_deg=turned,
-        mirrored=bool(mirrored),
-        order=order,
-    )
+    return Findings(joints, signs * size, backlash, mounting, turned, order)
 
 
 def _expected(config: RigConfig) -> Array:
@@ -434,17 +420,12 @@ def _way(rate: float) -> str:
 def lines(config: RigConfig, found: Findings) -> list[str]:
     """The findings in words, a line for each drive and each thing found."""
     ratios = ratios_of(config, found)
-    text = ["  unit  turns   sense     measured/commanded  play   cross-talk"]
+    text = ["  unit  turns   sense     measured/commanded  play"]
     for drive, joint in enumerate(found.joints):
         axis, unit = config.axes[joint], config.axes[drive].unit
-        cross = ", ".join(
-            f"{AXIS_NAMES[i]} {100 * found.cross_talk[i, drive]:+.1f} %"
-            for i in range(3)
-            if i != joint
-        )
         text.append(
             f"  {unit:>4}  {axis.name:<6}  {_way(found.deg_per_pulse[drive]):<8}  "
-            f"{ratios[drive]:18.3f}  {max(0.0, found.backlash_deg[drive]):.3f}  {cross}"
+            f"{ratios[drive]:18.3f}  {max(0.0, found.backlash_deg[drive]):.3f}"
         )
     angles = matrix_to_euler(found.mounting, "ZYX")
     text.append(
@@ -453,9 +434,4 @@ def lines(config: RigConfig, found: Findings) -> list[str]:
     )
     order = found.order or "not clear from these moves"
     text.append(f"  joints from the base outwards: {order}")
-    if found.mirrored:
-        text.append(
-            "  note: the axes are mirrored against the configuration: a direction is "
-            "wrong, or two drives are exchanged"
-        )
     return text
