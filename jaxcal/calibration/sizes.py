@@ -4,9 +4,10 @@ The prior says how errors of lengths compare with each other, and those of angle
 large they are altogether is seldom known. Here a factor for all lengths, one for the
 turns of the axes (alpha, beta), one for the zeros of the joints (theta), one for their
 compliance and the level of the noise make the readings most probable (marginal
-likelihood, the model linear about the fit), with a factor of three either way as what
-is thought of each beforehand. Sources: MacKay, 1992; Bishop, Pattern Recognition and
-Machine Learning, 3.5.
+likelihood, the model linear about the fit), with a factor of three either way (ten of
+the harmonics) as what is thought of each beforehand.
+
+Sources: MacKay, 1992; Bishop, Pattern Recognition and Machine Learning, 3.5.
 """
 
 from __future__ import annotations
@@ -25,8 +26,10 @@ __all__ = ["Sizes", "group_sizes", "of_sizes"]
 
 Array = NDArray[np.float64]
 
-_MIDDLE = np.log([1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
-_SPREAD = np.log([3.0, 3.0, 3.0, 3.0, 3.0, 3.0])
+# Beforehand, of the factors of the groups and of the level: median, and the factor of
+# one standard deviation. Most arms have little misfit and some have much.
+_MIDDLE = np.log([1.0, 1.0, 1.0, 1.0, 0.3, 1.0])
+_SPREAD = np.log([3.0, 3.0, 3.0, 3.0, 10.0, 3.0])
 _MOST = 5.0  # of a logarithm
 _SCORES = 100  # steps of Fisher's scoring, at most
 _GROUPS = 5  # lengths, turns of the axes, zeros of the joints, compliance, harmonics
@@ -88,9 +91,9 @@ def group_sizes(
         curve[:-1, :-1] += 2.0 * member @ (scaled.T @ seen) ** 2 @ member.T
         curve[-1, :-1] = curve[:-1, -1] = 2.0 * level * member @ (seen**2).sum(axis=0)
         curve[-1, -1] += 2.0 * (level**2 * (inverse**2).sum() + count - top)
-        thought = (logs - _MIDDLE) / _SPREAD
-        value = float(value + thought @ thought)
-        return value, 2.0 * (slope + thought / _SPREAD), 2.0 * curve
+        off = (logs - _MIDDLE) / _SPREAD
+        value = float(value + off @ off)
+        return value, 2.0 * (slope + off / _SPREAD), 2.0 * curve
 
     # A level that is known floats too: misfit beyond it is no size of the errors.
     best = _MIDDLE if before is None else before.logs
@@ -109,9 +112,11 @@ def group_sizes(
     factors[groups >= 0] = np.exp(best[groups[groups >= 0]])
     steps = 1e-3 * np.eye(len(best))
     curves = [cost(best + step)[1] - cost(best - step)[1] for step in steps]
-    size, axes = np.linalg.eigh(np.array(curves) / 4e-3)  # of half the cost
-    size = np.maximum(size, _SPREAD.max() ** -2.0)
-    inside = (axes / size) @ axes.T
+    # Half the cost's, in units of what was thought, which the readings only sharpen.
+    curve = np.array(curves) / 4e-3 * np.outer(_SPREAD, _SPREAD)
+    size, axes = np.linalg.eigh(curve)
+    axes = _SPREAD[:, None] * axes
+    inside = (axes / np.maximum(size, 1.0)) @ axes.T
     return Sizes(best, factors, groups, inside[:_GROUPS, :_GROUPS])
 
 

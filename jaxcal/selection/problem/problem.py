@@ -25,6 +25,7 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 _EPS = float(np.finfo(np.float64).eps)
+_IN_PLANE = 1e-7  # of whitened rows of height one above the origin
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -87,6 +88,19 @@ class Problem:
     def upper(self) -> Indices:
         """(M,) how often each candidate may be chosen."""
         return np.where(self.available, min(self.max_replicates, self.k), 0)
+
+    @property
+    def simplex(self) -> bool:
+        """The k = p chosen span a simplex, and det is its squared volume.
+
+        True where each candidate gives one reading, nothing is known beforehand, D is
+        wanted and all rows lie in one plane off the origin, as those of [u, 1] do: the
+        optimum then uses vertices of the convex hull only.
+        """
+        if not self.rank_one or self.k != self.num_regressors or len(self.root):
+            return False
+        height = self.rows @ self.rows.sum(axis=0)
+        return bool((np.abs(height - 1.0) <= _IN_PLANE)[self.available].all())
 
     @property
     def held_rank(self) -> int:

@@ -19,14 +19,9 @@ from rig.config import AXIS_NAMES
 from rig.core.attitude import Array
 from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE
 from rig.journal import JOURNAL, Record, RunFolder, is_written, measured_postures
-from rig.workbench.outputs.console import (
-    choice_text,
-    numbers,
-    recalibrate,
-    summary_lines,
-)
 from rig.workbench.outputs.state import RunState
-from rig.workbench.outputs.words import headline, trouble, verdict
+from rig.workbench.outputs.view import headline, trouble, verdict
+from rig.workbench.outputs.words import choice_text, numbers, recalibrate, summary_lines
 from rig.workbench.readings import angles, recorded_frame
 
 FOOTER = (

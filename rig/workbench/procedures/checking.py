@@ -19,7 +19,7 @@ from rig.core.known import KeptZero, unseen
 from rig.core.motion import move
 from rig.core.session import visit
 from rig.workbench.identification.fit import held_out_errors, pairs
-from rig.workbench.outputs.console import error_text, numbers
+from rig.workbench.outputs.words import error_text, numbers
 from rig.workbench.procedures.calibrate import END, pair_names, visit_pairs
 from rig.workbench.procedures.plan import draw, draw_held_out
 from rig.workbench.procedures.play import CHARACTERISED, Play
@@ -41,7 +41,6 @@ def collect(run: Run, count: int) -> int:
     if run.dry_run:
         for number, target in enumerate(targets):
             run.say(f"  {number:>5}   {numbers(config.to_deg(target))}   {target}")
-    run.planned = len(targets) + 1
     names = [f"collect:{number}" for number in range(len(targets))]
     if run.lacks([*names, END]):
         with run.device() as device:
@@ -158,7 +157,6 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     )["pairs"]
     if not held:
         raise Refused("no target in the ranges can be reached through this calibration")
-    run.planned = 2 * len(held)
     if run.dry_run:
         for raw, command in held:
             run.say(f"  target {numbers(config.to_deg(raw))}  command {list(command)}")
@@ -209,7 +207,6 @@ def goto(run: Run, calibration: Any, desired: Array, play: Play) -> int:
                 + f" less its play, {most:.3f} deg"
                 * bool(most)
             )
-    run.planned = 1
     if run.dry_run or not play.axes:
         _tell(run, desired, command)
     if run.lacks(["goto"]):
