@@ -210,7 +210,7 @@ def _stack(
     else:
         shift = np.zeros((*batch, p, p))
         centred[...] = blocks
-    largest = np.maximum(blocks.max(axis=(-3, -2)), -blocks.min(axis=(-3, -2)))
+    largest = np.abs(blocks).max(axis=(-3, -2))
     if len(root):
         rows[..., count * q :, :] = root - root @ shift
         largest = np.maximum(largest, np.abs(root).max(axis=0))

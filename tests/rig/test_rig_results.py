@@ -202,11 +202,11 @@ def test_a_heading_that_drifts_is_taken_out_of_a_session(tmp_path):
     assert (left < 0.3 * before).all()
 
 
-def test_a_run_of_before_the_first_version_is_refused(run, capsys):
-    rewritten(run, lambda record: {k: v for k, v in record.items() if k != "device"})
+def test_a_run_of_an_earlier_version_is_refused(run, capsys):
+    rewritten(run, lambda record: record | {"schema": 1})
     for command in (["report"], ["refit"], ["export", "--to", "c"], ["resume"]):
         assert main([command[0], str(run), *command[1:]]) == 2
-        assert "before jaxcal 0.1.0" in capsys.readouterr().err
+        assert "by an earlier version of jaxcal" in capsys.readouterr().err
 
 
 def test_a_journal_keeps_every_reading_in_little_room(finished):

@@ -155,7 +155,7 @@ def _touching(
         gram = gram + 1e-6 * trace * np.eye(gram.shape[-1])
         step = np.linalg.solve(gram, -off[going][..., None])
         step = (np.matrix_transpose(slopes) @ step)[..., 0]
-        step *= np.minimum(1.0, 0.1 / np.abs(step).max(axis=1, keepdims=True))
+        step *= 0.1 / np.maximum(np.abs(step).max(axis=1, keepdims=True), 0.1)
         commands[going, :j] = np.clip(at + step * scale, low, high)
     reached = np.linalg.norm(arm.predict(commands), axis=1) <= limit
     why = "do not reach within the limits"

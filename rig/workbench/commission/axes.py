@@ -7,7 +7,6 @@ import numpy as np
 from rig.config import AXIS_NAMES
 from rig.core.device import Device, Posture
 from rig.core.faults import MotionFault, Refused
-from rig.core.measure import measure
 from rig.core.motion import move
 from rig.core.proof import FIRST_MOTOR_DEG, unit_proved
 from rig.journal import SIGN_CHECKED
@@ -23,6 +22,7 @@ from rig.workbench.commission.findings import (
     ratios_of,
     require_gearing,
     require_unit,
+    stand_at,
     turn,
 )
 from rig.workbench.run import Run
@@ -88,14 +88,8 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
 
     def visit(name: str, offset: dict[int, int], samples: int = 0) -> Stand:
         """Stand at pulses away from the start, and measure."""
-        target = list(start)
-        for axis, way in offset.items():
-            target[axis] += way
-        run.signals.check_pause()
-        posture = Posture(name, tuple(target))
-        measured = measure(move(device, posture), samples or None)
-        run.emit("stand", sync=True, name=name, **measured)
-        stands[name] = Stand.of(measured)
+        target = tuple(p + offset.get(axis, 0) for axis, p in enumerate(start))
+        stands[name] = stand_at(run, device, Posture(name, target), samples)
         return stands[name]
 
     run.say(
