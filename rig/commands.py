@@ -489,6 +489,7 @@ def _journal(run: Path) -> Path:
 def _records(run: Path) -> list[Record]:
     """The journal of a run; Refused where its folder holds none, or a damaged one."""
     from rig.journal import JournalError, read_journal
+    from rig.journal.run import SCHEMA
 
     try:
         records = read_journal(_journal(run))
@@ -496,10 +497,10 @@ def _records(run: Path) -> list[Record]:
         raise Refused(str(error)) from None
     if not records or records[0]["event"] != "start":
         raise Refused(f"{run} holds no run: its journal has no start")
-    if "device" not in records[0]:
+    if records[0].get("schema") != SCHEMA:
         raise Refused(
-            f"{run} was written before jaxcal 0.1.0, whose runs are not read any more. "
-            "Make a new one"
+            f"{run} was written by an earlier version of jaxcal, whose runs are not "
+            "read. Make a new one"
         )
     return records
 

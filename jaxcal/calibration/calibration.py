@@ -155,20 +155,26 @@ class Calibration(Fit):
         return check(self, commands, measured, tolerance, placed_anew)
 
     def verification(
-        self, candidates: ArrayLike, k: int, *, region: ArrayLike | None = None
+        self,
+        candidates: ArrayLike,
+        k: int,
+        *,
+        region: ArrayLike | None = None,
+        tolerance: float | None = None,
     ) -> NDArray[np.int64]:
         """The k of the candidates that show best that the calibration is wrong.
 
         Args:
             candidates: (M, n) commands that could be measured.
-            k: two or three see what many random ones see.
+            k: three or four see what six random ones see.
             region: (R, n) commands where it is used, which say how much a drift of a
                 parameter matters; those of the calibration when not given.
+            tolerance: the drift to be seen, as of :meth:`check`.
 
         Returns:
             (k,) indices.
         """
-        return verification(self, candidates, k, region)
+        return verification(self, candidates, k, region, tolerance)
 
     # -- an arm, written back ----------------------------------------------------------
 

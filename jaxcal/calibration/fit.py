@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.calibration.harmonics import WithHarmonics
 from jaxcal.checks import numbers
 from jaxcal.models import Affine, Model, Prior, SerialChain, identifiability
-from jaxcal.models.checked import derivative, predict
 from jaxcal.models.identifiability import Identifiability
+from jaxcal.models.model import derivative, predict
 
 __all__ = ["Fit"]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.models import SerialChain
-from jaxcal.models.checked import facts
+from jaxcal.models.model import facts
 
 __all__ = ["WithHarmonics"]
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.models import Model
-from jaxcal.models.checked import derivative, facts, predict
+from jaxcal.models.model import derivative, facts, predict
 
 __all__ = ["Solution", "Task", "solve", "student_constants"]
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers, require_finite, whole_number
-from jaxcal.information.blocks import rank_rule
+from jaxcal.information.blocks import log_det_blocks
 
 __all__ = [
     "log_det_gram",
@@ -92,13 +92,8 @@ def log_det_gram(commands: ArrayLike) -> Array:
     Returns:
         (...,) natural log; ``-inf`` where the postures span fewer than n dimensions.
     """
-    commands = _as_commands(commands)
-    num_postures, num_inputs = commands.shape[-2:]
-    if num_postures <= num_inputs:
-        return np.full(commands.shape[:-2], -np.inf)
-    centred = commands - commands.mean(axis=-2, keepdims=True)
-    largest = np.abs(commands).max(axis=-2)
-    return np.log(num_postures) + rank_rule(centred, largest)[1]
+    z = regressors(commands)
+    return log_det_blocks(z[..., None, :], np.zeros((0, z.shape[-1])))
 
 
 def log_det_information(

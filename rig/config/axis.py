@@ -6,8 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
 
-from rig.config.maps import RegisterMap, load_map
-from rig.config.registers import encode
+from rig.config.maps import RegisterMap, encode, load_map
 from rig.config.schema import Section, advanced, key
 
 AXIS_NAMES = ("pitch", "yaw", "roll")  # the order of every (3,) in this package
@@ -141,13 +140,13 @@ class Axis(Scale):
             place = self.map.move.place_of(name)
             if place is None:
                 continue
-            key_name, per = ("accel_deg_s2", per_accel)
+            key_name, unit, per = "accel_deg_s2", "deg/s^2", per_accel
             if name == "speed":
-                key_name, per = ("speed_deg_s", per_speed)
+                key_name, unit, per = "speed_deg_s", "deg/s", per_speed
             if count < 1:
                 raise ValueError(
-                    f"{key_name}: must be at least {1.0 / per:.6g}, one count of the "
-                    f"drive's register, got {getattr(self, key_name):g}"
+                    f"{key_name}: must be at least {1.0 / per:.6g} {unit}, one count "
+                    f"of the drive's register, got {getattr(self, key_name):g}"
                 )
             try:
                 encode(count, place[1], self.map.word_order)

@@ -53,11 +53,6 @@ def _by_format(hyperimu: Any, other: Any) -> Callable[[dict[str, Any]], Any]:
     return lambda made: hyperimu if made["format"] == "hyperimu" else other
 
 
-def _phone_order(made: dict[str, Any]) -> str | None:
-    angles = made["format"] == "lines" and not made["quaternion_columns"]
-    return None if angles else "ZYX"
-
-
 class ImuSettings(Section):
     """The phone's stream."""
 
@@ -89,7 +84,9 @@ class ImuSettings(Section):
     unit: Literal["deg", "rad"] = key("of the angles", "deg")
     order: Order | None = key(
         "sequence of the phone's Euler angles", "ZYX; lines of angles: required",
-        by=_phone_order,
+        by=lambda made: (
+            "ZYX" if made["format"] != "lines" or made["quaternion_columns"] else None
+        ),
     )  # fmt: skip
     signs: tuple[Sign, Sign, Sign] = key(
         "of the angles, in the sequence of order",

@@ -137,6 +137,7 @@ class Journal:
 
 
 JOURNAL = "journal.jsonl"
+SCHEMA = 2  # of the first record; runs of others are not read
 # A full disk must not keep a stop from the bus, nor from the console.
 SPARED = ("write", "stop", "comm_restored", "note")
 
@@ -198,7 +199,7 @@ class RunFolder:
             return
         config, device = self.config.described(), self.config.device_fingerprint()
         start = {"config": config, "device": device, **provenance, **start}
-        self.emit("start", sync=True, schema=1, mode=mode, **start)
+        self.emit("start", sync=True, schema=SCHEMA, mode=mode, **start)
 
     def emit(self, event: str, *, sync: bool = False, **fields: Any) -> Record:
         """Journal an event, then tell the listeners: the one stream of a run.

@@ -13,7 +13,7 @@ from rig.core.attitude import ORDERS, Frame, Reading, euler_to_matrix, raw_field
 from rig.simulator import Truth
 from rig.workbench.identification.conclusion import estimate_drift, without_drift
 from rig.workbench.identification.fit import uncertainty
-from rig.workbench.outputs.console import drift_text, recalibrate
+from rig.workbench.outputs.words import drift_text, recalibrate
 from rig.workbench.readings import attitudes
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])

@@ -18,7 +18,7 @@ from rig.journal import Journal, is_written, read_journal
 from rig.workbench import live
 from rig.workbench.live import charts
 from rig.workbench.live.watcher import Tail, Watcher
-from rig.workbench.outputs import words
+from rig.workbench.outputs import view
 from rig.workbench.outputs.state import RunState
 
 
@@ -33,15 +33,15 @@ def run(tmp_path_factory):
 
 
 def queue(state):
-    return live.draw("queue", postures=words.queue(state), count=len(state.postures))
+    return live.draw("queue", postures=view.queue(state), count=len(state.postures))
 
 
 def trouble(state, running, folder):
-    return live.draw("trouble", lines=words.trouble(state, running, folder))
+    return live.draw("trouble", lines=view.trouble(state, running, folder))
 
 
 def numbers(state, running):
-    return live.draw("numbers", rows=words.numbers(state.present({}, running)))
+    return live.draw("numbers", rows=view.numbers(state.present({}, running)))
 
 
 def waiting(state):
@@ -91,8 +91,8 @@ def test_a_finished_run_shows_what_its_journal_holds(run):
     assert state.planned == len(measured)
     assert not waiting(state)
     assert not state.damaged
-    assert words.headline(state, running=False) == ("good", "Done")
-    assert not words.trouble(state, False, "run")
+    assert view.headline(state, running=False) == ("good", "Done")
+    assert not view.trouble(state, False, "run")
     end = [r for r in measured if r["role"] == "reference"][-1]
     assert state.drift[-1][1] == end["measured_deg"]
 
@@ -101,11 +101,11 @@ def test_every_moment_of_a_run_can_be_drawn(run):
     state = RunState()
     for record in read_journal(run[0] / "journal.jsonl"):
         state.apply(record)
-        now, said = words.headline(state, True), words.progress(state)
+        now, said = view.headline(state, True), view.progress(state)
         for text in (
             live.draw("head", state=state, now=now, said=said, folder="run"),
             queue(state),
-            live.draw("numbers", rows=words.numbers(state.present({}, True))),
+            live.draw("numbers", rows=view.numbers(state.present({}, True))),
             trouble(state, True, "run"),
             live.draw("log", lines=state.log),
         ):
@@ -121,7 +121,7 @@ def test_places_of_a_commissioning_step_are_shown_and_what_goes_on_is_the_step()
     fault = {"event": "fault", "code": 3, "reason": "the phone fell silent"}
     state = state_of(numbered([start, stand, fault]))
     assert "pitch:plus" in queue(state)
-    commanded = words.angle(state.to_deg([100, 0, 0])[0])
+    commanded = view.angle(state.to_deg([100, 0, 0])[0])
     for running in (True, False):
         assert commanded in numbers(state, running)
     told = trouble(state, False, "runs/axes")
@@ -138,7 +138,7 @@ def test_the_posture_under_way_goes_through_its_states():
         seen.append(state_of(numbered(records)).postures["select:3"].state)
     assert seen == ["moving", "moving", "settling", "measuring"]
     state = state_of(numbered(records))
-    assert words.headline(state, True) == ("run", "Measuring posture 3")
+    assert view.headline(state, True) == ("run", "Measuring posture 3")
     records += [posture("select:3")]
     state = state_of(numbered(records))
     assert state.postures["select:3"].state == "done"
@@ -212,7 +212,7 @@ def test_another_choice_forgets_what_was_only_waiting():
 def test_the_headline_says_how_it_stands(last, running, tone, part):
     records = [*begun(), {"event": "phase", "phase": "moving"}]
     state = state_of(numbered(records + ([last] if last else [])))
-    shown = words.headline(state, running)
+    shown = view.headline(state, running)
     assert shown[0] == tone and part in shown[1]
     told = trouble(state, running, "runs/one")
     if last and last["event"] != "end":

@@ -12,6 +12,7 @@ import pytest
 from harness import HASTY, UNSETTLED, WATCHED, fast_config, fast_text, simulator
 
 from rig.config import parse_config
+from rig.core import measure as measuring
 from rig.core import motion as moving
 from rig.core.attitude import Reading, euler_to_matrix
 from rig.core.device import Device, Posture, approach, check_plan
@@ -97,6 +98,37 @@ def test_an_alarm_or_a_silent_phone_keeps_it_from_arming():
         time.sleep(motion.config.imu.stale_s + 0.1)
         with pytest.raises(ImuError, match="reading is"):
             motion.device.arm()
+
+
+def other_controller(motion):
+    """What shares a gateway with us, where no lock is possible, moves yaw slowly."""
+    with motion.sim.server.lock:
+        drive = motion.sim.drives[1]
+        drive._enable()
+        drive.advance()
+        drive._move(round(drive.position) + 5000, 10.0, 1e5)
+
+
+def test_a_drive_that_another_controller_moves_keeps_it_from_arming():
+    with bench(arm=False) as motion:
+        other_controller(motion)
+        with pytest.raises(MotionFault, match="yaw is already moving"):
+            motion.device.arm()
+
+
+def test_a_drive_that_another_controller_moves_ends_what_is_measured(monkeypatch):
+    """Settled, then moved: slower than any reading of the phone shows."""
+    with bench() as motion:
+        settled = measuring._settled
+
+        def then_moved(*args):
+            statuses = settled(*args)
+            other_controller(motion)
+            return statuses
+
+        monkeypatch.setattr(measuring, "_settled", then_moved)
+        with pytest.raises(MotionFault, match="moves while the posture is measured"):
+            measure(Standing(motion.device, Posture("", (0, 0, 0))), 200)
 
 
 def test_a_position_outside_the_limits_keeps_it_from_arming():

@@ -33,10 +33,10 @@ from rig.journal import read_journal
 from rig.simulator import Simulator, Truth
 from rig.workbench.identification.refit import reread
 from rig.workbench.outputs import trend
-from rig.workbench.outputs.console import numbers
 from rig.workbench.outputs.export import LANGUAGES, load_inverse
 from rig.workbench.outputs.export import checksum as checksum_of
 from rig.workbench.outputs.report import write_report
+from rig.workbench.outputs.words import numbers
 from rig.workbench.readings import attitudes
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
@@ -202,11 +202,11 @@ def test_a_heading_that_drifts_is_taken_out_of_a_session(tmp_path):
     assert (left < 0.3 * before).all()
 
 
-def test_a_run_of_before_the_first_version_is_refused(run, capsys):
-    rewritten(run, lambda record: {k: v for k, v in record.items() if k != "device"})
+def test_a_run_of_an_earlier_version_is_refused(run, capsys):
+    rewritten(run, lambda record: record | {"schema": 1})
     for command in (["report"], ["refit"], ["export", "--to", "c"], ["resume"]):
         assert main([command[0], str(run), *command[1:]]) == 2
-        assert "before jaxcal 0.1.0" in capsys.readouterr().err
+        assert "by an earlier version of jaxcal" in capsys.readouterr().err
 
 
 def test_a_journal_keeps_every_reading_in_little_room(finished):
@@ -261,7 +261,7 @@ def test_reports_of_collect_verify_and_goto(run, tmp_path, capsys):
         page = (folder / "report.html").read_text()
         assert "measured [deg]" in page and "<p>Done" in page
         assert folder.name in page
-        assert ("Held-out error" in page) == folder.name.startswith("verify")
+        assert ("error before" in page) == folder.name.startswith("verify")
 
 
 def test_a_refused_sender_is_in_the_journal_and_in_the_report(run):
@@ -455,6 +455,11 @@ def test_trend_tells_what_moved_and_separates_devices(run, capsys):
             else r
         ),
     )
+    unreal = shutil.copytree(run, run.parent / "unreal")
+    rewritten(
+        unreal,
+        lambda r: r | {"simulated": {"noise": 0.02}} if r["event"] == "start" else r,
+    )
     unfinished = shutil.copytree(run, run.parent / "unfinished")
     (unfinished / "summary.json").unlink()
     broken = shutil.copytree(run, run.parent / "broken")
@@ -462,13 +467,15 @@ def test_trend_tells_what_moved_and_separates_devices(run, capsys):
     assert main(["trend", str(run.parent)]) == 1  # the other device: recalibrate
     said = capsys.readouterr()
     assert said.out.count("device pitch") == 2
+    assert said.out.count("device simulated: pitch") == 1
     assert "b[yaw] +10.0000" in said.out and "b[pitch]" not in said.out
     assert "the last calibration still holds" in said.out
     assert "RECALIBRATE: other" in said.out and "unfinished" not in said.out
     assert "broken" in said.err
     page = (run.parent / "trend.html").read_text()
-    assert page.count("no figure") == 2 and "recalibrate" in page
+    assert page.count("no figure") == 3 and "recalibrate" in page
     shutil.rmtree(other)
+    shutil.rmtree(unreal)
     assert main(["trend", str(run.parent)]) == 0
     assert main(["trend", str(unfinished)]) == 2
     assert main(["trend", str(run.parent / "none")]) == 2

@@ -72,9 +72,9 @@ def test_auto_stops_where_the_bound_proves_enough(k):
     assert found.value == pytest.approx(problem.log_det(found.indices))
 
 
-def test_a_sphere_is_not_searched_where_the_bound_suffices():
+def test_a_large_hull_is_not_enumerated_where_the_bound_suffices():
     found = jaxcal.select(sphere(500), 4, least_efficiency=0.9)
-    assert found.method == "exchange" and found.nodes < 500
+    assert (found.method, found.nodes) == ("exchange", 1)
     assert found.efficiency >= 0.9
 
 

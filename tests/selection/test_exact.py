@@ -12,7 +12,10 @@ from questions import make_problem, score
 from jaxcal.models import Affine
 from jaxcal.selection import exact_batch, exchange_batch, select
 from jaxcal.selection.exact import exact as exact_module
+from jaxcal.selection.exact.branch_and_bound import branch_and_bound
 from jaxcal.selection.exact.exact import solve_exact, upper_bound
+from jaxcal.selection.exact.volume import largest_volumes
+from jaxcal.selection.exchange.exchange import exchange_indices
 
 
 def full_log_dets(candidates, subsets, num_outputs=None):
@@ -172,11 +175,38 @@ def test_grid_optimum_is_its_corners(k):
     assert select(grid(4), k, "exact").log_det == pytest.approx(values[0], abs=1e-8)
 
 
-def test_a_sphere_whose_points_are_all_corners_is_solved():
-    points = sphere(0, 40)
-    _, values = brute_force(points, 4, num_outputs=1)
-    found = select(points, 4, "exact", model=Affine(3, 1))
-    assert found.proven and found.log_det == pytest.approx(values[0], abs=1e-9)
+def test_hull_enumeration_and_branch_and_bound_agree_on_a_sphere():
+    problem = make_problem(sphere(0, 40), 4)
+    enumerated = solve_exact(problem)
+    start = np.bincount(exchange_indices(problem, 5), minlength=40)
+    branched = branch_and_bound(
+        problem.blocks, problem.prior, problem.criterion, problem.lower, problem.upper,
+        start,
+    )  # fmt: skip
+    assert branched.proven
+    assert problem.log_det(enumerated.indices) == pytest.approx(
+        problem.log_det(np.flatnonzero(branched.counts[0])), abs=1e-8
+    )
+
+
+@pytest.mark.parametrize("q", range(1, 7))
+@pytest.mark.parametrize("h", [8, 11])
+def test_largest_volumes_are_those_of_every_determinant(q, h):
+    vectors = np.random.default_rng(q).normal(size=(h, q))
+    subsets = np.array(list(itertools.combinations(range(h), q)))
+    volumes = np.abs(np.linalg.det(vectors[subsets]))
+    order = np.argsort(-volumes)
+    found = largest_volumes(vectors, best=5)
+    np.testing.assert_array_equal(found.subsets, subsets[order[:5]])
+    one = largest_volumes(vectors)
+    np.testing.assert_array_equal(one.subsets[0], subsets[order[0]])
+
+
+def test_grouped_enumeration_agrees_with_branch_and_bound():
+    problem = make_problem(uniform(3, 120), 4)
+    found = largest_volumes(problem.rows)  # all of them: no hull, the grouped products
+    exact = solve_exact(problem)
+    assert problem.log_det(found.subsets[0]) == pytest.approx(exact.bound, abs=1e-8)
 
 
 @pytest.mark.parametrize("k", [4, 8, 12])
@@ -265,7 +295,7 @@ def test_there_is_a_time_limit_by_default(monkeypatch, method):
     assert 0.9 < found.efficiency < 1.0
 
 
-def test_a_time_limit_of_nothing_is_honest_too():
+def test_time_limit_during_enumeration_is_honest_too():
     found = select(sphere(0, 300), 4, "exact", time_limit=1e-6)
     assert not found.proven
     optimum = select(sphere(0, 300), 4, "exchange").log_det

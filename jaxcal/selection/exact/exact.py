@@ -1,4 +1,11 @@
-"""The proven optimum: branch and bound, started from the exchange."""
+"""The proven optimum, by whichever proof is cheaper.
+
+k = n + 1 affine postures: the absolute determinant is convex in each posture, so only
+vertices of the convex hull matter, and :mod:`jaxcal.selection.exact.volume` finds the
+largest volume. Everything else (more postures, blocks, priors, other criteria, many
+runners-up) goes to branch and bound, started from the exchange. The runner-up need not
+lie on the hull, so ``best`` > 1 does without it.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
+from jaxcal.selection.exact.volume import largest_volumes
 from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
 from jaxcal.selection.problem import Problem, values
 from jaxcal.selection.solver import Found, in_threads
@@ -25,8 +33,8 @@ _BLOCKS_LIMIT = 2.0  # of auto: what is not proven by then often takes minutes
 
 TOLERATED = 1e-9  # share by which rounding may change what is called proven
 
-_CHEAP = 5_000_000  # subsets: the optimum is mostly proven within milliseconds, and
-_CHEAP_LIMIT = 1.0  # seconds at most
+_CHEAP = 5_000_000  # subsets: the largest volume is found within milliseconds
+_LARGEST_HULL_DIMENSION = 4  # qhull's facets grow as M^(n // 2)
 
 
 def solve(
@@ -51,6 +59,8 @@ def solve_many(
     def solved(problem: Problem) -> Found:
         return solve_exact(problem, deadline=deadline)
 
+    if problems[0].simplex:  # mostly the hull, which keeps other threads waiting
+        return [solved(problem) for problem in problems]
     return in_threads(problems, solved)
 
 
@@ -115,6 +125,20 @@ def solve_exact(
         restarts, seed: of the exchange that starts branch and bound.
         enough: efficiency in (0, 1] at which to stop, unless the proof is cheap.
     """
+    if problem.simplex:
+        pool = _pool(problem, hull=best == 1)
+        free = problem.k - len(problem.required)
+        cheap = math.comb(len(pool), free) <= _CHEAP
+        if best == 1 or cheap:
+            if enough and not cheap:  # the relaxation may do without
+                start = np.sort(exchange_indices(problem, restarts, seed, deadline))
+                relaxed = _relaxed(problem, start)
+                found = _found(problem, [start], best, relaxed, 1)
+                assert found.value is not None and found.bound is not None
+                if problem.criterion.efficiency(found.value, found.bound) >= enough:
+                    return dataclasses.replace(found, seed=seed, restarts=restarts)
+            found = _enumerate(problem, pool, best, deadline)
+            return dataclasses.replace(found, seed=seed, restarts=restarts)
     start = exchange_indices(problem, restarts, seed, deadline)
     keep, first = _groups(problem, merge=best == 1)
     counts = np.bincount(start, minlength=len(problem.blocks))
@@ -144,23 +168,79 @@ def upper_bound(problem: Problem) -> float:
 
     As reported: of A, As and I a lower bound.
     """
-    free = problem.k - len(problem.required)
-    if problem.rank_one and math.comb(int(problem.available.sum()), free) <= _CHEAP:
-        found = solve_exact(problem, deadline=time.perf_counter() + _CHEAP_LIMIT)
-        assert found.bound is not None
-        return found.bound
+    if problem.simplex:
+        pool = _pool(problem, hull=True)
+        free = problem.k - len(problem.required)
+        if math.comb(len(pool), free) <= _CHEAP:
+            found = _enumerate(problem, pool, 1, None)
+            assert found.bound is not None
+            return found.bound
+    relaxed = _relaxed(problem, greedy_indices(problem))
+    return float(problem.criterion.reported(relaxed))
+
+
+def _relaxed(problem: Problem, start: Indices) -> float:
+    """Upper bound on phi of the criterion, from a selection (k,) to climb from."""
     keep = np.flatnonzero(problem.available)
-    start = np.bincount(greedy_indices(problem), minlength=len(problem.blocks))
-    relaxed = branch_and_bound(
+    counts = np.bincount(start, minlength=len(problem.blocks))
+    return branch_and_bound(
         problem.blocks[keep],
         problem.prior,
         problem.criterion,
         problem.lower[keep],
         problem.upper[keep],
-        start[keep],
+        counts[keep],
         root_only=True,
     ).bound
-    return float(problem.criterion.reported(relaxed))
+
+
+def _pool(problem: Problem, hull: bool) -> Indices:
+    """Candidates that may join the required ones in an optimum with k = p."""
+    usable = problem.available.copy()
+    usable[problem.required] = False
+    pool = np.flatnonzero(usable)
+    n = problem.num_regressors - 1
+    few = math.comb(len(pool), n + 1) <= _CHEAP  # faster than loading qhull
+    if not hull or n > _LARGEST_HULL_DIMENSION or few:
+        return pool
+    # Whitened postures lie in a plane across the sum of all rows: reflected so that it
+    # is the first axis, the other axes are coordinates in that plane.
+    rows, mirror = problem.rows[pool], problem.rows.sum(axis=0)
+    mirror[0] += np.copysign(np.sqrt(mirror @ mirror), mirror[0])
+    mirror *= np.sqrt(2.0 / (mirror @ mirror))
+    points = rows[:, 1:] - (rows @ mirror)[:, None] * mirror[1:]
+    if n == 1:
+        return pool[np.unique([points.argmin(), points.argmax()])]
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        return pool[ConvexHull(points).vertices]
+    except QhullError:  # flat without the required ones: every candidate stays in
+        return pool
+
+
+def _enumerate(
+    problem: Problem, pool: Indices, best: int, deadline: float | None
+) -> Found:
+    """Largest volumes beside the required rows, in the space these leave free."""
+    required = problem.rows[problem.required]
+    vectors = problem.rows[pool]
+    if len(required):
+        # The rows outside the span of the required ones keep all the volume there is.
+        basis = np.linalg.qr(required.T, mode="complete")[0][:, len(required) :]
+        vectors = vectors @ basis
+    found = largest_volumes(vectors, best, deadline)
+    subsets = [
+        np.sort(np.concatenate([problem.required, pool[s]])) for s in found.subsets
+    ]
+    if found.complete:
+        return _found(problem, subsets, best, None, found.examined)
+    # Out of time: whatever greedy has, if that is better, and the sharper bound.
+    greedy = np.sort(greedy_indices(problem))
+    # log det(X_s.T X_s) is twice the log of the volume, beside that of ``required``.
+    fixed = np.linalg.slogdet(required @ required.T)[1] if len(required) else 0.0
+    bound = min(_relaxed(problem, greedy), fixed + 2.0 * float(np.log(found.bound)))
+    return _found(problem, [*subsets, greedy], best, bound, found.examined)
 
 
 def _found(

@@ -1,4 +1,3 @@
-cdef _describe(double[:, :, ::1] x, Py_ssize_t[:, :] chosen, unsigned char[:, ::1] active, Py_ssize_t k, Py_ssize_t depth, bint best_only, float[:, :, ::1] features, float[:, :, ::1] moments, double[:, ::1] ahead, double[:, ::1] y, double[:, ::1] values, double[:, ::1] work, double[::1] weights)
 cdef void _behind_best(double[:, ::1] values) noexcept nogil
 cdef void _features(double[:, ::1] y, unsigned char[::1] active, double[:, ::1] values, float[:, ::1] features, float[:, ::1] moments) noexcept nogil
 cdef void _conditional(double[:, ::1] x, Py_ssize_t[:] chosen, unsigned char[::1] active, Py_ssize_t k, double[:, ::1] y, double[::1] inner) noexcept nogil

@@ -45,57 +45,29 @@ def describe(x, chosen, active, k, depth, best_only, features, moments, ahead):
         ahead: (E, M) written: log-volume at the end of the look-ahead, behind the best.
     """
     p, m = x.shape[1:]
-    _describe(
-        np.ascontiguousarray(x),
-        chosen,
-        np.ascontiguousarray(active).view(np.uint8),
-        k,
-        depth,
-        best_only,
-        features,
-        moments,
-        ahead,
-        np.empty((p, m)),
-        np.empty((4, m)),
-        np.empty((p + depth + 2, m)),
-        np.empty(p + depth),
-    )
-
-
-def _describe(
-    x,
-    chosen,
-    active,
-    k,
-    depth,
-    best_only,
-    features,
-    moments,
-    ahead,
-    y,
-    values,
-    work,
-    weights,
-):
+    vectors: cython.double[:, :, ::1] = np.ascontiguousarray(x)
+    made: cython.Py_ssize_t[:, :] = chosen
+    seen: cython.uchar[:, ::1] = np.ascontiguousarray(active).view(np.uint8)
+    shown: cython.float[:, :, ::1] = features
+    second: cython.float[:, :, ::1] = moments
+    behind: cython.double[:, ::1] = ahead
+    y: cython.double[:, ::1] = np.empty((p, m))
+    values: cython.double[:, ::1] = np.empty((4, m))
+    work: cython.double[:, ::1] = np.empty((p + depth + 2, m))
+    weights: cython.double[::1] = np.empty(p + depth)
+    all_of: cython.Py_ssize_t = k
+    far: cython.Py_ssize_t = depth
+    spanned: cython.bint = k > p
+    only: cython.bint = best_only
     b: cython.Py_ssize_t
     with cython.nogil:
-        for b in range(x.shape[0]):
-            _conditional(x[b], chosen[b], active[b], k, y, work[0])
-            _look_ahead(
-                y,
-                active[b],
-                k > x.shape[1],
-                depth,
-                best_only,
-                None,
-                values,
-                work,
-                weights,
-            )
+        for b in range(vectors.shape[0]):
+            _conditional(vectors[b], made[b], seen[b], all_of, y, work[0])
+            _look_ahead(y, seen[b], spanned, far, only, None, values, work, weights)
             _behind_best(values)
-            ahead[b] = values[3]
-            if not best_only:
-                _features(y, active[b], values, features[b], moments[b])
+            behind[b] = values[3]
+            if not only:
+                _features(y, seen[b], values, shown[b], second[b])
 
 
 def _behind_best(values):

@@ -25,6 +25,7 @@ Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 _EPS = float(np.finfo(np.float64).eps)
+_IN_PLANE = 1e-7  # of whitened rows of height one above the origin
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -89,6 +90,19 @@ class Problem:
         return np.where(self.available, min(self.max_replicates, self.k), 0)
 
     @property
+    def simplex(self) -> bool:
+        """The k = p chosen span a simplex, and det is its squared volume.
+
+        True where each candidate gives one reading, nothing is known beforehand, D is
+        wanted and all rows lie in one plane off the origin, as those of [u, 1] do: the
+        optimum then uses vertices of the convex hull only.
+        """
+        if not self.rank_one or self.k != self.num_regressors or len(self.root):
+            return False
+        height = self.rows @ self.rows.sum(axis=0)
+        return bool((np.abs(height - 1.0) <= _IN_PLANE)[self.available].all())
+
+    @property
     def held_rank(self) -> int:
         """Rank of what is known with the required candidates."""
         rows = self.blocks[self.required].reshape(-1, self.num_regressors)
@@ -122,7 +136,8 @@ class Problem:
 def log_dets(problems: list[Problem], indices: Indices) -> Array:
     """log det S (S, R) of subsets (S, R, k) of S problems made together."""
     chosen = [problem.raw[of] for problem, of in zip(problems, indices, strict=True)]
-    value = log_det_blocks(np.stack(chosen), problems[0].root)
+    blocks = np.stack(chosen) if len(chosen) > 1 else chosen[0][None]
+    value = log_det_blocks(blocks, problems[0].root)
     return problems[0].multiplicity * value
 
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from rig.config import AXIS_NAMES
-from rig.config.axis import Pulses
 from rig.core.device import Device, Posture
 from rig.core.faults import MotionFault, Refused
-from rig.core.measure import measure
 from rig.core.motion import move
 from rig.core.proof import FIRST_MOTOR_DEG, unit_proved
 from rig.journal import SIGN_CHECKED
@@ -24,6 +22,7 @@ from rig.workbench.commission.findings import (
     ratios_of,
     require_gearing,
     require_unit,
+    stand_at,
     turn,
 )
 from rig.workbench.run import Run
@@ -75,26 +74,28 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
             of the phone's angles is not the one that is configured.
     """
     config, start = run.config, device.positions()
-    _check_room(run, start)
     stands: dict[str, Stand] = {}
-    run.planned = 1 + 8 * 3 + len(CORNERS)
+    room: list[float] = []  # degrees from the start to the nearer limit of an axis
+    for axis, pulses in zip(config.axes, start, strict=True):
+        here = axis.to_deg(pulses)
+        room.append(min(here - axis.min_deg, axis.max_deg - here) - ROOM_DEG)
+        if room[-1] < REACH_DEG:
+            raise Refused(
+                f"{axis.name} stands {room[-1] + ROOM_DEG:.1f} deg from a limit; the "
+                f"check moves it {REACH_DEG:g} deg either way. Move it inwards: "
+                f"jaxcal-rig jog {axis.name}"
+            )
 
     def visit(name: str, offset: dict[int, int], samples: int = 0) -> Stand:
         """Stand at pulses away from the start, and measure."""
-        target = list(start)
-        for axis, way in offset.items():
-            target[axis] += way
-        run.signals.check_pause()
-        posture = Posture(name, tuple(target))
-        measured = measure(move(device, posture), samples or None)
-        run.emit("stand", sync=True, name=name, **measured)
-        stands[name] = Stand.of(measured)
+        target = tuple(p + offset.get(axis, 0) for axis, p in enumerate(start))
+        stands[name] = stand_at(run, device, Posture(name, target), samples)
         return stands[name]
 
     run.say(
-        f"axes: about {run.planned} places; each axis first by {FIRST_MOTOR_DEG:g} deg "
-        f"of its motor, then as far as the phone's turn allows, {REACH_DEG:g} deg at "
-        "most either way"
+        f"axes: about {25 + len(CORNERS)} places; each axis first by "
+        f"{FIRST_MOTOR_DEG:g} deg of its motor, then as far as the phone's turn "
+        f"allows, {REACH_DEG:g} deg at most either way"
     )
     base = visit("start", {}, 4 * config.settle.samples)
     device.proof.stay_near(base.attitude)
@@ -152,7 +153,7 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
         visit(f"{name}:back", {j: 0})
         visit(f"{name}:minus", {j: -far})
         visit(f"{name}:up", {j: 0})
-        most = min(CORNER_DEG, _room(run, start, j))
+        most = min(CORNER_DEG, room[j])
         corner[j] = round(far * min(REACH_DEG / way, most / abs(axis.to_deg(far))))
         run.say(
             f"  {name}: {abs(axis.to_deg(far)):.2f} deg commanded, the phone turned "
@@ -165,20 +166,3 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
         visit(corner_name(signs), ways, samples)
     move(device, Posture("back", start))
     return stands
-
-
-def _room(run: Run, start: Pulses, axis: int) -> float:
-    """Degrees from the start to the nearer limit of an axis."""
-    each = run.config.axes[axis]
-    here = each.to_deg(start[axis])
-    return min(here - each.min_deg, each.max_deg - here) - ROOM_DEG
-
-
-def _check_room(run: Run, start: Pulses) -> None:
-    for j, name in enumerate(AXIS_NAMES):
-        if (room := _room(run, start, j)) < REACH_DEG:
-            raise Refused(
-                f"{name} stands {room + ROOM_DEG:.1f} deg from a limit; the check "
-                f"moves it {REACH_DEG:g} deg either way. Move it inwards: jaxcal-rig "
-                f"jog {name}"
-            )

@@ -22,10 +22,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rig.config import AXIS_NAMES, RigConfig
-from rig.config.axis import Axis, Scale
+from rig.config.axis import Scale
 from rig.core.attitude import ORDERS, Array, euler_to_matrix, matrix_to_euler
+from rig.core.device import Device, Posture
 from rig.core.faults import MotionFault
+from rig.core.measure import measure
+from rig.core.motion import move
 from rig.core.proof import RADIANS
+from rig.workbench.run import Run
 
 CLEAR = 4.0  # standard deviations that make a difference a finding
 NEAREST = 0.7  # cosine: an axis within 45 degrees of where it is expected
@@ -60,15 +64,18 @@ class Stand:
     std_deg: float  # of one reading
     samples: int
 
-    @classmethod
-    def of(cls, record: Mapping[str, Any]) -> Stand:
-        """From what ``Observer.measure`` returns."""
-        return cls(
-            np.array(record["pulses"], dtype=np.float64),
-            np.array(record["attitude"]),
-            float(np.max(record["std_deg"])),
-            int(record["samples"]),
-        )
+
+def stand_at(run: Run, device: Device, posture: Posture, samples: int = 0) -> Stand:
+    """Move and measure, with ``samples`` readings or as configured; journalled."""
+    run.signals.check_pause()
+    measured = measure(move(device, posture), samples or None)
+    run.emit("stand", sync=True, name=posture.name, **measured)
+    return Stand(
+        np.array(measured["pulses"], dtype=np.float64),
+        np.array(measured["attitude"]),
+        float(np.max(measured["std_deg"])),
+        int(measured["samples"]),
+    )
 
 
 def corner_name(signs: Sequence[int]) -> str:
@@ -157,10 +164,8 @@ class Findings:
     joints: tuple[int, ...]  # for each drive: the axis that it turns
     deg_per_pulse: Array  # (3,) of the phone, > 0 where pulses turn the joint positive
     backlash_deg: Array  # (3,) at the phone
-    cross_talk: Array  # (3, 3) rotation about joint i, a share of drive j's own
     mounting: Array  # (3, 3) phone to end-effector, nearest to the three axes
     turned_deg: float  # that from the configured one
-    mirrored: bool  # the axes are a mirror image of those configured
     order: str | None  # axes of the mechanism from the base outwards; None: not clear
 
 
@@ -205,19 +210,7 @@ def find(
         )
     told = euler_to_matrix(config.imu.mounting_deg, "ZYX")
     turned = float(np.linalg.norm(turn(told, mounting)))
-    kept = told if turned <= MOUNTING_DEG else mounting
-    share = _expected(config).T @ kept @ rates
-    own = share[list(joints), range(3)]
-    return Findings(
-        joints=joints,
-        deg_per_pulse=signs * size,
-        backlash_deg=backlash,
-        cross_talk=share / own,
-        mounting=mounting,
-        turned_deg=turned,
-        mirrored=bool(mirrored),
-        order=order,
-    )
+    return Findings(joints, signs * size, backlash, mounting, turned, order)
 
 
 def _expected(config: RigConfig) -> Array:
@@ -368,19 +361,33 @@ def proposals(
     """
     tables = {table["name"]: table for table in tomllib.loads(config.text)["axes"]}
     changes: list[Change] = []
+    low, high = SOUND_RATIO
     for drive, joint in enumerate(found.joints):
         source, axis = config.axes[drive], config.axes[joint]
-        own = _of_drive(source, axis, tables, told[drive])
-        per_pulse = float(found.deg_per_pulse[drive])
-        pulses = told[drive] or source.pulses_per_rev
-        own += _of_joint(axis, per_pulse, pulses)
-        if any(change.key.endswith(tuple(Scale.model_fields)) for change in own):
-            own += [
-                Change(f"axes.{axis.name}.{name}", value, None, "pulses mean otherwise")
-                for name, value in tables[axis.name].items()
-                if name in ("min_pulses", "max_pulses")
-            ]
-        changes += own
+        wanted: dict[str, tuple[Any, Any, str]] = {}  # key: old, new, reason
+        for name in OF_DRIVE:
+            # A map stands in the file as its name or its path.
+            old, new = tables[axis.name].get(name), tables[source.name].get(name)
+            reason = f"unit {source.unit} turns {axis.name}"
+            if name == "pulses_per_rev" and told[drive] not in (None, new):
+                new, reason = told[drive], f"unit {source.unit} says so itself"
+            wanted[name] = old, new, reason
+        rate, pulses = found.deg_per_pulse[drive], told[drive] or source.pulses_per_rev
+        reason = f"positive pulses turn it the {_way(rate)} way"
+        wanted["direction"] = axis.direction, 1 if rate > 0 else -1, reason
+        geared = axis.model_copy(update={"pulses_per_rev": pulses})
+        ratio = abs(float(rate) * geared.pulses_per_deg)
+        if not low <= ratio <= high:
+            new = float(f"{axis.reduction / ratio:.{DIGITS}g}")
+            reason = f"it turns {ratio:.3g} of what is commanded; sound is {low:g} to "
+            wanted["reduction"] = axis.reduction, new, f"{reason}{high:g}"
+        wanted = {name: each for name, each in wanted.items() if each[0] != each[1]}
+        if wanted.keys() & Scale.model_fields.keys():
+            for name in ("min_pulses", "max_pulses"):
+                if (old := tables[axis.name].get(name)) is not None:
+                    wanted[name] = old, None, "pulses mean otherwise"
+        for name, each in wanted.items():
+            changes.append(Change(f"axes.{axis.name}.{name}", *each))
     if found.turned_deg > MOUNTING_DEG:
         angles = matrix_to_euler(found.mounting, "ZYX").round(2) + 0.0
         before, reason = list(config.imu.mounting_deg), "the three axes put the phone"
@@ -393,40 +400,6 @@ def proposals(
     return changes
 
 
-def _of_drive(
-    source: Axis, axis: Axis, tables: dict[str, Any], told: int | None
-) -> list[Change]:
-    """Keys of the drive that turns ``axis``, which is configured as ``source``."""
-    changes = []
-    for name in OF_DRIVE:
-        # A map stands in the file as its name or its path.
-        old, new = tables[axis.name].get(name), tables[source.name].get(name)
-        reason = f"unit {source.unit} turns {axis.name}"
-        if name == "pulses_per_rev" and told not in (None, new):
-            new, reason = told, f"unit {source.unit} says so itself"
-        if old != new:
-            changes.append(Change(f"axes.{axis.name}.{name}", old, new, reason))
-    return changes
-
-
-def _of_joint(axis: Axis, deg_per_pulse: float, pulses_per_rev: int) -> list[Change]:
-    """Direction and reduction of a joint whose drive is known."""
-    changes, at = [], f"axes.{axis.name}"
-    direction = 1 if deg_per_pulse > 0 else -1
-    if direction != axis.direction:
-        reason = f"positive pulses turn it the {_way(direction)} way"
-        changes.append(Change(f"{at}.direction", axis.direction, direction, reason))
-    geared = axis.model_copy(update={"pulses_per_rev": pulses_per_rev})
-    ratio = abs(deg_per_pulse * geared.pulses_per_deg)
-    low, high = SOUND_RATIO
-    if not low <= ratio <= high:
-        reduction = float(f"{axis.reduction / ratio:.{DIGITS}g}")
-        reason = f"it turns {ratio:.3g} of what is commanded; sound is {low:g} to "
-        reason += f"{high:g}"
-        changes.append(Change(f"{at}.reduction", axis.reduction, reduction, reason))
-    return changes
-
-
 def _way(rate: float) -> str:
     return "positive" if rate > 0 else "negative"
 
@@ -434,17 +407,12 @@ def _way(rate: float) -> str:
 def lines(config: RigConfig, found: Findings) -> list[str]:
     """The findings in words, a line for each drive and each thing found."""
     ratios = ratios_of(config, found)
-    text = ["  unit  turns   sense     measured/commanded  play   cross-talk"]
+    text = ["  unit  turns   sense     measured/commanded  play"]
     for drive, joint in enumerate(found.joints):
         axis, unit = config.axes[joint], config.axes[drive].unit
-        cross = ", ".join(
-            f"{AXIS_NAMES[i]} {100 * found.cross_talk[i, drive]:+.1f} %"
-            for i in range(3)
-            if i != joint
-        )
         text.append(
             f"  {unit:>4}  {axis.name:<6}  {_way(found.deg_per_pulse[drive]):<8}  "
-            f"{ratios[drive]:18.3f}  {max(0.0, found.backlash_deg[drive]):.3f}  {cross}"
+            f"{ratios[drive]:18.3f}  {max(0.0, found.backlash_deg[drive]):.3f}"
         )
     angles = matrix_to_euler(found.mounting, "ZYX")
     text.append(
@@ -453,9 +421,4 @@ def lines(config: RigConfig, found: Findings) -> list[str]:
     )
     order = found.order or "not clear from these moves"
     text.append(f"  joints from the base outwards: {order}")
-    if found.mirrored:
-        text.append(
-            "  note: the axes are mirrored against the configuration: a direction is "
-            "wrong, or two drives are exchanged"
-        )
     return text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections.abc import Callable
 
@@ -50,10 +51,9 @@ class Operator:
         """A number; asked again where the answer is none."""
         while True:
             answer = self.ask(question, f"{default:g}")
-            try:
+            with contextlib.suppress(ValueError):
                 return float(answer)
-            except ValueError:
-                self.say(f"  must be a number, got {answer!r}")
+            self.say(f"  must be a number, got {answer!r}")
 
     def choose(self, question: str, known: list[str], default: str) -> str:
         """One of ``known``; asked again where the answer is none of them."""

@@ -270,8 +270,8 @@ def _check_axes(place: Place, names_known: bool, again: bool = False) -> int:
     place.say(f"  written; the old file is kept beside {place.path}")
     homed = place.record.state(HOMED) or {}
     identify(place)
+    # Which also forgets where each named axis was left: it is not what it was.
     place.record.reach(HOMED, place.config, **homed)
-    place.record.forget_left()  # where each named axis stands is not what it was
     return _check_axes(place, names_known, again=True)
 
 

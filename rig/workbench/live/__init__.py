@@ -63,7 +63,7 @@ def draw(part: str, **values: Any) -> str:
 def _template() -> Any:
     import jinja2
 
-    from rig.workbench.outputs.words import angle
+    from rig.workbench.outputs.view import angle
 
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(pathlib.Path(__file__).parent),

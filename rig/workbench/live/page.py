@@ -14,7 +14,7 @@ from rig.workbench.live import draw
 from rig.workbench.live.charts import charts
 from rig.workbench.live.scene import DeviceScene
 from rig.workbench.live.watcher import Watcher
-from rig.workbench.outputs import words
+from rig.workbench.outputs import view
 
 TICK_S = 0.1
 ANSWER_S = 10.0  # for a browser to show what it was sent
@@ -87,8 +87,8 @@ class LivePage:
         sample = watcher.samples[-1] if watcher.running and watcher.samples else {}
         now = watcher.state.present(sample, watcher.running)
         self._device.show(now["measured"], now["commanded"])
-        self._parts["numbers"].set_content(draw("numbers", rows=words.numbers(now)))
-        self._stream.set_text(words.stream(sample, time.time()))
+        self._parts["numbers"].set_content(draw("numbers", rows=view.numbers(now)))
+        self._stream.set_text(view.stream(sample, time.time()))
 
     def _plot(self) -> None:
         watcher = self.watcher
@@ -105,14 +105,14 @@ class LivePage:
         self._version = watcher.version
         head = json.dumps(_head(watcher))
         ui.run_javascript(f"live.head({head}, {json.dumps(watcher.here)})")
-        tone = words.headline(state, watcher.running)[0]
-        lines = words.trouble(state, watcher.running, str(watcher.folder))
-        result = words.verdict(state, watcher.summary)
+        tone = view.headline(state, watcher.running)[0]
+        lines = view.trouble(state, watcher.running, str(watcher.folder))
+        result = view.verdict(state, watcher.summary)
         for name, content in {
             "trouble": draw("trouble", lines=lines),
             "verdict": draw("verdict", lines=result, report=watcher.report),
             "queue": draw(
-                "queue", postures=words.queue(state), count=len(state.postures)
+                "queue", postures=view.queue(state), count=len(state.postures)
             ),
             "log": draw("log", lines=state.log),
         }.items():
@@ -126,7 +126,7 @@ class LivePage:
 
 def _head(watcher: Watcher) -> str:
     state = watcher.state
-    now, said = words.headline(state, watcher.running), words.progress(state)
+    now, said = view.headline(state, watcher.running), view.progress(state)
     return draw("head", state=state, now=now, said=said, folder=watcher.folder.name)
 
 

@@ -21,7 +21,7 @@ from rig.config import AXIS_NAMES
 from rig.config.axis import Scale
 from rig.core.faults import Refused
 from rig.journal import Record
-from rig.workbench.outputs.console import recalibrate
+from rig.workbench.outputs.words import recalibrate
 
 NUMBERS = ("matrix", "offset_deg", "min_deg", "max_deg", "pulses_per_deg", "min_pulses",
            "max_pulses")  # fmt: skip

@@ -10,7 +10,7 @@ import dataclasses
 from typing import Any
 
 from rig.config.axis import Scale
-from rig.workbench.outputs.console import ENDS, event_lines
+from rig.workbench.outputs.words import ENDS, event_lines
 
 Record = dict[str, Any]
 Degrees = list[float]  # pitch, yaw, roll

@@ -12,8 +12,8 @@ import numpy as np
 from jaxcal.pages import Badge, Block, Page, Section, Table, Text, write_page
 from rig.config import AXIS_NAMES
 from rig.journal import JournalError, Record, read_journal
-from rig.workbench.outputs.console import held_out, recalibrate
 from rig.workbench.outputs.report import draw_parameters, drawn
+from rig.workbench.outputs.words import held_out, recalibrate
 
 HEAD = ["measured", "run", "mode", "held-out error [deg]", "moved since the one before"]
 HOLDS = "the last calibration still holds"

@@ -1,145 +1,180 @@
-"""What page and report say of a run: pure functions of its state."""
+"""What the events of a run and the results of a calibration come to, in words.
+
+Console, page and report say the same.
+"""
 
 from __future__ import annotations
 
 import math
-import shlex
+from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from rig.config import AXIS_NAMES
-from rig.core.faults import EXIT_RECALIBRATE
 from rig.core.stop import UnitStop
-from rig.workbench.outputs.console import error_text, summary_lines
-from rig.workbench.outputs.state import ACTIVE, SESSIONS, Posture, Record, RunState
+from rig.journal import Record
 
-SHOWN = 40  # rows of a long queue
-STALE_S = 1.0
-NONE = (None, None, None)  # of three axes, where nothing is known
-PHASES = {
-    "opening": "Waiting for drives and phone",
-    "zeroing": "Taking the zero",
-    "moving": "Moving to {}",
-    "settling": "Waiting until {} is quiet",
-    "measuring": "Measuring {}",
-    "saving": "Saving",
-    "finishing": "All is measured, and the drives are at rest",
-}
-ENDED = {
-    "end": ("good", "Done"),
-    "paused": ("warn", "Paused"),
-    "refused": ("bad", "Refused; nothing was moved"),
-    "stopped": ("bad", "Stopped on request"),
-    "fault": ("bad", "Stopped by a fault"),
+ENDS = ("end", "fault", "stopped", "paused", "refused")
+REPLIES = {
+    "obeyed": "the drive obeys",
+    "not taken": "the drive did not take it, so it is sent again",
+    "unknown": "whether the drive took it is unknown, so all stop",
 }
 
 
-def angle(value: float | None, digits: int = 3) -> str:
-    """Degrees with a sign, or a dash."""
-    if value is None or not math.isfinite(value):
-        return "–"
-    return f"{value:+.{digits}f}".replace("-", "−")
+def _reference(record: Record) -> str:
+    worst = max(map(abs, record["angles"]))
+    good = f"reference posture reads {worst:.3f} deg from zero: going on"
+    return good if worst <= record["limit"] else ""
 
 
-def headline(state: RunState, running: bool) -> tuple[str, str]:
-    """Tone (run, good, warn, bad) and one line: what happens now, or how it ended."""
-    ended = state.ended
-    if ended is not None:
-        if ended["event"] == "end" and ended.get("code") == EXIT_RECALIBRATE:
-            return "warn", "Done: recalibrate"
-        return ENDED[ended["event"]]
-    if not running:
-        return "bad", "Ended without a last record: killed, or the power failed"
-    if not state.candidates and state.mode == "calibrate":
-        return "run", "Choosing the postures"
-    posture = state.postures.get(state.current or "")
-    line = PHASES.get(state.phase, state.phase)
-    line = line.format(posture.title if posture else "the zero posture")
-    return "run", line + (", then pausing" if state.pausing else "")
+def _comm_restored(record: Record) -> str:
+    return record["error"] and (
+        f"{record['axis']}: its communication timeout was not put back to "
+        f"{record['counts']} ({record['error']}); `jaxcal-rig resume` does it"
+    )
 
 
-def progress(state: RunState) -> str:
-    """How far it is."""
-    if not state.planned:
-        return ""
-    left = f", about {state.left_s():.0f} s left" if state.left_s() else ""
-    return f"{len(state.done)} of {state.planned} postures{left}"
+def _stop(record: Record) -> str:
+    units = "".join(f"\n  {UnitStop(**unit)}" for unit in record["units"])
+    return f"stop: {record['reason'] or 'end of run'}{units}"
 
 
-def trouble(state: RunState, running: bool, folder: str) -> list[str]:
-    """Faults and stops in plain words, and what to do."""
-    lines, ended, stop = [], state.ended, state.stop
-    typed = state.start.get("arguments") or [state.mode]
-    typed = ["resume", folder] if state.mode in SESSIONS else typed
-    go_on = f"To go on: jaxcal-rig {shlex.join(typed)}"
-    if state.damaged:
-        lines.append("The journal has lines that cannot be read; some are left out.")
-    if ended is None and not running and state.start:
-        lines += [
-            "The session's process is gone. A move that had begun ran to its end "
-            "unless the drive watches its line. Look at the device first.",
-            go_on,
-        ]
-    elif ended is not None and ended["event"] != "end":
-        units = stop["units"] if stop else []
-        lines += [ended.get("reason", ""), *(str(UnitStop(**u)) for u in units)]
-        lines += [go_on] if ended["event"] != "refused" else []
-    elif ended is None and stop is not None and stop["reason"]:
-        lines.append(f"Stopped: {stop['reason']}")
-    lines += state.warnings
-    verbs = {"unreachable": "is out of reach", "withdrawn": "was withdrawn"}
-    lines += [
-        f"{posture.title} {verbs[posture.state]}: {posture.note}"
-        for posture in state.postures.values()
-        if posture.state in verbs
-    ]
-    return [line for line in lines if line]
+# An event of the run in words, for console, page and report: its fields are put in.
+SENTENCES: dict[str, str | Callable[[Record], str]] = {
+    "start": "{mode} begun",
+    "resume": "gone on with after an interruption",
+    "listening": "IMU: waiting for the phone on port {port} ({format})",
+    "armed": "armed: {drives} drives on {where}",
+    "note": "{text}",
+    "reference": _reference,
+    "reoriented": "the phone came back, its heading turned {turned_deg:.3f} deg: "
+    "{told}",
+    "zero": "zero taken at pulses {pulses}",
+    "void": lambda r: f"  withdrawn, to be measured again: {', '.join(r['names'])}",
+    "replan": lambda r: (
+        "  the postures that are left were selected again: log det "
+        f"{r['choice']['log_det']:.4f}"
+    ),
+    "pausing": "pausing after this posture; another Ctrl-C stops at once",
+    "lost_reply": lambda r: (
+        f"  the reply to a move of {r['axis']} was lost: {REPLIES[r['outcome']]}"
+    ),
+    "sender_refused": "WARNING: {reason}",
+    "unreachable": "  {name} is out of reach: {reason}",
+    "comm_restored": _comm_restored,
+    "stop": _stop,
+}
 
 
-def numbers(now: dict[str, Any]) -> list[tuple[str, ...]]:
-    """A row an axis: commanded, drive, measured, difference, scatter."""
-    columns = [now[name] or NONE for name in ("commanded", "drives", "measured", "std")]
-    return [
-        (
-            name, angle(a), angle(d), angle(y),
-            angle(None if a is None or y is None else y - a),
-            "–" if s is None else f"{s:.3f}",
+def event_lines(record: Record) -> list[str]:
+    """What an event of the run comes to; most are silent."""
+    sentence = SENTENCES.get(record["event"], "")
+    if isinstance(sentence, str):
+        return sentence.format_map(record).splitlines()
+    return sentence(record).splitlines()
+
+
+def numbers(values: Any, width: int = 9, digits: int = 4) -> str:
+    """Numbers side by side; what rounds to zero has no sign."""
+    rounded = (round(float(value), digits) + 0.0 for value in values)
+    return " ".join(f"{value:{width}.{digits}f}" for value in rounded)
+
+
+def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
+    """A and b with their intervals, the errors and any warning."""
+    lines = ["y = A u + b in degrees, +- 95 % confidence for all twelve at once:"]
+    for row, name in enumerate(AXIS_NAMES):
+        a, b, wide = summary["A"][row], summary["b"][row], summary["ci95"][row]
+        values = "  ".join(f"{a[i]:8.5f} +- {wide[i]:.5f}" for i in range(3))
+        lines.append(f"  {name:<5} [{values}]   {b:8.4f} +- {wide[3]:.4f}")
+    lines.append(f"  {noise_text(summary)}")
+    if "after" in summary:
+        lines.append(f"held-out {error_text(summary)}")
+    elif found := summary.get("prediction"):  # a refit: nothing was compensated by it
+        lines.append(
+            f"held-out postures predicted to {found['rms']:.4f} deg rms "
+            f"(max {found['max']:.4f})"
         )
-        for name, a, d, y, s in zip(AXIS_NAMES, *columns, strict=True)
-    ]  # fmt: skip
+    if summary.get("drift"):
+        lines.append(f"drift: {drift_text(summary['drift'])}")
+    if summary["orders"]["warning"]:
+        lines.append(f"WARNING: {summary['orders']['warning']}")
+    if reasons := recalibrate(summary, limit_deg):
+        lines.append(
+            f"RECALIBRATE: {' and '.join(reasons)}. Do not use this calibration before "
+            "the cause is known"
+        )
+    return lines
 
 
-def stream(sample: Record, now: float) -> str:
-    """How the phone's stream is; empty where there is nothing to report."""
-    if not sample:
-        return ""
-    if now - sample["time"] > STALE_S:
-        return f"no telemetry for {now - sample['time']:.0f} s"
-    if "age" not in sample:
-        return "no reading from the phone"
-    late = f"phone {sample['rate']:.0f} Hz, newest reading {1e3 * sample['age']:.0f} ms"
-    return late + ("" if "deg" in sample else "; angles follow once the zero is taken")
+def held_out(summary: dict[str, Any]) -> tuple[str, float]:
+    """Which error at held-out targets a calibration is judged by, and the largest."""
+    if "after" in summary:
+        return "after compensation", summary["after"]["max"]
+    return "of the prediction", summary.get("prediction", {}).get("max", math.nan)
 
 
-def queue(state: RunState) -> list[Posture]:
-    """The present posture, those to come, then those done, the newest first."""
-    postures = state.postures.values()
-    ahead = [p for p in postures if p.state in ("waiting", *ACTIVE)]
-    ahead.sort(key=lambda p: p.state == "waiting")
-    behind = [p for p in postures if p not in ahead]
-    behind.sort(key=lambda p: -p.time)
-    shown = ahead[: SHOWN - min(len(behind), SHOWN // 2)]
-    return shown + behind[: SHOWN - len(shown)]
+def recalibrate(summary: dict[str, Any], limit_deg: float) -> list[str]:
+    """Why a calibration is not to be used; nothing where all is well."""
+    reasons = []
+    what, worst = held_out(summary)
+    if worst > limit_deg:
+        limit = f"session.verify_limit_deg ({limit_deg:g})"
+        reasons.append(f"the error {what} exceeds {limit}")
+    if summary.get("drift") and summary["drift"]["over"]:
+        limit = f"session.drift_limit_deg ({summary['drift']['limit_deg']:g})"
+        reasons.append(f"the drift of the zero that is left exceeds {limit}")
+    return reasons
 
 
-def verdict(state: RunState, summary: dict[str, Any]) -> list[str]:
-    """The result at the end of a run, as on the console; empty before."""
-    if state.ended is None or state.ended["event"] != "end":
-        return []
-    limit = state.setting("session", "verify_limit_deg", math.nan)
-    if "A" in summary:
-        return summary_lines(summary, limit)
-    if "before" in summary:
-        return [f"{error_text(summary)}, limit {limit:g}"]
-    if state.mode == "goto" and state.done:
-        return ["Reached " + " ".join(map(angle, state.done[-1].measured or [])) + "°"]
-    return [f"{len(state.done)} postures recorded"] * (state.mode == "collect")
+def drift_text(drift: dict[str, Any]) -> str:
+    """How far the zero drifted, and what was done about it."""
+    worst = int(np.argmax(np.abs(drift["angles_deg"]).max(axis=0)))
+    text = (
+        f"the zero posture read up to {drift['size_deg']:.4f} deg from zero "
+        f"({AXIS_NAMES[worst]}) on later visits (limit {drift['limit_deg']:g})"
+    )
+    if drift["corrected"]:
+        rate = drift["angles_deg"][-1][worst] / drift["minutes"][-1]
+        text += (
+            f"; linear, {rate:+.4f} deg/min, and taken out: {drift['left_deg']:.4f} "
+            "deg are left"
+        )
+    if drift["over"]:
+        kind = "It is not linear. " if len(drift["minutes"]) == 3 else ""
+        text += (
+            f". {kind}Look for a loose phone, play, or a magnetic heading near the "
+            "motors"
+        )
+    return text
+
+
+def noise_text(summary: dict[str, Any]) -> str:
+    """How large the noise is, axis by axis, and where it was taken from."""
+    std = zip(AXIS_NAMES, summary["noise_std_deg"], strict=True)
+    return (
+        f"noise of one posture {', '.join(f'{name} {v:.4f}' for name, v in std)} deg, "
+        f"from {summary['basis']} ({summary['dof']} degrees of freedom each)"
+    )
+
+
+def choice_text(choice: dict[str, Any]) -> str:
+    """How the postures were chosen, and how good they are."""
+    rank = "proven optimum" if choice["proven"] else "best known"
+    gap = choice["best_log_det"] - choice["log_det"]
+    return (
+        f"{choice['method']}: log det {choice['log_det']:.4f} (commands in degrees), "
+        f"{rank} {choice['best_log_det']:.4f}, gap {gap:.4f}, D-efficiency "
+        f"{choice['efficiency']:.4f}"
+    )
+
+
+def error_text(found: dict[str, Any]) -> str:
+    """Errors at held-out postures, raw and compensated."""
+    before, after = found["before"], found["after"]
+    return (
+        f"error before {before['rms']:.4f} deg rms (max {before['max']:.4f}), after "
+        f"compensation {after['rms']:.4f} (max {after['max']:.4f})"
+    )

@@ -1,0 +1,145 @@
+"""What page and report say of a run: pure functions of its state."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from typing import Any
+
+from rig.config import AXIS_NAMES
+from rig.core.faults import EXIT_RECALIBRATE
+from rig.core.stop import UnitStop
+from rig.workbench.outputs.state import ACTIVE, SESSIONS, Posture, Record, RunState
+from rig.workbench.outputs.words import error_text, summary_lines
+
+SHOWN = 40  # rows of a long queue
+STALE_S = 1.0
+NONE = (None, None, None)  # of three axes, where nothing is known
+PHASES = {
+    "opening": "Waiting for drives and phone",
+    "zeroing": "Taking the zero",
+    "moving": "Moving to {}",
+    "settling": "Waiting until {} is quiet",
+    "measuring": "Measuring {}",
+    "saving": "Saving",
+    "finishing": "All is measured, and the drives are at rest",
+}
+ENDED = {
+    "end": ("good", "Done"),
+    "paused": ("warn", "Paused"),
+    "refused": ("bad", "Refused; nothing was moved"),
+    "stopped": ("bad", "Stopped on request"),
+    "fault": ("bad", "Stopped by a fault"),
+}
+
+
+def angle(value: float | None, digits: int = 3) -> str:
+    """Degrees with a sign, or a dash."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    return f"{value:+.{digits}f}".replace("-", "−")
+
+
+def headline(state: RunState, running: bool) -> tuple[str, str]:
+    """Tone (run, good, warn, bad) and one line: what happens now, or how it ended."""
+    ended = state.ended
+    if ended is not None:
+        if ended["event"] == "end" and ended.get("code") == EXIT_RECALIBRATE:
+            return "warn", "Done: recalibrate"
+        return ENDED[ended["event"]]
+    if not running:
+        return "bad", "Ended without a last record: killed, or the power failed"
+    if not state.candidates and state.mode == "calibrate":
+        return "run", "Choosing the postures"
+    posture = state.postures.get(state.current or "")
+    line = PHASES.get(state.phase, state.phase)
+    line = line.format(posture.title if posture else "the zero posture")
+    return "run", line + (", then pausing" if state.pausing else "")
+
+
+def progress(state: RunState) -> str:
+    """How far it is."""
+    if not state.planned:
+        return ""
+    left = f", about {state.left_s():.0f} s left" if state.left_s() else ""
+    return f"{len(state.done)} of {state.planned} postures{left}"
+
+
+def trouble(state: RunState, running: bool, folder: str) -> list[str]:
+    """Faults and stops in plain words, and what to do."""
+    lines, ended, stop = [], state.ended, state.stop
+    typed = state.start.get("arguments") or [state.mode]
+    typed = ["resume", folder] if state.mode in SESSIONS else typed
+    go_on = f"To go on: jaxcal-rig {shlex.join(typed)}"
+    if state.damaged:
+        lines.append("The journal has lines that cannot be read; some are left out.")
+    if ended is None and not running and state.start:
+        lines += [
+            "The session's process is gone. A move that had begun ran to its end "
+            "unless the drive watches its line. Look at the device first.",
+            go_on,
+        ]
+    elif ended is not None and ended["event"] != "end":
+        units = stop["units"] if stop else []
+        lines += [ended.get("reason", ""), *(str(UnitStop(**u)) for u in units)]
+        lines += [go_on] if ended["event"] != "refused" else []
+    elif ended is None and stop is not None and stop["reason"]:
+        lines.append(f"Stopped: {stop['reason']}")
+    lines += state.warnings
+    verbs = {"unreachable": "is out of reach", "withdrawn": "was withdrawn"}
+    lines += [
+        f"{posture.title} {verbs[posture.state]}: {posture.note}"
+        for posture in state.postures.values()
+        if posture.state in verbs
+    ]
+    return [line for line in lines if line]
+
+
+def numbers(now: dict[str, Any]) -> list[tuple[str, ...]]:
+    """A row an axis: commanded, drive, measured, difference, scatter."""
+    columns = [now[name] or NONE for name in ("commanded", "drives", "measured", "std")]
+    return [
+        (
+            name, angle(a), angle(d), angle(y),
+            angle(None if a is None or y is None else y - a),
+            "–" if s is None else f"{s:.3f}",
+        )
+        for name, a, d, y, s in zip(AXIS_NAMES, *columns, strict=True)
+    ]  # fmt: skip
+
+
+def stream(sample: Record, now: float) -> str:
+    """How the phone's stream is; empty where there is nothing to report."""
+    if not sample:
+        return ""
+    if now - sample["time"] > STALE_S:
+        return f"no telemetry for {now - sample['time']:.0f} s"
+    if "age" not in sample:
+        return "no reading from the phone"
+    late = f"phone {sample['rate']:.0f} Hz, newest reading {1e3 * sample['age']:.0f} ms"
+    return late + ("" if "deg" in sample else "; angles follow once the zero is taken")
+
+
+def queue(state: RunState) -> list[Posture]:
+    """The present posture, those to come, then those done, the newest first."""
+    postures = state.postures.values()
+    ahead = [p for p in postures if p.state in ("waiting", *ACTIVE)]
+    ahead.sort(key=lambda p: p.state == "waiting")
+    behind = [p for p in postures if p not in ahead]
+    behind.sort(key=lambda p: -p.time)
+    shown = ahead[: SHOWN - min(len(behind), SHOWN // 2)]
+    return shown + behind[: SHOWN - len(shown)]
+
+
+def verdict(state: RunState, summary: dict[str, Any]) -> list[str]:
+    """The result of a run, as on the console; empty before there is one."""
+    limit = state.setting("session", "verify_limit_deg", math.nan)
+    if "A" in summary:
+        return summary_lines(summary, limit)
+    if "before" in summary:
+        return [f"{error_text(summary)}, limit {limit:g}"]
+    if state.ended is None or state.ended["event"] != "end":
+        return []
+    if state.mode == "goto" and state.done:
+        return ["Reached " + " ".join(map(angle, state.done[-1].measured or [])) + "°"]
+    return [f"{len(state.done)} postures recorded"] * (state.mode == "collect")
