@@ -15,8 +15,9 @@ import pytest
 
 from jaxcal.learning.core import network as networks
 from jaxcal.learning.policies import decoding
+from jaxcal.learning.policies.compact import build
 from jaxcal.learning.policies.features import remaining
-from jaxcal.learning.policies.networks import NetworkConfig, build
+from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training import checkpoint
 from jaxcal.paper.network import HEADS
 

@@ -23,7 +23,8 @@ from jaxcal.commands import train_candidates
 from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
-from jaxcal.learning.policies.networks import NetworkConfig, build
+from jaxcal.learning.policies.compact import build
+from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.training import checkpoint, presets
 from jaxcal.learning.training import postures as training
@@ -341,7 +342,7 @@ def test_an_unknown_network_or_preset_is_named():
 def test_learning_finds_the_papers_network_without_importing_the_paper():
     code = (
         "import sys\n"
-        "from jaxcal.learning.policies.networks import build\n"
+        "from jaxcal.learning.policies.compact import build\n"
         "from jaxcal.learning.training import presets\n"
         "assert not any(name.startswith('jaxcal.paper') for name in sys.modules)\n"
         "print(type(build(presets.load('paper').network)).__module__)"

@@ -10,14 +10,10 @@ as jaxcal's own pyproject.toml adds ``paper``:
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING
 
 from jaxcal.learning.settings import installed, require, setting
 
-if TYPE_CHECKING:
-    from jaxcal.learning.core.network import Network
-
-__all__ = ["GROUP", "NetworkConfig", "build"]
+__all__ = ["GROUP", "NetworkConfig"]
 
 GROUP = "jaxcal.networks"
 
@@ -50,13 +46,3 @@ class NetworkConfig:
         require(self, "at least 1", lambda v: v >= 1, "width", "lookahead")
         rounds = ("encoder_rounds", "decoder_rounds")
         require(self, "0 or more", lambda v: v >= 0, *rounds)
-
-
-def build(config: NetworkConfig) -> Network:
-    """The network that a configuration names, as a flax module."""
-    if config.kind == "compact":
-        from jaxcal.learning.policies.compact import CompactNetwork
-
-        return CompactNetwork(config)
-    network: Network = installed(GROUP)[config.kind].load()(config)
-    return network

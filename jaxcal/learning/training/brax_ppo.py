@@ -25,7 +25,8 @@ from brax.training.networks import FeedForwardNetwork
 from jaxcal.learning.core.network import initial
 from jaxcal.learning.environments.brax_env import SelectionEnv, wrap_fresh
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.policies.networks import NetworkConfig, build
+from jaxcal.learning.policies.compact import build
+from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.settings import settings_of
 from jaxcal.learning.training import checkpoint
 from jaxcal.learning.training.config import TrainConfig
