@@ -46,9 +46,9 @@ from jaxcal.adaptive.policy import run
 from jaxcal.adaptive.rules import Gain, GainRate, best
 from jaxcal.adaptive.tasks.knee import PRICED, STATE_RULE, knee
 from jaxcal.adaptive.tuning import tune
+from jaxcal.extras import versions
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.learning.runtime import cache
-from jaxcal.learning.training.checkpoint import package_versions
 
 OTHER: dict[str, dict[str, Any]] = {
     "as trained": {},
@@ -278,7 +278,7 @@ def main(argv: list[str] | None = None) -> int:
     cache.keep_compiled_programs()
     trained = run.load(options.checkpoint)
     document: dict[str, Any] = {
-        "versions": package_versions(), "policy": trained.meta, "seed": options.seed,
+        "versions": versions(), "policy": trained.meta, "seed": options.seed,
         "episodes": options.episodes,
     }  # fmt: skip
     policies = {"policy": trained.decider}

@@ -37,6 +37,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcal.extras import versions
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.information.regression import log_det_information
 from jaxcal.learning.environments import scenarios
@@ -48,7 +49,6 @@ from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import cache
 from jaxcal.learning.training import postures as training
 from jaxcal.learning.training import presets
-from jaxcal.learning.training.checkpoint import package_versions
 from jaxcal.selection import exact_batch, greedy_batch, select
 from jaxcal.selection.policy import select_batch
 from jaxcal.selection.teacher import teacher
@@ -407,7 +407,7 @@ def main(argv: list[str] | None = None) -> int:
     cache.keep_compiled_programs()
     result: dict[str, Any] = {
         "arguments": vars(arguments),
-        "versions": package_versions(),
+        "versions": versions(),
         "device": jax.devices()[0].device_kind,
     }
     if {"unlearned", "shipped"} & set(arguments.parts):

@@ -16,9 +16,6 @@ from jaxcal import compiled
 if TYPE_CHECKING:
     from jaxcal.calibration import Calibration, identify
     from jaxcal.information.regression import (
-        hat_matrix,
-        information_matrix,
-        leverages,
         log_det_information,
         regression_matrix,
     )
@@ -35,11 +32,8 @@ __all__ = [
     "Noise",
     "Prior",
     "Selection",
-    "hat_matrix",
     "identifiability",
     "identify",
-    "information_matrix",
-    "leverages",
     "log_det_information",
     "regression_matrix",
     "select",

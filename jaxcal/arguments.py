@@ -8,7 +8,16 @@ import sys
 from collections.abc import Callable, Iterable
 from typing import Any, NoReturn, TypeVar
 
-__all__ = ["Flag", "Parser", "at_least", "flag", "refused", "seconds", "several"]
+__all__ = [
+    "Flag",
+    "Parser",
+    "at_least",
+    "exit_code",
+    "flag",
+    "refused",
+    "seconds",
+    "several",
+]
 
 T = TypeVar("T")
 Flag = tuple[tuple[str, ...], dict[str, Any]]  # what ``add_argument`` takes
@@ -59,6 +68,18 @@ def refused(program: str, error: Exception) -> int:
         text = f"{error.filename}: {error.strerror}"
     print(f"{program}: {text}", file=sys.stderr)
     return 2
+
+
+def exit_code(command: Callable[[], None], program: str, interrupted: str) -> int:
+    """Run a command: 0; 2 where something given is bad, 130 where it is interrupted."""
+    try:
+        command()
+    except KeyboardInterrupt:
+        print(f"{program}: interrupted; {interrupted}", file=sys.stderr)
+        return 130
+    except (ValueError, OSError) as error:
+        return refused(program, error)
+    return 0
 
 
 def at_least(least: int) -> Callable[[str], int]:

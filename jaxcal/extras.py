@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.metadata
+import platform
 from collections.abc import Iterator
 
-__all__ = ["MissingExtraError", "needs"]
+__all__ = ["MissingExtraError", "needs", "versions"]
+
+_COMPUTE = ("jaxcal", "numpy", "scipy", "jax", "jaxlib", "flax", "optax")
 
 
 class MissingExtraError(ImportError):
@@ -34,3 +38,12 @@ def needs(extra: str, purpose: str) -> Iterator[None]:
             f"pip install 'jaxcal[{extra}]'",
             name=error.name,
         ) from error
+
+
+def versions() -> dict[str, str]:
+    """What computed a result: Python and the packages that matter, where installed."""
+    found = {"python": platform.python_version()}
+    for name in (*_COMPUTE, "orbax-checkpoint"):
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    return found

@@ -271,9 +271,9 @@ def _step(given: Step, state: str, name: str, *options: Any) -> int:
 
 @contextlib.contextmanager
 def _place(given: Target, state: str = "") -> Iterator[Place]:
-    """The device that a command is about.
+    """The device that a command is about, which has reached a state.
 
-    A simulated one is first taken through the states before the command's own.
+    A simulated one is first taken through the states up to it.
     """
     from rig.journal import DeviceRecord
     from rig.workbench.commission import steps
@@ -289,6 +289,8 @@ def _place(given: Target, state: str = "") -> Iterator[Place]:
             place.operator.yes = yes
         else:
             record = DeviceRecord.load(config.device_path)
+            if state and (lack := record.missing(config, state)):
+                raise Refused(lack)
             operator = steps.Operator(yes, _say)
             place = steps.Place(config, record, operator, given.config)
         place.reset_alarms = getattr(given, "reset_alarms", False)
@@ -378,25 +380,24 @@ def _run(
         if not real:
             simulator = given.simulator(config, start["simulated"])
             config = stack.enter_context(simulator).start()
-        lock = BusLock(config.bus)
-        if not given.dry_run:
+        lock, record = BusLock(config.bus), DeviceRecord.load(config.device_path)
+        if real and not given.dry_run:
             stack.enter_context(lock.acquire(command))
-        record = DeviceRecord.load(config.device_path)
-        if real and not given.dry_run and (lack := record.missing(config)):
-            raise Refused(lack)
+            if lack := record.missing(config):
+                raise Refused(lack)
         if folder is None:
             folder = new_run_folder(given.out or Path(config.output), start["mode"])
             (folder / "rig.toml").write_text(text, encoding="utf-8")
-        lock.tell(run=str(folder.resolve()))
         if simulator is not None:
             record = DeviceRecord(folder / "device.json")
             if not given.dry_run:
-                place = steps.simulated(simulator, config, record, _say)
-                place.folder, place.locked = folder / "axes", True
-                place.folder.mkdir(exist_ok=True)
+                at = config.model_copy(update={"output": str(folder)})
+                place = steps.simulated(simulator, at, record, _say)
                 # Faults wait for the session's own phases.
                 place.listeners = (simulator.answer,)
                 steps.begin_simulated(place, SIGN_CHECKED)
+                stack.enter_context(lock.acquire(command))
+        lock.tell(run=str(folder.resolve()))
         run = Run(
             config,
             folder,
@@ -447,6 +448,8 @@ def _procedure(
 
 def _confirm(given: Session, session: Run) -> None:
     """Ask for what --arm and --zero would have confirmed."""
+    from rig.workbench.commission.operator import Operator
+
     takes_zero = not session.journal.events("zero") and session.zero_at is None
     questions = {
         "arm": "the device will move; its way is clear, no patient is attached, the "
@@ -455,12 +458,8 @@ def _confirm(given: Session, session: Run) -> None:
     if takes_zero and session.config.session.zero == "here":
         questions["zero"] = "the device stands in its zero posture"
     for word, text in questions.items():
-        if getattr(given, word):
-            continue
-        if not sys.stdin.isatty():
-            raise Refused(f"{text}: confirm with --{word}")
-        if input(f"{text}. Type {word} to confirm: ").strip() != word:
-            raise Refused("not confirmed; nothing was moved")
+        if not getattr(given, word):
+            Operator(say=_say, option=f"--{word}").confirm(text, word)
 
 
 def _recorded(run: Path, config: Path | None = None) -> tuple[RigConfig, Record]:
@@ -491,6 +490,7 @@ def _journal(run: Path) -> Path:
 def _records(run: Path) -> list[Record]:
     """The journal of a run; Refused where its folder holds none, or a damaged one."""
     from rig.journal import JournalError, read_journal
+    from rig.journal.run import SCHEMA
 
     try:
         records = read_journal(_journal(run))
@@ -498,10 +498,10 @@ def _records(run: Path) -> list[Record]:
         raise Refused(str(error)) from None
     if not records or records[0]["event"] != "start":
         raise Refused(f"{run} holds no run: its journal has no start")
-    if "device" not in records[0]:
+    if records[0].get("schema") != SCHEMA:
         raise Refused(
-            f"{run} was written before jaxcal 0.1.0, whose runs are not read any more. "
-            "Make a new one"
+            f"{run} was written by an earlier version of jaxcal, whose runs are not "
+            "read. Make a new one"
         )
     return records
 
@@ -540,11 +540,8 @@ def identify(given: Target) -> int:
         for axis in config.axes:
             unit, drive = f"{axis.name} (unit {axis.unit}", Drive(bus, axis)
             try:
-                status, alarm, identity = (
-                    drive.status(),
-                    drive.alarm(),
-                    drive.identity(),
-                )
+                status, alarm = drive.status(), drive.alarm()
+                identity = drive.identity()
             except BusError as error:
                 code = EXIT_FAULT
                 print(f"{unit}): {error}")
@@ -632,12 +629,12 @@ def report(run: RunPath) -> int:
 def export(
     run: RunPath,
     *,
-    to: Literal["c", "st", "ros", "json", "csv"],
+    to: Literal["c", "st", "ros", "json"],
     out: Annotated[Path, "file to write; without it it is printed"] | None = None,
 ) -> int:
     """print the inverse map of a calibration for a controller"""
     from jaxcal.files import write_text
-    from rig.workbench.outputs.export import LANGUAGES, checksum, load_inverse
+    from rig.workbench.outputs.export import LANGUAGES, load_inverse
 
     inverse = load_inverse(run, _records(run))
     for text in inverse["warnings"]:
@@ -647,7 +644,7 @@ def export(
         print(text, end="")
     else:
         write_text(out, text)
-        print(f"{out}: SHA-256 of the numbers {checksum(inverse)}")
+        print(f"{out}: SHA-256 of the numbers {inverse['checksum']}")
     return EXIT_OK
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import importlib
 import os
 from typing import Any
 
@@ -12,11 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration import file
 from jaxcal.calibration.check import Check, check, verification
-from jaxcal.calibration.discrepancy import WithHarmonics
 from jaxcal.calibration.estimate import fit_model
 from jaxcal.calibration.fit import Fit
+from jaxcal.calibration.harmonics import WithHarmonics
 from jaxcal.calibration.inverse import Carry, limits_of, reach, solve_affine
-from jaxcal.calibration.summary import columns_of, summary
+from jaxcal.calibration.summary import summary
 from jaxcal.calibration.verdict import Verdict, verdict
 from jaxcal.models import Affine, Model, Noise, Pose, SerialChain
 
@@ -78,7 +77,7 @@ class Calibration(Fit):
                 f"command_for needs at most as many outputs as inputs, got {m} and {n}"
             )
         begin = None
-        if isinstance(self.model, Affine) and m == n and self.phases is None:
+        if isinstance(self.model, Affine) and m == n:
             begin = solve_affine(self, wanted.reshape(-1, m), max_condition)
         elif start is not None:
             points = self.points("start", start, n)
@@ -156,20 +155,26 @@ class Calibration(Fit):
         return check(self, commands, measured, tolerance, placed_anew)
 
     def verification(
-        self, candidates: ArrayLike, k: int, *, region: ArrayLike | None = None
+        self,
+        candidates: ArrayLike,
+        k: int,
+        *,
+        region: ArrayLike | None = None,
+        tolerance: float | None = None,
     ) -> NDArray[np.int64]:
         """The k of the candidates that show best that the calibration is wrong.
 
         Args:
             candidates: (M, n) commands that could be measured.
-            k: two or three see what many random ones see.
+            k: three or four see what six random ones see.
             region: (R, n) commands where it is used, which say how much a drift of a
                 parameter matters; those of the calibration when not given.
+            tolerance: the drift to be seen, as of :meth:`check`.
 
         Returns:
             (k,) indices.
         """
-        return verification(self, candidates, k, region)
+        return verification(self, candidates, k, region, tolerance)
 
     # -- an arm, written back ----------------------------------------------------------
 
@@ -206,7 +211,6 @@ class Calibration(Fit):
             prior=self.model.default_prior(),
             noise=Noise(std=self.noise_std) if self.noise_known else None,
             loss=self.loss,
-            discrepancy=None,
             common_noise=None,
         )
         return np.asarray(found["estimate"])
@@ -223,23 +227,6 @@ class Calibration(Fit):
     def summary(self) -> str:
         """The parameters with their 95 % intervals, the noise and the fit, as text."""
         return summary(self, self.verdict)
-
-    def to_frame(self) -> Any:
-        """One row per parameter: value, unit, std_error, low and high (95 %), ...
-
-        Returns:
-            A ``pandas.DataFrame``; the last three only where the noise is known.
-
-        Raises:
-            ImportError: pandas is not installed.
-        """
-        try:
-            pandas = importlib.import_module("pandas")
-        except ModuleNotFoundError:
-            raise ImportError(
-                "to_frame needs pandas, which is not installed: pip install pandas"
-            ) from None
-        return pandas.DataFrame(columns_of(self)).set_index("parameter")
 
     def to_dict(self) -> dict[str, Any]:
         """The content of the file: names, numbers and lists, as JSON has them."""

@@ -98,19 +98,13 @@ def check(
     free = (calibration.free[:p] > 0.0) & ~own
     seen = np.sqrt((by**2).sum(axis=0))
     size = np.sqrt(needed) / np.where(seen > 0.0, seen, np.nan)
-    matters = (
-        float(3.0 * np.sqrt(np.mean(noise**2))) if tolerance is None else tolerance
-    )
-    if not matters > 0.0:
-        raise ValueError(f"tolerance must be positive, got {tolerance}")
+    matters = _tolerance(tolerance, noise)
     used = np.asarray(model.jacobian(calibration.commands, theta))
     per_unit = np.sqrt((used**2).mean(axis=(0, 1)) * q)
     moved = np.where(np.isnan(size), np.inf, np.nan_to_num(size)) * per_unit
     judged = free & (per_unit > 0.0)
     hidden = judged & (moved > matters)
-    shifts = (matters * seen[judged] / per_unit[judged]) ** 2
-    missed = special.chndtr(limit, freedom, shifts)  # NaN where far too large
-    power = float(np.mean(1.0 - np.nan_to_num(missed, nan=0.0)))
+    power = _mean_power(freedom, (matters * seen[judged] / per_unit[judged]) ** 2)
     if p_value < 0.05:
         says = "does not hold"
     else:
@@ -118,7 +112,7 @@ def check(
     return Check(
         says=says,
         p_value=p_value,
-        power=power,
+        power=float(power),
         drift={
             name: float(value) if np.isfinite(value) else np.inf
             for name, value, is_free in zip(names, size, free, strict=True)
@@ -127,6 +121,22 @@ def check(
         unseen=tuple(name for name, lost in zip(names, hidden, strict=True) if lost),
         tolerance=matters,
     )
+
+
+def _tolerance(given: float | None, noise: Array) -> float:
+    matters = float(3.0 * np.sqrt(np.mean(noise**2))) if given is None else given
+    if not matters > 0.0:
+        raise ValueError(f"tolerance must be positive, got {given}")
+    return matters
+
+
+def _mean_power(freedom: int, shifts: Array) -> Array:
+    """(...,) of changes with noncentralities (..., p), at 5 % false alarms."""
+    from scipy import special
+
+    missed = special.chndtr(special.chdtri(freedom, 0.05), freedom, shifts)
+    seen = 1.0 - np.nan_to_num(missed, nan=0.0)  # NaN where far too large
+    return np.asarray(seen.mean(axis=-1))
 
 
 def _noncentrality(freedom: int, limit: float) -> float:
@@ -145,11 +155,11 @@ def verification(
     candidates: ArrayLike,
     k: int,
     region: ArrayLike | None,
+    tolerance: float | None,
 ) -> NDArray[np.int64]:
     """See :meth:`jaxcal.calibration.Calibration.verification`.
 
-    Greedy, then swaps, for the smallest sum over parameters of the squared drift that
-    is seen, as a move of the outputs.
+    Greedy, then swaps, for the mean power of the check that follows.
     """
     points = table("candidates", candidates)
     if not 1 <= whole_number("k", k, 1) <= len(points):
@@ -165,15 +175,15 @@ def verification(
     seen = (white**2).sum(axis=1)  # (M, p) by a drift of one
     where = calibration.commands if region is None else table("region", region)
     used = np.asarray(model.jacobian(where, theta))
-    per_unit = (used**2).mean(axis=(0, 1))
+    q = used.shape[1]
+    per_unit = (used**2).mean(axis=(0, 1)) * q
     matters = (calibration.free[: len(theta)] > 0.0) & (per_unit > 0.0)
-    seen = seen[:, matters] / per_unit[matters]  # by a drift that moves outputs by one
-    least = 1e-6 * seen.max(initial=0.0) or 1.0
+    by_change = _tolerance(tolerance, noise) ** 2 / per_unit[matters]
+    shifts = seen[:, matters] * by_change  # noncentralities of one posture
 
     def value(rows: list[int]) -> Array:
         """(M,) of the rows and each candidate."""
-        together = seen[rows].sum(axis=0) + seen + least
-        return np.asarray(-(1.0 / together).sum(axis=1))
+        return _mean_power(q * (len(rows) + 1), shifts[rows].sum(axis=0) + shifts)
 
     chosen: list[int] = []
     for _ in range(k):

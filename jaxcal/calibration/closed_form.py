@@ -95,6 +95,4 @@ def fit_affine(
         "noise_known": known,
         "noise_dof": float(noise_dof),
         "num_measurements": len(u),
-        "frequencies": None,
-        "phases": None,
     }

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.discrepancy import WithDiscrepancy, WithHarmonics
+from jaxcal.calibration.harmonics import WithHarmonics
 from jaxcal.calibration.sizes import Sizes, group_sizes, of_sizes
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
-from jaxcal.checks import in_words, one_of, whole_number
-from jaxcal.information.blocks import significant
+from jaxcal.checks import in_words, one_of
+from jaxcal.information.blocks import significant, triangle
 from jaxcal.models import (
     Model,
     Noise,
@@ -22,7 +22,7 @@ from jaxcal.models import (
     SerialChain,
     Socket,
 )
-from jaxcal.models.checked import facts
+from jaxcal.models.model import facts
 
 __all__ = ["fit_model", "require_model"]
 
@@ -63,7 +63,6 @@ def fit_model(
     prior: Prior | None,
     noise: Noise | None,
     loss: str,
-    discrepancy: int | None,
     common_noise: bool | None,
 ) -> dict[str, Any]:
     """The fields of a ``Calibration`` but names, units and provenance."""
@@ -93,16 +92,12 @@ def fit_model(
     asked = prior is not None
     prior = prior or model.default_prior()
     resolved = prior.resolve(model)
-    whole, extra = model, np.zeros(0)  # precision of what is added, 0: estimated
-    if discrepancy is not None:
-        features = whole_number("discrepancy", discrepancy, 1)
-        whole = WithDiscrepancy.over(model, commands[used], features)  # type: ignore[assignment]  # as far as a fit needs it
-        extra = np.zeros(features * measured.shape[1])
-    elif isinstance(model, SerialChain) and model.sensor.harmonic:
+    whole, extra = model, np.zeros(0)  # precision of what is added
+    if isinstance(model, SerialChain) and model.sensor.harmonic:
         # Of a URDF file what is written back is what is predicted: it holds none.
         plain = asked or spread.any() or model.harmonics or model.source is not None
         if not plain:
-            whole = WithHarmonics(model)  # type: ignore[assignment]  # likewise
+            whole = WithHarmonics(model)  # type: ignore[assignment]  # as far as a fit needs it
             extra = whole.std**-2.0  # type: ignore[attr-defined]  # see above
     task = Task(
         model=whole,
@@ -111,20 +106,16 @@ def fit_model(
         white=white[used],
         mean=np.concatenate([resolved.mean, 0.0 * extra]),
         precision=np.concatenate([np.diagonal(resolved.precision), extra]),
-        free=np.concatenate([resolved.free, extra >= 0.0]),
-        sized=np.concatenate([resolved.free & False, extra == 0.0]),
+        free=np.concatenate([resolved.free, extra > 0.0]),
         command_std=spread,
         known=known,
         per_output=common_noise is False,
         student=loss == "student",
     )
-    beyond = discrepancy is not None or spread.any()  # what the sizes are not made for
     sizes: Sizes | None = None
-    if prior.by_data and (asked or not beyond):
-        if not isinstance(model, SerialChain) or beyond:
-            raise ValueError(
-                "Prior.sized() is of arms, without discrepancy and command_std"
-            )
+    if prior.by_data and (asked or not spread.any()):
+        if not isinstance(model, SerialChain) or spread.any():
+            raise ValueError("Prior.sized() is of arms, without command_std")
         found, stated = solve(task, rough=True), task
         for last in (False, True):
             sizes = group_sizes(model, stated, found, sizes)
@@ -271,7 +262,7 @@ def _fields(
     rows = rows.reshape(-1, rows.shape[-1])
     known = facts(task.model, found.parameters)[1][:, task.free]
     rows = np.concatenate([rows, known])
-    covariance, null = _covariance(task, rows, found.precision[task.free], found.left)
+    covariance, null = _covariance(task, rows, task.precision[task.free], found.left)
     freedom = float(found.freedom.sum())
     noise_std: Array | None = _noise(task, found, weights[used])
     noise_dof = 0.0
@@ -287,14 +278,13 @@ def _fields(
         estimated[used] = found.commands
     loss_weights, distance = np.zeros((2, len(commands)))
     loss_weights[used], distance[used] = found.weights, found.deleted
-    features = task.model if isinstance(task.model, WithDiscrepancy) else None
     return {
         "estimate": found.parameters,
         "joint_covariance": None if noise_std is None else covariance,
         "centre": None,
         "unidentified": null,
         "prior_mean": task.mean,
-        "prior_precision": found.precision,
+        "prior_precision": task.precision,
         "free": task.free.astype(np.float64),
         "commands": commands,
         "estimated_commands": estimated,
@@ -308,8 +298,6 @@ def _fields(
         "noise_known": task.known,
         "noise_dof": noise_dof,
         "num_measurements": int(used.sum()),
-        "frequencies": features and features.frequencies,
-        "phases": features and features.phases,
     }
 
 
@@ -332,14 +320,14 @@ def _covariance(
     size, free = len(task.mean), np.flatnonzero(task.free)
     scale = np.sqrt((rows**2).sum(axis=0) + precision)
     scale = np.where(scale > 0.0, scale, 1.0)
-    triangle = np.linalg.qr(
-        np.concatenate([rows, np.diag(np.sqrt(precision))]) / scale, "r"
-    )
-    _, singular, right = np.linalg.svd(triangle)
+    whole = np.concatenate([rows, np.diag(np.sqrt(precision))]) / scale
+    _, singular, right = np.linalg.svd(triangle(whole))
     known = significant(singular)
     readings = left * len(task.commands)
-    of_rows = significant(np.linalg.svd(rows / scale, compute_uv=False)).sum()
-    if not known.all() and of_rows >= readings:
+    of_rows = 0
+    if not known.all():
+        of_rows = significant(np.linalg.svd(rows / scale, compute_uv=False)).sum()
+    if of_rows >= readings:
         raise ValueError(
             f"measured holds {readings} independent readings, too few for "
             f"{len(free)} free parameters: {int((~known).sum())} combinations of them "

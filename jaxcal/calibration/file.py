@@ -13,8 +13,8 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from jaxcal.calibration.discrepancy import WithHarmonics
 from jaxcal.calibration.fit import Fit
+from jaxcal.calibration.harmonics import WithHarmonics
 from jaxcal.files import write_text
 from jaxcal.models import Affine, Model, SerialChain, from_dict
 
@@ -41,12 +41,10 @@ _SHAPES = {
     "noise_dof": "",
     "dof": "",
     "square": "",
-    "frequencies": "nD",
-    "phases": "D",
 }
 _MAY_BE_NULL = (
     *("joint_covariance", "centre", "unidentified", "estimated_commands"),
-    *("noise_std", "frequencies", "phases"),
+    "noise_std",
 )
 _NOT_NEGATIVE = (
     *("prior_precision", "free", "loss_weights", "distance", "noise_std"),
@@ -163,13 +161,11 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
         raise ValueError(
             f"model must have the parameters of the file, {names}, got {model.names}"
         )
-    features = 0 if found["phases"] is None else len(found["phases"])
-    expected = len(names) + features * len(found["output_names"])
-    if isinstance(model, SerialChain) and not features:
-        whole = len(WithHarmonics(model).names)
-        expected = whole if len(found["estimate"]) == whole else expected
-    if len(found["estimate"]) != expected:
-        raise ValueError(f'"estimate" must have shape ({expected},)')
+    size = len(found["estimate"])
+    if size != len(names) and not (
+        isinstance(model, SerialChain) and size == len(WithHarmonics(model).names)
+    ):
+        raise ValueError(f'"estimate" must have shape ({len(names)},)')
     if (found["noise_std"] is None) != (found["joint_covariance"] is None):
         raise ValueError('"noise_std" and "joint_covariance" contradict each other')
     return found | {"model": model}

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration.discrepancy import WithDiscrepancy, WithHarmonics
+from jaxcal.calibration.harmonics import WithHarmonics
 from jaxcal.checks import numbers
 from jaxcal.models import Affine, Model, Prior, SerialChain, identifiability
-from jaxcal.models.checked import derivative, predict
 from jaxcal.models.identifiability import Identifiability
+from jaxcal.models.model import derivative, predict
 
 __all__ = ["Fit"]
 
@@ -25,8 +25,8 @@ Array = NDArray[np.float64]
 class Fit:
     """The identified map from commands u (n inputs) to outputs y (m of them).
 
-    ``y = f(u; theta)`` with the most probable p parameters; P of them with those of the
-    discrepancy, if any. ``identify`` fills it, in closed form where the model is affine
+    ``y = f(u; theta)`` with the most probable p parameters; P of them with
+    an arm's harmonics. ``identify`` fills it, in closed form where the model is affine
     and nothing else is asked for. Arrays are copied and frozen on entry.
     """
 
@@ -56,8 +56,6 @@ class Fit:
     dof: float  # residual degrees of freedom of all readings, prior counted
     square: float  # sum of the squared residuals in noise
     num_readings: int  # of a measurement, less its unknown commands
-    frequencies: Array | None  # (n, D) of the discrepancy
-    phases: Array | None  # (D,)
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -246,13 +244,11 @@ class Fit:
 
     @property
     def whole(self) -> Model:
-        """The model with its discrepancy."""
+        """The model with its harmonics."""
         more = len(self.estimate) > len(self.names)
-        if more and self.phases is None and isinstance(self.model, SerialChain):
-            return WithHarmonics(self.model)  # type: ignore[return-value]  # likewise
-        if self.frequencies is None or self.phases is None:
-            return self.model
-        return WithDiscrepancy(self.model, self.frequencies, self.phases)  # type: ignore[return-value]  # no prior, no file of its own
+        if more and isinstance(self.model, SerialChain):
+            return WithHarmonics(self.model)  # type: ignore[return-value]  # no prior, no file of its own
+        return self.model
 
     @property
     def undetermined(self) -> NDArray[np.bool_]:

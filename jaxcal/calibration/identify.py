@@ -41,7 +41,6 @@ def identify(
     weights: ArrayLike | None = None,
     common_noise: bool | None = None,
     loss: str | None = None,
-    discrepancy: int | None = None,
     input_names: Sequence[str] | None = None,
     output_names: Sequence[str] | None = None,
     command_unit: str = "",
@@ -50,8 +49,8 @@ def identify(
 ) -> Calibration:
     """The parameters of ``y = f(u; theta)`` that the measurements make most probable.
 
-    The affine model without prior, student's loss, discrepancy or noise of another kind
-    than ``noise_std`` is fitted by weighted least squares in closed form, and refuses
+    The affine model without prior, student's loss or noise of another kind than
+    ``noise_std`` is fitted by weighted least squares in closed form, and refuses
     commands that leave a direction unexcited. Every other fit starts at the prior's
     mean and is of the most probable parameters, so directions that no measurement shows
     stay there.
@@ -76,9 +75,6 @@ def identify(
         loss: "gaussian" is least squares; "student" (4 degrees of freedom, of a
             measurement as a whole) gives outliers little weight. "student" when not
             given, but least squares where the closed form applies.
-        discrepancy: number of random features of a smooth function of the commands
-            that is added to every output, its size estimated: for a model that is not
-            exact, so that the intervals of predictions say so.
         input_names: n names; u_x, u_y, u_z or u_1 ... u_n when not given.
         output_names: m names, likewise y_x or y_1.
         command_unit: stored with the result.
@@ -134,7 +130,7 @@ def identify(
         require_model(model, commands, measured)
         affine = isinstance(model, Affine)
     if affine and loss in (None, "gaussian"):
-        if prior is None and noise is None and discrepancy is None:
+        if prior is None and noise is None:
             shared = bool(common_noise)
             found = fit_affine(commands, measured, weight, level, shared, inputs)
             return Calibration(**found, **about)
@@ -146,7 +142,6 @@ def identify(
         prior=prior,
         noise=Noise(std=level) if noise is None and level is not None else noise,
         loss=loss or "student",
-        discrepancy=discrepancy,
         common_noise=common_noise,
     )
     calibration = Calibration(**found, **about)

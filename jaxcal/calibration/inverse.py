@@ -11,7 +11,7 @@ from jaxcal.calibration.fit import Fit
 from jaxcal.checks import in_words, numbers
 from jaxcal.information.excitation import direction_in_words
 from jaxcal.models import Affine, Model
-from jaxcal.models.checked import derivative, predict
+from jaxcal.models.model import derivative, predict
 
 __all__ = ["Carry", "limits_of", "reach", "solve_affine"]
 

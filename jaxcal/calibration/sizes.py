@@ -4,9 +4,10 @@ The prior says how errors of lengths compare with each other, and those of angle
 large they are altogether is seldom known. Here a factor for all lengths, one for the
 turns of the axes (alpha, beta), one for the zeros of the joints (theta), one for their
 compliance and the level of the noise make the readings most probable (marginal
-likelihood, the model linear about the fit), with a factor of three either way as what
-is thought of each beforehand. Sources: MacKay, 1992; Bishop, Pattern Recognition and
-Machine Learning, 3.5.
+likelihood, the model linear about the fit), with a factor of three either way (ten of
+the harmonics) as what is thought of each beforehand.
+
+Sources: MacKay, 1992; Bishop, Pattern Recognition and Machine Learning, 3.5.
 """
 
 from __future__ import annotations
@@ -17,15 +18,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration.solve import Solution, Task
-from jaxcal.information.blocks import without
+from jaxcal.information.blocks import significant, triangle, without
 from jaxcal.models import SerialChain
-from jaxcal.models.checked import derivative, facts
+from jaxcal.models.model import derivative, facts
 
 __all__ = ["Sizes", "group_sizes", "of_sizes"]
 
 Array = NDArray[np.float64]
 
-_THOUGHT = np.log(3.0)  # standard deviation of the logarithm of each factor
+# Beforehand, of the factors of the groups and of the level: median, and the factor of
+# one standard deviation. Most arms have little misfit and some have much.
+_MIDDLE = np.log([1.0, 1.0, 1.0, 1.0, 0.3, 1.0])
+_SPREAD = np.log([3.0, 3.0, 3.0, 3.0, 10.0, 3.0])
 _MOST = 5.0  # of a logarithm
 _SCORES = 100  # steps of Fisher's scoring, at most
 _GROUPS = 5  # lengths, turns of the axes, zeros of the joints, compliance, harmonics
@@ -61,10 +65,10 @@ def group_sizes(
     sized = groups[task.free & (task.precision > 0.0)]
     count, width = len(right), rows.shape[1]
     # All that the readings say is in a triangle; the rest of them is noise alone.
-    triangle = np.asarray(np.linalg.qr(np.column_stack([rows, right]), mode="r"))
-    top = min(width, len(triangle))
-    rest = float((triangle[top:, width] ** 2).sum())
-    rows, right = triangle[:top, :width], triangle[:top, width]
+    factor = triangle(np.column_stack([rows, right]))
+    top = min(width, len(factor))
+    rest = float((factor[top:, width] ** 2).sum())
+    rows, right = factor[:top, :width], factor[:top, width]
     member = sized == np.arange(_GROUPS)[:, None]  # (groups, s)
 
     def cost(logs: Array) -> tuple[float, Array, Array]:
@@ -83,16 +87,16 @@ def group_sizes(
             spread - member @ (white @ scaled) ** 2,
             level * (np.trace(inverse) - white @ white) + count - top - rest / level,
         )
-        curve = np.eye(_GROUPS + 1) / _THOUGHT**2
+        curve = np.diag(_SPREAD**-2.0)
         curve[:-1, :-1] += 2.0 * member @ (scaled.T @ seen) ** 2 @ member.T
         curve[-1, :-1] = curve[:-1, -1] = 2.0 * level * member @ (seen**2).sum(axis=0)
         curve[-1, -1] += 2.0 * (level**2 * (inverse**2).sum() + count - top)
-        thought = logs / _THOUGHT
-        value = float(value + thought @ thought)
-        return value, 2.0 * (slope + thought / _THOUGHT), 2.0 * curve
+        off = (logs - _MIDDLE) / _SPREAD
+        value = float(value + off @ off)
+        return value, 2.0 * (slope + off / _SPREAD), 2.0 * curve
 
     # A level that is known floats too: misfit beyond it is no size of the errors.
-    best = np.zeros(_GROUPS + 1) if before is None else before.logs
+    best = _MIDDLE if before is None else before.logs
     least, slope, curve = cost(best)
     for _ in range(_SCORES):
         step = np.linalg.solve(curve, slope)
@@ -108,9 +112,11 @@ def group_sizes(
     factors[groups >= 0] = np.exp(best[groups[groups >= 0]])
     steps = 1e-3 * np.eye(len(best))
     curves = [cost(best + step)[1] - cost(best - step)[1] for step in steps]
-    size, axes = np.linalg.eigh(np.array(curves) / 4e-3)  # of half the cost
-    size = np.maximum(size, _THOUGHT**-2.0)
-    inside = (axes / size) @ axes.T
+    # Half the cost's, in units of what was thought, which the readings only sharpen.
+    curve = np.array(curves) / 4e-3 * np.outer(_SPREAD, _SPREAD)
+    size, axes = np.linalg.eigh(curve)
+    axes = _SPREAD[:, None] * axes
+    inside = (axes / np.maximum(size, 1.0)) @ axes.T
     return Sizes(best, factors, groups, inside[:_GROUPS, :_GROUPS])
 
 
@@ -131,10 +137,14 @@ def of_sizes(task: Task, found: Solution, sizes: Sizes) -> Array:
     off = (found.parameters - task.mean)[free]
     right = scale * (gram @ off + precision * off)  # as the fit balances them
 
+    gram = scale[:, None] * gram * scale
+    value, vectors = np.linalg.eigh(gram + np.diag(scale**2 * precision))
+    none = vectors[:, ~significant(value, squares=True)]  # nothing determines these
+    gram, none = gram + none @ none.T, none @ none.T
+
     def at(logs: Array) -> tuple[Array, Array]:
         factor = np.where(groups >= 0, np.exp(-2.0 * logs[groups]), 1.0)
-        whole = scale[:, None] * gram * scale + np.diag(scale**2 * precision * factor)
-        inverse = np.asarray(np.linalg.pinv(whole, hermitian=True), dtype=np.float64)
+        inverse = np.linalg.inv(gram + np.diag(scale**2 * precision * factor)) - none
         return inverse @ right, inverse
 
     values, axes = np.linalg.eigh(sizes.covariance)

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.models import Model
-from jaxcal.models.checked import derivative, facts, predict
+from jaxcal.models.model import derivative, facts, predict
 
 __all__ = ["Solution", "Task", "solve", "student_constants"]
 
@@ -45,7 +45,6 @@ class Task:
     mean: Array  # (P,) of the prior
     precision: Array  # (P,) of the prior, 0 where nothing is known
     free: NDArray[np.bool_]  # (P,) False: held at the mean
-    sized: NDArray[np.bool_]  # (P,) coefficients whose prior size is estimated
     command_std: Array  # (n,) 0 exact, inf unknown in every measurement
     known: bool  # the level is 1; else it is estimated
     per_output: bool  # one level for each output
@@ -60,14 +59,12 @@ class Solution:
     commands: Array  # (N, n) as estimated; as given where they are exact
     residuals: Array  # (N, q) measured less predicted at these commands
     level: Array  # (q,) of the noise
-    size: float  # prior std of the ``sized`` coefficients
     weights: Array  # (N,) of the loss, 1 for least squares
     distance: Array  # (N,) squared, of each measurement from the fit, in noise
     deleted: Array  # (N,) the same from the fit without that measurement
     left: int  # readings of a measurement less its unknown commands
     freedom: Array  # (q,) residual degrees of freedom of each output
     rows: Array  # (N, R, F) whitened derivatives, commands eliminated, no weights
-    precision: Array  # (P,) of the prior
 
 
 @functools.lru_cache
@@ -159,12 +156,11 @@ class _Search:
         self.residuals = task.measured - predict(task.model, self.commands, self.theta)
         if start is None:
             self.weights, self.level = np.ones(count), np.ones(q)
-            self.size = float(np.sqrt(np.mean(self.residuals**2))) or 1.0
             if not task.known:
                 first = np.sqrt(np.mean(_times(task.white, self.residuals) ** 2))
                 self.level = np.full(q, max(first, self.floor))
         else:
-            self.weights, self.level, self.size = start.weights, start.level, start.size
+            self.weights, self.level = start.weights, start.level
         self._linearise()
 
     def _linearise(self) -> None:
@@ -182,10 +178,6 @@ class _Search:
             inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
             rows = derivative(task.model, self.commands, self.theta, inputs)
             self.by_command = task.white @ rows[..., self.uncertain]
-
-    def _precision(self) -> Array:
-        """(P,) of the prior, with the size estimated of some coefficients."""
-        return np.where(self.task.sized, self.size**-2.0, self.task.precision)
 
     def _distance(self, residuals: Array, commands: Array) -> Array:
         """(N,) squared distance of each measurement from the fit, in noise."""
@@ -206,7 +198,7 @@ class _Search:
     def _cost(
         self, residuals: Array, theta: Array, commands: Array, known: Array
     ) -> float:
-        off = (theta - self.task.mean) ** 2 @ self._precision() + known @ known
+        off = (theta - self.task.mean) ** 2 @ self.task.precision + known @ known
         return float(self.weights @ self._distance(residuals, commands) + off)
 
     def _reduce(self, damping: float) -> tuple[Array, Array]:
@@ -242,7 +234,7 @@ class _Search:
     def _system(self, damping: float) -> tuple[Array, Array, Array]:
         """Weighted rows (R, F), residuals (R,), scale (F,): readings, prior, facts."""
         free = self.task.free
-        root = np.sqrt(self._precision()[free])
+        root = np.sqrt(self.task.precision[free])
         weight = np.sqrt(self.weights)[:, None]
         rows, right = self._reduce(damping)
         rows = (weight[..., None] * rows).reshape(-1, len(root))
@@ -331,30 +323,23 @@ class _Search:
         ``slack`` times 1e-6 of a weight and 1e-4 of a level are no change.
         """
         task = self.task
-        before = self.weights, np.log(self.level), np.log(self.size)
+        before = self.weights, np.log(self.level)
         if task.student:
             distance = self._distance(self.residuals, self.commands)
             self.weights = student_weight(distance, self.left)
-        if not task.known or task.sized.any():
-            self._estimate_levels()
-        after = self.weights, np.log(self.level), np.log(self.size)
+        if not task.known:
+            self._estimate_level()
+        after = self.weights, np.log(self.level)
         return all(
             np.abs(new - old).max() < slack * limit
-            for new, old, limit in zip(after, before, (1e-6, 1e-4, 1e-4), strict=True)
+            for new, old, limit in zip(after, before, (1e-6, 1e-4), strict=True)
         )
 
-    def _estimate_levels(self) -> None:
+    def _estimate_level(self) -> None:
         """Sums of squares over the degrees of freedom that they have."""
         task = self.task
-        readings, prior = self._leverage(self.solved)
-        if task.sized.any():
-            left = (1.0 - (prior**2).sum(axis=1))[task.sized[task.free]].sum()
-            found = np.sqrt(np.sum(self.theta[task.sized] ** 2) / max(left, 1e-6))
-            # A hundredth of the noise is as good as none, and reached in few steps.
-            noise = self.level / np.abs(np.diagonal(task.white, axis1=1, axis2=2))
-            self.size = max(float(found), 0.01 * float(np.median(noise)))
-        self.freedom = freedom = self._freedom(readings)
-        if task.known or freedom.sum() < 1.0:
+        self.freedom = freedom = self._freedom(self._leverage(self.solved))
+        if freedom.sum() < 1.0:
             return
         square = self.weights @ _times(task.white, self.residuals) ** 2
         if not task.per_output or (freedom < 0.5).any():
@@ -369,10 +354,8 @@ class _Search:
         near = np.abs(change).max() < 0.3
         self.level = self.level * np.exp(change * (faster if near else 1.0))
 
-    def _leverage(
-        self, solved: tuple[Array, Array] | None = None
-    ) -> tuple[Array, Array]:
-        """Roots of the hat matrix: of the readings (N, R, F), the prior (F, F)."""
+    def _leverage(self, solved: tuple[Array, Array] | None = None) -> Array:
+        """(N, R, F) roots of the hat matrix, of the readings."""
         if solved is None:
             rows, right, _ = self._system(0.0)
             solved = rows, _factor(rows, right, _LEAST_DAMPING, 2)[0]
@@ -380,8 +363,7 @@ class _Search:
         root = rows @ inverse
         width, count = rows.shape[1], len(self.weights)
         readings = len(root) - width - len(self.known)
-        prior = root[readings : readings + width]
-        return root[:readings].reshape(count, -1, width), prior
+        return root[:readings].reshape(count, -1, width)
 
     def _freedom(self, readings: Array) -> Array:
         """(q,) residual degrees of freedom of each output."""
@@ -395,7 +377,7 @@ class _Search:
         return np.asarray(count - none.sum(axis=0) - used.sum(axis=0))
 
     def solution(self) -> Solution:
-        readings, _ = self._leverage()
+        readings = self._leverage()
         rows, right = self._reduce(0.0)
         gap = np.eye(rows.shape[1]) - readings @ np.matrix_transpose(readings)
         gap += 1e-9 * np.eye(rows.shape[1])
@@ -405,14 +387,12 @@ class _Search:
             commands=self.commands,
             residuals=self.residuals,
             level=self.level,
-            size=self.size,
             weights=self.weights,
             distance=self._distance(self.residuals, self.commands),
             deleted=np.maximum((right * deleted).sum(axis=1), 0.0),
             left=self.left,
             freedom=self._freedom(readings),
             rows=rows,
-            precision=self._precision(),
         )
 
 

@@ -1,8 +1,6 @@
-"""A calibration as text and as columns: values, intervals, noise, what is wrong."""
+"""A calibration as text: values, intervals, noise, what is wrong."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 
@@ -11,12 +9,11 @@ from jaxcal.calibration.verdict import Verdict
 from jaxcal.checks import in_words
 from jaxcal.models import Affine
 
-__all__ = ["columns_of", "summary"]
+__all__ = ["summary"]
 
 
 def summary(fit: Fit, verdict: Verdict | None) -> str:
     """The parameters with their 95 % intervals, the noise and the fit, as text."""
-    columns = columns_of(fit)
     affine = isinstance(fit.model, Affine)
     what = "y = A u + b" if affine else f"of {type(fit.model).__name__}"
     fixed = int((fit.free[: len(fit.parameters)] == 0).sum())
@@ -26,25 +23,24 @@ def summary(fit: Fit, verdict: Verdict | None) -> str:
         f"({', '.join(fit.output_names)}), {fit.num_measurements} measurements, "
         f"{len(fit.parameters)} parameters"
         + (f" ({fixed} fixed)" if fixed else "")
-        + (", with discrepancy" if fit.phases is not None else "")
         + f", {fit.loss} loss"
     ]
-    cells = {"": columns["parameter"]}
+    cells = {"": list(fit.names)}
     if affine:
-        cells["meaning"] = columns["meaning"]
-    cells |= {
-        "value": [f"{value: .6g}" for value in columns["value"]],
-    }
-    if "low" in columns:
-        cells["std error"] = [f"{error:.3g}" for error in columns["std_error"]]
-        cells["95 % interval"] = [
-            f"[{low: .6g}, {high: .6g}]"
-            for low, high in zip(columns["low"], columns["high"], strict=True)
+        cells["meaning"] = [
+            *(f"{y} per {u}" for y in fit.output_names for u in fit.input_names),
+            *(f"{y} at u = 0" for y in fit.output_names),
         ]
+    cells["value"] = [f"{value: .6g}" for value in fit.parameters]
+    errors, shares = fit.standard_errors, fit.from_data
+    if errors is not None and shares is not None:
+        cells["std error"] = [f"{error:.3g}" for error in errors]
+        ends = fit.confidence_intervals()
+        cells["95 % interval"] = [f"[{low: .6g}, {high: .6g}]" for low, high in ends]
         if fit.prior_precision.any() or fit.unidentified is not None:
-            cells["from data"] = [f"{share:.0%}" for share in columns["from_data"]]
-    if any(columns["unit"]):
-        cells["unit"] = columns["unit"]
+            cells["from data"] = [f"{share:.0%}" for share in shares]
+    if any(units := _units(fit)):
+        cells["unit"] = units
     lines += _in_lines(cells)
     unit = f" {fit.measured_unit}" if fit.measured_unit else ""
     size = np.sqrt(np.mean(fit.residuals**2, axis=0))
@@ -76,21 +72,6 @@ def summary(fit: Fit, verdict: Verdict | None) -> str:
             f"deviations from the fit of the others, weight {weight:.2g}"
         )
     return "\n".join(lines)
-
-
-def columns_of(fit: Fit) -> dict[str, list[Any]]:
-    columns: dict[str, list[Any]] = {"parameter": list(fit.names)}
-    if isinstance(fit.model, Affine):
-        columns["meaning"] = [
-            *(f"{y} per {u}" for y in fit.output_names for u in fit.input_names),
-            *(f"{y} at u = 0" for y in fit.output_names),
-        ]
-    columns |= {"value": fit.parameters.tolist(), "unit": _units(fit)}
-    if fit.standard_errors is not None and fit.from_data is not None:
-        columns["std_error"] = fit.standard_errors.tolist()
-        columns["low"], columns["high"] = fit.confidence_intervals().T.tolist()
-        columns["from_data"] = fit.from_data.tolist()
-    return columns
 
 
 def _units(fit: Fit) -> list[str]:

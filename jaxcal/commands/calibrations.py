@@ -25,11 +25,20 @@ from jaxcal.commands.tables import (
 from jaxcal.models import SerialChain
 from jaxcal.models.sensors import SENSORS, Placed, Socket
 
-__all__ = ["FLAGS", "command", "identify", "predict"]
+__all__ = ["ARM", "FLAGS", "command", "commands_of", "identify", "predict", "read_arm"]
 
 Array = NDArray[np.float64]
 
 _KINDS = tuple(kind for kind in SENSORS if kind != "several")
+ARM = (
+    flag("--sensor", "of an arm, what its tip is measured with", choices=_KINDS,
+         default="position"),
+    flag("--base", "of an arm, the link that stands still", "LINK"),
+    flag("--tip", "of an arm, the link that is measured", "LINK"),
+    flag("--radians", "joint columns are in radians", on=True),
+    flag("--distance", "two sockets, how far apart they are and its std: "
+         "0,1,0.05,0.0001", "N", several(float, "numbers"), action="append"),
+)  # fmt: skip
 _CALIBRATION = flag("calibration", "calibration.json", "CALIBRATION")
 FLAGS = {
     "identify": (
@@ -37,13 +46,7 @@ FLAGS = {
         flag("--inputs", "columns of commands", "A,B"),
         flag("--outputs", "columns of measurements", "C,D"),
         MODEL,
-        flag("--sensor", "of an arm, what its tip is measured with", choices=_KINDS,
-             default="position"),
-        flag("--base", "of an arm, the link that stands still", "LINK"),
-        flag("--tip", "of an arm, the link that is measured", "LINK"),
-        flag("--radians", "joint columns are in radians", on=True),
-        flag("--distance", "two sockets, how far apart they are and its std: "
-             "0,1,0.05,0.0001", "N", several(float, "numbers"), action="append"),
+        *ARM,
         flag("--noise", "standard deviation of a measurement, where it is known", "S",
              several(float, "numbers")),
         flag("--weights", "column of relative weights", "W"),
@@ -85,7 +88,7 @@ def identify(arguments: argparse.Namespace) -> None:
     table, noise, out = read_table(arguments.file), arguments.noise, arguments.out
     as_urdf = (out or "").lower().endswith(".urdf")
     if (arguments.model or "").lower().endswith(".urdf"):
-        model: Any = _arm(arguments, table)
+        model: Any = read_arm(arguments, table)
         commands, measured, inputs, outputs = _readings(model, table, arguments)
         if as_urdf and os.path.exists(out) and not arguments.force:
             raise ValueError(f"{out} is there already; --force writes over it")
@@ -188,13 +191,18 @@ def _emit(arguments: argparse.Namespace, names: Sequence[str], values: Array) ->
         write_rows(None, names, rows)
 
 
-def _arm(arguments: argparse.Namespace, table: Table) -> SerialChain:
-    """The arm in a URDF file; things that it touches are counted in the table."""
+def read_arm(
+    arguments: argparse.Namespace, table: Table | None, places: Any = None
+) -> SerialChain:
+    """The arm in a URDF file; things that it touches are given or in the table."""
     kind = SENSORS[arguments.sensor]
     given: dict[str, Any] = {}
-    if issubclass(kind, Placed) and arguments.sensor in table.names:
-        column = table.columns([arguments.sensor])
-        given["count"] = 1 + int(column.max(initial=0.0))
+    if issubclass(kind, Placed):
+        if places is not None:
+            given |= {"count": len(places), "places": places}
+        elif table is not None and arguments.sensor in table.names:
+            column = table.columns([arguments.sensor])
+            given["count"] = 1 + int(column.max(initial=0.0))
     if arguments.distance:
         if kind is not Socket:
             raise ValueError("--distance is of --sensor socket")
@@ -202,6 +210,17 @@ def _arm(arguments: argparse.Namespace, table: Table) -> SerialChain:
     return SerialChain.from_urdf(
         arguments.model, base=arguments.base, tip=arguments.tip, sensor=kind(**given)
     )
+
+
+def commands_of(
+    arm: SerialChain, table: Table, inputs: Sequence[str], radians: bool
+) -> Array:
+    """(N, n) the columns of joints and sensor, in degrees."""
+    commands = table.columns(inputs).copy()
+    if radians:
+        turning = [i for i, unit in enumerate(arm.command_units) if unit == "deg"]
+        commands[:, turning] = np.degrees(commands[:, turning])
+    return commands
 
 
 def _readings(
@@ -212,10 +231,7 @@ def _readings(
     A sensor whose readings are zeros (a contact) needs no columns of them.
     """
     inputs = table.inputs(arguments.inputs) if arguments.inputs else arm.inputs
-    commands = table.columns(inputs).copy()
-    if arguments.radians:
-        turning = [i for i, unit in enumerate(arm.command_units) if unit == "deg"]
-        commands[:, turning] = np.degrees(commands[:, turning])
+    commands = commands_of(arm, table, inputs, arguments.radians)
     outputs = arm.sensor.outputs
     if arm.sensor.zeros:
         return commands, np.zeros((len(commands), len(outputs))), inputs, outputs

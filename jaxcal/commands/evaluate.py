@@ -16,6 +16,7 @@ from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder
 
 if TYPE_CHECKING:
+    from jaxcal.evaluation.dataset import Dataset
     from jaxcal.evaluation.results import Evaluation, Summary
     from jaxcal.progress import Progress
 
@@ -126,19 +127,8 @@ def _whole(
 ) -> Iterator[tuple[Summary, Evaluation]]:
     """Every dataset, read or made before the first is evaluated."""
     from jaxcal.evaluation.methods import evaluate
-    from jaxcal.paper.datasets import catalogue
 
-    datasets = [
-        catalogue.load(
-            name,
-            options.seed,
-            options.episodes,
-            recordings=options.recordings,
-            progress=progress,
-        )
-        for name in options.dataset
-    ]
-    for dataset in datasets:
+    for dataset in [_dataset(name, options, progress) for name in options.dataset]:
         found = evaluate(
             dataset,
             options.k,
@@ -151,6 +141,27 @@ def _whole(
             progress=progress,
         )
         yield found.summarise(indices=options.indices), found
+
+
+def _dataset(name: str, options: argparse.Namespace, progress: Progress) -> Dataset:
+    """The first episodes of one of the paper's datasets, or of a file."""
+    from jaxcal.evaluation.dataset_files import load_dataset
+    from jaxcal.paper.constants import EPISODES
+
+    if name in EPISODES:
+        with needs("study", f"--dataset {name}"):
+            from jaxcal.paper.datasets import make_dataset
+
+            count = min(options.episodes or EPISODES[name], EPISODES[name])
+            known = {"recordings": options.recordings, "progress": progress}
+            return make_dataset(name, options.seed, count, **known)
+    if pathlib.Path(name).suffix.lower() not in (".npz", ".csv"):
+        raise ValueError(
+            f"--dataset must be one of {', '.join(EPISODES)} or a .npz or .csv file, "
+            f"got {name!r}"
+        )
+    dataset = load_dataset(name)
+    return dataset if options.episodes is None else dataset.part(0, options.episodes)
 
 
 def _streamed(

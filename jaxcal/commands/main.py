@@ -19,6 +19,7 @@ _HERE = {  # command: one line of help, and the module with its flags and functi
     "select": ("choose the few rows of a table worth measuring", "questions"),
     "score": ("judge a choice made elsewhere", "questions"),
     "plan": ("how many measurements a wanted accuracy takes", "questions"),
+    "postures": ("where to put an arm to calibrate it, as a plan", "postures"),
     "identify": (
         "fit y = A u + b, or a model, to measurements and save the calibration",
         "calibrations",
@@ -40,6 +41,7 @@ examples:
   jaxcal select candidates.csv -k 4                 the four rows to measure
   jaxcal select candidates.csv -k 6 --csv > plan.csv
   jaxcal select candidates.csv -k 30 --model arm.urdf --noise 0.0001
+  jaxcal postures arm.urdf -k 12 --picture plan.png
   jaxcal identify measured.csv --out calibration.json
   jaxcal command calibration.json targets.csv --limits=-20,20
   jaxcal COMMAND --help                             options of one command

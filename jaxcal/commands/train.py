@@ -94,10 +94,11 @@ def _run(arguments: argparse.Namespace) -> int:
     )
     if arguments.export:
         from jaxcal.adaptive.policy import run
+        from jaxcal.learning.runtime import weights
         from jaxcal.learning.training import checkpoint
 
         load: Callable[..., Any] = run.load if arguments.task else checkpoint.load
-        checkpoint.export(load(out).weights, arguments.export)
+        weights.write(arguments.export, load(out).weights)
         print(f"exported the policy alone to {arguments.export}")
     return 0
 

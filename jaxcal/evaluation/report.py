@@ -7,7 +7,8 @@ import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from jaxcal.evaluation.results import Evaluation, Summary, versions
+from jaxcal.evaluation.results import Evaluation, Summary
+from jaxcal.extras import versions
 from jaxcal.files import atomic_write
 from jaxcal.pages import Block, Code, Figure, Page, Section, Table, Text, render
 
@@ -70,7 +71,7 @@ def notes(shown: Summary) -> list[str]:
             f"k = {shown.k} fits {shown.num_parameters} parameters with as many "
             "equations: no residual, so no estimate of the noise; a larger k leaves one"
         )
-    return [*texts, *shown.notes]
+    return texts
 
 
 def json_document(summaries: Sequence[Summary], *, command: Sequence[str]) -> str:
@@ -112,12 +113,9 @@ def write_report(
         drawn = evaluation_figures(evaluation).items()
         figures = {f"{prefix}_{name}": figure for name, figure in drawn}
         sections[_heading(shown)] = blocks, figures
-    curves = {}
-    for number, run in enumerate(runs, start=1):
-        suffix = f"_{number}" if len(runs) > 1 else ""
-        curves[f"training_curves{suffix}"] = training_curves(run)
-    if curves:
-        sections["Training"] = (), curves
+    if runs:
+        curves = training_curves({run.name: run for run in runs})
+        sections["Training"] = (), {"training_curves": curves}
     title = "Posture selection against the proven optimum"
     return write_folder(folder, title, sections, command, _ABOUT)
 

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import platform
-from importlib import metadata
 from typing import Any
 
 import numpy as np
@@ -13,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.evaluation.parameters import parameter_names
+from jaxcal.models import Affine
 
 __all__ = [
     "HIT_TOLERANCE",
@@ -22,7 +19,6 @@ __all__ = [
     "Row",
     "Summary",
     "log_mean",
-    "versions",
 ]
 
 Array = NDArray[np.float64]
@@ -61,7 +57,6 @@ class Summary:
     num_proven: int
     rows: tuple[Row, ...]
     parameter_names: tuple[str, ...] | None = None  # where outputs were measured
-    notes: tuple[str, ...] = ()  # beyond those that follow from the numbers
 
     @property
     def num_parameters(self) -> int:
@@ -105,7 +100,7 @@ class Evaluation:
             rows.append(Row(result.method, result.checkpoint, numbers))
         names = None
         if data.measured is not None:
-            names = parameter_names(data.num_inputs, data.num_outputs)
+            names = Affine(data.num_inputs, data.num_outputs).names
         proven = int(self.proven.sum())
         return Summary(data.facts(), self.k, self.seed, proven, tuple(rows), names)
 
@@ -144,15 +139,6 @@ class Evaluation:
         if result.parameters is None:
             raise ValueError(f"{self.dataset.name} holds no measured outputs")
         return np.median(result.parameters.var(axis=0), axis=0)
-
-
-def versions() -> dict[str, str]:
-    """What computed the numbers: Python and the packages that matter."""
-    found = {"python": platform.python_version()}
-    for name in ("jaxcal", "numpy", "scipy", "jax", "flax"):
-        with contextlib.suppress(metadata.PackageNotFoundError):
-            found[name] = metadata.version(name)
-    return found
 
 
 def log_mean(log_values: Array) -> float:

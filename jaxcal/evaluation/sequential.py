@@ -204,34 +204,6 @@ def _decider(method: str, rules: Mapping[str, Scored], rollouts: int) -> Any:
 
 
 @jax.jit
-def _middle(task: Any, keys: jax.Array) -> tuple[Any, Any]:
-    """(B,) beliefs and sessions after two measurements of any kind."""
-
-    def one(key: jax.Array) -> tuple[Any, Any]:
-        key_truth, key_begin, *steps = jax.random.split(key, 4)
-        truth = task.draw(key_truth)
-        belief, session = task.begin(key_begin)
-        for step in steps:
-            keys = jax.random.split(step, 4)
-            options = task.options(belief, session, keys[0])
-            index = Random()(task, belief, session, options, keys[1])
-            design = jax.tree.map(lambda leaf, at=index: leaf[at], options.designs)
-            outcome = task.measure(truth, design, keys[2])
-            after = (
-                belief.update(task, design, outcome, keys[3]),
-                task.spend(session, design, outcome),
-            )
-            belief, session = jax.tree.map(
-                lambda old, new, over=after[1].over: jnp.where(over, old, new),
-                (belief, session),
-                after,
-            )
-        return belief, session
-
-    return jax.vmap(one)(keys)
-
-
-@jax.jit
 def _choose(task: Any, decider: Any, belief: Any, session: Any, keys: Any) -> Any:
     def one(belief: Any, session: Any, key: jax.Array) -> jax.Array:
         key_options, key_choice = jax.random.split(key)
@@ -242,10 +214,10 @@ def _choose(task: Any, decider: Any, belief: Any, session: Any, keys: Any) -> An
 
 
 def seconds_a_choice(task: Any, decider: Any, seed: int) -> float:
-    """Processor time of one choice, in a batch; that of all threads counts."""
+    """Processor time of a first choice, in a batch; that of all threads counts."""
     count = min(_TIMED, getattr(task, "batch", _TIMED))
     keys = jax.random.split(jax.random.key(seed), count)
-    states = _middle(task, keys)
+    states = jax.jit(lambda task, keys: jax.vmap(task.begin)(keys))(task, keys)
     jax.block_until_ready(_choose(task, decider, *states, keys))
     best = np.inf
     for _ in range(5):

@@ -1,8 +1,9 @@
-"""The paper's Figure 2: how a training run went, from what the trainer recorded."""
+"""The paper's Figure 2: how training went, from what the trainer recorded."""
 
 from __future__ import annotations
 
 import pathlib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -18,70 +19,63 @@ __all__ = ["last_rewards", "read_metrics", "training_curves"]
 Array = NDArray[np.float64]
 
 
-def training_curves(folder: pathlib.Path | str) -> Figure:
-    """The paper's Figure 2 of a training run, from its ``metrics.csv``.
+def training_curves(runs: Mapping[str, pathlib.Path]) -> Figure:
+    """The paper's Figure 2 of training runs by name, from their ``metrics.csv``.
 
-    (a) reward with its moving average and spread; (b) distribution of the reward over
-    the last 1,000 episodes (``last_rewards.npy``; without it, of the mean rewards of
-    the last updates); (c) smoothed curve, with the share of the optimum reached.
+    (a) reward with its moving average, and of a single run its spread; (b) distribution
+    of the reward over the last 1,000 episodes (``last_rewards.npy``; without it, of the
+    mean rewards of the last updates); (c) smoothed curve, with the share of the optimum
+    reached.
 
     Raises:
-        OSError: there is no metrics.csv in the folder.
+        OSError: there is no metrics.csv in a folder.
         ValueError: it cannot be understood, naming the line or column.
     """
-    folder = pathlib.Path(folder)
-    metrics = read_metrics(folder / "metrics.csv")
-    episodes, reward = metrics["episodes"], metrics["reward_mean"]
-    x = episodes / 1000.0
-    window = max(1, min(len(reward) // 10, 50))
-    span = window * (episodes[-1] - episodes[0]) / max(len(episodes) - 1, 1)
-    figure, (left, middle, right) = panels((12.0, 3.6), shape=(1, 3))
-    unit = "reward (log det S, scaled)"
-
-    left.plot(x, reward, color=COLOURS[5], linewidth=0.8, label="mean reward")
-    if "reward_std" in metrics:
-        ends = reward - metrics["reward_std"], reward + metrics["reward_std"]
-        look: dict[str, Any] = {"color": COLOURS[5], "alpha": 0.2, "linewidth": 0}
-        left.fill_between(x, *ends, label="± 1 s.d. of episodes", **look)
-    # The mean of the last ``window`` values, of fewer at the beginning.
-    count = np.minimum(np.arange(1, len(reward) + 1), window)
-    mean = np.convolve(reward, np.ones(window))[: len(reward)] / count
-    label = f"moving average, {span:,.0f} episodes"
-    left.plot(x, mean, color=COLOURS[0], label=label)
+    figure, (left, middle, right) = panels((12.0, 3.8), shape=(1, 3))
+    twin, label, what = None, {"label": "moving average"}, ""
+    for number, (name, folder) in enumerate(runs.items()):
+        metrics, colour = read_metrics(folder / "metrics.csv"), COLOURS[number % 6]
+        x, reward = metrics["episodes"] / 1000.0, metrics["reward_mean"]
+        left.plot(x, reward, color=colour, linewidth=0.8, alpha=0.5)
+        if "reward_std" in metrics and len(runs) == 1:
+            ends = reward - metrics["reward_std"], reward + metrics["reward_std"]
+            look: dict[str, Any] = {"color": COLOURS[5], "alpha": 0.2, "linewidth": 0}
+            left.fill_between(x, *ends, label="± 1 s.d. of episodes", **look)
+        # The mean of the last ``window`` values, of fewer at the beginning.
+        window = max(1, min(len(reward) // 10, 50))
+        count = np.minimum(np.arange(1, len(reward) + 1), window)
+        mean = np.convolve(reward, np.ones(window))[: len(reward)] / count
+        left.plot(x, mean, color=colour, **label)
+        label = {}
+        last, what = last_rewards(folder, metrics)
+        text = f"{name}: {np.mean(last):.3g} ± {np.std(last):.2g}"
+        bins = min(50, max(5, len(last) // 10))
+        middle.hist(
+            last, bins=bins, color=colour, histtype="step", density=True, label=text
+        )
+        # An exponential moving average, unbiased at the beginning.
+        sums, weights = (
+            lfilter([0.05], [1.0, -0.95], column)
+            for column in (reward, np.ones(len(x)))
+        )
+        right.plot(x, sums / weights, color=colour, label=name)
+        known = np.isfinite(ratio := metrics.get("ratio_to_exact", np.nan * x))
+        if known.any():
+            twin = right.twinx() if twin is None else twin
+            twin.plot(x[known], ratio[known], color=colour, linestyle="--")
+            twin.set(ylabel="dashed: mean det S / det S*", ylim=(0.0, 1.02))
     left.set_title("(a) reward", fontsize=10)
-    left.set_ylabel(unit)
-    left.legend(fontsize=8, frameon=False)
-
-    last, what = last_rewards(folder, metrics)
-    bins = min(50, max(5, len(last) // 10))
-    middle.hist(last, bins=bins, color=COLOURS[0], alpha=0.8)
-    label = f"mean {np.mean(last):.3g}, s.d. {np.std(last):.2g}"
-    middle.axvline(float(np.mean(last)), color=COLOURS[1], linestyle="--", label=label)
     middle.set_title(f"(b) {what}", fontsize=10)
-    middle.set(xlabel=unit, ylabel="count")
-    middle.margins(y=0.2)  # room for the legend
-    middle.legend(fontsize=8, framealpha=1.0, edgecolor="none")  # over the line
-
-    # An exponential moving average, unbiased at the beginning.
-    sums, weights = (
-        lfilter([0.05], [1.0, -0.95], column) for column in (reward, np.ones(len(x)))
-    )
-    lines = right.plot(x, sums / weights, color=COLOURS[0], label="reward, smoothed")
     right.set_title("(c) smoothed curve", fontsize=10)
-    right.set_ylabel(unit)
-    ratio = metrics.get("ratio_to_exact", np.array([np.nan]))
-    known = np.isfinite(ratio)
-    if known.any():
-        twin = right.twinx()
-        label = "det S / det S* (validation, right axis)"
-        look = {"color": COLOURS[1], "linestyle": "--", "label": label}
-        lines += twin.plot(x[known], ratio[known], **look)
-        twin.set(ylabel="mean det S / det S*", ylim=(0.0, 1.02))
+    unit = "reward (log det S, scaled)"
+    left.set(xlabel="training episodes (thousands)", ylabel=unit)
+    middle.set(xlabel=unit, ylabel="density")
+    right.set(xlabel="training episodes (thousands)", ylabel=unit)
+    left.legend(fontsize=8, frameon=False)
+    middle.margins(y=0.1 + 0.08 * len(runs))  # room for the legend
+    middle.legend(fontsize=7, framealpha=1.0, edgecolor="none")  # over the lines
     place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.2)}
-    names = [line.get_label() for line in lines]  # below: two curves leave no corner
-    right.legend(lines, names, fontsize=8, frameon=False, **place)
-    for axes in (left, right):
-        axes.set_xlabel("training episodes (thousands)")
+    right.legend(fontsize=8, frameon=False, ncols=3, **place)
     return figure
 
 

@@ -17,6 +17,12 @@ cdef enum:
     UNTHREADED = 240_000  # multiplications up to which BLAS starts no threads
     SMALL = 300  # multiplications that take less than a call of BLAS
 
+cdef inline double* take(double** room, Py_ssize_t count) noexcept nogil:
+    """Where the next ``count`` numbers of the room are; it begins after them then."""
+    cdef double* here = room[0]
+    room[0] = <double*> (<size_t> here + count * sizeof(double))
+    return here
+
 cdef inline void copy(
     double* into, const double* source, Py_ssize_t count
 ) noexcept nogil:

@@ -17,12 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers, require_finite, whole_number
-from jaxcal.information.blocks import rank_rule
+from jaxcal.information.blocks import log_det_blocks
 
 __all__ = [
-    "hat_matrix",
-    "information_matrix",
-    "leverages",
     "log_det_gram",
     "log_det_information",
     "regression_matrix",
@@ -83,20 +80,6 @@ def regression_matrix(commands: ArrayLike, num_outputs: int | None = None) -> Ar
     return rows.reshape(*batch, num_postures * m, m * (num_inputs + 1))
 
 
-def information_matrix(commands: ArrayLike, num_outputs: int | None = None) -> Array:
-    """Information matrix ``S = A.T @ A`` for unit noise.
-
-    Args:
-        commands: (..., N, n).
-        num_outputs: m; as many as inputs when not given.
-
-    Returns:
-        (..., m (n + 1), m (n + 1)), 12 x 12 for three inputs and three outputs.
-    """
-    a = regression_matrix(commands, num_outputs)
-    return np.matrix_transpose(a) @ a
-
-
 def log_det_gram(commands: ArrayLike) -> Array:
     """Log-determinant of ``Z.T @ Z``, computed about the centroid.
 
@@ -109,13 +92,8 @@ def log_det_gram(commands: ArrayLike) -> Array:
     Returns:
         (...,) natural log; ``-inf`` where the postures span fewer than n dimensions.
     """
-    commands = _as_commands(commands)
-    num_postures, num_inputs = commands.shape[-2:]
-    if num_postures <= num_inputs:
-        return np.full(commands.shape[:-2], -np.inf)
-    centred = commands - commands.mean(axis=-2, keepdims=True)
-    largest = np.abs(commands).max(axis=-2)
-    return np.log(num_postures) + rank_rule(centred, largest)[1]
+    z = regressors(commands)
+    return log_det_blocks(z[..., None, :], np.zeros((0, z.shape[-1])))
 
 
 def log_det_information(
@@ -137,32 +115,3 @@ def log_det_information(
     m = commands.shape[-1] if num_outputs is None else num_outputs
     value = m * log_det_gram(commands)
     return float(value) if value.ndim == 0 else value
-
-
-def hat_matrix(commands: ArrayLike) -> Array:
-    """Hat matrix ``H = Z (Z.T Z)^-1 Z.T`` of a whole candidate set.
-
-    H does not change under any invertible affine map of the commands, and for a subset
-    s of n + 1 postures ``det(Z_s.T Z_s) = det(Z.T Z) det(H_ss)``: it holds all there is
-    to know for D-optimal selection.
-
-    Args:
-        commands: (..., M, n), not all in one plane.
-
-    Returns:
-        (..., M, M), symmetric, idempotent, trace n + 1.
-
-    Raises:
-        ValueError: the postures lie in one plane, so ``Z.T @ Z`` has no inverse.
-    """
-    commands = _as_commands(commands)
-    if np.any(np.isneginf(log_det_gram(commands))):
-        raise ValueError("commands must not all lie in one plane: Z.T @ Z is singular")
-    centred = commands - commands.mean(axis=-2, keepdims=True)
-    q = np.linalg.qr(regressors(centred / np.abs(centred).max(-2, keepdims=True)))[0]
-    return q @ np.matrix_transpose(q)
-
-
-def leverages(commands: ArrayLike) -> Array:
-    """(..., M) diagonal of the hat matrix; each in (0, 1], summing to n + 1."""
-    return np.diagonal(hat_matrix(commands), axis1=-2, axis2=-1)

@@ -4,9 +4,8 @@ from jaxcal.models.affine import Affine
 from jaxcal.models.from_jax import FromJax
 from jaxcal.models.identifiability import Direction, Identifiability, identifiability
 from jaxcal.models.kinds import from_dict
-from jaxcal.models.linear import Linear
+from jaxcal.models.linear import Linear, Polynomial
 from jaxcal.models.model import Model
-from jaxcal.models.polynomial import Polynomial
 from jaxcal.models.sensors import (
     Board,
     Distance,

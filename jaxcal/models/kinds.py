@@ -8,9 +8,8 @@ from typing import Any
 
 from jaxcal.checks import one_of
 from jaxcal.models.affine import Affine
-from jaxcal.models.linear import Linear
+from jaxcal.models.linear import Linear, Polynomial
 from jaxcal.models.model import Model
-from jaxcal.models.polynomial import Polynomial
 from jaxcal.models.serial import SerialChain
 
 __all__ = ["from_dict"]

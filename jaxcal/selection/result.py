@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +13,6 @@ from jaxcal.checks import axis_names
 from jaxcal.information.criteria import Criteria, criteria
 from jaxcal.selection.criteria import CRITERIA
 from jaxcal.selection.problem import Problem
-
-if TYPE_CHECKING:
-    import pandas  # type: ignore[import-untyped]  # optional, and without types
 
 __all__ = ["BatchSelection", "Selection", "Subset"]
 
@@ -122,24 +119,6 @@ class Selection:
             "seconds": self.seconds,
             "seed": self.seed,
         }
-
-    def to_frame(self) -> pandas.DataFrame:
-        """The chosen candidates, a row each, under the caller's own labels.
-
-        Raises:
-            ImportError: pandas is not installed.
-        """
-        try:
-            import pandas
-        except ModuleNotFoundError as error:
-            raise ImportError(
-                "to_frame needs pandas, which is not installed: pip install pandas"
-            ) from error
-        columns = {"index": self.indices}
-        if self.problem.candidates is not None:
-            chosen = self.problem.candidates[self.indices]
-            columns |= dict(zip(self._axes(), chosen.T, strict=True))
-        return pandas.DataFrame(columns, index=list(self.labels))
 
     def _axes(self) -> tuple[str, ...]:
         assert self.problem.candidates is not None

@@ -1,6 +1,6 @@
 """What rig.toml and a register map may say, and what is wrong with one that does not.
 
-``settings`` and ``registers`` are the two schemas, one field a key; ``schema`` words
+``settings``, ``axis`` and ``maps`` are the schemas, one field a key; ``schema`` words
 the faults; ``config`` reads. (3,) arrays are in the order pitch, yaw, roll.
 """
 

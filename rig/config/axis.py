@@ -6,8 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
 
-from rig.config.maps import RegisterMap, load_map
-from rig.config.registers import encode
+from rig.config.maps import RegisterMap, encode, load_map
 from rig.config.schema import Section, advanced, key
 
 AXIS_NAMES = ("pitch", "yaw", "roll")  # the order of every (3,) in this package
@@ -29,10 +28,24 @@ class Scale(Section):
         "-1: positive pulses turn the joint the negative way", 1
     )
 
+    @classmethod
+    def of(cls, described: dict[str, Any]) -> "Scale":
+        """Of an axis as a journal describes it."""
+        return cls(**{name: described[name] for name in Scale.model_fields})
+
+    @property
+    def turns_per_deg(self) -> float:
+        """Turns of the motor for one degree of the joint."""
+        return self.reduction / 360.0
+
     @property
     def pulses_per_deg(self) -> float:
         """Signed pulses for one degree of the joint."""
-        return self.direction * self.pulses_per_rev * self.reduction / 360.0
+        return self.direction * self.pulses_per_rev * self.turns_per_deg
+
+    def motor_pulses(self, angle_deg: float) -> float:
+        """Pulses of a turn of the motor itself."""
+        return self.pulses_per_rev * angle_deg / 360.0
 
     def to_pulses(self, angle_deg: float) -> int:
         """Nearest whole pulse; the angle that counts is ``to_deg`` of it."""
@@ -45,7 +58,7 @@ class Scale(Section):
 
 def _limit(pick: Callable[..., int]) -> Callable[[dict[str, Any]], int]:
     def pulses(made: dict[str, Any]) -> int:
-        scale = Scale(**{name: made[name] for name in Scale.model_fields})
+        scale = Scale.of(made)
         return pick(scale.to_pulses(made["min_deg"]), scale.to_pulses(made["max_deg"]))
 
     return pulses
@@ -100,15 +113,14 @@ class Axis(Scale):
     @property
     def _counts_per_deg(self) -> tuple[float, float]:
         """Register counts of 1 deg/s and of 1 deg/s^2 (of its inverse for a time)."""
-        units, turns = self.map.units, self.reduction / 360.0
-        speed, accel = turns * units.speed_per_unit, turns * units.accel_per_unit
-        if units.speed == "pulse_per_s":
-            speed *= self.pulses_per_rev
-        if units.accel == "pulse_per_s2":
-            accel *= self.pulses_per_rev
-        if units.accel == "s_per_rev_per_s":
-            accel = units.accel_per_unit / turns
-        return speed, accel
+        units, turns = self.map.units, self.turns_per_deg
+        per_deg = {
+            "rev_per_s": turns, "rev_per_s2": turns, "s_per_rev_per_s": 1.0 / turns,
+            "pulse_per_s": abs(self.pulses_per_deg),
+            "pulse_per_s2": abs(self.pulses_per_deg),
+        }  # fmt: skip
+        speed, accel = per_deg[units.speed], per_deg[units.accel]
+        return speed * units.speed_per_unit, accel * units.accel_per_unit
 
     def motion_counts(self) -> dict[str, int]:
         """Speed and ramps as register values, never faster than configured.
@@ -128,11 +140,9 @@ class Axis(Scale):
             place = self.map.move.place_of(name)
             if place is None:
                 continue
-            key_name, per, unit = (
-                ("speed_deg_s", per_speed, "deg/s")
-                if name == "speed"
-                else ("accel_deg_s2", per_accel, "deg/s^2")
-            )
+            key_name, unit, per = "accel_deg_s2", "deg/s^2", per_accel
+            if name == "speed":
+                key_name, unit, per = "speed_deg_s", "deg/s", per_speed
             if count < 1:
                 raise ValueError(
                     f"{key_name}: must be at least {1.0 / per:.6g} {unit}, one count "

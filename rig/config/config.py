@@ -36,17 +36,11 @@ PHONE = (
 UNMEASURED = (
     "bus.", "axes.pitch.comm_timeout_s", "axes.yaw.comm_timeout_s",
     "axes.roll.comm_timeout_s", "imu.host", "imu.port", "imu.transport", "imu.allow",
-    "imu.stale_s", "imu.heading", "motion.poll_s", "motion.deadline_factor",
-    "motion.deadline_slack_s", "motion.stall_s", "motion.following_deg",
-    "motion.envelope_margin_deg", "motion.max_disagreement_deg", "motion.heartbeat_s",
-    "motion.mirror_limits", "settle.timeout_s", "session.verify_limit_deg",
+    "imu.stale_s", "imu.heading", "motion.poll_s", "motion.stall_s",
+    "motion.envelope_margin_deg", "motion.mirror_limits",
+    "settle.timeout_s", "session.verify_limit_deg",
     "session.reference_tolerance_deg", "session.max_unreachable",
 )  # fmt: skip
-
-KEYS = {  # of rig.toml, where a description of it says otherwise
-    "scale": "", "letter": "rotates", "mechanism_order": "mechanism.order",
-    "angle_unit": "unit", "quaternion": "quaternion_columns",
-}  # fmt: skip
 
 
 def differences(then: dict[str, Any], now: dict[str, Any]) -> list[str]:
@@ -68,8 +62,7 @@ def _flat(data: Any, at: str = "") -> dict[str, Any]:
         return {at: data}
     flat: dict[str, Any] = {}
     for name, value in pairs:
-        name = KEYS.get(name, name)
-        flat |= _flat(value, ".".join(filter(None, (at, name))))
+        flat |= _flat(value, f"{at}.{name}" if at else name)
     return flat
 
 
@@ -177,24 +170,12 @@ class RigConfig(Section):
         return np.asarray(pulses, dtype=np.float64) / scales
 
     def described(self) -> dict[str, Any]:
-        """Everything as JSON values, as the journal keeps it."""
-        data = self.model_dump(exclude={"mechanism", "output", "axes", "device"})
-        imu, session = data["imu"], data["session"]
-        imu["quaternion"] = imu.pop("quaternion_columns")
-        imu["angle_unit"] = imu.pop("unit")
-        imu["stamp_column"] = None if imu["stamp_column"] < 0 else imu["stamp_column"]
-        imu["column_count"] = imu["column_count"] or None
-        for name in AXIS_NAMES:
-            del session[f"{name}_range_deg"]
-        session["ranges"] = self.ranges
-        scale = set(Scale.model_fields)
-        axes = [
-            axis.model_dump(exclude={*scale, "rotates", "map"})
-            | {"letter": axis.rotates, "scale": axis.model_dump(include=scale)}
-            | {"map": {"name": axis.map.name, "digest": axis.map.digest}}
-            for axis in self.axes
-        ]
-        return {**data, "axes": axes, "mechanism_order": self.mechanism.order}
+        """Every key as JSON, as the journal keeps it; of a map its name and digest."""
+        data = self.model_dump(exclude={"output", "device"})
+        data["session"]["ranges"] = self.ranges  # those left out too
+        for axis, described in zip(self.axes, data["axes"], strict=True):
+            described["map"] = {"name": axis.map.name, "digest": axis.map.digest}
+        return data
 
     def changed_since(self, described: dict[str, Any]) -> list[str]:
         """Keys that would make a resumed run move or measure differently, in words.

@@ -1,4 +1,4 @@
-"""Register maps: a drive family as data.
+"""Register maps: a drive family as data; and their parts: values, words, frames, bits.
 
 A map is one TOML file in ``rig/maps`` (or anywhere: a configuration may give a path).
 It says where a drive keeps its status, position and alarm, and which registers to write
@@ -8,24 +8,243 @@ to move, stop, enable. Nothing here opens a port.
 import hashlib
 import json
 import pathlib
+import struct
 import tomllib
 from collections.abc import Iterator
-from typing import Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
-from rig.config.registers import (
-    Alarm,
-    CommTimeout,
-    Move,
-    Position,
-    Predicate,
-    Read,
-    StatusWord,
-    Units,
-    Writes,
-)
+from pydantic import BeforeValidator, Field, PlainValidator, WithJsonSchema
+
 from rig.config.schema import Section, key, parse, read_text
 
 MAP_FOLDER = pathlib.Path(__file__).parent.parent / "maps"
+Kind = Literal["u16", "i16", "u32", "i32"]
+FORMATS: dict[Kind, str] = {
+    "u16": ">H",
+    "i16": ">h",
+    "u32": ">I",
+    "i32": ">i",
+}  # of struct
+VALUES = ("position", "speed", "accel", "decel", "timeout", "min", "max", "home")
+
+
+class Word(NamedTuple):
+    """What a frame has at one place: one or two registers."""
+
+    value: int | str  # a constant, or one of VALUES
+    kind: Kind = "u16"
+
+
+def encode(value: int, kind: Kind, word_order: str) -> list[int]:
+    """Registers of a value; ValueError where it does not fit the type."""
+    try:
+        data = struct.pack(FORMATS[kind], value)
+    except struct.error:
+        raise ValueError(f"{value} does not fit {kind}") from None
+    words = list(struct.unpack(f">{len(data) // 2}H", data))
+    return words if word_order == "big" else words[::-1]
+
+
+def decode(words: list[int], kind: Kind, word_order: str) -> int:
+    """Value of one or two registers."""
+    ordered = words if word_order == "big" else words[::-1]
+    return struct.unpack(FORMATS[kind], struct.pack(f">{len(words)}H", *ordered))[0]
+
+
+def registers_of(kind: Kind) -> int:
+    """Registers that a type takes."""
+    return struct.calcsize(FORMATS[kind]) // 2
+
+
+def _word(word: Any) -> Word:
+    if type(word) is int and 0 <= word <= 0xFFFF:
+        return Word(word)
+    name, _, kind = str(word).partition(":")
+    known: dict[str, Kind] = {each: each for each in FORMATS}
+    if isinstance(word, str) and name in VALUES and kind in known:
+        return Word(name, known[kind])
+    raise ValueError(
+        f"must be 0..65535 or NAME:TYPE with NAME of {', '.join(VALUES)} and TYPE of "
+        f"{', '.join(FORMATS)}, got {word!r}"
+    )
+
+
+def _codes(names: Any) -> Any:
+    try:
+        return {int(code, 0): text for code, text in names.items()}
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ValueError(f"must be numbers and their names: {error}") from None
+
+
+Register = Annotated[int, Field(ge=0, le=0xFFFF)]
+Bits = tuple[Annotated[int, Field(ge=0, le=31)], ...]
+FrameWord = Annotated[Word, PlainValidator(_word), WithJsonSchema({"type": "string"})]
+Names = Annotated[
+    dict[int, str], BeforeValidator(_codes), WithJsonSchema({"type": "object"})
+]
+
+
+class Read(Section):
+    """A value to read: one or two registers."""
+
+    address: Register
+    type: Kind = "u16"
+
+    @property
+    def count(self) -> int:
+        return registers_of(self.type)
+
+
+class Position(Read):
+    """The drive's own position in pulses."""
+
+    type: Kind = "i32"
+
+
+class Alarm(Read):
+    """The alarm's code; 0 is none."""
+
+    names: Names = key("of codes, such as 0x0001", {})
+
+
+class Predicate(Section):
+    """Bits of the status word: every ``set`` bit is 1 and every ``clear`` bit is 0."""
+
+    set: Bits = ()
+    clear: Bits = ()
+
+    def holds(self, word: int) -> bool:
+        """Whether a status word satisfies it."""
+        return all(word >> b & 1 for b in self.set) and not any(
+            word >> b & 1 for b in self.clear
+        )
+
+    def broken_rules(self) -> Iterator[str]:
+        if not self.set and not self.clear:
+            yield "set: name at least one bit in set or clear"
+
+
+FLAGS = ("enabled", "done", "moving", "fault")
+
+
+class StatusWord(Read):
+    """The status word and what its bits say."""
+
+    done: Predicate
+    moving: Predicate
+    fault: Predicate
+    enabled: Predicate | None = None  # where no bit says it, the drive always is
+
+    def flags(self, word: int) -> dict[str, bool]:
+        """Which of FLAGS a word has."""
+        named = {name: getattr(self, name) for name in FLAGS}
+        return {name: not bits or bits.holds(word) for name, bits in named.items()}
+
+    def broken_rules(self) -> Iterator[str]:
+        for name in FLAGS:
+            bits = getattr(self, name)
+            if bits and max((*bits.set, *bits.clear)) >= 16 * self.count:
+                yield f"{name}: must name bits 0..{16 * self.count - 1} of {self.type}"
+
+
+class Write(Section):
+    """One frame to write: constants, and values by name such as ``position:i32``."""
+
+    address: Register
+    words: Annotated[tuple[FrameWord, ...], Field(min_length=1)]
+    function: Literal[6, 16] = Field(
+        default_factory=lambda made: 6 if _registers(made["words"]) == 1 else 16
+    )
+
+    @property
+    def count(self) -> int:
+        return _registers(self.words)
+
+    def registers(self, word_order: str, **values: int) -> list[int]:
+        """What the frame holds, with the values that its words name."""
+        found = []
+        for value, kind in self.words:
+            number = values[value] if isinstance(value, str) else value
+            found += encode(number, kind, word_order)
+        return found
+
+    def places(self) -> Iterator[tuple[int, Word]]:
+        """Every word with its address."""
+        address = self.address
+        for word in self.words:
+            yield address, word
+            address += registers_of(word.kind)
+
+    def broken_rules(self) -> Iterator[str]:
+        if self.function == 6 and self.count != 1:
+            yield "function: must be 16, or 6 for one register"
+        if self.count > 123 or self.address + self.count > 0x10000:
+            yield f"words: {self.count} registers from {self.address} do not fit"
+
+
+def _registers(words: tuple[Word, ...]) -> int:
+    return sum(registers_of(word.kind) for word in words)
+
+
+class Writes(Section):
+    """Frames that are written one after another."""
+
+    write: Annotated[tuple[Write, ...], Field(min_length=1)]
+
+    def place_of(self, name: str) -> tuple[int, Kind] | None:
+        """Address and type of a named value, or None where no frame holds it."""
+        places = (place for frame in self.write for place in frame.places())
+        return next(((a, w.kind) for a, w in places if w.value == name), None)
+
+
+class Trigger(Section):
+    """The register and the value whose writing starts the move."""
+
+    address: Register
+    value: Register
+
+
+# Words that make a family move by a distance, by the register they are written to:
+# Leadshine PR, Oriental AZ, Applied Motion.
+RELATIVE = {0x6200: (0x0041, 0x0081), 0x005B: (2, 3), 0x007C: (0x0066,)}
+
+
+class Move(Writes):
+    """An absolute move; after a lost reply it may be sent twice."""
+
+    trigger: Trigger
+
+    def broken_rules(self) -> Iterator[str]:
+        if not self.place_of("position"):
+            yield "write: no frame writes position"
+        *_, (address, last) = self.write[-1].places()
+        if (address, last.value) != (self.trigger.address, self.trigger.value):
+            yield "trigger: must be the last word of the last frame"
+        places = (place for frame in self.write for place in frame.places())
+        for address, word in places:
+            if word.value in RELATIVE.get(address, ()):
+                yield (
+                    f"write: 0x{word.value:04X} in register 0x{address:04X} is a "
+                    "relative move; targets must be absolute"
+                )
+
+
+Positive = Annotated[float, Field(ge=1e-12, le=1e12)]
+
+
+class CommTimeout(Writes):
+    """The drive's own watch over the line."""
+
+    per_s: Positive  # register counts for one second
+
+
+class Units(Section):
+    """Units of the speed and acceleration registers, and their counts for 1."""
+
+    speed: Literal["rev_per_s", "pulse_per_s"]
+    speed_per_unit: Positive
+    accel: Literal["rev_per_s2", "pulse_per_s2", "s_per_rev_per_s"]
+    accel_per_unit: Positive
 
 
 class RegisterMap(Section):

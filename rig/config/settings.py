@@ -53,11 +53,6 @@ def _by_format(hyperimu: Any, other: Any) -> Callable[[dict[str, Any]], Any]:
     return lambda made: hyperimu if made["format"] == "hyperimu" else other
 
 
-def _phone_order(made: dict[str, Any]) -> str | None:
-    angles = made["format"] == "lines" and not made["quaternion_columns"]
-    return None if angles else "ZYX"
-
-
 class ImuSettings(Section):
     """The phone's stream."""
 
@@ -89,7 +84,9 @@ class ImuSettings(Section):
     unit: Literal["deg", "rad"] = key("of the angles", "deg")
     order: Order | None = key(
         "sequence of the phone's Euler angles", "ZYX; lines of angles: required",
-        by=_phone_order,
+        by=lambda made: (
+            "ZYX" if made["format"] != "lines" or made["quaternion_columns"] else None
+        ),
     )  # fmt: skip
     signs: tuple[Sign, Sign, Sign] = key(
         "of the angles, in the sequence of order",
@@ -148,19 +145,11 @@ class MotionSettings(Section):
         "a drive this close is on its target", 0.05, 1e-4, 5
     )
     poll_s: float = advanced("between two looks at drives and IMU", 0.05, 0.001, 0.1)
-    deadline_factor: float = advanced(
-        "a move may take its computed time times", 2.0, 1, 20
-    )
-    deadline_slack_s: float = advanced("plus", 2.0, 0.05, 60)
     stall_s: float = advanced(
         "standing so long off its target is a fault", 1.0, 0.05, 30
     )
-    following_deg: float = advanced("a drive may leave its way by", 3.0, 0.01, 45)
     envelope_margin_deg: float = advanced(
         "the IMU may read past limits by", 15.0, 0.1, 90
-    )
-    max_disagreement_deg: float = advanced(
-        "between IMU and command at a posture", 45.0, 0.1, 180
     )
     mirror_limits: bool = advanced("write the soft limits to the drives too", False)
 

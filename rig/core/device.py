@@ -18,7 +18,7 @@ import numpy as np
 
 from rig.config.axis import Pulses
 from rig.config.config import RigConfig
-from rig.config.registers import Read
+from rig.config.maps import Read
 from rig.core.attitude import Array, Frame
 from rig.core.bus import Bus, BusError, Rejected
 from rig.core.drive import Drive, Status
@@ -27,6 +27,10 @@ from rig.core.phone import Imu
 from rig.core.proof import Proof
 from rig.core.stop import Stopper
 from rig.journal import DeviceRecord, Record, RunFolder
+
+LOOK_S = 0.002  # between two looks for a reading
+OVERDUE_S = 0.3  # of a stop that was asked for and that no loop has answered
+TICK_S = 0.05  # of the heartbeat
 
 
 class Posture(NamedTuple):
@@ -63,10 +67,6 @@ def check_plan(config: RigConfig, targets: Iterable[Pulses]) -> None:
         raise LimitError("the plan leaves the limits: " + "; ".join(faults))
 
 
-LOOK_S = 0.002  # between two looks for a reading
-OVERDUE_S = 0.3  # of a stop that was asked for and that no loop has answered
-
-
 class Heartbeat(threading.Thread):
     """A thread that stops the drives when the motion loop is silent for too long, or
     does not answer to a stop.
@@ -97,7 +97,7 @@ class Heartbeat(threading.Thread):
             self.join(2.0)
 
     def run(self) -> None:
-        while not self._closing.wait(0.05):
+        while not self._closing.wait(TICK_S):
             silence = time.monotonic() - self._fed
             if not self._stopper.reason and (late := self._requests.overdue(OVERDUE_S)):
                 self._stopper.stop(f"{late}, which the session did not answer")

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 
 from rig.config.axis import HIGHEST, LOWEST, Axis
-from rig.config.registers import Read, Writes, decode
+from rig.config.maps import Read, Writes, decode
 from rig.core.bus import Bus, BusError, Rejected
 from rig.core.faults import LimitError, MotionFault
 

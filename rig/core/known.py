@@ -71,12 +71,13 @@ def _exchanged(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
 def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
     """Why the drive's pulses may no longer mean the place that they meant."""
     axis, status = drive.axis, drive.status()
-    left = record.left().get(axis.name, status.position)
+    pulses, homed = record.left()
+    left = pulses.get(axis.name, status.position)
     if axis.map.absolute_encoder:
         return ""
     if status.fault:
         return f"{axis.name} is in alarm: {drive.alarm() or 'no code given'}"
-    if axis.name in record.left_homed():
+    if axis.name in homed:
         if not drive.says_homed:
             return f"the homed bit of {axis.name} is gone: the drive was without power"
     elif left is None:
@@ -210,9 +211,9 @@ def check_zero(config: RigConfig, then: Array, now: Array, whose: str) -> str:
 
 def axes_text(joints: Sequence[float] | Array) -> str:
     """(3,) degrees in words, of the axes that moved most."""
-    pairs = sorted(zip(np.abs(joints), AXIS_NAMES, joints, strict=True), reverse=True)
+    told = TOLD_SHARE * np.abs(joints).max()
     return ", ".join(
         f"{name} stands {angle:+.2f} deg away from where it stood"
-        for size, name, angle in pairs
-        if size >= TOLD_SHARE * pairs[0][0]
+        for name, angle in zip(AXIS_NAMES, joints, strict=True)
+        if abs(angle) >= told
     )

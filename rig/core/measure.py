@@ -14,6 +14,7 @@ from rig.core.drive import Status
 from rig.core.faults import MotionFault, NotFollowing
 from rig.core.motion import Standing
 
+DISAGREEMENT_DEG = 45.0  # between IMU and command at a posture, at most
 FOLLOW_MIN_DEG = 3.0  # a commanded change this large must be seen by the IMU
 FOLLOW_SHARE = 0.1  # at least this share of it
 FOLLOW_LEADING = 0.3  # of axes that move at least this share of the largest move
@@ -102,13 +103,16 @@ def _settled(device: Device, deadline: float) -> list[Status]:
 def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
     """Why the last readings do not show a device at rest, and what to do."""
     settle = device.config.settle
-    # The last window_s, or the last min_samples of a slow phone.
-    recent = sum(reading.time >= now - settle.window_s for reading in readings)
-    readings = readings[-max(recent, settle.min_samples) :]
-    span = readings[-1].time - readings[0].time if readings else 0.0
+    # The last that span the window, as many as wanted: of a slow phone, or one whose
+    # readings come in bursts, they span more.
+    newest = readings[-1].time if readings else now
+    before = sum(reading.time <= newest - settle.window_s for reading in readings)
+    first = min(before - 1, len(readings) - settle.min_samples)
     hint = "Check the phone's app and its Wi-Fi"
-    if len(readings) < settle.min_samples or span < 0.8 * settle.window_s:
+    if first < 0:
+        span = newest - readings[0].time if readings else 0.0
         return f"{len(readings)} readings over {span:.2f} s of the window. {hint}"
+    readings = readings[first:]
     if now - readings[-1].time > device.config.imu.stale_s:
         return f"the phone's readings are stale. {hint}"
     angles = _frame(device, readings).angles([reading.matrix for reading in readings])
@@ -170,12 +174,12 @@ def _check_agreement(
 ) -> None:
     """The joints are where the drives say, roughly, and moved when they moved."""
     apart = np.abs(measured - commanded)
-    if (apart > device.config.motion.max_disagreement_deg).any():
+    if (apart > DISAGREEMENT_DEG).any():
         worst = int(np.argmax(apart))
         raise MotionFault(
             f"the IMU reads {AXIS_NAMES[worst]} {apart[worst]:.1f} deg away from "
-            "the command, more than motion.max_disagreement_deg. Check zero, axis "
-            "order and signs"
+            f"the command (limit {DISAGREEMENT_DEG:g}). Check zero, axis order and "
+            "signs"
         )
     seen = device.seen
     way = commanded - seen.commanded

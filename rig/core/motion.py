@@ -13,6 +13,8 @@ from rig.core.drive import START_S, Drive, Status, refusal
 from rig.core.faults import MotionFault, Unreachable
 from rig.core.stop import STILL_COUNTS
 
+DEADLINE_FACTOR, DEADLINE_SLACK_S = 2.0, 2.0  # of a move's computed time, and more
+FOLLOWING_DEG = 3.0  # a drive may leave its way by
 LAG_S = 0.1  # of the phone behind a move that is longer than those before
 
 
@@ -110,7 +112,7 @@ def _watch(device: Device, here: Pulses, target: Pulses, connection: int) -> Non
     for drive, a, b in zip(device.drives, here, target, strict=True):
         speed, accel = drive.axis.drive_motion
         most_s = max(most_s, abs(drive.axis.to_deg(b - a)) / speed + speed / accel)
-    most_s = motion.deadline_factor * most_s + motion.deadline_slack_s
+    most_s = DEADLINE_FACTOR * most_s + DEADLINE_SLACK_S
     last = [(position, begun) for position in here]
     while True:
         device.guard(moving=True)
@@ -126,11 +128,11 @@ def _watch(device: Device, here: Pulses, target: Pulses, connection: int) -> Non
                 arrived += status.done and not status.moving and not begins
                 continue
             begin, end, angle = map(axis.to_deg, (start, goal, status.position))
-            slack = motion.following_deg
-            if not min(begin, end) - slack <= angle <= max(begin, end) + slack:
+            low, high = min(begin, end) - FOLLOWING_DEG, max(begin, end) + FOLLOWING_DEG
+            if not low <= angle <= high:
                 raise MotionFault(
                     f"{axis.name} is at {angle:.3f} deg on its way from {begin:.3f} to "
-                    f"{end:.3f}, more than motion.following_deg off it. Check gearing "
+                    f"{end:.3f}, more than {FOLLOWING_DEG:g} deg off it. Check gearing "
                     "and direction, and that no other controller moves it"
                 )
             if abs(status.position - last[index][0]) > STILL_COUNTS:
@@ -153,7 +155,7 @@ def _watch(device: Device, here: Pulses, target: Pulses, connection: int) -> Non
         if time.monotonic() > begun + most_s:
             raise MotionFault(
                 f"the move took longer than its deadline, {most_s:.2f} s. Check the "
-                "drives' speed, or raise motion.deadline_factor"
+                "drives' speed and load"
             )
         _check_attitude(device, connection)
         time.sleep(motion.poll_s)

@@ -51,7 +51,8 @@ class Receiver:
     """Hears one phone, whoever else connects.
 
     Who may not be heard is refused before a byte of it is read. At most MOST_OPEN
-    connections are open, none for longer than PATIENCE_S without a word. Messages are
+    connections are open, none for longer than PATIENCE_S without a word; where they are
+    all taken, the oldest that has sent nothing makes way for the next. Messages are
     pushed over any connection of one address. Lines come over one connection: a phone
     that lost its Wi-Fi leaves it half open and comes back on another, which takes its
     place once no reading of it was of use for ``stale_s``. While one still is, another
@@ -66,6 +67,7 @@ class Receiver:
         self.phone = ""  # address that is heard, once a reading of it was used
         self.refused: list[str] = []  # addresses
         self._current: Connection | None = None  # that lines are taken of
+        self._unheard: list[asyncio.Task[None]] = []  # that have sent nothing yet
         self._closing = threading.Event()
         self._listener: socket.socket | None = None
         if s.transport == "listen":
@@ -121,15 +123,24 @@ class Receiver:
                 except OSError:
                     await asyncio.sleep(LOOK_S)
                     continue
-                if self._admits(address) and len(tasks) < MOST_OPEN:
+                room = MOST_OPEN - len(tasks)
+                if self._admits(address) and (room > 0 or self._unheard):
+                    if room <= 0:
+                        self._unheard.pop(0).cancel()
                     task = loop.create_task(self._hear(address, sock=made))
                     tasks.add(task)
+                    self._unheard.append(task)
                     task.add_done_callback(tasks.discard)
+                    task.add_done_callback(self._has_sent)
                 else:  # it is still sending: closed at once, it would not see why
                     with contextlib.suppress(OSError):
                         made.send(_answer(403, False))
                     leaving = [each for each in leaving if each.fileno() >= 0] + [made]
                     loop.call_later(LOOK_S * (len(leaving) < BACKLOG), made.close)
+
+    def _has_sent(self, task: asyncio.Task[None] | None) -> None:
+        if task in self._unheard:
+            self._unheard.remove(task)
 
     async def _hear(self, address: str, **how: Any) -> None:
         """Take what one connection sends, until it ends or says nothing."""
@@ -145,6 +156,7 @@ class Receiver:
                 while stays:  # not wait_for, which may lose the cancelling of a task
                     async with asyncio.timeout(PATIENCE_S):
                         stays = await (self._message if pushed else self._lines)(each)
+                    self._has_sent(asyncio.current_task())
             finally:
                 each.writer.close()
                 self._current = None if self._current is each else self._current

@@ -83,7 +83,7 @@ class Reach:
         Where that or ``most_deg`` of the joint takes several moves, they grow evenly.
         """
         if not self.longest:
-            first = FIRST_MOTOR_DEG / 360.0 * self.axis.pulses_per_rev
+            first = self.axis.motor_pulses(FIRST_MOTOR_DEG)
             return max(1, math.floor(min(abs(wanted), first)))
         goal = abs(wanted)
         if self.deg_per_pulse:
@@ -116,16 +116,16 @@ class Reach:
             MotionFault: so many were gone already.
         """
         axis = self.axis
-        most = max(1, int(UNSEEN_MOTOR_DEG / 360.0 * axis.pulses_per_rev))
+        most = max(1, int(axis.motor_pulses(UNSEEN_MOTOR_DEG)))
         gone = abs(here - begun)
         if abs(goal - begun) <= max(most, gone):
             return abs(goal - here)
         if gone < most:
             return most - gone
         raise MotionFault(
-            f"unit {axis.unit} turned its motor by "
-            f"{gone * 360 / axis.pulses_per_rev:.3g} deg for {axis.name}, and the "
-            f"phone shows nothing to go on by: {BLIND if self.factor == 1 else NO_UNIT}"
+            f"unit {axis.unit} turned its motor by {gone / axis.motor_pulses(1.0):.3g} "
+            f"deg for {axis.name}, and the phone shows nothing to go on by: "
+            f"{BLIND if self.factor == 1 else NO_UNIT}"
         )
 
     def paced(self, pulses: float) -> Axis:

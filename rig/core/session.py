@@ -142,11 +142,12 @@ def take_zero(
     if at is not None or config.motion.approach_overshoot_deg:
         standing = move(device, zero)  # from the side of all references
     check_plan(config, [zero.pulses])  # it is where a resumed run looks again
-    count, found = -1, {}
-    while device.imu.connections != count:
-        count = device.imu.connections
+    while True:
+        connection = device.imu.connections
         # Every posture is measured against this one: its noise must be the smaller.
         found = measure(standing, ZERO_FACTOR * config.settle.samples)
+        if device.imu.connections == connection:
+            break
     attitude = np.array(found["attitude"])
     _compare_zero(device, zero.pulses, attitude, kept)
     device.emit("zero", sync=True, **found)

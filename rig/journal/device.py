@@ -156,19 +156,11 @@ class DeviceRecord:
         self._left = {"time": _now(), "pulses": pulses, "homed": list(homed)}
         self.save()
 
-    def forget_left(self) -> None:
-        """Where the drives were left says nothing any more: they stand as homed."""
-        self._left = {}
-        self.save()
-
-    def left(self) -> dict[str, int | None]:
-        """Pulses at which the last session left each axis; None where it armed the axis
-        and did not say afterwards where it stands."""
-        return self._left.get("pulses", {})
-
-    def left_homed(self) -> list[str]:
-        """Names of the axes whose drives said then that they are homed."""
-        return self._left.get("homed", [])
+    def left(self) -> tuple[dict[str, int | None], list[str]]:
+        """Pulses at which the last session left each axis, None where it armed the axis
+        and did not say afterwards where it stands; and names of the axes whose drives
+        said then that they are homed."""
+        return self._left.get("pulses", {}), self._left.get("homed", [])
 
 
 def _now() -> str:

@@ -19,6 +19,7 @@ import re
 import signal
 import socket
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rig.journal.errors import Refused
@@ -56,17 +57,14 @@ class BusLock:
         Raises:
             Refused: another process, or this one, holds it; names the holder.
         """
-        self._fd = self._open(os.O_RDWR | os.O_CREAT)
-        end = time.monotonic() + PATIENCE_S
-        while not _flock(self._fd, fcntl.LOCK_EX):
-            if time.monotonic() > end:
-                told = _content(self._fd)
-                self.release()
-                raise Refused(
-                    f"{self.where} is {held_by(told)}. Wait until it ends, or end it "
-                    "with `jaxcal-rig stop`"
-                )
-            time.sleep(LOOK_S)
+        self._fd = fd = self._open(os.O_RDWR | os.O_CREAT)
+        if not until(PATIENCE_S, lambda: flock(fd, fcntl.LOCK_EX)):
+            told = _content(fd)
+            self.release()
+            raise Refused(
+                f"{self.where} is {held_by(told)}. Wait until it ends, or end it with "
+                "`jaxcal-rig stop`"
+            )
         self._told = {}
         since = time.strftime("%Y-%m-%d %H:%M:%S")
         self.tell(pid=os.getpid(), command=what, since=since)
@@ -105,14 +103,8 @@ class BusLock:
         except FileNotFoundError:
             return None
         try:
-            end = time.monotonic() + PATIENCE_S
-            while True:
-                if _flock(fd, fcntl.LOCK_SH):
-                    return None
-                told = _content(fd)
-                if told or time.monotonic() > end:
-                    return told
-                time.sleep(LOOK_S)
+            until(PATIENCE_S, lambda: flock(fd, fcntl.LOCK_SH) or bool(_content(fd)))
+            return None if flock(fd, fcntl.LOCK_SH) else _content(fd)
         finally:
             os.close(fd)
 
@@ -170,12 +162,7 @@ class BusLock:
 
     def freed(self, seconds: float) -> bool:
         """Wait so long for the holder to let go; whether it did."""
-        end = time.monotonic() + seconds
-        while self.holder() is not None:
-            if time.monotonic() > end:
-                return False
-            time.sleep(LOOK_S)
-        return True
+        return until(seconds, lambda: self.holder() is None)
 
     def _open(self, flags: int) -> int:
         try:
@@ -246,7 +233,16 @@ def _identity(settings: BusSettings) -> str:
     return f"{address}:{settings.port}"
 
 
-def _flock(fd: int, kind: int) -> bool:
+def until(seconds: float, holds: Callable[[], bool]) -> bool:
+    """Wait at most so long for something to hold; whether it does."""
+    end = time.monotonic() + seconds
+    while not (held := holds()) and time.monotonic() < end:
+        time.sleep(LOOK_S)
+    return held
+
+
+def flock(fd: int, kind: int) -> bool:
+    """Take the flock of an open file, unless another holds it; whether it was taken."""
     try:
         fcntl.flock(fd, kind | fcntl.LOCK_NB)
     except BlockingIOError:

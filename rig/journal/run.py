@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 from jaxcal.files import write_text
 from rig.journal.errors import JournalError
+from rig.journal.lock import PATIENCE_S, flock, until
 
 if TYPE_CHECKING:
     from rig.config import RigConfig
@@ -60,13 +61,8 @@ def read_journal(path: pathlib.Path) -> list[Record]:
 
 def is_written(path: pathlib.Path) -> bool:
     """A running session holds the journal; the lock ends with its process."""
-    try:
-        with path.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        pass
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        return not flock(file.fileno(), fcntl.LOCK_SH)
     return False
 
 
@@ -94,24 +90,14 @@ class Journal:
         except OSError as error:
             raise JournalError(f"{path}: {error.strerror or error}") from None
         try:
-            self._claim()
+            # A live page that asks `is_written` holds it for an instant.
+            if not until(PATIENCE_S, lambda: flock(self._fd, fcntl.LOCK_EX)):
+                raise JournalError(f"{path}: a running session is writing it")
             self.records, self._size = _parse(path.read_bytes(), path)
             os.ftruncate(self._fd, self._size)
-        except BlockingIOError:
-            self.close()
-            raise JournalError(f"{path}: a running session is writing it") from None
         except BaseException:
             self.close()
             raise
-
-    def _claim(self) -> None:
-        """Lock the file. A live page that asks `is_written` holds it for an instant."""
-        for _ in range(20):
-            with contextlib.suppress(BlockingIOError):
-                fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                return
-            time.sleep(0.01)
-        fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def write(self, event: str, *, sync: bool = False, **fields: Any) -> Record:
         """Append one record; with ``sync`` it is on the disk when this returns.
@@ -151,6 +137,7 @@ class Journal:
 
 
 JOURNAL = "journal.jsonl"
+SCHEMA = 2  # of the first record; runs of others are not read
 # A full disk must not keep a stop from the bus, nor from the console.
 SPARED = ("write", "stop", "comm_restored", "note")
 
@@ -212,7 +199,7 @@ class RunFolder:
             return
         config, device = self.config.described(), self.config.device_fingerprint()
         start = {"config": config, "device": device, **provenance, **start}
-        self.emit("start", sync=True, schema=1, mode=mode, **start)
+        self.emit("start", sync=True, schema=SCHEMA, mode=mode, **start)
 
     def emit(self, event: str, *, sync: bool = False, **fields: Any) -> Record:
         """Journal an event, then tell the listeners: the one stream of a run.

@@ -7,7 +7,7 @@ server is written from the protocol's text and shares no code with the client's 
 from __future__ import annotations
 
 from rig.simulator.faults import parse_fault
-from rig.simulator.plant import Truth, truth_of
 from rig.simulator.simulator import Simulator
+from rig.simulator.truth import Truth, truth_of
 
 __all__ = ["Simulator", "Truth", "parse_fault", "truth_of"]

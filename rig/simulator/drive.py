@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import random
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
-from rig.config.maps import RegisterMap
-from rig.config.registers import (
+from rig.config.axis import Axis
+from rig.config.maps import (
     FLAGS,
     VALUES,
     Read,
@@ -19,6 +18,8 @@ from rig.config.registers import (
     encode,
     registers_of,
 )
+from rig.simulator.faults import FaultInjector
+from rig.simulator.truth import Truth
 
 ILLEGAL_ADDRESS, ILLEGAL_VALUE, DEVICE_FAILURE = 2, 3, 4
 STEP_S = 0.001
@@ -34,16 +35,6 @@ class DriveException(Exception):
         super().__init__(f"exception {code}")
 
 
-@dataclasses.dataclass(frozen=True)
-class Habits:
-    """What real drives do besides what their registers say."""
-
-    enable_delay_s: float = 0.0  # > 0: it starts disabled, and takes so long to enable
-    reset_delay_s: float = 0.0  # until an alarm is gone after its reset
-    jitter_counts: int = 0  # of the position read while it stands
-    idle_watchdog: bool = False  # the comm timeout also acts while it stands
-
-
 class SimDrive:
     """One unit; positions in pulses of its own counter.
 
@@ -53,26 +44,28 @@ class SimDrive:
 
     def __init__(
         self,
-        register_map: RegisterMap,
-        pulses_per_rev: int,
-        position: float = 0.0,
+        axis: Axis,
+        number: int = 0,
+        truth: Truth | None = None,
+        faults: FaultInjector | None = None,
         speedup: float = 1.0,
         travel: Sequence[int] | None = None,
-        stuck: Callable[[], object] = lambda: False,
-        habits: Habits | None = None,
-        seed: int = 0,
+        at_deg: float = 0.0,
     ) -> None:
-        self.map = register_map
-        self.pulses_per_rev = pulses_per_rev
-        self.habits = habits or Habits()
-        self.position = float(position)
+        self.map = axis.map
+        self.truth = truth or Truth()
+        set_to = self.truth.drive_pulses_per_rev
+        self.pulses_per_rev = set_to[number] if set_to else axis.pulses_per_rev
+        per_turn = axis.pulses_per_deg / axis.pulses_per_rev
+        self.pulses_per_deg = per_turn * self.pulses_per_rev  # signed, of the joint
+        self.position = float(round(at_deg * self.pulses_per_deg))
         self.executions: list[int] = []  # target of each move that was run
         self.stops: list[float] = []
         self.comm_stops = 0
         self.offset = 0
         self._travel = travel  # targets outside are answered with exception 3
-        self._stuck = stuck
-        self._random = random.Random(seed)
+        self._number, self._faults = number, faults or FaultInjector()
+        self._random = random.Random(self.truth.seed + number)
         self._speedup = speedup
         self._speed = self._accel = 1.0
         self._last_frame = self._now = time.monotonic()
@@ -81,7 +74,7 @@ class SimDrive:
     def _switch_on(self) -> None:
         self.target, self.velocity, self.alarm = round(self.position), 0.0, 0
         self.moving = self._stopping = self._homing = self.homed = False
-        self.done, self.enabled = True, not self.habits.enable_delay_s
+        self.done, self.enabled = True, not self.truth.enable_delay_s
         self._set_to = 0  # what it was told to count at its origin
         self._enables = self._clears = math.inf  # when what was asked for is done
         self._comm_timeout = math.inf
@@ -104,7 +97,7 @@ class SimDrive:
             self.enabled, self._enables = True, math.inf
         if now >= self._clears:
             self.alarm, self._clears = 0, math.inf
-        watched = self.moving or self.habits.idle_watchdog
+        watched = self.moving or self.truth.idle_watchdog
         lost = self._last_frame + self._comm_timeout
         if watched and now > lost and not self._stopping and not self.alarm:
             self._integrate(lost)
@@ -121,7 +114,7 @@ class SimDrive:
         self._now = max(self._now, now)
 
     def _step(self, dt: float) -> None:
-        stuck = bool(self._stuck())
+        stuck = self._faults.take("stuck_axis", self._number) is not None
         self.velocity = 0.0 if stuck else self.velocity
         if self._stopping:
             drop = QUICK_STOP_FACTOR * self._accel * dt
@@ -163,9 +156,10 @@ class SimDrive:
         self.target, self.offset, self._set_to = round(self.position), 0, 0
         self.homed, self._homing = True, False
 
-    def power_cycle(self, offset: int = 0) -> None:
-        """Off and on again: its counter comes back ``offset`` pulses away."""
+    def power_cycle(self, lost_deg: float = 0.0) -> None:
+        """Off and on again: its counter comes back so many degrees away."""
         self.advance()
+        offset = round(lost_deg * self.pulses_per_deg)
         self.offset += offset
         self.position = float(round(self.position) + offset)
         self._switch_on()
@@ -174,7 +168,7 @@ class SimDrive:
         """Holding registers; raises DriveException where there are none."""
         self.advance()
         self._last_frame = time.monotonic()
-        flicker = 0 if self.velocity else self.habits.jitter_counts
+        flicker = 0 if self.velocity else self.truth.jitter_counts
         counter = round(self.position) + self._random.randint(-flicker, flicker)
         self._show(self.map.status, self._status())
         self._show(self.map.position, counter)
@@ -243,10 +237,10 @@ class SimDrive:
         self._stopping, self.target = self.moving, round(self.position)
 
     def _reset(self) -> None:
-        self._clears = time.monotonic() + self.habits.reset_delay_s
+        self._clears = time.monotonic() + self.truth.reset_delay_s
 
     def _enable(self) -> None:
-        self._enables = time.monotonic() + self.habits.enable_delay_s
+        self._enables = time.monotonic() + self.truth.enable_delay_s
 
     def _set_zero(self) -> None:
         assert self.map.set_zero is not None  # it was just written

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import functools
 from typing import Any
 
 from rig.config.config import RigConfig
 from rig.core.attitude import Array
-from rig.simulator.drive import Habits, SimDrive
+from rig.simulator.drive import SimDrive
 from rig.simulator.faults import FaultInjector, FaultSpec
 from rig.simulator.phone import Phone
-from rig.simulator.plant import Plant, Truth, gearing
+from rig.simulator.plant import Plant
 from rig.simulator.server import ModbusServer
+from rig.simulator.truth import Truth
 
 
 class Simulator:
@@ -33,32 +33,21 @@ class Simulator:
         self.faults = FaultInjector(faults)
         self.transport = transport
         self.drives: list[SimDrive] = []
-        t = self.truth
-        habits = Habits(
-            t.enable_delay_s, t.reset_delay_s, t.jitter_counts, t.idle_watchdog
-        )
         for number, axis in enumerate(config.axes):
-            travel, position = None, 0
-            set_to = (t.drive_pulses_per_rev or [axis.pulses_per_rev] * 3)[number]
-            per_deg = gearing(axis, set_to)
-            if travel_deg is not None:
-                travel = sorted(axis.to_pulses(end) for end in travel_deg)
+            travel = travel_deg and sorted(axis.to_pulses(end) for end in travel_deg)
+            at_deg = 0.0
             if config.session.zero == "here":
-                position = round(float(t.jig_deg[number]) * per_deg)
+                at_deg = float(self.truth.jig_deg[number])
             drive = SimDrive(
-                axis.map, set_to, position, speedup, travel,
-                functools.partial(self.faults.take, "stuck_axis", number),
-                habits, t.seed + number,
-            )  # fmt: skip
-            drive.power_cycle(round(t.lost_origin_deg[number] * per_deg))
+                axis, number, self.truth, self.faults, speedup, travel, at_deg
+            )
+            drive.power_cycle(self.truth.lost_origin_deg[number])
             self.drives.append(drive)
-        slipping = functools.partial(self.faults.take, "slipping_axis")
-        self.plant = Plant(config, self.truth, self.drives, slipping)
-        units = [axis.unit for axis in config.axes]
-        self.server = ModbusServer(
-            dict(zip(units, self.drives, strict=True)), self.faults, t.seed, t.latency_s
-        )
-        self.phone = Phone(config.imu, self._attitude, self.faults, rate_hz, t.seed)
+        self.plant = Plant(config, self.truth, self.drives, self.faults)
+        units = dict(zip((a.unit for a in config.axes), self.drives, strict=True))
+        seed = self.truth.seed
+        self.server = ModbusServer(units, self.faults, seed, self.truth.latency_s)
+        self.phone = Phone(config.imu, self._attitude, self.faults, rate_hz, seed)
 
     def start(self, port: int = 0) -> RigConfig:
         """Serve the drives; the phone starts with ``start_phone``."""
@@ -113,15 +102,13 @@ class Simulator:
     def power_cycle(self, lost_deg: tuple[float, float, float] = (0, 0, 0)) -> None:
         """All drives off and on: their counters come back so many degrees away."""
         with self.server.lock:
-            for axis, drive, lost in zip(
-                self.config.axes, self.drives, lost_deg, strict=True
-            ):
-                drive.power_cycle(round(lost * gearing(axis, drive.pulses_per_rev)))
+            for drive, lost in zip(self.drives, lost_deg, strict=True):
+                drive.power_cycle(lost)
 
     def repair(self) -> None:
         """Undo every fault, as a technician would before the run is resumed."""
         self.faults.clear()
-        self.plant.tighten()
+        self.plant.slip[:] = 0.0
         with self.server.lock:
             for drive in self.drives:
                 if drive.offset:

@@ -13,9 +13,9 @@ from rig.core.attitude import Array, Frame, euler_to_matrix
 def recorded_frame(described: dict[str, Any], zero: dict[str, Any]) -> Frame:
     """The same from the journal: ``config`` of its start, and a zero record."""
     mounting = euler_to_matrix(described["imu"]["mounting_deg"], "ZYX")
-    letters = tuple(axis["letter"] for axis in described["axes"])
+    letters = tuple(axis["rotates"] for axis in described["axes"])
     attitude = np.array(zero["attitude"])
-    return Frame(attitude, mounting, described["mechanism_order"], letters)
+    return Frame(attitude, mounting, described["mechanism"]["order"], letters)
 
 
 def attitudes(record: dict[str, Any]) -> Array:

@@ -47,7 +47,6 @@ class Run(RunFolder):
         self.dry_run = dry_run
         self.reset_alarms = reset_alarms
         self.signals = signals or Signals()
-        self.planned = 0  # postures, as far as it is known
         super().__init__(config, folder, mode, start or {})
 
     def say(self, *lines: str) -> None:

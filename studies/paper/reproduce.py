@@ -9,16 +9,13 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from jaxcal.arguments import Parser
+from jaxcal.arguments import Parser, at_least, exit_code
 from jaxcal.files import atomic_write, require_writable_folder
-from jaxcal.paper import command
 from jaxcal.progress import Progress
 
 if TYPE_CHECKING:
     from studies.paper.exhibits.exhibit import Claim, Exhibit
     from studies.paper.exhibits.material import Settings
-
-__all__ = ["main"]
 
 _DESCRIPTION = """\
 Make every figure and table of the paper from our own runs, each beside what the paper
@@ -69,7 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         finally:
             progress.clear()
 
-    return command.run(make, "reproduce", "nothing was written")
+    return exit_code(make, "reproduce", "nothing was written")
 
 
 def _run(options: argparse.Namespace, progress: Progress) -> None:
@@ -160,7 +157,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
     add("--quick", action="store_true", help="fewer episodes, draws and devices")
-    seed: dict[str, Any] = {"type": command.seed, "metavar": "S"}
+    seed: dict[str, Any] = {"type": at_least(0), "metavar": "S"}
     add("--seed", default=0, help="of everything random; 0", **seed)
     add("--data", help="real recordings for Datasets 4 and 5", **folder)
     add("--studies", help="kept runs; the repository's studies", **folder)

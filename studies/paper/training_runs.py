@@ -18,16 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.arguments import Parser
+from jaxcal.arguments import Parser, exit_code
 from jaxcal.evaluation.csv_rows import csv_text
 from jaxcal.files import require_writable_folder, write_text
-from jaxcal.paper import command
-
-__all__ = ["FORMAT", "MAX_ROWS", "collect", "main", "thinned"]
 
 Array = NDArray[np.float64]
 
-FORMAT = "jaxcal-training-run"
 MAX_ROWS = 1_000
 _LAST_OF_BLOCK = ("update", "episodes", "seconds", "learning_rate")
 _IF_MEASURED = ("ratio_to_exact", "hit_rate")
@@ -52,7 +48,7 @@ def collect(run: pathlib.Path, out: pathlib.Path) -> dict[str, Any]:
     from jaxcal.evaluation.training_figure import read_metrics
 
     metrics = read_metrics(run / "metrics.csv")
-    summary = _summary(run, len(metrics["episodes"]))
+    summary = _summary(run)
     out.mkdir(parents=True, exist_ok=True)
     rewards = run / "last_rewards.npy"
     if rewards.is_file():
@@ -91,7 +87,7 @@ def thinned(metrics: dict[str, Array], max_rows: int = MAX_ROWS) -> dict[str, Ar
     }
 
 
-def _summary(run: pathlib.Path, rows: int) -> dict[str, Any]:
+def _summary(run: pathlib.Path) -> dict[str, Any]:
     """What the run was and how good its policy is, measured on dataset2."""
     import jax
 
@@ -103,33 +99,21 @@ def _summary(run: pathlib.Path, rows: int) -> dict[str, Any]:
     data = make_dataset("dataset2")
     measured = evaluate(data, 4, ("policy",), (str(run),), random_draws=1)
     row = measured.summary(measured.results[0])
-    meta, progress = policy.meta, policy.meta["progress"]
-    planned = meta["ppo"]["num_episodes"]
+    progress = policy.meta["progress"]
     return {
-        "format": FORMAT,
-        "version": 1,
-        "preset": meta["preset"],
-        "network": meta["network"]["kind"],
+        "seed": policy.meta["seed"],
         "parameters": sum(leaf.size for leaf in jax.tree.leaves(policy.params)),
-        "seed": meta["seed"],
         "episodes": progress["episodes"],
-        "planned_episodes": planned,
-        "episodes_per_update": meta["ppo"]["episodes_per_update"],
-        "finished": progress["episodes"] >= planned,
+        "planned_episodes": policy.meta["ppo"]["num_episodes"],
         "seconds": float(progress["seconds"]),
         "device": progress["device"],
-        "versions": meta["versions"],
-        "rows": [rows, min(rows, MAX_ROWS)],
+        "versions": policy.meta["versions"],
         "dataset2": {
             "episodes": data.num_episodes,
             "ratio_to_exact": row["ratio_to_exact"],
             "hit_rate": row["hit_rate"],
-            "log_det_s_mean": row["log_det_s"]["mean"],
         },
     }
-
-
-# -- command ---------------------------------------------------------------------------
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -137,9 +121,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = Parser(
         prog="python -m studies.paper.training_runs", description=_DESCRIPTION
     )
-    folder: dict[str, Any] = {"type": pathlib.Path, "required": True, "metavar": "DIR"}
-    parser.add_argument("runs", nargs="+", type=pathlib.Path, metavar="RUN")
-    parser.add_argument("--out", help="of the kept folders", **folder)
+    folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
+    parser.add_argument("runs", nargs="+", help="folders of training runs", **folder)
+    parser.add_argument("--out", required=True, help="of the kept folders", **folder)
     options = parser.parse_args(arguments)
 
     def keep() -> None:
@@ -150,16 +134,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for run in options.runs:
             out = options.out / run.resolve().name
             summary = collect(run, out)
-            good = summary["dataset2"]
-            print(
-                f"{out}: {summary['episodes']:,} of {summary['planned_episodes']:,} "
-                f"episodes, {summary['seconds'] / 60:.1f} min, det S/det S* "
-                f"{good['ratio_to_exact']:.4f}, hit rate {good['hit_rate']:.3f} on "
-                "dataset2",
-                flush=True,
-            )
+            print(f"saved: {out}, {summary['episodes']:,} episodes", flush=True)
 
-    return command.run(keep, "training_runs", "runs already named are kept")
+    return exit_code(keep, "training_runs", "runs already named are kept")
 
 
 if __name__ == "__main__":

@@ -314,8 +314,6 @@ def test_without_freedom_the_noise_is_unknown() -> None:
 
 def test_what_nothing_determines_is_named_and_has_no_interval() -> None:
     commands, measured = waves(7)
-    wide = identify(commands, measured, model=WAVE, noise_std=0.05, discrepancy=9)
-    assert np.isfinite(wide.predict_std(commands)).all()
     found = identify(commands, measured, model=WAVE, noise_std=0.05)
     assert found.parameters[5] == 3.0 and np.isinf(found.standard_errors[5])
     assert np.isfinite(found.standard_errors[:5]).all()
@@ -355,38 +353,6 @@ def test_lack_of_fit_is_small_where_the_model_is_wrong() -> None:
         commands, measured + commands**2, model=WAVE, noise_std=0.05
     ).lack_of_fit()
     assert good > 0.01 and bad < 1e-6
-
-
-def test_a_discrepancy_makes_the_bands_honest() -> None:
-    rng = np.random.default_rng(3)
-    commands = rng.uniform(-1, 1, (40, 1))
-    test = np.linspace(-0.9, 0.9, 60)[:, None]
-
-    def truth(u: np.ndarray) -> np.ndarray:
-        return 2 * u + 0.3 * np.sin(4 * u)
-
-    measured = truth(commands) + rng.normal(0, 0.02, (40, 1))
-    line = Polynomial(1, 1)
-    share = []
-    for discrepancy in (None, 30):
-        found = identify(
-            commands, measured, model=line, noise_std=0.02, discrepancy=discrepancy
-        )
-        low, high = found.predict_interval(test)
-        share.append(float(((low <= truth(test)) & (truth(test) <= high)).mean()))
-        assert len(found.parameters) == len(found.covariance) == 2
-    assert share[0] < 0.3 and share[1] > 0.9
-    slopes = (found.predict(test + 1e-6) - found.predict(test - 1e-6)) / 2e-6
-    whole = found.whole.command_jacobian(test, found.estimate)
-    np.testing.assert_allclose(whole[..., 0], slopes, rtol=1e-5, atol=1e-6)
-    exact = identify(
-        commands,
-        2 * commands + rng.normal(0, 0.02, (40, 1)),
-        model=line,
-        noise_std=0.02,
-        discrepancy=30,
-    )
-    assert exact.predict_std(test).max() < found.predict_std(test).max() / 2
 
 
 # -- the inverse -----------------------------------------------------------------------
@@ -475,7 +441,6 @@ def test_no_inverse_where_the_outputs_do_not_respond() -> None:
     "options",
     [
         {"noise_std": 0.1},
-        {"discrepancy": 5},
         {"prior": Prior({"1": 0.1}, fixed=["x"])},
         {"noise": Noise(0.1, command_std=[0.1, 0.0])},
     ],
@@ -567,7 +532,6 @@ def broken(method: str, answer: Any) -> Any:
         ({"noise_std": 1.0, "common_noise": True}, "give one of them"),
         ({"noise": 0.1}, "noise must be a jaxcal.Noise, got float; a number goes"),
         ({"loss": "huber"}, "loss must be one of student, gaussian"),
-        ({"discrepancy": 0}, "discrepancy must be at least 1, got 0"),
         ({"weights": np.zeros(12)}, "weights must be positive for one"),
     ],
 )

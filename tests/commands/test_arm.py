@@ -72,3 +72,31 @@ def test_joints_far_beyond_their_limits_are_named(files):
         ValueError, match=r"panda_joint4 must be within its limits .*, to 2,"
     ):
         jaxcal.identify(swapped, np.zeros((len(q), 3)), model=arm)
+
+
+def test_postures_are_planned_and_the_rest_chosen_again(files, capsys):
+    urdf, _, folder = files
+    out, reached, picture = (folder / name for name in ("a.csv", "b.csv", "plan.png"))
+    given = ["postures", str(urdf), "--tip", "ball_link", "--sensor", "socket",
+             "--radians", "--count", "20"]  # fmt: skip
+    near = ["--near=.4,.1,.3", "--near=.4,.15,.3"]
+    assert main([*given, *near, "-k", "8", "--out", str(out)]) == 0
+    lines = out.read_text().splitlines()
+    arm = SerialChain.from_urdf(urdf, tip="ball_link")
+    assert lines[0] == ",".join([*arm.joint_names, "socket"])
+    rows = np.loadtxt(lines[1:], delimiter=",")
+    points = arm.predict(np.degrees(rows[:, :7]))
+    sockets = np.array([[0.4, 0.1, 0.3], [0.4, 0.15, 0.3]])
+    np.testing.assert_allclose(points, sockets[rows[:, 7].astype(int)], atol=1e-6)
+    # Columns of what was reached may come in any order; contacts show the sockets.
+    both = [rows[rows[:, 7] == k][:2] for k in (0, 1)]
+    columns = ",".join([*arm.joint_names[::-1], "socket"])
+    table = np.vstack(both)[:, [*range(7)[::-1], 7]]
+    np.savetxt(reached, table, delimiter=",", header=columns, comments="")
+    given += ["--measured", str(reached)]
+    capsys.readouterr()
+    assert main([*given, "-k", "7", "--picture", str(picture)]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 1 + 7 - 4
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert main([*given, "-k", "4"]) == 2
+    assert "more than the 4 that were reached" in capsys.readouterr().err

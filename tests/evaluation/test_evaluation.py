@@ -20,7 +20,7 @@ from jaxcal.evaluation import figures
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.figures import evaluation_figures
 from jaxcal.evaluation.methods import check_methods, evaluate
-from jaxcal.evaluation.parameters import estimate_parameters, parameter_names
+from jaxcal.evaluation.parameters import estimate_parameters
 from jaxcal.evaluation.report import (
     file_prefixes,
     json_document,
@@ -30,6 +30,7 @@ from jaxcal.evaluation.report import (
 from jaxcal.evaluation.results import Evaluation, MethodResult
 from jaxcal.evaluation.training_figure import training_curves
 from jaxcal.information.regression import regression_matrix
+from jaxcal.models import Affine
 from jaxcal.paper.datasets.datasets import make_dataset
 from jaxcal.plots import as_bytes
 
@@ -308,7 +309,7 @@ def test_parameters_are_those_of_lstsq(n: int, m: int, k: int) -> None:
     )[..., :k]
     found = estimate_parameters(dataset, indices)
     assert found is not None and found.shape == (3, 2, m * (n + 1))
-    assert len(parameter_names(n, m)) == m * (n + 1)
+    assert len(Affine(n, m).names) == m * (n + 1)
     assert dataset.measured is not None
     for e, r in itertools.product(range(3), range(2)):
         rows = regression_matrix(dataset.candidates[e, indices[e, r]], m)
@@ -483,13 +484,13 @@ def test_training_curves_have_the_papers_three_panels(
     tmp_path: pathlib.Path, updates: int
 ) -> None:
     metrics(tmp_path, updates)
-    figure = training_curves(tmp_path)
+    figure = training_curves({"run": tmp_path})
     titles = [axes.get_title() for axes in figure.axes]
     assert titles[0].startswith("(a)") and titles[2].startswith("(c)")
     assert "updates" in titles[1]
     rewards = np.random.default_rng(0).normal(size=1500).astype(np.float32)
     np.save(tmp_path / "last_rewards.npy", rewards)
-    figure = training_curves(tmp_path)
+    figure = training_curves({"run": tmp_path})
     assert "last 1,000 episodes" in figure.axes[1].get_title()
     figure.suptitle("Training of the paper's network", fontsize=10)
     assert texts_outside(figure) == []
@@ -504,7 +505,7 @@ def test_labels_of_a_long_run_are_not_cut_off(tmp_path: pathlib.Path) -> None:
     lines += [f"{500 * i},{r},0.3,0.5" for i, r in zip(u, reward, strict=True)]
     (tmp_path / "metrics.csv").write_text("\n".join(lines) + "\n")
     np.save(tmp_path / "last_rewards.npy", rng.normal(-0.25, 0.26, size=1000))
-    figure = training_curves(tmp_path)
+    figure = training_curves({"run": tmp_path})
     figure.suptitle("Training of the paper's network", fontsize=10)
     assert texts_outside(figure) == []
 
@@ -522,4 +523,4 @@ def test_labels_of_a_long_run_are_not_cut_off(tmp_path: pathlib.Path) -> None:
 def test_bad_metrics_are_named(tmp_path: pathlib.Path, text: str, message: str) -> None:
     (tmp_path / "metrics.csv").write_text(text)
     with pytest.raises(ValueError, match=message):
-        training_curves(tmp_path)
+        training_curves({"run": tmp_path})

@@ -53,9 +53,9 @@ def test_a_run_of_train_is_kept(
     given = ["--seed", "3", "--episodes", "4096", "--out", str(run)]
     assert train(given) == 0
     assert main([str(run), "--out", str(kept.parent)]) == 0
-    assert "4,096 of 4,096 episodes" in capsys.readouterr().out
+    assert "4,096 episodes" in capsys.readouterr().out
     summary = json.loads((kept / "summary.json").read_text())
-    assert summary["seed"] == 3 and summary["finished"]
+    assert summary["seed"] == 3
     assert summary["episodes"] == summary["planned_episodes"] == 4096
     assert summary["parameters"] == 42946
     assert 0.0 < summary["dataset2"]["ratio_to_exact"] <= 1.0

@@ -316,7 +316,7 @@ def _unknown_cell(fault: str, folder: pathlib.Path) -> Outcome:
         before = sim.executions()
         if fault == "pushed_while_off":
             for drive, axis in zip(sim.drives, served.axes, strict=True):
-                drive.power_cycle(-round(drive.position))
+                drive.power_cycle(-drive.position / drive.pulses_per_deg)
                 drive.offset -= round(10.0 * axis.pulses_per_deg)
             code = session(served, folder / "run", sim, said, record=record)
             reason = said[-1]

@@ -242,7 +242,7 @@ def test_a_count_of_0_after_a_power_cycle_is_not_home(at, name, obeys, monkeypat
         np.testing.assert_allclose(sim.plant.joints(), 0.0, atol=0.1)
         assert [round(drive.position) for drive in sim.drives] == counts
         for drive in sim.drives:
-            drive.power_cycle(-round(drive.position))
+            drive.power_cycle(-drive.position / drive.pulses_per_deg)
             assert drive.position == 0.0
         with place.bus("look") as drives:
             if obeys:

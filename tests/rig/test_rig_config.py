@@ -10,8 +10,14 @@ import pytest
 from rig.config import ConfigError, load_config, parse_config
 from rig.config.axis import Axis, Scale
 from rig.config.config import EXAMPLES, RigConfig
-from rig.config.maps import MAP_FOLDER, RegisterMap, available_maps, load_map
-from rig.config.registers import decode, encode
+from rig.config.maps import (
+    MAP_FOLDER,
+    RegisterMap,
+    available_maps,
+    decode,
+    encode,
+    load_map,
+)
 from rig.config.schema import Section, parse
 
 EXAMPLE_TEXT = (EXAMPLES / "simulate.toml").read_text()

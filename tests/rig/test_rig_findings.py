@@ -1,7 +1,5 @@
 """What small moves say, against a chain of joints built by products of rotations."""
 
-import itertools
-
 import numpy as np
 import pytest
 from harness import changed, fast_config
@@ -12,9 +10,16 @@ from scipy.spatial.transform import Rotation
 from rig.config import AXIS_NAMES
 from rig.core.attitude import ORDERS, angle_between_deg, euler_to_matrix
 from rig.core.faults import MotionFault
-from rig.workbench.commission.findings import Stand, find, proposals
+from rig.workbench.commission.findings import (
+    CORNERS,
+    Stand,
+    corner_name,
+    find,
+    proposals,
+)  # fmt: skip
 
 CONFIG = fast_config()
+GAINS = (0.43, 0.71, 0.87)  # of the paper's device
 START = (0, 0, 0)  # the zero posture: the axes are at right angles
 AXIS = {"X": [1.0, 0, 0], "Y": [0, 1.0, 0], "Z": [0, 0, 1.0]}
 
@@ -47,7 +52,7 @@ class Chain:
         whole *= Rotation.from_matrix(self.mounting)
         return whole.as_matrix()
 
-    def stands(self, reach_deg=3.0, samples=25):
+    def stands(self, reach_deg=3.0, samples=25, corner_deg=(3.0, 3.0, 3.0)):
         """The places of the axis check, visited as it visits them."""
         stands, end = {}, np.array([0.0, 0.0, 0.0])  # sense of each drive's last move
         here = np.array(START, dtype=float)
@@ -72,9 +77,8 @@ class Chain:
                 ("minus", -reach_deg), ("up", 0.0),
             ):  # fmt: skip
                 stand(f"{name}:{part}", {j: way})
-        for a, b in itertools.combinations(range(3), 2):
-            for sign, way in (("-", -reach_deg), ("+", reach_deg)):
-                stand(f"{AXIS_NAMES[a]}{sign}{AXIS_NAMES[b]}+", {a: way, b: reach_deg})
+        for signs in CORNERS:
+            stand(corner_name(signs), dict(enumerate(np.multiply(corner_deg, signs))))
         return stands
 
 
@@ -154,6 +158,16 @@ def test_mirrored_readings_are_not_taken_for_a_reversed_axis(changes):
     config = CONFIG.model_copy(update={"imu": read})
     with pytest.raises(MotionFault, match=r"imu.signs = \[-1, -1, -1\]"):
         find(config, stands)
+
+
+@pytest.mark.parametrize("play", [0.0, 0.4])
+def test_the_noise_of_a_sound_phone_is_not_taken_for_a_wrong_order(play):
+    """The error of an axis's direction does not enter how the axes combine."""
+    rates = [g / a.pulses_per_deg for g, a in zip(GAINS, CONFIG.axes, strict=True)]
+    chain = Chain(deg_per_pulse=rates)
+    chain.std, chain.play = 0.03, np.full(3, play)
+    stands = [chain.stands(corner_deg=(6.0, 4.2, 3.4)) for _ in range(60)]
+    assert {find(CONFIG, each).order for each in stands} == {"ZXY"}
 
 
 def test_a_noisy_phone_leaves_the_order_open_and_mirrored_axes_uncorrected():

@@ -17,8 +17,8 @@ from rig.core.faults import Refused
 from rig.journal import Journal
 from rig.signals import PAUSE
 from rig.workbench import live
-from rig.workbench.live import words
 from rig.workbench.live.watcher import Watcher
+from rig.workbench.outputs import view
 
 HOST = "127.0.0.1:8642"
 OWN = f"http://{HOST}"
@@ -168,7 +168,7 @@ def test_a_pause_that_was_asked_for_is_shown(tmp_path):
     journal.write("pausing")
     watcher = Watcher(tmp_path)
     watcher.poll()
-    assert words.headline(watcher.state, True)[1].endswith(", then pausing")
+    assert view.headline(watcher.state, True)[1].endswith(", then pausing")
     journal.close()
 
 

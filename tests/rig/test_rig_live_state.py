@@ -5,6 +5,7 @@ import json
 import pathlib
 import re
 import tempfile
+import time
 
 import numpy as np
 import pytest
@@ -14,11 +15,11 @@ from hypothesis import strategies as st
 
 from rig.config import parse_config
 from rig.journal import Journal, is_written, read_journal
-from rig.workbench.live import charts, words
-from rig.workbench.live.state import RunState
+from rig.workbench import live
+from rig.workbench.live import charts
 from rig.workbench.live.watcher import Tail, Watcher
-
-PICTURE = charts.LIGHT
+from rig.workbench.outputs import view
+from rig.workbench.outputs.state import RunState
 
 
 @pytest.fixture(scope="module")
@@ -32,15 +33,15 @@ def run(tmp_path_factory):
 
 
 def queue(state):
-    return words.draw("queue", postures=words.queue(state), count=len(state.postures))
+    return live.draw("queue", postures=view.queue(state), count=len(state.postures))
 
 
 def trouble(state, running, folder):
-    return words.draw("trouble", lines=words.trouble(state, running, folder))
+    return live.draw("trouble", lines=view.trouble(state, running, folder))
 
 
-def numbers(state, live):
-    return words.draw("numbers", rows=words.numbers(state, {}, live))
+def numbers(state, running):
+    return live.draw("numbers", rows=view.numbers(state.present({}, running)))
 
 
 def waiting(state):
@@ -90,8 +91,8 @@ def test_a_finished_run_shows_what_its_journal_holds(run):
     assert state.planned == len(measured)
     assert not waiting(state)
     assert not state.damaged
-    assert words.headline(state, running=False) == ("good", "Done")
-    assert not words.trouble(state, False, "run")
+    assert view.headline(state, running=False) == ("good", "Done")
+    assert not view.trouble(state, False, "run")
     end = [r for r in measured if r["role"] == "reference"][-1]
     assert state.drift[-1][1] == end["measured_deg"]
 
@@ -100,17 +101,17 @@ def test_every_moment_of_a_run_can_be_drawn(run):
     state = RunState()
     for record in read_journal(run[0] / "journal.jsonl"):
         state.apply(record)
-        now, said = words.headline(state, True), words.progress(state)
+        now, said = view.headline(state, True), view.progress(state)
         for text in (
-            words.draw("head", state=state, now=now, said=said, folder="run"),
+            live.draw("head", state=state, now=now, said=said, folder="run"),
             queue(state),
-            words.draw("numbers", rows=words.numbers(state, {}, True)),
+            live.draw("numbers", rows=view.numbers(state.present({}, True))),
             trouble(state, True, "run"),
-            words.draw("log", lines=state.log),
+            live.draw("log", lines=state.log),
         ):
             assert "nan" not in text and "None" not in text
         samples = [{"time": state.time, "drives": [None] * 3, "deg": [1, 2, 3]}]
-        drawn = charts.charts(state, samples, state.time, PICTURE)
+        drawn = charts.charts(state, samples, state.time)
         json.dumps(drawn, allow_nan=False)
 
 
@@ -120,9 +121,9 @@ def test_places_of_a_commissioning_step_are_shown_and_what_goes_on_is_the_step()
     fault = {"event": "fault", "code": 3, "reason": "the phone fell silent"}
     state = state_of(numbered([start, stand, fault]))
     assert "pitch:plus" in queue(state)
-    commanded = words.angle(state.to_deg([100, 0, 0])[0])
-    for live in (True, False):
-        assert commanded in numbers(state, live)
+    commanded = view.angle(state.to_deg([100, 0, 0])[0])
+    for running in (True, False):
+        assert commanded in numbers(state, running)
     told = trouble(state, False, "runs/axes")
     assert "To go on: jaxcal-rig axes<" in told and "resume" not in told
     killed = trouble(state_of(numbered([start, stand])), False, "runs/axes")
@@ -137,7 +138,7 @@ def test_the_posture_under_way_goes_through_its_states():
         seen.append(state_of(numbered(records)).postures["select:3"].state)
     assert seen == ["moving", "moving", "settling", "measuring"]
     state = state_of(numbered(records))
-    assert words.headline(state, True) == ("run", "Measuring posture 3")
+    assert view.headline(state, True) == ("run", "Measuring posture 3")
     records += [posture("select:3")]
     state = state_of(numbered(records))
     assert state.postures["select:3"].state == "done"
@@ -211,7 +212,7 @@ def test_another_choice_forgets_what_was_only_waiting():
 def test_the_headline_says_how_it_stands(last, running, tone, part):
     records = [*begun(), {"event": "phase", "phase": "moving"}]
     state = state_of(numbered(records + ([last] if last else [])))
-    shown = words.headline(state, running)
+    shown = view.headline(state, running)
     assert shown[0] == tone and part in shown[1]
     told = trouble(state, running, "runs/one")
     if last and last["event"] != "end":
@@ -248,6 +249,24 @@ def test_a_missing_record_is_told_and_a_foreign_one_harms_nothing(tmp_path):
     assert watcher.state.damaged
     assert watcher.state.current == "select:3"
     assert not watcher.running
+
+
+def test_the_last_word_of_a_session_that_ends_meanwhile_is_read(tmp_path, monkeypatch):
+    """It was taken for one that had armed nothing: STOPPED, of no drive."""
+    path = tmp_path / "journal.jsonl"
+    path.write_text("".join(json.dumps(r) + "\n" for r in numbered(begun())))
+    unit = {"axis": "yaw", "unit": 2, "acknowledged": True, "standing": True}
+
+    def ends(journal):
+        with path.open("a") as file:
+            record = {"event": "stop", "reason": "SIGTERM", "units": [unit]}
+            file.write(json.dumps(record | {"time": time.time()}) + "\n")
+        return False
+
+    watcher = Watcher(tmp_path)
+    monkeypatch.setattr(watcher, "ask", lambda number: None)
+    monkeypatch.setattr("rig.workbench.live.watcher.is_written", ends)
+    assert [each.axis for each in watcher.stop()] == ["yaw"]
 
 
 @settings(deadline=None)

@@ -12,6 +12,9 @@ import pytest
 from harness import HASTY, UNSETTLED, WATCHED, fast_config, fast_text, simulator
 
 from rig.config import parse_config
+from rig.core import measure as measuring
+from rig.core import motion as moving
+from rig.core.attitude import Reading, euler_to_matrix
 from rig.core.device import Device, Posture, approach, check_plan
 from rig.core.drive import HOME
 from rig.core.faults import (
@@ -21,7 +24,7 @@ from rig.core.faults import (
     StopRequested,
     Unreachable,
 )
-from rig.core.measure import measure
+from rig.core.measure import _unquiet, measure
 from rig.core.motion import Standing, move
 from rig.core.phone import ImuError
 from rig.core.proof import GROWTH, SHOWN_DEG
@@ -95,6 +98,37 @@ def test_an_alarm_or_a_silent_phone_keeps_it_from_arming():
         time.sleep(motion.config.imu.stale_s + 0.1)
         with pytest.raises(ImuError, match="reading is"):
             motion.device.arm()
+
+
+def other_controller(motion):
+    """What shares a gateway with us, where no lock is possible, moves yaw slowly."""
+    with motion.sim.server.lock:
+        drive = motion.sim.drives[1]
+        drive._enable()
+        drive.advance()
+        drive._move(round(drive.position) + 5000, 10.0, 1e5)
+
+
+def test_a_drive_that_another_controller_moves_keeps_it_from_arming():
+    with bench(arm=False) as motion:
+        other_controller(motion)
+        with pytest.raises(MotionFault, match="yaw is already moving"):
+            motion.device.arm()
+
+
+def test_a_drive_that_another_controller_moves_ends_what_is_measured(monkeypatch):
+    """Settled, then moved: slower than any reading of the phone shows."""
+    with bench() as motion:
+        settled = measuring._settled
+
+        def then_moved(*args):
+            statuses = settled(*args)
+            other_controller(motion)
+            return statuses
+
+        monkeypatch.setattr(measuring, "_settled", then_moved)
+        with pytest.raises(MotionFault, match="moves while the posture is measured"):
+            measure(Standing(motion.device, Posture("", (0, 0, 0))), 200)
 
 
 def test_a_position_outside_the_limits_keeps_it_from_arming():
@@ -237,6 +271,20 @@ def test_settled_means_drives_done_and_imu_quiet():
         assert measured["feedback"] == list(target)
 
 
+@pytest.mark.parametrize("moves", [False, True])
+def test_readings_that_come_in_bursts_settle_over_more_than_the_window(moves):
+    """Of a phone that saves power, or a busy computer: ten within 2 ms, then 0.1 s."""
+    config = fast_config()
+    times = [0.1 * burst + 2e-4 * number for burst in range(4) for number in range(10)]
+    turns = [[5.0 * moves * (time < 0.25), 0.0, 0.0] for time in times]
+    matrices = euler_to_matrix(turns, "ZYX")
+    readings = [Reading(*each) for each in zip(times, matrices, strict=True)]
+    device = SimpleNamespace(config=config, frame=None)
+    found = _unquiet(device, readings, now=0.35)
+    assert "std_deg" in found if moves else found == ""
+    assert "10 readings over 0.00 s" in _unquiet(device, readings[-10:], now=0.35)
+
+
 def test_a_shaking_device_never_settles():
     # On a machine so busy that the phone is not heard, that is what it is told instead.
     reason = r"did not settle.*(std_deg|readings over)"
@@ -277,9 +325,9 @@ def test_trouble_on_the_way_is_noticed(fault, error):
             motion.move_to((0, 0, 0), "after a fault")
 
 
-def test_a_missed_deadline_stops():
-    text = fast_text({"stall_s = 0.3": "stall_s = 0.3\ndeadline_slack_s = 0.05"})
-    with bench(parse_config(text), speedup=0.05) as motion:
+def test_a_missed_deadline_stops(monkeypatch):
+    monkeypatch.setattr(moving, "DEADLINE_SLACK_S", 0.05)
+    with bench(speedup=0.05) as motion:
         with pytest.raises(MotionFault, match="deadline"):
             motion.move_to(motion.config.to_pulses([10, 10, 10]), "x")
 

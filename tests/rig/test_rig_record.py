@@ -27,7 +27,7 @@ def test_a_record_without_a_file_is_empty_and_says_what_to_do(tmp_path):
     text = record.missing(CONFIG)
     assert "not IDENTIFIED" in text and "it never was" in text
     assert text.index("scan") < text.index("home") < text.index("axes")
-    assert record.left() == {} and not (tmp_path / "device.json").exists()
+    assert record.left() == ({}, []) and not (tmp_path / "device.json").exists()
 
 
 def test_states_are_kept_on_the_disk(record):
@@ -98,13 +98,13 @@ def test_a_fingerprint_is_the_same_once_it_was_json():
 
 def test_where_the_drives_were_left(record):
     record.left_at((10, None, -3))
-    assert DeviceRecord.load(record.path).left() == {
+    assert DeviceRecord.load(record.path).left()[0] == {
         "pitch": 10,
         "yaw": None,
         "roll": -3,
     }
     record.left_at()
-    assert set(DeviceRecord.load(record.path).left().values()) == {None}
+    assert set(DeviceRecord.load(record.path).left()[0].values()) == {None}
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"schema": 2}', "\x00"])

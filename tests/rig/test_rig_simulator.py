@@ -12,7 +12,7 @@ from rig.config import parse_config
 from rig.core.bus import Bus
 from rig.core.drive import Drive
 from rig.simulator import Simulator, Truth, truth_of
-from rig.simulator.drive import COMM_ALARM, Habits, SimDrive
+from rig.simulator.drive import COMM_ALARM, SimDrive
 
 STILL = {"noise_deg": 0.0}
 
@@ -87,10 +87,10 @@ def test_homing_finds_the_origin_again_and_power_loss_forgets_it():
         assert not axis.map.homed.holds(drive.status().word)
 
 
-def drive_of(habits, register_map="generic"):
+def drive_of(truth, register_map="generic"):
     text = fast_text({'map = "leadshine_pr"': f'map = "{register_map}"'})
     axis = parse_config(text).axes[0]
-    return axis.map, SimDrive(axis.map, 10000, habits=habits)
+    return axis.map, SimDrive(axis, truth=truth)
 
 
 def flags(register_map, drive):
@@ -101,7 +101,7 @@ def flags(register_map, drive):
 def test_enabling_and_resetting_take_their_time(monkeypatch):
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    register_map, drive = drive_of(Habits(enable_delay_s=0.5, reset_delay_s=0.3))
+    register_map, drive = drive_of(Truth(enable_delay_s=0.5, reset_delay_s=0.3))
     (enable,), (reset,) = register_map.enable.write, register_map.alarm_reset.write
     assert not flags(register_map, drive)["enabled"]
     drive.write(enable.address, [1])
@@ -117,7 +117,7 @@ def test_enabling_and_resetting_take_their_time(monkeypatch):
 
 
 def test_the_position_of_a_standing_drive_flickers_by_a_count():
-    register_map, drive = drive_of(Habits(jitter_counts=1))
+    register_map, drive = drive_of(Truth(jitter_counts=1))
     seen = {tuple(drive.read(register_map.position.address, 2)) for _ in range(200)}
     assert seen == {(0xFFFF, 0xFFFF), (0, 0), (0, 1)}
     assert drive.position == 0
@@ -127,7 +127,7 @@ def test_the_position_of_a_standing_drive_flickers_by_a_count():
 def test_an_idle_watchdog_alarms_on_a_silent_line(idle, monkeypatch):
     now = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    register_map, drive = drive_of(Habits(idle_watchdog=idle))
+    register_map, drive = drive_of(Truth(idle_watchdog=idle))
     drive.write(register_map.comm_timeout.write[0].address, [800])
     now[0] += 0.7
     assert not flags(register_map, drive)["fault"]
@@ -168,7 +168,7 @@ def test_a_drive_ends_on_its_target_and_never_passes_it(monkeypatch):
     monkeypatch.setattr("rig.simulator.drive.time", clock)
     axis = fast_config().axes[0]
     for target in rng.integers(100, 8000, 60):
-        drive = SimDrive(axis.map, axis.pulses_per_rev, speedup=3.0)
+        drive = SimDrive(axis, speedup=3.0)
         drive._speed = axis.speed_deg_s * axis.pulses_per_deg
         drive._accel = axis.accel_deg_s2 * axis.pulses_per_deg
         drive.target, drive.moving, drive.done = int(target), True, False

@@ -174,7 +174,7 @@ def test_drives_that_are_not_where_they_were_left_have_lost_their_place(
         config = sim.start()
         record = commissioned(config, tmp_path)
         code, _ = run_verify(config, calibrated, tmp_path / "a", sim, record)
-        assert code == 0 and len(record.left()) == 3
+        assert code == 0 and len(record.left()[0]) == 3
         sim.power_cycle((0.0, LOST, 0.0))
         moves = sim.executions()
         code, said = run_verify(config, calibrated, tmp_path / "b", sim, record)
@@ -287,7 +287,7 @@ def test_a_zero_by_the_drives_is_compared_with_the_last_one(tmp_path):
             )
             run.listeners.append(sim.answer)
             assert run_safely(run, lambda r: collect(r, 1)) == 0
-            record.forget_left()
+            record._left = {}
             sim.power_cycle((0.0, 0.0, LOST))
     assert sum("WARNING: the zero posture is not that of" in t for t in said) == 1
     assert record.state(ZEROED)["pulses"] == [0, 0, 0]
@@ -448,12 +448,12 @@ def test_while_armed_the_place_of_the_drives_is_not_known(tmp_path):
 
         def look(run, phase):
             if phase == "moving":
-                seen.append(DeviceRecord.load(tmp_path / "device.json").left())
+                seen.append(DeviceRecord.load(tmp_path / "device.json").left()[0])
 
         assert session(served, tmp_path, sim, listeners=[look]) == 0
         positions = [round(drive.position) for drive in sim.drives]
     assert seen and all(set(each.values()) == {None} for each in seen)
-    left = DeviceRecord.load(tmp_path / "device.json").left()
+    left = DeviceRecord.load(tmp_path / "device.json").left()[0]
     assert list(left.values()) == positions
 
 

@@ -13,7 +13,7 @@ from test_rig_motion import bench
 
 from rig.config import load_config, parse_config
 from rig.config.config import EXAMPLES
-from rig.config.registers import decode
+from rig.config.maps import decode
 from rig.core import stop
 from rig.core.device import timeouts_left
 from rig.core.faults import MotionFault

@@ -171,21 +171,6 @@ def test_the_affine_problem_is_that_of_its_kronecker_blocks(seed, m):
     assert m * counted.log_det == pytest.approx(affine.log_det, abs=1e-9)
 
 
-def test_the_hull_is_used_wherever_rows_lie_in_a_plane():
-    candidates = np.random.default_rng(0).random((30, 3))
-    rows = Affine(3, 3).blocks(candidates)
-    mapped = rows @ np.random.default_rng(1).normal(size=(4, 4))
-    assert make_problem(candidates, 4).simplex
-    assert make_block_problem(mapped, 4).simplex
-    assert not make_problem(candidates, 5).simplex
-    assert not make_block_problem(rows, 4, prior=np.eye(4)).simplex
-    assert not make_block_problem(
-        np.random.default_rng(1).normal(size=(9, 1, 4))
-    ).simplex
-    found = select(blocks=mapped, k=4, method="exact")
-    assert set(found.indices) == set(select(candidates, 4, "exact").indices)
-
-
 def test_offsets_lose_no_digits():
     rng = np.random.default_rng(0)
     pulses = rng.integers(0, 1000, (14, 2)).astype(float)

@@ -15,11 +15,10 @@ import numpy as np
 import pytest
 
 from jaxcal.extras import MissingExtraError
-from jaxcal.information.regression import log_det_gram
 from jaxcal.learning.core import network as networks
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies import decoding
-from jaxcal.learning.policies.build import build
+from jaxcal.learning.policies.compact import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.training import checkpoint
@@ -76,11 +75,12 @@ def test_the_picks_are_those_of_jax(rng, m, n, k, masked, required, how):
     number = 20 if m > 1000 else 200
     problems, sets, available, kept = drawn(rng, number, m, n, k, masked, required)
     policy = checkpoint.load()
-    expected = np.asarray(
-        decoding.choose(
+    with jax.enable_x64(True):  # in float32 it picks another of two near ties
+        double = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), policy.params)
+        expected = decoding.choose(
             policy.network,
-            policy.params,
-            jnp.asarray(whitened(problems), jnp.float32),
+            double,
+            jnp.asarray(whitened(problems)),
             jnp.asarray(available),
             jnp.asarray(kept, jnp.int32),
             jax.random.key(0),
@@ -89,18 +89,12 @@ def test_the_picks_are_those_of_jax(rng, m, n, k, masked, required, how):
             decoding=how,
             num=4,
         )
-    )
     found = select_batch(
         sets, k, available=available, required=kept, decoding=how, num=4
     )
     np.testing.assert_array_equal(found[:, :required], kept)
     # The last two are one pair: rounding decides which of them is named first.
-    same = (np.sort(found, axis=1) == np.sort(expected, axis=1)).all(axis=1)
-    value, other = (
-        log_det_gram(np.take_along_axis(sets, picks[..., None], axis=1))
-        for picks in (found, expected)
-    )
-    assert (same | (abs(value - other) < 1e-6)).mean() >= 0.995
+    np.testing.assert_array_equal(np.sort(found), np.sort(expected))
 
 
 VARIANTS = [

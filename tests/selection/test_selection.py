@@ -447,23 +447,11 @@ class Frame:
         return np.asarray(self.values, dtype=dtype)
 
 
-def test_a_data_frame_keeps_its_labels(monkeypatch):
+def test_a_data_frame_keeps_its_labels():
     found = select(Frame(uniform(0)), 4)
     assert found.labels == tuple(f"p{i}" for i in found.indices)
     assert str(found).splitlines()[1].split()[2:] == ["pitch", "yaw", "roll"]
     assert score(Frame(uniform(0)), found.indices).labels == found.labels
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ImportError, match=r"to_frame needs pandas, .* pip install"):
-        found.to_frame()
-
-
-def test_to_frame_is_a_row_for_each_chosen():
-    pandas = pytest.importorskip("pandas")
-    given = pandas.DataFrame(uniform(0), columns=["a", "b", "c"]).rename("p{}".format)
-    found = select(given, 4)
-    frame = found.to_frame()
-    assert list(frame.columns) == ["index", "a", "b", "c"]
-    np.testing.assert_array_equal(frame[["a", "b", "c"]], given.loc[frame.index])
 
 
 def test_rooms_are_there_after_the_import_alone():

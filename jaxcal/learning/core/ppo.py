@@ -38,7 +38,6 @@ __all__ = [
     "normalised",
     "placed",
     "schedule",
-    "squared_error",
     "surrogate",
 ]
 
@@ -141,7 +140,9 @@ def surrogate(
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1.0 - config.clip_range, 1.0 + config.clip_range)
     gain = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
-    error = squared_error(value - batch.target, config.value_error_limit)
+    # Beyond the limit a line: it has a gradient however wrong a value is.
+    limit = config.value_error_limit
+    error = 2.0 * optax.losses.huber_loss(value, batch.target, delta=limit)
     metrics = {
         "policy_loss": -gain.mean(),
         "value_loss": error.mean(),
@@ -152,17 +153,6 @@ def surrogate(
     bonus = (1.0 - share) * config.entropy_start + share * config.entropy_end
     loss = metrics["policy_loss"] + config.value_coefficient * metrics["value_loss"]
     return loss - bonus * metrics["entropy"], metrics
-
-
-def squared_error(error: jax.Array, limit: float) -> jax.Array:
-    """The square of an error, beyond ``limit`` going on as a line: twice Huber's loss.
-
-    Unlike the square of a clipped error it has a gradient however wrong a value is.
-    (``optax.losses.huber_loss`` cancels large numbers in its gradient.)
-    """
-    size = jnp.abs(error)
-    near = jnp.minimum(size, limit)
-    return near * (2.0 * size - near)
 
 
 @struct.dataclass

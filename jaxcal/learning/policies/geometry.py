@@ -22,9 +22,7 @@ __all__ = [
     "whiten",
 ]
 
-_ALL_START = 1024  # candidates up to which every one is looked ahead from
-_STARTS = 512  # of more candidates, those of largest gain that are
-_LOWEST = -30.0  # log-volume of a candidate that is not active or no start
+_LOWEST = -30.0  # log-volume of a candidate that is not active
 _LEAST_GAIN = 1e-5  # of a whitened vector: below it float32 shows the rounding of zero
 
 
@@ -63,27 +61,48 @@ def projected(x: jax.Array, chosen: jax.Array) -> jax.Array:
     Returns:
         (..., M, p); squared lengths are the Schur-complement gains.
     """
-    # Component by component: XLA's CPU backend (jaxlib 0.10.2) computes the reduction
-    # form wrongly where x is shared by a vmapped axis and chosen is not.
     p = x.shape[-1]
     rest = [x[..., i] for i in range(p)]
-    basis: list[list[jax.Array]] = []
+    for e, _ in _orthogonal(chosen):
+        wide = [b[..., None] for b in e]
+        along = _dot(rest, wide)
+        rest = [a - along * b for a, b in zip(rest, wide, strict=True)]
+    return jnp.stack(rest, axis=-1)
+
+
+def log_det_lengths(chosen: jax.Array) -> jax.Array:
+    """Log of the squared volume that up to p chosen vectors span.
+
+    Args:
+        chosen: (..., c, p), c <= p.
+
+    Returns:
+        (...,) 0 where nothing is chosen.
+    """
+    squares = [jnp.log(jnp.maximum(square, 1e-9)) for _, square in _orthogonal(chosen)]
+    return sum(squares, jnp.zeros(chosen.shape[:-2], chosen.dtype))
+
+
+def _orthogonal(chosen: jax.Array) -> list[tuple[list[jax.Array], jax.Array]]:
+    """Unit vectors that span the chosen (..., c, p), and the square of what was left.
+
+    A vector in the span of those before it becomes zero. Component by component: XLA's
+    CPU backend (jaxlib 0.10.2) computes the reduction form wrongly where one side is
+    shared by a vmapped axis and the other is not.
+    """
+    basis: list[tuple[list[jax.Array], jax.Array]] = []
     for j in range(chosen.shape[-2]):
-        v = [chosen[..., j, i] for i in range(p)]
+        v = [chosen[..., j, i] for i in range(chosen.shape[-1])]
         scale = _dot(v, v)
-        for e in basis:
+        for e, _ in basis:
             along = _dot(v, e)
             v = [a - along * b for a, b in zip(v, e, strict=True)]
         square = _dot(v, v)
         independent = square > 1e-9 * scale
         factor = jax.lax.rsqrt(jnp.where(independent, square, 1.0))
         factor = jnp.where(independent, factor, 0.0)
-        basis.append([a * factor for a in v])
-    for e in basis:
-        wide = [b[..., None] for b in e]
-        along = _dot(rest, wide)
-        rest = [a - along * b for a, b in zip(rest, wide, strict=True)]
-    return jnp.stack(rest, axis=-1)
+        basis.append(([a * factor for a in v], square))
+    return basis
 
 
 def _dot(a: list[jax.Array], b: list[jax.Array]) -> jax.Array:
@@ -136,10 +155,7 @@ def lookahead(
         ``depth`` arrays (..., M): the log of the factor by which the determinant grows
         over the first 1, 2, ... choices; -30 where not active. The first is the gain.
         The second is the gain of the best pair, exactly; later ones are what greedy
-        choices reach. Cost: ``depth - 1`` products of (S, p) with (p, M) from S starts.
-        Of more than 1,024 candidates only the 512 of largest gain are starts; the
-        others have -30 after the first choice. (A member of the best set has a large
-        gain of its own; memory and time then grow with M and not with its square.)
+        choices reach. Cost: ``depth - 1`` products of (M, p) with (p, M).
     """
     m = y.shape[-2]
     base = 1.0 if spanned else 0.0
@@ -149,19 +165,10 @@ def lookahead(
     if depth == 1:
         return values
     # For every start i (axis -2): the gains of all j (axis -1) after its choices.
-    number = m if m <= _ALL_START else _STARTS
-    shape = (*square.shape[:-1], number, m)
-    if number < m:
-        starts = jax.lax.top_k(values[0], number)[1]
-        itself = jax.nn.one_hot(starts, m, dtype=bool)
-        picked = jnp.take_along_axis(y, starts[..., None], axis=-2)
-        start_active = jnp.take_along_axis(active, starts, axis=-1)
-        reached = jnp.take_along_axis(values[0], starts, axis=-1)
-    else:
-        itself = jnp.broadcast_to(jnp.eye(m, dtype=bool), shape)
-        picked, start_active, reached = y, active, values[0]
-    # ``picked`` (..., S, p): the newest choice of each start, as it was when chosen.
+    shape = (*square.shape, m)
+    picked, reached = y, values[0]  # (..., M, p): the newest choice of each start
     gains = jnp.broadcast_to(square[..., None, :], shape)
+    itself = jnp.broadcast_to(jnp.eye(m, dtype=bool), shape)
     rest = jnp.broadcast_to(active[..., None, :], shape) & ~itself
     along: list[tuple[jax.Array, jax.Array]] = []  # directions, and how far they shrink
     for _ in range(1, depth):
@@ -184,14 +191,8 @@ def lookahead(
         step = jnp.log(jnp.maximum(base + gain, _LEAST_GAIN))
         which = jax.nn.one_hot(best, m, dtype=bool)
         rest = rest & ~which
-        reached = jnp.where(start_active, reached + step, _LOWEST)
-        if number < m:
-            nothing = jnp.full_like(values[0], _LOWEST)
-            values.append(
-                jnp.put_along_axis(nothing, starts, reached, axis=-1, inplace=False)
-            )
-        else:
-            values.append(reached)
+        reached = jnp.where(active, reached + step, _LOWEST)
+        values.append(reached)
         picked = jnp.einsum(
             "...ij,...jp->...ip",
             which.astype(y.dtype),
@@ -202,25 +203,3 @@ def lookahead(
             overlap = (picked * before).sum(-1) * shrink
             picked = picked - overlap[..., None] * before
     return values
-
-
-def log_det_lengths(chosen: jax.Array) -> jax.Array:
-    """Log of the squared volume that up to p chosen vectors span.
-
-    Args:
-        chosen: (..., c, p), c <= p.
-
-    Returns:
-        (...,) 0 where nothing is chosen.
-    """
-    total = jnp.zeros(chosen.shape[:-2], chosen.dtype)
-    basis: list[list[jax.Array]] = []
-    for j in range(chosen.shape[-2]):
-        v = [chosen[..., j, i] for i in range(chosen.shape[-1])]
-        for e in basis:
-            along = _dot(v, e)
-            v = [a - along * b for a, b in zip(v, e, strict=True)]
-        square = jnp.maximum(_dot(v, v), 1e-9)
-        total = total + jnp.log(square)
-        basis.append([a * jax.lax.rsqrt(square) for a in v])
-    return total

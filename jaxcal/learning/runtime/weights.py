@@ -113,7 +113,10 @@ def nested(arrays: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write(path: str | pathlib.Path, weights: Weights) -> None:
-    """Write a weights file atomically."""
+    """Write a weights file, NAME.npz, atomically; one that is there is replaced."""
+    if not str(path).endswith(".npz"):
+        raise ValueError(f"the policy is exported to one file NAME.npz, got {path}")
+    pathlib.Path(path).parent.mkdir(parents=True, exist_ok=True)
     header = {
         "format": _FORMAT,
         "version": _VERSION,

@@ -3,9 +3,8 @@
 A run's folder ``checkpoint`` holds one numbered folder a save. Each has ``policy`` (the
 averaged weights), ``state`` (what else an uninterrupted run would need) and ``meta``
 (JSON: schema, configuration, package versions, progress). Orbax writes a step beside
-the others and renames it, so a kill during a save leaves the previous one. ``export``
-writes the policy alone to a weights file (``runtime.weights``), which is what ships and
-what a rig reads without JAX.
+the others and renames it, so a kill during a save leaves the previous one. A policy
+alone is one weights file (``runtime.weights``): what ships, and what a rig reads.
 
 orbax calls this interface legacy and its successor is still experimental; it is used
 here alone, so that changing it touches one file.
@@ -16,20 +15,19 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import datetime
-import importlib.metadata
 import json
 import logging
 import pathlib
-import platform
 from typing import Any
 
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
+from jaxcal.extras import versions
 from jaxcal.learning.core.network import Network, initial
 from jaxcal.learning.core.ppo import TrainState
-from jaxcal.learning.policies.build import build
+from jaxcal.learning.policies.compact import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.weights import CheckpointError, Weights, locate
@@ -38,10 +36,7 @@ __all__ = [
     "SCHEMA",
     "CheckpointError",
     "Policy",
-    "export",
-    "fingerprint",
     "load",
-    "package_versions",
     "read",
     "read_meta",
     "restore",
@@ -50,7 +45,6 @@ __all__ = [
 
 SCHEMA = "jaxcal-policy"
 VERSION = 2
-_PACKAGES = ("jaxcal", "jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy")
 
 # orbax warns of every default it takes, on every load.
 logging.getLogger("absl").setLevel(logging.ERROR)
@@ -68,17 +62,6 @@ class Policy:
     def weights(self) -> Weights:
         """As plain arrays."""
         return Weights(self.meta["network"], weights.flat(self.params), self.meta)
-
-
-def package_versions() -> dict[str, str]:
-    """Versions of what a result depends on."""
-    versions = {"python": platform.python_version()}
-    for name in _PACKAGES:
-        try:
-            versions[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    return versions
 
 
 def _alone() -> Any:
@@ -112,7 +95,7 @@ def save(
     root.mkdir(parents=True, exist_ok=True)
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     own: dict[str, Any] = {"schema": SCHEMA, "version": VERSION}
-    meta = own | {"created": now, "versions": package_versions()} | meta
+    meta = own | {"created": now, "versions": versions()} | meta
     trees = {"policy": policy} | ({} if state is None else {"state": _rest(state)})
     # Arrays of the host, which know no device; nothing is written twice.
     items = {
@@ -280,32 +263,6 @@ def read(path: pathlib.Path, meta: dict[str, Any], like: Any) -> Any:
                 f"checkpoint {path} holds weights that are not finite, in {name}"
             )
     return params
-
-
-def fingerprint(checkpoint: str | pathlib.Path | None = None) -> str:
-    """SHA-256 of a policy's network and weights, the same wherever it lies.
-
-    Raises:
-        CheckpointError: see ``load``.
-    """
-    return load(checkpoint).weights.fingerprint
-
-
-def export(policy: Weights, path: str | pathlib.Path) -> None:
-    """Write a policy alone to a weights file, atomically.
-
-    Args:
-        policy: of a run.
-        path: of the file, ending in ``.npz``; one that is there is replaced.
-
-    Raises:
-        ValueError: the path has another ending.
-    """
-    target = pathlib.Path(path)
-    if target.suffix != ".npz":
-        raise ValueError(f"the policy is exported to one file NAME.npz, got {path}")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    weights.write(target, policy)
 
 
 def restore(

@@ -18,11 +18,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from flax import struct
 
 from jaxcal.learning.core.network import decode, encode, mask_logits
 from jaxcal.learning.core.postures import Postures
-from jaxcal.learning.core.ppo import Metrics, squared_error
+from jaxcal.learning.core.ppo import Metrics
 
 __all__ = ["Imitation", "Lesson", "Lessons", "Teacher", "draw"]
 
@@ -172,9 +173,10 @@ class Imitation:
             return (array * attempt.weight).mean()
 
         error = self.postures.task.value_scale * (value - attempt.best[:, None])
+        square = 2.0 * optax.losses.huber_loss(error, delta=config.value_error_limit)
         metrics = {
             "policy_loss": -mean(jax.nn.logsumexp(hopes, axis=-1)),
-            "value_loss": mean(squared_error(error, config.value_error_limit)),
+            "value_loss": mean(square),
             "entropy": mean(-(jnp.exp(log_probs) * log_probs).sum(-1)),
         }
         value_loss = config.value_coefficient * metrics["value_loss"]

@@ -37,7 +37,7 @@ _COLUMNS = ("a", "alpha", "d", "theta", "beta")
 # 1.7 degrees of the base and the tool.
 _LENGTH, _TWIST, _ZERO = 1.5e-3, 0.3, 0.5  # share of the links' length; degrees
 _GEAR, _SAG = 5e-3, 0.5  # ratio; degrees under the largest torque
-_WAVES, _WAVE = ("sin", "cos", "sin2", "cos2"), 0.05  # of gears; degrees
+_WAVES, _WAVE = ("sin", "cos", "sin2", "cos2"), 0.015  # of gears; degrees
 _MOUNTING, _MOUNTING_ANGLE = 0.1, 1.7
 
 

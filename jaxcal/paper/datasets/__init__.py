@@ -1,7 +1,6 @@
 """The paper's Datasets 0 to 5 (Table 3): drawn, simulated and recorded.
 
-``python -m jaxcal.paper.datasets --out DIR`` writes them all, each with a data card;
-``python -m jaxcal.paper.datasets.record`` records 4 and 5 against the rig's simulator.
+``python -m jaxcal.paper.datasets --out DIR`` writes them all, each with a data card.
 """
 
 from jaxcal.paper.constants import BIAS_DEG, SCALE

@@ -2,36 +2,68 @@
 
 from __future__ import annotations
 
-import argparse
+import dataclasses
+import hashlib
+import importlib.metadata
 import json
 import pathlib
+import platform
 import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from jaxcal.arguments import Parser
+import numpy as np
+
+from jaxcal.arguments import Parser, at_least, exit_code, flag, several
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.dataset_files import save_csv_parts, save_npz
 from jaxcal.files import require_writable_folder, write_text
-from jaxcal.paper import command
-from jaxcal.paper.constants import BLOCK, EPISODES, NAMES
-from jaxcal.paper.datasets.data_card import card_of, digest_of, page_of
-from jaxcal.paper.datasets.datasets import make_dataset
+from jaxcal.paper.constants import (
+    AXES,
+    BIAS_DEG,
+    BLOCK,
+    EPISODES,
+    NAMES,
+    NOISE_STD_DEG,
+    RECORDED,
+    SCALE,
+)
+from jaxcal.paper.datasets.datasets import dataset0_robot, make_dataset
+from jaxcal.paper.datasets.recordings import SHIPPED
 from jaxcal.progress import Progress
 
 __all__ = ["main", "write_datasets"]
 
 _DESCRIPTION = """\
 Write the paper's Datasets 0 to 5 to a folder: NAME.npz, NAME.csv and the data card
-NAME.json of each, and README.md, the cards as a page. dataset0 is simulated in MuJoCo
-(some seconds), dataset1 takes 240 MB as .npz and 670 MB as .csv, dataset4 and dataset5
-are made from recordings.
+NAME.json of each. dataset0 is simulated in MuJoCo (some seconds), dataset1 takes
+240 MB as .npz and 670 MB as .csv, dataset4 and dataset5 are made from recordings.
 """
+_FLAGS = (
+    flag("names", f"{', '.join(NAMES)}; all", "NAME", nargs="*"),
+    flag("--out", "folder to write to", "DIR", pathlib.Path, required=True),
+    flag("--seed", "of every dataset; 0", "S", at_least(0), default=0),
+    flag("--episodes", "at most the first N of each", "N", at_least(1)),
+    flag("--formats", "npz,csv", "LIST", several(str, "npz and csv"),
+         default=["npz", "csv"]),
+    flag("--recordings", "folder of dataset4.csv and dataset5.csv, your own; the "
+         "shipped ones", "DIR", pathlib.Path),
+    flag("--quiet", "no progress", on=True),
+)  # fmt: skip
+_WHAT = {
+    "dataset0": "the ideal robot of Table 1 driven open loop in MuJoCo, 50 postures of "
+    "one second per group, read at the end of each second",
+    "dataset1": "commands for training",
+    "dataset2": "commands for evaluation",
+    "dataset3": "y = diag(scale) u + bias of Table 1, with noise",
+    "dataset4": "drawn from a pool of recorded postures, without repeats in an episode",
+    "dataset5": "one recorded session",
+}
 
 
 def write_datasets(
     folder: pathlib.Path,
-    names: Sequence[str],
+    names: Sequence[str] = NAMES,
     seed: int = 0,
     *,
     episodes: int | None = None,
@@ -54,26 +86,31 @@ def write_datasets(
         OSError: the folder cannot be written, or a recording not be read.
         ValueError: of an argument or a recording.
     """
+    for what, given, known in (
+        ("names", names, NAMES),
+        ("formats", formats, ("npz", "csv")),
+    ):
+        if unknown := set(given) - set(known):
+            raise ValueError(
+                f"{what} must be of {', '.join(known)}, got {min(unknown)}"
+            )
     report = progress or Progress(quiet=True)
     folder.mkdir(parents=True, exist_ok=True)
-    written, cards = [], []
-    for name in names:
+    written = []
+    for name in dict.fromkeys(names):
         total = EPISODES[name] if episodes is None else min(episodes, EPISODES[name])
         data = make_dataset(name, seed, total, recordings=recordings, progress=report)
-        files = [folder / f"{name}.{kind}" for kind in formats]
+        files = [folder / f"{name}.{kind}" for kind in dict.fromkeys(formats)]
         for path in files:
             if path.suffix == ".npz":
                 save_npz(data, path)
             else:
                 save_csv_parts(_parts(data, f"write {path.name}", report), path)
-        digests = {path.name: digest_of(path) for path in files}
-        cards.append(card_of(data, digests, recordings=recordings))
-        files.append(folder / f"{name}.json")
-        write_text(files[-1], json.dumps(cards[-1], indent=2) + "\n")
-        written += files
+        card = folder / f"{name}.json"
+        write_text(card, json.dumps(_card(data, files, recordings), indent=2) + "\n")
+        written += [*files, card]
     report.clear()
-    write_text(folder / "README.md", page_of(cards))
-    return [*written, folder / "README.md"]
+    return written
 
 
 def _parts(data: Dataset, task: str, progress: Progress) -> Iterator[Dataset]:
@@ -82,47 +119,88 @@ def _parts(data: Dataset, task: str, progress: Progress) -> Iterator[Dataset]:
         yield data.part(begin, begin + BLOCK)
 
 
+def _card(
+    dataset: Dataset, files: Sequence[pathlib.Path], recordings: pathlib.Path | None
+) -> dict[str, Any]:
+    """Everything a reader of the files needs, without jaxcal."""
+    name, ranges = dataset.name, dataset.ranges
+    assert ranges is not None  # all of the paper's have them
+    normalised = "1; command in degrees = low + value * (high - low)"
+    units = {"candidates": ("u", normalised), "measured": ("y", "degrees")}
+    arrays = {
+        key: {
+            "shape": list(getattr(dataset, key).shape),
+            "dtype": "float64",
+            "unit": unit,
+            "axes": list(AXES),
+            "csv_columns": [f"{letter}_{axis}" for axis in "xyz"],
+        }
+        for key, (letter, unit) in units.items()
+        if getattr(dataset, key) is not None
+    }
+    ends = np.stack([ranges.low, ranges.high], axis=1).tolist()
+    digests = {}
+    for path in files:
+        with path.open("rb") as file:
+            digests[path.name] = hashlib.file_digest(file, "sha256").hexdigest()
+    card: dict[str, Any] = {
+        "schema": 1,
+        "name": name,
+        "what": _WHAT[name],
+        "episodes": dataset.num_episodes,
+        "candidates_per_episode": dataset.num_candidates,
+        "arrays": arrays,
+        "ranges_deg": dict(zip(AXES, ends, strict=True)),
+        "distribution": "uniform within the ranges, independent",
+        "seed": dataset.seed,
+        "files": digests,
+        "command": f"python -m jaxcal.paper.datasets --out DIR --seed {dataset.seed} "
+        f"{name}",
+        "made_with": {p: importlib.metadata.version(p) for p in ("jaxcal", "numpy")}
+        | {"python": platform.python_version()},
+    }
+    if name in ("dataset0", "dataset3"):
+        kind = "white Gaussian on every output"
+        card["noise"] = {"kind": kind, "std_deg": NOISE_STD_DEG}
+        card["truth"] = {
+            "scale": dict(zip(AXES, SCALE.tolist(), strict=True)),
+            "bias_deg": dict(zip(AXES, BIAS_DEG.tolist(), strict=True)),
+        }
+    if name == "dataset0":
+        from jaxcal.paper.twin import HOLD_S
+
+        card["made_with"]["mujoco"] = importlib.metadata.version("mujoco")
+        card["simulation"] = {
+            "seconds_per_posture": HOLD_S,
+            "timestep_s": dataset0_robot().timestep_s,
+            "robot": dataclasses.asdict(dataset0_robot()),
+        }
+    if name in RECORDED:
+        place = "shipped with jaxcal" if recordings is None else str(recordings)
+        card["recording"] = {"file": place, "sha256": dataset.sha256}
+        held = (recordings or SHIPPED) / f"{name}.json"
+        if held.is_file():
+            card["recording"]["card"] = json.loads(held.read_text(encoding="utf-8"))
+    return card
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Write; the exit code."""
-    options = vars(_parser().parse_args(arguments))
-    folder, names = options.pop("out"), list(dict.fromkeys(options.pop("names")))
+    parser = Parser(prog="python -m jaxcal.paper.datasets", description=_DESCRIPTION)
+    options = vars(parser.with_flags(_FLAGS).parse_args(arguments))
+    folder, names = options.pop("out"), options.pop("names") or NAMES
     progress = Progress(quiet=options.pop("quiet"))
 
     def write() -> None:
         require_writable_folder(folder)
         try:
-            files = write_datasets(folder, names or NAMES, progress=progress, **options)
+            files = write_datasets(folder, names, progress=progress, **options)
         finally:
             progress.clear()
         for file in files:
             print(f"saved: {file}")
 
-    return command.run(write, "datasets", "each file in the folder is complete")
-
-
-def _formats(text: str) -> list[str]:
-    kinds = list(dict.fromkeys(text.split(",")))
-    if set(kinds) - {"npz", "csv"}:
-        raise argparse.ArgumentTypeError(f"must be npz, csv or both, got {text!r}")
-    return kinds
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = Parser(prog="python -m jaxcal.paper.datasets", description=_DESCRIPTION)
-    add = parser.add_argument
-    folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
-    name = command.one_of(NAMES)
-    add("names", nargs="*", type=name, metavar="NAME", help=f"{', '.join(NAMES)}; all")
-    add("--out", required=True, **folder)
-    add("--seed", type=command.seed, default=0, metavar="S", help="of every dataset; 0")
-    size: dict[str, Any] = {"type": command.positive, "metavar": "N"}
-    add("--episodes", help="at most the first N of each", **size)
-    kinds: dict[str, Any] = {"type": _formats, "default": "npz,csv"}
-    add("--formats", metavar="LIST", help="npz,csv", **kinds)
-    about = "folder of dataset4.csv and dataset5.csv, your own; the shipped ones"
-    add("--recordings", help=about, **folder)
-    add("--quiet", action="store_true", help="no progress")
-    return parser
+    return exit_code(write, "datasets", "each file in the folder is complete")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ dataset5           1  50    6  recorded on the rig, in a session of its own
 Commands are uniform within ``RANGES`` and stored normalised to [0, 1], as in the paper.
 The outputs of dataset3 are ``y = diag(scale) u + bias`` (Table 1) of the commands in
 degrees, with white Gaussian noise of ``NOISE_STD_DEG`` on every output; those of
-dataset0 are what the robot of ``jaxcal.paper.twin.robot_model`` reads after a second at
+dataset0 are what the robot of ``jaxcal.paper.twin`` reads after a second at
 each posture, with the same noise. ``recordings`` reads what 4 and 5 are made from.
 
 Every block of 1,000 episodes of every simulated dataset (every group of dataset0) has a
@@ -49,7 +49,7 @@ from jaxcal.paper.constants import (
 from jaxcal.paper.datasets.recordings import recorded_dataset
 
 if TYPE_CHECKING:
-    from jaxcal.paper.twin.robot import RobotConfig
+    from jaxcal.paper.twin import RobotConfig
 
 __all__ = ["DRAWN", "chunks", "dataset0_robot", "drawn", "make_dataset"]
 
@@ -169,7 +169,7 @@ def _streams(
 
 def _simulated(seed: int, total: int, progress: Progress) -> Dataset:
     """Dataset0: groups of postures driven in MuJoCo, each with a stream of its own."""
-    from jaxcal.paper.twin.robot_model import simulate
+    from jaxcal.paper.twin import simulate
 
     shape = (NUM_CANDIDATES, 3)
     streams = [_streams("dataset0", seed, group) for group in range(total)]
@@ -181,6 +181,6 @@ def _simulated(seed: int, total: int, progress: Progress) -> Dataset:
 
 def dataset0_robot() -> RobotConfig:
     """The ideal robot of Table 1."""
-    from jaxcal.paper.twin.robot import RobotConfig
+    from jaxcal.paper.twin import RobotConfig
 
     return RobotConfig(tuple(SCALE), tuple(BIAS_DEG))

@@ -10,7 +10,6 @@ cdef class Search:
     cdef double[:, ::1] best_counts  # (best, M)
     cdef double[::1] best_values  # (best,)
     cdef double[::1] room  # which holds all that is a pointer below
-    cdef Py_ssize_t used  # of the room
     cdef int most_moved  # counts of a Newton step
     cdef double* blocks  # (M, q, p)
     cdef double* prior  # (p, p)
@@ -49,6 +48,8 @@ cdef class Search:
     cdef double cut  # the multiplier of the bound
     cdef double* leverage  # (M,)
     cdef double* wish  # (M,)
+    cdef Py_ssize_t[::1] open  # (M,) counts that are not fixed, of which ``opened`` count
+    cdef Py_ssize_t opened
     cdef Py_ssize_t[::1] which  # (m,) counts that a Newton step moves
     cdef Py_ssize_t[::1] free
     cdef int[::1] side
@@ -67,8 +68,7 @@ cdef class Search:
     cdef double* right  # (2, m)
     cdef double* node  # (3, M)
     cdef Watch watch
-    cdef double* _take(self, Py_ssize_t count) noexcept
-    cdef void _lay_out(self) noexcept
+    cdef Py_ssize_t _lay_out(self, double* room) noexcept
     cdef void _sum(self, const double* low, const double* counts, const double* start, double* gram) noexcept nogil
     cdef double _evaluate(self, int kind) noexcept nogil
     cdef double _covariance(self, bint det, double* root, int s, double* gradient) noexcept nogil
@@ -82,7 +82,7 @@ cdef class Search:
     cdef void _turn(self, int m, double* matrix, bint turn) noexcept nogil
     cdef void _hessian(self, int kind, int m) noexcept nogil
     cdef void _spectral_hessian(self, int m) noexcept nogil
-    cdef void _leverages(self, const double* low, const double* high) noexcept nogil
+    cdef void _leverages(self) noexcept nogil
     cdef double _linear_gain(self, const double* low, const double* high, const double* c) noexcept nogil
     cdef int _working_set(self, const double* low, const double* high, const double* c) noexcept nogil
     cdef double _solve(self, int m, int size) noexcept nogil

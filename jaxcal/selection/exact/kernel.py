@@ -58,6 +58,7 @@ from cython.cimports.jaxcal.information.linear_algebra import (
     eigen,
     factor,
     multiply,
+    take,
 )
 from cython.cimports.jaxcal.watch import begin, late
 from cython.cimports.libc.math import INFINITY, exp, fabs, floor, log, log1p, sqrt
@@ -107,51 +108,45 @@ class Search:
         self.most_moved = min(self.count, _FRACTIONAL + 2 * self.p + 4)
         self.whole = np.empty(3 + 5 * self.p, dtype=np.intc)
         self.which, self.free = np.empty((2, self.most_moved), dtype=np.intp)
+        self.open = np.empty(self.count, dtype=np.intp)
         self.side = np.empty(self.most_moved, dtype=np.intc)
-        self._lay_out()
-        self.room = np.zeros(self.used)
-        self._lay_out()
+        self.room = np.zeros(self._lay_out(cython.NULL))
+        self._lay_out(cython.address(self.room[0]))
         given: cython.double[::1] = np.concatenate(
             [blocks.ravel(), prior.ravel(), root.ravel()]
         )
         copy(self.blocks, cython.address(given[0]), given.shape[0])
 
-    def _take(self, count):
-        """Where the next ``count`` numbers of the room are."""
-        self.used += count
-        if self.room is None:
-            return cython.NULL
-        return cython.address(self.room[0]) + (self.used - count)
-
-    def _lay_out(self):
-        """Share the room out; before there is one, count how much is needed."""
+    def _lay_out(self, room):
+        """Share the room out, and how many numbers that takes; of NULL only that."""
+        at, first = cython.address(room), room
         p, m, square = self.p, self.most_moved, self.p * self.p
         wide: cython.Py_ssize_t = m * self.q
         crossed = max(wide * wide, m * p * (p + 1) // 2)
-        self.used = 0
-        self.blocks = self._take(self.count * self.q * p)  # as given, in this order
-        self.prior, self.root = self._take(square), self._take(self.s * p)
-        self.known, self.rest = self._take(square), self._take(square)
-        self.gram, self.gradient = self._take(square), self._take(square)
-        self.inverse, self.other = self._take(square), self._take(square)
-        self.half, self.basis = self._take(square), self._take(square)
-        self.bend, self.lines = self._take(square), self._take(square)
-        self.share, self.vectors = self._take(square), self._take(square)
-        self.reach, self.scaled = self._take(square), self._take(square)
-        self.small, self.spare = self._take(square), self._take(square)
-        self.values, self.slopes = self._take(p), self._take(p)
-        self.own, self.tail = self._take(p), self._take(p)
-        self.weights = self._take(p)
-        self.lapack = self._take(1 + 6 * p + 2 * square)
-        self.leverage, self.wish = self._take(self.count), self._take(self.count)
-        self.picked, self.turned = self._take(wide * p), self._take(wide * p)
-        self.crossed, self.bent = self._take(crossed), self._take(crossed)
-        self.curvature, self.face = self._take(m * m), self._take(m * m)
-        self.ends, self.move = self._take(m), self._take(m)
-        self.before, self.slope = self._take(m), self._take(m)
-        self.least, self.most = self._take(m), self._take(m)
-        self.right = self._take(2 * m)
-        self.node = self._take(3 * self.count)
+        self.blocks = take(at, self.count * self.q * p)  # as given, in this order
+        self.prior, self.root = take(at, square), take(at, self.s * p)
+        self.known, self.rest = take(at, square), take(at, square)
+        self.gram, self.gradient = take(at, square), take(at, square)
+        self.inverse, self.other = take(at, square), take(at, square)
+        self.half, self.basis = take(at, square), take(at, square)
+        self.bend, self.lines = take(at, square), take(at, square)
+        self.share, self.vectors = take(at, square), take(at, square)
+        self.reach, self.scaled = take(at, square), take(at, square)
+        self.small, self.spare = take(at, square), take(at, square)
+        self.values, self.slopes = take(at, p), take(at, p)
+        self.own, self.tail = take(at, p), take(at, p)
+        self.weights = take(at, p)
+        self.lapack = take(at, 1 + 6 * p + 2 * square)
+        self.leverage, self.wish = take(at, self.count), take(at, self.count)
+        self.picked, self.turned = take(at, wide * p), take(at, wide * p)
+        self.crossed, self.bent = take(at, crossed), take(at, crossed)
+        self.curvature, self.face = take(at, m * m), take(at, m * m)
+        self.ends, self.move = take(at, m), take(at, m)
+        self.before, self.slope = take(at, m), take(at, m)
+        self.least, self.most = take(at, m), take(at, m)
+        self.right = take(at, 2 * m)
+        self.node = take(at, 3 * self.count)
+        return room - first
 
     # --- the criterion at fractional counts -----------------------------------------
 
@@ -439,24 +434,21 @@ class Search:
             for j in range(m):
                 out[i * m + j] -= self.tail_weight * self.ends[i] * self.ends[j]
 
-    def _leverages(self, low, high):
+    def _leverages(self):
         """``trace(B_i G B_i.T)`` where the count is not fixed."""
         size: cython.int = self.q * self.p
-        i: cython.Py_ssize_t = 0
-        while i < self.count:
-            m: cython.int = 0
-            while i < self.count and m < self.most_moved:
-                self.leverage[i] = 0.0
-                if low[i] < high[i]:
-                    copy(self.picked + m * size, self.blocks + i * size, size)
-                    self.which[m] = i
-                    m += 1
-                i += 1
+        done: cython.Py_ssize_t = 0
+        while done < self.opened:
+            m = min(self.opened - done, self.most_moved)
+            for f in range(m):
+                block = self.blocks + self.open[done + f] * size
+                copy(self.picked + f * size, block, size)
             self._turn(m, self.gradient, False)
             for f in range(m):
                 at = f * size
                 found = dot(self.picked + at, self.turned + at, size)
-                self.leverage[self.which[f]] = found
+                self.leverage[self.open[done + f]] = found
+            done += m
 
     def _linear_gain(self, low, high, c):
         """Largest ``sum of (c'_i - c_i) d_i`` within the bounds; sets the multiplier.
@@ -466,7 +458,11 @@ class Search:
         """
         least: cython.double = INFINITY
         most: cython.double = -INFINITY
+        left = self.k
         for i in range(self.count):
+            left -= c[i]
+        for o in range(self.opened):
+            i = self.open[o]
             if c[i] < high[i]:
                 most = max(most, self.leverage[i])
             if c[i] > low[i]:
@@ -479,23 +475,23 @@ class Search:
             if most - least <= 1e-13 * fabs(most):
                 break
             room: cython.double = 0.0
-            for i in range(self.count):
-                room += high[i] if self.leverage[i] > cut else low[i]
-            if room > self.k:
+            for o in range(self.opened):
+                i = self.open[o]
+                room += (high[i] if self.leverage[i] > cut else low[i]) - c[i]
+            if room > left:
                 least = cut
-            elif room < self.k:
+            elif room < left:
                 most = cut
             else:
                 break
             cut = 0.5 * (least + most)
         gain: cython.double = 0.0
-        total: cython.double = 0.0
-        for i in range(self.count):
+        for o in range(self.opened):
+            i = self.open[o]
             slope = self.leverage[i] - cut
-            total += c[i]
             gain += ((high[i] if slope > 0.0 else low[i]) - c[i]) * slope
         self.cut = cut
-        return gain + (self.k - total) * cut
+        return gain + left * cut
 
     def _working_set(self, low, high, c):
         """Counts to move: the fractional ones and some of those that should move."""
@@ -503,16 +499,18 @@ class Search:
         fractional: cython.int = 0
         count: cython.int = 0
         largest: cython.double = 0.0
-        for i in range(self.count):
+        for o in range(self.opened):
+            i = self.open[o]
             slope = self.leverage[i] - self.cut
             self.wish[i] = 0.0
             if low[i] < c[i] and c[i] < high[i]:
                 fractional += 1
-            if low[i] < high[i] and (c[i] < high[i] if slope > 0.0 else c[i] > low[i]):
+            if c[i] < high[i] if slope > 0.0 else c[i] > low[i]:
                 self.wish[i] = fabs(slope)
                 largest = max(largest, self.wish[i])
         if fractional <= _FRACTIONAL:
-            for i in range(self.count):
+            for o in range(self.opened):
+                i = self.open[o]
                 if low[i] < c[i] and c[i] < high[i]:
                     self.wish[i] = 0.0
         else:
@@ -520,14 +518,15 @@ class Search:
         least = largest
         for _ in range(40):
             count = 0
-            for i in range(self.count):
-                count += self.wish[i] > 0.5 * least
+            for o in range(self.opened):
+                count += self.wish[self.open[o]] > 0.5 * least
             if count > extra:
                 break
             least *= 0.5
         size: cython.int = 0
         room: cython.int = fractional + extra
-        for i in range(self.count):
+        for o in range(self.opened):
+            i = self.open[o]
             inside: cython.bint = fractional > 0 and low[i] < c[i] and c[i] < high[i]
             wanted: cython.bint = self.wish[i] > 0.0 and self.wish[i] >= least
             if inside or (wanted and size < room):
@@ -658,6 +657,12 @@ class Search:
         Returns:
             The bound, -inf where every selection of the node is singular.
         """
+        self.opened = 0
+        for i in range(self.count):
+            self.leverage[i] = 0.0
+            if low[i] < high[i]:
+                self.open[self.opened] = i
+                self.opened += 1
         value = self._at(kind, low, c)
         if not value > -INFINITY:
             self._spread(low, high, c)
@@ -668,7 +673,7 @@ class Search:
         after: cython.double = value
         tunes = _TUNES
         for step in range(_MAX_STEPS):
-            self._leverages(low, high)
+            self._leverages()
             gain = self._linear_gain(low, high, c)
             bound = self.base + gain
             if bound <= goal or step == _MAX_STEPS - 1:

@@ -90,28 +90,14 @@ def descend(
     return depth < 0, nodes
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _length(
-    points: cython.double[:, ::1], c: cython.Py_ssize_t, dimension: cython.Py_ssize_t
-) -> cython.double:
+def _length(points, c, dimension):
     total: cython.double = 0.0
     for a in range(dimension):
         total += points[c, a] * points[c, a]
     return sqrt(total)
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _too_short(
-    points: cython.double[:, ::1],
-    first: cython.Py_ssize_t,
-    size: cython.Py_ssize_t,
-    dimension: cython.Py_ssize_t,
-    needed: cython.double,
-) -> cython.bint:
+def _too_short(points, first, size, dimension, needed):
     """Do all subsets of the points from ``first`` on stay below the volume needed?"""
     if first + dimension > size:
         return True
@@ -121,20 +107,7 @@ def _too_short(
     return bound == 0.0 or bound < needed
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _open(
-    points: cython.double[:, :, ::1],
-    index: cython.Py_ssize_t[:, ::1],
-    size: cython.Py_ssize_t[::1],
-    volume: cython.double[::1],
-    depth: cython.Py_ssize_t,
-    c: cython.Py_ssize_t,
-    reached: cython.double,
-    room: cython.double[:, ::1],
-    order: cython.Py_ssize_t[:, ::1],
-) -> cython.void:
+def _open(points, index, size, volume, depth, c, reached, room, order):
     """Fill depth + 1 with what comes after c, without what is too short to matter.
 
     Args:
@@ -184,14 +157,7 @@ def _open(
             below[k, a] = room[i, a]
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _longest_first(
-    room: cython.double[:, ::1],
-    order: cython.Py_ssize_t[:, ::1],
-    count: cython.Py_ssize_t,
-) -> cython.void:
+def _longest_first(room, order, count):
     """Sort the first ``count`` of ``order[0]`` by length, by merging runs."""
     key = room.shape[1] - 1
     width: cython.Py_ssize_t = 1
@@ -216,19 +182,7 @@ def _longest_first(
         width *= 2
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(-1)
-def _best_pairs(
-    plane: cython.double[:, ::1],
-    index: cython.Py_ssize_t[:, ::1],
-    size: cython.Py_ssize_t[::1],
-    volume: cython.double[::1],
-    chosen: cython.Py_ssize_t[::1],
-    subsets: cython.Py_ssize_t[:, ::1],
-    largest: cython.double[::1],
-    watch: cython.pointer(Watch),
-) -> cython.int:
+def _best_pairs(plane, index, size, volume, chosen, subsets, largest, watch):
     """Keep the pairs of the planar points that are large enough; 1 if time is over."""
     last = chosen.shape[0] - 2
     count = size[last]
@@ -247,15 +201,7 @@ def _best_pairs(
     return 0
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _keep(
-    chosen: cython.Py_ssize_t[::1],
-    found: cython.double,
-    subsets: cython.Py_ssize_t[:, ::1],
-    largest: cython.double[::1],
-) -> cython.void:
+def _keep(chosen, found, subsets, largest):
     """Put the chosen in the place of the least incumbent, and the new least first.
 
     The incumbents are a heap: those at 2 k + 1 and 2 k + 2 are no smaller than k.
@@ -275,12 +221,7 @@ def _keep(
     subsets[k, :] = chosen
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _polygon_bound(
-    plane: cython.double[:, ::1], count: cython.Py_ssize_t
-) -> cython.double:
+def _polygon_bound(plane, count):
     """Largest cross product of two points of the polygon that holds the points.
 
     Its sides are at equal angles and touch the points or their negatives.

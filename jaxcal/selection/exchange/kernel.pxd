@@ -13,7 +13,6 @@ cdef class Climber:
     cdef int k, q, p, s, fixed, groups
     cdef Py_ssize_t size  # q q WIDE
     cdef double[::1] room  # which holds all that is a pointer below
-    cdef Py_ssize_t used  # of the room
     cdef const double[:, :, ::1] blocks  # (M, q, p)
     cdef double* columns  # (groups, q, p, WIDE), zeros after the M
     cdef const double[:, ::1] prior  # (p, p)
@@ -57,8 +56,7 @@ cdef class Climber:
     cdef unsigned long long state  # of the random numbers
     cdef Watch watch
     cdef int looked  # groups since the clock was read
-    cdef double* _take(self, Py_ssize_t count) noexcept
-    cdef void _lay_out(self) noexcept
+    cdef Py_ssize_t _lay_out(self, double* room) noexcept
     cdef void _clear(self) noexcept nogil
     cdef void _count(self, Py_ssize_t i, int more) noexcept nogil
     cdef Py_ssize_t _draw(self, Py_ssize_t below) noexcept nogil
@@ -80,3 +78,12 @@ cdef class Climber:
     cdef Py_ssize_t _replacement(self, Py_ssize_t out, double rise) noexcept nogil
     cdef double _least(self) noexcept nogil
     cdef Py_ssize_t _strongest(self, Py_ssize_t at, double* found) noexcept nogil
+
+cdef void _weigh(double* into, double* weights, double* rows, Py_ssize_t count) noexcept nogil
+cdef void _dots(double* into, double* left, double* right, Py_ssize_t count) noexcept nogil
+cdef void _times(double* into, double weight, double* left, double* right, bint turned, int q) noexcept nogil
+cdef void _invert(double* matrices, double* det, int q, int wide) noexcept nogil
+cdef void _mix(double* into, double weight, double* matrix, double* these, int rows, int q) noexcept nogil
+cdef void _lower(double* grown, double* left, double* right, int rows, int q) noexcept nogil
+cdef double _largest(double* values) noexcept nogil
+cdef Py_ssize_t _best_of(double* gain, double* closed, double most) noexcept nogil

@@ -46,6 +46,7 @@ from cython.cimports.jaxcal.information.linear_algebra import (
     eigen,
     factor,
     multiply,
+    take,
 )
 from cython.cimports.jaxcal.selection.exchange.kernel import WIDE
 from cython.cimports.jaxcal.watch import begin, late
@@ -70,16 +71,7 @@ _SLIGHT = cython.declare(cython.double, 1e-10)
 _PATIENCE = cython.declare(cython.int, 16)  # groups between two looks at the clock
 
 
-@cython.cfunc
-@cython.nogil
-@cython.inline
-@cython.exceptval(check=False)
-def _weigh(
-    into: cython.p_double,
-    weights: cython.p_double,
-    rows: cython.p_double,
-    count: cython.Py_ssize_t,
-) -> cython.void:
+def _weigh(into, weights, rows, count):
     """``into = weights @ rows``, of (count,) and (count, WIDE)."""
     total = cython.declare(cython.double[16])  # kept in registers
     for b in range(WIDE // 16):
@@ -93,16 +85,7 @@ def _weigh(
             into[16 * b + j] = total[j]
 
 
-@cython.cfunc
-@cython.nogil
-@cython.inline
-@cython.exceptval(check=False)
-def _dots(
-    into: cython.p_double,
-    left: cython.p_double,
-    right: cython.p_double,
-    count: cython.Py_ssize_t,
-) -> cython.void:
+def _dots(into, left, right, count):
     """``into_j = left_j @ right_j``, of (count, WIDE) both."""
     total = cython.declare(cython.double[16])
     for b in range(WIDE // 16):
@@ -116,17 +99,7 @@ def _dots(
             into[16 * b + j] = total[j]
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _times(
-    into: cython.p_double,
-    weight: cython.double,
-    left: cython.p_double,
-    right: cython.p_double,
-    turned: cython.bint,
-    q: cython.int,
-) -> cython.void:
+def _times(into, weight, left, right, turned, q):
     """``into_j += weight left_j @ right_j``, or ``right_j.T``, of (q, q, WIDE)."""
     for r in range(q):
         for s in range(q):
@@ -138,13 +111,7 @@ def _times(
                     out[j] += weight * x[j] * y[j]
 
 
-@cython.cfunc
-@cython.nogil
-@cython.inline
-@cython.exceptval(check=False)
-def _invert(
-    matrices: cython.p_double, det: cython.p_double, q: cython.int, wide: cython.int
-) -> cython.void:
+def _invert(matrices, det, q, wide):
     """Invert (q, q, wide) in place by sweeps in the order of the rows; fill ``det``."""
     for j in range(wide):
         det[j] = 1.0
@@ -171,17 +138,7 @@ def _invert(
                     over[j] *= -pivot[j]
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _mix(
-    into: cython.p_double,
-    weight: cython.double,
-    matrix: cython.p_double,
-    these: cython.p_double,
-    rows: cython.int,
-    q: cython.int,
-) -> cython.void:
+def _mix(into, weight, matrix, these, rows, q):
     """``into_j += weight matrix @ these_j`` of (rows, rows) and (rows, q, WIDE)."""
     for r in range(rows):
         for a in range(rows):
@@ -192,16 +149,7 @@ def _mix(
                     out[j] += scaled * x[j]
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _lower(
-    grown: cython.p_double,
-    left: cython.p_double,
-    right: cython.p_double,
-    rows: cython.int,
-    q: cython.int,
-) -> cython.void:
+def _lower(grown, left, right, rows, q):
     """``grown_j -= left_j.T @ right_j + right_j.T @ left_j`` of (rows, q, WIDE)."""
     for s in range(q):
         for t in range(s + 1):
@@ -215,10 +163,7 @@ def _lower(
                 copy(other, out, WIDE)
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _largest(values: cython.p_double) -> cython.double:
+def _largest(values):
     """Of (WIDE,), by halves: the compiler knows how to compare vectors."""
     half = cython.declare(cython.double[32])
     for j in range(32):
@@ -231,12 +176,7 @@ def _largest(values: cython.p_double) -> cython.double:
     return top
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _best_of(
-    gain: cython.p_double, closed: cython.p_double, most: cython.double
-) -> cython.Py_ssize_t:
+def _best_of(gain, closed, most):
     """Which of a group has the largest ``gain - closed`` above ``most``; -1: none."""
     open_ = cython.declare(cython.double[64])
     for j in range(WIDE):
@@ -281,9 +221,8 @@ class Climber:
         for r in range(len(required)):
             self.chosen[r] = required[r]
         self.whole = np.empty(3 + 5 * p, dtype=np.intc)
-        self._lay_out()
-        self.room = np.zeros(self.used)
-        self._lay_out()
+        self.room = np.zeros(self._lay_out(cython.NULL))
+        self._lay_out(cython.address(self.room[0]))
         for i in range(count):
             for r in range(q):
                 for a in range(p):
@@ -297,37 +236,31 @@ class Climber:
         for _ in range(8):
             self._draw(2)
 
-    def _take(self, count):
-        """Where the next ``count`` numbers of the room are."""
-        self.used += count
-        if self.room is None:
-            return cython.NULL
-        return cython.address(self.room[0]) + (self.used - count)
-
-    def _lay_out(self):
-        """Share the room out; before there is one, count how much is needed."""
+    def _lay_out(self, room):
+        """Share the room out, and how many numbers that takes; of NULL only that."""
+        at, first = cython.address(room), room
         q, p, s, wide = self.q, self.p, self.s, self.groups * WIDE
-        self.used = 0
-        self.columns = self._take(q * p * wide)
-        self.grown = self._take(2 * self.groups * self.size)
-        self.kept = self._take(2 * self.groups * self.size)
-        self.alone, self.bounds = self._take(wide), self._take(wide)
-        self.closed, self.tops = self._take(wide), self._take(2 * self.groups)
-        self.gain, self.det = self._take(WIDE), self._take(WIDE)
-        self.part = self._take(p * WIDE)
-        self.cross, self.work = self._take(4 * self.size), self._take(4 * self.size)
-        self.mixed, self.middle = self._take(2 * self.size), self._take(12 * q * q)
-        self.at_out, self.changed = self._take(2 * q * q), self._take(2 * q * p)
-        self.tall = self._take(4 * q * p)
-        self.now, self.trial = self._take(2 * p * p), self._take(2 * p * p)
-        self.halved = self._take(p * p)
-        self.known, self.gram = self._take(p * p), self._take(p * p)
-        self.lower, self.metric = self._take(p * p), self._take(p * p)
-        self.rest = self._take(p * p)
-        self.half, self.solved = self._take(s * p), self._take(s * p)
-        self.small, self.other = self._take(s * s), self._take(s * s)
-        self.values, self.weakest = self._take(p), self._take(p)
-        self.lapack = self._take(1 + 6 * p + 2 * p * p)
+        self.columns = take(at, q * p * wide)
+        self.grown = take(at, 2 * self.groups * self.size)
+        self.kept = take(at, 2 * self.groups * self.size)
+        self.alone, self.bounds = take(at, wide), take(at, wide)
+        self.closed, self.tops = take(at, wide), take(at, 2 * self.groups)
+        self.gain, self.det = take(at, WIDE), take(at, WIDE)
+        self.part = take(at, p * WIDE)
+        self.cross, self.work = take(at, 4 * self.size), take(at, 4 * self.size)
+        self.mixed, self.middle = take(at, 2 * self.size), take(at, 12 * q * q)
+        self.at_out, self.changed = take(at, 2 * q * q), take(at, 2 * q * p)
+        self.tall = take(at, 4 * q * p)
+        self.now, self.trial = take(at, 2 * p * p), take(at, 2 * p * p)
+        self.halved = take(at, p * p)
+        self.known, self.gram = take(at, p * p), take(at, p * p)
+        self.lower, self.metric = take(at, p * p), take(at, p * p)
+        self.rest = take(at, p * p)
+        self.half, self.solved = take(at, s * p), take(at, s * p)
+        self.small, self.other = take(at, s * s), take(at, s * s)
+        self.values, self.weakest = take(at, p), take(at, p)
+        self.lapack = take(at, 1 + 6 * p + 2 * p * p)
+        return room - first
 
     def climb(self, start, share, swaps, seconds):
         """Complete ``start`` (size,), required first, and swap while that helps.

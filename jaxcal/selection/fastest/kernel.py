@@ -62,16 +62,7 @@ def _exact_order(times, start):
     return order, least
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _extend(
-    tours: cython.double[:, ::1],
-    times: cython.double[:, ::1],
-    start: cython.double[::1],
-    chosen: cython.Py_ssize_t[::1],
-    depth: cython.Py_ssize_t,
-) -> cython.double:
+def _extend(tours, times, start, chosen, depth):
     """Add a posture to the table of best open tours (Held and Karp).
 
     Args:
@@ -116,14 +107,7 @@ def _extend(
     return least
 
 
-@cython.cfunc
-@cython.exceptval(-1.0)
-def _improve(
-    times: cython.double[:, ::1],
-    start: cython.double[::1],
-    order: cython.Py_ssize_t[::1],
-    seconds: cython.double,
-) -> cython.double:
+def _improve(times, start, order, seconds):
     """Reverse pieces and move single postures until neither shortens ``order`` (K,)."""
     k = order.shape[0]
     saved: cython.double = 1.0
@@ -230,19 +214,7 @@ def fastest_subset(
     return depth < fixed, nodes
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _bound(
-    blocks: cython.const[cython.double][:, :, ::1],
-    prior: cython.const[cython.double][:, ::1],
-    held: cython.Py_ssize_t[::1],
-    count: cython.Py_ssize_t,
-    k: cython.Py_ssize_t,
-    relaxed: cython.const[cython.double][:, ::1],
-    room: cython.double[:, ::1],
-    gains: cython.double[::1],
-) -> cython.double:
+def _bound(blocks, prior, held, count, k, relaxed, room, gains):
     """Upper bound on log det of the first ``count`` held with k - count after them.
 
     It is log det where all k are held, and infinite where it cannot be computed.

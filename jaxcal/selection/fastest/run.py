@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import array_of, one_of, seconds, share, whole_number
+from jaxcal.checks import array_of, one_of, seconds, share
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.exchange.exchange import exchange_indices
 from jaxcal.selection.fastest.motion import Motion, travel_times
@@ -40,6 +40,7 @@ _EXACT_BY_DEFAULT = 8
 _STARTS = 12  # the D-optimum and local optima of the exchange
 _KICKS = 20  # random changes of the best run found, from which to search again
 _KICK_TRIES = 50  # swaps drawn until one keeps the determinant
+_MOST_POINTS = 200  # of a front, which is then not proven
 _RIDGE = 1e-8  # of the whitened information of fewer postures than identify
 _TRIED = 8  # most promising swaps that are put in their best order
 
@@ -117,7 +118,6 @@ class Travelled(Asked):
         motion: Motion,
         *,
         least_efficiency: float = 0.7,
-        max_points: int = 200,
         **options: Any,
     ) -> ParetoFront:
         """Time against D-efficiency, from ``least_efficiency`` up to the D-optimum.
@@ -127,17 +127,15 @@ class Travelled(Asked):
         Args:
             k, motion: as in :meth:`fastest`.
             least_efficiency: where to cut the front off, in (0, 1].
-            max_points: points after which to stop; the front is then not proven.
             options: start, method, seed and time_limit (for each point) of
                 :meth:`fastest`.
         """
         least = share("least_efficiency", least_efficiency)
-        most = whole_number("max_points", max_points, 1)
         asked = {"start": None, "method": None, "time_limit": 60.0, "seed": 0}
         search = _Search(self, k, motion, **(asked | options))
         points: list[FastSelection] = []
         point = search.answer(least, None)
-        while point is not None and len(points) < most:
+        while point is not None and len(points) < _MOST_POINTS:
             points.append(point)
             point = search.answer(least, point.log_det)
         kept = [

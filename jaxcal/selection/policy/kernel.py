@@ -45,64 +45,32 @@ def describe(x, chosen, active, k, depth, best_only, features, moments, ahead):
         ahead: (E, M) written: log-volume at the end of the look-ahead, behind the best.
     """
     p, m = x.shape[1:]
-    _describe(
-        np.ascontiguousarray(x),
-        chosen,
-        np.ascontiguousarray(active).view(np.uint8),
-        k,
-        depth,
-        best_only,
-        features,
-        moments,
-        ahead,
-        np.empty((p, m)),
-        np.empty((4, m)),
-        np.empty((p + depth + 2, m)),
-        np.empty(p + depth),
-    )
-
-
-@cython.cfunc
-def _describe(
-    x: cython.double[:, :, ::1],
-    chosen: cython.Py_ssize_t[:, :],
-    active: cython.uchar[:, ::1],
-    k: cython.Py_ssize_t,
-    depth: cython.Py_ssize_t,
-    best_only: cython.bint,
-    features: cython.float[:, :, ::1],
-    moments: cython.float[:, :, ::1],
-    ahead: cython.double[:, ::1],
-    y: cython.double[:, ::1],
-    values: cython.double[:, ::1],
-    work: cython.double[:, ::1],
-    weights: cython.double[::1],
-):
+    vectors: cython.double[:, :, ::1] = np.ascontiguousarray(x)
+    made: cython.Py_ssize_t[:, :] = chosen
+    seen: cython.uchar[:, ::1] = np.ascontiguousarray(active).view(np.uint8)
+    shown: cython.float[:, :, ::1] = features
+    second: cython.float[:, :, ::1] = moments
+    behind: cython.double[:, ::1] = ahead
+    y: cython.double[:, ::1] = np.empty((p, m))
+    values: cython.double[:, ::1] = np.empty((4, m))
+    work: cython.double[:, ::1] = np.empty((p + depth + 2, m))
+    weights: cython.double[::1] = np.empty(p + depth)
+    all_of: cython.Py_ssize_t = k
+    far: cython.Py_ssize_t = depth
+    spanned: cython.bint = k > p
+    only: cython.bint = best_only
     b: cython.Py_ssize_t
     with cython.nogil:
-        for b in range(x.shape[0]):
-            _conditional(x[b], chosen[b], active[b], k, y, work[0])
-            _look_ahead(
-                y,
-                active[b],
-                k > x.shape[1],
-                depth,
-                best_only,
-                None,
-                values,
-                work,
-                weights,
-            )
+        for b in range(vectors.shape[0]):
+            _conditional(vectors[b], made[b], seen[b], all_of, y, work[0])
+            _look_ahead(y, seen[b], spanned, far, only, None, values, work, weights)
             _behind_best(values)
-            ahead[b] = values[3]
-            if not best_only:
-                _features(y, active[b], values, features[b], moments[b])
+            behind[b] = values[3]
+            if not only:
+                _features(y, seen[b], values, shown[b], second[b])
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _behind_best(values: cython.double[:, ::1]) -> cython.void:
+def _behind_best(values):
     """Values less the largest of their row, at least ``_LOWEST``."""
     for d in range(values.shape[0]):
         best: cython.double = _LOWEST
@@ -112,16 +80,7 @@ def _behind_best(values: cython.double[:, ::1]) -> cython.void:
             values[d, j] = max(values[d, j] - best, _LOWEST)
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _features(
-    y: cython.double[:, ::1],
-    active: cython.uchar[::1],
-    values: cython.double[:, ::1],
-    features: cython.float[:, ::1],
-    moments: cython.float[:, ::1],
-) -> cython.void:
+def _features(y, active, values, features, moments):
     """What ``describe`` writes of one decision."""
     p, m = y.shape[0], y.shape[1]
     number: cython.Py_ssize_t = 0
@@ -161,17 +120,7 @@ def _features(
             features[j, d] = exp(max(_close[d - 13] * values[3, j], -80.0))
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _conditional(
-    x: cython.double[:, ::1],
-    chosen: cython.Py_ssize_t[:],
-    active: cython.uchar[::1],
-    k: cython.Py_ssize_t,
-    y: cython.double[:, ::1],
-    inner: cython.double[::1],
-) -> cython.void:
+def _conditional(x, chosen, active, k, y, inner):
     """y (p, M): what is left of every active candidate after the choices, else 0.
 
     With k = p every choice is a new direction, which leaves the other candidates. With
@@ -242,20 +191,7 @@ def look_ahead(y, active, spanned, depth, best_only, factors, values):
         _look_ahead(vectors, seen, grows, ahead, only, tolls, to, work, factor)
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(-1)
-def _look_ahead(
-    y: cython.double[:, ::1],
-    active: cython.uchar[::1],
-    spanned: cython.bint,
-    depth: cython.Py_ssize_t,
-    best_only: cython.bint,
-    factors: cython.double[:, ::1] | None,
-    values: cython.double[:, ::1],
-    work: cython.double[:, ::1],
-    weights: cython.double[::1],
-) -> cython.int:
+def _look_ahead(y, active, spanned, depth, best_only, factors, values, work, weights):
     """``look_ahead``; raises KeyboardInterrupt.
 
     Args:
@@ -329,12 +265,7 @@ def _look_ahead(
     return 0
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _combine(
-    weights: cython.double[::1], rows: cython.double[:, ::1], count: cython.Py_ssize_t
-) -> cython.void:
+def _combine(weights, rows, count):
     """``rows[count]`` is the weighted sum of those before it, four at a time."""
     m = rows.shape[1]
     out = rows[count]
@@ -362,10 +293,7 @@ def _combine(
         done += 1
 
 
-@cython.cfunc
-@cython.nogil
-@cython.exceptval(check=False)
-def _least_start(square: cython.double[::1], largest: cython.double) -> cython.double:
+def _least_start(square, largest):
     """The least squared length of a start, among (M,) of them, by bisection."""
     low: cython.double = 0.0
     high = largest

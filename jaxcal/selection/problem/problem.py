@@ -136,7 +136,8 @@ class Problem:
 def log_dets(problems: list[Problem], indices: Indices) -> Array:
     """log det S (S, R) of subsets (S, R, k) of S problems made together."""
     chosen = [problem.raw[of] for problem, of in zip(problems, indices, strict=True)]
-    value = log_det_blocks(np.stack(chosen), problems[0].root)
+    blocks = np.stack(chosen) if len(chosen) > 1 else chosen[0][None]
+    value = log_det_blocks(blocks, problems[0].root)
     return problems[0].multiplicity * value
 
 

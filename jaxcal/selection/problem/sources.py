@@ -22,9 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.checks import array_of, numbers
 from jaxcal.information.blocks import prior_root
 from jaxcal.models.affine import Affine
-from jaxcal.models.checked import derivative, facts
 from jaxcal.models.identifiability import identifiability
-from jaxcal.models.model import Model
+from jaxcal.models.model import Model, derivative, facts
 from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["Given", "Modelled", "Shared", "Source", "shares_regressor"]

@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 
 from rig.config import AXIS_NAMES
-from rig.config.axis import Pulses
 from rig.core.device import Device, Posture
 from rig.core.faults import MotionFault, Refused
-from rig.core.measure import measure
 from rig.core.motion import move
 from rig.core.proof import FIRST_MOTOR_DEG, unit_proved
 from rig.journal import SIGN_CHECKED
 from rig.workbench.commission.findings import (
     CLEAR,
+    CORNERS,
     Change,
     Stand,
+    corner_name,
     find,
     lines,
     proposals,
     ratios_of,
     require_gearing,
     require_unit,
+    stand_at,
     turn,
 )
 from rig.workbench.run import Run
@@ -31,8 +30,9 @@ from rig.workbench.run import Run
 REACH_DEG = 3.0  # each way
 FAR_ENOUGH = 1.1  # a move that would be no longer than that is not made
 SURE_SIGMA = 3.0
-PAIR_DEG = 6.0  # commanded at most, so that the phone turns about REACH_DEG
-PAIR_STD_DEG = 0.03  # two rotations of REACH_DEG in either order are 0.16 deg apart
+CORNER_DEG = 6.0  # commanded at most, so that the phone turns about REACH_DEG
+# Of the mean over the corners: two rotations of REACH_DEG make 0.08 deg there.
+CORNER_STD_DEG = 0.015
 ROOM_DEG = 0.2  # left to a limit
 SEEN_DEG = 0.03  # the phone must turn at least this much in a whole move
 SEEN_SIGMA = 6.0
@@ -74,26 +74,28 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
             of the phone's angles is not the one that is configured.
     """
     config, start = run.config, device.positions()
-    _check_room(run, start)
     stands: dict[str, Stand] = {}
-    run.planned = 1 + 8 * 3 + 2 * 3
+    room: list[float] = []  # degrees from the start to the nearer limit of an axis
+    for axis, pulses in zip(config.axes, start, strict=True):
+        here = axis.to_deg(pulses)
+        room.append(min(here - axis.min_deg, axis.max_deg - here) - ROOM_DEG)
+        if room[-1] < REACH_DEG:
+            raise Refused(
+                f"{axis.name} stands {room[-1] + ROOM_DEG:.1f} deg from a limit; the "
+                f"check moves it {REACH_DEG:g} deg either way. Move it inwards: "
+                f"jaxcal-rig jog {axis.name}"
+            )
 
     def visit(name: str, offset: dict[int, int], samples: int = 0) -> Stand:
         """Stand at pulses away from the start, and measure."""
-        target = list(start)
-        for axis, way in offset.items():
-            target[axis] += way
-        run.signals.check_pause()
-        posture = Posture(name, tuple(target))
-        measured = measure(move(device, posture), samples or None)
-        run.emit("stand", sync=True, name=name, **measured)
-        stands[name] = Stand.of(measured)
+        target = tuple(p + offset.get(axis, 0) for axis, p in enumerate(start))
+        stands[name] = stand_at(run, device, Posture(name, target), samples)
         return stands[name]
 
     run.say(
-        f"axes: about {run.planned} places; each axis first by {FIRST_MOTOR_DEG:g} deg "
-        f"of its motor, then as far as the phone's turn allows, {REACH_DEG:g} deg at "
-        "most either way"
+        f"axes: about {25 + len(CORNERS)} places; each axis first by "
+        f"{FIRST_MOTOR_DEG:g} deg of its motor, then as far as the phone's turn "
+        f"allows, {REACH_DEG:g} deg at most either way"
     )
     base = visit("start", {}, 4 * config.settle.samples)
     device.proof.stay_near(base.attitude)
@@ -130,7 +132,7 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
             ratios.append(geared * seen / abs(axis.to_deg(far)))
             visit(f"{AXIS_NAMES[j]}:back", {j: 0})
         require_unit(config, ratios)
-    pair = [0, 0, 0]
+    corner = [0, 0, 0]
     for j, name in enumerate(AXIS_NAMES):
         axis = config.axes[j]
         look, far = grow(j, True)
@@ -151,35 +153,16 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
         visit(f"{name}:back", {j: 0})
         visit(f"{name}:minus", {j: -far})
         visit(f"{name}:up", {j: 0})
-        most = min(PAIR_DEG, _room(run, start, j))
-        pair[j] = round(far * min(REACH_DEG / way, most / abs(axis.to_deg(far))))
+        most = min(CORNER_DEG, room[j])
+        corner[j] = round(far * min(REACH_DEG / way, most / abs(axis.to_deg(far))))
         run.say(
             f"  {name}: {abs(axis.to_deg(far)):.2f} deg commanded, the phone turned "
             f"{way:.3f}"
         )
-    clear = int(np.ceil(2.0 * (CLEAR * base.std_deg / PAIR_STD_DEG) ** 2))
+    clear = int(np.ceil((CLEAR * base.std_deg / CORNER_STD_DEG) ** 2 / 8))
     samples = min(max(clear, config.settle.samples), 8 * config.settle.samples)
-    for a, b in itertools.combinations(range(3), 2):
-        for sign in "-+":
-            way_a = pair[a] if sign == "+" else -pair[a]
-            label = f"{AXIS_NAMES[a]}{sign}{AXIS_NAMES[b]}+"
-            visit(label, {a: way_a, b: pair[b]}, samples)
+    for signs in CORNERS:
+        ways = {j: sign * corner[j] for j, sign in enumerate(signs)}
+        visit(corner_name(signs), ways, samples)
     move(device, Posture("back", start))
     return stands
-
-
-def _room(run: Run, start: Pulses, axis: int) -> float:
-    """Degrees from the start to the nearer limit of an axis."""
-    each = run.config.axes[axis]
-    here = each.to_deg(start[axis])
-    return min(here - each.min_deg, each.max_deg - here) - ROOM_DEG
-
-
-def _check_room(run: Run, start: Pulses) -> None:
-    for j, name in enumerate(AXIS_NAMES):
-        if (room := _room(run, start, j)) < REACH_DEG:
-            raise Refused(
-                f"{name} stands {room + ROOM_DEG:.1f} deg from a limit; the check "
-                f"moves it {REACH_DEG:g} deg either way. Move it inwards: jaxcal-rig "
-                f"jog {name}"
-            )

@@ -29,11 +29,10 @@ from rig.config import AXIS_NAMES
 from rig.core.attitude import mean_rotation
 from rig.core.device import Device, Posture
 from rig.core.faults import MotionFault, Refused
-from rig.core.measure import measure
-from rig.core.motion import Standing, move
+from rig.core.motion import move
 from rig.core.proof import ALLOWED_DEG
 from rig.workbench.commission.axes import ROOM_DEG, SEEN_DEG
-from rig.workbench.commission.findings import Stand, turn
+from rig.workbench.commission.findings import Stand, stand_at, turn
 from rig.workbench.run import Run
 
 LEVEL = 0.95
@@ -80,19 +79,18 @@ class Probe:
 
     def stand(self, label: str, *ways_deg: float) -> Stand:
         """Go the ways one after the other, and measure at the last."""
-        for way in ways_deg:
-            standing = self.go(way, label)
-        measured = measure(standing)
-        self.run.emit("stand", sync=True, name=label, **measured)
+        *before, last = ways_deg
+        for way in before:
+            self.run.signals.check_pause()
+            move(self.device, self.at(way, label))
         self.count += 1
-        return Stand.of(measured)
+        return stand_at(self.run, self.device, self.at(last, label))
 
-    def go(self, way_deg: float, label: str = "back") -> Standing:
-        """Move the axis."""
+    def at(self, way_deg: float, label: str = "back") -> Posture:
+        """The axis this far from where it began, the others there."""
         target = list(self.start)
         target[self.axis] += self.scale.to_pulses(self.side * way_deg)
-        self.run.signals.check_pause()
-        return move(self.device, Posture(label, tuple(target)))
+        return Posture(label, tuple(target))
 
     def way(self, found: Stand) -> float:
         """Degrees commanded from where the axis stood."""
@@ -223,7 +221,7 @@ def characterise(run: Run, device: Device, axis: int) -> dict[str, Any]:
     play, sigma = probe.play()
     zone, centre = probe.zone(play.mean, sigma)
     up, down = probe.breakaway(sigma)
-    probe.go(0.0)
+    move(device, probe.at(0.0))
     result = {
         "axis": probe.name,
         "level": LEVEL,

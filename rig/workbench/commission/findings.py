@@ -22,10 +22,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rig.config import AXIS_NAMES, RigConfig
-from rig.config.axis import Axis, Scale
+from rig.config.axis import Scale
 from rig.core.attitude import ORDERS, Array, euler_to_matrix, matrix_to_euler
+from rig.core.device import Device, Posture
 from rig.core.faults import MotionFault
+from rig.core.measure import measure
+from rig.core.motion import move
 from rig.core.proof import RADIANS
+from rig.workbench.run import Run
 
 CLEAR = 4.0  # standard deviations that make a difference a finding
 NEAREST = 0.7  # cosine: an axis within 45 degrees of where it is expected
@@ -38,7 +42,16 @@ SOUND_RATIO = (0.4, 1.5)
 # The same where the phone sends radians for degrees, and those are allowed for.
 NEAR_UNIT = (0.3, 2.0)
 UNPROVED_FACTOR = 2.0  # by which a gearing is corrected on the phone's word alone
+BY_PLATE = (
+    "Nothing was corrected. Set pulses_per_rev and reduction as the drives and the "
+    "gearboxes' plates say, then run `jaxcal-rig axes` again"
+)
 DIGITS = 4  # of a reduction that was measured
+# Signs of the moves of the three drives, one of them changed at a time.
+CORNERS = (
+    (-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1),
+    (-1, 1, 1), (1, 1, 1), (1, -1, 1), (-1, -1, 1),
+)  # fmt: skip
 OF_DRIVE = ("unit", "map", "pulses_per_rev", "comm_timeout_s")  # go with the cable
 
 
@@ -51,15 +64,24 @@ class Stand:
     std_deg: float  # of one reading
     samples: int
 
-    @classmethod
-    def of(cls, record: Mapping[str, Any]) -> Stand:
-        """From what ``Observer.measure`` returns."""
-        return cls(
-            np.array(record["pulses"], dtype=np.float64),
-            np.array(record["attitude"]),
-            float(np.max(record["std_deg"])),
-            int(record["samples"]),
-        )
+
+def stand_at(run: Run, device: Device, posture: Posture, samples: int = 0) -> Stand:
+    """Move and measure, with ``samples`` readings or as configured; journalled."""
+    run.signals.check_pause()
+    measured = measure(move(device, posture), samples or None)
+    run.emit("stand", sync=True, name=posture.name, **measured)
+    return Stand(
+        np.array(measured["pulses"], dtype=np.float64),
+        np.array(measured["attitude"]),
+        float(np.max(measured["std_deg"])),
+        int(measured["samples"]),
+    )
+
+
+def corner_name(signs: Sequence[int]) -> str:
+    """Such as ``pitch+ yaw- roll+``."""
+    named = zip(AXIS_NAMES, signs, strict=True)
+    return " ".join(f"{name}{'+' if sign > 0 else '-'}" for name, sign in named)
 
 
 def turn(base: Array, attitude: Array) -> Array:
@@ -89,26 +111,28 @@ def _inner(stands: Mapping[str, Stand], rates: Array) -> list[int] | None:
 
     With A nearer to the base the phone turns by exp(a) exp(b), otherwise by exp(b)
     exp(a). The two differ by a x b: half of it, up or down, in the direction in which
-    neither turns alone. From A- to A+ at the same B that component changes by a x b.
-    Angles read in a wrong order or with wrong signs turn like a mirror image, and
-    combine like nothing. None: the phone is too noisy to tell.
+    neither turns alone. It changes its sign with either move, so its mean over the
+    eight corners, each with the product of the two signs, is free of what A or B turn
+    alone, of play and of a steady drift. Angles read in a wrong order or with wrong
+    signs turn like a mirror image, and combine like nothing. None: the phone is too
+    noisy to tell.
     """
-    base = stands["start"]
+    base, corners = stands["start"], [stands[corner_name(each)] for each in CORNERS]
+    turned = np.array([turn(base.attitude, each.attitude) for each in corners])
+    ways = np.array([each.pulses - base.pulses for each in corners])
+    noise = base.std_deg * np.sqrt(sum(1 / each.samples for each in corners)) / 8
     inner = [0, 0, 0]
     for a, b in itertools.combinations(range(3), 2):
-        high, low = (stands[f"{AXIS_NAMES[a]}{s}{AXIS_NAMES[b]}+"] for s in "+-")
+        product = ways[:, a] * ways[:, b]  # as large at each
         normal = np.cross(rates[:, a], rates[:, b])
         scale = np.linalg.norm(normal)
-        change = turn(base.attitude, high.attitude) - turn(base.attitude, low.attitude)
-        seen = change @ normal / scale
-        ways = (high.pulses - low.pulses)[a], (high.pulses - base.pulses)[b]
-        whole = np.radians(ways[0] * ways[1] * scale) / 2.0
-        noise = base.std_deg * np.sqrt(1 / high.samples + 1 / low.samples)
-        if CLEAR * noise > abs(whole) / 2:
+        seen = np.sign(product) @ turned @ normal / scale / 8
+        whole = np.radians(np.abs(product).mean() * scale) / 2
+        if CLEAR * noise > whole / 2:
             return None
-        if not abs(whole) / 2 < abs(seen) < 2 * abs(whole):
+        if not whole / 2 < abs(seen) < 2 * whole:
             return []
-        inner[a if seen * whole > 0 else b] += 1
+        inner[a if seen > 0 else b] += 1
     return inner if sorted(inner) == [0, 1, 2] else []
 
 
@@ -140,10 +164,8 @@ class Findings:
     joints: tuple[int, ...]  # for each drive: the axis that it turns
     deg_per_pulse: Array  # (3,) of the phone, > 0 where pulses turn the joint positive
     backlash_deg: Array  # (3,) at the phone
-    cross_talk: Array  # (3, 3) rotation about joint i, a share of drive j's own
     mounting: Array  # (3, 3) phone to end-effector, nearest to the three axes
     turned_deg: float  # that from the configured one
-    mirrored: bool  # the axes are a mirror image of those configured
     order: str | None  # axes of the mechanism from the base outwards; None: not clear
 
 
@@ -157,7 +179,7 @@ def find(
     Args:
         config: as the moves were made.
         stands: ``start``; of each axis NAME ``NAME:look``, ``:plus``, ``:back``,
-            ``:minus``, ``:up``; of each pair ``A+B+`` and ``A-B+``.
+            ``:minus``, ``:up``; of each of CORNERS its ``corner_name``.
         names_known: units and directions are as configured, and the phone may be placed
             in any way; otherwise the phone is placed about as configured.
 
@@ -188,19 +210,7 @@ def find(
         )
     told = euler_to_matrix(config.imu.mounting_deg, "ZYX")
     turned = float(np.linalg.norm(turn(told, mounting)))
-    kept = told if turned <= MOUNTING_DEG else mounting
-    share = _expected(config).T @ kept @ rates
-    own = share[list(joints), range(3)]
-    return Findings(
-        joints=joints,
-        deg_per_pulse=signs * size,
-        backlash_deg=backlash,
-        cross_talk=share / own,
-        mounting=mounting,
-        turned_deg=turned,
-        mirrored=bool(mirrored),
-        order=order,
-    )
+    return Findings(joints, signs * size, backlash, mounting, turned, order)
 
 
 def _expected(config: RigConfig) -> Array:
@@ -292,9 +302,7 @@ def require_unit(
     """
     unit = config.imu.unit
     other, factor = ("rad", RADIANS) if unit == "deg" else ("deg", 1.0 / RADIANS)
-    seen = ", ".join(f"{ratio:.3g}" for ratio in ratios)
-    seen = f"the phone turned {seen} of what pitch, yaw and roll were commanded"
-    low, high = NEAR_UNIT
+    seen, (low, high) = _seen(ratios), NEAR_UNIT
     if all(low <= ratio * factor <= high for ratio in ratios):
         raise MotionFault(
             f'{seen}, about {1 / factor:.3g}: rig.toml says imu.unit = "{unit}", and '
@@ -305,9 +313,7 @@ def require_unit(
     if not proved and sum(low <= ratio <= high for ratio in ratios) < 2:
         raise MotionFault(
             f"{seen}, and none of its angles is over 6.3: either imu.unit or the "
-            "gearings are wrong. Nothing was corrected. Set pulses_per_rev and "
-            "reduction as the drives and the gearboxes' plates say, then run "
-            "`jaxcal-rig axes` again"
+            f"gearings are wrong. {BY_PLATE}"
         )
 
 
@@ -331,14 +337,16 @@ def require_gearing(
         return
     for axis, ratio, register in zip(config.axes, ratios, told, strict=True):
         if register is None and max(ratio, 1.0 / ratio) > UNPROVED_FACTOR:
-            seen = ", ".join(f"{each:.3g}" for each in ratios)
             raise MotionFault(
-                f"the phone turned {seen} of what pitch, yaw and roll were commanded, "
-                f"and the drive of {axis.name} has no register that says its pulses "
-                "for a turn, so it is not known what is wrong. Nothing was corrected. "
-                "Set pulses_per_rev and reduction as the drives and the gearboxes' "
-                "plates say, then run `jaxcal-rig axes` again"
+                f"{_seen(ratios)}, and the drive of {axis.name} has no register that "
+                "says its pulses for a turn, so it is not known what is wrong. "
+                f"{BY_PLATE}"
             )
+
+
+def _seen(ratios: Sequence[float]) -> str:
+    text = ", ".join(f"{ratio:.3g}" for ratio in ratios)
+    return f"the phone turned {text} of what pitch, yaw and roll were commanded"
 
 
 def proposals(
@@ -353,19 +361,33 @@ def proposals(
     """
     tables = {table["name"]: table for table in tomllib.loads(config.text)["axes"]}
     changes: list[Change] = []
+    low, high = SOUND_RATIO
     for drive, joint in enumerate(found.joints):
         source, axis = config.axes[drive], config.axes[joint]
-        own = _of_drive(source, axis, tables, told[drive])
-        per_pulse = float(found.deg_per_pulse[drive])
-        pulses = told[drive] or source.pulses_per_rev
-        own += _of_joint(axis, per_pulse, pulses)
-        if any(change.key.endswith(tuple(Scale.model_fields)) for change in own):
-            own += [
-                Change(f"axes.{axis.name}.{name}", value, None, "pulses mean otherwise")
-                for name, value in tables[axis.name].items()
-                if name in ("min_pulses", "max_pulses")
-            ]
-        changes += own
+        wanted: dict[str, tuple[Any, Any, str]] = {}  # key: old, new, reason
+        for name in OF_DRIVE:
+            # A map stands in the file as its name or its path.
+            old, new = tables[axis.name].get(name), tables[source.name].get(name)
+            reason = f"unit {source.unit} turns {axis.name}"
+            if name == "pulses_per_rev" and told[drive] not in (None, new):
+                new, reason = told[drive], f"unit {source.unit} says so itself"
+            wanted[name] = old, new, reason
+        rate, pulses = found.deg_per_pulse[drive], told[drive] or source.pulses_per_rev
+        reason = f"positive pulses turn it the {_way(rate)} way"
+        wanted["direction"] = axis.direction, 1 if rate > 0 else -1, reason
+        geared = axis.model_copy(update={"pulses_per_rev": pulses})
+        ratio = abs(float(rate) * geared.pulses_per_deg)
+        if not low <= ratio <= high:
+            new = float(f"{axis.reduction / ratio:.{DIGITS}g}")
+            reason = f"it turns {ratio:.3g} of what is commanded; sound is {low:g} to "
+            wanted["reduction"] = axis.reduction, new, f"{reason}{high:g}"
+        wanted = {name: each for name, each in wanted.items() if each[0] != each[1]}
+        if wanted.keys() & Scale.model_fields.keys():
+            for name in ("min_pulses", "max_pulses"):
+                if (old := tables[axis.name].get(name)) is not None:
+                    wanted[name] = old, None, "pulses mean otherwise"
+        for name, each in wanted.items():
+            changes.append(Change(f"axes.{axis.name}.{name}", *each))
     if found.turned_deg > MOUNTING_DEG:
         angles = matrix_to_euler(found.mounting, "ZYX").round(2) + 0.0
         before, reason = list(config.imu.mounting_deg), "the three axes put the phone"
@@ -378,57 +400,19 @@ def proposals(
     return changes
 
 
-def _of_drive(
-    source: Axis, axis: Axis, tables: dict[str, Any], told: int | None
-) -> list[Change]:
-    """Keys of the drive that turns ``axis``, which is configured as ``source``."""
-    changes = []
-    for name in OF_DRIVE:
-        # A map stands in the file as its name or its path.
-        old, new = tables[axis.name].get(name), tables[source.name].get(name)
-        reason = f"unit {source.unit} turns {axis.name}"
-        if name == "pulses_per_rev" and told not in (None, new):
-            new, reason = told, f"unit {source.unit} says so itself"
-        if old != new:
-            changes.append(Change(f"axes.{axis.name}.{name}", old, new, reason))
-    return changes
-
-
-def _of_joint(axis: Axis, deg_per_pulse: float, pulses_per_rev: int) -> list[Change]:
-    """Direction and reduction of a joint whose drive is known."""
-    changes, at = [], f"axes.{axis.name}"
-    direction = 1 if deg_per_pulse > 0 else -1
-    if direction != axis.direction:
-        reason = f"positive pulses turn it the {_way(direction)} way"
-        changes.append(Change(f"{at}.direction", axis.direction, direction, reason))
-    ratio = abs(deg_per_pulse) * pulses_per_rev * axis.reduction / 360.0
-    low, high = SOUND_RATIO
-    if not low <= ratio <= high:
-        reduction = float(f"{axis.reduction / ratio:.{DIGITS}g}")
-        reason = f"it turns {ratio:.3g} of what is commanded; sound is {low:g} to "
-        reason += f"{high:g}"
-        changes.append(Change(f"{at}.reduction", axis.reduction, reduction, reason))
-    return changes
-
-
-def _way(direction: float) -> str:
-    return "positive" if direction > 0 else "negative"
+def _way(rate: float) -> str:
+    return "positive" if rate > 0 else "negative"
 
 
 def lines(config: RigConfig, found: Findings) -> list[str]:
     """The findings in words, a line for each drive and each thing found."""
-    text = ["  unit  turns   sense     measured/commanded  play   cross-talk"]
+    ratios = ratios_of(config, found)
+    text = ["  unit  turns   sense     measured/commanded  play"]
     for drive, joint in enumerate(found.joints):
         axis, unit = config.axes[joint], config.axes[drive].unit
-        ratio = abs(found.deg_per_pulse[drive] * config.axes[drive].pulses_per_deg)
-        cross = ", ".join(
-            f"{AXIS_NAMES[i]} {100 * found.cross_talk[i, drive]:+.1f} %"
-            for i in range(3)
-            if i != joint
-        )
         text.append(
             f"  {unit:>4}  {axis.name:<6}  {_way(found.deg_per_pulse[drive]):<8}  "
-            f"{ratio:18.3f}  {max(0.0, found.backlash_deg[drive]):.3f}  {cross}"
+            f"{ratios[drive]:18.3f}  {max(0.0, found.backlash_deg[drive]):.3f}"
         )
     angles = matrix_to_euler(found.mounting, "ZYX")
     text.append(
@@ -437,9 +421,4 @@ def lines(config: RigConfig, found: Findings) -> list[str]:
     )
     order = found.order or "not clear from these moves"
     text.append(f"  joints from the base outwards: {order}")
-    if found.mirrored:
-        text.append(
-            "  note: the axes are mirrored against the configuration: a direction is "
-            "wrong, or two drives are exchanged"
-        )
     return text

@@ -1,4 +1,4 @@
-"""Home and zero: what place the drives' counts and the phone's attitude mean."""
+"""Home: what place the drives' counts mean; and what the drives are."""
 
 from __future__ import annotations
 
@@ -8,14 +8,11 @@ from rig.config import RigConfig
 from rig.config.axis import HIGHEST, LOWEST
 from rig.core.attitude import Array, Reading, angle_between_deg
 from rig.core.bus import BusError
-from rig.core.device import Device, Posture
+from rig.core.device import Device
 from rig.core.drive import HOME, Drive
 from rig.core.faults import MotionFault, Refused
-from rig.core.measure import measure
-from rig.core.motion import Standing
 from rig.core.proof import NOISE_DEG
-from rig.core.session import ZERO_FACTOR
-from rig.journal import HOMED, ZEROED
+from rig.journal import HOMED
 from rig.workbench.run import Run
 
 HOME_S = 120.0  # for one axis on its own way home
@@ -164,16 +161,6 @@ def _check_homing(
             "its way home, and the phone saw nothing of it. Look for a loose coupling, "
             "a stream that does not change, or units that are exchanged"
         )
-
-
-def zero(run: Run, device: Device) -> None:
-    """Measure the attitude of the zero posture, where the device stands: ZEROED."""
-    posture = Posture("zero", device.positions())
-    samples = ZERO_FACTOR * run.config.settle.samples
-    measured = measure(Standing(device, posture), samples)
-    run.emit("zero", sync=True, **measured)
-    zero = {"pulses": list(posture.pulses), "attitude": measured["attitude"]}
-    run.record.reach(ZEROED, run.config, **zero)
 
 
 def identity(drives: list[Drive]) -> dict[str, dict[str, int | str]]:

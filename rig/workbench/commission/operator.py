@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections.abc import Callable
 
@@ -16,10 +17,12 @@ class Operator:
         yes: bool = False,
         say: Callable[[str], None] = print,
         read: Callable[[str], str] = input,
+        option: str = "--yes",  # that confirms
     ) -> None:
         self.yes = yes
         self.say = say
         self._read = read
+        self._option = option
 
     def ask(self, question: str, default: str = "") -> str:
         """An answer, or the default where none is given.
@@ -36,7 +39,9 @@ class Operator:
 
     def _answer(self, prompt: str) -> str:
         if self._read is input and not sys.stdin.isatty():
-            raise Refused(f"{prompt}no terminal to answer on; use --yes")
+            raise Refused(
+                f"{prompt}no terminal to answer on; confirm with {self._option}"
+            )
         try:
             return self._read(prompt).strip()
         except EOFError:
@@ -46,10 +51,9 @@ class Operator:
         """A number; asked again where the answer is none."""
         while True:
             answer = self.ask(question, f"{default:g}")
-            try:
+            with contextlib.suppress(ValueError):
                 return float(answer)
-            except ValueError:
-                self.say(f"  must be a number, got {answer!r}")
+            self.say(f"  must be a number, got {answer!r}")
 
     def choose(self, question: str, known: list[str], default: str) -> str:
         """One of ``known``; asked again where the answer is none of them."""

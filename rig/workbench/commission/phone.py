@@ -57,34 +57,25 @@ def watch(
     Raises:
         ImuError: nothing came, or the stream is not to be trusted.
     """
-    imu.wait_for_stream(wait_s)
-    start = time.monotonic()
-    end = start + seconds
-    told: Stream | None = None
-    while time.monotonic() < end:
-        time.sleep(min(LOOK_S, max(0.0, end - time.monotonic())))
+    start, spent = imu.wait_for_stream(wait_s).time, 0.0
+    while spent < seconds:
+        time.sleep(min(LOOK_S, seconds - spent))
         imu.latest()
-        told = _stream(imu, start)
-        say(f"  {told}")
-    return told or _stream(imu, start)
-
-
-def _stream(imu: Imu, start: float) -> Stream:
-    readings = imu.since(start)
-    spent = max(time.monotonic() - start, 1e-3)
-    times = np.array([reading.time for reading in readings])
-    mean = mean_rotation([reading.matrix for reading in readings[-500:]])
-    apart = [angle_between_deg(mean, reading.matrix) for reading in readings[-500:]]
-    dropped = imu.counts
-    dropped.pop("accepted", None)
-    return Stream(
-        rate_hz=len(readings) / spent,
-        longest_gap_s=float(np.diff(times).max()) if len(times) > 1 else spent,
-        scatter_deg=float(np.sqrt(np.mean(np.square(apart)) / 3.0)),
-        tilt_deg=float(np.degrees(np.arccos(np.clip(mean[2, 2], -1.0, 1.0)))),
-        dropped=dropped,
-        sender=imu.sender,
-    )
+        readings, spent = imu.since(start), time.monotonic() - start
+        gaps = np.diff([reading.time for reading in readings])
+        matrices = [reading.matrix for reading in readings[-500:]]
+        mean = mean_rotation(matrices)
+        apart = [angle_between_deg(mean, matrix) for matrix in matrices]
+        stream = Stream(
+            rate_hz=len(readings) / spent,
+            longest_gap_s=float(gaps.max(initial=0.0)) or spent,
+            scatter_deg=float(np.sqrt(np.mean(np.square(apart)) / 3.0)),
+            tilt_deg=float(np.degrees(np.arccos(np.clip(mean[2, 2], -1.0, 1.0)))),
+            dropped={n: k for n, k in imu.counts.items() if n != "accepted"},
+            sender=imu.sender,
+        )
+        say(f"  {stream}")
+    return stream
 
 
 def serial_lines() -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import re
 import time
 from collections.abc import Callable
 
@@ -19,7 +20,11 @@ from rig.journal import BusLock
 # For each absent unit, three times; a drive answers within 25 ms at 9600 baud.
 SCAN_TIMEOUT_S, RETRIES = 0.2, 2
 ABSENT = (4, 10, 11)  # what servers and gateways answer for a unit that is not there
-PARITIES = ("N", "E", "O")
+OF_BUS = {
+    "tcp": ("host", "port"),
+    "rtu_tcp": ("host", "port"),
+    "rtu": ("device", "baudrate", "parity", "bytesize", "stopbits"),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,38 +49,22 @@ def parse_bus(text: str) -> BusSettings:
     """Settings of ``tcp:HOST[:PORT]``, ``rtu_tcp:HOST[:PORT]`` or ``rtu:DEVICE,...``.
 
     After the device follow baud rate, parity, data bits and stop bits, as far as they
-    are given: ``rtu:/dev/ttyUSB0,115200,N,8,1``; ``115200,8,N,1`` is the same.
+    are given: ``rtu:/dev/ttyUSB0,115200,N,8,1``.
 
     Raises:
         ConfigError: not such a text, or settings that cannot be.
     """
     transport, _, rest = text.partition(":")
-    found: dict[str, str | int] = {"transport": transport}
-    try:
-        if transport == "rtu":
-            found["device"], *line = rest.split(",")
-            for place, word in enumerate(line):
-                value = word if word in PARITIES else int(word)
-                name = "baudrate" if place == 0 else "parity"
-                if place and isinstance(value, int):
-                    name = "stopbits" if value < 3 else "bytesize"
-                if name in found:
-                    raise ValueError
-                found[name] = value
-        elif transport in ("tcp", "rtu_tcp"):
-            found["host"], _, port = rest.partition(":")
-            if port:
-                found["port"] = int(port)
-        else:
-            raise ValueError
-    except ValueError:
-        must = (
-            "must be tcp:HOST[:PORT], rtu_tcp:HOST[:PORT] or rtu:DEVICE[,BAUD[,PARITY"
-        )
-        fault = f"{must}[,BITS[,STOPBITS]]]], got {text!r}"
-        raise ConfigError("--bus", [fault]) from None
-    lines = (f"{name} = {json.dumps(value)}" for name, value in found.items())
-    return parse(BusSettings, "\n".join(lines), "--bus")
+    names = OF_BUS.get(transport, ())
+    words = re.split("," if transport == "rtu" else ":", rest)
+    if not names or len(words) > len(names) or not all(words):
+        kinds = "tcp:HOST[:PORT], rtu_tcp:HOST[:PORT] or rtu:DEVICE"
+        must = f"must be {kinds}[,BAUD[,PARITY[,BITS[,STOPBITS]]]]"
+        raise ConfigError("--bus", [f"{must}, got {text!r}"])
+    given = [f"transport = {json.dumps(transport)}"]
+    for name, word in zip(names, words, strict=False):
+        given.append(f"{name} = {word if word.isdecimal() else json.dumps(word)}")
+    return parse(BusSettings, "\n".join(given), "--bus")
 
 
 def scan(

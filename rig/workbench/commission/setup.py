@@ -161,10 +161,20 @@ def go(place: steps.Place, given: Given) -> int:
     pin(place, stream.sender)
     if record.missing(place.config, HOMED):
         say("6 jog and home")
-        if not operator.yes:
-            _offer_jog(place)
-        here = _ask_home(place, given)
-        if code := steps.go_home(place, here):
+        choices = [*AXIS_NAMES, "no"]
+        question = f"move an axis to the zero posture by hand ({', '.join(choices)})"
+        while not operator.yes:
+            if (name := operator.choose(question, choices, "no")) == "no":
+                break
+            steps.jog(place, AXIS_NAMES.index(name), None)
+        how = "here"
+        if can_home(place.config):
+            question = (
+                "home here (the device stands in its zero posture), or drive (each "
+                "drive runs its own homing)"
+            )
+            how = operator.choose(question, ["here", "drive"], given.home)
+        if code := steps.go_home(place, how == "here"):
             return code
         say("7 limits")
         _ask_limits(place)
@@ -191,23 +201,6 @@ def pin(place: steps.Place, sender: str) -> None:
         f"imu: listen to {sender} only, and to no other sender", "listen"
     )
     place.take(edit(place.path, {"imu.allow": [sender]}))
-
-
-def _offer_jog(place: steps.Place) -> None:
-    choices = [*AXIS_NAMES, "no"]
-    question = f"move an axis to the zero posture by hand ({', '.join(choices)})"
-    while (name := place.operator.choose(question, choices, "no")) != "no":
-        steps.jog(place, AXIS_NAMES.index(name), None)
-
-
-def _ask_home(place: steps.Place, given: Given) -> bool:
-    if not can_home(place.config):
-        return True
-    question = (
-        "home here (the device stands in its zero posture), or drive (each drive runs "
-        "its own homing)"
-    )
-    return place.operator.choose(question, ["here", "drive"], given.home) == "here"
 
 
 def _ask_limits(place: steps.Place) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 from rig.config import AXIS_NAMES, RigConfig
+from rig.core import session
 from rig.core.bus import Bus
 from rig.core.device import Device
 from rig.core.drive import Drive
@@ -19,7 +20,6 @@ from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault, Refused
 from rig.core.known import check_drives
 from rig.core.phone import Imu
 from rig.core.proof import slowed
-from rig.core.session import STREAM_WAIT_S, Check
 from rig.journal import (
     HOMED,
     IDENTIFIED,
@@ -32,7 +32,7 @@ from rig.journal import (
 from rig.journal.lock import BusLock
 from rig.workbench.commission.axes import check_axes
 from rig.workbench.commission.findings import Change
-from rig.workbench.commission.home import can_home, home, identity, unlimited, zero
+from rig.workbench.commission.home import can_home, home, identity, unlimited
 from rig.workbench.commission.jog import by_keyboard, step
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.phone import Stream, addresses_text, watch
@@ -56,9 +56,7 @@ class Place:
     record: DeviceRecord
     operator: Operator
     path: pathlib.Path | None = None  # rig.toml, where there is one to correct
-    folder: pathlib.Path | None = None  # of the run; a new one where not given
     full_speed: bool = False  # of a simulated device
-    locked: bool = False  # the caller holds the bus
     reset_alarms: bool = False
     listeners: tuple[Callable[[Record], None], ...] = ()
 
@@ -77,20 +75,14 @@ class Place:
         where = "" if self.path is None else f" --config {os.path.relpath(self.path)}"
         return f"jaxcal-rig {words}{where}"
 
-    def require(self, through: str) -> None:
-        """Refused where the device has not reached a state; says what to do."""
-        if text := self.record.missing(self.config, through):
-            raise Refused(text)
-
-    def _lock(self, what: str) -> BusLock:
-        lock = BusLock(self.config.bus)
-        return lock if self.locked else lock.acquire(what)
-
     @contextlib.contextmanager
     def bus(self, what: str) -> Iterator[list[Drive]]:
         """The drives, to be read; nobody else writes meanwhile."""
         config = self.config
-        with self._lock(what), Bus(config.bus, config.silence_s) as bus:
+        with (
+            BusLock(config.bus).acquire(what),
+            Bus(config.bus, config.silence_s) as bus,
+        ):
             yield [Drive(bus, axis) for axis in config.axes]
 
     def run(
@@ -107,11 +99,11 @@ class Place:
         motion = config.motion.model_copy(update={"approach_overshoot_deg": 0.0})
         config = config.model_copy(update={"axes": axes, "motion": motion})
         # Homed drives are where they were left; the gearing is still to be checked.
-        check: Check = functools.partial(check_drives, geared=False)
-        with self._lock(name) as lock:
+        check: session.Check = functools.partial(check_drives, geared=False)
+        with BusLock(config.bus).acquire(name) as lock:
             run = Run(
                 config if limits else unlimited(config),
-                self.folder or new_run_folder(pathlib.Path(config.output), name),
+                new_run_folder(pathlib.Path(config.output), name),
                 name, self.say, record=self.record, reset_alarms=self.reset_alarms,
                 start={"simulated": None, "inputs": {}, "maps_from": ""},
             )  # fmt: skip
@@ -150,7 +142,7 @@ def look_at_phone(place: Place, seconds: float | None = None) -> Stream:
         place.say(f"imu: {addresses_text(settings, imu.port)}; then start its stream")
         for listener in place.listeners:
             listener({"event": "listening", "port": imu.port})
-        stream = watch(imu, seconds or WATCH_S, STREAM_WAIT_S, place.say)
+        stream = watch(imu, seconds or WATCH_S, session.STREAM_WAIT_S, place.say)
     if stream.rate_hz < SLOW_HZ or stream.longest_gap_s > LONG_GAP_S:
         place.say(
             f"  note: sessions want {SLOW_HZ:g} readings per s without gaps over "
@@ -162,7 +154,6 @@ def look_at_phone(place: Place, seconds: float | None = None) -> Stream:
 
 def go_home(place: Place, here: bool) -> int:
     """Make the counts mean a place: HOMED."""
-    place.require(IDENTIFIED)
     names = [axis.name for axis in place.config.axes]
     if not here and not can_home(place.config):
         without = {a.map.name for a in place.config.axes if a.map.home is None}
@@ -186,7 +177,6 @@ def go_home(place: Place, here: bool) -> int:
 
 def jog(place: Place, axis: int, way_deg: float | None) -> int:
     """Move one axis by a step, or as long as a key is held."""
-    place.require(IDENTIFIED)
     name = AXIS_NAMES[axis]
     if way_deg is None and (place.operator.yes or not sys.stdin.isatty()):
         raise Refused(f"jog {name}: holding a key needs a terminal; give a step in deg")
@@ -215,7 +205,6 @@ def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> i
         load_calibration,
     )
 
-    place.require(SIGN_CHECKED)
     path = None if into is None else calibration_path(into)
     if path is not None:
         # Of this device; simulated ones alone are moved at full speed.
@@ -238,11 +227,11 @@ def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> i
 
 def axes(place: Place, names_known: bool = False) -> int:
     """Check each axis, correct rig.toml after a yes, and check again: SIGN_CHECKED."""
-    place.require(HOMED)
     place.operator.confirm(
         "axes: the device stands in its zero posture. Each axis in turn will move a "
-        "little, then up to 3 deg either way; then two at a time. Watch that the joint "
-        "that moves is the one that is named, and keep out of the device's reach",
+        "little, then up to 3 deg either way; then all three by turns, up to 6 deg. "
+        "Watch that the joint that moves is the one that is named, and keep out of the "
+        "device's reach",
         "axes",
     )
     return _check_axes(place, names_known)
@@ -269,20 +258,19 @@ def _check_axes(place: Place, names_known: bool, again: bool = False) -> int:
     place.say(f"  written; the old file is kept beside {place.path}")
     homed = place.record.state(HOMED) or {}
     identify(place)
+    # Which also forgets where each named axis was left: it is not what it was.
     place.record.reach(HOMED, place.config, **homed)
-    place.record.forget_left()  # where each named axis stands is not what it was
     return _check_axes(place, names_known, again=True)
 
 
 def take_zero(place: Place) -> int:
     """Measure the zero posture: ZEROED."""
-    place.require(SIGN_CHECKED)
     place.operator.confirm(
-        "zero: nothing moves; the device stands in its zero posture (jig, level), and "
-        "the phone's attitude there is measured",
+        "zero: the device stands in its zero posture (jig, level), or moves to pulse 0 "
+        'with session.zero = "drive"; the phone\'s attitude there is measured',
         "zero",
     )
-    return place.run("zero", zero)
+    return place.run("zero", lambda run, device: session.take_zero(device))
 
 
 def simulated(

@@ -9,19 +9,15 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from rig.config import AXIS_NAMES, RigConfig
-from rig.core.attitude import ORDERS, Array, Frame, frame_at
+from rig.core.attitude import ORDERS, Frame, frame_at
 from rig.core.faults import MotionFault
 from rig.journal import Record, measured_postures
 from rig.workbench.identification.fit import (
-    correlation,
     held_out_errors,
     identify,
-    mean_share,
-    mean_variance,
     pairs,
     uncertainty,
 )
-from rig.workbench.readings import angles
 
 USUAL = (1 / 3, 3.0)  # degrees of a joint for one commanded; outside it is told
 SIGNIFICANT = 3.0  # standard deviations, of a drift
@@ -43,19 +39,16 @@ def conclude(
     zero, held = last["zero"], last.get("held_out", {"pairs": []})["pairs"]
     frame = frame_at(config, np.array(zero["attitude"]))
     postures = measured_postures(records)
-    of_role: dict[str, list[Record]] = {"reference": []}
-    for record in postures.values():
-        of_role.setdefault(record["role"], []).append(record)
-    phi = correlation([angles(r, frame) for r in (zero, *postures.values())])
-    visits = sorted([zero, *of_role["reference"]], key=lambda record: record["time"])
-    drift = estimate_drift(visits, frame, phi, config.session.drift_limit_deg)
+    references = [r for r in postures.values() if r["role"] == "reference"]
+    visits = sorted([zero, *references], key=lambda record: record["time"])
+    drift = estimate_drift(visits, frame, config.session.drift_limit_deg)
     if drift and drift["corrected"]:
         turn = drift["turn_deg_per_min"]
         postures = {n: without_drift(r, turn, zero, frame) for n, r in postures.items()}
-    chosen = [postures[record["name"]] for record in of_role["select"]]
-    first = identify(chosen)
-    held_out, off = held_out_errors(config, held, postures, first)
-    limits = uncertainty(first, chosen, held_out, zero, phi)
+    chosen = [r for r in postures.values() if r["role"] == "select"]
+    held_out, errors = held_out_errors(config, held, postures, identify(chosen))
+    zero_share = chosen[0]["samples"] / zero["samples"]
+    limits = uncertainty(chosen, held_out, zero_share)
     shared = {
         "zero_pulses": zero["pulses"],
         "zero_attitude": zero["attitude"],
@@ -68,9 +61,8 @@ def conclude(
         "noise_from": limits["basis"],
         "drift_corrected": bool(drift and drift["corrected"]),
     }
-    noise = np.array(limits["noise_std_deg"])
-    calibration = identify(chosen, noise, notes, np.array(limits["zero_std_deg"]) ** 2)
-    count = config.settle.samples
+    noise = np.maximum(1e-9, limits["noise_std_deg"])
+    calibration = identify(chosen, noise, notes, zero_share)
     return calibration, {
         "schema": 1,
         "measured_at": zero["time"],
@@ -79,17 +71,15 @@ def conclude(
         "A": np.asarray(calibration.matrix).tolist(),
         "b": np.asarray(calibration.bias).tolist(),
         **limits,
-        "effective_samples": (1.0 / mean_share(phi, count)).tolist(),
-        "samples": count,
         **shared,
         "orders": order_residuals(config, frame, chosen + held_out),
-        **off,
+        **errors,
         "drift": drift,
     }
 
 
 def estimate_drift(
-    visits: list[Record], frame: Frame, phi: Array, limit_deg: float
+    visits: list[Record], frame: Frame, limit_deg: float
 ) -> dict[str, Any] | None:
     """How far the phone's zero drifted; None where it was visited once.
 
@@ -101,7 +91,6 @@ def estimate_drift(
     Args:
         visits: the zero, then postures measured there, in order of time.
         frame: of the zero.
-        phi: (3,) correlation of readings, for the noise of a visit.
         limit_deg: ``session.drift_limit_deg``.
 
     Returns:
@@ -120,7 +109,7 @@ def estimate_drift(
     turn = away @ turns / max(float(away @ away), 1e-12)
     rest = [without_drift(visit, turn, zero, frame) for visit in visits[1:]]
     bend = np.abs([visit["measured_deg"] for visit in rest]).max(axis=0)
-    noise = mean_variance(zero, phi) + mean_variance(visits[-1], phi)
+    noise = sum(np.square(v["std_deg"]) / v["samples"] for v in (zero, visits[-1]))
     least = np.maximum(SIGNIFICANT * np.sqrt(noise), LEAST * limit_deg)
     size, end = float(np.abs(seen).max()), np.abs(seen[-1])
     straight = bool((bend <= np.maximum(least, STRAIGHT * end.max())).all())

@@ -7,11 +7,14 @@ framework.
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import pathlib
 import socket
 import subprocess
 import sys
+import time
+from typing import Any
 
 HOST, PORT = "127.0.0.1", 8642  # the usual port; where it is taken, any free one
 LOG = "live.log"
@@ -49,3 +52,30 @@ def start(folder: pathlib.Path) -> str:
     except OSError as error:
         return f"no live page: {error}"
     return line
+
+
+def draw(part: str, **values: Any) -> str:
+    """A part of the page as HTML, escaped: a macro of page.html.j2."""
+    return str(getattr(_template(), part)(**values))
+
+
+@functools.cache
+def _template() -> Any:
+    import jinja2
+
+    from rig.workbench.outputs.view import angle
+
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(pathlib.Path(__file__).parent),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["angles"] = lambda values: " ".join(
+        angle(value, 2) for value in values
+    )
+    environment.filters["clock"] = lambda when: time.strftime(
+        "%H:%M:%S", time.localtime(when)
+    )
+    return environment.get_template("page.html.j2").module

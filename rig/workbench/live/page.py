@@ -10,11 +10,11 @@ from typing import Any
 
 from nicegui import ui
 
-from rig.workbench.live import words
-from rig.workbench.live.charts import DARK, LIGHT, Palette, charts
-from rig.workbench.live.scene import CommandScene, DeviceScene
+from rig.workbench.live import draw
+from rig.workbench.live.charts import charts
+from rig.workbench.live.scene import DeviceScene
 from rig.workbench.live.watcher import Watcher
-from rig.workbench.live.words import draw
+from rig.workbench.outputs import view
 
 TICK_S = 0.1
 ANSWER_S = 10.0  # for a browser to show what it was sent
@@ -23,14 +23,13 @@ HEAD = """
 <link rel="stylesheet" href="/page.css">
 <script src="/page.js" defer></script>
 """
-DARK_QUERY = "matchMedia('(prefers-color-scheme: dark)').matches"
 NOTES = {  # of the cards, in their order: below the title
     "Device": "Solid: as the phone measures. Ghost: as commanded. They differ by what "
     "is calibrated.",
     "Postures": "",
     "Angles": "Solid: phone. Dashed: drives.",
     "Settling": "Standard deviation over the settle window.",
-    "Commands": "The cube of the ranges with the candidates. Green: measured.",
+    "Commands": "Candidates and postures. The larger the mark, the larger the roll.",
     "Drift": "The zero posture, read again; it should read zero.",
     "What happened": "",
 }
@@ -39,8 +38,8 @@ NOTES = {  # of the cards, in their order: below the title
 class LivePage:
     """One browser's view of a run."""
 
-    def __init__(self, watcher: Watcher, palette: Palette) -> None:
-        self.watcher, self.palette = watcher, palette
+    def __init__(self, watcher: Watcher) -> None:
+        self.watcher = watcher
         self._version = -1
         self._ticks = 0
         self._parts: dict[str, Any] = {}  # HTML by the macro that draws it
@@ -58,12 +57,9 @@ class LivePage:
     def _fill(self, title: str) -> None:
         match title:
             case "Device":
-                config = self.watcher.state.start.get("config", {})
-                self._device = DeviceScene(config, self.palette)
+                self._device = DeviceScene(self.watcher.state.start.get("config", {}))
                 self._parts["numbers"] = ui.html().classes("wide")
                 self._stream = ui.label().classes("note")
-            case "Commands":
-                self._commands = CommandScene(self.palette)
             case "Postures":
                 self._parts["queue"] = ui.html()
             case "What happened":
@@ -87,21 +83,17 @@ class LivePage:
             await ui.run_javascript("0", timeout=ANSWER_S)
 
     def _follow(self) -> None:
-        watcher, state = self.watcher, self.watcher.state
-        sample = watcher.samples[-1] if watcher.samples else {}
-        measured, commanded = sample.get("deg"), state.target
-        if not watcher.running and state.done:
-            measured, commanded = state.done[-1].measured, state.done[-1].commanded
-        self._device.show(measured, commanded)
-        rows = words.numbers(state, sample, watcher.running)
-        self._parts["numbers"].set_content(draw("numbers", rows=rows))
-        self._stream.set_text(words.stream(sample, watcher.running, time.time()))
+        watcher = self.watcher
+        sample = watcher.samples[-1] if watcher.running and watcher.samples else {}
+        now = watcher.state.present(sample, watcher.running)
+        self._device.show(now["measured"], now["commanded"])
+        self._parts["numbers"].set_content(draw("numbers", rows=view.numbers(now)))
+        self._stream.set_text(view.stream(sample, time.time()))
 
     def _plot(self) -> None:
         watcher = self.watcher
         end = time.time() if watcher.running else watcher.state.time
-        drawn = charts(watcher.state, watcher.samples, end, self.palette)
-        for title, options in drawn.items():
+        for title, options in charts(watcher.state, watcher.samples, end).items():
             chart = self._charts[title]
             chart.options.clear()
             chart.options.update(options)
@@ -113,30 +105,28 @@ class LivePage:
         self._version = watcher.version
         head = json.dumps(_head(watcher))
         ui.run_javascript(f"live.head({head}, {json.dumps(watcher.here)})")
-        lines = words.trouble(state, watcher.running, str(watcher.folder))
-        result = words.verdict(state, watcher.summary)
-        shown = {
+        tone = view.headline(state, watcher.running)[0]
+        lines = view.trouble(state, watcher.running, str(watcher.folder))
+        result = view.verdict(state, watcher.summary)
+        for name, content in {
             "trouble": draw("trouble", lines=lines),
             "verdict": draw("verdict", lines=result, report=watcher.report),
             "queue": draw(
-                "queue", postures=words.queue(state), count=len(state.postures)
+                "queue", postures=view.queue(state), count=len(state.postures)
             ),
             "log": draw("log", lines=state.log),
-        }
-        tone = words.headline(state, watcher.running)[0]
-        for name, content in shown.items():
+        }.items():
             part = self._parts[name]
             part.set_content(content)
             if name in ("trouble", "verdict"):
                 part.set_visibility(bool(content.strip()))
                 part.classes(tone, remove="run good warn bad")
-        self._commands.show(state)
         self._plot()
 
 
 def _head(watcher: Watcher) -> str:
     state = watcher.state
-    now, said = words.headline(state, watcher.running), words.progress(state)
+    now, said = view.headline(state, watcher.running), view.progress(state)
     return draw("head", state=state, now=now, said=said, folder=watcher.folder.name)
 
 
@@ -148,10 +138,8 @@ def make_page(watcher: Watcher) -> Any:
         # Stands before anything is connected: STOP works from the first moment.
         ui.add_body_html(draw("body", head=_head(watcher), here=watcher.here))
         await ui.context.client.connected()
-        dark = await ui.run_javascript(DARK_QUERY, timeout=20.0)
         while not watcher.state.start:  # the device's axes are drawn from it
             await asyncio.sleep(TICK_S)
-        live = LivePage(watcher, DARK if dark else LIGHT)
-        ui.timer(TICK_S, live.tick)
+        ui.timer(TICK_S, LivePage(watcher).tick)
 
     return page

@@ -7,6 +7,7 @@ import os
 import pathlib
 import platform
 import signal
+import threading
 import time
 from collections import deque
 from typing import Any
@@ -17,7 +18,7 @@ from rig.journal import JOURNAL, Record, is_written
 from rig.signals import PAUSE
 from rig.stopping import stop_run
 from rig.workbench.live.charts import SHOWN_S
-from rig.workbench.live.state import RunState
+from rig.workbench.outputs.state import RunState
 from rig.workbench.outputs.telemetry import PERIOD_S, TELEMETRY
 
 ASK_S = 0.5  # between two looks at the journal's lock; for a session to say it stopped
@@ -68,9 +69,14 @@ class Watcher:
         self._journal = Tail(folder / JOURNAL)
         self._telemetry = Tail(folder / TELEMETRY)
         self._asked = 0.0
+        self._polling = threading.Lock()
 
     def poll(self) -> None:
-        """Take what is new."""
+        """Take what is new; the server's loop and a stop's thread both ask."""
+        with self._polling:
+            self._poll()
+
+    def _poll(self) -> None:
         records = self._journal.read()
         for record in records:
             try:
@@ -136,10 +142,12 @@ class Watcher:
         since, end = time.time(), time.monotonic() + ASK_S
         self.ask(signal.SIGTERM)
         while time.monotonic() < end:
+            ended = not is_written(self.folder / JOURNAL)
+            self.poll()  # after the look at the lock: its last word is written before
             stop = self.state.stop
             if stop is not None and stop["time"] >= since:
                 return [UnitStop(**unit) for unit in stop["units"]]
-            if not is_written(self.folder / JOURNAL):
+            if ended:
                 return []  # it had armed nothing
             time.sleep(0.02)
         return stop_run(self.folder)

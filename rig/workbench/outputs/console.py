@@ -1,79 +1,19 @@
-"""What a session prints, as lines of text."""
+"""What a session prints."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from rig.config import AXIS_NAMES, RigConfig
+from rig.config import RigConfig
 from rig.core.attitude import Array
-from rig.core.stop import UnitStop
 from rig.journal import Record
+from rig.workbench.outputs.state import RunState
 from rig.workbench.outputs.telemetry import telemetry
+from rig.workbench.outputs.words import choice_text, event_lines, numbers
 from rig.workbench.run import Run
-
-ENDS = ("end", "fault", "stopped", "paused", "refused")
-REPLIES = {
-    "obeyed": "the drive obeys",
-    "not taken": "the drive did not take it, so it is sent again",
-    "unknown": "whether the drive took it is unknown, so all stop",
-}
-
-
-def _reference(record: Record) -> str:
-    worst = max(map(abs, record["angles"]))
-    good = f"reference posture reads {worst:.3f} deg from zero: going on"
-    return good if worst <= record["limit"] else ""
-
-
-def _comm_restored(record: Record) -> str:
-    return record["error"] and (
-        f"{record['axis']}: its communication timeout was not put back to "
-        f"{record['counts']} ({record['error']}); `jaxcal-rig resume` does it"
-    )
-
-
-def _stop(record: Record) -> str:
-    units = "".join(f"\n  {UnitStop(**unit)}" for unit in record["units"])
-    return f"stop: {record['reason'] or 'end of run'}{units}"
-
-
-# An event of the run in words, for console, page and report: its fields are put in.
-SENTENCES: dict[str, str | Callable[[Record], str]] = {
-    "listening": "IMU: waiting for the phone on port {port} ({format})",
-    "armed": "armed: {drives} drives on {where}",
-    "note": "{text}",
-    "reference": _reference,
-    "reoriented": "the phone came back, its heading turned {turned_deg:.3f} deg: "
-    "{told}",
-    "zero": "zero taken at pulses {pulses}",
-    "void": lambda r: f"  withdrawn, to be measured again: {', '.join(r['names'])}",
-    "pausing": "pausing after this posture; another Ctrl-C stops at once",
-    "lost_reply": lambda r: (
-        f"  the reply to a move of {r['axis']} was lost: {REPLIES[r['outcome']]}"
-    ),
-    "sender_refused": "WARNING: {reason}",
-    "unreachable": "  {name} is out of reach: {reason}",
-    "comm_restored": _comm_restored,
-    "stop": _stop,
-}
-
-
-def event_lines(record: Record) -> list[str]:
-    """What an event of the run comes to; most are silent."""
-    sentence = SENTENCES.get(record["event"], "")
-    if isinstance(sentence, str):
-        return sentence.format_map(record).splitlines()
-    return sentence(record).splitlines()
-
-
-def numbers(values: Any, width: int = 9, digits: int = 4) -> str:
-    """Numbers side by side; what rounds to zero has no sign."""
-    rounded = (round(float(value), digits) + 0.0 for value in values)
-    return " ".join(f"{value:{width}.{digits}f}" for value in rounded)
 
 
 def listen(run: Run) -> None:
@@ -81,22 +21,19 @@ def listen(run: Run) -> None:
 
     A session neither waits for them nor needs them.
     """
-    begun, visits_s = 0.0, []  # type: float, list[float]
+    state = RunState()
+    for record in run.journal.records:
+        state.apply(record)
 
     def hear(record: Record) -> None:
-        nonlocal begun
+        state.apply(record)
         lines = event_lines(record)
-        if record["event"] == "visit":
-            begun = record["time"]
-        elif record["event"] == "posture":
-            visits_s.append(record["time"] - begun)
-            visited = len(run.postures())
-            left = max(0, run.planned - visited) * float(np.mean(visits_s[-10:]))
+        if record["event"] == "posture":
+            left = f", about {state.left_s():.0f} s left" if state.left_s() else ""
             lines = [
-                f"  [{visited:>3}/{run.planned}] {record['name']:<12} "
+                f"  [{len(state.done):>3}/{state.planned}] {record['name']:<12} "
                 f"u [{numbers(record['commanded_deg'], 8, 3)}]  "
-                f"y [{numbers(record['measured_deg'], 8, 3)}]  {visits_s[-1]:5.2f} s,"
-                f" about {left:.0f} s left"
+                f"y [{numbers(record['measured_deg'], 8, 3)}]{left}"
             ]
         if threading.current_thread() is threading.main_thread():
             run.say(*lines)
@@ -134,98 +71,3 @@ def plan_lines(
         f"{total:.0f} s"
     )
     return lines
-
-
-def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
-    """A and b with their intervals, the errors and any warning."""
-    lines = ["y = A u + b in degrees, +- 95 % confidence for all twelve at once:"]
-    for row, name in enumerate(AXIS_NAMES):
-        a, b, wide = summary["A"][row], summary["b"][row], summary["ci95"][row]
-        values = "  ".join(f"{a[i]:8.5f} +- {wide[i]:.5f}" for i in range(3))
-        lines.append(f"  {name:<5} [{values}]   {b:8.4f} +- {wide[3]:.4f}")
-    lines.append(f"  {noise_text(summary)}")
-    if "after" in summary:
-        lines.append(f"held-out {error_text(summary)}")
-    elif "prediction_max" in summary:  # a refit: nothing was compensated by it
-        lines.append(
-            f"held-out postures predicted to {summary['prediction_rms']:.4f} deg rms "
-            f"(max {summary['prediction_max']:.4f})"
-        )
-    if summary.get("drift"):
-        lines.append(f"drift: {drift_text(summary['drift'])}")
-    if summary["orders"]["warning"]:
-        lines.append(f"WARNING: {summary['orders']['warning']}")
-    if reasons := recalibrate(summary, limit_deg):
-        lines.append(
-            f"RECALIBRATE: {' and '.join(reasons)}. Do not use this calibration before "
-            "the cause is known"
-        )
-    return lines
-
-
-def recalibrate(summary: dict[str, Any], limit_deg: float) -> list[str]:
-    """Why a calibration is not to be used; nothing where all is well."""
-    reasons = []
-    what, worst = "after compensation", summary.get("after", {}).get("max", 0.0)
-    if "after" not in summary:
-        what, worst = "of the prediction", summary.get("prediction_max", 0.0)
-    if worst > limit_deg:
-        limit = f"session.verify_limit_deg ({limit_deg:g})"
-        reasons.append(f"the error {what} exceeds {limit}")
-    if summary.get("drift") and summary["drift"]["over"]:
-        limit = f"session.drift_limit_deg ({summary['drift']['limit_deg']:g})"
-        reasons.append(f"the drift of the zero that is left exceeds {limit}")
-    return reasons
-
-
-def drift_text(drift: dict[str, Any]) -> str:
-    """How far the zero drifted, and what was done about it."""
-    worst = int(np.argmax(np.abs(drift["angles_deg"]).max(axis=0)))
-    text = (
-        f"the zero posture read up to {drift['size_deg']:.4f} deg from zero "
-        f"({AXIS_NAMES[worst]}) on later visits (limit {drift['limit_deg']:g})"
-    )
-    if drift["corrected"]:
-        rate = drift["angles_deg"][-1][worst] / drift["minutes"][-1]
-        text += (
-            f"; linear, {rate:+.4f} deg/min, and taken out: {drift['left_deg']:.4f} "
-            "deg are left"
-        )
-    if drift["over"]:
-        kind = "It is not linear. " if len(drift["minutes"]) == 3 else ""
-        text += (
-            f". {kind}Look for a loose phone, play, or a magnetic heading near the "
-            "motors"
-        )
-    return text
-
-
-def noise_text(summary: dict[str, Any]) -> str:
-    """How large the noise is, axis by axis, and where it was taken from."""
-    as_good = ", ".join(f"{value:.1f}" for value in summary["effective_samples"])
-    std = zip(AXIS_NAMES, summary["noise_std_deg"], strict=True)
-    return (
-        f"noise of one posture {', '.join(f'{name} {v:.4f}' for name, v in std)} deg, "
-        f"from {summary['basis']} ({summary['dof']} degrees of freedom each); "
-        f"{summary['samples']} readings are correlated and count as {as_good}"
-    )
-
-
-def choice_text(choice: dict[str, Any]) -> str:
-    """How the postures were chosen, and how good they are."""
-    rank = "proven optimum" if choice["proven"] else "best known"
-    gap = choice["best_log_det"] - choice["log_det"]
-    return (
-        f"{choice['method']}: log det {choice['log_det']:.4f} (commands in degrees), "
-        f"{rank} {choice['best_log_det']:.4f}, gap {gap:.4f}, D-efficiency "
-        f"{np.exp(-gap / 12.0):.4f}"
-    )
-
-
-def error_text(found: dict[str, Any]) -> str:
-    """Errors at held-out postures, raw and compensated."""
-    before, after = found["before"], found["after"]
-    return (
-        f"error before {before['rms']:.4f} deg rms (max {before['max']:.4f}), after "
-        f"compensation {after['rms']:.4f} (max {after['max']:.4f})"
-    )

@@ -3,14 +3,12 @@
 C and Structured Text compute the same: a desired posture to commands in degrees and
 pulses, each clamped to its limits, with a status of one bit for each axis that was
 clamped. An input that is not a finite number sets the status and nothing else, so that
-the caller keeps its last command. JSON, CSV and ROS parameters hold the numbers.
+the caller keeps its last command. JSON and ROS parameters hold the numbers.
 """
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import io
 import json
 import pathlib
 from collections.abc import Callable
@@ -23,11 +21,10 @@ from rig.config import AXIS_NAMES
 from rig.config.axis import Scale
 from rig.core.faults import Refused
 from rig.journal import Record
-from rig.workbench.outputs.console import recalibrate
+from rig.workbench.outputs.words import recalibrate
 
 NUMBERS = ("matrix", "offset_deg", "min_deg", "max_deg", "pulses_per_deg", "min_pulses",
            "max_pulses")  # fmt: skip
-SINGLE = ("run", "created", "checksum")  # of the fields: texts
 
 
 def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
@@ -37,7 +34,7 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
         matrix (3, 3) M = A^-1 and offset_deg (3,) c = -A^-1 b; min_deg, max_deg (3,)
         soft limits of the commands, the same in pulses, pulses_per_deg (3,) signed;
         forward (3, 4) [A | b] and half_widths (3, 4), 95 % of all twelve at once; run,
-        created; device, its fingerprint as keys of rig.toml; warnings; axes.
+        created; device, its fingerprint as keys of rig.toml; warnings; axes; checksum.
 
     Raises:
         Refused: it holds none, or A cannot be inverted.
@@ -61,12 +58,12 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
     warnings = recalibrate(summary, config["session"]["verify_limit_deg"])
     if summary.get("simulated"):
         warnings.append("made on a simulated rig")
-    return {
+    inverse = {
         "matrix": np.column_stack(columns).tolist(),
         "offset_deg": at_zero.tolist(),
         "min_deg": [float(axis["min_deg"]) for axis in axes],
         "max_deg": [float(axis["max_deg"]) for axis in axes],
-        "pulses_per_deg": [Scale(**axis["scale"]).pulses_per_deg for axis in axes],
+        "pulses_per_deg": [Scale.of(axis).pulses_per_deg for axis in axes],
         "min_pulses": [axis["min_pulses"] for axis in axes],
         "max_pulses": [axis["max_pulses"] for axis in axes],
         "forward": np.column_stack([calibration.matrix, calibration.bias]).tolist(),
@@ -77,6 +74,7 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
         "warnings": warnings,
         "axes": list(AXIS_NAMES),
     }
+    return inverse | {"checksum": checksum(inverse)}
 
 
 def checksum(inverse: dict[str, Any]) -> str:
@@ -93,7 +91,7 @@ def _origin(inverse: dict[str, Any]) -> list[str]:
     """Where the numbers are from, in lines that are safe in a comment anywhere."""
     lines = [
         f"run {inverse['run']}, calibrated {inverse['created']}",
-        f"SHA-256 of the numbers: {checksum(inverse)}",
+        f"SHA-256 of the numbers: {inverse['checksum']}",
         "device fingerprint (keys of rig.toml):",
         *(f"  {key} = {json.dumps(value)}" for key, value in inverse["device"].items()),
         *(f"WARNING: {text}" for text in inverse["warnings"]),
@@ -112,9 +110,7 @@ def _code(name: str, inverse: dict[str, Any]) -> str:
         keep_trailing_newline=True,
     )
     environment.filters |= {"c": _c, "real": _real}
-    template = environment.get_template(name)
-    values = {"origin": _origin(inverse), "checksum": checksum(inverse)}
-    return template.render(**inverse | values)
+    return environment.get_template(name).render(**inverse, origin=_origin(inverse))
 
 
 def _c(value: Any) -> str:
@@ -129,36 +125,23 @@ def _real(value: float) -> str:
     return mantissa + ".0" * ("." not in mantissa) + e + exponent
 
 
-def _flat(inverse: dict[str, Any]) -> dict[str, list[Any]]:
-    """Every field as a list of texts or of numbers, matrices row by row."""
+def _ros(inverse: dict[str, Any]) -> str:
+    """Matrices row by row: ROS has no nested lists; and no empty ones."""
     told = [f"{key} = {json.dumps(value)}" for key, value in inverse["device"].items()]
     texts = {"device": told, "warnings": inverse["warnings"] or [""]}
-    values = inverse | texts | {"checksum": checksum(inverse)}
-    return {name: np.ravel(value).tolist() for name, value in values.items()}
-
-
-def _ros(inverse: dict[str, Any]) -> str:
     lines = [f"# {line}" for line in _origin(inverse)]
     lines += ["/**:", "  ros__parameters:", "    jaxcal:"]
-    for name, values in _flat(inverse).items():
+    for name, value in (inverse | texts).items():
+        values = np.ravel(value).tolist()
         each = [_real(v) if isinstance(v, float) else json.dumps(v) for v in values]
-        text = each[0] if name in SINGLE else f"[{', '.join(each)}]"
+        text = each[0] if isinstance(value, str) else f"[{', '.join(each)}]"
         lines.append(f"      {name}: {text}")
     return "\n".join([*lines, ""])
 
 
 def _json(inverse: dict[str, Any]) -> str:
     data = {"format": "jaxcal-inverse", "schema": 1, **inverse}
-    return json.dumps(data | {"checksum": checksum(inverse)}, indent=1) + "\n"
-
-
-def _csv(inverse: dict[str, Any]) -> str:
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["name", "number", "value"])
-    for name, values in _flat(inverse).items():
-        table.writerows((name, i, value) for i, value in enumerate(values))
-    return text.getvalue()
+    return json.dumps(data, indent=1) + "\n"
 
 
 LANGUAGES: dict[str, Callable[[dict[str, Any]], str]] = {
@@ -166,5 +149,4 @@ LANGUAGES: dict[str, Callable[[dict[str, Any]], str]] = {
     "st": lambda inverse: _code("calibration.st.j2", inverse),  # IEC 61131-3
     "ros": _ros,  # a ROS 2 parameter file
     "json": _json,
-    "csv": _csv,  # name, number, value; one value a row
 }

@@ -14,28 +14,20 @@ from typing import Any
 
 import numpy as np
 
-from jaxcal.pages import Figure, Page, Section, Strong, Table, Text, write_page
+from jaxcal.pages import Code, Figure, Page, Section, Table, Text, write_page
 from rig.config import AXIS_NAMES
 from rig.core.attitude import Array
 from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE
-from rig.journal import Record, RunFolder, measured_postures
-from rig.workbench.outputs.console import (
-    ENDS,
-    choice_text,
-    drift_text,
-    event_lines,
-    noise_text,
-    numbers,
-    recalibrate,
-    summary_lines,
-)
+from rig.journal import JOURNAL, Record, RunFolder, is_written, measured_postures
+from rig.workbench.outputs.state import RunState
+from rig.workbench.outputs.view import headline, trouble, verdict
+from rig.workbench.outputs.words import choice_text, numbers, recalibrate, summary_lines
 from rig.workbench.readings import angles, recorded_frame
 
 FOOTER = (
     "Research software, not a medical device. Calibrate with no patient attached; a "
     "hardware emergency stop is required."
 )
-TOLD = (*ENDS, "resume", "stop", "void", "unreachable", "replan", "sender_refused")
 MOST_ROWS = 60  # of the table of postures; more are in pairs.csv
 HEAD = [*(f"u {name}" for name in AXIS_NAMES), "b"]  # of the columns of [A | b]
 
@@ -57,32 +49,25 @@ def save_result(
 
 def write_report(folder: pathlib.Path, records: list[Record]) -> pathlib.Path:
     """Write ``report.html`` of a run, from the records of its journal."""
-    start, summary = records[0], {}
+    start, summary, state = records[0], {}, RunState()
+    for record in records:
+        state.apply(record)
     if (folder / "summary.json").is_file():
         text = (folder / "summary.json").read_text(encoding="utf-8")
         summary = json.loads(text)
     made = f"{start['started']} on {start['host']}, jaxcal {start['jaxcal']}"
-    intro = [Text([made, "."])]
-    if start.get("simulated"):
-        intro = [Text([made, ", ", Strong("simulated rig"), "."])]
-    intro.append(_ending(records))
-    if text := summary.get("orders", {}).get("warning"):
-        intro.append(Text(text, "warning"))
-    limit = start["config"]["session"]["verify_limit_deg"]
-    if reasons := recalibrate(summary, limit):
-        intro.append(Text(f"RECALIBRATE: {' and '.join(reasons)}.", "warning"))
-    sections = [*_calibrated(summary), *_checked(summary), *_measured(records)]
-    if rows := [
-        [
-            f"{datetime.datetime.fromtimestamp(record['time']):%H:%M:%S}",
-            record["event"],
-            " ".join(event_lines(record)) or record.get("reason", ""),
-        ]
-        for record in records
-        if record["event"] in TOLD
-    ]:
-        table = Table(["", "event", ""], rows, numeric=False)
-        sections.append(Section("What happened", [table]))
+    running = is_written(folder / JOURNAL)
+    told = ["made on a simulated device"] if start.get("simulated") else []
+    told += trouble(state, running, str(folder))
+    intro = [Text(f"{made}."), Text(f"{headline(state, running)[1]}.")]
+    intro += [Text(f"{text}.", "warning") for text in told]
+    sections = [*_result(state, summary), *_measured(records)]
+    rows = [
+        [f"{datetime.datetime.fromtimestamp(when):%H:%M:%S}", line]
+        for when, line in state.log
+    ]
+    table = Table(["", ""], rows, numeric=False)
+    sections.append(Section("What happened", [table]))
     path, kind = folder / "report.html", str(start["mode"])
     kind = "Calibration" if kind == "calibrate" else kind.capitalize()
     title = f"{kind} {folder.name}"
@@ -90,82 +75,38 @@ def write_report(folder: pathlib.Path, records: list[Record]) -> pathlib.Path:
     return path
 
 
-def _ending(records: list[Record]) -> Text:
-    """How the run ended, or that it did not."""
-    last = next(
-        r
-        for r in reversed(records)
-        if r["event"] in (*ENDS, "start", "resume") or r.get("phase") == "finishing"
-    )
-    match last["event"]:
-        case "phase":  # a calibration writes its report before its end
-            return Text("All was measured, and every drive was stopped.")
-        case "start" | "resume":
-            text = "This run has no end: it still runs, or it was killed."
-            return Text(text, "warning")
-        case "end":
-            return Text(f"Ended with exit code {last['code']}.")
-    return Text(f"Ended: {last['event']}. {last['reason']}", "warning")
-
-
-def _calibrated(summary: Record) -> list[Section]:
-    """A and b, how they were found, and what was changed by a refit."""
-    if "A" not in summary:
-        return []
-    values = np.column_stack([summary["A"], summary["b"]])
-    rows = [
-        [name, *(f"{v:.5f} ± {w:.5f}" for v, w in zip(row, wide, strict=True))]
-        for name, row, wide in zip(AXIS_NAMES, values, summary["ci95"], strict=True)
+def _result(state: RunState, summary: Record) -> list[Section]:
+    """What console and page say, errors at held-out targets, and what a refit did."""
+    lines = verdict(state, summary)
+    if choice := summary.get("choice"):
+        lines.append(f"chosen by {choice_text(choice)}. {choice['note']}")
+    warned = ("WARNING", "RECALIBRATE")
+    parts: list[Any] = [
+        Text(Code(line), "warning" if line.startswith(warned) else "") for line in lines
     ]
-    told = f"{noise_text(summary).capitalize()}. Measured postures: "
-    title = "y = A u + b, degrees, ± 95 % for all twelve at once"
-    told += f"{', '.join(summary['postures'])}."
-    found = [Section(title, [Table(["", *HEAD], rows), told])]
+    if "before" in summary:
+        shown = {"raw": "before", "compensated": "after"}
+        each = {t: summary[key]["each"] for t, key in shown.items() if key in summary}
+        alt = "held-out errors in degrees, raw and compensated"
+        parts.append(drawn(draw_errors, each, (9, 3.4), alt))
+    if rms := summary.get("orders", {}).get("rms"):
+        rows = [[order, f"{left:.4f}"] for order, left in rms.items()]
+        told = f"configured: {summary['orders']['configured']}"
+        parts.append(Table(["Euler order", "residual, degrees rms"], rows, told))
+    found = [Section("Result", parts)] if parts else []
     if changes := summary.get("changed"):
         rows = [[key, str(old), str(new)] for key, (old, new) in changes.items()]
         head = ["key of rig.toml", "as recorded", "here"]
         parts = [Table(head, rows, numeric=False)]
         if was := summary["was"]:
-            moved = values - np.column_stack([was["A"], was["b"]])
+            moved = [np.subtract(summary[name], was[name]) for name in ("A", "b")]
             rows = [
                 [name, *(f"{value:+.5f}" for value in row)]
-                for name, row in zip(AXIS_NAMES, moved, strict=True)
+                for name, row in zip(AXIS_NAMES, np.column_stack(moved), strict=True)
             ]
             parts.append(Table(["changed by", *HEAD], rows))
         found.append(Section(f"Identified anew from {summary['refit_of']}", parts))
-    if choice := summary.get("choice"):
-        text = f"{choice_text(choice)}. {choice['note']}"
-        found.append(Section("Choice", [text]))
-    if summary.get("drift"):
-        text = f"{drift_text(summary['drift']).capitalize()}."
-        found.append(Section("Drift", [text]))
-    if (orders := summary["orders"])["rms"]:
-        rows = [
-            [order + " (configured)" * (order == orders["configured"]), f"{rms:.4f}"]
-            for order, rms in orders["rms"].items()
-        ]
-        title = "Residual under each Euler order, degrees rms"
-        found.append(Section(title, [Table(["order", "residual"], rows)]))
     return found
-
-
-def _checked(summary: Record) -> list[Section]:
-    """Errors at held-out targets."""
-    if "before" not in summary:
-        return []
-    shown = {"raw": "before", "compensated": "after"}
-    shown = {title: key for title, key in shown.items() if key in summary}
-    rows = []
-    for title, key in shown.items():
-        values = (*summary[key]["rms_axis"], summary[key]["rms"], summary[key]["max"])
-        rows.append([title, *(f"{value:.4f}" for value in values)])
-    each = {title: summary[key]["each"] for title, key in shown.items()}
-    parts: list[Any] = [
-        Table(["", *AXIS_NAMES, "rms", "max"], rows),
-        drawn(draw_errors, each, (9, 3.4), "held-out errors, raw and compensated"),
-        f"Predicted by the calibration to {summary['prediction_rms']:.4f} deg rms.",
-    ]
-    return [Section("Held-out error, degrees", parts)]
 
 
 def _measured(records: list[Record]) -> list[Section]:

@@ -12,8 +12,8 @@ import numpy as np
 from jaxcal.pages import Badge, Block, Page, Section, Table, Text, write_page
 from rig.config import AXIS_NAMES
 from rig.journal import JournalError, Record, read_journal
-from rig.workbench.outputs.console import recalibrate
 from rig.workbench.outputs.report import draw_parameters, drawn
+from rig.workbench.outputs.words import held_out, recalibrate
 
 HEAD = ["measured", "run", "mode", "held-out error [deg]", "moved since the one before"]
 HOLDS = "the last calibration still holds"
@@ -75,8 +75,8 @@ def _device(runs: list[Record]) -> Device:
                 (", ".join(_moved(before[0], run)) or "nothing") if before else "first"
             )
             device.calibrations.append(run)
-        if "after" in run or "prediction_max" in run:  # compensated, or of a refit
-            worst = run["after"]["max"] if "after" in run else run["prediction_max"]
+        if "prediction" in run:
+            _, worst = held_out(run)
             error = f"{worst:.4f} (limit {run['limit']:g})"
             reasons = recalibrate(run, run["limit"])
             device.reasons = [f"{run['name']}: {reason}" for reason in reasons]

@@ -29,10 +29,9 @@ MIDDLE, END = "reference:middle", "reference:end"  # visits of the zero posture
 
 def calibrate(run: Run) -> int:
     """Run the whole session; returns the exit code."""
-    config, session = run.config, run.config.session
+    config = run.config
     candidates, choice = _plan(run)
     check_plan(config, [tuple(candidates[i].tolist()) for i in choice.indices])
-    run.planned = session.k + 2 * session.verify_postures + 2
     if run.lacks([END]):
         with run.device() as device:
             _visit_chosen(run, device, candidates, choice)
@@ -41,7 +40,6 @@ def calibrate(run: Run) -> int:
             _check_gains(run, first.matrix)
             first.save(run.folder / "calibration.partial.json")
             held = _held_out(run, first)
-            run.planned = session.k + 2 * len(held) + 2
             if held:
                 visit(device, Posture(MIDDLE, run.zero_pulses), role="reference")
             visit_pairs(run, device, held)
@@ -115,10 +113,6 @@ def _visit_chosen(run: Run, device: Device, candidates: Array, choice: Choice) -
             choice = choose(config, degrees, available, tuple(done), replanning=True)
             plan = run.emit("replan", sync=True, choice=dataclasses.asdict(choice))
         choice = Choice(**plan["choice"])
-        run.say(
-            f"  selected again without {index}: log det {choice.log_det:.4f}, "
-            f"{len(done)} measured postures kept"
-        )
 
 
 def _check_gains(run: Run, matrix: Any) -> None:

@@ -19,7 +19,7 @@ from rig.core.known import KeptZero, unseen
 from rig.core.motion import move
 from rig.core.session import visit
 from rig.workbench.identification.fit import held_out_errors, pairs
-from rig.workbench.outputs.console import error_text, numbers
+from rig.workbench.outputs.words import error_text, numbers
 from rig.workbench.procedures.calibrate import END, pair_names, visit_pairs
 from rig.workbench.procedures.plan import draw, draw_held_out
 from rig.workbench.procedures.play import CHARACTERISED, Play
@@ -41,7 +41,6 @@ def collect(run: Run, count: int) -> int:
     if run.dry_run:
         for number, target in enumerate(targets):
             run.say(f"  {number:>5}   {numbers(config.to_deg(target))}   {target}")
-    run.planned = len(targets) + 1
     names = [f"collect:{number}" for number in range(len(targets))]
     if run.lacks([*names, END]):
         with run.device() as device:
@@ -117,7 +116,15 @@ def load_calibration(
             f"{path}: made with a real device: what is found of a simulated one says "
             "nothing of it. Leave out --simulate, or name a simulated calibration"
         )
-    _check_device(path, notes, config)
+    if "device" not in notes:
+        raise Refused(
+            f"{path}: does not say with which device it was made. Calibrate this device"
+        )
+    if changed := differences(notes["device"], config.device_fingerprint()):
+        raise Refused(
+            f"{path}: made with another device: {'; '.join(changed)}. Correct "
+            "rig.toml, or calibrate this device"
+        )
     zero, attitude = notes.get("zero_pulses"), notes.get("zero_attitude")
     kept = KeptZero(
         f"calibration {notes.get('run', path)}",
@@ -142,19 +149,6 @@ def keep(path: pathlib.Path, axis: str, found: dict[str, Any]) -> None:
     file.write(path, content)
 
 
-def _check_device(path: pathlib.Path, notes: dict[str, Any], config: RigConfig) -> None:
-    """Refused where a calibration is of another device."""
-    if "device" not in notes:
-        raise Refused(
-            f"{path}: does not say with which device it was made. Calibrate this device"
-        )
-    if changed := differences(notes["device"], config.device_fingerprint()):
-        raise Refused(
-            f"{path}: made with another device: {'; '.join(changed)}. Correct "
-            "rig.toml, or calibrate this device"
-        )
-
-
 def verify(run: Run, calibration: Any, count: int) -> int:
     """Fresh held-out postures against a saved calibration: is it still true?"""
     config = run.config
@@ -163,7 +157,6 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     )["pairs"]
     if not held:
         raise Refused("no target in the ranges can be reached through this calibration")
-    run.planned = 2 * len(held)
     if run.dry_run:
         for raw, command in held:
             run.say(f"  target {numbers(config.to_deg(raw))}  command {list(command)}")
@@ -214,7 +207,6 @@ def goto(run: Run, calibration: Any, desired: Array, play: Play) -> int:
                 + f" less its play, {most:.3f} deg"
                 * bool(most)
             )
-    run.planned = 1
     if run.dry_run or not play.axes:
         _tell(run, desired, command)
     if run.lacks(["goto"]):
@@ -268,18 +260,15 @@ def unchecked(
 
 
 def _with_play(run: Run, device: Device, command: Array, play: Play) -> Array:
-    """(3,) the command with the play put back, once what is too near has run up."""
-    config, one_way = run.config, run.config.motion.approach_overshoot_deg > 0.0
-    here = config.to_deg(device.positions())
-    direction = np.ones(3) if one_way else np.where(command < here, -1.0, 1.0)
-    near = np.abs(command - here) < play.run_up
-    if near.any() and not one_way:  # so that the last move takes the play up
-        begin = np.where(near, command - direction * play.run_up, here)
+    """(3,) the command with the play put back, once a move from below has taken it up.
+
+    From above, where there is no room below.
+    """
+    config, direction = run.config, np.ones(3)
+    if not config.motion.approach_overshoot_deg:  # else every posture is so reached
         low = [axis.min_deg for axis in config.axes]
-        high = [axis.max_deg for axis in config.axes]
-        turned = near & ((begin < low) | (begin > high))
-        direction = np.where(turned, -direction, direction)
-        begin = np.where(near, command - direction * play.run_up, here)
+        direction = np.where(command - play.run_up < low, -1.0, 1.0)
+        begin = command - direction * play.run_up
         move(device, Posture("goto", config.to_pulses(begin)))
     run.say(*play.lines(command, direction))
     return command + play.shift(direction)

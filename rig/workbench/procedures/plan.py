@@ -25,14 +25,10 @@ class Choice:
     indices: tuple[int, ...]
     log_det: float  # of the 12 x 12 information matrix, commands in degrees
     best_log_det: float  # of the best subset known
+    efficiency: float  # D-efficiency (det S / det S*) ** (1/12)
     proven: bool  # that best is the proven optimum
     method: str
     note: str = ""
-
-    @property
-    def efficiency(self) -> float:
-        """D-efficiency ``(det S / det S*) ** (1/12)``."""
-        return math.exp((self.log_det - self.best_log_det) / 12.0)
 
 
 def draw(config: RigConfig, count: int, *seed: int) -> Array:
@@ -92,25 +88,23 @@ def choose(
             # A missing or foreign checkpoint must not keep a rig from being calibrated.
             reason = " ".join(str(error).split())[:200]
             note = f"no policy could be used ({reason}); exact is used instead"
-
-    def rated(selection: Any, note: str) -> Choice:
-        return Choice(
-            indices=tuple(int(i) for i in selection.indices),
-            log_det=float(selection.log_det),
-            best_log_det=float(max(exact.log_det, selection.log_det)),
-            proven=bool(exact.proven),
-            method=str(selection.method),
-            note=note,
+    best = max(exact.log_det, chosen.log_det)
+    efficiency = math.exp((chosen.log_det - best) / 12.0)
+    if efficiency < session.min_efficiency:
+        note = (
+            f"{session.method} reached a D-efficiency of {efficiency:.3f}, under "
+            f"session.min_efficiency = {session.min_efficiency:g}; using exact"
         )
-
-    choice = rated(chosen, note)
-    if choice.efficiency >= session.min_efficiency:
-        return choice
-    note = (
-        f"{session.method} reached a D-efficiency of {choice.efficiency:.3f}, under "
-        f"session.min_efficiency = {session.min_efficiency:g}; using exact"
+        chosen, efficiency = exact, math.exp((exact.log_det - best) / 12.0)
+    return Choice(
+        indices=tuple(int(i) for i in chosen.indices),
+        log_det=float(chosen.log_det),
+        best_log_det=float(best),
+        efficiency=efficiency,
+        proven=bool(exact.proven),
+        method=str(chosen.method),
+        note=note,
     )
-    return rated(exact, note)
 
 
 def travel_order(config: RigConfig, points_deg: Array, start_deg: Array) -> list[int]:

@@ -9,17 +9,15 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from jaxcal.calibration.identify import identify
-from jaxcal.evaluation.parameters import least_squares, parameter_names, predict
+from jaxcal.evaluation.parameters import least_squares, predict
+from jaxcal.models import Affine
 from jaxcal.paper.constants import AXES, BIAS_DEG, NOISE_STD_DEG, RANGES, SCALE
 from jaxcal.paper.datasets import dataset0_robot
-from jaxcal.paper.twin.robot import ORDERS, RobotConfig, read_out
-from jaxcal.paper.twin.robot_model import simulate
+from jaxcal.paper.twin import ORDERS, RobotConfig, read_out, simulate
 from jaxcal.plots.style import BLACK, COLOURS, boxes, legend_right, panels
 from studies.paper.exhibits.exhibit import Exhibit, by_axis, judge
 from studies.paper.exhibits.intervals import mean_interval, share_interval
 from studies.paper.exhibits.material import Material, commands_deg
-
-__all__ = ["exhibits"]
 
 Array = NDArray[np.float64]
 
@@ -40,7 +38,7 @@ def _robot(material: Material) -> Exhibit:
     """Whether MuJoCo, which drives dataset0, and the closed form read the same."""
     robot = dataset0_robot()
     commands = commands_deg(material.dataset("dataset3"))[0]
-    apart = np.abs(simulate(robot, commands) - np.asarray(read_out(robot, commands)))
+    apart = np.abs(simulate(robot, commands) - read_out(robot, commands))
     numbers = {"postures": len(commands), "largest_difference_deg": apart.max()}
     return Exhibit.from_texts("robot", {}, numbers=numbers)
 
@@ -127,7 +125,7 @@ def _table_1(material: Material) -> Exhibit:
     commands, measured = material.measured("dataset0")
     pooled = identify(commands.reshape(-1, 3), measured.reshape(-1, 3))
     truth = np.concatenate([np.diag(SCALE).ravel(), BIAS_DEG])
-    names = parameter_names(3, 3)
+    names = Affine(3, 3).names
     low, high = pooled.confidence_intervals(1.0 - 0.05 / 12).T  # all twelve at once
     ends = [
         identify(*pairs).confidence_intervals()
@@ -168,7 +166,7 @@ def _orders(material: Material) -> Exhibit:
     commands = RANGES.denormalise(material.settings.rng(6).random((count, 3)))
     left = []
     for order in ORDERS:
-        read = np.asarray(read_out(RobotConfig(read_out_order=order), commands))
+        read = read_out(RobotConfig(read_out_order=order), commands)
         left.append(read - predict(least_squares(commands, read), commands))
     rms, largest = (np.square(left).mean(axis=1) ** 0.5, np.abs(left).max(axis=1))
     columns: dict[str, Any] = {"read_out_order": list(ORDERS)}

@@ -11,11 +11,9 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxcal import pages
-from jaxcal.evaluation.results import versions
+from jaxcal.extras import versions
 from studies.paper.exhibits.exhibit import Claim, Exhibit, Verdict
 from studies.paper.exhibits.material import Settings
-
-__all__ = ["json_document", "page"]
 
 _TONES: dict[Verdict, tuple[Literal["good", "fair", "bad", "neutral"], str]] = {
     "agrees": ("good", "agree"),

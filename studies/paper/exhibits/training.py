@@ -13,7 +13,6 @@ import pathlib
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from jaxcal.evaluation.training_figure import (
@@ -21,18 +20,15 @@ from jaxcal.evaluation.training_figure import (
     read_metrics,
     training_curves,
 )
-from jaxcal.plots.style import COLOURS, GREY, band, boxes, panels
 from studies.paper.exhibits.exhibit import Exhibit, Verdict, judge
 from studies.paper.exhibits.intervals import mean_interval
 from studies.paper.exhibits.material import Material
-
-__all__ = ["Run", "exhibits", "kept_runs", "plateau"]
 
 Array = NDArray[np.float64]
 
 CLAIMED = 200_000  # episodes within which the paper's training converges
 _SUMMARY = (  # what is read of a run's summary.json
-    *("seed", "episodes", "planned_episodes", "finished", "seconds", "parameters"),
+    *("seed", "episodes", "planned_episodes", "seconds", "parameters"),
     "dataset2",
 )
 
@@ -130,11 +126,6 @@ def _seeds(runs: list[Run], paper: list[Run]) -> Exhibit:
     for run in runs:
         curve = np.interp(grid, run.metrics["episodes"], run.metrics["reward_mean"])
         columns[f"reward_seed_{run.summary['seed']}"] = curve
-    bands = [
-        mean_interval(row) for row in zip(*list(columns.values())[1:], strict=True)
-    ]
-    for name, field in (("mean", "value"), ("low", "low"), ("high", "high")):
-        columns[f"reward_{name}"] = [getattr(found, field) for found in bands]
     flat = [plateau(run) for run in runs]
     lengths = [run.summary["episodes"] for run in runs]
     numbers: dict[str, Any] = {
@@ -149,9 +140,8 @@ def _seeds(runs: list[Run], paper: list[Run]) -> Exhibit:
     for name in ("ratio_to_exact", "hit_rate"):
         reached = [run.summary["dataset2"][name] for run in runs]
         numbers[name] = mean_interval(reached, upper_limit=1.0)
-    rewards = {f"seed {run.summary['seed']}": run.rewards for run in runs}
-    if paper:
-        rewards["paper's network"] = paper[0].rewards
+    shown = {f"seed {run.summary['seed']}": run for run in runs}
+    shown |= dict(zip(["paper's"], paper, strict=False))
     ends = dict.fromkeys((min(lengths), max(lengths)))
     return Exhibit.from_texts(
         "figure_2",
@@ -160,12 +150,14 @@ def _seeds(runs: list[Run], paper: list[Run]) -> Exhibit:
             "caution": _caution(runs),
         },
         verdict=_converges(runs, flat),
-        figures={"figure_2_seeds": _curves(runs, columns, rewards, paper)},
+        figures={
+            "figure_2_seeds": training_curves({n: r.folder for n, r in shown.items()})
+        },
         data={
             "reward": columns,
             "last_rewards": {
-                "run": [name for name, values in rewards.items() for _ in values],
-                "reward": np.concatenate(list(rewards.values())),
+                "run": [name for name, run in shown.items() for _ in run.rewards],
+                "reward": np.concatenate([run.rewards for run in shown.values()]),
             },
         },
         numbers=numbers,
@@ -184,59 +176,13 @@ def _caution(runs: list[Run]) -> str:
     return ", ".join(parts) + ". " if parts else ""
 
 
-def _curves(
-    runs: list[Run],
-    columns: dict[str, Any],
-    rewards: dict[str, Array],
-    paper: list[Run],
-) -> Figure:
-    """Reward with its band, last rewards by seed, and the share of the optimum."""
-    title = "Training of the compact preset"
-    figure, (left, middle, right) = panels((12.0, 3.8), title, (1, 3))
-    thin = {"color": GREY, "linewidth": 0.6, "alpha": 0.7}
-    for i, run in enumerate(runs):
-        x, y = run.metrics["episodes"] / 1e3, run.metrics["reward_mean"]
-        left.plot(x, y, label="one seed" if i == 0 else None, **thin)
-    ends = (columns[f"reward_{name}"] for name in ("mean", "low", "high"))
-    text = "mean; band: its 95 % interval"
-    band(left, columns["episodes"] / 1e3, *ends, color=COLOURS[0], label=text)
-    left.set_title(f"(a) reward, {len(runs)} seeds", fontsize=10)
-
-    colours = [COLOURS[0 if name.startswith("seed") else 1] for name in rewards]
-    boxes(middle, list(rewards.values()), colours, (5, 95))
-    short = [n.removeprefix("seed ").removesuffix("'s network") for n in rewards]
-    middle.set_xticks(range(1, len(rewards) + 1), short)
-    middle.set_xlabel("seed; box: quartiles, whiskers: 5 to 95 %")
-    middle.set_title("(b) reward, last 1,000 episodes", fontsize=10)
-
-    seed: dict[str, Any] = {"color": GREY, "linewidth": 1.0, "linestyle": "-"}
-    other: dict[str, Any] = {"color": COLOURS[1], "linewidth": 1.6, "linestyle": "--"}
-    labels = {"compact, one seed": (runs, seed), "paper's network": (paper, other)}
-    for label, (shown, look) in labels.items():
-        for i, run in enumerate(shown):
-            x = run.metrics["episodes"]
-            ratio = run.metrics.get("ratio_to_exact", np.full(len(x), np.nan))
-            known = np.isfinite(ratio)
-            name = None if i else label
-            right.plot(x[known] / 1e3, ratio[known], label=name, **look)
-    right.set_ylim(0.0, 1.02)
-    right.set_title("(c) share of the optimum, validation", fontsize=10)
-    right.set_ylabel("mean det S / det S*")
-    for axes in (left, middle):
-        axes.set_ylabel("reward (log det S / 10)")
-    for axes in (left, right):
-        axes.set_xlabel("training episodes (thousands)")
-        axes.legend(fontsize=8, frameon=False, loc="lower right")
-    return figure
-
-
 def _paper(runs: list[Run]) -> Exhibit:
     if not runs:
         return Exhibit.missing("figure_2_paper", present=False)
     run = runs[0]
     held, flat = run.summary, plateau(run)
     took = "." if run.finished else ": not finished, so this is how far it went."
-    figure = training_curves(run.folder)
+    figure = training_curves({"paper's": run.folder})
     figure.suptitle("Training of the paper's network", fontsize=10)
     return Exhibit.from_texts(
         "figure_2_paper",

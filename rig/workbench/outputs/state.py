@@ -10,7 +10,7 @@ import dataclasses
 from typing import Any
 
 from rig.config.axis import Scale
-from rig.workbench.outputs.console import ENDS, event_lines
+from rig.workbench.outputs.words import ENDS, event_lines
 
 Record = dict[str, Any]
 Degrees = list[float]  # pitch, yaw, roll
@@ -134,7 +134,11 @@ class RunState:
             case _ if event in ENDS:
                 self._interrupt()
                 self.ended, self.phase = record, event
-        if line := self._line(record):
+        lines = event_lines(record)
+        if event in ENDS and record["reason"]:
+            lines = [f"{event}: {record['reason']}"]
+        if lines:
+            line = "; ".join(line.strip() for line in lines)
             self.log = [*self.log, (now, line)][-LOGGED:]
 
     def _interrupt(self) -> None:
@@ -163,24 +167,21 @@ class RunState:
             posture.commanded = self.to_deg(pulses)
         return posture
 
-    def _line(self, record: Record) -> str:
-        """What is worth a line of the log."""
-        match record.get("event"):
-            case "start":
-                return f"{record.get('mode', 'run')} begun"
-            case "resume":
-                return "gone on with after an interruption"
-            case "replan":
-                return "the remaining postures were chosen again"
-            case event if event in ENDS and record.get("reason"):
-                return f"{event}: {record['reason']}"
-        return "; ".join(line.strip() for line in event_lines(record))
-
     def to_deg(self, pulses: Any) -> Degrees:
         """Degrees of (3,) pulses, by the scales in the journal's configuration."""
-        scales = [Scale(**axis["scale"]) for axis in self.start["config"]["axes"]]
+        scales = [Scale.of(axis) for axis in self.start["config"]["axes"]]
         pairs = zip(scales, pulses, strict=True)
         return [round(scale.to_deg(count), 6) for scale, count in pairs]
+
+    def present(self, sample: Record, running: bool) -> dict[str, Degrees | None]:
+        """commanded, drives, measured and std: by telemetry, or as measured last."""
+        if not running and self.done:
+            last = self.done[-1]
+            asked, found, std = last.commanded, last.measured, last.std
+        else:
+            asked, found, std = self.target, sample.get("deg"), sample.get("std")
+        drives = sample.get("drives")
+        return {"commanded": asked, "drives": drives, "measured": found, "std": std}
 
     @property
     def mode(self) -> str:

@@ -1,24 +1,16 @@
-"""What the page says, and how it is drawn: pure functions of the state.
-
-The sentences are made here; page.html.j2 draws and escapes them.
-"""
+"""What page and report say of a run: pure functions of its state."""
 
 from __future__ import annotations
 
-import functools
 import math
-import pathlib
 import shlex
-import time
 from typing import Any
-
-import jinja2
 
 from rig.config import AXIS_NAMES
 from rig.core.faults import EXIT_RECALIBRATE
 from rig.core.stop import UnitStop
-from rig.workbench.live.state import ACTIVE, SESSIONS, Posture, Record, RunState
-from rig.workbench.outputs.console import error_text, summary_lines
+from rig.workbench.outputs.state import ACTIVE, SESSIONS, Posture, Record, RunState
+from rig.workbench.outputs.words import error_text, summary_lines
 
 SHOWN = 40  # rows of a long queue
 STALE_S = 1.0
@@ -30,7 +22,7 @@ PHASES = {
     "settling": "Waiting until {} is quiet",
     "measuring": "Measuring {}",
     "saving": "Saving",
-    "finishing": "Drives at rest; identifying",
+    "finishing": "All is measured, and the drives are at rest",
 }
 ENDED = {
     "end": ("good", "Done"),
@@ -103,13 +95,9 @@ def trouble(state: RunState, running: bool, folder: str) -> list[str]:
     return [line for line in lines if line]
 
 
-def numbers(state: RunState, sample: Record, live: bool) -> list[tuple[str, ...]]:
+def numbers(now: dict[str, Any]) -> list[tuple[str, ...]]:
     """A row an axis: commanded, drive, measured, difference, scatter."""
-    asked, found, std = state.target, sample.get("deg"), sample.get("std")
-    if not live and state.done:
-        last = state.done[-1]
-        asked, found, std = last.commanded, last.measured, last.std
-    columns = [v or NONE for v in (asked, sample.get("drives"), found, std)]
+    columns = [now[name] or NONE for name in ("commanded", "drives", "measured", "std")]
     return [
         (
             name, angle(a), angle(d), angle(y),
@@ -120,9 +108,9 @@ def numbers(state: RunState, sample: Record, live: bool) -> list[tuple[str, ...]
     ]  # fmt: skip
 
 
-def stream(sample: Record, running: bool, now: float) -> str:
+def stream(sample: Record, now: float) -> str:
     """How the phone's stream is; empty where there is nothing to report."""
-    if not running or not sample:
+    if not sample:
         return ""
     if now - sample["time"] > STALE_S:
         return f"no telemetry for {now - sample['time']:.0f} s"
@@ -144,37 +132,14 @@ def queue(state: RunState) -> list[Posture]:
 
 
 def verdict(state: RunState, summary: dict[str, Any]) -> list[str]:
-    """The result at the end of a run, as on the console; empty before."""
-    if state.ended is None or state.ended["event"] != "end":
-        return []
+    """The result of a run, as on the console; empty before there is one."""
     limit = state.setting("session", "verify_limit_deg", math.nan)
     if "A" in summary:
         return summary_lines(summary, limit)
     if "before" in summary:
         return [f"{error_text(summary)}, limit {limit:g}"]
+    if state.ended is None or state.ended["event"] != "end":
+        return []
     if state.mode == "goto" and state.done:
         return ["Reached " + " ".join(map(angle, state.done[-1].measured or [])) + "°"]
     return [f"{len(state.done)} postures recorded"] * (state.mode == "collect")
-
-
-def draw(part: str, **values: Any) -> str:
-    """A part of the page as HTML: a macro of page.html.j2."""
-    return str(getattr(_template(), part)(**values))
-
-
-@functools.cache
-def _template() -> Any:
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(pathlib.Path(__file__).parent),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters["angles"] = lambda values: " ".join(
-        angle(value, 2) for value in values
-    )
-    environment.filters["clock"] = lambda when: time.strftime(
-        "%H:%M:%S", time.localtime(when)
-    )
-    return environment.get_template("page.html.j2").module

@@ -1,0 +1,180 @@
+"""What the events of a run and the results of a calibration come to, in words.
+
+Console, page and report say the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from rig.config import AXIS_NAMES
+from rig.core.stop import UnitStop
+from rig.journal import Record
+
+ENDS = ("end", "fault", "stopped", "paused", "refused")
+REPLIES = {
+    "obeyed": "the drive obeys",
+    "not taken": "the drive did not take it, so it is sent again",
+    "unknown": "whether the drive took it is unknown, so all stop",
+}
+
+
+def _reference(record: Record) -> str:
+    worst = max(map(abs, record["angles"]))
+    good = f"reference posture reads {worst:.3f} deg from zero: going on"
+    return good if worst <= record["limit"] else ""
+
+
+def _comm_restored(record: Record) -> str:
+    return record["error"] and (
+        f"{record['axis']}: its communication timeout was not put back to "
+        f"{record['counts']} ({record['error']}); `jaxcal-rig resume` does it"
+    )
+
+
+def _stop(record: Record) -> str:
+    units = "".join(f"\n  {UnitStop(**unit)}" for unit in record["units"])
+    return f"stop: {record['reason'] or 'end of run'}{units}"
+
+
+# An event of the run in words, for console, page and report: its fields are put in.
+SENTENCES: dict[str, str | Callable[[Record], str]] = {
+    "start": "{mode} begun",
+    "resume": "gone on with after an interruption",
+    "listening": "IMU: waiting for the phone on port {port} ({format})",
+    "armed": "armed: {drives} drives on {where}",
+    "note": "{text}",
+    "reference": _reference,
+    "reoriented": "the phone came back, its heading turned {turned_deg:.3f} deg: "
+    "{told}",
+    "zero": "zero taken at pulses {pulses}",
+    "void": lambda r: f"  withdrawn, to be measured again: {', '.join(r['names'])}",
+    "replan": lambda r: (
+        "  the postures that are left were selected again: log det "
+        f"{r['choice']['log_det']:.4f}"
+    ),
+    "pausing": "pausing after this posture; another Ctrl-C stops at once",
+    "lost_reply": lambda r: (
+        f"  the reply to a move of {r['axis']} was lost: {REPLIES[r['outcome']]}"
+    ),
+    "sender_refused": "WARNING: {reason}",
+    "unreachable": "  {name} is out of reach: {reason}",
+    "comm_restored": _comm_restored,
+    "stop": _stop,
+}
+
+
+def event_lines(record: Record) -> list[str]:
+    """What an event of the run comes to; most are silent."""
+    sentence = SENTENCES.get(record["event"], "")
+    if isinstance(sentence, str):
+        return sentence.format_map(record).splitlines()
+    return sentence(record).splitlines()
+
+
+def numbers(values: Any, width: int = 9, digits: int = 4) -> str:
+    """Numbers side by side; what rounds to zero has no sign."""
+    rounded = (round(float(value), digits) + 0.0 for value in values)
+    return " ".join(f"{value:{width}.{digits}f}" for value in rounded)
+
+
+def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
+    """A and b with their intervals, the errors and any warning."""
+    lines = ["y = A u + b in degrees, +- 95 % confidence for all twelve at once:"]
+    for row, name in enumerate(AXIS_NAMES):
+        a, b, wide = summary["A"][row], summary["b"][row], summary["ci95"][row]
+        values = "  ".join(f"{a[i]:8.5f} +- {wide[i]:.5f}" for i in range(3))
+        lines.append(f"  {name:<5} [{values}]   {b:8.4f} +- {wide[3]:.4f}")
+    lines.append(f"  {noise_text(summary)}")
+    if "after" in summary:
+        lines.append(f"held-out {error_text(summary)}")
+    elif found := summary.get("prediction"):  # a refit: nothing was compensated by it
+        lines.append(
+            f"held-out postures predicted to {found['rms']:.4f} deg rms "
+            f"(max {found['max']:.4f})"
+        )
+    if summary.get("drift"):
+        lines.append(f"drift: {drift_text(summary['drift'])}")
+    if summary["orders"]["warning"]:
+        lines.append(f"WARNING: {summary['orders']['warning']}")
+    if reasons := recalibrate(summary, limit_deg):
+        lines.append(
+            f"RECALIBRATE: {' and '.join(reasons)}. Do not use this calibration before "
+            "the cause is known"
+        )
+    return lines
+
+
+def held_out(summary: dict[str, Any]) -> tuple[str, float]:
+    """Which error at held-out targets a calibration is judged by, and the largest."""
+    if "after" in summary:
+        return "after compensation", summary["after"]["max"]
+    return "of the prediction", summary.get("prediction", {}).get("max", math.nan)
+
+
+def recalibrate(summary: dict[str, Any], limit_deg: float) -> list[str]:
+    """Why a calibration is not to be used; nothing where all is well."""
+    reasons = []
+    what, worst = held_out(summary)
+    if worst > limit_deg:
+        limit = f"session.verify_limit_deg ({limit_deg:g})"
+        reasons.append(f"the error {what} exceeds {limit}")
+    if summary.get("drift") and summary["drift"]["over"]:
+        limit = f"session.drift_limit_deg ({summary['drift']['limit_deg']:g})"
+        reasons.append(f"the drift of the zero that is left exceeds {limit}")
+    return reasons
+
+
+def drift_text(drift: dict[str, Any]) -> str:
+    """How far the zero drifted, and what was done about it."""
+    worst = int(np.argmax(np.abs(drift["angles_deg"]).max(axis=0)))
+    text = (
+        f"the zero posture read up to {drift['size_deg']:.4f} deg from zero "
+        f"({AXIS_NAMES[worst]}) on later visits (limit {drift['limit_deg']:g})"
+    )
+    if drift["corrected"]:
+        rate = drift["angles_deg"][-1][worst] / drift["minutes"][-1]
+        text += (
+            f"; linear, {rate:+.4f} deg/min, and taken out: {drift['left_deg']:.4f} "
+            "deg are left"
+        )
+    if drift["over"]:
+        kind = "It is not linear. " if len(drift["minutes"]) == 3 else ""
+        text += (
+            f". {kind}Look for a loose phone, play, or a magnetic heading near the "
+            "motors"
+        )
+    return text
+
+
+def noise_text(summary: dict[str, Any]) -> str:
+    """How large the noise is, axis by axis, and where it was taken from."""
+    std = zip(AXIS_NAMES, summary["noise_std_deg"], strict=True)
+    return (
+        f"noise of one posture {', '.join(f'{name} {v:.4f}' for name, v in std)} deg, "
+        f"from {summary['basis']} ({summary['dof']} degrees of freedom each)"
+    )
+
+
+def choice_text(choice: dict[str, Any]) -> str:
+    """How the postures were chosen, and how good they are."""
+    rank = "proven optimum" if choice["proven"] else "best known"
+    gap = choice["best_log_det"] - choice["log_det"]
+    return (
+        f"{choice['method']}: log det {choice['log_det']:.4f} (commands in degrees), "
+        f"{rank} {choice['best_log_det']:.4f}, gap {gap:.4f}, D-efficiency "
+        f"{choice['efficiency']:.4f}"
+    )
+
+
+def error_text(found: dict[str, Any]) -> str:
+    """Errors at held-out postures, raw and compensated."""
+    before, after = found["before"], found["after"]
+    return (
+        f"error before {before['rms']:.4f} deg rms (max {before['max']:.4f}), after "
+        f"compensation {after['rms']:.4f} (max {after['max']:.4f})"
+    )
