@@ -1,4 +1,4 @@
-"""What the page shows of a run, from the records of its journal and nothing else.
+"""What console, page and report show of a run, from the records of its journal.
 
 ``RunState`` takes the records one by one and touches neither files nor clocks, so that
 a page that is opened late shows the same as one that was there from the beginning.
@@ -10,9 +10,9 @@ import dataclasses
 from typing import Any
 
 from rig.config.axis import Scale
+from rig.journal import Record
 from rig.workbench.outputs.words import ENDS, event_lines
 
-Record = dict[str, Any]
 Degrees = list[float]  # pitch, yaw, roll
 LOGGED = 200  # newest lines of what happened
 SESSIONS = ("calibrate", "collect", "verify", "goto")  # the others are commissioning
