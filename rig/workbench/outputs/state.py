@@ -72,7 +72,13 @@ class RunState:
     _seq: int = -1
 
     def apply(self, record: Record) -> None:
-        """Take the next record."""
+        """Take the next record; one of another version, or edited by hand, harms not."""
+        try:
+            self._apply(record)
+        except (KeyError, ValueError, TypeError, IndexError):
+            self.damaged = True
+
+    def _apply(self, record: Record) -> None:
         event, now = record.get("event", ""), float(record.get("time", self.time))
         self.damaged |= record.get("seq", 0) != self._seq + 1
         self._seq, self.time = record.get("seq", 0), now
