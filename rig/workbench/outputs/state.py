@@ -72,7 +72,7 @@ class RunState:
     _seq: int = -1
 
     def apply(self, record: Record) -> None:
-        """Take the next record; one of another version, or edited by hand, harms not."""
+        """Take the next record. One that was edited by hand, say, is left out."""
         try:
             self._apply(record)
         except (KeyError, ValueError, TypeError, IndexError):
