@@ -1,4 +1,4 @@
-"""``shares``, which is not tuned, and other rules on twenty families of tasks.
+"""``ahead``, which is not tuned, and other deciders on twenty families of tasks.
 
     python benchmarks/families.py [--episodes 4096] [--seed 0] [--families 0 1 ...]
         [--methods NAME ...] [--keep DIR] [--json FILE]
@@ -6,9 +6,9 @@
     python benchmarks/families.py --tune
 
 A family is a task drawn by ``jaxcal.adaptive.family`` from a held-out structure: the
-constants of ``shares`` were found on other structures. Every method plays the same
-sessions of it; ``priced`` and ``state`` are tuned on it first, 20 generations each, on
-other sessions. ``two_step`` and ``rollouts`` follow ``shares`` and play fewer sessions.
+constants of ``shares`` and ``ahead`` were found on other structures. Every method plays
+the same sessions of it; ``priced`` and ``state`` are tuned on it first, 20 generations
+each, on other sessions. ``two_step`` and ``rollouts`` follow ``shares`` and play fewer.
 Differences are in pairs with standard errors; times are of one core, a choice in a
 batch. With --keep what was played lies in DIR and is not played again.
 --optimum plays small tasks of the same structures, their answers made certain and
@@ -37,7 +37,7 @@ from jaxcal.adaptive.family.draws import draw
 from jaxcal.adaptive.family.padded import batch
 from jaxcal.adaptive.family.structures import HELD_OUT, Limits
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.lookahead import Rollouts, TwoStep
+from jaxcal.adaptive.lookahead import AHEAD, Rollouts, TwoStep
 from jaxcal.adaptive.rules import (
     SHARES,
     Gain,
@@ -53,8 +53,8 @@ from jaxcal.files import require_writable_folder, write_text
 from jaxcal.learning.runtime import cache
 
 METHODS = (
-    "random", "gain", "rate", "shares", "priced", "state", "two_step", "rollouts16",
-    "rollouts64",
+    "random", "gain", "rate", "shares", "ahead", "priced", "state", "two_step",
+    "rollouts16", "rollouts64",
 )  # fmt: skip
 TUNED = ("priced", "state")
 RULES = ("gain", "rate", *TUNED)
@@ -156,6 +156,7 @@ def decider_of(method: str, task: GridTask, seed: int, found: dict[str, Any]) ->
         )
     return {
         "random": Random, "gain": Gain, "rate": GainRate, "shares": lambda: SHARES,
+        "ahead": lambda: AHEAD,
         "priced": lambda: found["priced"], "state": lambda: found["state"],
         "two_step": lambda: TwoStep(SHARES),
         "rollouts16": lambda: Rollouts(SHARES, rollouts=16),
@@ -238,7 +239,7 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     rows = []
     print(f"{'family':34}" + "".join(f"{m:>11}" for m in options.methods)
-          + f"{'shares less best':>19}")  # fmt: skip
+          + f"{'ahead less best':>19}")  # fmt: skip
     for number in options.families:
         row = played(number, options.methods, options)
         gains = row.pop("gains")
@@ -249,13 +250,13 @@ def main(argv: list[str] | None = None) -> int:
         rivals = [m for m in RULES if m in gains] or options.methods
         best = max(rivals, key=lambda m: row["nats"][m][0])
         gains["best"], row["nats"]["best"] = gains[best], row["nats"][best]
-        if "shares" in gains:
-            mine = gains.pop("shares")
+        if "ahead" in gains:
+            mine = gains.pop("ahead")
             row["less"] = {m: paired(mine, other) for m, other in gains.items()}
             line += shown(row["less"]["best"], 19)
         rows.append(row)
         print(line, flush=True)
-    if "shares" in options.methods:
+    if "ahead" in options.methods:
         _summary(rows)
     if options.json is not None:
         document = {"episodes": options.episodes, "seed": options.seed, "rows": rows}
@@ -264,8 +265,8 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _summary(rows: list[dict[str, Any]]) -> None:
-    """Means over the families, and in how many shares is clearly above or below."""
-    print(f"shares less, mean of {len(rows)} families; best: of the four rules")
+    """Means over the families, and in how many ahead is clearly above or below."""
+    print(f"ahead less, mean of {len(rows)} families; best: of the four rules")
     for method in rows[0]["less"]:
         each = np.array([row["less"][method] for row in rows])
         error = np.sqrt((each[:, 1] ** 2).sum()) / len(each)

@@ -271,9 +271,9 @@ def _step(given: Step, state: str, name: str, *options: Any) -> int:
 
 @contextlib.contextmanager
 def _place(given: Target, state: str = "") -> Iterator[Place]:
-    """The device that a command is about.
+    """The device that a command is about, which has reached a state.
 
-    A simulated one is first taken through the states before the command's own.
+    A simulated one is first taken through the states up to it.
     """
     from rig.journal import DeviceRecord
     from rig.workbench.commission import steps
@@ -289,6 +289,8 @@ def _place(given: Target, state: str = "") -> Iterator[Place]:
             place.operator.yes = yes
         else:
             record = DeviceRecord.load(config.device_path)
+            if state and (lack := record.missing(config, state)):
+                raise Refused(lack)
             operator = steps.Operator(yes, _say)
             place = steps.Place(config, record, operator, given.config)
         place.reset_alarms = getattr(given, "reset_alarms", False)
@@ -378,25 +380,24 @@ def _run(
         if not real:
             simulator = given.simulator(config, start["simulated"])
             config = stack.enter_context(simulator).start()
-        lock = BusLock(config.bus)
-        if not given.dry_run:
+        lock, record = BusLock(config.bus), DeviceRecord.load(config.device_path)
+        if real and not given.dry_run:
             stack.enter_context(lock.acquire(command))
-        record = DeviceRecord.load(config.device_path)
-        if real and not given.dry_run and (lack := record.missing(config)):
-            raise Refused(lack)
+            if lack := record.missing(config):
+                raise Refused(lack)
         if folder is None:
             folder = new_run_folder(given.out or Path(config.output), start["mode"])
             (folder / "rig.toml").write_text(text, encoding="utf-8")
-        lock.tell(run=str(folder.resolve()))
         if simulator is not None:
             record = DeviceRecord(folder / "device.json")
             if not given.dry_run:
-                place = steps.simulated(simulator, config, record, _say)
-                place.folder, place.locked = folder / "axes", True
-                place.folder.mkdir(exist_ok=True)
+                at = config.model_copy(update={"output": str(folder)})
+                place = steps.simulated(simulator, at, record, _say)
                 # Faults wait for the session's own phases.
                 place.listeners = (simulator.answer,)
                 steps.begin_simulated(place, SIGN_CHECKED)
+                stack.enter_context(lock.acquire(command))
+        lock.tell(run=str(folder.resolve()))
         run = Run(
             config,
             folder,

@@ -86,8 +86,8 @@ def main(pythons: list[str]) -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = pathlib.Path(name)
         for python in pythons:
-            check(python, None, folder / python)
-            shutil.rmtree(folder / python)
+            check(python, None, folder / "env")
+            shutil.rmtree(folder / "env")
         builder = fresh(sys.executable, folder / "build")
         pip(builder, "install", "hatchling")
         run(builder, "-m", "hatchling", "build", "-t", "sdist", "-d", folder / "dist")

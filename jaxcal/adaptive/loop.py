@@ -23,7 +23,8 @@ from jaxcal.adaptive.history import (
     step_keys,
 )
 from jaxcal.adaptive.journal import Journal, fingerprint
-from jaxcal.adaptive.rules import SHARES, Gain
+from jaxcal.adaptive.lookahead import AHEAD
+from jaxcal.adaptive.rules import Gain
 from jaxcal.adaptive.session import Decider, Session, Task
 
 __all__ = ["Finished", "Proposal", "next_measurement", "run"]
@@ -68,7 +69,7 @@ def next_measurement(
         history: (design, outcome) of each measurement in order. A design is an index of
             ``task.designs`` (a whole number) or its coordinates.
         decider: when not given, the largest expected gain, and where time or uses count
-            the largest per share of what is left (``rules.SHARES``).
+            ``lookahead.AHEAD``.
         seconds: budget of the whole session; the task's when not given.
         uses: likewise of what is countable.
         seed: of deciders and beliefs that draw. The same arguments, the same proposal.
@@ -143,7 +144,7 @@ def run(
 
 def _default(task: Task, session: Session) -> Decider:
     counted = isinstance(task, GridTask) and bool((task.uses > 0).any())
-    return SHARES if math.isfinite(session.seconds) or counted else Gain()
+    return AHEAD if math.isfinite(session.seconds) or counted else Gain()
 
 
 def _proposal(

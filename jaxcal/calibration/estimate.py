@@ -12,7 +12,7 @@ from jaxcal.calibration.harmonics import WithHarmonics
 from jaxcal.calibration.sizes import Sizes, group_sizes, of_sizes
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
 from jaxcal.checks import in_words, one_of
-from jaxcal.information.blocks import significant
+from jaxcal.information.blocks import significant, triangle
 from jaxcal.models import (
     Model,
     Noise,
@@ -320,14 +320,14 @@ def _covariance(
     size, free = len(task.mean), np.flatnonzero(task.free)
     scale = np.sqrt((rows**2).sum(axis=0) + precision)
     scale = np.where(scale > 0.0, scale, 1.0)
-    triangle = np.linalg.qr(
-        np.concatenate([rows, np.diag(np.sqrt(precision))]) / scale, "r"
-    )
-    _, singular, right = np.linalg.svd(triangle)
+    whole = np.concatenate([rows, np.diag(np.sqrt(precision))]) / scale
+    _, singular, right = np.linalg.svd(triangle(whole))
     known = significant(singular)
     readings = left * len(task.commands)
-    of_rows = significant(np.linalg.svd(rows / scale, compute_uv=False)).sum()
-    if not known.all() and of_rows >= readings:
+    of_rows = 0
+    if not known.all():
+        of_rows = significant(np.linalg.svd(rows / scale, compute_uv=False)).sum()
+    if of_rows >= readings:
         raise ValueError(
             f"measured holds {readings} independent readings, too few for "
             f"{len(free)} free parameters: {int((~known).sum())} combinations of them "

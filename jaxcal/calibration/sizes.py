@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration.solve import Solution, Task
-from jaxcal.information.blocks import without
+from jaxcal.information.blocks import significant, triangle, without
 from jaxcal.models import SerialChain
 from jaxcal.models.model import derivative, facts
 
@@ -65,10 +65,10 @@ def group_sizes(
     sized = groups[task.free & (task.precision > 0.0)]
     count, width = len(right), rows.shape[1]
     # All that the readings say is in a triangle; the rest of them is noise alone.
-    triangle = np.asarray(np.linalg.qr(np.column_stack([rows, right]), mode="r"))
-    top = min(width, len(triangle))
-    rest = float((triangle[top:, width] ** 2).sum())
-    rows, right = triangle[:top, :width], triangle[:top, width]
+    factor = triangle(np.column_stack([rows, right]))
+    top = min(width, len(factor))
+    rest = float((factor[top:, width] ** 2).sum())
+    rows, right = factor[:top, :width], factor[:top, width]
     member = sized == np.arange(_GROUPS)[:, None]  # (groups, s)
 
     def cost(logs: Array) -> tuple[float, Array, Array]:
@@ -137,10 +137,14 @@ def of_sizes(task: Task, found: Solution, sizes: Sizes) -> Array:
     off = (found.parameters - task.mean)[free]
     right = scale * (gram @ off + precision * off)  # as the fit balances them
 
+    gram = scale[:, None] * gram * scale
+    value, vectors = np.linalg.eigh(gram + np.diag(scale**2 * precision))
+    none = vectors[:, ~significant(value, squares=True)]  # nothing determines these
+    gram, none = gram + none @ none.T, none @ none.T
+
     def at(logs: Array) -> tuple[Array, Array]:
         factor = np.where(groups >= 0, np.exp(-2.0 * logs[groups]), 1.0)
-        whole = scale[:, None] * gram * scale + np.diag(scale**2 * precision * factor)
-        inverse = np.asarray(np.linalg.pinv(whole, hermitian=True), dtype=np.float64)
+        inverse = np.linalg.inv(gram + np.diag(scale**2 * precision * factor)) - none
         return inverse @ right, inverse
 
     values, axes = np.linalg.eigh(sizes.covariance)

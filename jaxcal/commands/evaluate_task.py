@@ -12,7 +12,7 @@ from jaxcal.files import require_writable_folder, write_text
 
 __all__ = ["parser", "require_outputs", "run"]
 
-_METHODS = "random,gain,rate,shares,two_step,policy"
+_METHODS = "random,gain,rate,shares,ahead,two_step,policy"
 _TUNED = "priced,state"  # where the task brings their constants
 
 _EPILOG = """\
@@ -93,7 +93,7 @@ def run(options: argparse.Namespace) -> None:
     if not methods:
         known = [m for m in _TUNED.split(",") if m in entry.rules or options.retune]
         methods = _METHODS.split(",")
-        methods[4:4] = known
+        methods[5:5] = known
     if options.checkpoint is not None and "policy" not in methods:
         if options.methods:
             raise ValueError("--checkpoint is given, but policy is not among --methods")

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 
-from jaxcal.evaluation.parameters import parameter_names
 from jaxcal.evaluation.results import Evaluation, MethodResult, log_mean
+from jaxcal.models import Affine
 from jaxcal.plots import selection
 from jaxcal.plots.style import (
     BLACK,
@@ -206,7 +206,7 @@ def parameter_variance(evaluation: Evaluation) -> Figure:
     unit = "unit of measured and commands, squared"
     if dataset.ranges is not None:
         unit = "A: no unit, b: deg²"
-    names = parameter_names(dataset.num_inputs, dataset.num_outputs)
+    names = Affine(dataset.num_inputs, dataset.num_outputs).names
     figure = variances(rows, names, unit)
     title = "Cross-episode variance of the identified parameters"
     figure.axes[0].set_title(_title(evaluation, title), fontsize=10)

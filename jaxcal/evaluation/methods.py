@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from jaxcal import selection
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.parameters import estimate_parameters
-from jaxcal.evaluation.random_draws import draw_random, log_det_gram_of
 from jaxcal.evaluation.results import Evaluation, MethodResult
+from jaxcal.information.regression import log_det_gram
 from jaxcal.models import Affine
 
 __all__ = [
@@ -238,16 +238,14 @@ class _Run:
 
     def require_valid(self, label: str, indices: Indices) -> None:
         """A policy is trained, not proven: check what it returned."""
-        expected = (self.dataset.num_episodes, self.k)
-        if indices.shape != expected:
-            raise ValueError(f"{label} must return {expected}, got {indices.shape}")
-        ordered = np.sort(indices, axis=1)
-        bad = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
-        bad |= (ordered[:, 0] < 0) | (ordered[:, -1] >= self.dataset.num_candidates)
-        if not bad.any() and self.dataset.available is not None:
-            bad = ~np.take_along_axis(self.dataset.available, indices, 1).all(axis=1)
-        if bad.any():
-            episode = int(np.flatnonzero(bad)[0])
+        free = self.dataset.available
+        if free is None:
+            free = np.ones(self.dataset.candidates.shape[:2], bool)
+        kept, within = free.copy(), indices % free.shape[1]
+        np.put_along_axis(kept, within, False, axis=1)
+        bad = (within != indices).any(axis=1)
+        bad |= (free & ~kept).sum(axis=1) != self.k
+        for episode in np.flatnonzero(bad)[:1]:
             raise ValueError(
                 f"{label} must choose {self.k} distinct available candidates, got "
                 f"{indices[episode].tolist()} in episode {episode}"
@@ -314,3 +312,37 @@ class _Run:
         )
         picks, gram = map(np.concatenate, zip(*found, strict=True))
         return self.result("random", picks, batch.seconds, gram=gram)
+
+
+def draw_random(
+    rng: np.random.Generator,
+    candidates: Array,
+    available: NDArray[np.bool_] | None,
+    k: int,
+    num: int,
+) -> tuple[Indices, Array]:
+    """(E, R, k) selections, R = ``num`` an episode, and their (E, R) log det(Z.T Z).
+
+    Uniform among the invertible ones; the solver draws the singular ones again.
+    """
+    shape = (len(candidates), num, candidates.shape[1])
+    order = rng.random(shape)
+    if available is not None:
+        order[np.broadcast_to(~available[:, None], shape)] = 2.0
+    picks = np.argpartition(order, k - 1, axis=2)[..., :k]
+    gram = log_det_gram_of(candidates, picks)
+    episode, draw = np.nonzero(np.isneginf(gram))
+    if episode.size:
+        sets, seed = candidates[episode], int(rng.integers(2**31))
+        mask = None if available is None else available[episode]
+        again = selection.random_batch(sets, k, available=mask, seed=seed).indices
+        picks[episode, draw] = again
+        gram[episode, draw] = log_det_gram_of(sets, again[:, None])[:, 0]
+    return picks, gram
+
+
+def log_det_gram_of(candidates: Array, indices: Indices) -> Array:
+    """(E, R) log det of Z.T Z for (E, R, k) indices into (E, M, n) candidates."""
+    return log_det_gram(
+        np.take_along_axis(candidates[:, None], indices[..., None], axis=2)
+    )

@@ -5,19 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.checks import axis_letter
 from jaxcal.evaluation.dataset import Dataset
 
-__all__ = ["estimate_parameters", "least_squares", "parameter_names", "predict"]
+__all__ = ["estimate_parameters", "least_squares", "predict"]
 
 Array = NDArray[np.float64]
-
-
-def parameter_names(num_inputs: int, num_outputs: int) -> tuple[str, ...]:
-    """``a11 a12 ... | bx by bz``: A row by row, then b (Equation 9)."""
-    slopes = [f"a{i + 1}{j + 1}" for i in range(num_outputs) for j in range(num_inputs)]
-    biases = [f"b{axis_letter(i, num_outputs)}" for i in range(num_outputs)]
-    return (*slopes, *biases)
 
 
 def estimate_parameters(dataset: Dataset, indices: NDArray[np.int64]) -> Array | None:

@@ -71,7 +71,7 @@ def notes(shown: Summary) -> list[str]:
             f"k = {shown.k} fits {shown.num_parameters} parameters with as many "
             "equations: no residual, so no estimate of the noise; a larger k leaves one"
         )
-    return [*texts, *shown.notes]
+    return texts
 
 
 def json_document(summaries: Sequence[Summary], *, command: Sequence[str]) -> str:

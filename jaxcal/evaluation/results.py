@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.evaluation.parameters import parameter_names
+from jaxcal.models import Affine
 
 __all__ = [
     "HIT_TOLERANCE",
@@ -57,7 +57,6 @@ class Summary:
     num_proven: int
     rows: tuple[Row, ...]
     parameter_names: tuple[str, ...] | None = None  # where outputs were measured
-    notes: tuple[str, ...] = ()  # beyond those that follow from the numbers
 
     @property
     def num_parameters(self) -> int:
@@ -101,7 +100,7 @@ class Evaluation:
             rows.append(Row(result.method, result.checkpoint, numbers))
         names = None
         if data.measured is not None:
-            names = parameter_names(data.num_inputs, data.num_outputs)
+            names = Affine(data.num_inputs, data.num_outputs).names
         proven = int(self.proven.sum())
         return Summary(data.facts(), self.k, self.seed, proven, tuple(rows), names)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from jaxcal.adaptive import static
 from jaxcal.adaptive.episodes import Comparison, compare
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.lookahead import Rollouts, TwoStep
+from jaxcal.adaptive.lookahead import AHEAD, Rollouts, TwoStep
 from jaxcal.adaptive.policy import run as policies
 from jaxcal.adaptive.rules import (
     SHARES,
@@ -38,6 +38,7 @@ METHODS = {
     "gain": "the largest expected information gain (EIG)",
     "rate": "the largest EIG a second",
     "shares": "EIG per share of time, uses and number left; its constants are fixed",
+    "ahead": "shares, over a tree of the next measurements and their outcomes",
     "priced": "EIG per price of time and uses, its constants tuned",
     "state": "the same with prices that follow what is left, tuned",
     "two_step": "state, or shares where that is not tuned, over two measurements",
@@ -142,7 +143,11 @@ def evaluate(
             for field in ("gain", "entropy_drop", "log_ratio", "choices")
         ),
     )
-    rivals = [m for m in ("state", "shares", "priced", "rate", "gain") if m in methods]
+    rivals = [
+        m
+        for m in ("state", "ahead", "shares", "priced", "rate", "gain")
+        if m in methods
+    ]
     return Result(
         task=name,
         options=options,
@@ -185,7 +190,10 @@ def _rules(
 
 
 def _decider(method: str, rules: Mapping[str, Scored], rollouts: int) -> Any:
-    simple = {"random": Random(), "gain": Gain(), "rate": GainRate(), "shares": SHARES}
+    simple = {
+        "random": Random(), "gain": Gain(), "rate": GainRate(), "shares": SHARES,
+        "ahead": AHEAD,
+    }  # fmt: skip
     if method in simple:
         return simple[method]
     if method == "two_step":

@@ -26,7 +26,7 @@ from jaxcal.files import write_text
 __all__ = ["PART", "evaluate_stream", "total"]
 
 PART = 5_000  # episodes whose rows are one file; the draws' blocks of 1,000 divide it
-_AVERAGES = ("ratio_to_exact", "hit_rate", "d_efficiency", "seconds_per_selection")
+_MEANS = ("ratio_to_exact", "hit_rate", "d_efficiency", "seconds_per_selection")
 
 
 def evaluate_stream(
@@ -90,7 +90,6 @@ def evaluate_stream(
         options["seed"],
         sum(part["proven"] for part in parts),
         tuple(row for row in kept if row.method in plan["methods"]),
-        notes=(f"medians are means of those of parts of {PART:,} episodes",),
     )
 
 
@@ -106,18 +105,20 @@ def total(counts: list[int], parts: list[dict[str, Any]]) -> dict[str, Any]:
         found = float(np.average(np.array(values, float), weights=counts))  # None: NaN
         return found if math.isfinite(found) else None
 
-    def moments(held: list[dict[str, float]]) -> dict[str, float | None]:
-        of = {name: np.array([one[name] for one in held], float) for name in held[0]}
-        middle, square = mean(of["mean"]), None
-        if middle is not None:
-            square = mean(of["std"] ** 2 + (of["mean"] - middle) ** 2)
-        std = None if square is None else math.sqrt(square)
-        return {"mean": middle, "std": std, "median": mean(of["median"])}
-
-    own = {name: mean([part[name] for part in parts]) for name in _AVERAGES}
+    own: dict[str, Any] = {
+        name: mean([part[name] for part in parts]) for name in _MEANS
+    }
     for name in ("det_s", "log_det_s"):
-        own[name] = moments([part[name] for part in parts])  # type: ignore[assignment]  # a row holds both
-    # Its label and number of draws are those of all; a variance is of all at once only.
+        middles, stds = (
+            np.array([part[name][moment] for part in parts], float)
+            for moment in ("mean", "std")
+        )
+        middle = mean(middles)
+        off = 0.0 if middle is None else middle
+        square = mean(stds**2 + (middles - off) ** 2)
+        std = None if square is None else math.sqrt(square)
+        own[name] = {"mean": middle, "std": std, "median": None}
+    # Its label and number of draws are those of all; medians and variances are not.
     return {k: v for k, v in parts[0].items() if k != "parameter_variance"} | own
 
 

@@ -27,6 +27,7 @@ __all__ = [
     "rank_of_blocks",
     "rank_rule",
     "significant",
+    "triangle",
     "whiten",
     "without",
 ]
@@ -40,6 +41,22 @@ _TINY = float(np.finfo(np.float64).tiny)
 _SURE = 1e5  # times the tolerance: pivots above it leave no doubt of the rank
 _LOSS = 1e-9  # of orthogonality that whitened rows may have
 _MENDED = 1e-3  # loss below which a second factor restores all of it
+
+
+def triangle(rows: Array) -> Array:
+    """(..., min(R, p), p) R of the QR factors of rows (..., R, p).
+
+    Many rows go in parts: BLAS shares a large part out among threads, which for these
+    sizes takes ten times as long as one thread does.
+    """
+    *lead, count, p = rows.shape
+    part = max(128, 2 * p)
+    while count > part:
+        short = np.zeros((*lead, -count % part, p))
+        parts = np.concatenate([rows, short], axis=-2).reshape(*lead, -1, part, p)
+        rows = np.asarray(np.linalg.qr(parts, mode="r")).reshape(*lead, -1, p)
+        count = rows.shape[-2]
+    return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def rank_rule(
@@ -64,7 +81,7 @@ def rank_rule(
         columns, norms = np.where(flat, 0.0, columns), np.where(flat, 1.0, norms)
     unit, rounding = columns / norms, np.asarray(rounding)
     if num_rows >= p:  # pivots first: they cost a third of the singular values
-        pivots = np.abs(np.diagonal(np.linalg.qr(unit, mode="r"), axis1=-2, axis2=-1))
+        pivots = np.abs(np.diagonal(triangle(unit), axis1=-2, axis2=-1))
         rank = np.full(rounding.shape, p)
     else:
         pivots, rank = np.zeros((*rounding.shape, p)), np.zeros(rounding.shape, int)
@@ -127,8 +144,9 @@ def significant(size: NDArray[Any], squares: bool = False) -> Mask:
 
 def without(nuisance: Array, *others: Array) -> list[Array]:
     """``others`` (R, ...) in a basis across the columns of ``nuisance`` (R, s)."""
-    left, size, _ = np.linalg.svd(nuisance, full_matrices=True)
-    across = left[:, int(significant(size).sum()) :].T
+    basis, size, _ = np.linalg.svd(nuisance, full_matrices=False)
+    basis = basis[:, significant(size)]
+    across = np.linalg.qr(basis, mode="complete")[0][:, basis.shape[1] :].T
     return [across @ each for each in others]
 
 
@@ -346,7 +364,7 @@ def _triangle(gram: Array, rows: Array, scale: Array) -> tuple[Array, Array]:
         pass
     short = max(0, p - rows.shape[1])
     padded = np.pad(rows / scale[:, None], ((0, 0), (0, short), (0, 0)))
-    triangle = np.asarray(np.linalg.qr(padded, mode="r"))
-    regular = np.abs(np.diagonal(triangle, axis1=1, axis2=2)).all(axis=1)
-    whole = np.where(regular[:, None, None], triangle, np.eye(p))
-    return triangle, np.linalg.inv(whole)
+    factor = triangle(padded)
+    regular = (np.diagonal(factor, axis1=1, axis2=2) != 0.0).all(axis=1)
+    whole = np.where(regular[:, None, None], factor, np.eye(p))
+    return factor, np.linalg.inv(whole)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+from typing import ClassVar
 
 from jaxcal.learning.settings import require, setting
 
@@ -14,6 +15,7 @@ __all__ = ["EpisodesConfig", "PPOConfig", "StreamsConfig"]
 class PPOConfig(abc.ABC):
     """Every number of the optimisation; what is played adds its sizes."""
 
+    unit: ClassVar[str]  # of what is played: "episodes" or "decisions"
     num_epochs: int = setting(2, "passes over what an update has played")
     num_minibatches: int = setting(4, "gradient steps per pass")
     learning_rate: float = setting(2e-3, "of Adam, after the warm-up")
@@ -65,6 +67,11 @@ class PPOConfig(abc.ABC):
         """Rows of experience that an update plays and cuts into minibatches."""
 
     @property
+    def played_per_update(self) -> int:
+        """Episodes or decisions."""
+        return int(getattr(self, f"{self.unit}_per_update"))
+
+    @property
     def steps_per_update(self) -> int:
         """Gradient steps in an update."""
         return self.num_epochs * self.num_minibatches
@@ -79,6 +86,7 @@ class PPOConfig(abc.ABC):
 class EpisodesConfig(PPOConfig):
     """How much is played, in episodes."""
 
+    unit: ClassVar[str] = "episodes"
     num_episodes: int = setting(200_000, "training budget")
     episodes_per_update: int = setting(2048, "fresh episodes in an update")
     episodes_per_set: int = setting(
@@ -109,6 +117,7 @@ class EpisodesConfig(PPOConfig):
 class StreamsConfig(PPOConfig):
     """How much is played, in decisions: sessions differ in length."""
 
+    unit: ClassVar[str] = "decisions"
     num_updates: int = setting(300, "training budget")
     decisions_per_update: int = setting(4096, "decisions in an update")
     stream_length: int = setting(32, "decisions of one stream in an update")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import table
-from jaxcal.information.blocks import SINGULAR, significant
+from jaxcal.information.blocks import SINGULAR, significant, triangle
 from jaxcal.models.model import Model
 from jaxcal.models.uncertainty import Noise, Prior
 
@@ -120,7 +120,7 @@ def identifiability(
     std = np.sqrt(np.diagonal(model.default_prior().resolve(model).precision))[at]
     scale = 1.0 / np.where(std > 0.0, std, 1.0)
     # A triangle of p rows holds all that is needed of the N q.
-    columns = np.linalg.qr(rows[:, at] * scale, mode="r")
+    columns = triangle(rows[:, at] * scale)
     norms = np.linalg.norm(columns, axis=0)
     seen = norms > _FLAT * norms.max(initial=0.0)
     unit = columns / np.where(seen, norms, 1.0) * seen

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from studies.paper.exhibits.exhibit import Claim, Exhibit
     from studies.paper.exhibits.material import Settings
 
-__all__ = ["main"]
-
 _DESCRIPTION = """\
 Make every figure and table of the paper from our own runs, each beside what the paper
 states, and judge its claims one by one. Writes into --out:

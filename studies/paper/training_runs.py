@@ -22,8 +22,6 @@ from jaxcal.arguments import Parser, exit_code
 from jaxcal.evaluation.csv_rows import csv_text
 from jaxcal.files import require_writable_folder, write_text
 
-__all__ = ["MAX_ROWS", "collect", "main", "thinned"]
-
 Array = NDArray[np.float64]
 
 MAX_ROWS = 1_000

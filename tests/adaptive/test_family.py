@@ -14,6 +14,7 @@ from jaxcal.adaptive.family.draws import BUDGETS, draw
 from jaxcal.adaptive.family.padded import SHAPE, batch, pad, stack
 from jaxcal.adaptive.family.structures import HELD_OUT, TRAINED_ON, Limits
 from jaxcal.adaptive.grid import GridTask
+from jaxcal.adaptive.lookahead import AHEAD
 from jaxcal.adaptive.rules import SHARES, Gain, Random
 from jaxcal.adaptive.tasks.knee import knee
 
@@ -183,11 +184,15 @@ def test_the_unit_of_time_changes_no_choice_of_shares(budget):
     assert one.alive.any(axis=0).sum() > 2
 
 
-def test_the_default_is_the_largest_share_where_time_or_uses_count():
-    budget = {"seconds": 20.0, "uses": 2}
-    counted, free = knee(), draw(3, "band", "number", SHAPE)
-    mine = next_measurement(counted, [(5, 0)], **budget)
-    assert mine.design == next_measurement(counted, [(5, 0)], SHARES, **budget).design
+def test_the_default_looks_ahead_where_time_or_uses_count():
+    budget = {"seconds": 9.0, "uses": 2}
+    counted, free = knee(8, sigma=0.05), draw(3, "band", "number", SHAPE)
+    made = [(5, 0)]
+    mine = next_measurement(counted, made, **budget)
+    assert (
+        mine.design == next_measurement(counted, made, AHEAD, **budget, seed=3).design
+    )
+    assert mine.design != next_measurement(counted, made, SHARES, **budget).design
     mine = next_measurement(free, [])
     assert mine.design == next_measurement(free, [], Gain()).design
 

@@ -42,7 +42,8 @@ def main() -> None:
         (run,) = (out / "rig").iterdir()
         shutil.copytree(run, FOLDER / "run")
         (FOLDER / "run" / "report.html").unlink()
-        shutil.rmtree(FOLDER / "run" / "axes")
+        for checked in (FOLDER / "run").glob("axes-*"):
+            shutil.rmtree(checked)
         journal = FOLDER / "run" / "journal.jsonl"
         own = {platform.node(): "bench", str(pathlib.Path.cwd().parent): "/rig"}
         text = journal.read_text()

@@ -20,7 +20,7 @@ from jaxcal.evaluation import figures
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.figures import evaluation_figures
 from jaxcal.evaluation.methods import check_methods, evaluate
-from jaxcal.evaluation.parameters import estimate_parameters, parameter_names
+from jaxcal.evaluation.parameters import estimate_parameters
 from jaxcal.evaluation.report import (
     file_prefixes,
     json_document,
@@ -30,6 +30,7 @@ from jaxcal.evaluation.report import (
 from jaxcal.evaluation.results import Evaluation, MethodResult
 from jaxcal.evaluation.training_figure import training_curves
 from jaxcal.information.regression import regression_matrix
+from jaxcal.models import Affine
 from jaxcal.paper.datasets.datasets import make_dataset
 from jaxcal.plots import as_bytes
 
@@ -308,7 +309,7 @@ def test_parameters_are_those_of_lstsq(n: int, m: int, k: int) -> None:
     )[..., :k]
     found = estimate_parameters(dataset, indices)
     assert found is not None and found.shape == (3, 2, m * (n + 1))
-    assert len(parameter_names(n, m)) == m * (n + 1)
+    assert len(Affine(n, m).names) == m * (n + 1)
     assert dataset.measured is not None
     for e, r in itertools.product(range(3), range(2)):
         rows = regression_matrix(dataset.candidates[e, indices[e, r]], m)

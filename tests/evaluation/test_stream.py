@@ -61,10 +61,6 @@ def test_a_total_has_the_moments_of_all_parts(rng: np.random.Generator) -> None:
     for name in ("det_s", "log_det_s"):
         for moment in ("mean", "std"):
             assert found[name][moment] == pytest.approx(whole[name][moment], rel=1e-12)
-    assert found["log_det_s"]["median"] == pytest.approx(
-        whole["log_det_s"]["median"],
-        abs=0.1,  # 20,000 draws of sd 3
-    )
     assert found["draws_per_episode"] == 5 and found["label"] == "x"
 
 
@@ -105,10 +101,13 @@ def test_the_first_block_has_the_numbers_of_a_plain_evaluation(
         for name in ("ratio_to_exact", "d_efficiency", "ratio_to_random"):
             assert row[name] == pytest.approx(expected[name], rel=1e-13)
         for name in ("det_s", "log_det_s"):
-            assert row[name] == pytest.approx(expected[name], rel=1e-12)
+            assert row[name]["median"] is None
+            for moment in ("mean", "std"):
+                wanted = pytest.approx(expected[name][moment], rel=1e-12)
+                assert row[name][moment] == wanted
     assert streamed.num_proven == 300
     text = text_table(streamed)
-    assert "300 episodes" in text and "means of those of parts" in text
+    assert "300 episodes" in text
     entry = json.loads(json_document([streamed], command=["x"]))["results"][0]
     assert entry["dataset"]["episodes"] == 300 and entry["proven"] == 1.0
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jaxcal.information.blocks import whiten
+from jaxcal.information.blocks import triangle, whiten
 
 
 def extended_log_det(rows):
@@ -45,3 +45,13 @@ def test_whitened_information_is_the_identity(digits, with_root):
     np.testing.assert_allclose(
         (raw @ white.basis[0]).ravel(), chosen.ravel(), rtol=0, atol=1e-6
     )
+
+
+@pytest.mark.parametrize("shape", [(5, 9), (130, 3), (2, 300, 60), (3, 1000, 7)])
+def test_a_triangle_made_in_parts_has_the_product_of_its_rows(shape):
+    rows = np.random.default_rng(0).normal(size=shape)
+    found = triangle(rows)
+    assert found.shape == (*shape[:-2], min(shape[-2:]), shape[-1])
+    np.testing.assert_array_equal(found, np.triu(found))
+    products = [np.matrix_transpose(each) @ each for each in (found, rows)]
+    np.testing.assert_allclose(*products, atol=1e-10)

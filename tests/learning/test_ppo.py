@@ -18,7 +18,7 @@ from jaxcal.learning.core import ppo
 from jaxcal.learning.core.postures import Postures
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
-from jaxcal.learning.policies.build import build
+from jaxcal.learning.policies.compact import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training.config import TrainConfig
 from jaxcal.learning.training.run import Recipe, run, updates
@@ -241,6 +241,13 @@ class Probe:
     ppo: EpisodesConfig
 
     tasks: tuple[Pick, ...] = (Pick(),)
+    seed: int = 3
+    num_seeds: int = 1
+    validate_every: float = 15.0
+    save_every: float = 60.0
+
+    def as_meta(self):
+        return {}
 
     @property
     def learners(self):
@@ -273,20 +280,7 @@ def test_a_run_trains_what_the_pure_function_does(tmp_path):
     """Also where two tasks take turns."""
     config = Probe(PROBE.ppo, (Pick(), Pick(payment=0.5)))
     average, metrics = jax.jit(ppo.make_train(config))(jax.random.key(3))
-    recipe = Recipe(
-        ppo=config.ppo,
-        learners=config.learners,
-        given=((),),
-        seed=3,
-        num_seeds=1,
-        meta={},
-        schema="probe",
-        unit="episodes",
-        per_update=64,
-        columns=("update", "reward_mean"),
-        measured=(),
-        validate=None,
-    )
+    recipe = Recipe(config, ((),), "probe", (), (), validate=None)
     state = run(recipe, tmp_path)
     for one, other in zip(*map(jax.tree.leaves, (average, state.average)), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-5)

@@ -38,10 +38,9 @@ def measured(tmp_path, monkeypatch):
                 served, record, Operator(yes=True, say=told.append),
                 full_speed=True, listeners=(sim.answer,),
             )  # fmt: skip
-            place.folder = tmp_path / "run"
-            place.folder.mkdir()
             code = steps.characterise(place, axis, into)
-        records = read_journal(place.folder / "journal.jsonl")
+        runs = tmp_path.glob("characterise-*/journal.jsonl")
+        records = read_journal(max(runs, key=lambda path: path.stat().st_mtime_ns))
         return code, records, "\n".join(told)
 
     return measure

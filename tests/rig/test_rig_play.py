@@ -59,8 +59,9 @@ def test_the_shift_brings_a_joint_to_where_the_calibration_means(below, directio
 @pytest.mark.parametrize(
     ("desired", "below"),
     [([5.0, -3.0, 4.0], False), ([-2.0, 3.0, -4.0], False), ([0.1, 0.1, -0.1], False),
-     ([-2.0, 3.0, 4.0], True)],
-    ids=["up", "down", "near, with a run-up", "calibrated from below"],
+     ([-2.0, 3.0, 4.0], True),
+     (np.array(Truth().matrix) @ [-19.6, 0, 0] + Truth().bias, False)],
+    ids=["up", "down", "near", "calibrated from below", "no room below"],
 )  # fmt: skip
 def test_goto_reaches_through_play(desired, below, tmp_path):
     matrix, bias = np.array(Truth().matrix), np.array(Truth().bias)

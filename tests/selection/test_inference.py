@@ -18,7 +18,7 @@ from jaxcal.extras import MissingExtraError
 from jaxcal.learning.core import network as networks
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.policies import decoding
-from jaxcal.learning.policies.build import build
+from jaxcal.learning.policies.compact import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.training import checkpoint

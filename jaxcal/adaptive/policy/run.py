@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -20,15 +19,11 @@ from jaxcal.learning.runtime import devices, weights
 from jaxcal.learning.runtime.weights import Weights
 from jaxcal.learning.training import checkpoint
 from jaxcal.learning.training.checkpoint import CheckpointError
-from jaxcal.learning.training.run import Recipe, Report, run
+from jaxcal.learning.training.run import Recipe, run
 
-__all__ = ["COLUMNS", "MEASURED", "Trained", "exercises", "load", "train"]
+__all__ = ["MEASURED", "Trained", "exercises", "load", "train"]
 
 SCHEMA = "jaxcal-sequential-policy"
-COLUMNS = (
-    *("update", "decisions", "seconds", "reward_mean", "choices"),
-    *("entropy", "policy_loss", "value_loss", "kl", "learning_rate"),
-)
 MEASURED = ("nats", "nats_over_base")
 _VALIDATED = 1024  # sessions
 _FRESH = 2**31 - 1  # their seed
@@ -74,23 +69,20 @@ def train(
     config: PolicyConfig,
     folder: str | pathlib.Path,
     *,
-    resume: bool = False,
-    report: Callable[[Report], None] = lambda report: None,
-    should_stop: Callable[[], bool] = lambda: False,
-    num_updates: int | None = None,
     num_devices: int | None = None,
+    **rest: Any,
 ) -> TrainState:
     """Train until the budget is spent or ``should_stop`` says so, and save.
+
+    It is validated on fresh sessions of the first task: ``nats`` of the averaged
+    weights, and ``nats_over_base`` in pairs.
 
     Args:
         config: the run.
         folder: of the run; made where missing.
-        resume: go on from the newest checkpoint in ``folder``.
-        report: called after every validation: fresh sessions of the first task, whose
-            columns ``nats`` and ``nats_over_base`` (in pairs) are of averaged weights.
-        should_stop: asked every few seconds, between updates.
-        num_updates: stop after this update instead of at the end of the budget.
         num_devices: use so many of each process; all when None.
+        rest: ``resume``, ``report``, ``should_stop`` and ``num_updates`` of
+            ``training.run.run``.
 
     Raises:
         CheckpointError: nothing to resume from, or damaged.
@@ -113,30 +105,14 @@ def train(
         return dict(zip(MEASURED, (nats, nats - rules[0]), strict=True))
 
     recipe = Recipe(
-        ppo=config.ppo,
-        learners=config.learners,
+        config=config,
         given=tuple((devices.replicate(each, mesh),) for each in given),
-        seed=config.seed,
-        num_seeds=config.num_seeds,
-        meta=config.as_meta(),
         schema=SCHEMA,
-        unit="decisions",
-        per_update=config.ppo.decisions_per_update,
-        columns=COLUMNS,
+        columns=("choices",),
         measured=MEASURED,
         validate=validate,
-        validate_every=config.validate_every,
-        save_every=config.save_every,
     )
-    return run(
-        recipe,
-        folder,
-        mesh=mesh,
-        resume=resume,
-        report=report,
-        should_stop=should_stop,
-        num_updates=num_updates,
-    )
+    return run(recipe, folder, mesh=mesh, **rest)
 
 
 def load(path: str | pathlib.Path | None = None) -> Trained:

@@ -18,9 +18,10 @@ from jaxcal.learning.policies.features import (
     remaining,
     vector_features,
 )
-from jaxcal.learning.policies.networks import NetworkConfig
+from jaxcal.learning.policies.networks import GROUP, NetworkConfig
+from jaxcal.learning.settings import installed
 
-__all__ = ["CompactNetwork"]
+__all__ = ["CompactNetwork", "build"]
 
 _SHARP = 60.0  # inverse temperature of the choices that need no learning
 
@@ -204,3 +205,11 @@ class CompactNetwork(Network):
         vectors = decision.vectors
         logits = mask_logits(_SHARP * vectors.ahead[..., 3], vectors.active)
         return logits, decision.reached
+
+
+def build(config: NetworkConfig) -> Network:
+    """The network that a configuration names: ``compact``, or what a package adds."""
+    if config.kind == "compact":
+        return CompactNetwork(config)
+    network: Network = installed(GROUP)[config.kind].load()(config)
+    return network

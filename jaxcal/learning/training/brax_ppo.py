@@ -25,7 +25,7 @@ from brax.training.networks import FeedForwardNetwork
 from jaxcal.learning.core.network import initial
 from jaxcal.learning.environments.brax_env import SelectionEnv, wrap_fresh
 from jaxcal.learning.environments.selection import SelectionConfig
-from jaxcal.learning.policies.build import build
+from jaxcal.learning.policies.compact import build
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.settings import settings_of
 from jaxcal.learning.training import checkpoint
@@ -60,9 +60,9 @@ def adapted(config: TrainConfig) -> TrainConfig:
 
 def require_read(given: Collection[str]) -> None:
     """Refuse values of fields, by name, that brax's trainer would not read."""
-    read = {*_READ, "num_episodes", "seed", "width"}
-    read |= {field.name for field in settings_of(SelectionConfig)}
-    if unread := sorted(set(given) - read):
+    known = {*_READ, "num_episodes", "seed", "width"}
+    known |= {field.name for field in settings_of(SelectionConfig)}
+    if unread := sorted(set(given) - known):
         flags = ", ".join("--" + name.replace("_", "-") for name in unread)
         raise ValueError(f"--trainer brax does not read {flags}: leave it out")
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import pathlib
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -18,14 +17,10 @@ from jaxcal.learning.policies import decoding
 from jaxcal.learning.runtime import devices
 from jaxcal.learning.training import checkpoint, imitation
 from jaxcal.learning.training.config import TrainConfig
-from jaxcal.learning.training.run import Recipe, Report, run
+from jaxcal.learning.training.run import Recipe, run
 
-__all__ = ["COLUMNS", "MEASURED", "Validation", "train"]
+__all__ = ["MEASURED", "Validation", "train"]
 
-COLUMNS = (
-    *("update", "episodes", "seconds", "reward_mean", "reward_std", "log_det_mean"),
-    *("entropy", "policy_loss", "value_loss", "kl", "learning_rate"),
-)
 MEASURED = ("ratio_to_exact", "hit_rate")
 
 
@@ -61,13 +56,11 @@ def train(
     config: TrainConfig,
     folder: str | pathlib.Path,
     *,
-    resume: bool = False,
     validation: Validation | None = None,
-    report: Callable[[Report], None] = lambda report: None,
-    should_stop: Callable[[], bool] = lambda: False,
+    teacher: imitation.Teacher | None = None,
     num_updates: int | None = None,
     num_devices: int | None = None,
-    teacher: imitation.Teacher | None = None,
+    **rest: Any,
 ) -> TrainState:
     """Train until the budget is spent or ``should_stop`` says so, and save.
 
@@ -77,13 +70,11 @@ def train(
     Args:
         config: the run.
         folder: of the run; made where missing.
-        resume: go on from the newest checkpoint in ``folder``.
         validation: fixed sets to measure the averaged weights on.
-        report: called after every look at the validation set.
-        should_stop: asked every few seconds, between updates.
+        teacher: whom the first ``config.num_imitated`` updates imitate.
         num_updates: stop after this update instead of at the end of the budget.
         num_devices: use so many of each process; all when None.
-        teacher: whom the first ``config.num_imitated`` updates imitate.
+        rest: ``resume``, ``report`` and ``should_stop`` of ``training.run.run``.
 
     Returns:
         The last state; each leaf has a leading axis of ``config.num_seeds`` where they
@@ -130,30 +121,14 @@ def train(
         return dict(zip(MEASURED, found, strict=True))
 
     recipe = Recipe(
-        ppo=config.ppo,
-        learners=learners,
+        config=config,
         given=((),),
-        seed=config.seed,
-        num_seeds=config.num_seeds,
-        meta=config.as_meta(),
         schema=checkpoint.SCHEMA,
-        unit="episodes",
-        per_update=config.ppo.episodes_per_update,
-        columns=COLUMNS,
+        columns=("reward_std", "log_det_mean"),
         measured=MEASURED,
         validate=None if validation is None else validate,
-        validate_every=config.validate_every,
-        save_every=config.save_every,
         num_imitated=imitated,
         imitate=imitate,
     )
     with contextlib.closing(imitation.Lessons(lesson, imitated)) as lessons:
-        return run(
-            recipe,
-            folder,
-            mesh=mesh,
-            resume=resume,
-            report=report,
-            should_stop=should_stop,
-            num_updates=last,
-        )
+        return run(recipe, folder, mesh=mesh, num_updates=last, **rest)

@@ -34,6 +34,7 @@ from jaxcal.learning.training import checkpoint
 
 __all__ = ["Recipe", "Report", "run", "updates"]
 
+_LOSSES = ("entropy", "policy_loss", "value_loss", "kl", "learning_rate")
 _LAST = 1000  # episodes whose rewards are kept
 _UPDATES = 16  # updates in one call
 _CALL_SECONDS = 2.0  # of one call: what a signal waits for
@@ -43,38 +44,36 @@ _CALL_SECONDS = 2.0  # of one call: what a signal waits for
 class Recipe:
     """What one kind of run trains, and how."""
 
-    ppo: PPOConfig
-    learners: tuple[Learner, ...]  # update u: number u modulo theirs
+    config: Any  # a ``TrainConfig`` or a ``PolicyConfig``
     given: tuple[tuple[Any, ...], ...]  # arrays that each learner is given
-    seed: int
-    num_seeds: int  # runs side by side: seed, seed + 1, ...
-    meta: dict[str, Any]  # JSON values saved with every checkpoint
     schema: str  # of the checkpoints
-    unit: str  # what an update plays: "episodes" or "decisions"
-    per_update: int  # of them
-    columns: tuple[str, ...]  # of metrics.csv, for every update
-    measured: tuple[
-        str, ...
-    ]  # its columns of looks; by the first the best seed is known
+    columns: tuple[str, ...]  # its own of metrics.csv, for every update
+    measured: tuple[str, ...]  # its columns of looks; the first says which seed is best
     validate: Callable[[Any], dict[str, float]] | None  # averaged weights -> measured
-    validate_every: float = 15.0  # seconds between looks
-    save_every: float = 60.0  # seconds between checkpoints
     # The first updates of imitation: their number, and the update and what it is shown.
     num_imitated: int = 0
     imitate: Callable[[int], tuple[Learner, Any]] | None = None
 
+    @functools.cached_property
+    def learners(self) -> tuple[Learner, ...]:
+        """Update u trains number u modulo theirs."""
+        return tuple(self.config.learners)
+
     def init(self) -> TrainState:
         """The state before the first update, from the seeds alone."""
-        learner, given = self.learners[0], self.given[0]
+        first, number = self.config.seed, self.config.num_seeds
 
         def begin(key: jax.Array) -> TrainState:
-            return ppo.begin(self.ppo, learner, key, *given)
+            learner, given = self.learners[0], self.given[0]
+            state: TrainState = _begun(self.config.ppo, learner, key, *given)
+            return state
 
-        # One program: op by op it would be two hundred small ones, seconds to compile.
-        keys = [jax.random.key(self.seed + i) for i in range(self.num_seeds)]
-        if len(keys) == 1:
-            return jax.jit(begin)(keys[0])
-        return jax.jit(jax.vmap(begin))(jnp.stack(keys))
+        keys = [jax.random.key(seed) for seed in range(first, first + number)]
+        return begin(keys[0]) if number == 1 else jax.vmap(begin)(jnp.stack(keys))
+
+
+# One program, the same for every seed: op by op it would be two hundred.
+_begun = jax.jit(ppo.begin, static_argnums=(0, 1))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,13 +173,13 @@ def run(
         CheckpointError: nothing to resume from, or damaged.
         OSError: the folder cannot be written.
     """
-    last = recipe.ppo.num_updates if num_updates is None else num_updates
+    last = recipe.config.ppo.num_updates if num_updates is None else num_updates
     root = pathlib.Path(folder)
     state, before, recent = devices.on_first(lambda: _begin(root, recipe, resume))
     if mesh is not None:
         state = devices.replicate(state, mesh)
     done = int(np.ravel(devices.local(state.num_updates))[0])
-    seeds = recipe.num_seeds if recipe.num_seeds > 1 else 0
+    seeds = recipe.config.num_seeds if recipe.config.num_seeds > 1 else 0
     count, timed = 1, False
     with contextlib.ExitStack() as stack:
         diary = None
@@ -198,7 +197,7 @@ def run(
             elif len(recipe.learners) > 1 or len(recipe.given) > 1:
                 at_most = 1  # the next update is of another program, or of other arrays
             count = min(count, at_most, last - done)
-            update = updates(recipe.ppo, learner, mesh, at_most, seeds)
+            update = updates(recipe.config.ppo, learner, mesh, at_most, seeds)
             with collective():
                 state, found = update(state, np.int32(count), *given)
                 # One transfer for all that these updates measured.
@@ -231,11 +230,12 @@ class _Diary:
         from tensorboardX import SummaryWriter  # 0.2 s; loads PyTorch where installed
 
         recipe = self.recipe
-        self._columns = (*recipe.columns, *recipe.measured)
+        first = ("update", recipe.config.ppo.unit, "seconds", "reward_mean")
+        self._columns = (*first, *recipe.columns, *_LOSSES, *recipe.measured)
         self._rows = _table(self.root / "metrics.csv", self.reported, self._columns)
         self._seeds: TextIO | None = None
         self._seed_columns = ("update", "seed", *recipe.measured)
-        if recipe.num_seeds > 1:
+        if recipe.config.num_seeds > 1:
             path = self.root / "seeds.csv"
             self._seeds = _table(path, self.reported, self._seed_columns)
         self._events = SummaryWriter(str(self.root), flush_secs=30)
@@ -247,8 +247,8 @@ class _Diary:
         self, state: TrainState, first: int, count: int, found: Mapping[str, Any]
     ) -> None:
         """Keep the metrics of ``count`` updates; look and save where it is time to."""
-        recipe, now = self.recipe, time.perf_counter()
-        schedule = ppo.schedule(recipe.ppo)
+        recipe, config, now = self.recipe, self.recipe.config, time.perf_counter()
+        schedule = ppo.schedule(config.ppo)
         for number in range(count):
             rewards = found["rewards"][number] if "rewards" in found else ()
             if (first + number) % len(recipe.learners) == 0:
@@ -261,29 +261,33 @@ class _Diary:
             }
             row |= {
                 "update": done,
-                recipe.unit: done * recipe.per_update,
+                config.ppo.unit: done * config.ppo.played_per_update,
                 "seconds": self._seconds(at),
-                "learning_rate": float(schedule(done * recipe.ppo.steps_per_update)),
+                "learning_rate": float(schedule(done * config.ppo.steps_per_update)),
             }
             if number == count - 1:
                 self._look(state, row)
             _add(self._rows, self._columns, row)
-            for name in set(self._columns) & set(row) - {"update", recipe.unit}:
+            for name in set(self._columns) & set(row) - {
+                "update",
+                config.ppo.unit,
+            }:
                 self._events.add_scalar(name, row[name], done)
         self._noted = now
-        if now - self._saved > recipe.save_every:
+        if now - self._saved > config.save_every:
             self._saved = now
             self.save(state, first + count)
 
     def _look(self, state: TrainState, row: dict[str, float]) -> None:
         """Validate and report where it is time to."""
-        recipe, done, now = self.recipe, int(row["update"]), time.perf_counter()
-        due = now - self._looked > recipe.validate_every
+        recipe, config = self.recipe, self.recipe.config
+        done, now = int(row["update"]), time.perf_counter()
+        due = now - self._looked > config.validate_every
         if not due and done not in (1, self.last):
             return
         spread: dict[str, float] = {}
         if recipe.validate is not None:
-            averages = _of_each_seed(devices.local(state.average), recipe.num_seeds)
+            averages = _of_each_seed(devices.local(state.average), config.num_seeds)
             self._each = [recipe.validate(average) for average in averages]
             for name in self._each[0]:
                 values = [each[name] for each in self._each]
@@ -291,16 +295,16 @@ class _Diary:
                 spread[name] = float(np.std(values, ddof=1)) if len(values) > 1 else 0.0
             if self._seeds is not None:
                 for number, each in enumerate(self._each):
-                    own = {"update": done, "seed": recipe.seed + number} | each
+                    own = {"update": done, "seed": config.seed + number} | each
                     _add(self._seeds, self._seed_columns, own)
         rate = (done - self.reported) / max(now - self._looked, 1e-9)
         self._looked, self.reported = time.perf_counter(), done
         self.report(
             Report(
                 update=done,
-                played=done * recipe.per_update,
+                played=done * config.ppo.played_per_update,
                 seconds=self._seconds(now),
-                per_second=rate * recipe.per_update,
+                per_second=rate * config.ppo.played_per_update,
                 eta=(self.last - done) / rate,
                 metrics=row,
                 spread=spread,
@@ -312,20 +316,20 @@ class _Diary:
 
     def save(self, state: TrainState, done: int) -> None:
         """Write a checkpoint of update ``done``."""
-        recipe = self.recipe
+        recipe, config = self.recipe, self.recipe.config
         with atomic_write(self.root / "last_rewards.npy") as file:
             np.save(file, self.recent)
         progress: dict[str, Any] = {
             "updates": done,
-            recipe.unit: done * recipe.per_update,
+            config.ppo.unit: done * config.ppo.played_per_update,
             "seconds": self._seconds(time.perf_counter()),
             "device": jax.devices()[0].device_kind,
         }
-        if recipe.num_seeds > 1:
+        if config.num_seeds > 1:
             scores = [each[recipe.measured[0]] for each in self._each]
             progress["best"] = int(np.argmax(scores)) if scores else 0
             progress["seeds"] = self._each
-        meta = recipe.meta | {"schema": recipe.schema, "progress": progress}
+        meta = config.as_meta() | {"schema": recipe.schema, "progress": progress}
         state = devices.local(state)
         checkpoint.save(self.root / "checkpoint", done, state.average, meta, state)
 

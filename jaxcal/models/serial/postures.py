@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 Chain = Any  # a SerialChain, whose module imports this one
 
 _ROUNDS, _STEPS = 40, 80  # batches of starts; steps of the inverse kinematics
+_VAIN = 8  # batches in which nothing is found: there is nothing
 _REACHED = 1e-7  # of the arm's length
 _APART = 2.0  # degrees (of a slide: percent of its stroke) between two postures
 _VIEW = np.cos(np.radians(25.0))  # of the board from the camera's axis, and its face
@@ -48,7 +49,9 @@ def postures(
     found = np.zeros((0, arm.num_inputs))
     lost: Counter[str] = Counter()
     tried = 0
-    for _ in range(_ROUNDS):
+    for batch in range(_ROUNDS):
+        if batch == _VAIN and not len(found):
+            break
         size = max(2 * (count - len(found)), 64)
         tried += size
         starts = rng.uniform(low, high, (size, arm.num_joints))
@@ -152,7 +155,7 @@ def _touching(
         gram = gram + 1e-6 * trace * np.eye(gram.shape[-1])
         step = np.linalg.solve(gram, -off[going][..., None])
         step = (np.matrix_transpose(slopes) @ step)[..., 0]
-        step *= np.minimum(1.0, 0.1 / np.abs(step).max(axis=1, keepdims=True))
+        step *= 0.1 / np.maximum(np.abs(step).max(axis=1, keepdims=True), 0.1)
         commands[going, :j] = np.clip(at + step * scale, low, high)
     reached = np.linalg.norm(arm.predict(commands), axis=1) <= limit
     why = "do not reach within the limits"

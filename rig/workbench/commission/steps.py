@@ -56,9 +56,7 @@ class Place:
     record: DeviceRecord
     operator: Operator
     path: pathlib.Path | None = None  # rig.toml, where there is one to correct
-    folder: pathlib.Path | None = None  # of the run; a new one where not given
     full_speed: bool = False  # of a simulated device
-    locked: bool = False  # the caller holds the bus
     reset_alarms: bool = False
     listeners: tuple[Callable[[Record], None], ...] = ()
 
@@ -77,20 +75,14 @@ class Place:
         where = "" if self.path is None else f" --config {os.path.relpath(self.path)}"
         return f"jaxcal-rig {words}{where}"
 
-    def require(self, through: str) -> None:
-        """Refused where the device has not reached a state; says what to do."""
-        if text := self.record.missing(self.config, through):
-            raise Refused(text)
-
-    def _lock(self, what: str) -> BusLock:
-        lock = BusLock(self.config.bus)
-        return lock if self.locked else lock.acquire(what)
-
     @contextlib.contextmanager
     def bus(self, what: str) -> Iterator[list[Drive]]:
         """The drives, to be read; nobody else writes meanwhile."""
         config = self.config
-        with self._lock(what), Bus(config.bus, config.silence_s) as bus:
+        with (
+            BusLock(config.bus).acquire(what),
+            Bus(config.bus, config.silence_s) as bus,
+        ):
             yield [Drive(bus, axis) for axis in config.axes]
 
     def run(
@@ -108,10 +100,10 @@ class Place:
         config = config.model_copy(update={"axes": axes, "motion": motion})
         # Homed drives are where they were left; the gearing is still to be checked.
         check: session.Check = functools.partial(check_drives, geared=False)
-        with self._lock(name) as lock:
+        with BusLock(config.bus).acquire(name) as lock:
             run = Run(
                 config if limits else unlimited(config),
-                self.folder or new_run_folder(pathlib.Path(config.output), name),
+                new_run_folder(pathlib.Path(config.output), name),
                 name, self.say, record=self.record, reset_alarms=self.reset_alarms,
                 start={"simulated": None, "inputs": {}, "maps_from": ""},
             )  # fmt: skip
@@ -162,7 +154,6 @@ def look_at_phone(place: Place, seconds: float | None = None) -> Stream:
 
 def go_home(place: Place, here: bool) -> int:
     """Make the counts mean a place: HOMED."""
-    place.require(IDENTIFIED)
     names = [axis.name for axis in place.config.axes]
     if not here and not can_home(place.config):
         without = {a.map.name for a in place.config.axes if a.map.home is None}
@@ -186,7 +177,6 @@ def go_home(place: Place, here: bool) -> int:
 
 def jog(place: Place, axis: int, way_deg: float | None) -> int:
     """Move one axis by a step, or as long as a key is held."""
-    place.require(IDENTIFIED)
     name = AXIS_NAMES[axis]
     if way_deg is None and (place.operator.yes or not sys.stdin.isatty()):
         raise Refused(f"jog {name}: holding a key needs a terminal; give a step in deg")
@@ -215,7 +205,6 @@ def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> i
         load_calibration,
     )
 
-    place.require(SIGN_CHECKED)
     path = None if into is None else calibration_path(into)
     if path is not None:
         # Of this device; simulated ones alone are moved at full speed.
@@ -238,7 +227,6 @@ def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> i
 
 def axes(place: Place, names_known: bool = False) -> int:
     """Check each axis, correct rig.toml after a yes, and check again: SIGN_CHECKED."""
-    place.require(HOMED)
     place.operator.confirm(
         "axes: the device stands in its zero posture. Each axis in turn will move a "
         "little, then up to 3 deg either way; then all three by turns, up to 6 deg. "
@@ -277,7 +265,6 @@ def _check_axes(place: Place, names_known: bool, again: bool = False) -> int:
 
 def take_zero(place: Place) -> int:
     """Measure the zero posture: ZEROED."""
-    place.require(SIGN_CHECKED)
     place.operator.confirm(
         "zero: the device stands in its zero posture (jig, level), or moves to pulse 0 "
         'with session.zero = "drive"; the phone\'s attitude there is measured',

@@ -260,18 +260,15 @@ def unchecked(
 
 
 def _with_play(run: Run, device: Device, command: Array, play: Play) -> Array:
-    """(3,) the command with the play put back, once what is too near has run up."""
-    config, one_way = run.config, run.config.motion.approach_overshoot_deg > 0.0
-    here = config.to_deg(device.positions())
-    direction = np.ones(3) if one_way else np.where(command < here, -1.0, 1.0)
-    near = np.abs(command - here) < play.run_up
-    if near.any() and not one_way:  # so that the last move takes the play up
-        begin = np.where(near, command - direction * play.run_up, here)
+    """(3,) the command with the play put back, once a move from below has taken it up.
+
+    From above, where there is no room below.
+    """
+    config, direction = run.config, np.ones(3)
+    if not config.motion.approach_overshoot_deg:  # else every posture is so reached
         low = [axis.min_deg for axis in config.axes]
-        high = [axis.max_deg for axis in config.axes]
-        turned = near & ((begin < low) | (begin > high))
-        direction = np.where(turned, -direction, direction)
-        begin = np.where(near, command - direction * play.run_up, here)
+        direction = np.where(command - play.run_up < low, -1.0, 1.0)
+        begin = command - direction * play.run_up
         move(device, Posture("goto", config.to_pulses(begin)))
     run.say(*play.lines(command, direction))
     return command + play.shift(direction)

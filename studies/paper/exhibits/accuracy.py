@@ -30,8 +30,6 @@ from studies.paper.exhibits.intervals import (
 )
 from studies.paper.exhibits.material import Material, commands_deg
 
-__all__ = ["exhibits"]
-
 Array = NDArray[np.float64]
 
 SWEEPS: dict[str, tuple[str, str, float, tuple[float, ...]]] = {

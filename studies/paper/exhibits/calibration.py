@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from jaxcal.calibration.identify import identify
-from jaxcal.evaluation.parameters import least_squares, parameter_names, predict
+from jaxcal.evaluation.parameters import least_squares, predict
+from jaxcal.models import Affine
 from jaxcal.paper.constants import AXES, BIAS_DEG, NOISE_STD_DEG, RANGES, SCALE
 from jaxcal.paper.datasets import dataset0_robot
 from jaxcal.paper.twin import ORDERS, RobotConfig, read_out, simulate
@@ -17,8 +18,6 @@ from jaxcal.plots.style import BLACK, COLOURS, boxes, legend_right, panels
 from studies.paper.exhibits.exhibit import Exhibit, by_axis, judge
 from studies.paper.exhibits.intervals import mean_interval, share_interval
 from studies.paper.exhibits.material import Material, commands_deg
-
-__all__ = ["exhibits"]
 
 Array = NDArray[np.float64]
 
@@ -126,7 +125,7 @@ def _table_1(material: Material) -> Exhibit:
     commands, measured = material.measured("dataset0")
     pooled = identify(commands.reshape(-1, 3), measured.reshape(-1, 3))
     truth = np.concatenate([np.diag(SCALE).ravel(), BIAS_DEG])
-    names = parameter_names(3, 3)
+    names = Affine(3, 3).names
     low, high = pooled.confidence_intervals(1.0 - 0.05 / 12).T  # all twelve at once
     ends = [
         identify(*pairs).confidence_intervals()

@@ -6,8 +6,6 @@ from collections.abc import Iterator, Mapping
 
 from studies.paper.exhibits.exhibit import Claim, Exhibit, judge
 
-__all__ = ["claims"]
-
 Found = Mapping[str, Exhibit]
 claim = Claim.from_texts
 

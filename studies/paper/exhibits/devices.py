@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from jaxcal.paper.constants import BIAS_DEG, NOISE_STD_DEG, SCALE
 
-__all__ = ["Device", "pick", "rms"]
-
 Array = NDArray[np.float64]
 
 

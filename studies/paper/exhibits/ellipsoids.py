@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
 
-from jaxcal.evaluation.parameters import least_squares, parameter_names
+from jaxcal.evaluation.parameters import least_squares
 from jaxcal.information.regression import regressors
+from jaxcal.models import Affine
 from jaxcal.paper.constants import BIAS_DEG, NOISE_STD_DEG, SCALE
 from jaxcal.plots import ellipsoid
 from jaxcal.plots.style import BLACK, COLOURS, GREY, legend_below, panels
@@ -19,8 +20,6 @@ from studies.paper.exhibits.devices import Device
 from studies.paper.exhibits.exhibit import Exhibit, from_rows
 from studies.paper.exhibits.intervals import share_interval
 from studies.paper.exhibits.material import Material, commands_deg
-
-__all__ = ["exhibits"]
 
 Array = NDArray[np.float64]
 
@@ -73,7 +72,7 @@ def exhibits(material: Material) -> list[Exhibit]:
             },
             data={
                 "covariance": from_rows(heads, rows),
-                "calibrations": dict(zip(parameter_names(3, 3), shown.T, strict=True)),
+                "calibrations": dict(zip(Affine(3, 3).names, shown.T, strict=True)),
             },
             numbers={
                 "share_inside_95": share_interval(square <= stats.chi2.ppf(0.95, 12)),

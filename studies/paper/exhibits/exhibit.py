@@ -15,8 +15,6 @@ from matplotlib.figure import Figure
 
 from jaxcal.paper.constants import AXES
 
-__all__ = ["Claim", "Columns", "Exhibit", "Verdict", "by_axis", "from_rows", "judge"]
-
 Verdict = Literal["agrees", "agrees in part", "disagrees", "not comparable"]
 Columns = Mapping[str, Sequence[Any] | np.ndarray]
 """A table by the names of its columns, written as CSV"""

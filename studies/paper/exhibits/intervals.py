@@ -16,16 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-__all__ = [
-    "Interval",
-    "Paired",
-    "bootstrap_interval",
-    "mean_interval",
-    "median_interval",
-    "paired",
-    "share_interval",
-]
-
 
 @dataclasses.dataclass(frozen=True)
 class Interval:

@@ -14,8 +14,6 @@ from jaxcal.evaluation.parameters import least_squares
 from jaxcal.evaluation.results import Evaluation, MethodResult
 from jaxcal.paper.datasets import make_dataset
 
-__all__ = ["STUDIES", "Material", "Settings", "commands_deg"]
-
 Array = NDArray[np.float64]
 
 METHODS = ("policy", "random", "greedy", "exact")

@@ -15,8 +15,6 @@ from jaxcal.extras import versions
 from studies.paper.exhibits.exhibit import Claim, Exhibit, Verdict
 from studies.paper.exhibits.material import Settings
 
-__all__ = ["json_document", "page"]
-
 _TONES: dict[Verdict, tuple[Literal["good", "fair", "bad", "neutral"], str]] = {
     "agrees": ("good", "agree"),
     "agrees in part": ("fair", "agree in part"),

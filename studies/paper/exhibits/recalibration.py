@@ -34,8 +34,6 @@ from studies.paper.exhibits.exhibit import Exhibit, by_axis, from_rows, judge
 from studies.paper.exhibits.intervals import median_interval, paired, share_interval
 from studies.paper.exhibits.material import Material
 
-__all__ = ["exhibits"]
-
 Array = NDArray[np.float64]
 
 DRIFT_DEG = 0.3  # step of the bias from a session to the next

@@ -19,8 +19,6 @@ from studies.paper.exhibits.intervals import (
 )
 from studies.paper.exhibits.material import Material, Settings
 
-__all__ = ["STREAM", "exhibits", "words_of"]
-
 Array = NDArray[np.float64]
 
 STREAM = {"dataset2": 2, "dataset3": 3, "dataset4": 4}

@@ -13,8 +13,6 @@ from studies.paper.exhibits.exhibit import Exhibit, from_rows, judge
 from studies.paper.exhibits.intervals import mean_interval
 from studies.paper.exhibits.material import Material
 
-__all__ = ["exhibits"]
-
 
 def exhibits(material: Material) -> list[Exhibit]:
     """Table 2, Table 3, the reward's range and the rank of the regression matrix."""

@@ -24,8 +24,6 @@ from studies.paper.exhibits.exhibit import Exhibit, Verdict, judge
 from studies.paper.exhibits.intervals import mean_interval
 from studies.paper.exhibits.material import Material
 
-__all__ = ["Run", "exhibits", "kept_runs", "plateau"]
-
 Array = NDArray[np.float64]
 
 CLAIMED = 200_000  # episodes within which the paper's training converges

@@ -8,13 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.evaluation import figures
-from jaxcal.evaluation.parameters import parameter_names
+from jaxcal.models import Affine
 from jaxcal.plots.style import BLACK, COLOURS, GREY
 from studies.paper.exhibits.exhibit import Exhibit, judge
 from studies.paper.exhibits.material import METHODS, Material
 from studies.paper.exhibits.selection import STREAM, words_of
-
-__all__ = ["exhibits", "variance_table"]
 
 Array = NDArray[np.float64]
 
@@ -77,7 +75,7 @@ def _variance(material: Material, name: str, key: str, title: str) -> Exhibit:
     table = variance_table(
         parameters, settings.rng(STREAM[name], 1), settings.size("resamples")
     )
-    names = parameter_names(3, 3)
+    names = Affine(3, 3).names
     columns: dict[str, Any] = {"parameter": list(names)}
     for method, (value, low, high) in table.items():
         plain = method.replace(" ", "_").replace("/", "_over_")

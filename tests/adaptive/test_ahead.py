@@ -1,0 +1,116 @@
+"""The tree of the next measurements, against every tree there is."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import special
+
+from jaxcal.adaptive.dynamic import solve
+from jaxcal.adaptive.episodes import compare
+from jaxcal.adaptive.family.draws import draw
+from jaxcal.adaptive.family.padded import pad, stack
+from jaxcal.adaptive.family.structures import Limits
+from jaxcal.adaptive.grid import GridTask
+from jaxcal.adaptive.lookahead import Ahead
+from jaxcal.adaptive.rules import SHARES, log_score
+from jaxcal.adaptive.tasks.knee import knee
+
+choose = jax.jit(
+    lambda task, decider, belief, session: decider(
+        task, belief, session, task.options(belief, session), jax.random.key(0)
+    )
+)
+WHOLE = Ahead(effort=1e9)
+
+
+def values(task, weights, place, seconds, uses, made):
+    """(A,) nats of a measurement and the best of all that may follow, by recursion."""
+    table = np.asarray(task.likelihood, np.float64)
+    chances = table @ weights
+    gains = (
+        special.entr(chances).sum(axis=1) - special.entr(table).sum(axis=1) @ weights
+    )
+    for a, y in np.ndindex(chances.shape):
+        left = seconds - float(task.travel[place, a]) - float(task.extra[a, y])
+        more = uses - int(task.uses[a, y])
+        if chances[a, y] > 0 and left > 0 and more > 0 and made + 1 < task.horizon:
+            then = weights * table[a, y] / chances[a, y]
+            at = int(task.place_after[a, y])
+            gains[a] += (
+                chances[a, y] * values(task, then, at, left, more, made + 1).max()
+            )
+    return gains
+
+
+def random_task(seed, designs, outcomes, horizon):
+    """Noise, travel, extra seconds and uses of all sizes; 8 values of theta."""
+    rng = np.random.default_rng(seed)
+    return GridTask.make(
+        np.arange(8.0), np.arange(designs, dtype=float),
+        rng.dirichlet(np.full(outcomes, 0.3), (designs, 8)).transpose(0, 2, 1),
+        prior=rng.dirichlet(np.ones(8)),
+        travel=rng.uniform(0.2, 2.0, (designs + 1, designs)),
+        extra=rng.uniform(0.0, 1.0, (designs, outcomes)),
+        uses=rng.integers(0, 2, (designs, outcomes)),
+        seconds=rng.uniform(1.0, 6.0), num_uses=int(rng.integers(1, 4)),
+        horizon=horizon,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("designs", "outcomes", "horizon"), [(6, 2, 2), (4, 3, 2), (6, 2, 1), (2, 2, 4)]
+)
+def test_what_ends_within_the_tree_is_decided_as_by_all_trees(
+    designs, outcomes, horizon
+):
+    for seed in range(4):
+        task = random_task(seed, designs, outcomes, horizon)
+        belief, session = task.begin(jax.random.key(0))
+        chosen = int(choose(task, WHOLE, belief, session))
+        weights = np.asarray(task.prior, np.float64)
+        worth = values(
+            task, weights, int(task.place), float(session.seconds), int(session.uses), 0
+        )
+        assert worth[chosen] == pytest.approx(worth.max(), abs=2e-5)
+
+
+@pytest.mark.slow
+def test_nearly_the_optimum_where_it_is_known():
+    task = knee(5, sigma=1e-9, slip=0.0, seconds=(4.0, 12.0), trips=(1, 2))
+    best = solve(task, 0.2)
+    found = compare(task, {"ahead": Ahead(), "shares": SHARES}, 1024, seed=3)
+    mean, error = found.mean("ahead")
+    assert mean > 0.99 * best.mean - 3.0 * error
+    assert mean < best.mean + 4.0 * error
+    assert found.paired("ahead", "shares")[0] > 0.01
+
+
+@pytest.mark.slow
+def test_padded_tasks_are_decided_as_each_alone_and_without_effort_as_shares():
+    limits = Limits(64, 24, 4, measurements=12)
+    tasks = [draw(seed, limits=limits) for seed in (1, 2, 5)]
+    tables = jax.tree.map(jnp.asarray, stack([pad(task, limits) for task in tasks]))
+    keys = jax.random.split(jax.random.key(1), 32)
+
+    def decide(task, key):
+        """Two choices, and by how much the second's score is below the best."""
+        belief, session = task.begin(key)
+        spread = jnp.exp(jax.random.normal(key, (8,)))[jnp.arange(64) % 8]
+        weights = belief.weights * spread[: len(belief.weights)]
+        belief = belief.replace(weights=weights / weights.sum())
+        options = task.options(belief, session)
+        gains, prices = SHARES.judged(task, belief, session, options, key)
+        score = jnp.where(options.allowed, log_score(gains, prices), -jnp.inf)
+        deciders = Ahead(), Ahead(effort=0.0)
+        ahead, none = (d(task, belief, session, options, key) for d in deciders)
+        return ahead, score.max() - score[none], ahead != jnp.argmax(score)
+
+    each = jax.jit(jax.vmap(decide, in_axes=(None, 0)))
+    batch = jax.jit(jax.vmap(jax.vmap(decide, in_axes=(None, 0)), in_axes=(0, None)))
+    chosen, less, other = (np.asarray(leaf) for leaf in batch(tables, keys))
+    assert less.max() < 1e-3 and other.any()
+    for number, task in enumerate(tasks):
+        alone = each(jax.tree.map(lambda leaf, at=number: leaf[at], tables), keys)[0]
+        assert (np.asarray(alone) == chosen[number]).mean() > 0.95  # others are level
+        assert chosen[number].max() < len(task.designs)
