@@ -123,13 +123,14 @@ def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
             if event == "refused" and len(run.journal.events("command")) > moved:
                 code, event = EXIT_FAULT, "fault"
         run.signals.ending = True
+        told = {} if event in ("end", "refused") else {"go_on": run.to_go_on}
         try:
-            run.emit(event, sync=True, code=code, reason=reason)
+            run.emit(event, sync=True, code=code, reason=reason, **told)
         except JournalError as error:
             run.say(f"the journal could not be closed with a last line: {error}")
         if event != "end":
             run.say(f"{event}: {reason}")
-            if event != "refused":
-                run.say(f"to go on: {run.to_go_on}")
+            if told:
+                run.say(f"to go on: {told['go_on']}")
         run.journal.close()
     return code

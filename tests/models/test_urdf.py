@@ -149,6 +149,11 @@ ONE = [("revolute", (0, 0, 1), (0, 0, 0), (0, 0, 1))]
         ),
         (_urdf(ONE, "<xacro:arm/>"), "xacro file: expand it first, xacro arm.xacro"),
         (
+            _urdf(ONE, '<xacro:arm xmlns:xacro="http://ros.org/wiki/xacro"/>'),
+            "it is a xacro file",
+        ),
+        (_urdf(ONE).replace('"0.0 0.0 1.0"', '"0 0 ${h}"'), "a xacro file: expand it"),
+        (
             _urdf(
                 ONE,
                 '<joint name="j2" type="fixed"><parent link="link0"/>'
@@ -275,3 +280,23 @@ def test_links_that_do_not_fit_are_refused(tmp_path):
     )
     with pytest.raises(ValueError, match="the joints back, j1 form a loop"):
         _read(tmp_path, ring, tip="link1")
+
+
+def test_what_xacro_left_behind_and_the_shape_of_links_do_not_matter(tmp_path):
+    left = '<!-- <xacro:include filename="$(find x)"/> --><material name="${colour}"/>'
+    assert _read(tmp_path, _urdf(ONE, left)).joint_names == ("j1",)
+
+
+def test_a_finger_that_mimics_a_slide_elsewhere_is_told_in_lengths(tmp_path):
+    finger = """
+      <link name="thumb"/><joint name="pinch" type="prismatic">
+      <parent link="right"/><child link="thumb"/><axis xyz="0 1 0"/>
+      <mimic joint="slide" multiplier="-1"/></joint></robot>"""
+    model = _read(tmp_path, TREE.replace("</robot>", finger), tip="thumb")
+    assert model.joint_names == ("neck", "slide")
+    assert model.command_units == ("deg", "length")
+    expected = (_transform((0, -0.2, 0.5)) @ _transform((0, -0.03, 0)))[:3, 3]
+    np.testing.assert_allclose(model.predict([[0.0, 0.03]])[0], expected, atol=1e-12)
+    np.testing.assert_array_equal(model.limits[1], [0.0, 0.1])
+    curled = _read(tmp_path, TREE, base="palm", tip="finger")  # by a slide outside
+    assert curled.command_units == ("length",)

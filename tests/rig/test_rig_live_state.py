@@ -237,6 +237,13 @@ def test_a_resumed_run_is_alive_again_under_its_new_process():
     assert (state.pid, state.host, state.ended) == (8, "here", None)
 
 
+def test_what_goes_on_after_a_fault_is_what_the_console_said():
+    lack = "the device is not HOMED: yaw. Run `jaxcal-rig home`. Then jaxcal-rig resume"
+    fault = {"event": "fault", "code": 3, "reason": "alarm", "go_on": lack}
+    state = state_of(numbered([*begun(), fault]))
+    assert f"To go on: {lack}" in view.trouble(state, False, "runs/one")
+
+
 def test_a_missing_record_is_told_and_a_foreign_one_harms_nothing(tmp_path):
     records = begun()
     del records[2]

@@ -473,14 +473,19 @@ class SerialChain(Arm):
             return ()
         return (*self.joint_names, *self.sensor.inputs)
 
-    @property
+    @functools.cached_property
     def command_units(self) -> tuple[str, ...]:
         """J units of the joints' columns, "deg" or "length"."""
-        # A column drives itself by one; a leader that is not of the arm is an angle.
         kinds = []
-        for column in self.drive.T:
-            own = np.flatnonzero(column == 1.0)
-            kinds.append(self.joints[own[0]] if own.size else "R")
+        for name, column in zip(self.joint_names, self.drive.T, strict=True):
+            # A column drives itself by one, its gear ratio apart.
+            own = int(np.abs(np.abs(column) - 1.0).argmin())
+            kind = self.joints[own]
+            if column[own] != 1.0 and self.source is not None:
+                from jaxcal.models.serial.urdf import joints_of
+
+                kind = joints_of(self.source["text"])[name].kind
+            kinds.append(kind)
         return tuple("deg" if kind == "R" else "length" for kind in kinds)
 
     @property

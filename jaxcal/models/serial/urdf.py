@@ -61,6 +61,7 @@ class Joint(NamedTuple):
     limits: tuple[float, float]  # as in the file, infinite where not known
 
 
+_XACRO = "xacro file: expand it first, xacro arm.xacro > arm.urdf"
 _KINDS = {"revolute": "R", "continuous": "R", "prismatic": "P", "fixed": ""}
 
 
@@ -161,14 +162,15 @@ def _up(link: str, above: dict[str, Joint]) -> list[Joint]:
 
 
 def _robot(text: str) -> ElementTree.Element:
-    if "xacro:" in text or "${" in text:
-        raise ValueError(
-            "it is a xacro file: expand it first, xacro arm.xacro > arm.urdf"
-        )
     try:
         robot = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
+        if "<xacro:" in text:
+            raise ValueError(f"it is a {_XACRO}") from None
         raise ValueError(f"is not a URDF file: {error}") from error
+    # Expanded files may keep their name space, and comments with it.
+    if any("xacro}" in each.tag for each in robot.iter()):
+        raise ValueError(f"it is a {_XACRO}")
     if robot.tag != "robot":
         raise ValueError(f"it must hold a <robot>, got <{robot.tag}>")
     return robot
@@ -263,6 +265,7 @@ def _numbers(
         count = {1: "a number", 3: "three numbers"}[len(default)]
         raise ValueError(
             f"{attribute} of <{tag}> of joint {name} must be {count}, got {text!r}"
+            + (f": a {_XACRO}" if "${" in text else "")
         ) from None
     return values
 

@@ -99,13 +99,8 @@ def refit(
     Raises:
         Refused: the run does not allow it; nothing was written.
     """
-    start, imu = held[0], then.imu
-    old = {
-        "mechanism.order": then.mechanism.order,
-        "imu.order": imu.order,
-        "imu.signs": [*imu.signs],
-        "imu.mounting_deg": [*imu.mounting_deg],
-    }
+    start, imu, described = held[0], then.imu, held[0]["config"]
+    old = {k: described[k.partition(".")[0]][k.partition(".")[2]] for k in wanted}
     new = {k: v for k, v in wanted.items() if v is not None and v != old[k]}
     quaternions = imu.format == "sensorlogger" or imu.quaternion_columns is not None
     for name in new.keys() & {"imu.order", "imu.signs"} if quaternions else ():

@@ -79,10 +79,7 @@ class Watcher:
     def _poll(self) -> None:
         records = self._journal.read()
         for record in records:
-            try:
-                self.state.apply(record)
-            except (KeyError, ValueError, TypeError, IndexError):
-                self.state.damaged = True  # of another version, or edited by hand
+            self.state.apply(record)
         self.samples.extend(self._telemetry.read())
         before, now = self.running, time.monotonic()
         if records or now - self._asked > ASK_S:

@@ -1,4 +1,4 @@
-"""What the page shows of a run, from the records of its journal and nothing else.
+"""What console, page and report show of a run, from the records of its journal.
 
 ``RunState`` takes the records one by one and touches neither files nor clocks, so that
 a page that is opened late shows the same as one that was there from the beginning.
@@ -10,9 +10,9 @@ import dataclasses
 from typing import Any
 
 from rig.config.axis import Scale
+from rig.journal import Record
 from rig.workbench.outputs.words import ENDS, event_lines
 
-Record = dict[str, Any]
 Degrees = list[float]  # pitch, yaw, roll
 LOGGED = 200  # newest lines of what happened
 SESSIONS = ("calibrate", "collect", "verify", "goto")  # the others are commissioning
@@ -72,7 +72,13 @@ class RunState:
     _seq: int = -1
 
     def apply(self, record: Record) -> None:
-        """Take the next record."""
+        """Take the next record. One that was edited by hand, say, is left out."""
+        try:
+            self._apply(record)
+        except (KeyError, ValueError, TypeError, IndexError):
+            self.damaged = True
+
+    def _apply(self, record: Record) -> None:
         event, now = record.get("event", ""), float(record.get("time", self.time))
         self.damaged |= record.get("seq", 0) != self._seq + 1
         self._seq, self.time = record.get("seq", 0), now

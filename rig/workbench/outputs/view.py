@@ -70,7 +70,8 @@ def trouble(state: RunState, running: bool, folder: str) -> list[str]:
     lines, ended, stop = [], state.ended, state.stop
     typed = state.start.get("arguments") or [state.mode]
     typed = ["resume", folder] if state.mode in SESSIONS else typed
-    go_on = f"To go on: jaxcal-rig {shlex.join(typed)}"
+    go_on = (ended or {}).get("go_on", f"jaxcal-rig {shlex.join(typed)}")
+    go_on = f"To go on: {go_on}"
     if state.damaged:
         lines.append("The journal has lines that cannot be read; some are left out.")
     if ended is None and not running and state.start:
