@@ -12,7 +12,8 @@ each, on other sessions. ``two_step`` and ``rollouts`` follow ``shares`` and pla
 Differences are in pairs with standard errors; times are of one core, a choice in a
 batch. With --keep what was played lies in DIR and is not played again.
 --optimum plays small tasks of the same structures, their answers made certain and
-their costs whole, of which dynamic programming finds the optimum. --tune finds the
+their costs whole, of which dynamic programming finds the optimum; any numbers of
+--families, by the first ten of which the trees of ``ahead`` were shaped. --tune finds the
 constants of ``shares`` on 128 tasks of the structures that are not held out.
 """
 
@@ -80,7 +81,7 @@ def certain(number: int) -> tuple[str, GridTask, float]:
     # The beliefs of pools are too many.
     structures = [name for name in HELD_OUT if name != "pools"]
     structure = structures[number % len(structures)]
-    budget = ("time+uses", "time")[number // len(structures)]
+    budget = ("time+uses", "time")[number // len(structures) % 2]
     limits = Limits(36, 16, 2, 3, 64)
     task = jax.device_get(draw(_FIRST + 100 + number, structure, budget, limits))
     tick = float(task.seconds[1]) / 60.0
@@ -99,7 +100,7 @@ def optimum(methods: list[str], options: argparse.Namespace) -> None:
     """Shares of the optimum on small tasks."""
     every = []
     print(f"{'task':24}{'optimum':>9}" + "".join(f"{m:>12}" for m in methods))
-    for number in range(10):
+    for number in options.families:
         name, task, tick = certain(number)
         best = solve(task, tick)
         task = arrays(task)
