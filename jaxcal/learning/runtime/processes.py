@@ -120,7 +120,6 @@ def run_job(
         job, _ = flags.parse_known_args(argv)
         if not expected(job):
             return work()
-        os.environ.pop("TF_CPP_MIN_LOG_LEVEL", None)  # JAX's errors say who was lost
     except (ValueError, argparse.ArgumentError) as error:
         print(f"{program}: {error}", file=sys.stderr)
         return 2
