@@ -79,7 +79,7 @@ def _chosen(horizon: int, effort: float, *arrays: Any) -> Any:
         sums_of = np.concatenate([*table.transpose(1, 0, 2)[1:], noise]).T
         tree = Tree(
             _single(sums_of), _single(table), _single(travel), _single(extra.T),
-            _single(uses.T), np.array(after, np.int32), np.array(allowed, np.uint8),
+            _single(uses.T), np.array(after, np.int32), _single(allowed),
             horizon, constants, effort,
         )  # fmt: skip
         at = tuple(

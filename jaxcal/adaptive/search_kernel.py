@@ -61,17 +61,22 @@ def _log(x: cython.float) -> cython.float:
     bits = (bits & 0x7FFFFF) + 0x3F3504F3
     f: cython.float = 0.0
     memcpy(cython.address(f), cython.address(bits), 4)
-    f -= 1.0
-    y: cython.float = 7.0376836292e-2
-    y = y * f - 1.1514610310e-1
-    y = y * f + 1.1676998740e-1
-    y = y * f - 1.2420140846e-1
-    y = y * f + 1.4249322787e-1
-    y = y * f - 1.6668057665e-1
-    y = y * f + 2.0000714765e-1
-    y = y * f - 2.4999993993e-1
-    y = y * f + 3.3333331174e-1
-    return (y * f - 0.5) * f * f + f + power * cython.cast(cython.float, 0.69314718)
+    one: cython.float = 1.0
+    half: cython.float = 0.5
+    log_2: cython.float = 0.69314718
+    c8: cython.float = 7.0376836292e-2
+    c7: cython.float = -1.1514610310e-1
+    c6: cython.float = 1.1676998740e-1
+    c5: cython.float = -1.2420140846e-1
+    c4: cython.float = 1.4249322787e-1
+    c3: cython.float = -1.6668057665e-1
+    c2: cython.float = 2.0000714765e-1
+    c1: cython.float = -2.4999993993e-1
+    c0: cython.float = 3.3333331174e-1
+    f -= one
+    y: cython.float = ((c8 * f + c7) * f + c6) * f + c5
+    y = (((y * f + c4) * f + c3) * f + c2) * f + c1
+    return ((y * f + c0) * f - half) * f * f + f + power * log_2
 
 
 @cython.cclass
@@ -84,7 +89,7 @@ class Tree:
     extra: cython.float[:, ::1]
     uses: cython.float[:, ::1]
     place_after: cython.int[:, ::1]
-    allowed: cython.uchar[::1]
+    allowed: cython.float[::1]  # 1 or 0
     horizon: cython.int
     time: cython.double
     use: cython.double
@@ -267,7 +272,7 @@ class Tree:
         value: cython.double = -1.0
         if made + 1 >= self.horizon:  # nothing follows: no price counts
             for a in range(self.designs):
-                if scores[a] >= 0.0 and gains[a] > value:
+                if scores[a] > 0.0 and gains[a] > value:
                     value = gains[a]
                     best[0] = a
             return value
@@ -285,14 +290,14 @@ class Tree:
         guess: cython.double = 0.0
         number: cython.int
         for number in range(self.width[level]):
-            top: cython.float = -1.0
+            top: cython.float = 0.0
             for a in range(self.designs):
                 if scores[a] > top:
                     top = scores[a]
                     first = a
-            if top < 0.0:
+            if top == 0.0:
                 break
-            scores[first] = -1.0
+            scores[first] = 0.0
             self.guess[level + 1] = 0.0
             unknown: cython.double = entropy - gains[first] / p
             total: cython.double = gains[first] + self._follow(
@@ -334,9 +339,9 @@ class Tree:
         scores: cython.p_float = cython.address(self.scores[level, 0])
         seconds: cython.p_float = cython.address(self.seconds[level, 0])
         needs: cython.p_float = cython.address(self.needs[level, 0])
-        always: cython.double = INFINITY
-        rate: cython.double = -1.0
-        each: cython.double = 1.0
+        share: cython.float = 1.0 / p
+        tiny: cython.float = 1e-12
+        zero: cython.float = 0.0
         for a in range(designs):
             gains[a] = sums[(outcomes - 1) * designs + a]
             seconds[a] = needs[a] = 0.0
@@ -349,46 +354,56 @@ class Tree:
             uses: cython.p_float = cython.address(self.uses[y % outcomes, 0])
             for a in range(designs):
                 q: cython.float = chances[a]
-                q = q if q > 1e-12 else 1e-12
+                q = q if q > tiny else tiny
                 scores[a] -= q
-                gains[a] -= q * _log(q / p)
+                gains[a] -= q * _log(q * share)
                 seconds[a] += q * extra[a]
                 needs[a] += q * uses[a]
+        travel: cython.p_float = cython.address(self.travel[place, 0])
+        allowed: cython.p_float = cython.address(self.allowed[0])
+        nothing: cython.float = 1e-9
         for a in range(designs):
-            if not self.allowed[a]:
-                scores[a] = -1.0
-                continue
-            gains[a] = fmax(gains[a], 0.0)
-            seconds[a] = fmax(self.travel[place, a] + seconds[a] / p, 1e-9)
-            needs[a] = needs[a] / p
-            scores[a] = 0.0
-            always = fmin(always, needs[a])
-            if gains[a] / p + 1e-9 > rate * seconds[a]:
-                rate = (gains[a] / p + 1e-9) / seconds[a]
+            gains[a] = gains[a] if gains[a] > zero else zero
+            s: cython.float = travel[a] + seconds[a] * share
+            seconds[a] = s if s > nothing else nothing
+            needs[a] *= share
+            scores[a] = allowed[a] * (gains[a] * share + nothing) / seconds[a]
+        rate: cython.float = 0.0
+        always: cython.float = 1e9
+        each: cython.double = 1.0
+        for a in range(designs):
+            if scores[a] > rate:
+                rate = scores[a]
                 each = seconds[a]
+            if allowed[a] > 0.0 and needs[a] < always:
+                always = needs[a]
         n: cython.double = fmax(self.horizon - made, 1.0)
         n = fmin(n, fmax(e / fmax(always, 1e-6), 1.0))
         t = fmax(t, 1e-9)
         e = max(e, 1)
         number: cython.double = fmin(n, fmax(t / each, 0.1))
-        use: cython.double = self.use * expf(self.a * _log(number) + self.b * _log(e))
-        self.work += self._node()
-        top: cython.double = -1.0
-        least_price: cython.double = 1.0
+        use: cython.float = (self.use / e) * expf(
+            self.a * _log(number) + self.b * _log(e)
+        )
+        last: cython.float = e
+        time: cython.float = self.time / t
+        end: cython.float = fmin(t, 1e30)
+        fixed: cython.float = 1.0 / n
+        least: cython.float = nothing * p
         for a in range(designs):
-            if scores[a] < 0.0:
-                continue
-            price: cython.double = (
-                1.0 / n
-                + self.time * fmin(seconds[a] / t, 1.0)
-                + use * fmin((needs[a] - always) / e, 1.0)
-            )
-            scores[a] = (gains[a] + 1e-9 * p) / price
+            s = seconds[a] if seconds[a] < end else end
+            u: cython.float = needs[a] - always
+            u = u if u < last else last
+            s = fixed + time * s + use * u
+            scores[a] = allowed[a] * (gains[a] + least) / s
+        self.work += self._node()
+        top: cython.float = 0.0
+        best[0] = 0
+        for a in range(designs):
             if scores[a] > top:
                 top = scores[a]
-                least_price = price
                 best[0] = a
-        return least_price
+        return (gains[best[0]] + least) / fmax(top, 1e-30)
 
     @cython.cfunc
     @cython.nogil
@@ -418,6 +433,8 @@ class Tree:
         rest: cython.p_float = cython.address(self.rest[level, 0])
         mine: cython.p_float = cython.address(self.sums[level, 0])
         best: cython.int = 0
+        tiny: cython.float = 1e-12
+        zero: cython.float = 0.0
         total: cython.double = 0.0
         mass: cython.float = p
         for r in range(wide):
@@ -442,7 +459,7 @@ class Tree:
                 like: cython.p_float = cython.address(self.likelihood[a, z, 0])
                 for i in range(self.likely):
                     w: cython.float = from_here[i] * like[self.which[i]]
-                    weights[i] = w if w > 1e-12 else 0.0
+                    weights[i] = w if w > tiny else zero
             if y < outcomes:
                 self._sum(then)
                 for r in range(wide):
