@@ -1,6 +1,6 @@
-"""Is each sensor's calibration of an arm as uncertain as it says? Three tables more.
+"""Is each sensor's calibration of an arm as uncertain as it says? Four tables more.
 
-    python -m benchmarks.arm_sensors [draws] [intervals sizes misfit checks]
+    python -m benchmarks.arm_sensors [draws] [intervals sizes misfit checks contacts]
 
 ``intervals``: arms whose errors are drawn from the default prior, each sensor alone and
 in pairs, 60 readings of each or more: how many 95 % intervals hold the truth.
@@ -9,7 +9,10 @@ elsewhere of a fit with the right tolerances over that with sizes from the readi
 and over that of ``identify`` as it comes, with harmonics.
 ``misfit``: positions of arms that no table explains (cables, eccentric gears): the
 error elsewhere with and without harmonics of the joints. ``checks``: what a few chosen
-postures and random ones can tell of a drift.
+postures and random ones can tell of a drift. ``contacts``: of real arms, trained on one
+place and judged at the others: 12 and 16 contacts that are random, chosen, or chosen
+for the very postures they are judged at; measured, and as expected of a model without
+any error, with the noise and the sizes that all contacts of the place show.
 """
 
 from __future__ import annotations
@@ -17,6 +20,7 @@ from __future__ import annotations
 import pathlib
 import sys
 import warnings
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -293,7 +297,76 @@ def sizes(draws: int) -> None:
         print(f"| {factor:g} times | {row} |", flush=True)
 
 
-TABLES = {each.__name__: each for each in (intervals, sizes, misfit, checks)}
+def contacts(draws: int) -> None:
+    """Errors at other places over those of as many random contacts, and of all."""
+    sys.path.insert(0, str(EXAMPLES))
+    import contacts as example
+
+    print(
+        "| arm, trained on | K | over random: measured, expected, at best | over all |"
+    )
+    print("| --- | --- | --- | --- |")
+    for name in ("panda_1", "kuka_14"):
+        places = example.load(name)
+        for trained, place in places.items():
+            others = [each for at, each in places.items() if at != trained]
+            table = np.column_stack(place)
+            every = np.arange(len(table))
+
+            def measured(rows: Array) -> float:
+                found = example.identify(name, place, rows).arm  # noqa: B023 - called here
+                return np.mean([example.consistency(found, each) for each in others])  # noqa: B023
+
+            expected, best = _expected(example.arm(name), table, others)
+            for k in (12, 16):
+                rng = np.random.default_rng(0)
+                random = [rng.choice(every, k, replace=False) for _ in range(draws)]
+                chosen = example.choose("I", name, place, k, rng)
+                rows = {"chosen": [chosen], "random": random, "best": [best(k)]}
+                real, theory = (
+                    {at: np.mean([error(each) for each in rows[at]]) for at in rows}
+                    for error in (measured, expected)
+                )
+                cells = (
+                    f"{real['chosen'] / real['random']:.2f}, "
+                    f"{theory['chosen'] / theory['random']:.2f}, "
+                    f"{theory['best'] / theory['random']:.2f} | "
+                    f"{real['chosen'] / measured(every):.2f}, "
+                    f"{theory['chosen'] / expected(every):.2f}, "
+                    f"{theory['best'] / expected(every):.2f}"
+                )
+                print(f"| {name}, {trained} | {k} | {cells} |", flush=True)
+
+
+def _expected(
+    arm: SerialChain, table: Array, others: list[tuple[Array, Array]]
+) -> tuple[Callable[[Array], float], Callable[[int], Array]]:
+    """Error of some rows at other places, linear, and the best k rows for it."""
+    found = jaxcal.identify(table, np.zeros((len(table), 3)), model=arm)
+    model, theta = found.model, found.parameters
+    free = found.free[: len(theta)] > 0.0
+    blocks = model.jacobian(table, theta)[..., free] / np.mean(found.noise_std)
+    known = model.facts(theta)[1][:, free]
+    prior = np.diag(found.prior_precision[: len(theta)][free]) + known.T @ known
+    judged = []
+    for joints, sockets in others:
+        moves = model.jacobian(np.column_stack([joints, sockets]), theta)[..., free]
+        judged += [moves[sockets == i] - moves[sockets == i].mean(0) for i in (0, 1)]
+    region = np.concatenate(judged)
+
+    def error(rows: Array) -> float:
+        gram = prior + np.einsum("nqi,nqj->ij", blocks[rows], blocks[rows])
+        spread = region @ np.linalg.inv(gram) @ np.matrix_transpose(region)
+        return float(np.sqrt(np.trace(spread, axis1=1, axis2=2)).mean())
+
+    def best(k: int) -> Array:
+        design = jaxcal.Design.from_blocks(blocks, prior=prior)
+        return design.select(k, jaxcal.I(region), "exchange").indices
+
+    return error, best
+
+
+TABLES = {each.__name__: each for each in (intervals, sizes, misfit, checks, contacts)}
 
 if __name__ == "__main__":
     given = sys.argv[1:]

@@ -35,7 +35,7 @@ class Verdict:
 
     explains: bool  # the scatter of the readings is what the sensor's noise can be
     helps: bool  # held-out errors are smaller than those of the nominal machine
-    clean: bool  # no reading is of another socket, or far from the fit of the others
+    clean: bool  # no reading is of another socket, far from the others' fit, or tip
     held_out: float  # mean held-out error of a measurement, in the readings' unit
     interval: tuple[float, float]  # 95 % of that mean
     nominal: float  # mean error of the nominal machine
@@ -92,12 +92,13 @@ def verdict(calibration: Fit) -> Verdict | None:
     right = ~np.isin(used, list(swapped))
     reasons += _moved(model, commands[right], residuals[right], used[right])
     exchanged = _exchanged(calibration, model)
-    reasons += exchanged + _far(calibration)
+    other_tip = _other_tip(calibration)
+    reasons += exchanged + _far(calibration) + other_tip
     loose = (calibration.distance[list(calibration.outliers)] > _LOOSE**2).any()
     return Verdict(
         explains=explains,
         helps=mean < nominal,
-        clean=not (swapped or exchanged or loose),
+        clean=not (swapped or exchanged or loose or other_tip),
         held_out=mean,
         interval=(max(mean - half, 0.0), mean + half),
         nominal=nominal,
@@ -147,7 +148,7 @@ def _far(calibration: Fit) -> list[str]:
         f"{names[i]} is {off[i]:.2g} standard deviations of the prior from what was "
         "known: a wrong tip, file or unit?"
         for i in np.flatnonzero(off > _FAR)
-    ] + _other_tip(calibration)
+    ]
 
 
 def _other_tip(calibration: Fit) -> list[str]:

@@ -13,9 +13,11 @@ from jaxcal.models.sensors import (
     Plane,
     Pose,
     Position,
+    Reading,
     Sensor,
     Several,
     Socket,
+    Tip,
 )
 from jaxcal.models.serial import SerialChain
 from jaxcal.models.uncertainty import Noise, Prior, ResolvedPrior
@@ -36,11 +38,13 @@ __all__ = [
     "Pose",
     "Position",
     "Prior",
+    "Reading",
     "ResolvedPrior",
     "Sensor",
     "SerialChain",
     "Several",
     "Socket",
+    "Tip",
     "from_dict",
     "identifiability",
 ]

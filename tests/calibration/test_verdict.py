@@ -150,6 +150,7 @@ def test_another_tip_within_the_prior_is_named():
     assert len(said) == 1 and said[0].startswith("the tip is 0.05 from where")
     clean = _fit("panda_1", *PLACE).verdict
     assert not [why for why in clean.reasons if "another tip" in why]
+    assert clean.good and not found.verdict.clean
 
 
 def test_a_wrong_tip_is_named():

@@ -324,7 +324,7 @@ CONFIG = TrainConfig(
         num_minibatches=2, learning_rate=5e-5, final_learning_rate=5e-5,
     ),
     seed=3,
-    tasks=(Task(SelectionConfig(6, 3, 1, 1)),),
+    tasks=(Task(SelectionConfig(6, 3, 1, 1, reward_gain=True)),),  # as the flags
 )
 
 def work():

@@ -400,3 +400,32 @@ def test_a_sensor_of_ones_own_needs_no_more_than_a_class():
 def test_what_cannot_be_a_sensor_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_views_of_a_board_weigh_by_their_covariance():
+    """A spoilt view of enormous covariance is as good as none."""
+    model = ur5(sensor=Board("camera", PLACE))
+    seen = model.predict(np.hstack([JOINTS, np.zeros((len(JOINTS), 6))]))
+    commands = np.hstack([JOINTS, seen + 0.01 * np.sin(np.arange(6.0) + JOINTS)])
+    spread = np.diag([1.0, 1.0, 4.0, 0.1, 0.1, 0.02]) ** 2
+    covariance = np.array([spread * (1.0 + i) for i in range(len(JOINTS))])
+    zeros = np.zeros((len(JOINTS), 6))
+    options = {"model": model, "loss": "gaussian", "prior": model.default_prior()}
+    without = jaxcal.identify(
+        commands[1:],
+        zeros[1:],
+        noise=jaxcal.Noise(covariance=covariance[1:]),
+        **options,
+    )
+    commands[0, 6:] += 5.0
+    covariance[0] *= 1e12
+    found = jaxcal.identify(
+        commands, zeros, noise=jaxcal.Noise(covariance=covariance), **options
+    )
+    np.testing.assert_allclose(found.parameters, without.parameters, atol=1e-6)
+    errors = found.standard_errors, without.standard_errors
+    np.testing.assert_allclose(*errors, rtol=1e-5)
+    plain = jaxcal.identify(
+        commands[1:], zeros[1:], noise=jaxcal.Noise(covariance=spread), **options
+    )
+    assert np.abs(plain.parameters - without.parameters).max() > 1e-4
