@@ -13,8 +13,8 @@ Differences are in pairs with standard errors; times are of one core, a choice i
 batch. With --keep what was played lies in DIR and is not played again.
 --optimum plays small tasks of the same structures, their answers made certain and
 their costs whole, of which dynamic programming finds the optimum; any numbers of
---families, by the first ten of which the trees of ``ahead`` were shaped. --tune finds the
-constants of ``shares`` on 128 tasks of the structures that are not held out.
+--families, by the first ten of which the trees of ``ahead`` were shaped. --tune finds
+the constants of ``shares`` on 128 tasks of the structures that are not held out.
 """
 
 from __future__ import annotations
