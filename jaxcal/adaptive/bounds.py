@@ -5,9 +5,9 @@ p(h) is an average over the unknown. Contrasts z_1..z_L from a proposal q estima
 their average of ``p(h | z) p(z) / q(z)`` bounds the information from above, and with
 the truth among the contrasts from below (Foster et al. 2020, 2021).
 
-Drawn from the prior (sPCE) the lower bound cannot exceed ``log(L + 1)``. ``sace`` draws
-them from the posterior, fitted by particles to each history: its bounds meet. On a grid
-``Episodes.entropy_drop`` is exact, without them.
+``spce`` draws contrasts from the prior (sPCE below, sNMC above): it cannot report more
+than ``log(L + 1)``. ``sace`` draws them from the posterior, fitted by particles to each
+history: its bounds meet. On a grid ``Episodes.entropy_drop`` is exact, without either.
 """
 
 from __future__ import annotations
@@ -22,9 +22,11 @@ from numpy.typing import NDArray
 
 from jaxcal.adaptive.episodes import Episodes
 from jaxcal.adaptive.particles import ParticleBelief, ParticleTask, log_mean
+from jaxcal.checks import whole_number
 
-__all__ = ["Bounds", "sace"]
+__all__ = ["Bounds", "sace", "spce"]
 
+_CHUNK = 4096  # contrasts at a time
 _PRIOR = 0.05  # share of the proposal: bounds the ratio of posterior to proposal
 _NEAREST = 32  # particles that shape each kernel
 
@@ -35,6 +37,7 @@ class Bounds:
 
     lower: NDArray[np.float64]  # (B,)
     upper: NDArray[np.float64]  # (B,)
+    cap: float  # what the lower bound cannot exceed; inf where there is no cap
 
     @property
     def mean(self) -> tuple[float, float]:
@@ -49,6 +52,29 @@ class Bounds:
             float(self.lower.std(ddof=1) / root),
             float(self.upper.std(ddof=1) / root),
         )
+
+
+def spce(
+    task: ParticleTask, episodes: Episodes, key: jax.Array, contrasts: int = 24 * _CHUNK
+) -> Bounds:
+    """sPCE from below and sNMC from above, with contrasts from the prior.
+
+    Args:
+        task: that was played.
+        episodes: B sessions.
+        key: of the contrasts, which are drawn anew for each session.
+        contrasts: L, a multiple of 4,096 or below it.
+
+    Raises:
+        ValueError: it is neither.
+    """
+    chunk = min(_CHUNK, whole_number("contrasts", contrasts, 1))
+    if contrasts % chunk:
+        raise ValueError(
+            f"contrasts must be below {_CHUNK} or a multiple of it, got {contrasts}"
+        )
+    found = _spce(task, episodes, key, chunk, contrasts // chunk)
+    return _bounds(found, float(np.log(contrasts + 1)))
 
 
 def sace(
@@ -71,8 +97,12 @@ def sace(
         moves: of the particles.
     """
     finer = dataclasses.replace(task, num_particles=particles, num_moves=moves)
-    found = _sace(finer, episodes, key, contrasts)
-    return Bounds(*(np.asarray(values, np.float64) for values in found))
+    return _bounds(_sace(finer, episodes, key, contrasts), np.inf)
+
+
+def _bounds(found: tuple[jax.Array, jax.Array], cap: float) -> Bounds:
+    lower, upper = (np.asarray(values, np.float64) for values in found)
+    return Bounds(lower, upper, cap)
 
 
 def _observed(task: ParticleTask, episode: Episodes) -> ParticleBelief:
@@ -86,6 +116,30 @@ def _observed(task: ParticleTask, episode: Episodes) -> ParticleBelief:
         made=episode.alive.sum().astype(jnp.int32),
         model=task.model,
     )
+
+
+@jax.jit(static_argnums=(3, 4))
+def _spce(
+    task: ParticleTask, episodes: Episodes, key: jax.Array, chunk: int, chunks: int
+) -> tuple[jax.Array, jax.Array]:
+    def one(given: Any) -> tuple[jax.Array, jax.Array]:
+        episode, key = given
+        observed = _observed(task, episode)
+        own = observed._history(episode.truth[None])[0]
+
+        def add(total: jax.Array, key: jax.Array) -> tuple[jax.Array, None]:
+            z = jax.random.normal(key, (chunk, task.model.dim))
+            return jnp.logaddexp(total, jax.nn.logsumexp(observed._history(z))), None
+
+        total, _ = jax.lax.scan(
+            add, jnp.asarray(-jnp.inf), jax.random.split(key, chunks)
+        )
+        count = float(chunk * chunks)
+        lower = own - jnp.logaddexp(total, own) + jnp.log(count + 1.0)
+        return lower, own - total + jnp.log(count)
+
+    keys = jax.random.split(key, len(episodes.truth))
+    return jax.lax.map(one, (episodes, keys))
 
 
 @jax.jit(static_argnums=3)

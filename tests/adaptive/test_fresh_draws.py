@@ -109,6 +109,20 @@ def test_a_proposal_states_what_it_tells(task):
     assert has_exact_mean(gains)
 
 
+def test_brax_is_rewarded_with_what_an_option_tells(task):
+    pytest.importorskip("brax")
+    from jaxcal.adaptive.brax_env import SequentialEnv
+
+    env = SequentialEnv(task, registry.FREE["state"], 6)
+
+    @jax.jit
+    @jax.vmap
+    def reward(key):  # the first of the shortlist is the one of the largest gain
+        return env.step(env.reset(key), jnp.int32(0)).reward
+
+    assert has_exact_mean(reward(jax.random.split(jax.random.PRNGKey(2), 256)))
+
+
 @pytest.mark.slow
 def test_ppo_is_rewarded_with_what_an_option_tells(path, tmp_path):
     sizes = ["--num-minibatches", "2", "--num-epochs", "1", "--width", "8"]

@@ -1,5 +1,6 @@
 """Particle beliefs, bounds and the public tasks, against exact and plain answers."""
 
+import inspect
 import math
 from typing import Any
 
@@ -14,7 +15,7 @@ from benchmarks.tasks.ces import CES, ces
 from benchmarks.tasks.hyperbolic import Hyperbolic
 from benchmarks.tasks.location import LocationFinding
 from benchmarks.tasks.prey import make_prey
-from jaxcal.adaptive.bounds import sace
+from jaxcal.adaptive.bounds import sace, spce
 from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.particles import ParticleTask, systematic
 from jaxcal.adaptive.rules import SHARES, Gain, GainRate, Random
@@ -193,12 +194,23 @@ def test_bounds_hold_the_closed_form_between_them(lines):
     tight = sace(
         task, episodes, jax.random.key(1), contrasts=512, particles=512, moves=4
     )
-    lower, upper = tight.mean
-    # The truths are drawn, so both move together by their common error.
-    assert lower - 4.0 * tight.error[0] < wanted < upper + 4.0 * tight.error[1]
-    assert upper - lower < 0.05
+    wide = spce(task, episodes, jax.random.key(2), 256)
+    for bounds in (tight, wide):
+        lower, upper = bounds.mean
+        # The truths are drawn, so both move together by their common error.
+        assert lower - 4.0 * bounds.error[0] < wanted < upper + 4.0 * bounds.error[1]
+    assert tight.mean[1] - tight.mean[0] < 0.05
+    assert wide.cap == pytest.approx(math.log(257))
+    assert (wide.lower <= wide.cap + 1e-5).all()
     gap = tight.lower - np.asarray(episodes.log_ratio)
     assert abs(gap.mean()) < 0.2
+
+
+def test_contrasts_that_are_not_drawn_whole_are_refused(lines):
+    task, episodes = lines
+    with pytest.raises(ValueError, match="below 4096 or a multiple of it, got 100000"):
+        spce(task, episodes, jax.random.key(0), 100_000)
+    assert inspect.signature(spce).parameters["contrasts"].default % 4096 == 0
 
 
 @pytest.mark.slow

@@ -193,6 +193,27 @@ def test_commands_run_a_task_of_particles(tmp_path, capsys):
     assert "policy" in capsys.readouterr().out
 
 
+@pytest.mark.slow
+def test_brax_plays_a_task_of_particles():
+    pytest.importorskip("brax")
+    from jaxcal.adaptive.brax_env import SequentialEnv
+    from jaxcal.learning.environments.brax_env import wrap_fresh
+
+    task = counts()
+    with jax.numpy_rank_promotion("allow"):
+        env = wrap_fresh(
+            SequentialEnv(task, registry.FREE["state"], 3), task.horizon, 1
+        )
+        assert env.action_size == 3
+        state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(1), 4))
+        step = jax.jit(env.step)
+        done = []
+        for _ in range(4):
+            state = step(state, jnp.zeros(4, jnp.int32))
+            done.append(np.asarray(state.done).tolist())
+    assert done == [[0.0] * 4, [0.0] * 4, [1.0] * 4, [0.0] * 4]
+
+
 @pytest.mark.parametrize("name", ["ces", "death", "hyperbolic", "location", "prey"])
 def test_public_tasks_are_files_as_a_user_writes_them(name):
     entry = registry.load(str(TASKS / f"{name}.py"))
