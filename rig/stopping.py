@@ -178,7 +178,7 @@ def _stop_units(target: Target, path: pathlib.Path | None) -> list[UnitStop]:
     with contextlib.ExitStack() as stack:
         try:
             stack.enter_context(target.lock.acquire("stop"))
-        except (OSError, Refused):  # a stop waits for nobody
+        except (OSError, Refused):  # stop without the lock
             _say(f"{target.lock.where} is not free: its drives are stopped anyway")
         bus = Bus(settings, silence_s)
         try:

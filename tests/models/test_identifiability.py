@@ -117,7 +117,7 @@ def test_a_direction_of_three_parameters_has_the_sizes_of_its_parts():
 
 
 def test_what_an_unknown_command_hides_is_named():
-    """A gain cannot be told from a command that nobody knows."""
+    """A gain cannot be identified where the command is unknown."""
     model = Affine(1, 2)
     commands = np.random.default_rng(0).normal(size=(20, 1))
     assert identifiability(model, commands).rank == 4

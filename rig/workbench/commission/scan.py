@@ -75,7 +75,7 @@ def scan(
 ) -> list[Found]:
     """Ask units 1 to ``units`` for their identity; ``maps`` beside those that ship.
 
-    The bus is nobody else's meanwhile.
+    It holds the lock of the bus until it ends.
     """
     known = [*maps, *(load_map(name) for name in available_maps())]
     known = list({each.name: each for each in known}.values())

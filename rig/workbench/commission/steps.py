@@ -77,7 +77,7 @@ class Place:
 
     @contextlib.contextmanager
     def bus(self, what: str) -> Iterator[list[Drive]]:
-        """The drives, to be read; nobody else writes meanwhile."""
+        """The drives, to be read, under the lock of the bus."""
         config = self.config
         with (
             BusLock(config.bus).acquire(what),
@@ -279,7 +279,7 @@ def simulated(
     record: DeviceRecord,
     say: Callable[[str], None],
 ) -> Place:
-    """A simulated device, at which nobody needs to stand; it corrects no file."""
+    """A simulated device: no operator confirms its moves, no file is corrected."""
     return Place(
         served, record, Operator(yes=True, say=say), full_speed=True,
         listeners=(simulator.hear,),
