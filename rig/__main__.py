@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from jaxcal.arguments import values_of
 from rig.commands import make_parser
-from rig.core.faults import EXIT_BAD_INPUT, EXIT_FAULT, EXIT_INTERRUPTED
+from rig.core.faults import EXIT_BAD_INPUT, EXIT_FAULT, EXIT_INTERRUPTED, told
 from rig.journal.errors import JournalError
 
 # Looked for before any port opens; finding is quicker than importing.
@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         return 141  # the reader of our output went away, as `| head` does
     except (ValueError, OSError, RuntimeError, ImportError) as error:
-        print(f"jaxcal-rig: {error}", file=sys.stderr)
+        print(f"jaxcal-rig: {told(error)}", file=sys.stderr)
         if isinstance(error, JournalError) and command == "resume":
             return EXIT_BAD_INPUT
         return EXIT_FAULT if isinstance(error, RuntimeError) else code

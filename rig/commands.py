@@ -101,8 +101,8 @@ class Target(Simulation):
             if self.simulate or simulated:
                 return parse_config(example_text("simulate"))
             if not FILE.exists():
-                lack = "there is no rig.toml here: --config FILE is required, or "
-                raise ConfigError("configuration", [lack + "--simulate"])
+                lack = "there is no rig.toml here: give --config FILE or --simulate"
+                raise ConfigError("configuration", [lack])
             self.config = FILE
         return load_config(self.config)
 
@@ -334,8 +334,8 @@ def resume(run: RunPath, *, given: Session) -> int:
     config, start = _recorded(run, given.config)
     if given.simulate and start["simulated"] is None:
         raise Refused(
-            f"{run} was made with a real device, and going on moves that. Leave out "
-            "--simulate, or begin a simulated run of its own"
+            f"{run} was made with a real device, and resuming it moves that. Leave out "
+            "--simulate, or begin a simulated run"
         )
     return _run(given, "resume", config, start, run)
 
@@ -483,7 +483,7 @@ def _journal(run: Path) -> Path:
     from rig.journal import JOURNAL
 
     if not (run / JOURNAL).is_file():
-        raise Refused(f"{run} holds no run: there is no {JOURNAL} in it")
+        raise Refused(f"{run} is not the folder of a run: it holds no {JOURNAL}")
     return run / JOURNAL
 
 
@@ -497,7 +497,7 @@ def _records(run: Path) -> list[Record]:
     except JournalError as error:
         raise Refused(str(error)) from None
     if not records or records[0]["event"] != "start":
-        raise Refused(f"{run} holds no run: its journal has no start")
+        raise Refused(f"{run} is not the folder of a run: its journal has no start")
     if records[0].get("schema") != SCHEMA:
         raise Refused(
             f"{run} was written by an earlier version of jaxcal, whose runs are not "
