@@ -146,7 +146,7 @@ def _seeds(runs: list[Run], paper: list[Run]) -> Exhibit:
         reached = [run.summary["dataset2"][name] for run in runs]
         numbers[name] = mean_interval(reached, upper_limit=1.0)
     shown = {f"seed {run.summary['seed']}": run for run in runs}
-    shown |= {"paper's": run for run in paper}
+    shown |= dict(zip(["paper's"], paper, strict=False))
     ends = dict.fromkeys((min(lengths), max(lengths)))
     return Exhibit.from_texts(
         "figure_2",
