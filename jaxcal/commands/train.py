@@ -244,7 +244,7 @@ def _task_configuration(
     entry = registry.load(arguments.task)
     given = values_of(arguments, task=True)
     if arguments.resume:
-        more = {"with": arguments.options} if arguments.options else {}
+        more = {"with": arguments.with_} if arguments.with_ else {}
         _refuse_with_resume(given | more, out)
         _, meta = checkpoint.read_meta(out, run.SCHEMA)
         config = PolicyConfig.from_meta(meta)
@@ -253,8 +253,8 @@ def _task_configuration(
         return config
     _refuse_to_overwrite(out)
     options = entry.train_on
-    if arguments.options:
-        options = (registry.options_from(entry, arguments.options),)
+    if arguments.with_:
+        options = (registry.options_from(entry, arguments.with_),)
     ppo, own = (
         {
             f.name: given[f.name]

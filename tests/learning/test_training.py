@@ -398,7 +398,7 @@ BRAX = ["--trainer", "brax"]
     [
         (["--episodes", "0"], "num_episodes must be at least 1"),
         (["--num-selected", "3"], "num_selected must be in"),
-        (["--seed", "one"], "argument --seed: invalid int value: 'one'"),
+        (["--seed", "one"], "--seed: must be a whole number, got 'one'"),
         (["--resume"], "does not exist"),
         (["--out", "/proc/nowhere/run"], "cannot write in /proc"),
         (["--kind", "big"], "kind must be one of compact, paper, got 'big'"),
