@@ -6,7 +6,7 @@ import importlib.util
 import sys
 from collections.abc import Sequence
 
-from rig.arguments import call
+from jaxcal.arguments import values_of
 from rig.commands import make_parser
 from rig.core.faults import EXIT_BAD_INPUT, EXIT_FAULT, EXIT_INTERRUPTED, told
 from rig.journal.errors import JournalError
@@ -27,7 +27,8 @@ def main(argv: Sequence[str] | None = None) -> int:
                 install = "which is not installed: pip install 'jaxcal[rig]'"
                 raise ModuleNotFoundError(f"{command} needs {name}, {install}")
         code = EXIT_FAULT if command == "stop" else EXIT_BAD_INPUT
-        return call(args)
+        code = args.function(**values_of(args))
+        return code
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     except BrokenPipeError:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
-from rig.arguments import parser_of
+from jaxcal.arguments import Parser
 from rig.core.faults import EXIT_FAULT, EXIT_OK, EXIT_RECALIBRATE, Refused
 
 if TYPE_CHECKING:
@@ -694,6 +694,22 @@ COMMANDS = (
 )  # fmt: skip
 
 
-def make_parser(only: str | None = None) -> argparse.ArgumentParser:
+EPILOG = """\
+exit codes: 0 done; 1 done, but the error says calibrate (again); 2 bad input, nothing
+moved; 3 stopped by a fault; 4 paused by Ctrl-C; 128 + signal stopped by a signal.
+After 3, 4 and signals `resume RUN` goes on.
+
+Research software, not a medical device. Calibrate with no patient attached; a hardware
+emergency stop is required.
+"""
+
+
+def make_parser(only: str | None = None) -> Parser:
     """The parser of every command; with the options of one alone it is made quicker."""
-    return parser_of(COMMANDS, only)
+    about = "Calibrate a three-axis device over Modbus and a phone's IMU."
+    parser = Parser(prog="jaxcal-rig", description=about, epilog=EPILOG)
+    added = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for function in [each for each in COMMANDS if each.__name__ == only] or COMMANDS:
+        name, text = function.__name__, function.__doc__
+        added.add_parser(name, help=text, description=text).of(function)
+    return parser
