@@ -119,7 +119,7 @@ def _train(
         from jaxcal.adaptive.policy import run as trainer
 
         schema, unit, columns = trainer.SCHEMA, "decisions", _TASK
-        told = f"task {config.task}, seed {config.seed}; run folder {out}"
+        introduction = f"task {config.task}, seed {config.seed}; run folder {out}"
     else:
         from jaxcal.learning.training import checkpoint
         from jaxcal.learning.training import postures as trainer
@@ -128,10 +128,10 @@ def _train(
         rows = config.ppo.rows_per_minibatch
         mesh = devices.make_mesh(rows, arguments.devices, config.num_seeds)
         schema, unit, columns = checkpoint.SCHEMA, "episodes", _POSTURES
-        told = _introduction(config, out, devices.describe(mesh))
+        introduction = _introduction(config, out, devices.describe(mesh))
         more = {"validation": None, "teacher": teacher}
     if first:
-        print(f"{told}\nconfiguration: {config.as_meta()}")
+        print(f"{introduction}\nconfiguration: {config.as_meta()}")
         if validates:
             more["validation"] = fixed_validation(config)
         _begin_table(unit, columns)

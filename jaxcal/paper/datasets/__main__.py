@@ -9,19 +9,18 @@ import json
 import pathlib
 import platform
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import numpy as np
 
 from jaxcal.arguments import Parser, exit_code, several, values_of
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.evaluation.dataset_files import save_csv_parts, save_npz
+from jaxcal.evaluation.dataset_files import save_csv, save_npz
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.paper.constants import (
     AXES,
     BIAS_DEG,
-    BLOCK,
     EPISODES,
     NAMES,
     NOISE_STD_DEG,
@@ -94,18 +93,12 @@ def write_datasets(
             if path.suffix == ".npz":
                 save_npz(data, path)
             else:
-                save_csv_parts(_parts(data, f"write {path.name}", report), path)
+                save_csv(data, path, report)
         card = folder / f"{name}.json"
         write_text(card, json.dumps(_card(data, files, recordings), indent=2) + "\n")
         written += [*files, card]
     report.clear()
     return written
-
-
-def _parts(data: Dataset, task: str, progress: Progress) -> Iterator[Dataset]:
-    for begin in range(0, data.num_episodes, BLOCK):
-        progress(task, begin, data.num_episodes)
-        yield data.part(begin, begin + BLOCK)
 
 
 def _card(
