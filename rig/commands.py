@@ -219,13 +219,9 @@ def imu(
 
 
 def jog(
-    axis: Axis,
-    step: Annotated[float, "degrees; without it while a key is held", (-3, 3)]
-    | None = None,
-    *,
-    given: Step,
+    axis: Axis, step: Annotated[float, "degrees", (-10, 10)], *, given: Step
 ) -> int:
-    """move one axis by hand"""
+    """move one axis by a step"""
     return _step(given, "IDENTIFIED", "jog", NAMES.index(axis), step)
 
 
@@ -430,6 +426,7 @@ def _procedure(
     import numpy as np
 
     from rig.workbench.procedures import calibrate, checking
+    from rig.workbench.procedures.goto import goto as move_to
 
     mode, inputs = start["mode"], start["inputs"]
     if mode == "calibrate":
@@ -443,7 +440,7 @@ def _procedure(
     if mode == "verify":
         return lambda run: checking.verify(run, found, inputs["count"]), saved.zero
     to = np.array(inputs["to"], dtype=np.float64)
-    return lambda run: checking.goto(run, found, to, saved.play), saved.zero
+    return lambda run: move_to(run, found, to, saved.play), saved.zero
 
 
 def _confirm(given: Session, session: Run) -> None:
