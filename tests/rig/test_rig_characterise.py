@@ -79,7 +79,7 @@ def test_each_lies_in_a_narrow_interval_that_the_calibration_keeps(
     assert len(stands) == found["measurements"]
     kept = load_calibration(path, fast_config(), simulated=True).play
     assert kept.widths[axis] == found["backlash_deg"]["value"]
-    assert "`goto` puts the play back" in told
+    assert "`jaxcal-rig goto` puts the play back" in told
 
 
 @pytest.mark.parametrize(

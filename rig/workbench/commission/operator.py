@@ -68,4 +68,4 @@ class Operator:
         if self.yes:
             self.say(f"confirmed by --yes: {word}")
         elif self._answer(f"Type {word} to go on: ") != word:
-            raise Refused("not confirmed; nothing was done")
+            raise Refused(f"{word!r} was not typed: not confirmed, nothing was done")

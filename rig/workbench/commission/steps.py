@@ -164,7 +164,7 @@ def go_home(place: Place, here: bool) -> int:
         without = {a.map.name for a in place.config.axes if a.map.home is None}
         raise Refused(
             f"the map {', '.join(sorted(without))} knows no homing. Put the device "
-            "into its home posture and use --here"
+            "into its home posture, then run `jaxcal-rig home --here`"
         )
     what = "nothing moves; where the device stands becomes the origin of its counts"
     if not here:
@@ -243,7 +243,7 @@ def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> i
         found = measured.characterise(run, device, axis)
         if path is not None:
             keep(path, name, found | {"run": run.folder.name})
-            run.say(f"kept in {path}: `goto` puts the play back")
+            run.say(f"kept in {path}: `jaxcal-rig goto` puts the play back")
 
     return place.run("characterise", procedure, again=f"characterise {name}")
 
@@ -271,7 +271,10 @@ def _check_axes(place: Place, names_known: bool, again: bool = False) -> int:
     for change in changes:
         place.say(f"  {change}")
     if again or place.path is None:
-        place.say("the device is NOT sign-checked")
+        place.say(
+            "the device is NOT SIGN_CHECKED: correct rig.toml, then run `jaxcal-rig "
+            "axes` again"
+        )
         return EXIT_RECALIBRATE
     place.operator.confirm(
         f"axes: write this to {place.path}, then move the axes again", "correct"
@@ -328,5 +331,6 @@ def begin_simulated(place: Place, through: str) -> None:
         place.record.reach(HOMED, place.config, **as_they_stand)
     if SIGN_CHECKED in states and _check_axes(place, names_known=False):
         raise MotionFault(
-            "the simulated device's axes were not found to be as configured"
+            "the simulated device's axes are not as configured. Leave out --reversed, "
+            "--swapped and --gearing; `jaxcal-rig setup --simulate` takes them"
         )

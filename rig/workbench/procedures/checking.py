@@ -115,7 +115,8 @@ def load_calibration(
         )
     if "device" not in notes:
         raise Refused(
-            f"{path}: does not say with which device it was made. Calibrate this device"
+            f"{path}: does not say with which device it was made. Calibrate this "
+            "device: jaxcal-rig calibrate"
         )
     if changed := differences(notes["device"], config.device_fingerprint()):
         raise Refused(
@@ -153,7 +154,10 @@ def verify(run: Run, calibration: Any, count: int) -> int:
         "held_out", lambda: {"pairs": telling(config, calibration, count)}
     )["pairs"]
     if not held:
-        raise Refused("no target in the ranges can be reached through this calibration")
+        raise Refused(
+            "no target in session.*_range_deg can be reached through this calibration. "
+            "Widen the ranges, or calibrate again"
+        )
     if run.dry_run:
         for raw, command in held:
             run.say(f"  target {numbers(config.to_deg(raw))}  command {list(command)}")
@@ -163,7 +167,10 @@ def verify(run: Run, calibration: Any, count: int) -> int:
             run.emit("phase", phase="saving")
     records, found = held_out_errors(config, held, run.postures(), calibration)
     if not found:
-        raise Refused("no held-out posture could be reached")
+        raise Refused(
+            "no held-out posture could be reached. Narrow session.*_range_deg to what "
+            "the device reaches"
+        )
     limit = config.session.verify_limit_deg
     again = found["after"]["max"] > limit
     run.save_pairs()
@@ -172,7 +179,8 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     if calibration.noise_std is not None:
         told = calibration.check(*pairs(records), tolerance=limit)
         run.say(f"a drift that moves it by {limit:g} is seen with {told.power:.0%}")
-    run.say("RECALIBRATE: over the limit" if again else "the calibration still holds")
+    over = "RECALIBRATE: over session.verify_limit_deg. Run `jaxcal-rig calibrate`"
+    run.say(over if again else "the calibration still holds")
     return EXIT_RECALIBRATE if again else EXIT_OK
 
 

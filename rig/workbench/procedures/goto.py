@@ -86,8 +86,8 @@ def goto(run: Run, calibration: Any, desired: Array, play: Play) -> int:
             raise LimitError(
                 f"{desired.tolist()} deg needs {axis.name} commanded to {value:.3f} "
                 f"deg, outside [{axis.min_deg:g}, {axis.max_deg:g}]"
-                + f" less its play, {most:.3f} deg"
-                * bool(most)
+                + f" less its play, {most:.3f} deg" * bool(most)
+                + ". Choose a target further inside"
             )
 
     def told(command: Array) -> None:
