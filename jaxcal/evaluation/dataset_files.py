@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.evaluation.dataset_csv import read_csv, save_csv, save_csv_parts
+from jaxcal.evaluation.dataset_csv import read_csv, save_csv
 from jaxcal.files import atomic_write
 
-__all__ = ["load_dataset", "save_csv", "save_csv_parts", "save_npz"]
+__all__ = ["load_dataset", "save_csv", "save_npz"]
 
 Array = NDArray[np.float64]
 

@@ -111,7 +111,10 @@ def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
     hint = "Check the phone's app and its Wi-Fi"
     if first < 0:
         span = newest - readings[0].time if readings else 0.0
-        return f"{len(readings)} readings over {span:.2f} s of the window. {hint}"
+        return (
+            f"{len(readings)} readings over {span:.2f} s (wanted: settle.min_samples = "
+            f"{settle.min_samples} over {settle.window_s:g} s). {hint}"
+        )
     readings = readings[first:]
     if now - readings[-1].time > device.config.imu.stale_s:
         return f"the phone's readings are stale. {hint}"
@@ -127,9 +130,8 @@ def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
         if found[worst] > limit:
             return (
                 f"{AXIS_NAMES[worst]} reads {found[worst]:.3f} {unit} (settle.{what} = "
-                f"{limit:g}). The device or the phone still shakes, or the phone is "
-                "noisier than the limit: compare its scatter, `jaxcal-rig imu`, and "
-                "raise that key of [settle] above it"
+                f"{limit:g}). Either something still shakes, or the limit is below "
+                "the phone's noise: `jaxcal-rig imu` shows that; raise the key above it"
             )
     return ""
 
@@ -152,8 +154,10 @@ def _collect(device: Device, wanted: int) -> list[Reading]:
         if now - polled > config.motion.poll_s:
             polled = now
             if any(status.moving for status in device.statuses()):
-                why = "a drive moves while the posture is measured"
-                raise MotionFault(f"{why}. Stop the other controller")
+                raise MotionFault(
+                    "a drive moves while the posture is measured. Stop the other "
+                    "controller"
+                )
         time.sleep(0.002)
 
 
@@ -178,8 +182,8 @@ def _check_agreement(
         worst = int(np.argmax(apart))
         raise MotionFault(
             f"the IMU reads {AXIS_NAMES[worst]} {apart[worst]:.1f} deg away from "
-            f"the command (limit {DISAGREEMENT_DEG:g}). Check zero, axis order and "
-            "signs"
+            f"the command (limit {DISAGREEMENT_DEG:g}). Check the zero posture, then "
+            "run `jaxcal-rig axes`"
         )
     seen = device.seen
     way = commanded - seen.commanded

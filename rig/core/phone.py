@@ -94,7 +94,7 @@ class Receiver:
     def _admits(self, address: str) -> bool:
         allowed = self._settings.allow
         if allowed and address not in allowed:
-            self.refuse(address, f"imu.allow names {', '.join(allowed)}")
+            self.refuse(address, f"it is not in imu.allow ({', '.join(allowed)})")
         elif self.phone and address != self.phone:
             self.refuse(address, f"{self.phone} is the phone of this session")
         else:
@@ -268,7 +268,7 @@ class Imu:
         with self._lock:
             reading = self._ring[-1] if self._ring else None
         if reading is None:
-            raise ImuError("the phone has sent no reading yet")
+            raise ImuError("the phone has sent no reading yet: start its app")
         now, limit = time.monotonic(), self.settings.stale_s
         if now - reading.time > limit:
             hint = "Check its Wi-Fi, and that its app is in front"
@@ -319,7 +319,7 @@ class Imu:
                     detail = f"; records dropped: {counts}" if counts else ""
                     if self._receiver and self._receiver.refused:
                         names = ", ".join(self._receiver.refused)
-                        detail += f"; refused by imu.allow: {names}"
+                        detail += f"; senders refused: {names}"
                     raise ImuError(
                         f"no usable reading from the phone in {timeout_s:g} s on "
                         f"{self.settings.host}:{self.port} ({self.connections} "

@@ -43,9 +43,7 @@ def _parse(data: bytes, path: pathlib.Path) -> tuple[list[Record], int]:
         if not whole:
             if number == len(lines) - 1 and not tail:
                 break  # the last line, whole but mangled: also torn
-            raise JournalError(
-                f"{path}: line {number + 1} is damaged; the run cannot be resumed"
-            )
+            raise JournalError(f"{path}: line {number + 1} is damaged; begin a new run")
         records.append(record)
         good += len(line) + 1
     return records, good

@@ -128,7 +128,7 @@ def test_a_zero_that_cannot_be_approached_moves_nothing(tmp_path):
     with Simulator(config, Truth(noise_deg=0.0), rate_hz=250.0) as sim:
         assert session(sim.start(), tmp_path / "run", sim, said) == 2, said
         assert sim.executions() == [[], [], []]
-    assert any("the plan leaves the limits: pitch" in line for line in said)
+    assert any("outside the limits, nothing was sent: pitch" in line for line in said)
 
 
 @pytest.mark.slow

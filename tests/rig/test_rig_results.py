@@ -498,7 +498,7 @@ def test_a_folder_of_runs_is_no_run(tmp_path, capsys):
     (tmp_path / "calibrate-1").mkdir()
     for command in (["report"], ["refit"], ["export", "--to", "c"], ["watch"]):
         assert main([command[0], str(tmp_path), *command[1:]]) == 2
-        lack = f"{tmp_path} holds no run: there is no journal.jsonl in it"
+        lack = f"{tmp_path} is not the folder of a run: it holds no journal.jsonl"
         assert lack in capsys.readouterr().err
 
 

@@ -433,4 +433,4 @@ def test_a_plan_that_leaves_the_limits_is_refused_before_arming(tmp_path):
         "plan", candidates=wild.tolist(), choice=dataclasses.asdict(choice)
     )
     assert run_safely(run, calibrate) == 2
-    assert any("leaves the limits" in line for line in said)
+    assert any("outside the limits" in line for line in said)

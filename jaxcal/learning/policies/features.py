@@ -14,6 +14,8 @@ import jax.numpy as jnp
 from jaxcal.learning.policies import geometry
 
 __all__ = [
+    "AHEAD",
+    "FEATURES",
     "CandidateFeatures",
     "DecisionFeatures",
     "Remaining",
@@ -27,17 +29,34 @@ _FLOOR = -8.0  # least log-volume, relative to the best, that a feature can show
 _RIDGE = 0.01  # of the mean square of a whitened coordinate, which is one
 _CLOSE = (32.0, 256.0, 2048.0)  # scales at which near-equal look-aheads differ
 
+AHEAD = ("gain", "best pair", "greedy triple", "greedy to the end")
+"""Choices that a look-ahead makes: 1, 2, 3 and all to the end."""
+FEATURES = (
+    *(f"half of {name}" for name in AHEAD),
+    *(f"exp of {name}" for name in AHEAD),
+    *(f"exp of 4 x {name}" for name in AHEAD),
+    "half of the squared length's log, less the mean's",
+    *(f"exp of {scale:g} x {AHEAD[-1]}" for scale in _CLOSE),  # where asked for
+)
+"""Columns of a candidate; the log-volumes ahead are relative to the best candidate's.
+``selection/policy/kernel.py`` writes the same."""
+
 
 class VectorFeatures(NamedTuple):
     """What the network reads of one vector a candidate, and of all of them together."""
 
-    columns: jax.Array  # (..., M, 13), with close-ups (..., M, 16)
+    columns: jax.Array  # (..., M, F) FEATURES, without close-ups all but the last three
     moments: jax.Array  # (..., M, p (p + 1) / 2) products of coordinates, scaled so
     # that messages keep their size whatever M is
     active: jax.Array  # (..., M) bool, which candidates count
-    ahead: jax.Array  # (..., M, 4) log-volume after 1, 2, 3 and all greedy choices that
+    ahead: jax.Array  # (..., M, 4) AHEAD: log-volume after the greedy choices that
     # begin with this candidate, relative to the best candidate's
     best: jax.Array  # (..., 4) that of the best candidate
+
+    @property
+    def to_the_end(self) -> jax.Array:
+        """(..., M) the last of ``ahead``."""
+        return self.ahead[..., -1]
 
 
 class CandidateFeatures(NamedTuple):
@@ -65,36 +84,31 @@ class Remaining(NamedTuple):
     spanned: bool  # whether a choice multiplies det by 1 + |y|^2, else by |y|^2
     log_det: jax.Array  # (...,) log det(Z.T Z) of the chosen
     progress: jax.Array  # (..., 7) as in DecisionFeatures
-    chosen: jax.Array  # (..., c, M) one-hot choices; c = count, K where that is traced
+    chosen: jax.Array  # (..., count, M) one-hot choices
 
 
-def remaining(
-    features: CandidateFeatures, chosen: jax.Array, count: int | jax.Array
-) -> Remaining:
+def remaining(features: CandidateFeatures, chosen: jax.Array, count: int) -> Remaining:
     """What is left of a set after ``count`` choices.
 
     Args:
         features: of the set.
         chosen: (..., K) int, of which the first ``count`` are chosen, the rest -1.
-        count: the same for the whole batch. Traced only where the chosen span the space
-            and the look-ahead is not cut short by the end.
+        count: the same for the whole batch.
     """
     x = features.whitened
     p, total = x.shape[-1], chosen.shape[-1]
     left = total - count
-    shown = chosen[..., :count] if isinstance(count, int) else chosen
-    which = jax.nn.one_hot(shown, x.shape[-2], dtype=x.dtype)
+    which = jax.nn.one_hot(chosen[..., :count], x.shape[-2], dtype=x.dtype)
     picked = jnp.einsum(
         "...km,...mp->...kp", which, x, precision=jax.lax.Precision.HIGHEST
     )
     if total == p:
         # Every choice is a new direction: exact projections.
-        y, spanned = geometry.projected(x, picked), False
-        so_far = geometry.log_det_lengths(picked)
+        (y, so_far), spanned = geometry.projected(x, picked), False
     else:
         # The metric of the chosen; until they span the space, with a ridge small
         # beside what a posture contributes.
-        ridge = _RIDGE if isinstance(count, int) and count < p else 0.0
+        ridge = _RIDGE if count < p else 0.0
         y, so_far = geometry.normalised_by(x, picked, ridge)
         spanned = True
     ends = (left == 1, left == 2, left == 3, 1.0 / left)

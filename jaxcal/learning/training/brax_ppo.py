@@ -6,14 +6,14 @@ observation and nothing else; it is masked by the availability in that observati
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import pathlib
 import time
 import types
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from typing import Any
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -108,25 +108,12 @@ def _networks(env: SelectionConfig, config: NetworkConfig) -> PPONetworks:
     return PPONetworks(read(0), read(1), _MaskedCategorical(m))
 
 
-@contextlib.contextmanager
-def _repaired() -> Iterator[None]:
-    """brax 0.14.2 on jax 0.10, for as long as it trains.
+def _replicated(tree: Any, devices: list[Any]) -> Any:
+    """``jax.device_put_replicated``, which jax 0.10 has no more and brax 0.14.2 calls.
 
-    It calls ``jax.device_put_replicated``, which jax removed (google/brax issue 671;
-    its main branch is mended, its newest release is not), and promotes ranks.
+    google/brax issue 671: its main branch is mended, its newest release is not.
     """
-
-    def replicated(tree: Any, devices: list[Any]) -> Any:
-        return jax.tree.map(lambda leaf: jnp.stack([leaf] * len(devices)), tree)
-
-    missing = not hasattr(jax, "device_put_replicated")
-    vars(jax).setdefault("device_put_replicated", replicated)
-    try:
-        with jax.numpy_rank_promotion("allow"):
-            yield
-    finally:
-        if missing:
-            del vars(jax)["device_put_replicated"]
+    return jax.tree.map(lambda leaf: jnp.stack([leaf] * len(devices)), tree)
 
 
 def train(
@@ -160,7 +147,8 @@ def train(
         say(f"{steps:10,d} decisions  {seconds:7.1f} s  mean log det S {log_det:.3f}")
 
     say("brax is compiling (about half a minute) ...")
-    with _repaired():
+    repaired = mock.patch.object(jax, "device_put_replicated", _replicated, create=True)
+    with repaired, jax.numpy_rank_promotion("allow"):
         _, params, _ = brax_train.train(
             environment=SelectionEnv(env, task.draw),
             wrap_env_fn=wrap_fresh,
