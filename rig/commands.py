@@ -267,10 +267,7 @@ def _step(given: Step, state: str, name: str, *options: Any) -> int:
 
 @contextlib.contextmanager
 def _place(given: Target, state: str = "") -> Iterator[Place]:
-    """The device that a command is about, which has reached a state.
-
-    A simulated one is first taken through the states up to it.
-    """
+    """The device that a command is about, which has reached a state."""
     from rig.journal import DeviceRecord
     from rig.workbench.commission import steps
 
@@ -279,9 +276,9 @@ def _place(given: Target, state: str = "") -> Iterator[Place]:
         if given.simulate:
             simulator = given.simulator(config)
             served = stack.enter_context(simulator).start()
-            record = DeviceRecord(steps.own_folder(served) / "device.json")
+            path = steps.own_folder(served) / "device.json"
+            record = steps.commissioned(path, served, state)
             place = steps.simulated(simulator, served, record, _say)
-            steps.begin_simulated(place, state)
             place.operator.yes = yes
         else:
             record = DeviceRecord.load(config.device_path)
@@ -377,22 +374,15 @@ def _run(
             simulator = given.simulator(config, start["simulated"])
             config = stack.enter_context(simulator).start()
         lock, record = BusLock(config.bus), DeviceRecord.load(config.device_path)
-        if real and not given.dry_run:
+        if not given.dry_run:
             stack.enter_context(lock.acquire(command))
-            if lack := record.missing(config):
+            if real and (lack := record.missing(config)):
                 raise Refused(lack)
         if folder is None:
             folder = new_run_folder(given.out or Path(config.output), start["mode"])
             (folder / "rig.toml").write_text(text, encoding="utf-8")
         if simulator is not None:
-            record = DeviceRecord(folder / "device.json")
-            if not given.dry_run:
-                at = config.model_copy(update={"output": str(folder)})
-                place = steps.simulated(simulator, at, record, _say)
-                # Faults wait for the session's own phases.
-                place.listeners = (simulator.answer,)
-                steps.begin_simulated(place, SIGN_CHECKED)
-                stack.enter_context(lock.acquire(command))
+            record = steps.commissioned(folder / "device.json", config, SIGN_CHECKED)
         lock.tell(run=str(folder.resolve()))
         run = Run(
             config,

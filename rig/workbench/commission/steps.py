@@ -24,7 +24,6 @@ from rig.core.proof import ALLOWED_DEG, slowed
 from rig.journal import (
     HOMED,
     IDENTIFIED,
-    SIGN_CHECKED,
     STATES,
     DeviceRecord,
     Record,
@@ -299,6 +298,14 @@ def take_zero(place: Place) -> int:
     return place.run("zero", lambda run, device: session.take_zero(device))
 
 
+def commissioned(path: pathlib.Path, config: RigConfig, through: str) -> DeviceRecord:
+    """A new record of a simulated device, up to a state: nothing of it was moved."""
+    record = DeviceRecord(path)
+    for state in STATES[: STATES.index(through) + 1] if through else ():
+        record.reach(state, config)
+    return record
+
+
 def simulated(
     simulator: Simulator,
     served: RigConfig,
@@ -310,18 +317,3 @@ def simulated(
         served, record, Operator(yes=True, say=say), full_speed=True,
         listeners=(simulator.hear,),
     )  # fmt: skip
-
-
-def begin_simulated(place: Place, through: str) -> None:
-    """Take a simulated device for commissioned up to a state, as it stands."""
-    states = STATES[: STATES.index(through) + 1] if through else ()
-    if IDENTIFIED in states:
-        identify(place)
-    if HOMED in states:
-        with place.bus("home") as drives:
-            pulses = [drive.status().position for drive in drives]
-            origins = {drive.axis.name: drive.origin for drive in drives}
-        as_they_stand = {"how": "as they stand", "pulses": pulses, "origins": origins}
-        place.record.reach(HOMED, place.config, **as_they_stand)
-    if SIGN_CHECKED in states:  # a session finds what is wired otherwise
-        place.record.reach(SIGN_CHECKED, place.config)

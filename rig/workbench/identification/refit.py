@@ -126,12 +126,10 @@ def refit(
         raise Refused(f"nothing was written: read like this, {fault}") from None
     if changed:
         summary.pop("after", None)  # compensated by another calibration than this
-    was = folder / "summary.json"
     summary |= {
         "mode": "refit",
         "refit_of": folder.name,
         "changed": changed,
-        "was": json.loads(was.read_text(encoding="utf-8")) if was.is_file() else None,
         "simulated": start["simulated"],
     }
     into = new_run_folder(folder.resolve().parent, "refit")

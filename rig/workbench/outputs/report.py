@@ -95,15 +95,8 @@ def _result(state: RunState, summary: Record) -> list[Section]:
     if changes := summary.get("changed"):
         rows = [[key, str(old), str(new)] for key, (old, new) in changes.items()]
         head = ["key of rig.toml", "as recorded", "here"]
-        parts = [Table(head, rows, numeric=False)]
-        if was := summary["was"]:
-            moved = [np.subtract(summary[name], was[name]) for name in ("A", "b")]
-            rows = [
-                [name, *(f"{value:+.5f}" for value in row)]
-                for name, row in zip(AXIS_NAMES, np.column_stack(moved), strict=True)
-            ]
-            parts.append(Table(["changed by", *HEAD], rows))
-        found.append(Section(f"Identified anew from {summary['refit_of']}", parts))
+        title = f"Identified anew from {summary['refit_of']}"
+        found.append(Section(title, [Table(head, rows, numeric=False)]))
     return found
 
 
