@@ -82,7 +82,7 @@ def test_everything_is_saved_and_loads(finished):
         angle = float(row["u_deg_pitch"])
         assert angle == pytest.approx(pulses[0] * 360 / (10000 * 10), abs=1e-6)
     page = (folder / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 2
+    assert page.count("data:image/svg+xml;base64,") == 2
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     assert "no patient" in page
 
