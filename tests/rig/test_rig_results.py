@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from harness import (
     Run,
+    Simulator,
     calibrate,
     changed,
     commissioned,
@@ -30,7 +31,7 @@ import jaxcal
 from rig.__main__ import main
 from rig.config import AXIS_NAMES, parse_config
 from rig.journal import read_journal
-from rig.simulator import Simulator, Truth
+from rig.simulator import Truth
 from rig.workbench.identification.refit import attitudes, reread
 from rig.workbench.outputs import trend
 from rig.workbench.outputs.export import LANGUAGES, load_inverse
