@@ -13,7 +13,6 @@ from jaxcal.calibration import file
 from jaxcal.calibration.check import Check, check, verification
 from jaxcal.calibration.estimate import fit_model
 from jaxcal.calibration.fit import Fit
-from jaxcal.calibration.harmonics import WithHarmonics
 from jaxcal.calibration.inverse import Carry, limits_of, reach, solve_affine
 from jaxcal.calibration.summary import summary
 from jaxcal.calibration.verdict import Verdict, verdict
@@ -181,9 +180,8 @@ class Calibration(Fit):
     @property
     def arm(self) -> SerialChain:
         """The arm as calibrated, its parameters nominal, with Position()."""
-        if isinstance(self.whole, WithHarmonics):
-            return self.whole.calibrated(self.estimate)
-        return self._chain().calibrated(self.parameters)
+        self._chain()
+        return self.whole.calibrated(self.estimate)  # type: ignore[attr-defined]  # a chain
 
     def to_urdf(self, path: str | os.PathLike[str], *, force: bool = False) -> str:
         """See :meth:`jaxcal.models.SerialChain.to_urdf`; returns the tip link."""
@@ -201,7 +199,7 @@ class Calibration(Fit):
 
     def _of_table(self) -> Array:
         """(p,) for a file, which holds no harmonics: fitted without them."""
-        if not isinstance(self.whole, WithHarmonics):
+        if self.whole is self.model:
             return self.parameters
         found = fit_model(
             self.commands,

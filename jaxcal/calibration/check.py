@@ -82,7 +82,7 @@ def check(
     if placed_anew:
         if not (isinstance(model, SerialChain) and len(model.sensor.names)):
             raise ValueError("placed_anew is of an arm whose sensor stands somewhere")
-        own[-len(model.sensor.names) :] = True
+        own[:] = np.isin(names, model.sensor.names)
     if own.any():  # what stands elsewhere now says nothing
         white, by = without(by[:, own], white, by)
     freedom = len(white)

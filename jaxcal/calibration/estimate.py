@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.calibration.harmonics import WithHarmonics
 from jaxcal.calibration.sizes import Sizes, group_sizes, of_sizes
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
 from jaxcal.checks import in_words, one_of
@@ -98,23 +97,20 @@ def fit_model(
     if common_noise is not None or spread.any():
         levels = each if common_noise is False else 0 * each
     asked = prior is not None
-    prior = prior or model.default_prior()
-    resolved = prior.resolve(model)
-    whole, extra = model, np.zeros(0)  # precision of what is added
-    if isinstance(model, SerialChain) and model.sensor.harmonic:
-        # Of a URDF file what is written back is what is predicted: it holds none.
-        plain = asked or spread.any() or model.harmonics or model.source is not None
-        if not plain:
-            whole = WithHarmonics(model)  # type: ignore[assignment]  # as far as a fit needs it
-            extra = whole.std**-2.0  # type: ignore[attr-defined]  # see above
+    whole = model
+    # Of a URDF file what is written back is what is predicted: it holds no harmonics.
+    if isinstance(model, SerialChain) and model.source is None:
+        whole = model if asked or spread.any() else model.with_misfit()
+    prior = prior or whole.default_prior()
+    resolved = prior.resolve(whole)
     task = Task(
         model=whole,
         commands=commands[used],
         measured=measured[used],
         white=white[used],
-        mean=np.concatenate([resolved.mean, 0.0 * extra]),
-        precision=np.concatenate([np.diagonal(resolved.precision), extra]),
-        free=np.concatenate([resolved.free, extra > 0.0]),
+        mean=resolved.mean,
+        precision=np.diagonal(resolved.precision),
+        free=resolved.free,
         command_std=spread,
         known=known,
         levels=levels,

@@ -14,7 +14,6 @@ from typing import Any, NoReturn
 import numpy as np
 
 from jaxcal.calibration.fit import Fit
-from jaxcal.calibration.harmonics import WithHarmonics
 from jaxcal.files import write_text
 from jaxcal.models import Affine, Model, SerialChain, from_dict
 
@@ -163,7 +162,7 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
         )
     size = len(found["estimate"])
     if size != len(names) and not (
-        isinstance(model, SerialChain) and size == len(WithHarmonics(model).names)
+        isinstance(model, SerialChain) and size == len(model.with_misfit().names)
     ):
         raise ValueError(f'"estimate" must have shape ({len(names)},)')
     if (found["noise_std"] is None) != (found["joint_covariance"] is None):

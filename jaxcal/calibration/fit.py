@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import functools
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.calibration.harmonics import WithHarmonics
 from jaxcal.checks import numbers
 from jaxcal.models import Affine, Model, Prior, SerialChain, identifiability
 from jaxcal.models.identifiability import Identifiability
@@ -242,12 +242,12 @@ class Fit:
         slopes = derivative(self.whole, rows, self.estimate)
         return slopes, np.asarray(self.joint_covariance)
 
-    @property
+    @functools.cached_property
     def whole(self) -> Model:
-        """The model with its harmonics."""
+        """The model with the harmonics that were found, if any: its last parameters."""
         more = len(self.estimate) > len(self.names)
         if more and isinstance(self.model, SerialChain):
-            return WithHarmonics(self.model)  # type: ignore[return-value]  # no prior, no file of its own
+            return self.model.with_misfit()
         return self.model
 
     @property

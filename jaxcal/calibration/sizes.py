@@ -110,6 +110,8 @@ def group_sizes(
             break
     factors = np.ones(p)
     factors[groups >= 0] = np.exp(best[groups[groups >= 0]])
+    if before is None:  # the sizes of a rough fit, which begin the next
+        return Sizes(best, factors, groups, np.zeros((_GROUPS, _GROUPS)))
     steps = 1e-3 * np.eye(len(best))
     curves = [cost(best + step)[1] - cost(best - step)[1] for step in steps]
     # Half the cost's, in units of what was thought, which the readings only sharpen.

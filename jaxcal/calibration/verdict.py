@@ -174,7 +174,7 @@ def _exchanged(calibration: Fit, model: SerialChain) -> list[str]:
     sensor = model.sensor
     if not isinstance(sensor, Socket) or sensor.places is None:
         return []
-    own = calibration.parameters[len(calibration.names) - sensor.places.size :]
+    own = calibration.parameters[[model.names.index(name) for name in sensor.names]]
     apart = np.linalg.norm(own.reshape(-1, 1, 3) - sensor.places, axis=-1)
     nearest = apart.argmin(axis=1)
     return [

@@ -52,7 +52,8 @@ def test_a_table_on_file_is_that_of_a_fit_without_them(found, tmp_path):
 
 
 def test_it_is_the_fit_of_the_arm_that_has_them_as_parameters(found):
-    """The same prior and sizes, another order of the parameters."""
+    """The same prior and sizes; harmonics are the last parameters of an arm."""
+    assert WHOLE.names[: len(ARM.names)] == ARM.names
     fit = jaxcal.identify(JOINTS, MEASURED, model=WHOLE, prior=WHOLE.default_prior())
     own = [WHOLE.names.index(name) for name in ARM.names]
     np.testing.assert_allclose(found.parameters, fit.parameters[own], atol=1e-4)

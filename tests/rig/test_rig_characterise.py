@@ -10,11 +10,11 @@ import time
 
 import pytest
 from fault_matrix import _free_port
-from harness import SPEEDUP, commissioned, fast_config, fast_text, simulator
+from harness import SPEEDUP, Simulator, commissioned, fast_config, fast_text, simulator
 from test_rig_play import saved
 
 from rig.journal import read_journal
-from rig.simulator import Simulator, Truth
+from rig.simulator import Truth
 from rig.workbench.commission import characterise, steps
 from rig.workbench.commission.characterise import ENOUGH_DEG
 from rig.workbench.commission.operator import Operator

@@ -222,7 +222,7 @@ def test_check_takes_its_file_with_and_without_config(tmp_path, capsys, monkeypa
     assert "calibration.json: not a calibration" in capsys.readouterr().err
     (tmp_path / "rig.toml").unlink()
     assert main(["check"]) == main(["calibrate"]) == 2
-    assert "--config FILE is required" in capsys.readouterr().err
+    assert "give --config FILE or --simulate" in capsys.readouterr().err
 
 
 def test_a_missing_package_is_one_line_with_the_command_that_installs_it(

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from harness import (
     Run,
+    Simulator,
     calibrate,
     changed,
     commissioned,
@@ -30,7 +31,7 @@ import jaxcal
 from rig.__main__ import main
 from rig.config import AXIS_NAMES, parse_config
 from rig.journal import read_journal
-from rig.simulator import Simulator, Truth
+from rig.simulator import Truth
 from rig.workbench.identification.refit import reread
 from rig.workbench.outputs import trend
 from rig.workbench.outputs.export import LANGUAGES, load_inverse
@@ -499,7 +500,7 @@ def test_a_folder_of_runs_is_no_run(tmp_path, capsys):
     (tmp_path / "calibrate-1").mkdir()
     for command in (["report"], ["refit"], ["export", "--to", "c"], ["watch"]):
         assert main([command[0], str(tmp_path), *command[1:]]) == 2
-        lack = f"{tmp_path} holds no run: there is no journal.jsonl in it"
+        lack = f"{tmp_path} is not the folder of a run: it holds no journal.jsonl"
         assert lack in capsys.readouterr().err
 
 

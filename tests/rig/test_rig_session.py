@@ -82,7 +82,7 @@ def test_everything_is_saved_and_loads(finished):
         angle = float(row["u_deg_pitch"])
         assert angle == pytest.approx(pulses[0] * 360 / (10000 * 10), abs=1e-6)
     page = (folder / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 3
+    assert page.count("data:image/svg+xml;base64,") == 3
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
     assert "no patient" in page
 
@@ -433,4 +433,4 @@ def test_a_plan_that_leaves_the_limits_is_refused_before_arming(tmp_path):
         "plan", candidates=wild.tolist(), choice=dataclasses.asdict(choice)
     )
     assert run_safely(run, calibrate) == 2
-    assert any("leaves the limits" in line for line in said)
+    assert any("outside the limits" in line for line in said)

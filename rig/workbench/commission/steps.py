@@ -158,7 +158,7 @@ def go_home(place: Place, here: bool) -> int:
     if not here and not can_home(place.config):
         without = {a.map.name for a in place.config.axes if a.map.home is None}
         raise Refused(
-            f"the map {', '.join(sorted(without))} knows no homing. Put the device "
+            f"the map {', '.join(sorted(without))} has no homing. Put the device "
             "into its home posture and use --here"
         )
     what = "nothing moves; where the device stands becomes the origin of its counts"

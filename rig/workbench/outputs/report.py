@@ -152,7 +152,7 @@ def drawn(
         return Text(f"{alt}: {missing}", "note")
     figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
     draw(figure, data)
-    return Figure(as_bytes(figure, "png"), alt)
+    return Figure(as_bytes(figure, "svg"), alt)
 
 
 def draw_errors(figure: Any, each: dict[str, Any]) -> None:
