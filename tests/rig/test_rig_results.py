@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from harness import (
     Run,
+    Simulator,
     calibrate,
     changed,
     commissioned,
@@ -30,14 +31,13 @@ import jaxcal
 from rig.__main__ import main
 from rig.config import AXIS_NAMES, parse_config
 from rig.journal import read_journal
-from rig.simulator import Simulator, Truth
-from rig.workbench.identification.refit import reread
+from rig.simulator import Truth
+from rig.workbench.identification.refit import attitudes, reread
 from rig.workbench.outputs import trend
 from rig.workbench.outputs.export import LANGUAGES, load_inverse
 from rig.workbench.outputs.export import checksum as checksum_of
 from rig.workbench.outputs.report import write_report
 from rig.workbench.outputs.words import numbers
-from rig.workbench.readings import attitudes
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 SESSION = '\n[session]\nmethod = "exact"\nverify_postures = 2\n'
@@ -178,7 +178,7 @@ def test_refit_says_why_it_refuses(run, capsys, tmp_path):
 
     rewritten(run, cut)
     assert main(["refit", str(run), "--order", "ZXY"]) == 2
-    assert "Resume it first" in capsys.readouterr().err
+    assert "Finish it first with `jaxcal-rig resume`" in capsys.readouterr().err
     assert not beside(run)
 
 

@@ -46,9 +46,9 @@ from rig.workbench.identification.conclusion import check_matrix
 from rig.workbench.procedures.checking import (
     collect,
     load_calibration,
-    unchecked,
     verify,
 )
+from rig.workbench.procedures.goto import unchecked
 from rig.workbench.run import run_safely
 
 LOST = 1.4  # degrees, as was seen
