@@ -1,45 +1,29 @@
-"""Command lines: a parser, types of values, and errors, each said in one line."""
+"""Command lines made of the signatures of functions, and errors said in one line.
+
+A command is a function, its docstring its help. A parameter is an argument, a
+keyword-only one an option; one whose type is a dataclass stands for options, its
+fields. ``Annotated[T, ...]`` says more of one: its help and, where the type does not
+tell, what stands for its value; two numbers are its range, a list its choices, a
+function makes the value of a text. An underscore at the end is no part of a name.
+"""
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
+import inspect
+import math
+import pathlib
 import re
 import sys
-from collections.abc import Callable, Iterable
-from typing import Any, NoReturn, TypeVar
+import typing
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Literal, NoReturn, TypeVar
 
-__all__ = [
-    "Flag",
-    "Parser",
-    "at_least",
-    "exit_code",
-    "flag",
-    "refused",
-    "seconds",
-    "several",
-]
+__all__ = ["Parser", "exit_code", "number_type", "refused", "several", "values_of"]
 
 T = TypeVar("T")
-Flag = tuple[tuple[str, ...], dict[str, Any]]  # what ``add_argument`` takes
-
-
-def flag(
-    name: str,
-    help: str,
-    metavar: str = "FILE",
-    type: Callable[[str], Any] | None = None,
-    *,
-    long: str = "",
-    on: bool = False,
-    **more: Any,
-) -> Flag:
-    """A flag (``on``: without a value), or an argument where the name has no dash."""
-    given = {"help": help, **more}
-    if on:
-        given["action"] = "store_true"
-    elif "choices" not in more:
-        given |= {"metavar": metavar, "type": type or str}
-    return ((name, long) if long else (name,)), given
+_METAVARS = {int: "N", float: "X", pathlib.Path: "FILE"}
 
 
 class Parser(argparse.ArgumentParser):
@@ -49,16 +33,99 @@ class Parser(argparse.ArgumentParser):
         fields.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         super().__init__(allow_abbrev=False, **fields)
 
-    def with_flags(self, flags: Iterable[Flag]) -> Parser:
-        """Itself, with these flags."""
-        for names, fields in flags:
-            self.add_argument(*names, **fields)
+    def of(self, function: Callable[..., Any]) -> Parser:
+        """Itself, for the arguments of a function, or a dataclass called ``options``:
+        a function's own come before those of its dataclasses."""
+        self.set_defaults(function=function)
+        for _, *one in sorted(_arguments(function), key=lambda each: bool(each[0])):
+            _add(self, *one)
         return self
 
     def error(self, message: str) -> NoReturn:
         if found := re.match(r"argument (?:.*/)?(--[\w-]+): expected one", message):
             message += f"; write {found[1]}=VALUE where it begins with a minus"
         self.exit(2, f"{self.prog}: {message}; see --help\n")
+
+
+def values_of(args: argparse.Namespace) -> dict[str, Any]:
+    """The arguments of ``args.function`` that were parsed."""
+    given: dict[Any, dict[str, Any]] = {None: {}}
+    for owner, name, *_ in _arguments(args.function):
+        given.setdefault(owner, {})[name] = getattr(args, name)
+    made = {name: kind(**given[name, kind]) for name, kind in filter(None, given)}
+    return given[None] | made
+
+
+def _arguments(function: Callable[..., Any]) -> Iterator[tuple[Any, ...]]:
+    """Parameter and dataclass of a field, or None; name, type, default and whether it
+    is an option."""
+    if isinstance(function, type):
+        yield from _options("options", function)
+        return
+    hints = typing.get_type_hints(function, include_extras=True)
+    for name, found in inspect.signature(function).parameters.items():
+        if dataclasses.is_dataclass(kind := hints[name]):
+            yield from _options(name, kind)
+        else:
+            option = found.kind is found.KEYWORD_ONLY
+            yield None, name, hints[name], found.default, option
+
+
+def _options(parameter: str, kind: Any) -> Iterator[tuple[Any, ...]]:
+    """The same of the fields of a dataclass, those of its bases last."""
+    hints = typing.get_type_hints(kind, include_extras=True)
+    fields = {each.name: each for each in dataclasses.fields(kind) if each.init}
+    bases = [vars(base).get("__annotations__", {}) for base in inspect.getmro(kind)]
+    for each in (fields[name] for base in bases for name in base if name in fields):
+        yield (parameter, kind), each.name, hints[each.name], each.default, True
+
+
+def _add(
+    parser: argparse.ArgumentParser, name: str, hint: Any, default: Any, option: bool
+) -> None:
+    kind: Any = hint
+    said: tuple[Any, ...] = ()
+    while (optional := type(None) in (parts := typing.get_args(kind))) or (
+        typing.get_origin(kind) is typing.Annotated
+    ):
+        kind, said = parts[0], said if optional else parts[1:]
+    text, metavar, *_ = *(each for each in said if isinstance(each, str)), "", ""
+    parse = next(filter(callable, said), None)
+    limits: tuple[float, ...] = next((x for x in said if isinstance(x, tuple)), ())
+    choices: Sequence[str] = next((x for x in said if isinstance(x, list)), ())
+    origin, one = typing.get_origin(kind), kind
+    if origin in (list, tuple):
+        one = parts[0]
+    more: dict[str, Any] = {}
+    if origin is Literal or choices:
+        more["choices"] = choices or parts
+    elif kind is not bool:
+        more["type"] = parse or (
+            number_type(one, *limits) if one in (int, float) else one
+        )
+        shown = metavar or _METAVARS.get(one, name.upper())
+        more["metavar"] = shown if option or metavar else name
+    if kind is bool:
+        more["action"] = "store_true"
+    elif origin is list and (parse is None or typing.get_origin(one) is list):
+        more["action"] = "append"
+    elif origin is tuple and parts[-1] is Ellipsis:
+        more |= {"nargs": "+", "action": "extend"} if option else {"nargs": "*"}
+        default = [] if default == () else default
+    elif origin is tuple:
+        more["nargs"] = len(parts)
+    if default in (inspect.Parameter.empty, dataclasses.MISSING):
+        more |= {"required": True} if option else {}
+    else:
+        more["default"] = default
+        if not option:
+            more.setdefault("nargs", "?")
+        if default not in (None, "", []) and default is not False:
+            text += f" (default {default})"
+    long = f"--{name.rstrip('_').replace('_', '-')}"
+    names = [f"-{name}", long] if len(name) == 1 else [long]
+    more |= {"dest": name, "help": text.replace("%", "%%")}
+    parser.add_argument(*names if option else (), **more)
 
 
 def refused(program: str, error: Exception) -> int:
@@ -82,32 +149,26 @@ def exit_code(command: Callable[[], None], program: str, interrupted: str) -> in
     return 0
 
 
-def at_least(least: int) -> Callable[[str], int]:
-    """A whole number of at least ``least``."""
+def number_type(
+    kind: type, low: float = -math.inf, high: float = math.inf
+) -> Callable[[str], Any]:
+    """Reads an int or float, not below ``low`` nor above ``high``."""
+    rule = "a whole number" if kind is int else "a number"
+    if high < math.inf:
+        rule += f" in [{low:g}, {high:g}]"
+    elif low > -math.inf:
+        rule += f" of at least {low:g}"
 
-    def parse(text: str) -> int:
+    def parse(text: str) -> Any:
         try:
-            number = int(text)
+            value = kind(text)
         except ValueError:
-            number = least - 1
-        if number < least:
-            raise argparse.ArgumentTypeError(
-                f"must be a whole number of at least {least}, got {text!r}"
-            )
-        return number
+            value = math.nan
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f"must be {rule}, got {text!r}")
+        return value
 
     return parse
-
-
-def seconds(text: str) -> float:
-    """A finite time above 0."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"must be seconds above 0, got {text!r}")
-    return value
 
 
 def several(kind: Callable[[str], T], what: str) -> Callable[[str], list[T]]:

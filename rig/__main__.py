@@ -6,9 +6,9 @@ import importlib.util
 import sys
 from collections.abc import Sequence
 
-from rig.arguments import call
+from jaxcal.arguments import values_of
 from rig.commands import make_parser
-from rig.core.faults import EXIT_BAD_INPUT, EXIT_FAULT, EXIT_INTERRUPTED
+from rig.core.faults import EXIT_BAD_INPUT, EXIT_FAULT, EXIT_INTERRUPTED, told
 from rig.journal.errors import JournalError
 
 # Looked for before any port opens; finding is quicker than importing.
@@ -27,13 +27,14 @@ def main(argv: Sequence[str] | None = None) -> int:
                 install = "which is not installed: pip install 'jaxcal[rig]'"
                 raise ModuleNotFoundError(f"{command} needs {name}, {install}")
         code = EXIT_FAULT if command == "stop" else EXIT_BAD_INPUT
-        return call(args)
+        code = args.function(**values_of(args))
+        return code
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     except BrokenPipeError:
         return 141  # the reader of our output went away, as `| head` does
     except (ValueError, OSError, RuntimeError, ImportError) as error:
-        print(f"jaxcal-rig: {error}", file=sys.stderr)
+        print(f"jaxcal-rig: {told(error)}", file=sys.stderr)
         if isinstance(error, JournalError) and command == "resume":
             return EXIT_BAD_INPUT
         return EXIT_FAULT if isinstance(error, RuntimeError) else code

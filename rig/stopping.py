@@ -60,15 +60,15 @@ class Target:
         if not freed and self._stand:
             freed = self.lock.freed(END_S)
         if not freed:
-            _say("it has not answered: it is ended now")
+            _say("it has not stopped its drives in time: it is killed now")
             with contextlib.suppress(OSError, Refused):
                 self.lock.signal_holder(signal.SIGKILL)
             if not self.lock.freed(KILLED_S):
                 _say("it still holds the bus")
         _say(
-            "it has no drive armed any more, as it says"
+            "it reported that all its drives stand"
             if self._stand
-            else "it has not said that all its drives stand"
+            else "it did not report that its drives stand"
         )
 
     @property
@@ -184,7 +184,7 @@ def _stop_units(target: Target, path: pathlib.Path | None) -> list[UnitStop]:
         try:
             bus.open()
         except BusError as error:
-            raise BusError(f"{NOTHING}: {error}. {LAST_RESORT}") from None
+            raise BusError(f"{NOTHING}: {error}", LAST_RESORT) from None
         with bus:
             results = stop_all([Drive(bus, axis) for axis in axes])
         if all(result.standing for result in results):

@@ -18,6 +18,8 @@ tells less than the one before since what is unknown ends; fitted to sessions of
 by ``_DOUBT`` of what is estimated, so a tree that reaches every session's end is exact.
 
 Trees are tried from the smallest, as long as ``effort`` multiplications suffice.
+
+Designs are padded to D, a multiple of 8: loops over them run in whole vectors.
 """
 
 # Products may be fused.
@@ -26,6 +28,7 @@ from __future__ import annotations
 
 import cython
 import numpy as np
+from cython.cimports.jaxcal.adaptive.search_kernel import State
 from cython.cimports.jaxcal.watch import Watch, begin, late
 from cython.cimports.libc.math import INFINITY, expf, fmax, fmin
 from cython.cimports.libc.string import memcpy
@@ -36,10 +39,11 @@ _DEPTH = cython.declare(cython.int, 4)
 # Measurements that are followed at each level.
 _WIDTHS = ((4, 1), (6, 1, 1), (6, 2, 1), (6, 2, 1, 1), (6, 3, 2, 1))
 # Multiplications that take as long as the rest of a node: of each sum, and of all.
-_EACH = cython.declare(cython.double, 16.0)
-_NODE = cython.declare(cython.double, 600.0)
+_EACH = cython.declare(cython.double, 35.0)
+_NODE = cython.declare(cython.double, 2400.0)
 _LIKELY = cython.declare(cython.float, 1e-4)  # of 1 / S: less weight is left out
 _NO_CHANCE = cython.declare(cython.double, 1e-6)  # of an outcome that is not followed
+_USES = cython.declare(cython.int, 64)  # from which on a use costs the same
 _DOUBT = cython.declare(cython.double, 0.3)
 # m is _FIT price^-_BEND; k is _FALL g / entropy + _FLAT.
 _FIT = cython.declare(cython.double, 2.4)
@@ -48,11 +52,7 @@ _FALL = cython.declare(cython.double, 1.2)
 _FLAT = cython.declare(cython.double, 0.015)
 
 
-@cython.cfunc
-@cython.inline
-@cython.nogil
-@cython.exceptval(check=False)
-def _log(x: cython.float) -> cython.float:
+def _log(x):
     """Natural logarithm of a normal number, to 1e-7; Cephes's, without branches."""
     bits: cython.int = 0
     memcpy(cython.address(bits), cython.address(x), 4)
@@ -79,61 +79,64 @@ def _log(x: cython.float) -> cython.float:
     return ((y * f + c0) * f - half) * f * f + f + power * log_2
 
 
-@cython.cclass
+def _largest(values, count, sign):
+    """Of ``sign`` times (count,), a multiple of 8, in eight lanes."""
+    lanes = cython.declare(cython.float[8])
+    for j in range(8):
+        lanes[j] = sign * values[j]
+    for b in range(8, count, 8):
+        for j in range(8):
+            x = sign * values[b + j]
+            lanes[j] = x if x > lanes[j] else lanes[j]
+    top = lanes[0]
+    for j in range(1, 8):
+        top = lanes[j] if lanes[j] > top else top
+    return top
+
+
+def _argmax(values, count):
+    top = _largest(values, count, 1.0)
+    for a in range(count):
+        if values[a] == top:
+            return a
+    return 0
+
+
 class Tree:
     """A task, the constants of ``shares`` and the work space of one path."""
 
-    sums_of: cython.float[:, ::1]
-    likelihood: cython.float[:, :, ::1]
-    travel: cython.float[:, ::1]
-    extra: cython.float[:, ::1]
-    uses: cython.float[:, ::1]
-    place_after: cython.int[:, ::1]
-    allowed: cython.float[::1]  # 1 or 0
-    horizon: cython.int
-    time: cython.double
-    use: cython.double
-    a: cython.double
-    b: cython.double
-    effort: cython.double
-
-    designs: cython.int
-    outcomes: cython.int
-    wide: cython.int
-    likely: cython.int
-    which: cython.int[::1]
-    widths: cython.int[:, ::1]
-    width: cython.p_int
-    work: cython.double
-    # Of each level:
-    weights: cython.float[:, ::1]
-    sums: cython.float[:, ::1]
-    rest: cython.float[:, ::1]
-    gains: cython.float[:, ::1]
-    scores: cython.float[:, ::1]
-    seconds: cython.float[:, ::1]
-    needs: cython.float[:, ::1]
-    guess: cython.double[::1]
-
     def __init__(
-        self, sums_of, likelihood, travel, extra, uses, place_after, allowed, horizon,
-        shares, effort,
+        self, likelihood, travel, extra, uses, place_after, allowed, horizon, shares,
+        effort,
     ):  # fmt: skip
-        # sums_of: (S, Y A) rows of L of all outcomes but the first, then of the sum of
-        # L log L over outcomes.
-        self.sums_of, self.likelihood, self.travel = sums_of, likelihood, travel
-        self.extra, self.uses, self.place_after = extra, uses, place_after
-        self.allowed, self.horizon, self.effort = allowed, horizon, effort
-        self.time, self.use, self.a, self.b = shares
-        self.designs, self.outcomes = likelihood.shape[:2]
-        states, self.wide = sums_of.shape
+        # As in GridTask, but for extra and uses, (Y, A).
+        designs, outcomes, states = likelihood.shape
+        more = -designs % 8
+        self.designs, self.outcomes = designs + more, outcomes
+        self.likelihood, self.place_after = likelihood, place_after
+        self.horizon, self.effort, self.cut = horizon, effort, _LIKELY / states
+        self.time, use, self.a, b = shares
+        e = np.arange(1.0, _USES + 1)
+        self.use_of = use * e ** (b - 1.0)
+        self.travel, self.extra, self.uses, self.allowed = (
+            np.pad(table, [(0, 0)] * (table.ndim - 1) + [(0, more)])
+            for table in (travel, extra, uses, allowed)
+        )
+        self.closed = np.float32(1e9) * (1 - np.pad(allowed, (0, more)))
+        # Of each state L of all outcomes but the first, then the sum of L log L.
+        noise = likelihood * np.log(np.where(likelihood > 0.0, likelihood, 1.0))
+        rows = [*likelihood.transpose(1, 2, 0)[1:], noise.sum(axis=1).T]
+        parts = [np.pad(row, [(0, 0), (0, more)]) for row in rows]
+        self.rows = np.concatenate(parts, axis=1)
+        self.wide = self.rows.shape[1]
         levels = _DEPTH + 1
         table = np.zeros((len(_WIDTHS), levels), np.int32)
         for number, widths in enumerate(_WIDTHS):
             table[number, : len(widths)] = widths
         self.widths = table
-        self.which = np.zeros(states, np.int32)
-        self.weights = np.zeros((levels, states), np.float32)
+        self.likely = np.zeros(levels, np.int32)
+        self.which = np.zeros((levels, states + 3), np.int32)
+        self.weights = np.zeros((levels, states + 3), np.float32)
         self.sums, self.rest = np.zeros((2, levels, self.wide), np.float32)
         four = np.zeros((4, levels, self.designs), np.float32)
         self.gains, self.scores, self.seconds, self.needs = four
@@ -149,137 +152,104 @@ class Tree:
         chosen: cython.int[::1],
     ):
         """Write the next measurement of each of B sessions; all are (B, ...)."""
-        number: cython.Py_ssize_t
+        now = cython.declare(State)
         watch: Watch = begin(INFINITY)
         with cython.nogil:
-            for number in range(beliefs.shape[0]):
+            for i in range(beliefs.shape[0]):
                 late(cython.address(watch))
-                chosen[number] = self._best(
-                    cython.address(beliefs[number, 0]),
-                    place[number],
-                    seconds[number],
-                    uses[number],
-                    made[number],
-                )
+                now.place, now.seconds = place[i], seconds[i]
+                now.uses, now.made = uses[i], made[i]
+                chosen[i] = self._best(cython.address(beliefs[i, 0]), now)
 
-    @cython.cfunc
-    @cython.nogil
-    @cython.exceptval(check=False)
-    def _best(
-        self,
-        belief: cython.p_float,
-        place: cython.int,
-        t: cython.double,
-        e: cython.int,
-        made: cython.int,
-    ) -> cython.int:
+    def _best(self, belief, now):
         """Of the largest tree that ``effort`` suffices for."""
-        states: cython.int = self.which.shape[0]
-        i: cython.int
+        states = self.likelihood.shape[2]
         n: cython.int = 0
         p: cython.float = 0.0
         for i in range(states):
             if belief[i] * states > _LIKELY:
-                self.which[n] = i
+                self.which[0, n] = i
                 self.weights[0, n] = belief[i]
                 p += belief[i]
                 n += 1
-        self.likely = n
+        self.likely[0] = n
         entropy: cython.float = 0.0
         for i in range(n):
             entropy -= self.weights[0, i] * _log(self.weights[0, i] / p)
+        entropy /= p
+        self.work = 0.0
         self._sum(0)
         self.width = cython.address(self.widths[0, _DEPTH])  # 0
         best: cython.int = 0
-        self._value(0, p, place, t, e, made, entropy / p, cython.address(best))
-        if made + 1 >= self.horizon:
+        self._value(0, p, now, entropy, cython.address(best))
+        if now.made + 1 >= self.horizon:
             return best
-        spent: cython.double = 0.0
+        spent = self.work
         # The largest that surely fits, then larger ones by what this one took.
-        for i in range(self.widths.shape[0] - 1, -1, -1):
-            work: cython.double = self._size(i)
-            if work <= self.effort:
-                break
-        while i < self.widths.shape[0] and spent + work <= self.effort:
+        number: cython.int = self.widths.shape[0] - 1
+        while number > 0 and self._size(number) > self.effort:
+            number -= 1
+        work = self._size(number)
+        while number < self.widths.shape[0] and spent + work <= self.effort:
             self.work = 0.0
-            self.width = cython.address(self.widths[i, 0])
-            self._value(0, p, place, t, e, made, entropy / p, cython.address(best))
+            self.width = cython.address(self.widths[number, 0])
+            self._value(0, p, now, entropy, cython.address(best))
             spent += self.work
-            i += 1
-            if i < self.widths.shape[0]:
-                work = self.work * self._size(i) / self._size(i - 1)
+            number += 1
+            if number < self.widths.shape[0]:
+                work = self.work * self._size(number) / self._size(number - 1)
         return best
 
-    @cython.cfunc
-    @cython.nogil
-    @cython.exceptval(check=False)
-    def _node(self) -> cython.double:
-        """Multiplications that a node takes, besides those of its sums."""
-        return _EACH * self.wide + _NODE
-
-    @cython.cfunc
-    @cython.nogil
-    @cython.exceptval(check=False)
-    def _size(self, number: cython.int) -> cython.double:
+    def _size(self, number):
         """Multiplications of a tree of which no session ends."""
-        level: cython.int
         size: cython.double = 0.0
         nodes: cython.double = 1.0
         for level in range(_DEPTH):
             nodes *= self.widths[number, level]
-            size += nodes * (self.outcomes - 1) * self.wide * self.likely
+            size += nodes * (self.outcomes - 1) * self.wide * self.likely[0]
             nodes *= self.outcomes
-            size += nodes * self._node()
+            size += nodes * (_EACH * self.wide + _NODE)
         return size
 
-    @cython.cfunc
-    @cython.nogil
-    @cython.exceptval(check=False)
-    def _sum(self, level: cython.int) -> cython.void:
-        i: cython.Py_ssize_t
-        r: cython.Py_ssize_t
-        wide: cython.Py_ssize_t = self.wide
-        sums: cython.p_float = cython.address(self.sums[level, 0])
+    def _sum(self, level):
+        """The sums over the likely states, four at a time."""
+        which = cython.address(self.which[level, 0])
+        weights = cython.address(self.weights[level, 0])
+        rows = cython.address(self.rows[0, 0])
+        sums = cython.address(self.sums[level, 0])
+        wide = self.wide
+        count = self.likely[level]
+        for i in range(count, count + 3):
+            which[i] = 0
+            weights[i] = 0.0
         for r in range(wide):
             sums[r] = 0.0
-        for i in range(self.likely):
-            w: cython.float = self.weights[level, i]
-            if w > 0.0:
-                row: cython.p_float = cython.address(self.sums_of[self.which[i], 0])
-                for r in range(wide):
-                    sums[r] += w * row[r]
-        self.work += wide * self.likely
+        for i in range(0, count, 4):
+            u, v, w, x = weights[i], weights[i + 1], weights[i + 2], weights[i + 3]
+            a = rows + which[i] * wide
+            b = rows + which[i + 1] * wide
+            c = rows + which[i + 2] * wide
+            d = rows + which[i + 3] * wide
+            for r in range(wide):
+                sums[r] += (u * a[r] + v * b[r]) + (w * c[r] + x * d[r])
+        self.work += wide * count
 
-    @cython.cfunc
-    @cython.nogil
-    @cython.exceptval(check=False)
-    def _value(
-        self,
-        level: cython.int,
-        p: cython.float,
-        place: cython.int,
-        t: cython.double,
-        e: cython.int,
-        made: cython.int,
-        entropy: cython.double,
-        best: cython.p_int,
-    ) -> cython.double:
+    def _value(self, level, p, now, entropy, best):
         """p times the nats still to gain after sums; the best measurement."""
-        gains: cython.p_float = cython.address(self.gains[level, 0])
-        scores: cython.p_float = cython.address(self.scores[level, 0])
-        a: cython.int
-        price: cython.double = self._propose(level, p, place, t, e, made, best)
+        gains = cython.address(self.gains[level, 0])
+        scores = cython.address(self.scores[level, 0])
+        price = self._propose(level, p, now, best)
+        first: cython.int = best[0]
         value: cython.double = -1.0
-        if made + 1 >= self.horizon:  # nothing follows: no price counts
+        if now.made + 1 >= self.horizon:  # nothing follows: no price counts
             for a in range(self.designs):
                 if scores[a] > 0.0 and gains[a] > value:
                     value = gains[a]
                     best[0] = a
             return value
-        first: cython.int = best[0]
         if self.width[level] == 0:
             m: cython.double = fmax(1.0, _FIT * expf(-_BEND * _log(price)))
-            m = fmin(m, self.horizon - made)
+            m = fmin(m, self.horizon - now.made)
             k: cython.double = _FALL * gains[first] / (p * fmax(entropy, 1e-3)) + _FLAT
             rest: cython.double = gains[first] * (
                 (1.0 - expf(-k * m)) / (1.0 - expf(-k)) - 1.0
@@ -288,27 +258,20 @@ class Tree:
             return gains[first] + rest
         kept: cython.double = 0.0
         guess: cython.double = 0.0
-        number: cython.int
+        own: cython.double = 0.0
         for number in range(self.width[level]):
-            top: cython.float = 0.0
-            for a in range(self.designs):
-                if scores[a] > top:
-                    top = scores[a]
-                    first = a
-            if top == 0.0:
+            first = _argmax(scores, self.designs)
+            if scores[first] == 0.0:
                 break
             scores[first] = 0.0
             self.guess[level + 1] = 0.0
-            unknown: cython.double = entropy - gains[first] / p
             total: cython.double = gains[first] + self._follow(
-                level, p, first, place, t, e, made, unknown
+                level, p, first, now, entropy - gains[first] / p
             )
             mine: cython.double = self.guess[level + 1]
             if number == 0:
-                value = total
-                kept = total
-                guess = mine
-                own: cython.double = mine
+                value = kept = total
+                guess = own = mine
             elif total > value and total > kept + _DOUBT * fmax(own, mine):
                 value = total
                 guess = mine
@@ -316,75 +279,62 @@ class Tree:
         self.guess[level] += guess
         return value
 
-    @cython.cfunc
-    @cython.nogil
-    @cython.exceptval(check=False)
-    def _propose(
-        self,
-        level: cython.int,
-        p: cython.float,
-        place: cython.int,
-        t: cython.double,
-        e: cython.int,
-        made: cython.int,
-        best: cython.p_int,
-    ) -> cython.double:
+    def _propose(self, level, p, now, best):
         """Gains times p and scores of ``shares``; the best by them, and its price."""
-        designs: cython.int = self.designs
-        outcomes: cython.int = self.outcomes
-        a: cython.int
-        y: cython.int
-        sums: cython.p_float = cython.address(self.sums[level, 0])
-        gains: cython.p_float = cython.address(self.gains[level, 0])
-        scores: cython.p_float = cython.address(self.scores[level, 0])
-        seconds: cython.p_float = cython.address(self.seconds[level, 0])
-        needs: cython.p_float = cython.address(self.needs[level, 0])
+        designs = self.designs
+        outcomes = self.outcomes
+        sums = cython.address(self.sums[level, 0])
+        gains = cython.address(self.gains[level, 0])
+        scores = cython.address(self.scores[level, 0])
+        seconds = cython.address(self.seconds[level, 0])
+        needs = cython.address(self.needs[level, 0])
+        travel = cython.address(self.travel[now.place, 0])
+        allowed = cython.address(self.allowed[0])
+        closed = cython.address(self.closed[0])
         share: cython.float = 1.0 / p
         tiny: cython.float = 1e-12
+        nothing: cython.float = 1e-9
         zero: cython.float = 0.0
+        # One array is written in each loop: more, and the compiler doubts that they are
+        # apart.
         for a in range(designs):
             gains[a] = sums[(outcomes - 1) * designs + a]
-            seconds[a] = needs[a] = 0.0
-            scores[a] = p  # less what the outcomes have
-        for y in range(1, outcomes + 1):
-            chances: cython.p_float = sums + (y - 1) * designs
-            if y == outcomes:
-                chances = scores
-            extra: cython.p_float = cython.address(self.extra[y % outcomes, 0])
-            uses: cython.p_float = cython.address(self.uses[y % outcomes, 0])
+        for a in range(designs):
+            scores[a] = p
+        for a in range(designs):
+            seconds[a] = zero
+        for a in range(designs):
+            needs[a] = zero
+        for y in range(outcomes - 1):
             for a in range(designs):
-                q: cython.float = chances[a]
-                q = q if q > tiny else tiny
-                scores[a] -= q
+                scores[a] -= sums[y * designs + a]
+        for y in range(outcomes):
+            chances = sums + (y - 1) * designs if y else scores
+            extra = cython.address(self.extra[y, 0])
+            uses = cython.address(self.uses[y, 0])
+            for a in range(designs):
+                q = chances[a] if chances[a] > tiny else tiny
                 gains[a] -= q * _log(q * share)
-                seconds[a] += q * extra[a]
-                needs[a] += q * uses[a]
-        travel: cython.p_float = cython.address(self.travel[place, 0])
-        allowed: cython.p_float = cython.address(self.allowed[0])
-        nothing: cython.float = 1e-9
+            for a in range(designs):
+                seconds[a] += chances[a] * extra[a]
+            for a in range(designs):
+                needs[a] += chances[a] * uses[a]
         for a in range(designs):
             gains[a] = gains[a] if gains[a] > zero else zero
-            s: cython.float = travel[a] + seconds[a] * share
-            seconds[a] = s if s > nothing else nothing
-            needs[a] *= share
-            scores[a] = allowed[a] * (gains[a] * share + nothing) / seconds[a]
-        rate: cython.float = 0.0
-        always: cython.float = 1e9
-        each: cython.double = 1.0
         for a in range(designs):
-            if scores[a] > rate:
-                rate = scores[a]
-                each = seconds[a]
-            if allowed[a] > 0.0 and needs[a] < always:
-                always = needs[a]
-        n: cython.double = fmax(self.horizon - made, 1.0)
-        n = fmin(n, fmax(e / fmax(always, 1e-6), 1.0))
-        t = fmax(t, 1e-9)
-        e = max(e, 1)
-        number: cython.double = fmin(n, fmax(t / each, 0.1))
-        use: cython.float = (self.use / e) * expf(
-            self.a * _log(number) + self.b * _log(e)
-        )
+            s = travel[a] + seconds[a] * share
+            seconds[a] = s if s > nothing else nothing
+        for a in range(designs):
+            scores[a] = allowed[a] * (gains[a] * share + nothing) / seconds[a]
+        for a in range(designs):
+            needs[a] = needs[a] * share + closed[a]
+        always = -_largest(needs, designs, -1.0)
+        e: cython.int = max(now.uses, 1)
+        t: cython.double = fmax(now.seconds, 1e-9)
+        n: cython.double = fmax(self.horizon - now.made, 1.0)
+        n = fmin(n, fmax(now.uses / fmax(always, 1e-6), 1.0))
+        number = fmin(n, fmax(t / seconds[_argmax(scores, designs)], 0.1))
+        use: cython.float = self.use_of[min(e, _USES) - 1] * expf(self.a * _log(number))
         last: cython.float = e
         time: cython.float = self.time / t
         end: cython.float = fmin(t, 1e30)
@@ -392,51 +342,31 @@ class Tree:
         least: cython.float = nothing * p
         for a in range(designs):
             s = seconds[a] if seconds[a] < end else end
-            u: cython.float = needs[a] - always
+            u = needs[a] - always
             u = u if u < last else last
-            s = fixed + time * s + use * u
-            scores[a] = allowed[a] * (gains[a] + least) / s
-        self.work += self._node()
-        top: cython.float = 0.0
-        best[0] = 0
-        for a in range(designs):
-            if scores[a] > top:
-                top = scores[a]
-                best[0] = a
-        return (gains[best[0]] + least) / fmax(top, 1e-30)
+            scores[a] = allowed[a] * (gains[a] + least) / (fixed + time * s + use * u)
+        self.work += _EACH * self.wide + _NODE
+        best[0] = _argmax(scores, designs)
+        return (gains[best[0]] + least) / fmax(scores[best[0]], 1e-30)
 
-    @cython.cfunc
-    @cython.nogil
-    @cython.exceptval(check=False)
-    def _follow(
-        self,
-        level: cython.int,
-        p: cython.float,
-        a: cython.int,
-        place: cython.int,
-        t: cython.double,
-        e: cython.int,
-        made: cython.int,
-        entropy: cython.double,
-    ) -> cython.double:
+    def _follow(self, level, p, a, now, entropy):
         """p times the nats that are gained after a measurement."""
-        designs: cython.int = self.designs
-        outcomes: cython.int = self.outcomes
-        wide: cython.Py_ssize_t = self.wide
-        y: cython.int
-        i: cython.Py_ssize_t
-        r: cython.Py_ssize_t
-        then: cython.int = level + 1
-        from_here: cython.p_float = cython.address(self.weights[level, 0])
-        weights: cython.p_float = cython.address(self.weights[then, 0])
-        sums: cython.p_float = cython.address(self.sums[then, 0])
-        rest: cython.p_float = cython.address(self.rest[level, 0])
-        mine: cython.p_float = cython.address(self.sums[level, 0])
+        designs = self.designs
+        outcomes = self.outcomes
+        wide = self.wide
+        then = level + 1
+        came = cython.address(self.which[level, 0])
+        which = cython.address(self.which[then, 0])
+        before = cython.address(self.weights[level, 0])
+        weights = cython.address(self.weights[then, 0])
+        mine = cython.address(self.sums[level, 0])
+        sums = cython.address(self.sums[then, 0])
+        rest = cython.address(self.rest[level, 0])
         best: cython.int = 0
-        tiny: cython.float = 1e-12
-        zero: cython.float = 0.0
         total: cython.double = 0.0
         mass: cython.float = p
+        after = cython.declare(State)
+        after.made = now.made + 1
         for r in range(wide):
             rest[r] = mine[r]
         for y in range(1, outcomes + 1):
@@ -446,27 +376,31 @@ class Tree:
                 mass -= q
             if q < _NO_CHANCE * p:
                 continue
-            z: cython.int = y % outcomes
-            left: cython.double = t - self.travel[place, a] - self.extra[z, a]
-            more: cython.int = e - cython.cast(cython.int, self.uses[z, a])
-            going: cython.bint = left > 0.0 and more > 0 and made + 1 < self.horizon
+            z = y % outcomes
+            after.seconds = now.seconds - self.travel[now.place, a] - self.extra[z, a]
+            after.uses = now.uses - cython.cast(cython.int, self.uses[z, a])
+            going: cython.bint = after.seconds > 0.0 and after.uses > 0
+            going = going and after.made < self.horizon
             if y == outcomes:
                 if not going:
                     break
                 for r in range(wide):
                     sums[r] = rest[r]
             if y < outcomes or self.width[then] > 0:
-                like: cython.p_float = cython.address(self.likelihood[a, z, 0])
-                for i in range(self.likely):
-                    w: cython.float = from_here[i] * like[self.which[i]]
-                    weights[i] = w if w > tiny else zero
+                like = cython.address(self.likelihood[a, z, 0])
+                least: cython.float = q * self.cut
+                n: cython.int = 0
+                for i in range(self.likely[level]):
+                    w = before[i] * like[came[i]]
+                    weights[n] = w
+                    which[n] = came[i]
+                    n += w > least
+                self.likely[then] = n
             if y < outcomes:
                 self._sum(then)
                 for r in range(wide):
                     rest[r] -= sums[r]
             if going:
-                total += self._value(
-                    then, q, self.place_after[a, z], left, more, made + 1, entropy,
-                    cython.address(best),
-                )  # fmt: skip
+                after.place = self.place_after[a, z]
+                total += self._value(then, q, after, entropy, cython.address(best))
         return total

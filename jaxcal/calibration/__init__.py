@@ -3,7 +3,7 @@
 ``fit`` holds what was found and predicts; ``calibration`` adds the judges (``verdict``,
 ``check``), the ``inverse``, the ``summary`` and the ``file``.
 ``closed_form`` fits the affine model; ``estimate`` (from arguments to the fit),
-``solve`` (the search) and ``harmonics`` every other one.
+``solve`` (the search) every other one.
 """
 
 from jaxcal.calibration.calibration import Calibration

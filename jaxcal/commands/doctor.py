@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib.metadata
 import importlib.util
 import json
@@ -11,24 +10,21 @@ import platform
 import re
 import sys
 from collections.abc import Iterator
-from typing import Any
+from typing import Annotated, Any
 
-from jaxcal.arguments import flag
+__all__ = ["doctor", "report"]
 
-__all__ = ["FLAGS", "doctor", "report"]
-
-FLAGS = {"doctor": (flag("--json", "print JSON", on=True),)}
 _CORE = ("numpy", "scipy")
 _CACHE, _MISSING = "JAX_COMPILATION_CACHE_DIR", "not installed"
 
 
-def doctor(arguments: argparse.Namespace) -> None:
+def doctor(*, json_: Annotated[bool, "print JSON"] = False) -> None:
     """Print the report.
 
     Nothing is changed and no port is opened.
     """
     found = report()
-    if arguments.json:
+    if json_:
         print(json.dumps(found, indent=1))
         return
     for title, rows in found.items():

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
+import dataclasses
 import functools
-import pathlib
 import signal
 import sys
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, NoReturn
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
-from jaxcal.arguments import Parser, refused
+from jaxcal.arguments import Parser, refused, several, values_of
 from jaxcal.commands import evaluate_task
 from jaxcal.extras import MissingExtraError, needs
 from jaxcal.files import require_writable_folder
@@ -20,10 +20,111 @@ if TYPE_CHECKING:
     from jaxcal.evaluation.results import Evaluation, Summary
     from jaxcal.progress import Progress
 
-__all__ = ["main"]
+__all__ = ["main", "parser"]
 
 EXIT_INTERRUPTED = 130
 EXIT_TERMINATED = 143
+
+_DESCRIPTION = """\
+Let every method choose K postures in every episode of a dataset, and compare the
+determinant of the information matrix S with that of the best choice there is (S*).
+
+columns:
+  mean, median det S  larger is better; in the unit of the dataset's commands
+  det S/det S*        mean over the episodes; 1 is optimal
+  hit rate            share of episodes in which the optimum itself was found
+  D-eff.              mean of (det S/det S*)^(1/p), p parameters (12 for 3 x 3)
+  x random            mean det S over that of random selection, the paper's measure
+  time each           seconds a selection, averaged over the batch, compilation left out
+"""
+
+_EPILOG = """\
+methods:
+  policy              the trained network, likeliest posture at every step
+  policy:samples      the best of --num sampled passes
+  policy:first        each of the --num likeliest first postures, completed; the best
+  policy:exchange     policy, then Fedorov exchange from what it chose
+  policy:all          all four
+  random              --draws selections an episode, all counted
+  greedy              the posture that adds most, K times
+  exchange            Fedorov exchange with random restarts
+  exact               the proven optimum
+  auto                what select does by default: the cheapest way to a proven
+                      D-efficiency of 0.999; not among the methods run by default
+
+datasets:
+  dataset0 to 5       the paper's, made from --seed (200, 200,000, 1,000, 100, 100 and
+                      1 episodes); 4 and 5 from --recordings, or those that ship
+  FILE.npz            candidates (episodes, M, n); optional measured, available
+  FILE.csv            episode,candidate,u_x,u_y,u_z[,y_x,y_y,y_z]
+
+examples:
+  {program}
+      the shipped policy and every baseline on 1,000 unseen sets of 50 postures
+  {program} --checkpoint runs/a runs/b --methods policy,exact --json out.json
+      two trainings side by side, the numbers for a script
+  {program} --dataset dataset3 mine.npz --report report
+      figures and report/index.html; dataset3 holds outputs, so parameters too
+  {program} --methods random,greedy,exact --k 8 --episodes 100
+      eight of fifty postures; loads no JAX
+  {program} --task knee
+      deciders of sequential measurement; {program} --task knee --help
+  {program} --stream runs/ten_million --episodes 10000000
+      any number of episodes in constant memory; the same command resumes where it
+      stopped; started again beside it, on any machine, it shares the work
+"""
+
+
+@dataclasses.dataclass
+class Options:
+    """What is evaluated, and where it is written."""
+
+    checkpoint: Annotated[
+        tuple[str, ...], "trained policies; the shipped one", "DIR"
+    ] = ()
+    dataset: Annotated[tuple[str, ...], "datasets; dataset2", "NAME|FILE"] = ()
+    recordings: Annotated[
+        Path | None, "of dataset4.csv and dataset5.csv, by the rig", "DIR"
+    ] = None
+    methods: Annotated[
+        list[str] | None, "comma separated; all but auto", "LIST", several(str, "names")
+    ] = None
+    k: Annotated[int, "postures to choose", "K", (1,)] = 4
+    episodes: Annotated[int | None, "at most the first N of each", (1,)] = None
+    seed: Annotated[int, "of datasets and draws", "S", (0,)] = 0
+    num: Annotated[int, "tries of policy:samples and :first", (1,)] = 16
+    draws: Annotated[int, "random selections an episode", (1,)] = 100
+    time_limit: Annotated[
+        float | None,
+        "of the exact solver, a dataset; what it cannot prove is bounded",
+        "SECONDS",
+        (1e-3,),
+    ] = None
+    json: Annotated[Path | None, "write every number"] = None
+    indices: Annotated[bool, "and the postures chosen, in the JSON"] = False
+    report: Annotated[Path | None, "write figures and index.html", "DIR"] = None
+    run: Annotated[
+        tuple[Path, ...],
+        "training runs to draw curves of; those of --checkpoint are found",
+        "DIR",
+    ] = ()
+    stream: Annotated[
+        Path | None,
+        "evaluate in parts kept in DIR: any number of --episodes, resumable",
+        "DIR",
+    ] = None
+    quiet: Annotated[bool, "no progress"] = False
+    command: list[str] = dataclasses.field(init=False)
+
+    @property
+    def checkpoints(self) -> list[str | None]:
+        """Each once; None is the shipped one."""
+        return [*dict.fromkeys(self.checkpoint)] or [None]
+
+    @property
+    def datasets(self) -> list[str]:
+        """Each once."""
+        return [*dict.fromkeys(self.dataset)] or ["dataset2"]
 
 
 def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> int:
@@ -41,11 +142,12 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
     of_task = any(word.partition("=")[0] == "--task" for word in given)
     kept, before = "nothing was written", signal.signal(signal.SIGTERM, _terminate)
     try:
-        options = _parser(of_task, prog, " ".join(command)).parse_args(given)
+        made = parser(prog, " ".join(command), of_task).parse_args(given)
+        options = values_of(made)["options"]
         options.command = [*command, *given]
         if not of_task and options.stream is not None:
             kept = "finished parts are kept; the same command goes on"
-        (evaluate_task.run if of_task else _run)(options)
+        made.function(options)
     except KeyboardInterrupt as stop:
         terminated = isinstance(stop, _Terminated)
         how = "terminated" if terminated else "interrupted"
@@ -58,13 +160,13 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
     return 0
 
 
-def _parser(of_task: bool, prog: str, typed: str) -> Parser:
+def parser(prog: str, typed: str, of_task: bool = False) -> Parser:
+    """The parser: ``prog`` begins a message, ``typed`` an example of the help."""
     if of_task:
-        with needs("policy", prog):
+        with needs("policy", "--task"):
             return evaluate_task.parser(prog, typed)
-    from jaxcal.commands.evaluate_arguments import parser
-
-    return parser(prog, typed)
+    more = _EPILOG.format(program=typed)
+    return Parser(prog=prog, description=_DESCRIPTION, epilog=more).of(_run)
 
 
 class _Terminated(KeyboardInterrupt):
@@ -75,33 +177,32 @@ def _terminate(number: int, frame: object) -> NoReturn:
     raise _Terminated
 
 
-def _run(options: argparse.Namespace) -> None:
+def _run(options: Options) -> None:
     with needs("study", "evaluate"):
         from jaxcal.progress import Progress
-    from jaxcal.evaluation.methods import POLICIES, check_methods
+    from jaxcal.evaluation.methods import DEFAULT_METHODS, POLICIES, check_methods
     from jaxcal.evaluation.report import json_document, text_table, write_report
     from jaxcal.files import write_text
 
-    options.methods = check_methods(options.methods)
+    asked = DEFAULT_METHODS if options.methods is None else options.methods
+    methods = check_methods(asked)
     if options.checkpoint:
-        if not set(options.methods) & set(POLICIES):
+        if not set(methods) & set(POLICIES):
             raise ValueError(
                 "--checkpoint is given, but no policy is among --methods "
-                f"{','.join(options.methods)}"
+                f"{','.join(methods)}"
             )
         with needs("policy", "--checkpoint"):  # it may need JAX
             from jaxcal.learning.runtime import cache
         cache.keep_compiled_programs()
     _check_outputs(options)
-    options.checkpoint = list(dict.fromkeys(options.checkpoint)) or [None]
-    options.dataset = list(dict.fromkeys(options.dataset)) or ["dataset2"]
-    many = len(options.checkpoint) > 1
+    many = len(options.checkpoints) > 1
     summaries: list[Summary] = []
     whole: list[Evaluation] = []
     evaluated = _whole if options.stream is None else _streamed
     progress = Progress(quiet=options.quiet)
     try:
-        for summary, evaluation in evaluated(options, progress):
+        for summary, evaluation in evaluated(options, methods, progress):
             progress.clear()
             if summaries:
                 print()
@@ -111,7 +212,7 @@ def _run(options: argparse.Namespace) -> None:
     finally:
         progress.clear()
     if options.report is not None:
-        runs = _run_folders(options.run, options.checkpoint)
+        runs = _run_folders(options.run, options.checkpoints)
         number = write_report(
             options.report, whole, runs, command=options.command, many=many
         )
@@ -123,17 +224,17 @@ def _run(options: argparse.Namespace) -> None:
 
 
 def _whole(
-    options: argparse.Namespace, progress: Progress
+    options: Options, methods: Sequence[str], progress: Progress
 ) -> Iterator[tuple[Summary, Evaluation]]:
     """Every dataset, read or made before the first is evaluated."""
     from jaxcal.evaluation.methods import evaluate
 
-    for dataset in [_dataset(name, options, progress) for name in options.dataset]:
+    for dataset in [_dataset(name, options, progress) for name in options.datasets]:
         found = evaluate(
             dataset,
             options.k,
-            options.methods,
-            options.checkpoint,
+            methods,
+            options.checkpoints,
             num=options.num,
             random_draws=options.draws,
             seed=options.seed,
@@ -143,7 +244,7 @@ def _whole(
         yield found.summarise(indices=options.indices), found
 
 
-def _dataset(name: str, options: argparse.Namespace, progress: Progress) -> Dataset:
+def _dataset(name: str, options: Options, progress: Progress) -> Dataset:
     """The first episodes of one of the paper's datasets, or of a file."""
     from jaxcal.evaluation.dataset_files import load_dataset
     from jaxcal.paper.constants import EPISODES
@@ -153,9 +254,14 @@ def _dataset(name: str, options: argparse.Namespace, progress: Progress) -> Data
             from jaxcal.paper.datasets import make_dataset
 
             count = min(options.episodes or EPISODES[name], EPISODES[name])
-            known = {"recordings": options.recordings, "progress": progress}
-            return make_dataset(name, options.seed, count, **known)
-    if pathlib.Path(name).suffix.lower() not in (".npz", ".csv"):
+            return make_dataset(
+                name,
+                options.seed,
+                count,
+                recordings=options.recordings,
+                progress=progress,
+            )
+    if Path(name).suffix.lower() not in (".npz", ".csv"):
         raise ValueError(
             f"--dataset must be one of {', '.join(EPISODES)} or a .npz or .csv file, "
             f"got {name!r}"
@@ -165,9 +271,10 @@ def _dataset(name: str, options: argparse.Namespace, progress: Progress) -> Data
 
 
 def _streamed(
-    options: argparse.Namespace, progress: Progress
+    options: Options, methods: Sequence[str], progress: Progress
 ) -> Iterator[tuple[Summary, None]]:
     """One dataset in parts."""
+    assert options.stream is not None  # it was given
     from jaxcal.evaluation.stream import evaluate_stream
     from jaxcal.paper.datasets.datasets import drawn
 
@@ -178,19 +285,19 @@ def _streamed(
     }
     for flag in (flag for flag, given in whole.items() if given):
         raise ValueError(f"{flag} needs every episode at once and --stream keeps none")
-    if len(options.dataset) > 1:
+    if len(options.datasets) > 1:
         raise ValueError(
-            f"--stream takes one dataset, got {', '.join(options.dataset)}"
+            f"--stream takes one dataset, got {', '.join(options.datasets)}"
         )
     if options.episodes is None:
         raise ValueError("--stream needs --episodes")
-    (name,) = options.dataset
+    (name,) = options.datasets
     plan = {
         "dataset": name,
         "seed": options.seed,
         "k": options.k,
-        "methods": options.methods,
-        "checkpoints": options.checkpoint,
+        "methods": methods,
+        "checkpoints": options.checkpoints,
         "num": options.num,
         "random_draws": options.draws,
     }
@@ -198,7 +305,7 @@ def _streamed(
     yield evaluate_stream(draw, options.episodes, options.stream, plan, progress), None
 
 
-def _check_outputs(options: argparse.Namespace) -> None:
+def _check_outputs(options: Options) -> None:
     """Refuse outputs that cannot be written before anything is computed."""
     evaluate_task.require_outputs(options)
     if options.stream is not None:
@@ -210,13 +317,11 @@ def _check_outputs(options: argparse.Namespace) -> None:
             raise ValueError("--run draws training curves and needs --report")
 
 
-def _run_folders(
-    given: list[pathlib.Path], checkpoints: list[str | None]
-) -> list[pathlib.Path]:
+def _run_folders(given: Sequence[Path], checkpoints: list[str | None]) -> list[Path]:
     """Run folders named, and those the checkpoints lie in."""
     found = list(given)
     for checkpoint in filter(None, checkpoints):
-        folder = pathlib.Path(checkpoint)
+        folder = Path(checkpoint)
         near = [folder, *folder.resolve().parents[:2]]
         found += [place for place in near if (place / "metrics.csv").is_file()][:1]
     return list({place.resolve(): place for place in found}.values())

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import argparse
+import dataclasses
 import importlib
-import pathlib
+from pathlib import Path
+from typing import Annotated, Any
 
-from jaxcal.arguments import Parser, at_least, flag, several
+from jaxcal.arguments import Parser, several
 from jaxcal.extras import needs
 from jaxcal.files import require_writable_folder, write_text
 
@@ -30,23 +31,32 @@ examples:
 """
 
 
-_FLAGS = (
-    flag("--task", "see below", "NAME", required=True),
-    flag("--with", "options of the task", "OPTION=VALUE", dest="options", nargs="+",
-         default=[]),
-    flag("--methods", f"comma separated; {_METHODS}, with {_TUNED} where the task has "
-         "their constants, or the task's own", "LIST", several(str, "names")),
-    flag("--checkpoint", "of the policy; the shipped one", "DIR"),
-    flag("--episodes", "sessions; 4096, fewer where a task takes long", "N",
-         at_least(2)),
-    flag("--seed", "of the sessions; 0", "S", at_least(0), default=0),
-    flag("--rollouts", "simulations of each candidate of the method rollouts; 16", "N",
-         at_least(1), default=16),
-    flag("--retune", "tune the rules on this task; else as they ship", on=True),
-    flag("--json", "write every number", type=pathlib.Path),
-    flag("--report", "write figure and index.html", "DIR", pathlib.Path),
-    flag("--quiet", "no progress", on=True),
-)  # fmt: skip
+@dataclasses.dataclass
+class Options:
+    """What is played, and where it is written."""
+
+    task: Annotated[str, "see below"]
+    with_: Annotated[tuple[str, ...], "options of the task", "OPTION=VALUE"] = ()
+    methods: Annotated[
+        list[str] | None,
+        f"comma separated; {_METHODS}, with {_TUNED} where the task has their "
+        "constants, or the task's own",
+        "LIST",
+        several(str, "names"),
+    ] = None
+    checkpoint: Annotated[str | None, "of the policy; the shipped one", "DIR"] = None
+    episodes: Annotated[
+        int | None, "sessions; 4096, fewer where a task takes long", (2,)
+    ] = None
+    seed: Annotated[int, "of the sessions", "S", (0,)] = 0
+    rollouts: Annotated[
+        int, "simulations of each candidate of the method rollouts", (1,)
+    ] = 16
+    retune: Annotated[bool, "tune the rules on this task; else as they ship"] = False
+    json: Annotated[Path | None, "write every number"] = None
+    report: Annotated[Path | None, "write figure and index.html", "DIR"] = None
+    quiet: Annotated[bool, "no progress"] = False
+    command: list[str] = dataclasses.field(init=False)
 
 
 def parser(prog: str, typed: str) -> Parser:
@@ -64,10 +74,10 @@ def parser(prog: str, typed: str) -> Parser:
         "nats, each less the best rule in pairs, and the time of a choice.",
         epilog=_EPILOG.format(methods=methods, tasks=tasks, program=typed),
     )
-    return out.with_flags(_FLAGS)
+    return out.of(run)
 
 
-def require_outputs(options: argparse.Namespace) -> None:
+def require_outputs(options: Any) -> None:
     """Refuse --json and --report that cannot be written, before computing anything."""
     if options.json is not None:
         if options.json.is_dir():
@@ -80,7 +90,7 @@ def require_outputs(options: argparse.Namespace) -> None:
         require_writable_folder(options.report)
 
 
-def run(options: argparse.Namespace) -> None:
+def run(options: Options) -> None:
     """Evaluate, print, write."""
     from jaxcal.adaptive.tasks import registry
     from jaxcal.evaluation import sequential, sequential_report
@@ -98,7 +108,7 @@ def run(options: argparse.Namespace) -> None:
         if options.methods:
             raise ValueError("--checkpoint is given, but policy is not among --methods")
         methods.append("policy")
-    chosen = registry.options_from(entry, options.options)
+    chosen = registry.options_from(entry, options.with_)
     cache.keep_compiled_programs()
     progress = Progress(quiet=options.quiet)
     try:

@@ -8,9 +8,8 @@ import logging
 import os
 import sys
 import warnings
-from typing import Any
 
-from jaxcal.arguments import Parser, refused
+from jaxcal.arguments import Parser, refused, values_of
 from jaxcal.extras import MissingExtraError
 
 __all__ = ["COMMANDS", "main"]
@@ -60,7 +59,6 @@ def main(argv: list[str] | None = None) -> int:
         module = importlib.import_module(f"jaxcal.commands.{given[0]}")
         return int(module.main(given[1:], prog=f"jaxcal {given[0]}"))
     arguments = _parser(given).parse_args(given)
-    run = getattr(_module(arguments.command), arguments.command)
     log, shown = logging.getLogger("jaxcal"), logging.StreamHandler()
     log.setLevel(logging.INFO)
     log.addHandler(shown)
@@ -72,7 +70,7 @@ def main(argv: list[str] | None = None) -> int:
                 "; ".join(str(warning).splitlines()),
                 file=sys.stderr,
             )
-            run(arguments)
+            arguments.function(**values_of(arguments))
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of a pipe, such as head, has left
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -97,11 +95,8 @@ def _parser(given: list[str]) -> Parser:
         about = line[0].upper() + line[1:] + "."
         command = commands.add_parser(name, help=line, description=about)
         if name in given and name in _HERE:  # only the one that runs is imported
-            told = inspect.getdoc(getattr(_module(name), name)) or ""
-            command.epilog = told.partition("\n\n")[2]
-            command.with_flags(_module(name).FLAGS[name])
+            module = importlib.import_module(f"jaxcal.commands.{_HERE[name][1]}")
+            function = getattr(module, name)
+            told = inspect.getdoc(function) or ""
+            command.of(function).epilog = told.partition("\n\n")[2]
     return parser
-
-
-def _module(command: str) -> Any:
-    return importlib.import_module(f"jaxcal.commands.{_HERE[command][1]}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import csv
 import dataclasses
 import io
@@ -11,27 +10,29 @@ import pathlib
 import re
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.arguments import flag
 from jaxcal.checks import axis_letter
 from jaxcal.files import write_text
 
 __all__ = [
-    "OUTPUT",
+    "Columns",
     "Frame",
+    "Output",
     "Table",
+    "TablePath",
     "read_table",
     "write_json",
     "write_rows",
-    "written",
 ]
 
 Array = NDArray[np.float64]
 
+TablePath = Annotated[str, ".csv, .npz or - (standard input)"]
+Columns = Annotated[str | None, "columns, where their names do not tell", "A,B"]
 _NPZ_COLUMNS = {"candidates": "u", "commands": "u", "measured": "y"}
 
 
@@ -263,48 +264,43 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-OUTPUT = (  # where the answer goes and in which form
-    flag("--json", "print JSON", on=True),
-    flag("--csv", "print CSV", on=True),
-    flag("--out", "write to FILE (.csv or .json) instead"),
-)
+@dataclasses.dataclass
+class Output:
+    """Where the answer goes and in which form."""
+
+    json: Annotated[bool, "print JSON"] = False
+    csv: Annotated[bool, "print CSV"] = False
+    out: Annotated[str, "write to FILE (.csv or .json) instead", "FILE"] = ""
+
+    def written(
+        self, names: Sequence[str], rows: Sequence[Sequence[Any]], document: Any
+    ) -> bool:
+        """Write where a form or a file is asked for; False where neither is."""
+        if self.json and self.csv:
+            raise ValueError("one of --json and --csv must be left out")
+        if self.json or self.out.endswith(".json"):
+            write_json(self.out, document)
+        elif self.csv or self.out:
+            write_rows(self.out, names, rows)
+        else:
+            return False
+        return True
 
 
-def written(
-    arguments: argparse.Namespace,
-    names: Sequence[str],
-    rows: Sequence[Sequence[Any]],
-    document: Any,
-) -> bool:
-    """Write where ``OUTPUT`` asks for a form or a file; False where neither is."""
-    out = arguments.out
-    if arguments.json and arguments.csv:
-        raise ValueError("one of --json and --csv must be left out")
-    if arguments.json or (out and out.endswith(".json")):
-        write_json(out, document)
-    elif arguments.csv or out:
-        write_rows(out, names, rows)
-    else:
-        return False
-    return True
-
-
-def write_rows(
-    out: str | None, names: Sequence[str], rows: Sequence[Sequence[Any]]
-) -> None:
+def write_rows(out: str, names: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Write rows as CSV to a file, atomically, or to standard output."""
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([names, *rows])
     _emit(out, text.getvalue())
 
 
-def write_json(out: str | None, document: Any) -> None:
+def write_json(out: str, document: Any) -> None:
     """Write a JSON document to a file, atomically, or to standard output."""
     _emit(out, json.dumps(document, indent=1, default=_plain) + "\n")
 
 
-def _emit(out: str | None, text: str) -> None:
-    if out is None or out == "-":
+def _emit(out: str, text: str) -> None:
+    if out in ("", "-"):
         sys.stdout.write(text)
     else:
         write_text(out, text)

@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
     def alone() -> int:  # this process may be one of several
         cache.keep_compiled_programs()
         try:
-            with needs("policy", prog):
+            with needs("policy", "training"):
                 from jaxcal.commands.train_arguments import parser
             return _run(parser(prog).parse_args(given))
         except (ValueError, OSError, MissingExtraError) as error:
@@ -119,7 +119,7 @@ def _train(
         from jaxcal.adaptive.policy import run as trainer
 
         schema, unit, columns = trainer.SCHEMA, "decisions", _TASK
-        told = f"task {config.task}, seed {config.seed}; run folder {out}"
+        introduction = f"task {config.task}, seed {config.seed}; run folder {out}"
     else:
         from jaxcal.learning.training import checkpoint
         from jaxcal.learning.training import postures as trainer
@@ -128,10 +128,10 @@ def _train(
         rows = config.ppo.rows_per_minibatch
         mesh = devices.make_mesh(rows, arguments.devices, config.num_seeds)
         schema, unit, columns = checkpoint.SCHEMA, "episodes", _POSTURES
-        told = _introduction(config, out, devices.describe(mesh))
+        introduction = _introduction(config, out, devices.describe(mesh))
         more = {"validation": None, "teacher": teacher}
     if first:
-        print(f"{told}\nconfiguration: {config.as_meta()}")
+        print(f"{introduction}\nconfiguration: {config.as_meta()}")
         if validates:
             more["validation"] = fixed_validation(config)
         _begin_table(unit, columns)
@@ -244,7 +244,7 @@ def _task_configuration(
     entry = registry.load(arguments.task)
     given = values_of(arguments, task=True)
     if arguments.resume:
-        more = {"with": arguments.options} if arguments.options else {}
+        more = {"with": arguments.with_} if arguments.with_ else {}
         _refuse_with_resume(given | more, out)
         _, meta = checkpoint.read_meta(out, run.SCHEMA)
         config = PolicyConfig.from_meta(meta)
@@ -253,8 +253,8 @@ def _task_configuration(
         return config
     _refuse_to_overwrite(out)
     options = entry.train_on
-    if arguments.options:
-        options = (registry.options_from(entry, arguments.options),)
+    if arguments.with_:
+        options = (registry.options_from(entry, arguments.with_),)
     ppo, own = (
         {
             f.name: given[f.name]

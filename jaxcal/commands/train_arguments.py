@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import textwrap
-from typing import Any
+from typing import Annotated, Any, Literal
 
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.tasks import registry
-from jaxcal.arguments import Parser, at_least, flag
+from jaxcal.arguments import Parser, number_type
 from jaxcal.learning.config import PPOConfig, StreamsConfig
 from jaxcal.learning.runtime import processes
 from jaxcal.learning.settings import Setting, settings_of
@@ -49,8 +50,35 @@ Ctrl-C saves and stops; --resume then continues bit for bit (on the same CPU).
 All devices of all processes share each update: docs/scaling.md."""
 
 TASK_PARTS: dict[str, type] = {"ppo": StreamsConfig, "policy": PolicyConfig}
-_ABOVE = ("num_episodes", "num_updates", "seed", "num_seeds")  # flags above the groups
+_FIRST = ("num_episodes", "num_updates", "seed", "num_seeds")
 _NAMES = {"num_episodes": "episodes", "num_updates": "updates", "num_seeds": "seeds"}
+
+
+@dataclasses.dataclass
+class Options:
+    """What is trained and where it is kept."""
+
+    preset: Annotated[str, "of postures, see below", "NAME"] = "compact"
+    task: Annotated[str | None, "of sequential measurement, see below", "NAME"] = None
+    with_: Annotated[tuple[str, ...], "options of the task", "OPTION=VALUE"] = ()
+    out: Annotated[str | None, "run folder [runs/PRESET or runs/TASK]", "DIR"] = None
+    resume: Annotated[bool, "go on from the run folder's checkpoint"] = False
+    candidates: Annotated[
+        str | None,
+        "train on your own postures, .csv or .npz: one table is a pool that every "
+        "episode draws --num-candidates from; several episodes are candidate sets",
+        "FILE",
+    ] = None
+    trainer: Annotated[
+        Literal["jaxcal", "brax"], "jaxcal's own PPO, or brax's on the same environment"
+    ] = "jaxcal"
+    export: Annotated[
+        str | None, "write the finished policy alone to one file, NAME.npz", "FILE"
+    ] = None
+    no_validation: Annotated[
+        bool, "do not measure the gap to the proven optimum while training"
+    ] = False
+    devices: Annotated[int | None, "devices of each process [all]"] = None
 
 
 def flag_of(name: str) -> str:
@@ -68,72 +96,44 @@ def parser(prog: str) -> Parser:
         description="Train a policy, and save it with all it needs: one that selects "
         "postures, or with --task one that picks the next measurement.",
         epilog=_EPILOG.format(program=program, presets=_abouts(known), tasks=_tasks()),
-    )
-    out.with_flags(
-        (
-            flag("--preset", "of postures, see below [compact]", default="compact",
-                 choices=sorted(known)),
-            flag("--task", "of sequential measurement, see below", "NAME"),
-            flag("--with", "options of the task", "OPTION=VALUE", dest="options",
-                 nargs="+", default=[]),
-            flag("--episodes", "training budget" + _held("num_episodes", known), "N",
-                 int, dest="num_episodes"),
-            flag("--updates", "training budget of a task: updates of "
-                 f"{PPO.decisions_per_update:,} decisions each [{PPO.num_updates}]",
-                 "N", at_least(1), dest="num_updates"),
-            flag("--seed", "of everything random [0]", "S", int),
-            flag("--seeds", "runs side by side in one program: seeds S, S + 1, ... [1]",
-                 "N", at_least(1), dest="num_seeds"),
-            flag("--out", "run folder [runs/PRESET or runs/TASK]", "DIR"),
-            flag("--resume", "go on from the run folder's checkpoint", on=True),
-            flag("--candidates", "train on your own postures, .csv or .npz: one table "
-                 "is a pool that every episode draws --num-candidates from; several "
-                 "episodes are candidate sets"),
-            flag("--trainer", "jaxcal's own PPO, or brax's on the same environment "
-                 "[jaxcal]", default="jaxcal", choices=("jaxcal", "brax")),
-            flag("--export", "write the finished policy alone to one file, NAME.npz"),
-            flag("--no-validation", "do not measure the gap to the proven optimum "
-                 "while training", on=True),
-            flag("--devices", "devices of each process [all]", "N", int),
-        )
-    )  # fmt: skip
+    ).of(Options)
     processes.add_arguments(out)
     common = {field.name for field in settings_of(PPOConfig)} | {"width"}
     parts = presets.PARTS
-    groups: tuple[tuple[str, str, list[Setting]], ...] = (
-        (
-            "optimisation and size",
-            "in brackets the value of compact, and of others that differ",
-            [f for kind in (PPOConfig, parts["network"]) for f in settings_of(kind)
-             if f.name in common],
-        ),
-        (
-            "postures",
-            "what an episode is, in presets of one task; --kind paper reads --width "
-            "alone of the network",
-            [f for part in ("ppo", "run", "environment", "network")
-             for f in settings_of(parts[part]) if f.name not in common],
-        ),
-        (
-            "tasks",
-            "with --task",
-            [f for part in TASK_PARTS.values() for f in settings_of(part)
-             if f.name not in common],
-        ),
+
+    def of(*kinds: type, shared: bool = False) -> list[Setting]:
+        found = [field for kind in kinds for field in settings_of(kind)]
+        return [
+            f for f in found if (f.name in common) == shared and f.name not in _FIRST
+        ]
+
+    first = {f.name: f for part in (*parts.values(), *TASK_PARTS.values())
+             for f in settings_of(part)}  # fmt: skip
+    groups = (
+        ("budget", "--episodes of postures, --updates of a task",
+         [first[name] for name in _FIRST]),
+        ("optimisation and size",
+         "in brackets the value of compact, and of others that differ",
+         of(PPOConfig, parts["network"], shared=True)),
+        ("postures",
+         "what an episode is, in presets of one task; --kind paper reads --width "
+         "alone of the network",
+         of(*(parts[part] for part in ("ppo", "run", "environment", "network")))),
+        ("tasks", "with --task", of(*TASK_PARTS.values())),
     )  # fmt: skip
     for title, description, fields in groups:
         group = out.add_argument_group(title, description)
         for field in fields:
-            if field.name in _ABOVE:
-                continue
             line = (field.help + _held(field.name, known)).replace("%", "%%")
+            flag = flag_of(field.name)
             if field.kind is bool:
                 yes_no = argparse.BooleanOptionalAction
-                group.add_argument(flag_of(field.name), action=yes_no, help=line)
+                group.add_argument(flag, action=yes_no, help=line)
             else:
                 metavar = {int: "N", float: "X", str: "NAME"}[field.kind]
+                kind = field.kind if field.kind is str else number_type(field.kind)
                 group.add_argument(
-                    flag_of(field.name), type=field.kind, metavar=metavar, help=line
+                    flag, type=kind, metavar=metavar, help=line, dest=field.name
                 )
     return out
 
@@ -157,7 +157,7 @@ def values_of(arguments: argparse.Namespace, task: bool) -> dict[str, Any]:
         unread |= {"--candidates"} if arguments.candidates else set()
         unread |= {"--trainer"} if arguments.trainer != "jaxcal" else set()
         unread |= {"--no-validation"} if arguments.no_validation else set()
-    elif arguments.options:
+    elif arguments.with_:
         unread.add("--with")
     if unread:
         who = f"--task {arguments.task}" if task else f"preset {arguments.preset}"
@@ -184,10 +184,10 @@ def _held(name: str, known: dict[str, TrainConfig]) -> str:
     values: dict[str, str] = {}
     for preset, config in known.items():
         for part in (config, config.ppo, config.network, config.tasks[0].environment):
-            if hasattr(part, name):
+            if name in part.__dataclass_fields__:
                 values[preset] = _shown(getattr(part, name))
     sizes = {f.name: f.default for f in PolicyConfig.__dataclass_fields__.values()}
-    if hasattr(PPO, name):
+    if name in PPO.__dataclass_fields__:
         values["tasks"] = _shown(getattr(PPO, name))
     elif name in ("width", "per_group"):
         values["tasks"] = _shown(sizes[name])

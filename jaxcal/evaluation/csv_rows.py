@@ -5,12 +5,13 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-__all__ = ["csv_text", "finite", "read_rows"]
+__all__ = ["csv_text", "read_columns", "read_rows"]
 
 
 def read_rows(data: bytes) -> tuple[list[str], list[tuple[int, list[str]]]]:
@@ -39,8 +40,39 @@ def read_rows(data: bytes) -> tuple[list[str], list[tuple[int, list[str]]]]:
     return header, rows
 
 
-def finite(name: str, cell: str) -> float:
-    """The number in a cell of the column ``name``."""
+def read_columns(
+    data: bytes,
+    choose: Callable[[list[str]], list[str]],
+    keep: Callable[[Mapping[str, str]], bool] = lambda cells: True,
+) -> tuple[list[str], list[int], NDArray[np.float64]]:
+    """Columns of finite numbers.
+
+    Args:
+        data: of the file.
+        choose: from the header to the columns to read, or ValueError.
+        keep: from the cells of a row, by column, to whether it counts.
+
+    Returns:
+        Their names, the (N,) lines, and (N, columns) numbers.
+
+    Raises:
+        ValueError: naming the line at fault.
+    """
+    header, rows = read_rows(data)
+    lines, values = [1], []  # the header's; then those of the rows
+    try:
+        names = choose(header)
+        for line, row in rows:
+            cells = dict(zip(header, row, strict=True))
+            if keep(cells):
+                lines.append(line)
+                values.append([_finite(name, cells[name]) for name in names])
+    except ValueError as error:
+        raise ValueError(f"line {lines[-1]}: {error}") from None
+    return names, lines[1:], np.array(values).reshape(len(values), len(names))
+
+
+def _finite(name: str, cell: str) -> float:
     try:
         number = float(cell)
     except ValueError:

@@ -5,127 +5,110 @@ from __future__ import annotations
 import csv
 import io
 import os
-from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from jaxcal.checks import axis_letter
-from jaxcal.evaluation.csv_rows import finite, read_rows
+from jaxcal.evaluation.csv_rows import read_columns
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.files import atomic_write
 
-__all__ = ["read_csv", "save_csv", "save_csv_parts"]
+__all__ = ["read_csv", "save_csv"]
+
+_LABELS = ("episode", "candidate")
+_MASK = "available"
 
 
-def save_csv(dataset: Dataset, path: str | os.PathLike[str]) -> None:
+def save_csv(
+    dataset: Dataset,
+    path: str | os.PathLike[str],
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> None:
     """Write a .csv atomically, every number with all its digits; ranges are not kept.
+
+    Args:
+        dataset: what to write.
+        path: of the file.
+        progress: told how many episodes of how many are written.
 
     Raises:
         OSError: the folder is missing, not writable or full.
     """
-    save_csv_parts([dataset], path)
-
-
-def save_csv_parts(parts: Iterable[Dataset], path: str | os.PathLike[str]) -> None:
-    """Write one .csv of a dataset that comes in parts, each with as many columns."""
-    with atomic_write(path) as file:
-        total = 0
-        for dataset in parts:
-            text = io.StringIO()
-            writer = csv.writer(text, lineterminator="\n")
-            if total == 0:
-                writer.writerow(_header(dataset))
-            mask = dataset.available
-            values = dataset.candidates
-            if dataset.measured is not None:
-                values = np.concatenate([values, dataset.measured], axis=2)
-            for e, episode in enumerate(values.tolist()):
-                for i, row in enumerate(episode):
-                    last = [] if mask is None else [int(mask[e, i])]
-                    writer.writerow([total + e, i, *row, *last])
-            file.write(text.getvalue().encode("utf-8"))
-            total += dataset.num_episodes
-
-
-def _header(dataset: Dataset) -> list[str]:
-    n, m = dataset.num_inputs, dataset.num_outputs
-    header = ["episode", "candidate", *(f"u_{axis_letter(i, n)}" for i in range(n))]
+    n, m, mask = dataset.num_inputs, dataset.num_outputs, dataset.available
+    header = [*_LABELS, *(f"u_{axis_letter(i, n)}" for i in range(n))]
+    values = [dataset.candidates]
     if dataset.measured is not None:
         header += [f"y_{axis_letter(i, m)}" for i in range(m)]
-    return header if dataset.available is None else [*header, "available"]
+        values.append(dataset.measured)
+    header += [] if mask is None else [_MASK]
+    with atomic_write(path) as file:
+        text = io.TextIOWrapper(file, "utf-8", newline="")
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(header)
+        for e, episode in enumerate(zip(*values, strict=True)):
+            if e % 1000 == 0:
+                progress(f"write {os.path.basename(path)}", e, dataset.num_episodes)
+            for i, row in enumerate(np.concatenate(episode, axis=1).tolist()):
+                last = [] if mask is None else [int(mask[e, i])]
+                writer.writerow([e, i, *row, *last])
+        text.detach()
 
 
 def read_csv(data: bytes) -> dict[str, Any]:
     """The fields of a ``Dataset``."""
-    header, rows = read_rows(data)
-    try:
-        inputs, outputs, masks = _columns(header)
-    except ValueError as error:
-        raise ValueError(f"line 1: {error}") from None
-    names = [*inputs, *outputs, *masks]
-    found: dict[tuple[int, int], tuple[int, list[float]]] = {}  # line and values
-    for line, row in rows:
-        cells = dict(zip(header, row, strict=True))
-        try:
-            label = _whole("episode", cells), _whole("candidate", cells)
-            if label in found:
-                raise ValueError(
-                    f"candidate {label[1]} of episode {label[0]} was already given in "
-                    f"line {found[label][0]}"
-                )
-            found[label] = line, [finite(name, cells[name]) for name in names]
-            if masks and found[label][1][-1] not in (0.0, 1.0):
-                text = cells["available"]
-                raise ValueError(f'"available" must be 0 or 1, got {text!r}')
-        except ValueError as error:
-            raise ValueError(f"line {line}: {error}") from None
-    if not found:
+    names, lines, table = read_columns(data, _columns)
+    if not lines:
         raise ValueError("no candidates below the header")
-    counts = Counter(episode for episode, _ in sorted(found))
-    (label0, size), *others = counts.items()
-    for episode, count in others:
-        if count != size:
+    labels = table[:, :2]
+    for row, place in np.argwhere((labels % 1 != 0) | (np.abs(labels) > 2.0**53)):
+        raise ValueError(
+            f'line {lines[row]}: "{names[place]}" must be a whole number of at most '
+            f"2^53, got {labels[row, place]:g}"
+        )
+    order = np.lexsort(labels.T[::-1])
+    labels = labels[order]
+    for place in np.flatnonzero((labels[1:] == labels[:-1]).all(axis=1)):
+        first, again = (lines[row] for row in order[place : place + 2])
+        raise ValueError(
+            f"line {again}: candidate {labels[place, 1]:.0f} of episode "
+            f"{labels[place, 0]:.0f} was already given in line {first}"
+        )
+    episodes, counts = np.unique(labels[:, 0], return_counts=True)
+    for other in np.flatnonzero(counts != counts[0]):
+        raise ValueError(
+            f"every episode must have as many candidates: episode {episodes[0]:.0f} "
+            f"has {counts[0]}, episode {episodes[other]:.0f} has {counts[other]}"
+        )
+    sorted_table = table[order].reshape(len(episodes), counts[0], len(names))
+    u, y, free = (
+        [i for i, name in enumerate(names) if name.startswith(start)]
+        for start in ("u_", "y_", _MASK)
+    )
+    fields: dict[str, Any] = {"candidates": sorted_table[..., u]}
+    if y:
+        fields["measured"] = sorted_table[..., y]
+    if free:
+        for row in np.flatnonzero(~np.isin(table[:, free[0]], (0, 1))):
             raise ValueError(
-                f"every episode must have as many candidates: episode {label0} has "
-                f"{size}, episode {episode} has {count}"
+                f'line {lines[row]}: "{_MASK}" must be 0 or 1, got '
+                f"{table[row, free[0]]:g}"
             )
-    table = np.array([found[label][1] for label in sorted(found)])
-    table = table.reshape(len(counts), size, len(names))
-    n, m = len(inputs), len(outputs)
-    fields: dict[str, Any] = {"candidates": table[..., :n]}
-    if outputs:
-        fields["measured"] = table[..., n : n + m]
-    if masks:
-        fields["available"] = table[..., -1] == 1.0
+        fields["available"] = sorted_table[..., free[0]] == 1.0
     return fields
 
 
-def _columns(header: list[str]) -> tuple[list[str], list[str], list[str]]:
-    """Inputs, outputs and, where it is there, ``available``."""
-    for name in ("episode", "candidate"):
+def _columns(header: Sequence[str]) -> list[str]:
+    """All of them, the labels first."""
+    for name in _LABELS:
         if name not in header:
             raise ValueError(f'column "{name}" is missing, found {",".join(header)}')
-    inputs, outputs = ([n for n in header if n.startswith(w)] for w in ("u_", "y_"))
-    if not inputs:
+    if not any(name.startswith("u_") for name in header):
         raise ValueError('no input column ("u_x", ...) in the header')
-    known = {"episode", "candidate", "available", *inputs, *outputs}
     for name in header:
-        if name not in known:
+        if name not in (*_LABELS, _MASK) and not name.startswith(("u_", "y_")):
             raise ValueError(f'unknown column "{name}"')
         if header.count(name) > 1:
             raise ValueError(f'column "{name}" comes twice')
-    return inputs, outputs, ["available"] if "available" in header else []
-
-
-def _whole(name: str, cells: dict[str, str]) -> int:
-    try:
-        number = int(cells[name])
-    except ValueError:
-        raise ValueError(
-            f'"{name}" must be a whole number, got {cells[name]!r}'
-        ) from None
-    if abs(number) > 2**53:
-        raise ValueError(f'"{name}" is out of range, got {cells[name]!r}')
-    return number
+    return [*_LABELS, *(name for name in header if name not in _LABELS)]

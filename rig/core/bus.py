@@ -32,6 +32,14 @@ LATEST_S = 10.0  # no gateway keeps a reply for so long
 class BusError(Fault):
     """No valid reply: silence, noise, a closed port, or a reply to something else."""
 
+    def __init__(
+        self,
+        text: str,
+        advice: str = "Check the unit's power, cable and id, and the line's settings",
+    ) -> None:
+        self.advice = advice
+        super().__init__(text)
+
 
 class Rejected(BusError):
     """The drive answered with an exception."""
@@ -43,7 +51,8 @@ class Rejected(BusError):
         name = next((each.name for each in ExcCodes if each == code), "unknown")
         name = name.lower().replace("_", " ")
         super().__init__(
-            f"unit {unit} answered exception {code} ({name}) at 0x{address:04X}"
+            f"unit {unit} answered exception {code} ({name}) at 0x{address:04X}",
+            "See its manual, and check that the axis's map is that of this drive",
         )
 
 
@@ -91,8 +100,8 @@ class Bus:
         with self._lock:
             self._client = self._client or self._make_client()
             if not self._client.connect():
-                why = _why_closed(self.settings)
-                raise BusError(f"cannot open {self.settings.where}: {why}")
+                why, advice = _why_closed(self.settings)
+                raise BusError(f"cannot open {self.settings.where}: {why}", advice)
         return self
 
     def close(self) -> None:
@@ -151,7 +160,7 @@ class Bus:
                 )
             except BusError as error:
                 if not left:
-                    error.args = (f"{error} (tried {tries} times)",)
+                    error.args = (f"{error}, tried {tries} times",)
                     raise
         raise AssertionError("unreachable")
 
@@ -214,7 +223,10 @@ class Bus:
             elif found in lengths:
                 del owed[: lengths.index(found) + 1]
         if self._owed.get(unit):
-            raise BusError(f"unit {unit}: its replies come too late to be told apart")
+            raise BusError(
+                f"unit {unit}: its replies come too late to be told apart",
+                "Raise bus.timeout_s",
+            )
 
     def broadcast(self, address: int, function: int, words: list[int]) -> None:
         """Write registers of every unit on a serial line; no unit answers."""
@@ -243,7 +255,7 @@ class Bus:
             try:
                 reply = self._send(function, unit, address, asked)
                 if reply is None or reply.dev_id != unit:
-                    raise BusError(f"unit {unit}: the reply is from another unit")
+                    raise BusError(f"unit {unit}: another unit replied")
                 code = reply.exception_code if reply.isError() else 0
                 if code not in GATEWAY_CODES:
                     self.silent.discard(unit)
@@ -251,7 +263,7 @@ class Bus:
                     raise Rejected(unit, code, address)
                 if reply.function_code != function:
                     given = reply.function_code
-                    raise BusError(f"unit {unit}: a reply of function {given}")
+                    raise BusError(f"unit {unit}: the reply is of function {given}")
             except Rejected:
                 raise  # a refusal is a whole reply
             except BusError:
@@ -310,14 +322,13 @@ class Bus:
                 self._client.close()
 
 
-def _why_closed(settings: BusSettings) -> str:
+def _why_closed(settings: BusSettings) -> tuple[str, str]:
+    """The reason, and what to do."""
     if settings.transport != "rtu":
-        return (
-            "nothing answers there, or its connections are all taken. Check power, "
-            "cable and address"
-        )
+        why = "nothing answers there, or all its connections are taken"
+        return why, "Check power, cable and address"
     if not os.path.exists(settings.device):
-        return "there is no such port. Is the adapter plugged in?"
+        return "there is no such port", "Plug in the adapter, or correct bus.device"
     if not os.access(settings.device, os.R_OK | os.W_OK):
-        return "this user may not open it. Join its group, often dialout"
-    return "held by another program. Is a session running?"
+        return "this user may not open it", "Join its group, often dialout"
+    return "held by another program", "Close that program"

@@ -64,7 +64,7 @@ def check_plan(config: RigConfig, targets: Iterable[Pulses]) -> None:
                     f"{axis.min_deg:g}..{axis.max_deg:g} deg"
                 )
     if faults:
-        raise LimitError("the plan leaves the limits: " + "; ".join(faults))
+        raise LimitError("outside the limits, nothing was sent: " + "; ".join(faults))
 
 
 class Heartbeat(threading.Thread):
@@ -103,7 +103,11 @@ class Heartbeat(threading.Thread):
                 self._stopper.stop(f"{late}, which the session did not answer")
                 return
             if self._moving and silence > self._silence_s:
-                self._stopper.stop(f"heartbeat lost for {silence:.2f} s while moving")
+                self._stopper.stop(
+                    f"this program paused for {silence:.2f} s while the device moved "
+                    f"(limit {self._silence_s:.2f}). Look for a computer that is "
+                    "overloaded or waits for its disk"
+                )
                 return
             if not self._moving and silence > self._keep_alive_s:
                 for drive in self._stopper.drives:
@@ -253,7 +257,7 @@ class Device:
         if status.fault:
             raise MotionFault(
                 f"{axis.name} is in alarm: {drive.alarm() or 'no code given'}. Find "
-                "the cause, then start again with --reset-alarms"
+                "its cause in the drive's manual, then start with --reset-alarms"
             )
         if status.moving:
             raise MotionFault(
@@ -270,7 +274,7 @@ class Device:
         if not axis.min_pulses - slack <= status.position <= axis.max_pulses + slack:
             raise MotionFault(
                 f"{axis.name} stands at {status.position} pulses, outside its limits "
-                f"{axis.min_pulses}..{axis.max_pulses}. Home it first"
+                f"{axis.min_pulses}..{axis.max_pulses}. Run `jaxcal-rig home`"
             )
 
     def guard(self, moving: bool = False) -> None:

@@ -88,8 +88,8 @@ class Drive:
                 text = self.alarm()
             text = text or "fault bit set"
             raise MotionFault(
-                f"{self.axis.name}: {text}. The drive has stopped itself: find the "
-                "cause, in its manual too, before you go on with --reset-alarms"
+                f"{self.axis.name}: {text}. The drive has stopped itself. Find the "
+                "cause in its manual, then go on with --reset-alarms"
             )
         return status
 

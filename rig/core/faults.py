@@ -26,6 +26,8 @@ class LimitError(Refused):
 class Fault(RuntimeError):
     """Bus, phone, journal or device failed: stop everything and latch."""
 
+    advice = ""  # what to do, where the text does not say so
+
 
 class MotionFault(Fault):
     """Something is wrong with the device."""
@@ -63,6 +65,11 @@ class PlanOnly(BaseException):
     """A dry run has come to the point where it would move."""
 
 
+def told(error: BaseException) -> str:
+    """What went wrong, and what to do."""
+    return ". ".join(filter(None, (str(error), getattr(error, "advice", ""))))
+
+
 def ending(error: BaseException, folder: pathlib.Path) -> tuple[int, str, str]:
     """Exit code, event and reason of a session in a folder that an error ended."""
     match error:
@@ -77,7 +84,7 @@ def ending(error: BaseException, folder: pathlib.Path) -> tuple[int, str, str]:
         case Refused():
             return EXIT_BAD_INPUT, "refused", str(error)
         case Fault() | JournalError():
-            return EXIT_FAULT, "fault", str(error)
+            return EXIT_FAULT, "fault", told(error)
         case OSError():
             text = f"cannot write to {folder}: {error.strerror or error}"
             return EXIT_FAULT, "fault", text

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from rig.config import AXIS_NAMES, RigConfig
 from rig.config.axis import Pulses
+from rig.config.config import differences
 from rig.core.attitude import Array, angle_between_deg, frame_at
 from rig.core.bus import BusError
 from rig.core.drive import Drive
@@ -48,24 +49,26 @@ def check_drives(
                 " Correct the one that is wrong; nothing was moved"
             )
     for state, fault in ((IDENTIFIED, _exchanged), (HOMED, _displaced)):
-        reasons = [fault(config, drive, record) for drive in drives]
-        if reason := "; ".join(filter(None, reasons)):
-            record.void(state, reason)
+        axes: dict[str, list[str]] = {}  # by what is wrong with them
+        for drive in drives:
+            axes.setdefault(fault(config, drive, record), []).append(drive.axis.name)
+        axes.pop("", None)
+        if axes:
+            reasons = (
+                f"{', '.join(names)}: {reason}" for reason, names in axes.items()
+            )
+            record.void(state, "; ".join(reasons))
         if lack := record.missing(config, state):
             raise Refused(lack)
 
 
 def _exchanged(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
     """What of a drive's identity differs from the record's."""
-    name = drive.axis.name
-    known = (record.state(IDENTIFIED) or {}).get("identity", {}).get(name, {})
+    evidence = record.state(IDENTIFIED) or {}
+    known = evidence.get("identity", {}).get(drive.axis.name, {})
     found = drive.identity() if known else {}
-    return "; ".join(
-        f"the drive of {name} is another one ({key}: {value} then, {found.get(key)} "
-        "now)"
-        for key, value in known.items()
-        if found.get(key) != value
-    )
+    changed = differences(known, {key: found.get(key) for key in known})
+    return f"another drive ({'; '.join(changed)})" if changed else ""
 
 
 def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
@@ -76,28 +79,28 @@ def _displaced(config: RigConfig, drive: Drive, record: DeviceRecord) -> str:
     if axis.map.absolute_encoder:
         return ""
     if status.fault:
-        return f"{axis.name} is in alarm: {drive.alarm() or 'no code given'}"
+        return f"in alarm: {drive.alarm() or 'no code given'}"
     if axis.name in homed:
         if not drive.says_homed:
-            return f"the homed bit of {axis.name} is gone: the drive was without power"
+            return "the homed bit is gone, so the drive was without power"
     elif left is None:
         return (
-            f"where {axis.name} was left is not known, as the last session could not "
-            "read it any more, and its drive does not say that it kept its power"
+            "the last session ended without reading where it stands, and the drive "
+            "does not say that it kept its power"
         )
     origins = (record.state(HOMED) or {}).get("origins", {})
     if drive.origin != origins.get(axis.name, drive.origin):
         return (
-            f"{axis.name} counts from {drive.origin} and no more from "
-            f"{origins[axis.name]}, where it was homed: it was without power"
+            f"its origin is {drive.origin} and was {origins[axis.name]} when it was "
+            "homed, so the drive was without power"
         )
     tolerance = axis.pulses_within(config.motion.position_tolerance_deg)
     if left is None or abs(status.position - left) <= tolerance:
         return ""
     return (
-        f"{axis.name} stands at {status.position} pulses, "
+        f"it stands at {status.position} pulses, "
         f"{abs(axis.to_deg(status.position - left)):.2f} deg from {left}, where it was "
-        "left: it was without power, or another controller moved it"
+        "left: the drive was without power, or another controller moved it"
     )
 
 
@@ -145,9 +148,9 @@ class KeptZero(NamedTuple):
             off = config.to_deg(np.subtract(pulses, self.pulses))
             if np.abs(off).max() > config.session.reference_tolerance_deg:
                 raise MotionFault(
-                    f"in its zero posture the device counts other pulses than for "
-                    f"{self.whose}: {axes_text(off)}. The drives have lost their "
-                    "origin, or this is not the zero posture"
+                    "in its zero posture the device counts other pulses than for "
+                    f"{self.whose}: {axes_text(off)}. Either this is not the zero "
+                    "posture, or the drives have lost their origin: home them"
                 )
         if self.attitude is None:
             return f"{self.whose} keeps no attitude of its zero posture: not compared"
@@ -198,7 +201,7 @@ def check_zero(config: RigConfig, then: Array, now: Array, whose: str) -> str:
     limit = config.session.reference_tolerance_deg
     angle, joints = moved(config, then, now)
     blind = unseen(config, then)
-    but = f"; {', '.join(blind)} turns about the vertical and is not seen" * bool(blind)
+    but = f"; not seen: {', '.join(blind)}, about the vertical" * bool(blind)
     if angle <= limit:
         return f"zero posture stands {angle:.3f} deg from that of {whose}{but}"
     raise MotionFault(
@@ -211,9 +214,7 @@ def check_zero(config: RigConfig, then: Array, now: Array, whose: str) -> str:
 
 def axes_text(joints: Sequence[float] | Array) -> str:
     """(3,) degrees in words, of the axes that moved most."""
-    told = TOLD_SHARE * np.abs(joints).max()
-    return ", ".join(
-        f"{name} stands {angle:+.2f} deg away from where it stood"
-        for name, angle in zip(AXIS_NAMES, joints, strict=True)
-        if abs(angle) >= told
-    )
+    least = TOLD_SHARE * np.abs(joints).max()
+    pairs = zip(AXIS_NAMES, joints, strict=True)
+    told = [f"{name} {angle:+.2f}" for name, angle in pairs if abs(angle) >= least]
+    return f"{', '.join(told)} deg from where it stood"

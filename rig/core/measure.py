@@ -90,7 +90,6 @@ def _settled(device: Device, deadline: float) -> list[Status]:
         now = time.monotonic()
         if any(status.moving for status in statuses):
             since = now
-        device.imu.check_fault()
         if not (reason := _unquiet(device, device.imu.since(since), now)):
             return statuses
         if now > deadline:
@@ -108,10 +107,13 @@ def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
     newest = readings[-1].time if readings else now
     before = sum(reading.time <= newest - settle.window_s for reading in readings)
     first = min(before - 1, len(readings) - settle.min_samples)
-    hint = "Check the phone's app and its Wi-Fi"
+    hint = f"Check the phone's app and its Wi-Fi{device.imu.dropped}"
     if first < 0:
         span = newest - readings[0].time if readings else 0.0
-        return f"{len(readings)} readings over {span:.2f} s of the window. {hint}"
+        return (
+            f"{len(readings)} readings over {span:.2f} s (wanted: settle.min_samples = "
+            f"{settle.min_samples} over {settle.window_s:g} s). {hint}"
+        )
     readings = readings[first:]
     if now - readings[-1].time > device.config.imu.stale_s:
         return f"the phone's readings are stale. {hint}"
@@ -127,9 +129,8 @@ def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
         if found[worst] > limit:
             return (
                 f"{AXIS_NAMES[worst]} reads {found[worst]:.3f} {unit} (settle.{what} = "
-                f"{limit:g}). The device or the phone still shakes, or the phone is "
-                "noisier than the limit: compare its scatter, `jaxcal-rig imu`, and "
-                "raise that key of [settle] above it"
+                f"{limit:g}). Either something still shakes, or the limit is below "
+                "the phone's noise: `jaxcal-rig imu` shows that; raise the key above it"
             )
     return ""
 
@@ -141,7 +142,6 @@ def _collect(device: Device, wanted: int) -> list[Reading]:
     deadline = start + settle.timeout_s * max(1.0, wanted / settle.samples)
     while True:
         device.guard()
-        imu.check_fault()
         readings = imu.since(start)
         if len(readings) >= wanted:
             return readings[:wanted]
@@ -152,8 +152,10 @@ def _collect(device: Device, wanted: int) -> list[Reading]:
         if now - polled > config.motion.poll_s:
             polled = now
             if any(status.moving for status in device.statuses()):
-                why = "a drive moves while the posture is measured"
-                raise MotionFault(f"{why}. Stop the other controller")
+                raise MotionFault(
+                    "a drive moves while the posture is measured. Stop the other "
+                    "controller"
+                )
         time.sleep(0.002)
 
 
@@ -178,8 +180,8 @@ def _check_agreement(
         worst = int(np.argmax(apart))
         raise MotionFault(
             f"the IMU reads {AXIS_NAMES[worst]} {apart[worst]:.1f} deg away from "
-            f"the command (limit {DISAGREEMENT_DEG:g}). Check zero, axis order and "
-            "signs"
+            f"the command (limit {DISAGREEMENT_DEG:g}). Check the zero posture, then "
+            "run `jaxcal-rig axes`"
         )
     seen = device.seen
     way = commanded - seen.commanded

@@ -92,7 +92,7 @@ def _send(device: Device, drive: Drive, start: Status, pulses: int) -> None:
             return drive.move(pulses)
         except BusError as error:
             if isinstance(error, Rejected) and error.code in (2, 3):
-                raise Unreachable(f"{axis.name} refused {pulses}: {error}") from None
+                raise Unreachable(f"{axis.name} to {pulses} pulses: {error}") from None
             if refusal(error):
                 drive.sound()  # an alarm says more than a refusal
                 raise
@@ -176,6 +176,6 @@ def _check_attitude(device: Device, connection: int) -> None:
         if not low <= angle <= high:
             raise MotionFault(
                 f"the IMU reads {axis.name} at {angle:.2f} deg, outside its "
-                f"envelope {low:.1f}..{high:.1f}. Check zero, axis order and "
-                "signs, and that the phone is fixed"
+                f"envelope {low:.1f}..{high:.1f}. Check the zero posture and that the "
+                "phone is fixed, then run `jaxcal-rig axes`"
             )

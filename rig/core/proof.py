@@ -39,12 +39,12 @@ TOO_FAR = 2.0  # times what checked axes are moved, and MARGIN_DEG: more is a fa
 MARGIN_DEG = 1.0
 SEEN_SHARE = 0.1  # of a checked axis's move must be seen, or the moves do not grow
 BLIND = (
-    "look for a loose coupling, a stream that does not change, or a reduction that is "
-    "far too small"
+    "The phone has shown no turn: look for a loose coupling, a stream that does not "
+    "change, or a reduction that is far too small"
 )
 NO_UNIT = (
-    "no angle of the phone is over 6.3, so it is not told whether imu.unit is right. "
-    "Turn the base, or the phone's heading, by some degrees"
+    "No angle of the phone is over 6.3, so it may be in radians or degrees: turn the "
+    "base, or the phone's heading, by some degrees"
 )
 RADIANS = 180.0 / math.pi
 LARGEST_RAD = 2.0 * math.pi + 0.1  # no larger number is an angle in radians
@@ -123,8 +123,8 @@ class Reach:
         if gone < most:
             return most - gone
         raise MotionFault(
-            f"unit {axis.unit} turned its motor by {gone / axis.motor_pulses(1.0):.3g} "
-            f"deg for {axis.name}, and the phone shows nothing to go on by: "
+            f"the motor of {axis.name} (unit {axis.unit}) was turned by "
+            f"{gone / axis.motor_pulses(1.0):.3g} deg, and may go no further unseen. "
             f"{BLIND if self.factor == 1 else NO_UNIT}"
         )
 

@@ -41,7 +41,8 @@ class UnitStop:
         state = "acknowledged" if self.acknowledged else "NOT acknowledged"
         rest = "standing" if self.standing else "NOT seen standing"
         detail = f" ({self.detail})" if self.detail else ""
-        return f"{self.axis} (unit {self.unit}): {state}, {rest}{detail}"
+        todo = "" if self.standing else ": use the emergency stop"
+        return f"{self.axis} (unit {self.unit}): {state}, {rest}{detail}{todo}"
 
 
 Pairs = list[tuple[Drive, UnitStop]]

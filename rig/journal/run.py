@@ -43,9 +43,7 @@ def _parse(data: bytes, path: pathlib.Path) -> tuple[list[Record], int]:
         if not whole:
             if number == len(lines) - 1 and not tail:
                 break  # the last line, whole but mangled: also torn
-            raise JournalError(
-                f"{path}: line {number + 1} is damaged; the run cannot be resumed"
-            )
+            raise JournalError(f"{path}: line {number + 1} is damaged; begin a new run")
         records.append(record)
         good += len(line) + 1
     return records, good
@@ -138,8 +136,9 @@ class Journal:
 
 JOURNAL = "journal.jsonl"
 SCHEMA = 2  # of the first record; runs of others are not read
-# A full disk must not keep a stop from the bus, nor from the console.
-SPARED = ("write", "stop", "comm_restored", "note")
+# A full disk must not keep a stop from the bus or the console, nor end the thread
+# that hears the phone.
+SPARED = ("write", "stop", "comm_restored", "note", "sender_refused")
 
 
 def new_run_folder(output: pathlib.Path, mode: str) -> pathlib.Path:

@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from jaxcal.arguments import Parser, at_least, exit_code
+from jaxcal.arguments import Parser, exit_code, number_type
 from jaxcal.files import atomic_write, require_writable_folder
 from jaxcal.progress import Progress
 
@@ -157,7 +157,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add = parser.add_argument
     folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
     add("--quick", action="store_true", help="fewer episodes, draws and devices")
-    seed: dict[str, Any] = {"type": at_least(0), "metavar": "S"}
+    seed: dict[str, Any] = {"type": number_type(int, 0), "metavar": "S"}
     add("--seed", default=0, help="of everything random; 0", **seed)
     add("--data", help="real recordings for Datasets 4 and 5", **folder)
     add("--studies", help="kept runs; the repository's studies", **folder)

@@ -165,7 +165,7 @@ FLAT[1, :, 2] = 1.0
         (["--k", "x"], "--k: must be a whole number of at least 1, got 'x'"),
         (["--episodes", "0"], "--episodes: must be a whole number"),
         (["--seed", "-1"], "--seed: must be a whole number of at least 0"),
-        (["--time-limit", "nan"], "--time-limit: must be seconds above 0"),
+        (["--time-limit", "nan"], "--time-limit: must be a number of at least 0.001"),
         (["--methods", "best"], "method must be one of policy, .* got 'best'"),
         (["--methods", ""], "at least one method"),
         (["--dataset", "dataset7"], "--dataset must be one of .* got 'dataset7'"),

@@ -16,7 +16,6 @@ import pytest
 from jaxcal.learning.core import network as networks
 from jaxcal.learning.policies import decoding
 from jaxcal.learning.policies.compact import build
-from jaxcal.learning.policies.features import remaining
 from jaxcal.learning.policies.networks import NetworkConfig
 from jaxcal.learning.training import checkpoint
 from jaxcal.paper.network import HEADS
@@ -201,45 +200,6 @@ def test_the_last_pair_is_the_best_one_unless_little_is_spanned(rng, k, close):
     assert 0.5 < exact.mean() < 0.95 if close else exact.all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("lookahead", [1, pytest.param(3, marks=slow)])
-def test_a_loop_over_like_choices_chooses_as_if_written_out(rng, lookahead):
-    config = NetworkConfig(width=8, encoder_rounds=1, lookahead=lookahead)
-    network, params = made(config)
-    points = jnp.asarray(rng.normal(size=(50, 15, 2)), jnp.float32)
-    free = jnp.asarray(rng.uniform(size=(50, 15)) < 0.8)
-    free = free.at[:, :10].set(True)
-    k = 6 + lookahead
-    features = jax.jit(network.candidate_features)(points, free)
-    memory = networks.encode(network, params, features)
-    shared = network.shares_program(features, k)
-    # Of K = 7: 3 to 5 chosen, as the last two are one choice. Of 9: 3 to 6.
-    assert list(shared) == {1: [3, 4, 5], 3: [3, 4, 5, 6]}[lookahead]
-    nothing = jnp.zeros((50, 0), jnp.int32)
-    found = decoding.choose(
-        network, params, points, free, nothing, jax.random.key(0), k=k
-    )
-    chosen, left = jnp.full((50, k), -1, jnp.int32), free
-    for count in range(k):
-        if count in shared:
-            known = remaining(features, chosen, count)
-            traced = remaining(features, chosen, jnp.asarray(count))
-            for part in ("vectors", "log_det", "progress"):
-                np.testing.assert_allclose(
-                    getattr(known, part), getattr(traced, part), atol=2e-5
-                )
-        logits, _ = decoding.logits_at(
-            network, params, features, memory, chosen, left, count
-        )
-        taken = logits.argmax(-1)
-        chosen = chosen.at[:, count].set(taken)
-        left = left & ~jax.nn.one_hot(taken, 15, dtype=bool)
-    # Look-aheads that end in the same set tie; which comes first is rounding.
-    assert (np.sort(found) == np.sort(chosen)).all(axis=1).mean() >= 0.9
-    assert jnp.take_along_axis(free, found, axis=1).all()
-    assert (np.diff(np.sort(found)) > 0).all()
-
-
 def test_a_close_up_tells_near_equal_look_aheads_apart(rng):
     network = build(CLOSE)
     points = jnp.asarray(rng.uniform(size=(1, 12, 3)), jnp.float32)
@@ -247,7 +207,7 @@ def test_a_close_up_tells_near_equal_look_aheads_apart(rng):
     vectors = jax.jit(network.candidate_features)(points, free).vectors
     plain = jax.jit(build(SMALL).candidate_features)(points, free).vectors
     np.testing.assert_allclose(vectors.columns[..., :13], plain.columns, atol=1e-6)
-    shown, behind = np.asarray(vectors.columns)[0, :, 13:], vectors.ahead[0, :, 3]
+    shown, behind = np.asarray(vectors.columns)[0, :, 13:], vectors.to_the_end[0]
     best = int(np.argmax(behind))
     assert (shown[best] == 1.0).all() and shown.shape == (12, 3)
     for scale, column in zip((32.0, 256.0, 2048.0), shown.T, strict=True):

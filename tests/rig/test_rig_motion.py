@@ -279,7 +279,8 @@ def test_readings_that_come_in_bursts_settle_over_more_than_the_window(moves):
     turns = [[5.0 * moves * (time < 0.25), 0.0, 0.0] for time in times]
     matrices = euler_to_matrix(turns, "ZYX")
     readings = [Reading(*each) for each in zip(times, matrices, strict=True)]
-    device = SimpleNamespace(config=config, frame=None)
+    imu = SimpleNamespace(dropped="")
+    device = SimpleNamespace(config=config, frame=None, imu=imu)
     found = _unquiet(device, readings, now=0.35)
     assert "std_deg" in found if moves else found == ""
     assert "10 readings over 0.00 s" in _unquiet(device, readings[-10:], now=0.35)
@@ -334,7 +335,7 @@ def test_a_missed_deadline_stops(monkeypatch):
 
 def test_a_refused_target_is_out_of_reach_and_latches_nothing():
     with bench(travel_deg=(-15, 15)) as motion:
-        with pytest.raises(Unreachable, match="refused"):
+        with pytest.raises(Unreachable, match="answered exception 3"):
             motion.move_to(motion.config.to_pulses([0, 19, 0]), "x")
         motion.device.stopper.stop("out of reach", latch=False)
         motion.move_to(motion.config.to_pulses([0, 5, 0]), "y")
@@ -379,12 +380,12 @@ def test_a_lost_heartbeat_stops_the_drives():
         ):
             drive.move(pulses)
         motion.device.heartbeat.feed(moving=True)  # and then the loop falls silent
-        end = time.monotonic() + 5
+        end = time.monotonic() + 60
         while not motion.device.stopper.reason:
             assert time.monotonic() < end
             time.sleep(0.01)
-        assert "heartbeat" in motion.device.stopper.reason
-        end = time.monotonic() + 5
+        assert "this program paused for" in motion.device.stopper.reason
+        end = time.monotonic() + 60
         while not motion.device.stopper.results:
             assert time.monotonic() < end
             time.sleep(0.01)

@@ -255,7 +255,7 @@ def test_stop_ends_the_session_that_moves_and_then_stops_every_unit(
         said = capsys.readouterr().out
         assert f"held by `calibrate` in {tmp_path}" in said
         assert f"process {child.pid}" in said and "told to stop now" in said
-        assert "it has no drive armed any more, as it says" in said
+        assert "it reported that all its drives stand" in said
         assert said.count("acknowledged, standing") == 3
         assert child.wait(10) == 128 + signal.SIGTERM
     assert not any(drive.moving for drive in rig.drives)
@@ -299,7 +299,7 @@ def test_a_suspended_session_is_ended_and_its_drives_are_stopped(
                 for drive in sim.drives
             )
             said = done.stdout
-            assert "it is ended now" in said and "it has not said that" in said
+            assert "it is killed now" in said and "it did not report" in said
             assert said.count("acknowledged, standing") == 3
             assert child.wait(5) == -signal.SIGKILL
         assert not any(drive.moving for drive in sim.drives)

@@ -114,9 +114,11 @@ def test_the_console_shows_what_the_library_logs(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     log = logging.getLogger("jaxcal.selection.exact")
-    monkeypatch.setattr(
-        "jaxcal.commands.questions.select", lambda arguments: log.info("said once")
-    )
+
+    def said(file: str, *, k: int) -> None:
+        log.info("said once")
+
+    monkeypatch.setattr("jaxcal.commands.questions.select", said)
     for _ in range(2):
         assert main(["select", "-", "-k", "4"]) == 0
         assert capsys.readouterr() == ("", "said once\n")

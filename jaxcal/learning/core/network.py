@@ -43,7 +43,7 @@ class Network(nn.Module):
         features: Any,
         chosen: jax.Array,
         available: jax.Array,
-        count: int | jax.Array,
+        count: int,
     ) -> Any:
         """Of the decision after ``count`` choices.
 
@@ -51,14 +51,9 @@ class Network(nn.Module):
             features: from ``candidate_features``.
             chosen: (..., K) int, -1 from ``count`` on.
             available: (..., M) bool.
-            count: traced only where it is in ``shares_program``.
+            count: choices made.
         """
         raise NotImplementedError(_OWN)
-
-    def shares_program(self, features: Any, k: int) -> range:
-        """Numbers of choices made, out of K, at which the next choice compiles to the
-        same program; ``decision_features`` takes them traced. None by default."""
-        return range(0)
 
     def encode(self, features: Any) -> jax.Array:
         """(..., M, width) memory of a set."""

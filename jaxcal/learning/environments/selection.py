@@ -59,9 +59,9 @@ class SelectionConfig:
 
     def __post_init__(self) -> None:
         require(self, "at least 1", lambda v: v >= 1, "num_inputs", "num_outputs")
-        least, most = self.num_regressors, self.num_candidates
+        least, end = self.num_regressors, self.num_candidates
         require(
-            self, f"in [{least}, {most})", lambda v: least <= v < most, "num_selected"
+            self, f"in [{least}, {end})", lambda v: least <= v < end, "num_selected"
         )
         require(self, "positive", lambda v: v > 0, "reward_scale")
 

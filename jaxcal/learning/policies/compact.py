@@ -15,7 +15,7 @@ from jaxcal.learning.policies.features import (
     DecisionFeatures,
     VectorFeatures,
     close_up_of,
-    remaining,
+    decision_features,
     vector_features,
 )
 from jaxcal.learning.policies.networks import GROUP, NetworkConfig
@@ -130,29 +130,13 @@ class CompactNetwork(Network):
         features: CandidateFeatures,
         chosen: jax.Array,
         available: jax.Array,
-        count: int | jax.Array,
+        count: int,
     ) -> DecisionFeatures:
         """The geometry of a decision; arguments as in ``Network``."""
-        left, depth = remaining(features, chosen, count), self.config.lookahead
-        if isinstance(count, int):
-            depth = min(depth, chosen.shape[-1] - count)
-        vectors = vector_features(
-            left.vectors, left.spanned, available, depth, self.config.close_up
+        config = self.config
+        return decision_features(
+            features, chosen, available, count, config.lookahead, config.close_up
         )
-        return DecisionFeatures(
-            vectors,
-            chosen=left.chosen.sum(-2) / jnp.maximum(count, 1),
-            reached=left.log_det + vectors.best[..., 3],
-            progress=left.progress,
-        )
-
-    def shares_program(self, features: CandidateFeatures, k: int) -> range:
-        """Numbers of choices made, out of K, at which the next choice compiles to the
-        same program: the chosen span the space, and the end does not cut the look-ahead
-        short."""
-        p = features.whitened.shape[-1]
-        ahead = max(self.config.lookahead, self.num_unlearned + 1)
-        return range(p, k - ahead + 1) if k > p else range(0)
 
     def encode(self, features: CandidateFeatures) -> jax.Array:
         """Embed a set: (..., M, width)."""
@@ -185,9 +169,9 @@ class CompactNetwork(Network):
             g = layer(g, vectors)
         g = self.final_norm(g)
         # How far to believe the greedy look ahead is learned.
-        rule = 20.0 * vectors.ahead[..., 3]
+        rule = 20.0 * vectors.to_the_end
         if self.config.close_up:
-            rule = rule + close_up_of(vectors.ahead[..., 3]).sum(-1)
+            rule = rule + close_up_of(vectors.to_the_end).sum(-1)
         logits = self.actor(g)[..., 0] + self.trust * rule
         logits = mask_logits(logits, active)
         weight = active[..., None].astype(g.dtype)
@@ -203,7 +187,7 @@ class CompactNetwork(Network):
     ) -> tuple[jax.Array, jax.Array]:
         """Logits and value of a choice that needs no parameters."""
         vectors = decision.vectors
-        logits = mask_logits(_SHARP * vectors.ahead[..., 3], vectors.active)
+        logits = mask_logits(_SHARP * vectors.to_the_end, vectors.active)
         return logits, decision.reached
 
 

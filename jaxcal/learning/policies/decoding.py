@@ -35,10 +35,8 @@ def complete(
     key: jax.Array | None,
 ) -> jax.Array:
     """Choose from position ``first`` to the end; by sampling where a key is given."""
-    k, m = chosen.shape[-1], available.shape[-1]
-
-    def next_one(position: Any, carry: Any) -> Any:
-        chosen, available, key = carry
+    m = available.shape[-1]
+    for position in range(first, chosen.shape[-1]):
         logits, _ = logits_at(
             network, params, features, memory, chosen, available, position
         )
@@ -48,21 +46,8 @@ def complete(
             key, key_action = jax.random.split(key)
             action = jax.random.categorical(key_action, logits)
         chosen = chosen.at[:, position].set(action.astype(chosen.dtype))
-        return chosen, available & ~jax.nn.one_hot(action, m, dtype=bool), key
-
-    # Written out, except where many choices are the same program: K = 50 would
-    # otherwise take minutes to compile.
-    shared = network.shares_program(features, k)
-    carry = (chosen, available, key)
-    position = first
-    while position < k:
-        if position in shared and position + 1 in shared:
-            carry = jax.lax.fori_loop(position, shared.stop, next_one, carry)
-            position = shared.stop
-        else:
-            carry = next_one(position, carry)
-            position += 1
-    return carry[0]
+        available = available & ~jax.nn.one_hot(action, m, dtype=bool)
+    return chosen
 
 
 def logits_at(
@@ -72,18 +57,14 @@ def logits_at(
     memory: Any,
     chosen: jax.Array,
     available: jax.Array,
-    count: int | jax.Array,
+    count: int,
 ) -> tuple[jax.Array, jax.Array]:
     """(B, M) logits and (B,) value of the decision after ``count`` choices.
 
-    Without ``params`` every choice is the look-ahead's. ``count`` may be traced where
-    it is in ``network.shares_program``.
+    The last ``network.num_unlearned`` choices are the look-ahead's.
     """
     decision = network.decision_features(features, chosen, available, count)
-    last = isinstance(count, int) and (
-        chosen.shape[-1] - count <= network.num_unlearned
-    )
-    if params is None or last:
+    if chosen.shape[-1] - count <= network.num_unlearned:
         return network.lookahead_logits(decision)
     return networks.decode(network, params, memory, decision)
 
@@ -130,12 +111,12 @@ def choose(
     free = available.at[rows, required].set(False)
     features = network.candidate_features(candidates, usable)
     memory = networks.encode(network, params, features)
-    finish = functools.partial(complete, network, params, features, memory)
+    completed = functools.partial(complete, network, params, features, memory)
     if decoding == "greedy" or num_required == k:
-        return finish(chosen, free, num_required, None)
+        return completed(chosen, free, num_required, None)
     if decoding == "samples":
         keys = jax.random.split(key, num)
-        tries = jax.vmap(lambda key: finish(chosen, free, num_required, key))(keys)
+        tries = jax.vmap(lambda key: completed(chosen, free, num_required, key))(keys)
     else:
         logits, _ = logits_at(
             network, params, features, memory, chosen, free, num_required
@@ -149,7 +130,7 @@ def choose(
         def with_first(first: jax.Array) -> jax.Array:
             begun = chosen.at[:, num_required].set(first)
             rest = free & ~jax.nn.one_hot(first, m, dtype=bool)
-            return finish(begun, rest, num_required + 1, None)
+            return completed(begun, rest, num_required + 1, None)
 
         tries = jax.vmap(with_first)(firsts.T)
     values = jax.vmap(lambda tried: log_det_of(candidates, tried))(tries)

@@ -14,12 +14,13 @@ import jax.numpy as jnp
 from jaxcal.learning.policies import geometry
 
 __all__ = [
+    "AHEAD",
+    "FEATURES",
     "CandidateFeatures",
     "DecisionFeatures",
-    "Remaining",
     "VectorFeatures",
     "close_up_of",
-    "remaining",
+    "decision_features",
     "vector_features",
 ]
 
@@ -27,17 +28,34 @@ _FLOOR = -8.0  # least log-volume, relative to the best, that a feature can show
 _RIDGE = 0.01  # of the mean square of a whitened coordinate, which is one
 _CLOSE = (32.0, 256.0, 2048.0)  # scales at which near-equal look-aheads differ
 
+AHEAD = ("gain", "best pair", "greedy triple", "greedy to the end")
+"""Choices that a look-ahead makes: 1, 2, 3 and all to the end."""
+FEATURES = (
+    *(f"half of {name}" for name in AHEAD),
+    *(f"exp of {name}" for name in AHEAD),
+    *(f"exp of 4 x {name}" for name in AHEAD),
+    "half of the squared length's log, less the mean's",
+    *(f"exp of {scale:g} x {AHEAD[-1]}" for scale in _CLOSE),  # where asked for
+)
+"""Columns of a candidate; the log-volumes ahead are relative to the best candidate's.
+``selection/policy/kernel.py`` writes the same."""
+
 
 class VectorFeatures(NamedTuple):
     """What the network reads of one vector a candidate, and of all of them together."""
 
-    columns: jax.Array  # (..., M, 13), with close-ups (..., M, 16)
+    columns: jax.Array  # (..., M, F) FEATURES, without close-ups all but the last three
     moments: jax.Array  # (..., M, p (p + 1) / 2) products of coordinates, scaled so
     # that messages keep their size whatever M is
     active: jax.Array  # (..., M) bool, which candidates count
-    ahead: jax.Array  # (..., M, 4) log-volume after 1, 2, 3 and all greedy choices that
+    ahead: jax.Array  # (..., M, 4) AHEAD: log-volume after the greedy choices that
     # begin with this candidate, relative to the best candidate's
     best: jax.Array  # (..., 4) that of the best candidate
+
+    @property
+    def to_the_end(self) -> jax.Array:
+        """(..., M) the last of ``ahead``."""
+        return self.ahead[..., -1]
 
 
 class CandidateFeatures(NamedTuple):
@@ -58,50 +76,50 @@ class DecisionFeatures(NamedTuple):
     # left / p, whether K > p
 
 
-class Remaining(NamedTuple):
-    """What is left of a set after ``count`` choices."""
-
-    vectors: jax.Array  # (..., M, p) conditional vectors; their size is the gain
-    spanned: bool  # whether a choice multiplies det by 1 + |y|^2, else by |y|^2
-    log_det: jax.Array  # (...,) log det(Z.T Z) of the chosen
-    progress: jax.Array  # (..., 7) as in DecisionFeatures
-    chosen: jax.Array  # (..., c, M) one-hot choices; c = count, K where that is traced
-
-
-def remaining(
-    features: CandidateFeatures, chosen: jax.Array, count: int | jax.Array
-) -> Remaining:
-    """What is left of a set after ``count`` choices.
+def decision_features(
+    features: CandidateFeatures,
+    chosen: jax.Array,
+    available: jax.Array,
+    count: int,
+    lookahead: int,
+    close_up: bool,
+) -> DecisionFeatures:
+    """What is left of a set after ``count`` choices, the same for the whole batch.
 
     Args:
         features: of the set.
         chosen: (..., K) int, of which the first ``count`` are chosen, the rest -1.
-        count: the same for the whole batch. Traced only where the chosen span the space
-            and the look-ahead is not cut short by the end.
+        available: (..., M) bool.
+        count: choices made.
+        lookahead: most greedy choices to look ahead.
+        close_up: as for ``vector_features``.
     """
     x = features.whitened
     p, total = x.shape[-1], chosen.shape[-1]
     left = total - count
-    shown = chosen[..., :count] if isinstance(count, int) else chosen
-    which = jax.nn.one_hot(shown, x.shape[-2], dtype=x.dtype)
+    which = jax.nn.one_hot(chosen[..., :count], x.shape[-2], dtype=x.dtype)
     picked = jnp.einsum(
         "...km,...mp->...kp", which, x, precision=jax.lax.Precision.HIGHEST
     )
+    # A choice multiplies the determinant by |y|^2, or by 1 + |y|^2.
     if total == p:
         # Every choice is a new direction: exact projections.
-        y, spanned = geometry.projected(x, picked), False
-        so_far = geometry.log_det_lengths(picked)
+        y, so_far = geometry.projected(x, picked)
     else:
         # The metric of the chosen; until they span the space, with a ridge small
         # beside what a posture contributes.
-        ridge = _RIDGE if isinstance(count, int) and count < p else 0.0
-        y, so_far = geometry.normalised_by(x, picked, ridge)
-        spanned = True
+        y, so_far = geometry.normalised_by(x, picked, _RIDGE if count < p else 0.0)
+    depth = min(lookahead, left)
+    vectors = vector_features(y, total != p, available, depth, close_up)
     ends = (left == 1, left == 2, left == 3, 1.0 / left)
-    shares = (count / p, jnp.minimum(left / p, 3.0), total > p)
-    numbers = [jnp.asarray(number, x.dtype) for number in (*ends, *shares)]
-    progress = jnp.broadcast_to(jnp.stack(numbers), (*so_far.shape, len(numbers)))
-    return Remaining(y, spanned, features.offset + so_far, progress, which)
+    shares = (count / p, min(left / p, 3.0), total > p)
+    numbers = jnp.asarray([*ends, *shares], x.dtype)
+    return DecisionFeatures(
+        vectors,
+        chosen=which.sum(-2) / max(count, 1),
+        reached=features.offset + so_far + vectors.best[..., -1],
+        progress=jnp.broadcast_to(numbers, (*so_far.shape, len(numbers))),
+    )
 
 
 def close_up_of(ahead: jax.Array) -> jax.Array:

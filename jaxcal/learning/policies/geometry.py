@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from jaxcal.learning.small_matrices import cholesky, solve_lower
 
 __all__ = [
-    "log_det_lengths",
     "lookahead",
     "normalised_by",
     "projected",
@@ -51,58 +50,37 @@ def whiten(candidates: jax.Array, usable: jax.Array) -> tuple[jax.Array, jax.Arr
     return jnp.concatenate([white, weight[..., None]], axis=-1), offset
 
 
-def projected(x: jax.Array, chosen: jax.Array) -> jax.Array:
+def projected(x: jax.Array, chosen: jax.Array) -> tuple[jax.Array, jax.Array]:
     """What is left of every vector once the chosen ones are projected out.
+
+    A chosen vector in the span of those before it is left out.
 
     Args:
         x: (..., M, p).
-        chosen: (..., c, p) vectors chosen so far.
+        chosen: (..., c, p) vectors chosen so far, c <= p.
 
     Returns:
-        (..., M, p); squared lengths are the Schur-complement gains.
+        (..., M, p), whose squared lengths are the Schur-complement gains; and (...,)
+        the log of the squared volume that the chosen span, 0 where nothing is chosen.
     """
-    p = x.shape[-1]
-    rest = [x[..., i] for i in range(p)]
-    for e, _ in _orthogonal(chosen):
-        wide = [b[..., None] for b in e]
-        along = _dot(rest, wide)
-        rest = [a - along * b for a, b in zip(rest, wide, strict=True)]
-    return jnp.stack(rest, axis=-1)
-
-
-def log_det_lengths(chosen: jax.Array) -> jax.Array:
-    """Log of the squared volume that up to p chosen vectors span.
-
-    Args:
-        chosen: (..., c, p), c <= p.
-
-    Returns:
-        (...,) 0 where nothing is chosen.
-    """
-    squares = [jnp.log(jnp.maximum(square, 1e-9)) for _, square in _orthogonal(chosen)]
-    return sum(squares, jnp.zeros(chosen.shape[:-2], chosen.dtype))
-
-
-def _orthogonal(chosen: jax.Array) -> list[tuple[list[jax.Array], jax.Array]]:
-    """Unit vectors that span the chosen (..., c, p), and the square of what was left.
-
-    A vector in the span of those before it becomes zero. Component by component: XLA's
-    CPU backend (jaxlib 0.10.2) computes the reduction form wrongly where one side is
-    shared by a vmapped axis and the other is not.
-    """
-    basis: list[tuple[list[jax.Array], jax.Array]] = []
+    rest = [x[..., i] for i in range(x.shape[-1])]
+    basis: list[list[jax.Array]] = []
+    volume = jnp.zeros(chosen.shape[:-2], chosen.dtype)
     for j in range(chosen.shape[-2]):
         v = [chosen[..., j, i] for i in range(chosen.shape[-1])]
         scale = _dot(v, v)
-        for e, _ in basis:
+        for e in basis:
             along = _dot(v, e)
             v = [a - along * b for a, b in zip(v, e, strict=True)]
         square = _dot(v, v)
+        volume = volume + jnp.log(jnp.maximum(square, 1e-9))
         independent = square > 1e-9 * scale
         factor = jax.lax.rsqrt(jnp.where(independent, square, 1.0))
-        factor = jnp.where(independent, factor, 0.0)
-        basis.append(([a * factor for a in v], square))
-    return basis
+        basis.append([a * jnp.where(independent, factor, 0.0) for a in v])
+        wide = [b[..., None] for b in basis[-1]]
+        along = _dot(rest, wide)
+        rest = [a - along * b for a, b in zip(rest, wide, strict=True)]
+    return jnp.stack(rest, axis=-1), volume
 
 
 def _dot(a: list[jax.Array], b: list[jax.Array]) -> jax.Array:

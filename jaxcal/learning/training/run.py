@@ -2,9 +2,9 @@
 
 A run folder holds ``metrics.csv`` (a row for each update; means where several seeds run
 side by side), ``seeds.csv`` (then: what each measured at every look),
-``last_rewards.npy`` (the rewards of the last 1,000 episodes), TensorBoard event files
-and ``checkpoint/``. The loop is on the host, over calls of several updates each, so
-that progress is printed while it runs and a signal stops it between two calls.
+``last_rewards.npy`` (the rewards of the last 1,000 episodes) and ``checkpoint/``. The
+loop is on the host, over calls of several updates each, so that progress is printed
+while it runs and a signal stops it between two calls.
 """
 
 from __future__ import annotations
@@ -227,8 +227,6 @@ class _Diary:
     recent: np.ndarray  # the last rewards
 
     def __post_init__(self) -> None:
-        from tensorboardX import SummaryWriter  # 0.2 s; loads PyTorch where installed
-
         recipe = self.recipe
         first = ("update", recipe.config.ppo.unit, "seconds", "reward_mean")
         self._columns = (*first, *recipe.columns, *_LOSSES, *recipe.measured)
@@ -238,7 +236,6 @@ class _Diary:
         if recipe.config.num_seeds > 1:
             path = self.root / "seeds.csv"
             self._seeds = _table(path, self.reported, self._seed_columns)
-        self._events = SummaryWriter(str(self.root), flush_secs=30)
         self._begun = self._looked = self._saved = time.perf_counter()
         self._noted = self._begun
         self._each: list[dict[str, float]] = []  # of every seed, at the last look
@@ -268,11 +265,6 @@ class _Diary:
             if number == count - 1:
                 self._look(state, row)
             _add(self._rows, self._columns, row)
-            for name in set(self._columns) & set(row) - {
-                "update",
-                config.ppo.unit,
-            }:
-                self._events.add_scalar(name, row[name], done)
         self._noted = now
         if now - self._saved > config.save_every:
             self._saved = now
@@ -339,7 +331,6 @@ class _Diary:
             file.flush()
             os.fsync(file.fileno())
             file.close()
-        self._events.close()
 
 
 def _begin(

@@ -74,17 +74,17 @@ class Arm:
 
     @property
     def nominal(self) -> Array:
-        """(p,) table, gears, compliance, harmonics, base, tool, the sensor's own."""
+        """(p,) table, gears, compliance, base, tool, the sensor's own, harmonics."""
         return np.concatenate(
             [
                 self.table.ravel(),
                 np.ones(len(self.gears)),
                 self.yields,
-                self.waves.ravel(),
                 self.base[:3, 3],
                 np.zeros(3),
                 np.concatenate([self.tool[:3, 3], np.zeros(3)])[self._tool],
                 self.sensor.nominal,
+                self.waves.ravel(),
             ]
         )
 
@@ -158,9 +158,9 @@ class Arm:
             [
                 (first[:, None] + _ORDER[self.convention]).ravel(),
                 moved[[i - 1 for i in (*self.gears, *self.compliance)]],
-                np.repeat(moved[[i - 1 for i in self.harmonics]], 4),
                 np.arange(6),
                 tool + np.array([0, 1, 2, 4, 5, 6])[self._tool],
+                np.repeat(moved[[i - 1 for i in self.harmonics]], 4),
             ]
         )
 
@@ -171,21 +171,21 @@ class Arm:
 
     def _split(self, parameters: Array) -> tuple[Array, Array, Array]:
         """Base (6,), tool (6,) and the sensor's own (s,)."""
-        last = len(parameters) - self._owned
+        end = len(parameters) - self.waves.size
+        last = end - self._owned
         first = last - len(self._tool)
         tool = np.concatenate([self.tool[:3, 3], np.zeros(3)])
         tool[self._tool] = parameters[first:last]
-        return parameters[first - 6 : first], tool, parameters[last:]
+        return parameters[first - 6 : first], tool, parameters[last:end]
 
     def _drives(self, parameters: Array) -> tuple[Array, Array, Array]:
         """Gear ratios (n,) of all joints, compliance (C,) and waves (H, 4)."""
         first = 5 * len(self.joints)
         last = first + len(self.gears)
-        end = last + len(self.compliance)
         ratios = np.ones(len(self.joints))
         ratios[[i - 1 for i in self.gears]] = parameters[first:last]
-        waves = parameters[end : end + 4 * len(self.harmonics)].reshape(-1, 4)
-        return ratios, parameters[last:end], waves
+        waves = parameters[len(parameters) - self.waves.size :].reshape(-1, 4)
+        return ratios, parameters[last : last + len(self.compliance)], waves
 
     def _swing(self, commands: Array, parameters: Array) -> tuple[Array, Array]:
         """(H, 4, N) sin, cos of the joints and of twice them; (n, N) what they add.

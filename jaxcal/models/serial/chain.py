@@ -52,10 +52,10 @@ class SerialChain(Arm):
     misalignment by small numbers (Hayati).
 
     Parameters, in this order: ``a1 alpha1 d1 theta1 beta1 a2 ...``; ``gear1 ...`` and
-    ``compliance1 ...`` and ``theta1 sin``, ``cos``, ``sin2``, ``cos2`` ... of those
-    asked for; ``base x``, ``y``, ``z``, ``rx``,
-    ``ry``, ``rz``; what the sensor sees of ``tool x``, ``y``, ``z``, ``rx``, ``ry``,
-    ``rz``; the sensor's own. The turns of base and tool are relative to their nominal
+    ``compliance1 ...`` of those asked for; ``base x``, ``y``, ``z``, ``rx``, ``ry``,
+    ``rz``; what the sensor sees of ``tool x``, ``y``, ``z``, ``rx``, ``ry``, ``rz``;
+    the sensor's own; ``theta1 sin``, ``cos``, ``sin2``, ``cos2`` ... of the harmonics
+    asked for, always last. The turns of base and tool are relative to their nominal
     rotation. Commands are the joints, then the columns that the sensor asks for.
 
     Made by :meth:`from_dh` and :meth:`from_urdf`.
@@ -501,10 +501,10 @@ class SerialChain(Arm):
             *(f"{column}{i + 1}" for i in range(n) for column in _COLUMNS),
             *(f"gear{i}" for i in self.gears),
             *(f"compliance{i}" for i in self.compliance),
-            *(f"theta{i} {wave}" for i in self.harmonics for wave in _WAVES),
             *(f"base {axis}" for axis in mounting),
             *(f"tool {axis}" for axis in self.sensor.tool),
             *self.sensor.names,
+            *(f"theta{i} {wave}" for i in self.harmonics for wave in _WAVES),
         )
 
     @property
@@ -515,10 +515,10 @@ class SerialChain(Arm):
             *["length", "deg", "length", "deg", "deg"] * len(self.joints),
             *["ratio"] * len(self.gears),
             *["deg per torque"] * len(self.compliance),
-            *["deg"] * 4 * len(self.harmonics),
             *mounting,
             *(mounting[i] for i in self._tool),
             *self.sensor.units,
+            *["deg"] * self.waves.size,
         )
 
     def predict(
@@ -549,11 +549,12 @@ class SerialChain(Arm):
         if self.compliance:
             torque = self._torque(commands)[0].T
             columns[..., last : last + len(self.compliance)] *= torque[:, None]
-        if self.harmonics:
-            first = last + len(self.compliance)
-            last = first + 4 * len(self.harmonics)
-            columns[..., first:last] *= swing.reshape(last - first, -1).T[:, None]
-        return np.concatenate([columns, own], axis=-1)
+        if not self.harmonics:
+            return np.concatenate([columns, own], axis=-1)
+        waves = swing.reshape(self.waves.size, -1).T[:, None]
+        waves = waves * columns[..., -self.waves.size :]
+        columns = columns[..., : -self.waves.size]
+        return np.concatenate([columns, own, waves], axis=-1)
 
     def command_jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
@@ -585,8 +586,9 @@ class SerialChain(Arm):
         parameters = as_parameters(self, parameters)
         own = self._split(parameters)[2]
         off, rows = self.sensor.facts(own)
-        before = np.zeros((len(off), len(parameters) - len(own)))
-        return off, np.hstack([before, rows])
+        after = np.zeros((len(off), self.waves.size))
+        before = np.zeros((len(off), len(parameters) - len(own) - self.waves.size))
+        return off, np.hstack([before, rows, after])
 
     def default_noise(self) -> Noise:
         """What ``select`` takes where no noise is given: the sensor's."""
@@ -607,10 +609,10 @@ class SerialChain(Arm):
                 *joint * len(self.joints),
                 *[_GEAR] * len(self.gears),
                 *[_SAG / torque if torque else np.inf] * len(self.compliance),
-                *[_WAVE] * 4 * len(self.harmonics),
                 *mounting,
                 *(mounting[i] for i in self._tool),
                 *self.sensor.prior_std(length),
+                *[_WAVE] * self.waves.size,
             ],
             fixed=self.sensor.unseen(self),
             by_data=self.sensor.sizes_prior,

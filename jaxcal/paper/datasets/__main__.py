@@ -9,19 +9,18 @@ import json
 import pathlib
 import platform
 import sys
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Annotated, Any
 
 import numpy as np
 
-from jaxcal.arguments import Parser, at_least, exit_code, flag, several
+from jaxcal.arguments import Parser, exit_code, several, values_of
 from jaxcal.evaluation.dataset import Dataset
-from jaxcal.evaluation.dataset_files import save_csv_parts, save_npz
+from jaxcal.evaluation.dataset_files import save_csv, save_npz
 from jaxcal.files import require_writable_folder, write_text
 from jaxcal.paper.constants import (
     AXES,
     BIAS_DEG,
-    BLOCK,
     EPISODES,
     NAMES,
     NOISE_STD_DEG,
@@ -39,17 +38,6 @@ Write the paper's Datasets 0 to 5 to a folder: NAME.npz, NAME.csv and the data c
 NAME.json of each. dataset0 is simulated in MuJoCo (some seconds), dataset1 takes
 240 MB as .npz and 670 MB as .csv, dataset4 and dataset5 are made from recordings.
 """
-_FLAGS = (
-    flag("names", f"{', '.join(NAMES)}; all", "NAME", nargs="*"),
-    flag("--out", "folder to write to", "DIR", pathlib.Path, required=True),
-    flag("--seed", "of every dataset; 0", "S", at_least(0), default=0),
-    flag("--episodes", "at most the first N of each", "N", at_least(1)),
-    flag("--formats", "npz,csv", "LIST", several(str, "npz and csv"),
-         default=["npz", "csv"]),
-    flag("--recordings", "folder of dataset4.csv and dataset5.csv, your own; the "
-         "shipped ones", "DIR", pathlib.Path),
-    flag("--quiet", "no progress", on=True),
-)  # fmt: skip
 _WHAT = {
     "dataset0": "the ideal robot of Table 1 driven open loop in MuJoCo, 50 postures of "
     "one second per group, read at the end of each second",
@@ -105,18 +93,12 @@ def write_datasets(
             if path.suffix == ".npz":
                 save_npz(data, path)
             else:
-                save_csv_parts(_parts(data, f"write {path.name}", report), path)
+                save_csv(data, path, report)
         card = folder / f"{name}.json"
         write_text(card, json.dumps(_card(data, files, recordings), indent=2) + "\n")
         written += [*files, card]
     report.clear()
     return written
-
-
-def _parts(data: Dataset, task: str, progress: Progress) -> Iterator[Dataset]:
-    for begin in range(0, data.num_episodes, BLOCK):
-        progress(task, begin, data.num_episodes)
-        yield data.part(begin, begin + BLOCK)
 
 
 def _card(
@@ -184,23 +166,46 @@ def _card(
     return card
 
 
+def _write(
+    names: Annotated[tuple[str, ...], f"{', '.join(NAMES)}; all"] = (),
+    *,
+    out: Annotated[pathlib.Path, "folder to write to", "DIR"],
+    seed: Annotated[int, "of every dataset", "S", (0,)] = 0,
+    episodes: Annotated[int | None, "at most the first N of each", (1,)] = None,
+    formats: Annotated[
+        list[str] | None, "npz,csv", "LIST", several(str, "npz and csv")
+    ] = None,
+    recordings: Annotated[
+        pathlib.Path | None,
+        "folder of dataset4.csv and dataset5.csv, your own; the shipped ones",
+        "DIR",
+    ] = None,
+    quiet: Annotated[bool, "no progress"] = False,
+) -> None:
+    require_writable_folder(out)
+    progress = Progress(quiet=quiet)
+    try:
+        files = write_datasets(
+            out,
+            names or NAMES,
+            seed,
+            episodes=episodes,
+            formats=formats or ("npz", "csv"),
+            recordings=recordings,
+            progress=progress,
+        )
+    finally:
+        progress.clear()
+    for file in files:
+        print(f"saved: {file}")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Write; the exit code."""
     parser = Parser(prog="python -m jaxcal.paper.datasets", description=_DESCRIPTION)
-    options = vars(parser.with_flags(_FLAGS).parse_args(arguments))
-    folder, names = options.pop("out"), options.pop("names") or NAMES
-    progress = Progress(quiet=options.pop("quiet"))
-
-    def write() -> None:
-        require_writable_folder(folder)
-        try:
-            files = write_datasets(folder, names, progress=progress, **options)
-        finally:
-            progress.clear()
-        for file in files:
-            print(f"saved: {file}")
-
-    return exit_code(write, "datasets", "each file in the folder is complete")
+    given = parser.of(_write).parse_args(arguments)
+    kept = "each file in the folder is complete"
+    return exit_code(lambda: _write(**values_of(given)), "datasets", kept)
 
 
 if __name__ == "__main__":

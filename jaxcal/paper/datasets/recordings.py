@@ -17,13 +17,14 @@ import hashlib
 import json
 import os
 import pathlib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges, draw_from_pool
-from jaxcal.evaluation.csv_rows import finite, read_rows
+from jaxcal.evaluation.csv_rows import read_columns
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.paper.constants import AXES, EPISODES, NUM_CANDIDATES, RANGES
 
@@ -85,7 +86,9 @@ def read_pool(
     data = file.read_bytes()
     ranges = _ranges_beside(file)
     try:
-        values = _table(data)
+        _, lines, values = read_columns(data, _wanted, _is_posture)
+        if not lines:
+            raise ValueError("no postures below the header")
         outside = ~ranges.contains(values[:, :3])
         if np.any(outside):
             row = int(np.flatnonzero(outside)[0])
@@ -100,26 +103,21 @@ def read_pool(
     return values[:, :3], values[:, 3:], ranges, hashlib.sha256(data).hexdigest()
 
 
-def _table(data: bytes) -> Array:
-    """(N, 6) commands and readings."""
-    header, rows = read_rows(data)
+def _wanted(header: list[str]) -> list[str]:
+    """The columns of commands and readings."""
     if not header:
         raise ValueError("the file is empty")
-    wanted = [f"{what}_deg_{axis}" for what in "uy" for axis in AXES]
-    for name in wanted:
+    names = [f"{what}_deg_{axis}" for what in "uy" for axis in AXES]
+    for name in names:
         if header.count(name) != 1:
             how = "missing" if name not in header else "there twice"
-            raise ValueError(f'line 1: column "{name}" is {how}')
-    values = []
-    for line, row in rows:
-        cells = dict(zip(header, row, strict=True))
-        try:
-            values.append([finite(name, cells[name]) for name in wanted])
-        except ValueError as error:
-            raise ValueError(f"line {line}: {error}") from None
-    if not values:
-        raise ValueError("no postures below the header")
-    return np.array(values)
+            raise ValueError(f'column "{name}" is {how}')
+    return names
+
+
+def _is_posture(cells: Mapping[str, str]) -> bool:
+    """Not the zero posture, which a session visits again to measure its drift."""
+    return cells.get("role") != "reference"
 
 
 def _ranges_beside(recording: pathlib.Path) -> JointRanges:

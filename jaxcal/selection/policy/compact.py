@@ -48,7 +48,7 @@ class _Sets(NamedTuple):
 class _Decision(NamedTuple):
     """What ``describe`` writes, and the candidates that count."""
 
-    features: Array32  # (E, M, F)
+    features: Array32  # (E, M, F) ``learning.policies.features.FEATURES``
     moments: Array32  # (E, p (p + 1) / 2, M)
     ahead: Array  # (E, M)
     active: Array32  # (E, M) 1 or 0

@@ -44,7 +44,7 @@ def _stop(record: Record) -> str:
 # An event of the run in words, for console, page and report: its fields are put in.
 SENTENCES: dict[str, str | Callable[[Record], str]] = {
     "start": "{mode} begun",
-    "resume": "gone on with after an interruption",
+    "resume": "resumed after an interruption",
     "listening": "IMU: waiting for the phone on port {port} ({format})",
     "armed": "armed: {drives} drives on {where}",
     "note": "{text}",

@@ -13,6 +13,7 @@ import pathlib
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from jaxcal.evaluation.training_figure import (
@@ -20,6 +21,7 @@ from jaxcal.evaluation.training_figure import (
     read_metrics,
     training_curves,
 )
+from jaxcal.plots.style import COLOURS, GREY, band, boxes, panels
 from studies.paper.exhibits.exhibit import Exhibit, Verdict, judge
 from studies.paper.exhibits.intervals import mean_interval
 from studies.paper.exhibits.material import Material
@@ -126,6 +128,9 @@ def _seeds(runs: list[Run], paper: list[Run]) -> Exhibit:
     for run in runs:
         curve = np.interp(grid, run.metrics["episodes"], run.metrics["reward_mean"])
         columns[f"reward_seed_{run.summary['seed']}"] = curve
+    means = [mean_interval(row) for row in np.transpose(list(columns.values())[1:])]
+    for name, field in (("mean", "value"), ("low", "low"), ("high", "high")):
+        columns[f"reward_{name}"] = np.array([getattr(m, field) for m in means])
     flat = [plateau(run) for run in runs]
     lengths = [run.summary["episodes"] for run in runs]
     numbers: dict[str, Any] = {
@@ -150,9 +155,7 @@ def _seeds(runs: list[Run], paper: list[Run]) -> Exhibit:
             "caution": _caution(runs),
         },
         verdict=_converges(runs, flat),
-        figures={
-            "figure_2_seeds": training_curves({n: r.folder for n, r in shown.items()})
-        },
+        figures={"figure_2_seeds": _curves(shown, columns)},
         data={
             "reward": columns,
             "last_rewards": {
@@ -174,6 +177,36 @@ def _caution(runs: list[Run]) -> str:
     if cut:
         parts.append(f"{len(cut)} not finished")
     return ", ".join(parts) + ". " if parts else ""
+
+
+def _curves(runs: dict[str, Run], columns: dict[str, Any]) -> Figure:
+    """Reward with the band over seeds, last rewards, share of the optimum."""
+    title = "Training of the compact preset over seeds, and of the paper's network"
+    figure, (left, middle, right) = panels((12.0, 3.8), title, (1, 3))
+    colours = [COLOURS[not name.startswith("seed")] for name in runs]
+    for (name, run), colour in zip(runs.items(), colours, strict=True):
+        x = run.metrics["episodes"] / 1e3
+        ratio = run.metrics.get("ratio_to_exact", np.full(len(x), np.nan))
+        known, label = np.isfinite(ratio), name
+        if name.startswith("seed"):
+            label = "one seed" if name == next(iter(runs)) else "_"  # not in legends
+            thin = {"color": GREY, "linewidth": 0.6, "alpha": 0.7, "label": label}
+            left.plot(x, run.metrics["reward_mean"], **thin)
+        right.plot(x[known], ratio[known], color=colour, label=label, linewidth=1.0)
+    ends = (columns[f"reward_{name}"] for name in ("mean", "low", "high"))
+    text = "mean of the seeds; band: its 95 % interval"
+    band(left, columns["episodes"] / 1e3, *ends, color=COLOURS[0], label=text)
+    boxes(middle, [run.rewards for run in runs.values()], colours, (5, 95))
+    middle.set_xticks(range(1, len(runs) + 1), [n.split()[-1] for n in runs])
+    unit, x_label = "reward (log det S / 10)", "training episodes (thousands)"
+    left.set(title="(a) reward", xlabel=x_label, ylabel=unit)
+    seeds = "seed; box: quartiles, whiskers: 5 to 95 %"
+    middle.set(title="(b) last 1,000 episodes", xlabel=seeds, ylabel=unit)
+    right.set(title="(c) validation", xlabel=x_label, ylabel="mean det S / det S*")
+    right.set_ylim(0.0, 1.02)
+    for axes in (left, right):
+        axes.legend(fontsize=8, frameon=False, loc="lower right")
+    return figure
 
 
 def _paper(runs: list[Run]) -> Exhibit:
