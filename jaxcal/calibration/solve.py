@@ -47,7 +47,7 @@ class Task:
     free: NDArray[np.bool_]  # (P,) False: held at the mean
     command_std: Array  # (n,) 0 exact, inf unknown in every measurement
     known: bool  # the level is 1; else it is estimated
-    per_output: bool  # one level for each output
+    levels: NDArray[np.intp]  # (q,) from 0: outputs of the same number share one
     student: bool
 
 
@@ -99,7 +99,7 @@ def solve(
 ) -> Solution:
     """The most probable parameters, from the prior's mean or from ``start``.
 
-    ``rough`` is to a hundredth of a standard deviation, for what another fit begins at.
+    ``rough`` is to .03 standard deviations, for what another fit begins at.
 
     Raises:
         ValueError: the model fails at the start, a derivative is not finite, or the
@@ -120,7 +120,7 @@ def solve(
             gain = evidence[-_PATIENCE] - search.evidence
             asked = max(1e-3, 0.1 * (len(evidence) // 60))
             creeps = gain < max(asked, 1e-3 * search.cost)
-        slack = 100.0 if rough or creeps else 1.0
+        slack = 300.0 if rough else 100.0 if creeps else 1.0
         if search.settle(slack) and (done or creeps):
             return search.solution()
     raise ValueError(
@@ -140,17 +140,19 @@ class _Search:
     def __init__(self, task: Task, start: Solution | None, rough: bool) -> None:
         self.task = task
         # 1e-6 standard deviations; 1e-5 where convergence is linear.
-        self.least = 1e-4 if rough else 1e-10 if task.student else 1e-12
+        self.least = 1e-3 if rough else 1e-10 if task.student else 1e-12
         self.linear = 0.0  # length of a step that did what its derivatives said
         self.solved: tuple[Array, Array] | None = None  # hardly damped, in a step
         count, q = task.measured.shape
         self.uncertain = task.command_std > 0.0
         self.command_root = 1.0 / task.command_std[self.uncertain]  # 0: unknown
         self.left = q - int(np.isinf(task.command_std).sum())  # readings, nuisance out
-        self.damping, self.grow = 1e-3, 2.0
+        # From where another search ended, the derivatives are right far enough.
+        self.damping, self.grow = 1e-3 if start is None else 1e-10, 2.0
         largest = float(np.abs(_times(task.white, task.measured)).max())
         self.floor = 1e-13 * largest or 1e-100
         self.freedom = np.zeros(q)
+        self.shared = task.levels
         self.theta = task.mean if start is None else start.parameters
         self.commands = task.commands if start is None else start.commands
         self.residuals = task.measured - predict(task.model, self.commands, self.theta)
@@ -324,31 +326,34 @@ class _Search:
         """
         task = self.task
         before = self.weights, np.log(self.level)
+        distance = self._distance(self.residuals, self.commands)
         if task.student:
-            distance = self._distance(self.residuals, self.commands)
             self.weights = student_weight(distance, self.left)
         if not task.known:
-            self._estimate_level()
+            self._estimate_level(distance)
         after = self.weights, np.log(self.level)
         return all(
             np.abs(new - old).max() < slack * limit
             for new, old, limit in zip(after, before, (1e-6, 1e-4), strict=True)
         )
 
-    def _estimate_level(self) -> None:
+    def _estimate_level(self, distance: Array) -> None:
         """Sums of squares over the degrees of freedom that they have."""
         task = self.task
         self.freedom = freedom = self._freedom(self._leverage(self.solved))
         if freedom.sum() < 1.0:
             return
         square = self.weights @ _times(task.white, self.residuals) ** 2
-        if not task.per_output or (freedom < 0.5).any():
-            square, freedom = square.sum(), freedom.sum()
+        same = self.shared[:, None] == self.shared
+        if (same @ freedom < 0.5).any():
+            # What is met exactly has no level of its own, from then on.
+            self.shared, same = 0 * self.shared, np.ones_like(same)
+        square, freedom = same @ square, same @ freedom
         faster = 1.0
         if task.student:
             square = square / student_constants(self.left)[0]
             # The weights follow the level: Newton's step takes both at once.
-            pulled = self.weights * self._distance(self.residuals, self.commands)
+            pulled = self.weights * distance
             faster = pulled.sum() / max(pulled @ self.weights, 1e-300)
         change = np.log(np.maximum(np.sqrt(square / freedom), self.floor) / self.level)
         near = np.abs(change).max() < 0.3
@@ -405,6 +410,8 @@ def _factor(
     where it succeeds, and does not wait for BLAS's threads in every column. Once is
     enough where the next step makes good what rounding left.
     """
+    from scipy.linalg.lapack import dtrtri
+
     width = rows.shape[1]
     whole = np.concatenate([rows, np.sqrt(damping) * np.eye(width)])
     inverse, turned = np.eye(width), whole
@@ -415,7 +422,7 @@ def _factor(
             size = np.diagonal(root)
             if size.min(initial=np.inf) < _WELL * size.max(initial=0.0):
                 raise np.linalg.LinAlgError
-            inverse = inverse @ np.linalg.inv(root)
+            inverse = inverse @ dtrtri(root)[0]
         return inverse, inverse.T @ (rows.T @ right)
     except np.linalg.LinAlgError:
         turned, triangle = np.linalg.qr(whole)

@@ -3,7 +3,6 @@
 import functools
 import hashlib
 import json
-import math
 import pathlib
 import tomllib
 from collections.abc import Iterator
@@ -116,18 +115,6 @@ class RigConfig(Section):
     def silence_s(self) -> float:
         """Silence between frames that the slowest of the drives wants."""
         return max(axis.map.inter_frame_s for axis in self.axes)
-
-    @property
-    def shortest_step_s(self) -> float:
-        """Time of a step of ``motion.max_step_deg`` on the quickest axis."""
-        motions = [axis.drive_motion for axis in self.axes]
-        step = self.motion.max_step_deg
-        return min(
-            step / speed + speed / accel
-            if step * accel > speed * speed
-            else 2.0 * math.sqrt(step / accel)  # it never reaches its speed
-            for speed, accel in motions
-        )
 
     @property
     def heartbeat_s(self) -> float:

@@ -90,7 +90,6 @@ def _settled(device: Device, deadline: float) -> list[Status]:
         now = time.monotonic()
         if any(status.moving for status in statuses):
             since = now
-        device.imu.check_fault()
         if not (reason := _unquiet(device, device.imu.since(since), now)):
             return statuses
         if now > deadline:
@@ -108,7 +107,7 @@ def _unquiet(device: Device, readings: list[Reading], now: float) -> str:
     newest = readings[-1].time if readings else now
     before = sum(reading.time <= newest - settle.window_s for reading in readings)
     first = min(before - 1, len(readings) - settle.min_samples)
-    hint = "Check the phone's app and its Wi-Fi"
+    hint = f"Check the phone's app and its Wi-Fi{device.imu.dropped}"
     if first < 0:
         span = newest - readings[0].time if readings else 0.0
         return (
@@ -143,7 +142,6 @@ def _collect(device: Device, wanted: int) -> list[Reading]:
     deadline = start + settle.timeout_s * max(1.0, wanted / settle.samples)
     while True:
         device.guard()
-        imu.check_fault()
         readings = imu.since(start)
         if len(readings) >= wanted:
             return readings[:wanted]

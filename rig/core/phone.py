@@ -19,8 +19,7 @@ import numpy as np
 from rig.config.settings import ImuSettings
 from rig.core.attitude import Array, Reading
 from rig.core.faults import Fault
-from rig.core.stream import MAX_BODY, LineSplitter, Parser, StreamFault
-from rig.journal import JournalError
+from rig.core.stream import MAX_BODY, LineSplitter, Parser
 
 RECONNECT_S = 0.2
 MOST_OPEN = 4  # connections at a time
@@ -89,7 +88,7 @@ class Receiver:
         if address not in self.refused:
             self.refused.append(address)
             text = f"refused a sender on the IMU port, {address}: {why}"
-            self._imu.tell("sender_refused", address=address, reason=text)
+            self._imu.report("sender_refused", address=address, reason=text)
 
     def _admits(self, address: str) -> bool:
         allowed = self._settings.allow
@@ -223,13 +222,12 @@ class Imu:
         self.settings = settings
         self.connections = 0
         self.world = np.eye(3)  # (3, 3) by which readings are turned
-        self._report = report
+        self.report = report
         self._parser = Parser(settings)
         self._ring: deque[Reading] = deque(maxlen=RING)
         self._lock = threading.Lock()
         self._receiver: Receiver | None = None
         self._arrived = 0.0
-        self._fault = ""
 
     def open(self) -> Imu:
         """Listen, or begin to connect; ImuError where the port cannot be opened."""
@@ -264,7 +262,6 @@ class Imu:
 
     def latest(self) -> Reading:
         """The newest reading; ImuError where none is fresh."""
-        self.check_fault()
         with self._lock:
             reading = self._ring[-1] if self._ring else None
         if reading is None:
@@ -276,7 +273,7 @@ class Imu:
                 hint = "It arrives late, or its stamps are not those configured"
             raise ImuError(
                 f"the phone's last reading is {now - reading.time:.2f} s old (limit "
-                f"imu.stale_s = {limit:g} s). {hint}"
+                f"imu.stale_s = {limit:g} s). {hint}{self.dropped}"
             )
         return reading
 
@@ -300,10 +297,14 @@ class Imu:
         with self._lock:
             return dict(self._parser.counts)
 
-    def check_fault(self) -> None:
-        """Raise ImuError where the stream was found not to be trusted."""
-        if self._fault:
-            raise ImuError(self._fault)
+    @property
+    def dropped(self) -> str:
+        """What was dropped, in words; empty where nothing was."""
+        counts = {
+            reason: n for reason, n in self.counts.items() if reason != "accepted"
+        }
+        each = (f"{count} {reason}" for reason, count in counts.items())
+        return f"; records dropped: {', '.join(each)}" if counts else ""
 
     def wait_for_stream(self, timeout_s: float) -> Reading:
         """The first fresh reading; ImuError where none came in time."""
@@ -312,11 +313,8 @@ class Imu:
             try:
                 return self.latest()
             except ImuError:
-                self.check_fault()
                 if time.monotonic() > end:
-                    counts = self.counts
-                    counts.pop("accepted", None)
-                    detail = f"; records dropped: {counts}" if counts else ""
+                    detail = self.dropped
                     if self._receiver and self._receiver.refused:
                         names = ", ".join(self._receiver.refused)
                         detail += f"; senders refused: {names}"
@@ -330,13 +328,6 @@ class Imu:
 
     # On the receiving thread
 
-    def tell(self, event: str, **fields: str) -> None:
-        """Report an event."""
-        try:
-            self._report(event, **fields)
-        except JournalError as fault:  # the journal cannot be written
-            self._fault = str(fault)
-
     def begin(self) -> None:
         """Lines come over another connection from now on."""
         self.connections += 1
@@ -346,11 +337,7 @@ class Imu:
     def take_lines(self, lines: list[bytes], now: float) -> bool:
         """Lines that came at a monotonic time; whether a reading of them was used."""
         with self._lock:
-            try:
-                return not self._fault and self._store(self._parser.lines(lines, now))
-            except StreamFault as fault:
-                self._fault = str(fault)
-                return False
+            return self._store(self._parser.lines(lines, now))
 
     def take_body(self, body: bytes) -> tuple[bool, bool]:
         """A message; whether it was used, and whether it is another device's."""

@@ -22,16 +22,11 @@ MAX_LINE = 1024  # bytes; a phone's line has under 200
 MAX_BODY = 1 << 20  # bytes of one pushed message
 NUMBER = re.compile(r"[+-]?[0-9]{1,15}(?:\.[0-9]{1,17})?(?:[eE][+-]?[0-9]{1,2})?")
 TOKEN = re.compile(r"[-+.:0-9A-Za-z_]{0,64}")
-RECOUNT = 3  # lines of one new width in a row that mean the phone's settings changed
 REJOIN = 5  # readings in a row that agree with each other after a jump
 ODD_STAMPS = 50  # stamps in a row out of line that mean the phone's clock was set
 AHEAD_S = 1.0  # a stamp so far ahead of the clock is torn, not early
 ROUNDED = 1 + 1e-5  # full turns in radians are written a little too large
 CLOCK_CREEP = 2e-4  # the phone's clock may run this much faster or slower
-
-
-class StreamFault(RuntimeError):
-    """The stream cannot be trusted any more, for instance its columns changed."""
 
 
 class _Dropped(ValueError):
@@ -81,7 +76,6 @@ class Parser:
 
     def reconnected(self) -> None:
         """A new connection: the phone may have moved and its clock may have changed."""
-        self._widths: deque[int] = deque(maxlen=RECOUNT)
         self._stamp: float | None = None
         self._odd = 0
         self._offset, self._offset_at = math.inf, 0.0  # of the clocks; inf: unknown
@@ -158,18 +152,8 @@ class Parser:
             for column in used:
                 _number(fields[column])
             self._width = width
-        if width == self._width:
-            self._widths.clear()
-            return
-        plain = sum(bool(NUMBER.fullmatch(field)) for field in fields)
-        if plain >= max(1, width - 1):
-            self._widths.append(width)
-        if len(self._widths) == RECOUNT and len(set(self._widths)) == 1:
-            raise StreamFault(
-                f"the phone sends {width} columns where {self._width} were agreed: its "
-                "sensor settings changed; set them back, or correct [imu] columns"
-            )
-        raise _Dropped("wrong number of columns")
+        if width != self._width:
+            raise _Dropped(f"not of {self._width} columns")
 
     def _euler(self, values: list[float]) -> Array:
         s = self._settings

@@ -136,8 +136,9 @@ class Journal:
 
 JOURNAL = "journal.jsonl"
 SCHEMA = 2  # of the first record; runs of others are not read
-# A full disk must not keep a stop from the bus, nor from the console.
-SPARED = ("write", "stop", "comm_restored", "note")
+# A full disk must not keep a stop from the bus or the console, nor end the thread
+# that hears the phone.
+SPARED = ("write", "stop", "comm_restored", "note", "sender_refused")
 
 
 def new_run_folder(output: pathlib.Path, mode: str) -> pathlib.Path:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import random
 import time
-from collections.abc import Sequence
 
 from rig.config.axis import Axis
 from rig.config.maps import (
@@ -49,7 +48,6 @@ class SimDrive:
         truth: Truth | None = None,
         faults: FaultInjector | None = None,
         speedup: float = 1.0,
-        travel: Sequence[int] | None = None,
         at_deg: float = 0.0,
     ) -> None:
         self.map = axis.map
@@ -63,7 +61,7 @@ class SimDrive:
         self.stops: list[float] = []
         self.comm_stops = 0
         self.offset = 0
-        self._travel = travel  # targets outside are answered with exception 3
+        self.travel = (-math.inf, math.inf)  # targets outside: exception 3
         self._number, self._faults = number, faults or FaultInjector()
         self._random = random.Random(self.truth.seed + number)
         self._speedup = speedup
@@ -263,8 +261,7 @@ class SimDrive:
         speed *= per_rev if m.units.speed == "rev_per_s" else 1.0
         accel *= 1.0 if m.units.accel == "pulse_per_s2" else per_rev
         target = self._value(m.move, "position")
-        way = target - self._set_to
-        if self._travel and not self._travel[0] <= way <= self._travel[1]:
+        if not self.travel[0] <= target - self._set_to <= self.travel[1]:
             raise DriveException(ILLEGAL_VALUE)
         self._move(target, speed, accel)
         self.executions.append(target)

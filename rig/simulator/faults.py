@@ -39,7 +39,6 @@ KINDS = {
 class FaultSpec:
     kind: str
     phase: str | None = None  # inject when the session first enters this phase
-    after_s: float | None = None  # or so long after the simulator started
     count: float = float("inf")  # replies or lines left to spoil
     axis: int | None = None  # None: any
     seconds: float | None = None  # length of a gap or delay
@@ -48,7 +47,7 @@ class FaultSpec:
 
 
 def parse_fault(text: str) -> FaultSpec:
-    """Read ``kind[@phase | @SECONDSs][,count=N][,axis=NAME][,seconds=S][,share=P]``."""
+    """Read ``kind[@phase][,count=N][,axis=NAME][,seconds=S][,share=P]``."""
     head, *options = text.split(",")
     kind, _, when = head.partition("@")
     if kind not in KINDS:
@@ -57,16 +56,14 @@ def parse_fault(text: str) -> FaultSpec:
     readers: dict[str, Any] = {"count": int, "seconds": float, "share": float}
     readers["axis"] = AXIS_NAMES.index
     try:
-        if when in PHASES:
-            found["phase"] = when
-        elif when:
-            found["after_s"] = float(when.removesuffix("s"))
+        if when:
+            found["phase"] = PHASES[PHASES.index(when)]
         for option in options:
             name, _, value = option.partition("=")
             found[name] = readers[name](value)
     except (KeyError, ValueError):
         raise ValueError(
-            f"fault {text!r}: after @ comes one of {', '.join(PHASES)} or seconds; "
+            f"fault {text!r}: after @ comes one of {', '.join(PHASES)}; "
             "options are count=N, seconds=S, share=P, axis=NAME of "
             f"{', '.join(AXIS_NAMES)}"
         ) from None
@@ -78,10 +75,9 @@ class FaultInjector:
 
     def __init__(self, specs: list[FaultSpec] | None = None) -> None:
         self._lock = threading.RLock()
-        self._start = time.monotonic()
         self._specs: list[FaultSpec] = []
         for spec in specs or []:
-            self.add(spec, waits=spec.phase is not None or spec.after_s is not None)
+            self.add(spec, waits=spec.phase is not None)
 
     def add(self, spec: FaultSpec, waits: bool = False) -> None:
         """Inject it now, or when it is due."""
@@ -110,9 +106,6 @@ class FaultInjector:
                     axis is not None and spec.axis not in (None, axis)
                 ):
                     continue
-                if spec.begun is None and spec.after_s is not None:
-                    due = self._start + spec.after_s
-                    spec.begun = now if now >= due else None
                 # The seconds of a delayed reply are its delay.
                 lasts = spec.seconds if kind != "delayed_reply" else None
                 over = spec.begun is None or (

@@ -26,7 +26,6 @@ class Simulator:
         transport: str = "tcp",
         rate_hz: float = 100.0,
         speedup: float = 1.0,
-        travel_deg: tuple[float, float] | None = None,
     ) -> None:
         self.config = config
         self.truth = truth or Truth(seed=config.session.seed)
@@ -34,13 +33,10 @@ class Simulator:
         self.transport = transport
         self.drives: list[SimDrive] = []
         for number, axis in enumerate(config.axes):
-            travel = travel_deg and sorted(axis.to_pulses(end) for end in travel_deg)
             at_deg = 0.0
             if config.session.zero == "here":
                 at_deg = float(self.truth.jig_deg[number])
-            drive = SimDrive(
-                axis, number, self.truth, self.faults, speedup, travel, at_deg
-            )
+            drive = SimDrive(axis, number, self.truth, self.faults, speedup, at_deg)
             drive.power_cycle(self.truth.lost_origin_deg[number])
             self.drives.append(drive)
         self.plant = Plant(config, self.truth, self.drives, self.faults)
@@ -98,25 +94,6 @@ class Simulator:
         self._alarms()
         with self.server.lock:
             return self.plant.attitude()
-
-    def power_cycle(self, lost_deg: tuple[float, float, float] = (0, 0, 0)) -> None:
-        """All drives off and on: their counters come back so many degrees away."""
-        with self.server.lock:
-            for drive, lost in zip(self.drives, lost_deg, strict=True):
-                drive.power_cycle(lost)
-
-    def repair(self) -> None:
-        """Undo every fault, as a technician would before the run is resumed."""
-        self.faults.clear()
-        self.plant.slip[:] = 0.0
-        with self.server.lock:
-            for drive in self.drives:
-                if drive.offset:
-                    drive.find_origin()
-
-    def executions(self) -> list[list[int]]:
-        """Targets in pulses each drive really ran, pitch, yaw, roll."""
-        return [list(drive.executions) for drive in self.drives]
 
     def close(self) -> None:
         self.phone.close()

@@ -3,11 +3,11 @@
 import contextlib
 import socket
 
-from harness import SPEEDUP, fast_config
+from harness import SPEEDUP, Simulator, fast_config
 
 from rig.__main__ import main
 from rig.config import AXIS_NAMES
-from rig.simulator import Simulator, Truth
+from rig.simulator import Truth
 from rig.workbench.commission.scan import parse_bus
 from rig.workbench.commission.setup import setting
 from rig.workbench.toml import set_values

@@ -29,6 +29,7 @@ from harness import (
     OTHERS,
     UNSETTLED,
     WATCHED,
+    Simulator,
     changed,
     fast_config,
     fast_text,
@@ -41,7 +42,7 @@ from rig.config import RigConfig, parse_config
 from rig.core.bus import Bus
 from rig.core.drive import Drive
 from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord, read_journal
-from rig.simulator import Simulator, Truth, parse_fault
+from rig.simulator import Truth, parse_fault
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.steps import Place, go_home, identify, simulated
 from rig.workbench.commission.steps import axes as check_the_axes

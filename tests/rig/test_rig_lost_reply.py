@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 from fault_matrix import calibration, uninterrupted
-from harness import HASTY, fast_config, fast_text, session, simulator
+from harness import HASTY, Simulator, fast_config, fast_text, session, simulator
 from test_rig_motion import bench
 
 from rig.config import ConfigError, parse_config
@@ -17,7 +17,7 @@ from rig.core.bus import Bus, BusError
 from rig.core.drive import Drive
 from rig.core.faults import MotionFault, StopRequested
 from rig.journal import read_journal
-from rig.simulator import Simulator, Truth, parse_fault
+from rig.simulator import Truth, parse_fault
 
 # Time enough for a busy computer: a reply that is late is one lost reply more.
 TIMEOUT = {"timeout_s = 0.5": "timeout_s = 0.25"}

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from harness import RATE_HZ, SPEEDUP, commissioned, fast_config, make_run
+from harness import RATE_HZ, SPEEDUP, Simulator, commissioned, fast_config, make_run
 
 import jaxcal
 from rig.core.faults import Refused
-from rig.simulator import Simulator, Truth
-from rig.workbench.procedures.checking import goto, keep, load_calibration
-from rig.workbench.procedures.play import CHARACTERISED, Play
+from rig.simulator import Truth
+from rig.workbench.procedures.checking import keep, load_calibration
+from rig.workbench.procedures.goto import CHARACTERISED, Play, goto
 from rig.workbench.run import run_safely
 
 WIDTH = 0.4

@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 import pytest
-from harness import changed, fast_text, session
+from harness import Simulator, changed, fast_text, session
 from test_rig_motion import bench
 
 from rig.config import parse_config
@@ -13,7 +13,7 @@ from rig.config.maps import MAP_FOLDER
 from rig.core.drive import Drive
 from rig.core.faults import MotionFault
 from rig.core.stop import stop_all
-from rig.simulator import Simulator, Truth, parse_fault
+from rig.simulator import Truth, parse_fault
 
 
 def realistic(config=None, **truth):

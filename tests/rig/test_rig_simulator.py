@@ -5,13 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from harness import fast_config, fast_text
+from harness import Simulator, fast_config, fast_text
 
 from rig.commands import make_parser
 from rig.config import parse_config
 from rig.core.bus import Bus
 from rig.core.drive import Drive
-from rig.simulator import Simulator, Truth, truth_of
+from rig.simulator import Truth, truth_of
 from rig.simulator.drive import COMM_ALARM, SimDrive
 
 STILL = {"noise_deg": 0.0}

@@ -1,6 +1,5 @@
 """The watchdogs: of the motion loop, and of the line in drives that have one."""
 
-import math
 import pathlib
 import signal
 import subprocess
@@ -8,17 +7,17 @@ import sys
 import time
 
 import pytest
-from harness import HASTY, changed, fast_config, fast_text, session
+from harness import HASTY, Simulator, changed, fast_config, fast_text, session
 from test_rig_motion import bench
 
-from rig.config import load_config, parse_config
+from rig.config import load_config
 from rig.config.config import EXAMPLES
 from rig.config.maps import decode
 from rig.core import stop
 from rig.core.device import timeouts_left
 from rig.core.faults import MotionFault
 from rig.journal import read_journal
-from rig.simulator import Simulator, Truth, parse_fault
+from rig.simulator import Truth, parse_fault
 from rig.workbench.run import Run
 
 WATCHED = {'map = "leadshine_pr"': 'map = "generic"'}
@@ -62,15 +61,9 @@ def test_the_heartbeat_ends_before_a_whole_step(name):
     config = load_config(EXAMPLES / f"{name}.toml")
     motion, axis = config.motion, config.axes[0]
     step = motion.max_step_deg / axis.speed_deg_s + axis.speed_deg_s / axis.accel_deg_s2
-    assert config.shortest_step_s == pytest.approx(step, rel=0.05)
     assert config.heartbeat_s < step
     # and is longer than the longest exchange, which may have to connect first
     assert config.heartbeat_s > 2 * config.bus.timeout_s + motion.poll_s
-
-
-def test_a_step_that_never_reaches_its_speed_is_timed_as_such():
-    config = parse_config(fast_text({"accel_deg_s2 = 8000": "accel_deg_s2 = 100"}))
-    assert config.shortest_step_s == pytest.approx(2 * math.sqrt(15 / 100), rel=0.01)
 
 
 def test_every_frame_is_a_sign_of_life():
