@@ -312,11 +312,9 @@ def _fields(
         "distance": distance,
         "dof": max(freedom, 0.0),
         "square": float(found.distance.sum()),
-        "num_readings": found.left,
+        "num_readings": float(found.left),
         "noise_std": noise_std,
-        "noise_known": task.known,
         "noise_dof": noise_dof,
-        "num_measurements": int(used.sum()),
     }
 
 

@@ -62,7 +62,13 @@ class Verdict:
 
 
 def verdict(calibration: Fit) -> Verdict | None:
-    """Of an arm's calibration; None of other models, and where the noise is unknown."""
+    """Of an arm: does its model explain the readings, does it help, what is wrong.
+
+    Held-out errors with an interval beside those of the nominal arm, the scatter
+    against the sensor's usual noise, and by name: outliers, contacts of another socket,
+    a socket that was moved, parameters far from what was known. None for other models,
+    and where the noise is unknown.
+    """
     model = calibration.model
     if not isinstance(model, SerialChain) or calibration.noise_std is None:
         return None
