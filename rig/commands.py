@@ -219,13 +219,9 @@ def imu(
 
 
 def jog(
-    axis: Axis,
-    step: Annotated[float, "degrees; without it while a key is held", (-3, 3)]
-    | None = None,
-    *,
-    given: Step,
+    axis: Axis, step: Annotated[float, "degrees", (-10, 10)], *, given: Step
 ) -> int:
-    """move one axis by hand"""
+    """move one axis by a step"""
     return _step(given, "IDENTIFIED", "jog", NAMES.index(axis), step)
 
 
@@ -271,10 +267,7 @@ def _step(given: Step, state: str, name: str, *options: Any) -> int:
 
 @contextlib.contextmanager
 def _place(given: Target, state: str = "") -> Iterator[Place]:
-    """The device that a command is about, which has reached a state.
-
-    A simulated one is first taken through the states up to it.
-    """
+    """The device that a command is about, which has reached a state."""
     from rig.journal import DeviceRecord
     from rig.workbench.commission import steps
 
@@ -283,9 +276,9 @@ def _place(given: Target, state: str = "") -> Iterator[Place]:
         if given.simulate:
             simulator = given.simulator(config)
             served = stack.enter_context(simulator).start()
-            record = DeviceRecord(steps.own_folder(served) / "device.json")
+            path = steps.own_folder(served) / "device.json"
+            record = steps.commissioned(path, served, state)
             place = steps.simulated(simulator, served, record, _say)
-            steps.begin_simulated(place, state)
             place.operator.yes = yes
         else:
             record = DeviceRecord.load(config.device_path)
@@ -381,22 +374,15 @@ def _run(
             simulator = given.simulator(config, start["simulated"])
             config = stack.enter_context(simulator).start()
         lock, record = BusLock(config.bus), DeviceRecord.load(config.device_path)
-        if real and not given.dry_run:
+        if not given.dry_run:
             stack.enter_context(lock.acquire(command))
-            if lack := record.missing(config):
+            if real and (lack := record.missing(config)):
                 raise Refused(lack)
         if folder is None:
             folder = new_run_folder(given.out or Path(config.output), start["mode"])
             (folder / "rig.toml").write_text(text, encoding="utf-8")
         if simulator is not None:
-            record = DeviceRecord(folder / "device.json")
-            if not given.dry_run:
-                at = config.model_copy(update={"output": str(folder)})
-                place = steps.simulated(simulator, at, record, _say)
-                # Faults wait for the session's own phases.
-                place.listeners = (simulator.answer,)
-                steps.begin_simulated(place, SIGN_CHECKED)
-                stack.enter_context(lock.acquire(command))
+            record = steps.commissioned(folder / "device.json", config, SIGN_CHECKED)
         lock.tell(run=str(folder.resolve()))
         run = Run(
             config,
@@ -430,6 +416,7 @@ def _procedure(
     import numpy as np
 
     from rig.workbench.procedures import calibrate, checking
+    from rig.workbench.procedures.goto import goto as move_to
 
     mode, inputs = start["mode"], start["inputs"]
     if mode == "calibrate":
@@ -443,7 +430,7 @@ def _procedure(
     if mode == "verify":
         return lambda run: checking.verify(run, found, inputs["count"]), saved.zero
     to = np.array(inputs["to"], dtype=np.float64)
-    return lambda run: checking.goto(run, found, to, saved.play), saved.zero
+    return lambda run: move_to(run, found, to, saved.play), saved.zero
 
 
 def _confirm(given: Session, session: Run) -> None:

@@ -13,7 +13,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # One cache of compiled programs for every test process, so subprocess tests start fast.
 _CACHE = pathlib.Path(__file__).parent.parent / ".cache" / "jax"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # see jaxcal.commands
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # see runtime/cache.py
 
 import hypothesis
 import jax

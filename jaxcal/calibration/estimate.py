@@ -84,10 +84,18 @@ def fit_model(
             "command_std must not be given with a Pose: the orientations are "
             "compared with those of the commands given; raise the std of the noise"
         )
+    each = np.arange(measured.shape[1])
+    levels = 0 * each
     if isinstance(model, SerialChain):
         _require_postures(model, commands[used], measured[used])
         model = model.located(commands[used], measured[used])
         _require_sockets(model, commands[used], measured[used])
+        if not known:
+            usual = np.asarray(model.default_noise().std)
+            white = white / usual[:, None]
+            levels = np.unique(usual, return_inverse=True)[1]  # positions and turns
+    if common_noise is not None or spread.any():
+        levels = each if common_noise is False else 0 * each
     asked = prior is not None
     whole = model
     # Of a URDF file what is written back is what is predicted: it holds no harmonics.
@@ -105,7 +113,7 @@ def fit_model(
         free=resolved.free,
         command_std=spread,
         known=known,
-        per_output=common_noise is False,
+        levels=levels,
         student=loss == "student",
     )
     sizes: Sizes | None = None
@@ -121,8 +129,10 @@ def fit_model(
     else:
         found = solve(task)
     if common_noise is None and _levels_differ(task, found):
-        task = dataclasses.replace(task, per_output=True)
-        found = solve(task, found)
+        apart = dataclasses.replace(task, levels=each)
+        other = solve(apart, found)
+        if other.freedom.min() >= 1.0:
+            task, found = apart, other
     fields = _fields(task, found, commands, measured, weights)
     if sizes is not None and fields["joint_covariance"] is not None:
         fields["joint_covariance"] += of_sizes(task, found, sizes)
@@ -229,14 +239,14 @@ def _noise_of(
 
 
 def _levels_differ(task: Task, found: Solution) -> bool:
-    """Whether one level for all outputs contradicts their residuals (F test, 0.1 %)."""
+    """Whether levels that are shared contradict the residuals (F test, 0.1 %)."""
     q = len(found.freedom)
     if task.known or q == 1 or found.freedom.min() < 1.0 or task.command_std.any():
         return False
     from scipy import special
 
     white = (task.white @ found.residuals[..., None])[..., 0]
-    variance = found.weights @ white**2 / found.freedom
+    variance = found.weights @ (white / found.level) ** 2 / found.freedom
     high, low = int(variance.argmax()), int(variance.argmin())
     ratio = variance[high] / max(variance[low], np.finfo(np.float64).tiny)
     chance = special.fdtrc(found.freedom[high], found.freedom[low], ratio)
@@ -263,7 +273,8 @@ def _fields(
     noise_std: Array | None = _noise(task, found, weights[used])
     noise_dof = 0.0
     if not task.known:
-        noise_dof = float(found.freedom.min()) if task.per_output else freedom
+        shared = np.unique(found.level, return_inverse=True)[1]
+        noise_dof = float(np.bincount(shared, found.freedom).min())
         if freedom < 1.0 or noise_dof <= 0.0:
             noise_std, noise_dof = None, 0.0
     residuals = measured - task.model.predict(commands, found.parameters)
@@ -289,11 +300,9 @@ def _fields(
         "distance": distance,
         "dof": max(freedom, 0.0),
         "square": float(found.distance.sum()),
-        "num_readings": found.left,
+        "num_readings": float(found.left),
         "noise_std": noise_std,
-        "noise_known": task.known,
         "noise_dof": noise_dof,
-        "num_measurements": int(used.sum()),
     }
 
 

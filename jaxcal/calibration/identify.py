@@ -70,8 +70,9 @@ def identify(
             of readings averaged, say); 0 leaves it out. All 1 when not given.
         common_noise: estimate one noise level for all outputs (they must share a unit),
             which has m times the degrees of freedom, or (False) one for each. When not
-            given: one for each of an affine fit; one for all of another model unless
-            the residuals contradict it (F test, 0.1 %).
+            given: one for each of an affine fit; one for all of another model (an arm:
+            one for positions, one for turns) unless the residuals contradict it
+            (F test, 0.1 %).
         loss: "gaussian" is least squares; "student" (4 degrees of freedom, of a
             measurement as a whole) gives outliers little weight. "student" when not
             given, but least squares where the closed form applies.

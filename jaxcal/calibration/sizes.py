@@ -61,7 +61,7 @@ def group_sizes(
     groups[: arm.table.size].reshape(-1, 5)[:] = [0, 1, 0, 2, 1]
     groups[np.flatnonzero(np.array(arm.units) == "deg per torque")] = 3
     groups[[name.endswith(_WAVES) for name in task.model.names]] = 4
-    rows, right = _reduced(arm, task, found)
+    rows, right = _reduced(task, found)
     sized = groups[task.free & (task.precision > 0.0)]
     count, width = len(right), rows.shape[1]
     # All that the readings say is in a triangle; the rest of them is noise alone.
@@ -162,16 +162,15 @@ def of_sizes(task: Task, found: Solution, sizes: Sizes) -> Array:
     return result
 
 
-def _reduced(arm: SerialChain, task: Task, found: Solution) -> tuple[Array, Array]:
+def _reduced(task: Task, found: Solution) -> tuple[Array, Array]:
     """Rows (R, s) by standard deviations of what a prior knows, and readings (R,).
 
-    In units of the noise, the usual one where it is not known, and free of the
-    parameters of which nothing is known.
+    Free of the parameters of which nothing is known.
     """
     theta, free, precision = found.parameters, task.free, task.precision
-    white = task.white
-    if not task.known:
-        white = white / np.asarray(arm.default_noise().std)[:, None]
+    # One level for all: what the fit found of how they compare is kept.
+    level = found.level / np.exp(np.log(found.level).mean())
+    white = task.white / level[:, None]
     white = white * np.sqrt(np.minimum(found.weights, 1.0))[:, None, None]
     slopes = derivative(task.model, task.commands, theta)
     off = found.residuals[..., None] + slopes @ (theta - task.mean)[:, None]

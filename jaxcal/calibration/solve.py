@@ -47,7 +47,7 @@ class Task:
     free: NDArray[np.bool_]  # (P,) False: held at the mean
     command_std: Array  # (n,) 0 exact, inf unknown in every measurement
     known: bool  # the level is 1; else it is estimated
-    per_output: bool  # one level for each output
+    levels: NDArray[np.intp]  # (q,) from 0: outputs of the same number share one
     student: bool
 
 
@@ -152,6 +152,7 @@ class _Search:
         largest = float(np.abs(_times(task.white, task.measured)).max())
         self.floor = 1e-13 * largest or 1e-100
         self.freedom = np.zeros(q)
+        self.shared = task.levels
         self.theta = task.mean if start is None else start.parameters
         self.commands = task.commands if start is None else start.commands
         self.residuals = task.measured - predict(task.model, self.commands, self.theta)
@@ -343,8 +344,11 @@ class _Search:
         if freedom.sum() < 1.0:
             return
         square = self.weights @ _times(task.white, self.residuals) ** 2
-        if not task.per_output or (freedom < 0.5).any():
-            square, freedom = square.sum(), freedom.sum()
+        same = self.shared[:, None] == self.shared
+        if (same @ freedom < 0.5).any():
+            # What is met exactly has no level of its own, from then on.
+            self.shared, same = 0 * self.shared, np.ones_like(same)
+        square, freedom = same @ square, same @ freedom
         faster = 1.0
         if task.student:
             square = square / student_constants(self.left)[0]

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.candidates import JointRanges
+from jaxcal.checks import array_of, require_none
 
 __all__ = ["Dataset"]
 
@@ -29,20 +30,22 @@ class Dataset:
     sha256: str | None = None  # of the file it was read from
 
     def __post_init__(self) -> None:
-        shape = self.candidates.shape
-        if len(shape) != 3 or 0 in shape:
-            raise ValueError(
-                "candidates must have shape (episodes, M, n), none of them 0, got "
-                f"{shape}"
-            )
+        u = array_of("candidates", self.candidates, "episodes", "M", "n")
+        if 0 in u.shape:
+            raise ValueError(f"candidates must have no axis of length 0, got {u.shape}")
+        object.__setattr__(self, "candidates", u)
         if self.measured is not None:
-            seen = self.measured.shape
-            if len(seen) != 3 or seen[:2] != shape[:2] or seen[2] < 1:
-                want = (*shape[:2], "m")
-                raise ValueError(f"measured must have shape {want}, got {seen}")
-        if self.available is not None and self.available.shape != shape[:2]:
+            y = array_of("measured", self.measured, *u.shape[:2], "m")
+            if 0 in y.shape:
+                raise ValueError(f"measured must have no axis of length 0: {y.shape}")
+            object.__setattr__(self, "measured", y)
+        if self.available is not None:
+            mask = array_of("available", self.available, *u.shape[:2])
+            require_none(~np.isin(mask, (0, 1)), mask, "available must be 1 or 0")
+            object.__setattr__(self, "available", mask == 1)
+        if self.ranges is not None and self.ranges.num_inputs != u.shape[2]:
             raise ValueError(
-                f"available must have shape {shape[:2]}, got {self.available.shape}"
+                f"ranges must hold {u.shape[2]} numbers, got {self.ranges.num_inputs}"
             )
 
     @property

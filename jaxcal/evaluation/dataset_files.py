@@ -25,8 +25,6 @@ from jaxcal.files import atomic_write
 
 __all__ = ["load_dataset", "save_csv", "save_npz"]
 
-Array = NDArray[np.float64]
-
 _KEYS = ("candidates", "measured", "available")
 _ENDS = ("low", "high")
 
@@ -82,30 +80,15 @@ def _read_npz(data: bytes) -> dict[str, Any]:
         if "candidates" not in held:
             found = ", ".join(sorted(archive.files)) or "nothing"
             raise ValueError(f'key "candidates" is missing, found {found}')
-    fields: dict[str, Any] = {
-        key: _cube(key, held[key]) for key in _KEYS[:2] if key in held
-    }
-    if "available" in held:
-        mask = held["available"]
-        if mask.dtype.kind not in "biuf" or not np.isin(mask, (0, 1)).all():
-            raise ValueError('key "available" must hold true and false (or 1 and 0)')
-        fields["available"] = mask.astype(np.bool_)
-    ends = [held[key] for key in _ENDS if key in held]
+    ends = [held.pop(key) for key in _ENDS if key in held]
     if len(ends) == 1:
         raise ValueError('keys "low" and "high" must come together')
-    if ends:
-        ranges, width = JointRanges(ends[0], ends[1]), fields["candidates"].shape[2]
-        if ranges.num_inputs != width:
-            raise ValueError(
-                f'"low" and "high" must hold {width} numbers, got {ranges.num_inputs}'
-            )
-        fields["ranges"] = ranges
-    return fields
+    return held | ({"ranges": JointRanges(ends[0], ends[1])} if ends else {})
 
 
-def _member(archive: np.lib.npyio.NpzFile, key: str) -> NDArray[np.generic]:
+def _member(archive: np.lib.npyio.NpzFile, key: str) -> NDArray[Any]:
     try:
-        member: NDArray[np.generic] = archive[key]
+        member: NDArray[Any] = archive[key]
     except Exception as error:  # as above
         if isinstance(error, ValueError) and "pickle" in str(error):
             raise ValueError(
@@ -113,22 +96,6 @@ def _member(archive: np.lib.npyio.NpzFile, key: str) -> NDArray[np.generic]:
                 "say) are not read"
             ) from None
         raise ValueError(f'key "{key}" is damaged') from None
+    if member.dtype.kind not in "biuf":
+        raise ValueError(f'key "{key}" must hold numbers, got dtype {member.dtype}')
     return member
-
-
-def _cube(key: str, array: NDArray[np.generic]) -> Array:
-    if array.dtype.kind not in "iuf":
-        raise ValueError(f'key "{key}" must hold numbers, got dtype {array.dtype}')
-    if array.ndim != 3 or 0 in array.shape:
-        raise ValueError(
-            f'key "{key}" must have shape (episodes, M, axes), none of them 0, got '
-            f"{array.shape}"
-        )
-    values = array.astype(np.float64)
-    if not np.isfinite(values).all():
-        episode, row, axis = (int(i) for i in np.argwhere(~np.isfinite(values))[0])
-        raise ValueError(
-            f'key "{key}" must be finite, got {values[episode, row, axis]} in episode '
-            f"{episode}, row {row}, axis {axis}"
-        )
-    return values

@@ -18,6 +18,7 @@ __all__ = [
     "MethodResult",
     "Row",
     "Summary",
+    "finite",
     "log_mean",
 ]
 
@@ -122,7 +123,7 @@ class Evaluation:
             "ratio_to_exact": float(np.exp(behind).mean()),
             "hit_rate": float(hits.mean()),
             "d_efficiency": float(np.exp(behind / num_parameters).mean()),
-            "ratio_to_random": _finite(times),
+            "ratio_to_random": finite(times),
             "seconds_per_selection": result.seconds,
             "draws_per_episode": log_det.shape[1],
         }
@@ -149,12 +150,12 @@ def log_mean(log_values: Array) -> float:
 def _moments(values: Array) -> dict[str, float | None]:
     with np.errstate(invalid="ignore", over="ignore"):
         return {
-            "mean": _finite(values.mean()),
-            "std": _finite(values.std()),
-            "median": _finite(np.median(values)),
+            "mean": finite(values.mean()),
+            "std": finite(values.std()),
+            "median": finite(np.median(values)),
         }
 
 
-def _finite(value: Any) -> float | None:
+def finite(value: Any) -> float | None:
     """A float, or None where it is too large for one."""
     return float(value) if np.isfinite(value) else None

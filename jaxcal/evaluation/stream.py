@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.evaluation.methods import POLICIES, evaluate
-from jaxcal.evaluation.results import Row, Summary
+from jaxcal.evaluation.results import Row, Summary, finite
 from jaxcal.extras import versions
 from jaxcal.files import write_text
 
@@ -101,23 +101,18 @@ def total(counts: list[int], parts: list[dict[str, Any]]) -> dict[str, Any]:
         parts: their rows: averages over their episodes, each with as many draws.
     """
 
-    def mean(values: Any) -> float | None:
-        found = float(np.average(np.array(values, float), weights=counts))  # None: NaN
-        return found if math.isfinite(found) else None
+    def mean(values: Any) -> float:
+        return float(np.average(np.array(values, float), weights=counts))  # None: NaN
 
     own: dict[str, Any] = {
-        name: mean([part[name] for part in parts]) for name in _MEANS
+        name: finite(mean([part[name] for part in parts])) for name in _MEANS
     }
     for name in ("det_s", "log_det_s"):
-        middles, stds = (
-            np.array([part[name][moment] for part in parts], float)
-            for moment in ("mean", "std")
-        )
+        held = [[part[name]["mean"], part[name]["std"]] for part in parts]
+        middles, stds = np.array(held, float).T
         middle = mean(middles)
-        off = 0.0 if middle is None else middle
-        square = mean(stds**2 + (middles - off) ** 2)
-        std = None if square is None else math.sqrt(square)
-        own[name] = {"mean": middle, "std": std, "median": None}
+        std = math.sqrt(mean(stds**2 + (middles - middle) ** 2))
+        own[name] = {"mean": finite(middle), "std": finite(std), "median": None}
     # Its label and number of draws are those of all; medians and variances are not.
     return {k: v for k, v in parts[0].items() if k != "parameter_variance"} | own
 

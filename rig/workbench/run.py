@@ -127,7 +127,7 @@ def run_safely(run: Run, procedure: Callable[[Run], int]) -> int:
         try:
             run.emit(event, sync=True, code=code, reason=reason, **told)
         except JournalError as error:
-            run.say(f"the journal could not be closed with a last line: {error}")
+            run.say(f"the run has no last line, as after a kill: {error}")
         if event != "end":
             run.say(f"{event}: {reason}")
             if told:

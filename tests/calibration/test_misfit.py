@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxcal
-from jaxcal.models import SerialChain
+from jaxcal.models import Pose, SerialChain
 
 from ..models.arms import CONTACTS, ur5
 
@@ -94,3 +94,23 @@ def test_what_is_written_to_a_urdf_file_is_what_is_predicted(tmp_path):
     tip = fit.to_urdf(tmp_path / "arm.urdf")
     again = SerialChain.from_urdf(tmp_path / "arm.urdf", tip=tip)
     np.testing.assert_allclose(again.predict(joints), fit.predict(joints), atol=1e-9)
+
+
+@pytest.mark.parametrize(("seed", "count"), [(34, 8), (50, 8), (1, 60)])
+def test_positions_have_one_level_of_noise_and_turns_another(seed, count):
+    """Of few poses the noise of a single reading ran to zero and back, without end."""
+    rng = np.random.default_rng(seed)
+    bent = ur5(sensor=Pose(), harmonics=range(1, 7))
+    waves = [" sin" in name or " cos" in name for name in bent.names]
+    truth = bent.nominal + 0.1 * np.array(waves) * rng.normal(size=len(waves))
+    truth = bent.nominal if count > 8 else truth
+    joints = rng.uniform(-120.0, 120.0, (count, 6))
+    noise = np.array([0.1, 0.1, 0.1, 0.02, 0.02, 0.02])
+    measured = bent.predict(joints, truth) + noise * rng.normal(size=(count, 6))
+    found = jaxcal.identify(joints, measured, model=ur5(sensor=Pose()))
+    place, turn = found.noise_std[:3], found.noise_std[3:]
+    np.testing.assert_allclose(place, place[0])
+    np.testing.assert_allclose(turn, turn[0])
+    if count > 8:
+        np.testing.assert_allclose([place[0], turn[0]], [0.1, 0.02], rtol=0.2)
+        assert found.noise_dof > 100.0

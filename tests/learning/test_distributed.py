@@ -186,18 +186,17 @@ def test_a_job_is_recognised_by_flags_or_by_its_launcher() -> None:
     assert not processes.expected(arguments(), {"TPU_WORKER_HOSTNAMES": "a"})
 
 
+ALL = ["--num-processes", "2", "--process-id", "1", "--coordinator", "a:1"]
+
+
 @pytest.mark.parametrize(
     ("flags", "says"),
     [
-        (["--num-processes", "0"], "--num-processes must be at least 1, got 0"),
-        (
-            ["--num-processes", "2", "--process-id", "2", "--coordinator", "a:1"],
-            "--process-id must be in [0, 2), got 2",
-        ),
-        (["--process-id", "0"], "--process-id must be in [0, --num-processes), got 0"),
-        (["--coordinator", "node1"], "--coordinator must be HOST:PORT, got 'node1'"),
-        (["--coordinator", "a:1"], "needs --num-processes and --process-id"),
-        (["--num-processes", "2"], "needs --coordinator and --process-id"),
+        ([*ALL, "--num-processes", "0"], "--num-processes must be at least 1, got 0"),
+        ([*ALL, "--process-id", "2"], "--process-id must be in [0, 2), got 2"),
+        ([*ALL, "--coordinator", "n1"], "--coordinator must be HOST:PORT, got 'n1'"),
+        (["--process-id", "0"], "--num-processes and --process-id must come together"),
+        (["--num-processes", "2"], "--coordinator, --num-processes and --process-id"),
         (["--process-id", "x"], "argument --process-id: invalid int value: 'x'"),
     ],
 )

@@ -124,7 +124,7 @@ def test_thousands_of_episodes_step_at_once_and_compile_once(key):
 def test_candidates_come_from_a_pool_once_each(key, rng):
     config = SelectionConfig(num_candidates=30)
     pool = rng.normal(size=(40, 3)).astype(np.float32)
-    points, _ = scenarios.from_pool(config, pool)(key)
+    points, _ = scenarios.given(config, pool[None])(key)
     rows = {tuple(row) for row in np.asarray(points)}
     assert len(rows) == 30 and rows <= {tuple(row) for row in pool}
 
@@ -145,12 +145,16 @@ def test_a_bad_configuration_is_named(values, named):
 
 def test_too_few_candidates_are_named():
     config = SelectionConfig()
-    with pytest.raises(ValueError, match="pool must hold at least 50"):
-        scenarios.from_pool(config, jnp.zeros((10, 3)))
+    with pytest.raises(
+        ValueError, match="num_candidates = 50 available candidates, got 10"
+    ):
+        scenarios.given(config, np.zeros((1, 10, 3)))
     free = np.ones((2, 50), bool)
     free[1, 3:] = False
-    with pytest.raises(ValueError, match="must have 4 available candidates, got 3"):
-        scenarios.from_sets(config, np.zeros((2, 50, 3)), free)
+    with pytest.raises(
+        ValueError, match="num_selected = 4 available candidates, got 3"
+    ):
+        scenarios.given(config, np.zeros((2, 50, 3)), free)
 
 
 @pytest.mark.parametrize("shape", scenarios.SHAPES)

@@ -13,8 +13,8 @@ from rig.core.attitude import ORDERS, Frame, Reading, euler_to_matrix, raw_field
 from rig.simulator import Truth
 from rig.workbench.identification.conclusion import estimate_drift, without_drift
 from rig.workbench.identification.fit import uncertainty
+from rig.workbench.identification.refit import attitudes
 from rig.workbench.outputs.words import drift_text, recalibrate
-from rig.workbench.readings import attitudes
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 LETTERS = ("X", "Z", "Y")

@@ -175,7 +175,7 @@ def test_a_pause_that_was_asked_for_is_shown(tmp_path):
 def test_a_session_on_another_computer_is_not_signalled(tmp_path):
     journal = _journal(tmp_path, os.getpid(), host="elsewhere")
     watcher = Watcher(tmp_path)
-    with pytest.raises(Refused, match="running here"):
+    with pytest.raises(Refused, match="running on this computer"):
         watcher.ask(signal.SIGTERM)
     assert watcher.running and not watcher.here
     journal.close()

@@ -15,8 +15,8 @@ from harness import (
 import jaxcal
 from rig.core.faults import Refused
 from rig.simulator import Truth
-from rig.workbench.procedures.checking import goto, keep, load_calibration
-from rig.workbench.procedures.play import CHARACTERISED, Play
+from rig.workbench.procedures.checking import keep, load_calibration
+from rig.workbench.procedures.goto import CHARACTERISED, Play, goto
 from rig.workbench.run import run_safely
 
 WIDTH = 0.4

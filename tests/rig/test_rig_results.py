@@ -13,6 +13,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from harness import (
+    QUIET,
     Run,
     Simulator,
     calibrate,
@@ -32,13 +33,12 @@ from rig.__main__ import main
 from rig.config import AXIS_NAMES, parse_config
 from rig.journal import read_journal
 from rig.simulator import Truth
-from rig.workbench.identification.refit import reread
+from rig.workbench.identification.refit import attitudes, reread
 from rig.workbench.outputs import trend
 from rig.workbench.outputs.export import LANGUAGES, load_inverse
 from rig.workbench.outputs.export import checksum as checksum_of
 from rig.workbench.outputs.report import write_report
 from rig.workbench.outputs.words import numbers
-from rig.workbench.readings import attitudes
 
 TRUTH = np.column_stack([Truth().matrix, Truth().bias])
 SESSION = '\n[session]\nmethod = "exact"\nverify_postures = 2\n'
@@ -179,7 +179,7 @@ def test_refit_says_why_it_refuses(run, capsys, tmp_path):
 
     rewritten(run, cut)
     assert main(["refit", str(run), "--order", "ZXY"]) == 2
-    assert "Resume it first" in capsys.readouterr().err
+    assert "Finish it first with `jaxcal-rig resume`" in capsys.readouterr().err
     assert not beside(run)
 
 
@@ -246,7 +246,7 @@ def test_a_report_says_what_there_is_of_an_unfinished_run(run, finished, kept):
 @pytest.mark.slow
 def test_reports_of_collect_verify_and_goto(run, tmp_path, capsys):
     (tmp_path / "rig.toml").write_text((run / "rig.toml").read_text())
-    given = ["--config", str(tmp_path / "rig.toml"), "--simulate", "--rate", "250"]
+    given = ["--config", str(tmp_path / "rig.toml"), "--simulate", *QUIET]
     given += ["--noise", "0"]
     out = ["--out", str(tmp_path / "more")]
     assert main(["collect", *given, *out, "--count", "3"]) == 0

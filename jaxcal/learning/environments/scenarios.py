@@ -18,62 +18,43 @@ from numpy.typing import ArrayLike
 from jaxcal.learning.environments import randomness
 from jaxcal.learning.environments.selection import Candidates, SelectionConfig
 
-__all__ = ["SHAPES", "from_pool", "from_sets", "mixture"]
+__all__ = ["SHAPES", "given", "mixture"]
 
 SHAPES = ("uniform", "gaussian", "sphere", "clustered", "grid", "cluster_uniform")
 
 
-def from_pool(
-    config: SelectionConfig, pool: ArrayLike, available: ArrayLike | None = None
-) -> Candidates:
-    """Candidates drawn without replacement from a pool.
-
-    Args:
-        config: sizes.
-        pool: (N, n) postures, N at least ``num_candidates``.
-        available: (N,) bool, those that may be chosen; all when None.
-    """
-    postures = np.asarray(pool, np.float32)
-    if available is not None:
-        postures = postures[np.asarray(available)]
-    if len(postures) < config.num_candidates:
-        raise ValueError(
-            f"pool must hold at least {config.num_candidates} postures, the "
-            f"num_candidates of an episode, got {len(postures)} available"
-        )
-    kept = jnp.asarray(postures)
-
-    def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        index = jax.random.permutation(key, len(kept))[: config.num_candidates]
-        return kept[index], jnp.ones(config.num_candidates, bool)
-
-    return draw
-
-
-def from_sets(
+def given(
     config: SelectionConfig, sets: ArrayLike, available: ArrayLike | None = None
 ) -> Candidates:
-    """One of the given candidate sets for every episode, each as likely.
+    """One of the given sets for every episode; of a single one, a pool, some rows.
 
     Args:
         config: sizes.
-        sets: (B, M, n) candidates.
-        available: (B, M) bool; all when None. At least ``num_selected`` in every set.
+        sets: (B, M, n) candidates; or (1, N, n), of which every episode draws M that
+            are available, without replacement.
+        available: (B, M) bool; all when None.
     """
-    points = jnp.asarray(sets, jnp.float32)
-    masks = jnp.ones(points.shape[:2], bool)
-    if available is not None:
-        masks = jnp.asarray(available)
-    least = int(masks.sum(axis=1).min())
-    if least < config.num_selected:
+    points = np.asarray(sets, np.float32)
+    masks = np.ones(points.shape[:2], bool) if available is None else available
+    masks = np.asarray(masks, bool)
+    pool, m = len(points) == 1, config.num_candidates
+    least, wanted = int(masks.sum(axis=1).min()), m if pool else config.num_selected
+    if least < wanted:
+        name = "num_candidates" if pool else "num_selected"
         raise ValueError(
-            f"every set must have {config.num_selected} available candidates, got "
-            f"{least} in one of them"
+            f"every set must have at least {name} = {wanted} available candidates, "
+            f"got {least}"
         )
+    if pool:
+        points, masks = points[masks][None], np.ones((1, least), bool)
+    kept, free = jnp.asarray(points), jnp.asarray(masks)
 
     def draw(key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        index = jax.random.randint(key, (), 0, len(points))
-        return points[index], masks[index]
+        if pool:
+            index = jax.random.permutation(key, least)[:m]
+            return kept[0, index], free[0, index]
+        index = jax.random.randint(key, (), 0, len(kept))
+        return kept[index], free[index]
 
     return draw
 

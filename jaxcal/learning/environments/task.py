@@ -41,10 +41,7 @@ class GivenCandidates:
                 f"this run was trained on {self.name}: give the file again with "
                 "--candidates"
             )
-        if len(self.values) > 1:
-            return scenarios.from_sets(config, self.values, self.available)
-        mask = None if self.available is None else self.available[0]
-        return scenarios.from_pool(config, self.values[0], mask)
+        return scenarios.given(config, self.values, self.available)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,24 +92,17 @@ class Task:
 
     def as_meta(self) -> dict[str, Any]:
         """Plain JSON values; ``from_meta`` reads them back."""
-        meta = {
-            "environment": dataclasses.asdict(self.environment),
-            "shapes": list(self.shapes),
-            "masked": self.masked,
-            "random_starts": self.random_starts,
-        }
-        if self.given is not None:
-            meta["given"] = {"name": self.given.name, "sha256": self.given.sha256}
-        return meta
+        given = self.given and {"name": self.given.name, "sha256": self.given.sha256}
+        meta = dataclasses.asdict(dataclasses.replace(self, given=None))
+        return meta | {"shapes": list(self.shapes), "given": given}
 
     @staticmethod
     def from_meta(meta: dict[str, Any]) -> Task:
         """The task that ``as_meta`` described; of given candidates only the digest."""
         given = meta.get("given")
-        return Task(
-            environment=SelectionConfig(**meta["environment"]),
-            shapes=tuple(meta["shapes"]),
-            masked=meta["masked"],
-            random_starts=meta["random_starts"],
-            given=None if given is None else GivenCandidates(**given),
-        )
+        own = {
+            "environment": SelectionConfig(**meta["environment"]),
+            "shapes": tuple(meta["shapes"]),
+            "given": given and GivenCandidates(**given),
+        }
+        return Task(**meta | own)

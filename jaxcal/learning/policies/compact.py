@@ -15,7 +15,7 @@ from jaxcal.learning.policies.features import (
     DecisionFeatures,
     VectorFeatures,
     close_up_of,
-    remaining,
+    decision_features,
     vector_features,
 )
 from jaxcal.learning.policies.networks import GROUP, NetworkConfig
@@ -133,16 +133,9 @@ class CompactNetwork(Network):
         count: int,
     ) -> DecisionFeatures:
         """The geometry of a decision; arguments as in ``Network``."""
-        left = remaining(features, chosen, count)
-        depth = min(self.config.lookahead, chosen.shape[-1] - count)
-        vectors = vector_features(
-            left.vectors, left.spanned, available, depth, self.config.close_up
-        )
-        return DecisionFeatures(
-            vectors,
-            chosen=left.chosen.sum(-2) / max(count, 1),
-            reached=left.log_det + vectors.best[..., -1],
-            progress=left.progress,
+        config = self.config
+        return decision_features(
+            features, chosen, available, count, config.lookahead, config.close_up
         )
 
     def encode(self, features: CandidateFeatures) -> jax.Array:

@@ -18,10 +18,9 @@ __all__ = [
     "FEATURES",
     "CandidateFeatures",
     "DecisionFeatures",
-    "Remaining",
     "VectorFeatures",
     "close_up_of",
-    "remaining",
+    "decision_features",
     "vector_features",
 ]
 
@@ -77,23 +76,23 @@ class DecisionFeatures(NamedTuple):
     # left / p, whether K > p
 
 
-class Remaining(NamedTuple):
-    """What is left of a set after ``count`` choices."""
-
-    vectors: jax.Array  # (..., M, p) conditional vectors; their size is the gain
-    spanned: bool  # whether a choice multiplies det by 1 + |y|^2, else by |y|^2
-    log_det: jax.Array  # (...,) log det(Z.T Z) of the chosen
-    progress: jax.Array  # (..., 7) as in DecisionFeatures
-    chosen: jax.Array  # (..., count, M) one-hot choices
-
-
-def remaining(features: CandidateFeatures, chosen: jax.Array, count: int) -> Remaining:
-    """What is left of a set after ``count`` choices.
+def decision_features(
+    features: CandidateFeatures,
+    chosen: jax.Array,
+    available: jax.Array,
+    count: int,
+    lookahead: int,
+    close_up: bool,
+) -> DecisionFeatures:
+    """What is left of a set after ``count`` choices, the same for the whole batch.
 
     Args:
         features: of the set.
         chosen: (..., K) int, of which the first ``count`` are chosen, the rest -1.
-        count: the same for the whole batch.
+        available: (..., M) bool.
+        count: choices made.
+        lookahead: most greedy choices to look ahead.
+        close_up: as for ``vector_features``.
     """
     x = features.whitened
     p, total = x.shape[-1], chosen.shape[-1]
@@ -102,20 +101,25 @@ def remaining(features: CandidateFeatures, chosen: jax.Array, count: int) -> Rem
     picked = jnp.einsum(
         "...km,...mp->...kp", which, x, precision=jax.lax.Precision.HIGHEST
     )
+    # A choice multiplies the determinant by |y|^2, or by 1 + |y|^2.
     if total == p:
         # Every choice is a new direction: exact projections.
-        (y, so_far), spanned = geometry.projected(x, picked), False
+        y, so_far = geometry.projected(x, picked)
     else:
         # The metric of the chosen; until they span the space, with a ridge small
         # beside what a posture contributes.
-        ridge = _RIDGE if count < p else 0.0
-        y, so_far = geometry.normalised_by(x, picked, ridge)
-        spanned = True
+        y, so_far = geometry.normalised_by(x, picked, _RIDGE if count < p else 0.0)
+    depth = min(lookahead, left)
+    vectors = vector_features(y, total != p, available, depth, close_up)
     ends = (left == 1, left == 2, left == 3, 1.0 / left)
-    shares = (count / p, jnp.minimum(left / p, 3.0), total > p)
-    numbers = [jnp.asarray(number, x.dtype) for number in (*ends, *shares)]
-    progress = jnp.broadcast_to(jnp.stack(numbers), (*so_far.shape, len(numbers)))
-    return Remaining(y, spanned, features.offset + so_far, progress, which)
+    shares = (count / p, min(left / p, 3.0), total > p)
+    numbers = jnp.asarray([*ends, *shares], x.dtype)
+    return DecisionFeatures(
+        vectors,
+        chosen=which.sum(-2) / max(count, 1),
+        reached=features.offset + so_far + vectors.best[..., -1],
+        progress=jnp.broadcast_to(numbers, (*so_far.shape, len(numbers))),
+    )
 
 
 def close_up_of(ahead: jax.Array) -> jax.Array:

@@ -50,20 +50,20 @@ def expected(job: argparse.Namespace, environ: Mapping[str, str] = os.environ) -
         ValueError: naming the flag, the rule and the value.
     """
     address, number, own = job.coordinator, job.num_processes, job.process_id
-    if number is not None and number < 1:
+    if number == 1:
+        return False
+    if address is number is own is None:
+        return _cluster(environ)
+    if address is None or number is None or own is None:
+        raise ValueError(
+            "--coordinator, --num-processes and --process-id must come together"
+        )
+    if number < 1:
         raise ValueError(f"--num-processes must be at least 1, got {number}")
-    if own is not None and (number is None or not 0 <= own < number):
-        limit = "--num-processes" if number is None else number
-        raise ValueError(f"--process-id must be in [0, {limit}), got {own}")
-    if address is not None:
-        if not re.fullmatch(r".+:\d+", address):
-            raise ValueError(f"--coordinator must be HOST:PORT, got {address!r}")
-        if number is None or own is None:
-            raise ValueError("--coordinator needs --num-processes and --process-id")
-    if number is None or number == 1:
-        return number is None and _cluster(environ)
-    if own is None or (address is None and not _cluster(environ)):
-        raise ValueError("--num-processes needs --coordinator and --process-id")
+    if not 0 <= own < number:
+        raise ValueError(f"--process-id must be in [0, {number}), got {own}")
+    if not re.fullmatch(r".+:\d+", address):
+        raise ValueError(f"--coordinator must be HOST:PORT, got {address!r}")
     return True
 
 

@@ -45,14 +45,12 @@ _FIXED = dict(
     num_envs=256, num_eval_envs=256, batch_size=64, num_minibatches=16,
     num_updates_per_batch=4, normalize_observations=False,
 )  # fmt: skip
-_WIDTH = 64  # of the network, where the preset has another kind
-_FASTEST = 1e-3  # learning rate; brax's updates diverge at the compact preset's 2e-3
 
 
 def adapted(config: TrainConfig) -> TrainConfig:
     """A preset as brax trains it: another architecture, a learning rate it bears."""
-    width = config.network.width if config.network.kind == "paper" else _WIDTH
-    rate = min(config.ppo.learning_rate, _FASTEST)
+    width = config.network.width if config.network.kind == "paper" else 64
+    rate = min(config.ppo.learning_rate, 1e-3)  # brax's updates diverge at 2e-3
     ppo = dataclasses.replace(config.ppo, learning_rate=rate)
     network = NetworkConfig(kind="paper", width=width)
     return dataclasses.replace(config, network=network, ppo=ppo)
@@ -70,17 +68,13 @@ def require_read(given: Collection[str]) -> None:
 class _MaskedCategorical(distribution.ParametricDistribution):
     """brax's distribution interface over logits that the network has masked."""
 
-    def __init__(self, num_actions: int) -> None:
-        identity = distribution.IdentityPostprocessor()
-        super().__init__(num_actions, identity, event_ndims=0, reparametrizable=False)
-
     def create_dist(self, parameters: jax.Array) -> Any:
         log_probs = jax.nn.log_softmax(parameters)
         entropy = -(jnp.exp(log_probs) * log_probs).sum(-1)
 
         def log_prob(x: jax.Array) -> jax.Array:
-            index = x.astype(jnp.int32)[..., None]
-            return jnp.take_along_axis(log_probs, index, axis=-1)[..., 0]
+            one = jax.nn.one_hot(x.astype(jnp.int32), log_probs.shape[-1])
+            return (one * log_probs).sum(-1)
 
         return types.SimpleNamespace(
             sample=lambda seed: jax.random.categorical(seed, log_probs),
@@ -105,7 +99,9 @@ def _networks(env: SelectionConfig, config: NetworkConfig) -> PPONetworks:
         begin = functools.partial(initial, network, m=m, n=n, k=env.num_selected)
         return FeedForwardNetwork(init=begin, apply=apply)
 
-    return PPONetworks(read(0), read(1), _MaskedCategorical(m))
+    identity = distribution.IdentityPostprocessor()
+    actions = _MaskedCategorical(m, identity, event_ndims=0, reparametrizable=False)
+    return PPONetworks(read(0), read(1), actions)
 
 
 def _replicated(tree: Any, devices: list[Any]) -> Any:

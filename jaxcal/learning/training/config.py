@@ -15,6 +15,8 @@ from jaxcal.learning.settings import require, setting
 
 __all__ = ["TrainConfig"]
 
+_PLAIN = ("preset", "imitation", "seed", "num_seeds")  # fields that JSON holds as is
+
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
@@ -52,24 +54,18 @@ class TrainConfig:
     def as_meta(self) -> dict[str, Any]:
         """Plain JSON values; ``from_meta`` reads them back."""
         return {
-            "preset": self.preset,
+            **{name: getattr(self, name) for name in _PLAIN},
             "network": dataclasses.asdict(self.network),
             "ppo": dataclasses.asdict(self.ppo),
             "tasks": [task.as_meta() for task in self.tasks],
-            "imitation": self.imitation,
-            "seed": self.seed,
-            "num_seeds": self.num_seeds,
         }
 
     @staticmethod
     def from_meta(meta: dict[str, Any]) -> TrainConfig:
         """The configuration a checkpoint was trained with."""
         return TrainConfig(
-            preset=meta["preset"],
+            **{name: meta[name] for name in _PLAIN},
             network=NetworkConfig(**meta["network"]),
             ppo=EpisodesConfig(**meta["ppo"]),
             tasks=tuple(Task.from_meta(task) for task in meta["tasks"]),
-            imitation=meta["imitation"],
-            seed=meta["seed"],
-            num_seeds=meta["num_seeds"],
         )

@@ -83,7 +83,7 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
             raise Refused(
                 f"{axis.name} stands {room[-1] + ROOM_DEG:.1f} deg from a limit; the "
                 f"check moves it {REACH_DEG:g} deg either way. Move it inwards: "
-                f"jaxcal-rig jog {axis.name}"
+                f"jaxcal-rig jog {axis.name} DEG"
             )
 
     def visit(name: str, offset: dict[int, int], samples: int = 0) -> Stand:

@@ -1,13 +1,14 @@
 """Play, dead zone and breakaway of one axis.
 
-The play comes first, away from where a dead zone may be: the difference of the readings
-at one place that is reached from either side. Then the dead zone, always from below, so
-that the play shifts all alike: the difference of the readings on its two sides. Both
-are repeated until their intervals are narrow. Then the breakaway: steps from rest, on
-in the direction in which the axis came, so that no play enters; there every step
-follows from the last, by a belief of :mod:`jaxcal.adaptive`.
+Play and dead zone have a fixed plan of PAIRS differences, since each says as much as
+any other. The play comes first, away from where a dead zone may be: the difference of
+the readings at one place that is reached from either side. Then the dead zone, always
+from below, so that the play shifts all alike: the difference of the readings on its two
+sides. Then the breakaway: steps from rest, on in the direction in which the axis came,
+so that no play enters; there every step follows from the last, by a belief of
+:mod:`jaxcal.adaptive`.
 
-Ways are degrees of the axis's commands from where it stood, on the side that has room.
+Ways are degrees of the axis's commands from where it stood, upwards.
 """
 
 from __future__ import annotations
@@ -33,21 +34,21 @@ from rig.core.motion import move
 from rig.core.proof import ALLOWED_DEG
 from rig.workbench.commission.axes import ROOM_DEG, SEEN_DEG
 from rig.workbench.commission.findings import Stand, stand_at, turn
+from rig.workbench.procedures.goto import CENTRE_DEG
 from rig.workbench.run import Run
 
 LEVEL = 0.95
-ENOUGH_DEG = 0.02  # width of an interval
+PAIRS = 8  # of readings, of the play and of the dead zone
 MOST_DEG = 1.5  # of play
 FAR_DEG = 1.5 * MOST_DEG  # of a move after which play and friction are taken up
 ZONE_DEG = 0.8  # of the dead zone at most
-CENTRE_DEG = 0.2  # of its centre from where the axis stands, at most
 REACH_DEG = 0.5 * ZONE_DEG + CENTRE_DEG + 0.2  # either way, to be past the zone
 BASE_DEG = FAR_DEG + REACH_DEG + MOST_DEG / 2.0  # where the play is measured
 STEPS = 64  # of a breakaway; its threshold is looked for under so many
 STEP_DEG = 0.01  # or the next whole number of pulses
+ENOUGH_DEG = 0.02  # width of the breakaway's intervals
 OVERSHOOT_DEG = 0.1  # by which a step may exceed the threshold
 RISK = 0.05  # that it exceeds it by more
-LEAST, MOST = 3, 20  # pairs of readings of the play, and of the dead zone
 MOST_STEPS = 40
 LEAST_SIGMA_DEG = 0.002  # of a reading: finer is not believed
 T = TypeVar("T")
@@ -63,14 +64,12 @@ class Probe:
         self.start = device.positions()
         self.here_deg = here = self.scale.to_deg(self.start[axis])
         low, high = self.scale.min_deg, self.scale.max_deg
-        above, below = high - here - ROOM_DEG, here - low - ROOM_DEG
         up, down = BASE_DEG + FAR_DEG, REACH_DEG + FAR_DEG
-        self.side = 1 if above >= up and below >= down else -1
-        if self.side < 0 and (below < up or above < down):
+        if here + up > high - ROOM_DEG or here - down < low + ROOM_DEG:
             raise Refused(
                 f"{self.name} stands at {here:.2f} deg, between its limits {low:g} and "
-                f"{high:g}; {up:g} deg of room one way and {down:g} the other are "
-                f"needed. Move it inwards: jaxcal-rig jog {self.name}"
+                f"{high:g}; {up:g} deg of room upwards and {down:g} downwards are "
+                f"needed. Move it: jaxcal-rig jog {self.name} DEG"
             )
         self.count = 0  # measurements
         self._base = device.attitude()  # (3, 3) that readings are from
@@ -89,20 +88,20 @@ class Probe:
     def at(self, way_deg: float, label: str = "back") -> Posture:
         """The axis this far from where it began, the others there."""
         target = list(self.start)
-        target[self.axis] += self.scale.to_pulses(self.side * way_deg)
+        target[self.axis] += self.scale.to_pulses(way_deg)
         return Posture(label, tuple(target))
 
     def way(self, found: Stand) -> float:
         """Degrees commanded from where the axis stood."""
-        pulses = round(found.pulses[self.axis] - self.start[self.axis])
-        return self.side * self.scale.to_deg(pulses)
+        return self.scale.to_deg(found.pulses[self.axis] - self.start[self.axis])
 
     def read(self, found: Stand) -> float:
         """Commanded degrees along the axis, by the phone."""
         return float(turn(self._base, found.attitude) @ self._line / self._rate)
 
-    def off(self, found: Stand) -> float:
-        """Reading less command, degrees of the commands."""
+    def off(self, label: str, *ways_deg: float) -> float:
+        """Reading less command at the last of the ways, degrees of the commands."""
+        found = self.stand(f"{self.name}:{label}", *ways_deg)
         return self.read(found) - self.way(found)
 
     def play(self) -> tuple[Estimate, float]:
@@ -115,11 +114,10 @@ class Probe:
         up = [self.stand("up", at - far, at), self.stand("top", at + far)]
         down = [self.stand("down", at), self.stand("bottom", at - far)]
         self._base = mean_rotation([up[0].attitude, down[0].attitude])
-        ends = [*up, *down[::-1]]
-        a, b, c, d = (turn(self._base, each.attitude) for each in ends)
-        ways = [self.way(each) for each in ends]
-        deg = abs(ways[1] - ways[0] + ways[3] - ways[2]) / 2.0
-        each = (b - a + d - c) / 2.0 / deg
+        turns = [turn(self._base, each.attitude) for each in [*up, *down]]
+        deg = (self.way(up[1]) - self.way(up[0]) + self.way(down[0])) / 2.0
+        deg -= self.way(down[1]) / 2.0
+        each = (turns[1] - turns[0] + turns[2] - turns[3]) / 2.0 / deg
         self._rate = float(np.linalg.norm(each))
         self._line = each / self._rate
         if self._rate * deg < SEEN_DEG:
@@ -130,45 +128,30 @@ class Probe:
         first = self.read(down[0]) - self.read(up[0])
         if first > 0.9 * MOST_DEG:
             raise self.too_much("play", first, MOST_DEG)
-        noise = max(each.std_deg / each.samples**0.5 for each in ends) / self._rate
-        sigma = max(noise, LEAST_SIGMA_DEG)
+        noise = max(each.std_deg / each.samples**0.5 for each in [*up, *down])
+        sigma = max(noise / self._rate, LEAST_SIGMA_DEG)
+        values = [
+            self.off(f"down:{number}", at + far, at)
+            - self.off(f"up:{number}", at - far, at)
+            for number in range(PAIRS)
+        ]
+        return _mean(values, sigma), sigma
 
-        def once(number: int) -> float:
-            above = self.stand(f"{self.name}:down:{number}", at + far, at)
-            below = self.stand(f"{self.name}:up:{number}", at - far, at)
-            return self.off(above) - self.off(below)
-
-        return _repeated(once, 2.0**0.5 * sigma), sigma
-
-    def zone(self, play: float, sigma: float) -> tuple[Estimate, float]:
-        """Width and centre of the dead zone; the play, taken up from below, is put
-        back."""
-
-        def off(label: str, command: float) -> float:
-            way = command + play / 2.0
-            return self.off(self.stand(f"{self.name}:{label}", way - FAR_DEG, way))
-
-        aboves: list[float] = []
-
-        def once(number: int) -> float:
-            aboves.append(off(f"above:{number}", REACH_DEG))
-            return off(f"below:{number}", -REACH_DEG) - aboves[-1]
-
-        width = _repeated(once, 2.0**0.5 * sigma)
+    def zone(self, play: float, sigma: float) -> Estimate:
+        """The dead zone's width; the play, taken up from below, is put back."""
+        above, below = play / 2.0 + REACH_DEG, play / 2.0 - REACH_DEG
+        values = [
+            self.off(f"below:{number}", below - FAR_DEG, below)
+            - self.off(f"above:{number}", above - FAR_DEG, above)
+            for number in range(PAIRS)
+        ]
+        width = _mean(values, sigma)
         if width.high > 0.98 * ZONE_DEG:
             raise self.too_much("dead zone", width.mean, ZONE_DEG)
-        if width.low == 0.0:
-            return width, 0.0
-        # Across it the joint stays, so that a command there is off by its distance.
-        commands = np.linspace(-CENTRE_DEG, CENTRE_DEG, 5)
-        seen = [off(f"across:{i}", c) - np.mean(aboves) for i, c in enumerate(commands)]
-        centres = np.linspace(-CENTRE_DEG, CENTRE_DEG, 401)
-        told = np.clip(width.mean / 2 - (commands - centres[:, None]), 0.0, width.mean)
-        errors = ((told - seen) ** 2).sum(axis=1)
-        return width, float(np.mean(centres[errors <= errors.min() + sigma**2]))
+        return width
 
     def breakaway(self, sigma: float) -> tuple[Estimate, Estimate]:
-        """Steps up and down that the joint does not answer, on the probe's side."""
+        """Steps up and down that the joint does not answer."""
         per_deg = abs(self.scale.pulses_per_deg)
         least = math.ceil(STEP_DEG * per_deg) / per_deg
         decider = Cautious(OVERSHOOT_DEG, RISK)
@@ -219,19 +202,9 @@ def characterise(run: Run, device: Device, axis: int) -> dict[str, Any]:
     next_measurement(_step_task(0.01, STEP_DEG), [(0, 0)], Cautious())  # compiles it
     probe = Probe(run, device, axis)
     play, sigma = probe.play()
-    zone, centre = probe.zone(play.mean, sigma)
+    zone = probe.zone(play.mean, sigma)
     up, down = probe.breakaway(sigma)
     move(device, probe.at(0.0))
-    result = {
-        "axis": probe.name,
-        "level": LEVEL,
-        "backlash_deg": _kept(play),
-        "dead_zone_deg": _kept(zone),
-        "dead_zone_at_deg": round(probe.here_deg + probe.side * centre, 5),
-        "breakaway_deg": [_kept(each) for each in (up, down)[:: probe.side]],
-        "measurements": probe.count,
-    }
-    run.emit("characterised", sync=True, **result)
     told = {
         "play": play, "dead zone": zone, "breakaway up": up, "breakaway down": down
     }  # fmt: skip
@@ -241,6 +214,16 @@ def characterise(run: Run, device: Device, axis: int) -> dict[str, Any]:
             f"{each.low:.4f}..{each.high:.4f}"
         )
     run.say(f"from {probe.count} measurements")
+    result = {
+        "axis": probe.name,
+        "level": LEVEL,
+        "backlash_deg": _kept(play),
+        "dead_zone_deg": _kept(zone),
+        "dead_zone_at_deg": round(probe.here_deg, 5),  # give or take CENTRE_DEG
+        "breakaway_deg": [_kept(up), _kept(down)],
+        "measurements": probe.count,
+    }
+    run.emit("characterised", sync=True, **result)
     return result
 
 
@@ -249,22 +232,10 @@ def _kept(found: Estimate) -> dict[str, float]:
     return {name: round(value, 5) for name, value in each.items()}
 
 
-def _repeated(measure: Callable[[int], float], sigma: float) -> Estimate:
-    """The mean of what a measurement says, again until its interval is narrow.
-
-    Each says as much as any other, so there is nothing to choose between them.
-
-    Args:
-        measure: the number of a measurement, from 1 on, to its value.
-        sigma: least standard deviation of one value.
-    """
-    values: list[float] = []
-    half = math.inf
-    while len(values) < LEAST or (len(values) < MOST and half > ENOUGH_DEG / 2):
-        values.append(measure(len(values) + 1))
-        if (count := len(values)) >= LEAST:
-            spread = max(sigma, float(np.std(values, ddof=1)))
-            half = special.stdtrit(count - 1, 0.5 + LEVEL / 2) * spread / count**0.5
+def _mean(values: list[float], sigma: float) -> Estimate:
+    """Of differences of two readings, each with at least this standard deviation."""
+    spread = max(2.0**0.5 * sigma, float(np.std(values, ddof=1))) / len(values) ** 0.5
+    half = float(special.stdtrit(len(values) - 1, 0.5 + LEVEL / 2)) * spread
     mean = max(0.0, float(np.mean(values)))
     return Estimate(mean, max(0.0, mean - half), mean + half)
 

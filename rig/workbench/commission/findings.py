@@ -205,8 +205,8 @@ def find(
     if mirrored and order is None and not names_known:
         raise MotionFault(
             "the axes are mirrored, and the phone is too noisy to tell whether a "
-            "direction is wrong or imu.signs. Raise settle.samples, or jog each axis, "
-            "correct axes.*.direction and imu.signs, and use --names-known"
+            "direction is wrong or imu.signs. Raise settle.samples, then run "
+            "`jaxcal-rig axes` again"
         )
     told = euler_to_matrix(config.imu.mounting_deg, "ZYX")
     turned = float(np.linalg.norm(turn(told, mounting)))
@@ -234,8 +234,8 @@ def _placed(
         if np.linalg.det(axes * signs) * np.linalg.det(expected) < 0:
             raise MotionFault(
                 "the three axes are mirrored: one direction is wrong, or all three. "
-                "Jog each axis, and set axes.*.direction of the one that turns the "
-                "negative way"
+                "Move each with `jaxcal-rig jog`, and set axes.*.direction of the one "
+                "that turns the negative way"
             )
     else:
         told = euler_to_matrix(config.imu.mounting_deg, "ZYX")

@@ -47,13 +47,14 @@ class Operator:
         except EOFError:
             raise Refused(f"{prompt}no answer") from None
 
-    def number(self, question: str, default: float) -> float:
-        """A number; asked again where the answer is none."""
+    def number(self, question: str, default: float, most: float = 1e9) -> float:
+        """A number; asked again where the answer is none, or larger either way."""
         while True:
             answer = self.ask(question, f"{default:g}")
             with contextlib.suppress(ValueError):
-                return float(answer)
-            self.say(f"  must be a number, got {answer!r}")
+                if abs(number := float(answer)) <= most:
+                    return number
+            self.say(f"  must be a number in [{-most:g}, {most:g}], got {answer!r}")
 
     def choose(self, question: str, known: list[str], default: str) -> str:
         """One of ``known``; asked again where the answer is none of them."""
@@ -67,4 +68,4 @@ class Operator:
         if self.yes:
             self.say(f"confirmed by --yes: {word}")
         elif self._answer(f"Type {word} to go on: ") != word:
-            raise Refused("not confirmed; nothing was done")
+            raise Refused(f"{word!r} was not typed: not confirmed, nothing was done")

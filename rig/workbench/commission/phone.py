@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import socket
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,24 +17,12 @@ from rig.core.phone import Imu
 LOOK_S = 1.0
 
 
-@dataclasses.dataclass(frozen=True)
-class Stream:
+class Stream(NamedTuple):
     """A phone's stream over some seconds."""
 
     rate_hz: float
     longest_gap_s: float
-    scatter_deg: float  # about the mean attitude
-    tilt_deg: float  # of the screen's normal from the vertical
-    dropped: dict[str, int]  # records that were not used, by reason
     sender: str  # address
-
-    def __str__(self) -> str:
-        dropped = ", ".join(f"{n} {reason}" for reason, n in self.dropped.items())
-        return (
-            f"{self.rate_hz:.0f} readings per s, longest gap "
-            f"{self.longest_gap_s:.2f} s, scatter {self.scatter_deg:.3f} deg, tilt "
-            f"{self.tilt_deg:.1f} deg, dropped: {dropped or 'none'}"
-        )
 
 
 def addresses_text(settings: ImuSettings, port: int) -> str:
@@ -66,16 +54,16 @@ def watch(
         matrices = [reading.matrix for reading in readings[-500:]]
         mean = mean_rotation(matrices)
         apart = [angle_between_deg(mean, matrix) for matrix in matrices]
-        stream = Stream(
-            rate_hz=len(readings) / spent,
-            longest_gap_s=float(gaps.max(initial=0.0)) or spent,
-            scatter_deg=float(np.sqrt(np.mean(np.square(apart)) / 3.0)),
-            tilt_deg=float(np.degrees(np.arccos(np.clip(mean[2, 2], -1.0, 1.0)))),
-            dropped={n: k for n, k in imu.counts.items() if n != "accepted"},
-            sender=imu.sender,
+        scatter = float(np.sqrt(np.mean(np.square(apart)) / 3.0))
+        tilt = float(np.degrees(np.arccos(np.clip(mean[2, 2], -1.0, 1.0))))
+        dropped = [f"{n} {why}" for why, n in imu.counts.items() if why != "accepted"]
+        rate, gap = len(readings) / spent, float(gaps.max(initial=0.0)) or spent
+        say(
+            f"  {rate:.0f} readings per s, longest gap {gap:.2f} s, scatter "
+            f"{scatter:.3f} deg, tilt {tilt:.1f} deg, dropped: "
+            + (", ".join(dropped) or "none")
         )
-        say(f"  {stream}")
-    return stream
+    return Stream(rate, gap, imu.sender)
 
 
 def serial_lines() -> list[str]:

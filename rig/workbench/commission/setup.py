@@ -162,11 +162,12 @@ def go(place: steps.Place, given: Given) -> int:
     if record.missing(place.config, HOMED):
         say("6 jog and home")
         choices = [*AXIS_NAMES, "no"]
-        question = f"move an axis to the zero posture by hand ({', '.join(choices)})"
+        question = f"move an axis towards the zero posture ({', '.join(choices)})"
         while not operator.yes:
             if (name := operator.choose(question, choices, "no")) == "no":
                 break
-            steps.jog(place, AXIS_NAMES.index(name), None)
+            way = operator.number(f"{name}: degrees", 1.0, steps.MOST_JOG_DEG)
+            steps.jog(place, AXIS_NAMES.index(name), way)
         how = "here"
         if can_home(place.config):
             question = (

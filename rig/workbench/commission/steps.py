@@ -7,23 +7,23 @@ import dataclasses
 import functools
 import os
 import pathlib
-import sys
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
 from rig.config import AXIS_NAMES, RigConfig
 from rig.core import session
+from rig.core.attitude import angle_between_deg
 from rig.core.bus import Bus
-from rig.core.device import Device
+from rig.core.device import Device, Posture
 from rig.core.drive import Drive
-from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, MotionFault, Refused
+from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
 from rig.core.known import check_drives
+from rig.core.motion import move
 from rig.core.phone import Imu
-from rig.core.proof import slowed
+from rig.core.proof import ALLOWED_DEG, slowed
 from rig.journal import (
     HOMED,
     IDENTIFIED,
-    SIGN_CHECKED,
     STATES,
     DeviceRecord,
     Record,
@@ -33,7 +33,6 @@ from rig.journal.lock import BusLock
 from rig.workbench.commission.axes import check_axes
 from rig.workbench.commission.findings import Change
 from rig.workbench.commission.home import can_home, home, identity, unlimited
-from rig.workbench.commission.jog import by_keyboard, step
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.phone import Stream, addresses_text, watch
 from rig.workbench.outputs.console import listen
@@ -44,8 +43,13 @@ if TYPE_CHECKING:
     from rig.simulator import Simulator
 
 WATCH_S = 5.0
+MOST_JOG_DEG = 10.0  # in one step
 # Below these a session's settle window would hardly ever fill.
 SLOW_HZ, LONG_GAP_S = 5.0, 0.3
+
+
+class Enough(Exception):
+    """The phone has turned as far as the whole step was to turn it."""
 
 
 @dataclasses.dataclass
@@ -158,8 +162,8 @@ def go_home(place: Place, here: bool) -> int:
     if not here and not can_home(place.config):
         without = {a.map.name for a in place.config.axes if a.map.home is None}
         raise Refused(
-            f"the map {', '.join(sorted(without))} has no homing. Put the device "
-            "into its home posture and use --here"
+            f"the map {', '.join(sorted(without))} has no homing. Put the device into "
+            "its home posture, then run `jaxcal-rig home --here`"
         )
     what = "nothing moves; where the device stands becomes the origin of its counts"
     if not here:
@@ -175,25 +179,43 @@ def go_home(place: Place, here: bool) -> int:
     return place.run("home", lambda run, dev: home(run, dev, here), limits=False)
 
 
-def jog(place: Place, axis: int, way_deg: float | None) -> int:
-    """Move one axis by a step, or as long as a key is held."""
+def jog(place: Place, axis: int, way_deg: float) -> int:
+    """Move one axis by so many degrees, cut at its limits.
+
+    Where its gearing is not proved it stops once the phone has turned so far.
+    """
     name = AXIS_NAMES[axis]
-    if way_deg is None and (place.operator.yes or not sys.stdin.isatty()):
-        raise Refused(f"jog {name}: holding a key needs a terminal; give a step in deg")
     homed = place.record.missing(place.config, HOMED) is None
     if not homed:
         place.say("the device is not HOMED: the soft limits are not in force")
-    move = "while a key is held" if way_deg is None else f"by {way_deg:g} deg"
-    place.operator.confirm(f"jog: {name} will move {move}, slowly", "jog")
+    place.operator.confirm(f"jog: {name} will move by {way_deg:g} deg, slowly", "jog")
 
     def procedure(run: Run, device: Device) -> None:
-        if way_deg is None:
-            by_keyboard(run, device, axis)
-        else:
-            step(run, device, axis, way_deg)
+        each, here = run.config.axes[axis], list(device.positions())
+        start, checked = here[axis], device.proof.reaches[axis].checked
+        goal = min(max(each.to_deg(start) + way_deg, each.min_deg), each.max_deg)
+        here[axis] = min(max(each.to_pulses(goal), each.min_pulses), each.max_pulses)
+        base = device.attitude()
+        device.proof.stay_near(base, max(ALLOWED_DEG, 2.0 * abs(way_deg)))
 
-    way = "" if way_deg is None else f" {way_deg:g}"
-    return place.run("jog", procedure, limits=homed, again=f"jog {name}{way}")
+        def look() -> None:
+            turned = angle_between_deg(base, device.imu.latest().matrix)
+            if turned > abs(way_deg) and not checked:
+                raise Enough(f"{turned:.1f}")
+
+        device.meanwhile = look
+        try:
+            move(device, Posture("jog", tuple(here)))
+        except Enough as turned:
+            device.stopper.stop("the phone has turned far enough", latch=False)
+            gone = abs(each.to_deg(device.positions()[axis] - start))
+            run.say(
+                f"  stopped: the phone has turned by {turned} deg after {gone:.2g} "
+                f"commanded. Check the reduction of {name}"
+            )
+        run.say(f"  {name} stands at {each.to_deg(device.positions()[axis]):.3f} deg")
+
+    return place.run("jog", procedure, limits=homed, again=f"jog {name} {way_deg:g}")
 
 
 def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> int:
@@ -220,7 +242,7 @@ def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> i
         found = measured.characterise(run, device, axis)
         if path is not None:
             keep(path, name, found | {"run": run.folder.name})
-            run.say(f"kept in {path}: `goto` puts the play back")
+            run.say(f"kept in {path}: `jaxcal-rig goto` puts the play back")
 
     return place.run("characterise", procedure, again=f"characterise {name}")
 
@@ -248,7 +270,10 @@ def _check_axes(place: Place, names_known: bool, again: bool = False) -> int:
     for change in changes:
         place.say(f"  {change}")
     if again or place.path is None:
-        place.say("the device is NOT sign-checked")
+        place.say(
+            "the device is NOT SIGN_CHECKED: correct rig.toml, then run `jaxcal-rig "
+            "axes` again"
+        )
         return EXIT_RECALIBRATE
     place.operator.confirm(
         f"axes: write this to {place.path}, then move the axes again", "correct"
@@ -273,6 +298,14 @@ def take_zero(place: Place) -> int:
     return place.run("zero", lambda run, device: session.take_zero(device))
 
 
+def commissioned(path: pathlib.Path, config: RigConfig, through: str) -> DeviceRecord:
+    """A new record of a simulated device, up to a state: nothing of it was moved."""
+    record = DeviceRecord(path)
+    for state in STATES[: STATES.index(through) + 1] if through else ():
+        record.reach(state, config)
+    return record
+
+
 def simulated(
     simulator: Simulator,
     served: RigConfig,
@@ -284,26 +317,3 @@ def simulated(
         served, record, Operator(yes=True, say=say), full_speed=True,
         listeners=(simulator.hear,),
     )  # fmt: skip
-
-
-def begin_simulated(place: Place, through: str) -> None:
-    """Take a simulated device through the states up to one, as a real one is taken.
-
-    Its drives keep their counts: they are homed as they stand.
-
-    Raises:
-        MotionFault: its axes are not as configured.
-    """
-    states = STATES[: STATES.index(through) + 1] if through else ()
-    if IDENTIFIED in states:
-        identify(place)
-    if HOMED in states:
-        with place.bus("home") as drives:
-            pulses = [drive.status().position for drive in drives]
-            origins = {drive.axis.name: drive.origin for drive in drives}
-        as_they_stand = {"how": "as they stand", "pulses": pulses, "origins": origins}
-        place.record.reach(HOMED, place.config, **as_they_stand)
-    if SIGN_CHECKED in states and _check_axes(place, names_known=False):
-        raise MotionFault(
-            "the simulated device's axes were not found to be as configured"
-        )

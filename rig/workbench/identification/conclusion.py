@@ -207,5 +207,7 @@ def check_matrix(matrix: ArrayLike) -> list[str]:
                 f"pulses_per_rev and reduction of axes.{name}"
             )
     if faults:
-        raise MotionFault(f"no calibration is saved: {'; '.join(faults)}")
+        raise MotionFault(
+            f"no calibration is saved: {'; '.join(faults)}. Run `jaxcal-rig axes`"
+        )
     return warnings

@@ -19,6 +19,7 @@ from jaxcal.files import write_text
 from rig.config import RigConfig, parse_config
 from rig.core.attitude import (
     DIGITS,
+    Array,
     euler_to_matrix,
     frame_at,
     matrix_to_euler,
@@ -28,8 +29,12 @@ from rig.core.faults import EXIT_OK, MotionFault, Refused
 from rig.journal import Record, RunFolder, measured_postures, new_run_folder
 from rig.workbench.identification.conclusion import check_matrix, conclude
 from rig.workbench.outputs.report import save_result
-from rig.workbench.readings import attitudes
 from rig.workbench.toml import set_values
+
+
+def attitudes(record: Record) -> Array:
+    """(samples, 3, 3) of the phone in its world, of a posture's or zero's readings."""
+    return Rotation.from_quat(record["quaternions"]).as_matrix()
 
 
 def reread(records: list[Record], then: RigConfig, now: RigConfig) -> list[Record]:
@@ -49,7 +54,7 @@ def reread(records: list[Record], then: RigConfig, now: RigConfig) -> list[Recor
     if not zeros or len(chosen) < then.session.k:
         raise Refused(
             f"the run holds {len(chosen)} of the {then.session.k} chosen postures that "
-            "a calibration takes. Resume it first"
+            "a calibration takes. Finish it first with `jaxcal-rig resume`"
         )
     same = (then.imu.order, then.imu.signs) == (now.imu.order, now.imu.signs)
     signs = np.array(then.imu.signs) * np.array(now.imu.signs)
@@ -121,12 +126,10 @@ def refit(
         raise Refused(f"nothing was written: read like this, {fault}") from None
     if changed:
         summary.pop("after", None)  # compensated by another calibration than this
-    was = folder / "summary.json"
     summary |= {
         "mode": "refit",
         "refit_of": folder.name,
         "changed": changed,
-        "was": json.loads(was.read_text(encoding="utf-8")) if was.is_file() else None,
         "simulated": start["simulated"],
     }
     into = new_run_folder(folder.resolve().parent, "refit")

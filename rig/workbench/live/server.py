@@ -110,7 +110,7 @@ def make_app(watcher: Watcher, linger_s: float | None = None) -> FastAPI:
     @app.get("/report")
     async def report() -> FileResponse:
         if watcher.report is None:
-            raise HTTPException(404, "this run has no report yet")
+            raise HTTPException(404, "no report yet: jaxcal-rig report writes one")
         return FileResponse(watcher.report)
 
     @app.get("/page.{kind}")

@@ -116,7 +116,10 @@ class Watcher:
         self.poll()
         pid = self.state.pid
         if not self.here or pid is None or not is_written(self.folder / JOURNAL):
-            raise Refused("nothing was sent: no session of this run is running here")
+            raise Refused(
+                "nothing was sent: no session of this run is running on this computer. "
+                "If the device moves, use the emergency stop"
+            )
         if number == PAUSE and self.state.phase in ("opening", "finishing"):
             raise Refused("there is nothing to pause: nothing is moving now")
         try:

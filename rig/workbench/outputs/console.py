@@ -64,10 +64,8 @@ def plan_lines(
     seconds = (ways / speeds).max(axis=1).sum() / session.k
     seconds += settle.window_s + 0.02 * settle.samples + 0.1
     total = seconds * (session.k + 2 * session.verify_postures + 2)
-    pitch, yaw, roll = ways.sum(axis=0)
     lines.append(
-        f"  travel pitch {pitch:.1f}, yaw {yaw:.1f}, roll {roll:.1f} deg; with "
-        f"{session.verify_postures} held-out postures, before and after, about "
+        f"  with {session.verify_postures} held-out postures, before and after, about "
         f"{total:.0f} s"
     )
     return lines

@@ -16,13 +16,11 @@ import numpy as np
 
 from jaxcal.pages import Code, Figure, Page, Section, Table, Text, write_page
 from rig.config import AXIS_NAMES
-from rig.core.attitude import Array
 from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE
 from rig.journal import JOURNAL, Record, RunFolder, is_written, measured_postures
 from rig.workbench.outputs.state import RunState
 from rig.workbench.outputs.view import headline, trouble, verdict
 from rig.workbench.outputs.words import choice_text, numbers, recalibrate, summary_lines
-from rig.workbench.readings import angles, recorded_frame
 
 FOOTER = (
     "Research software, not a medical device. Calibrate with no patient attached; a "
@@ -61,7 +59,7 @@ def write_report(folder: pathlib.Path, records: list[Record]) -> pathlib.Path:
     told += trouble(state, running, str(folder))
     intro = [Text(f"{made}."), Text(f"{headline(state, running)[1]}.")]
     intro += [Text(f"{text}.", "warning") for text in told]
-    sections = [*_result(state, summary), *_measured(records)]
+    sections = [*_result(state, summary), _measured(records)]
     rows = [
         [f"{datetime.datetime.fromtimestamp(when):%H:%M:%S}", line]
         for when, line in state.log
@@ -97,25 +95,18 @@ def _result(state: RunState, summary: Record) -> list[Section]:
     if changes := summary.get("changed"):
         rows = [[key, str(old), str(new)] for key, (old, new) in changes.items()]
         head = ["key of rig.toml", "as recorded", "here"]
-        parts = [Table(head, rows, numeric=False)]
-        if was := summary["was"]:
-            moved = [np.subtract(summary[name], was[name]) for name in ("A", "b")]
-            rows = [
-                [name, *(f"{value:+.5f}" for value in row)]
-                for name, row in zip(AXIS_NAMES, np.column_stack(moved), strict=True)
-            ]
-            parts.append(Table(["changed by", *HEAD], rows))
-        found.append(Section(f"Identified anew from {summary['refit_of']}", parts))
+        title = f"Identified anew from {summary['refit_of']}"
+        found.append(Section(title, [Table(head, rows, numeric=False)]))
     return found
 
 
-def _measured(records: list[Record]) -> list[Section]:
-    """Every posture measured so far, and its readings."""
+def _measured(records: list[Record]) -> Section:
+    """Every posture measured so far."""
     postures = list(measured_postures(records).values())
     if not postures:
         planned = any(r["event"] in ("plan", "collection") for r in records)
         what = "measured" if planned else "planned or measured"
-        return [Section("Postures", [f"Nothing was {what}."])]
+        return Section("Postures", [f"Nothing was {what}."])
     rows = [
         [
             r["name"], numbers(r["commanded_deg"], 0, 3),
@@ -127,13 +118,7 @@ def _measured(records: list[Record]) -> list[Section]:
     more = f", the first {MOST_ROWS} of them" if len(postures) > MOST_ROWS else ""
     table = Table(head, rows, f"{len(postures)} measured{more}")
     picture = drawn(draw_postures, postures, (6, 5), "commanded postures")
-    found = [Section("Postures", [picture, table])]
-    if zeros := [record for record in records if record["event"] == "zero"]:
-        frame = recorded_frame(records[0]["config"], zeros[-1])
-        off = [angles(r, frame) - np.array(r["measured_deg"]) for r in postures]
-        alt = "readings of every posture about their mean"
-        found.append(Section("Readings", [drawn(draw_readings, off, (9, 4), alt)]))
-    return found
+    return Section("Postures", [picture, table])
 
 
 # Figures
@@ -174,17 +159,6 @@ def draw_postures(figure: Any, records: list[Record]) -> None:
     axes = figure.add_subplot(projection="3d")
     shown = chosen or range(len(commands))
     plots.selection(axes, commands, list(shown), names, label="measured")
-
-
-def draw_readings(figure: Any, off: list[Array]) -> None:
-    """(samples, 3) of each posture about its mean, one after another."""
-    from jaxcal import plots
-
-    axes = figure.subplots(3, 1, sharex=True)
-    for axis, name, column in zip(axes, AXIS_NAMES, np.vstack(off).T, strict=True):
-        plots.residuals(axis, column, markersize=2)
-        axis.set(ylabel=f"{name} [deg]", xlabel="")
-    axes[-1].set_xlabel("reading, posture by posture, less the posture's mean")
 
 
 def draw_parameters(figure: Any, runs: list[Record]) -> None:

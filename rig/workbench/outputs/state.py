@@ -92,11 +92,15 @@ class RunState:
             case "plan" | "replan":
                 points = [self.to_deg(p) for p in record.get("candidates", [])]
                 self.candidates = points or self.candidates
-                self._choose(record["choice"]["indices"])
+                for name, each in [*self.postures.items()]:
+                    if each.role == "select" and each.state == "waiting":
+                        del self.postures[name]
+                for index in record["choice"]["indices"]:
+                    self._posture(f"select:{index}").commanded = self.candidates[index]
             case "held_out":
-                for number, (raw, compensated) in enumerate(record["pairs"]):
-                    self._posture(f"before:{number}", raw)
-                    self._posture(f"after:{number}", compensated)
+                for number, pair in enumerate(record["pairs"]):
+                    for role, pulses in zip(("before", "after"), pair, strict=True):
+                        self._posture(f"{role}:{number}", pulses)
             case "collection":
                 for number, pulses in enumerate(record["pulses"]):
                     self._posture(f"collect:{number}", pulses)
@@ -128,11 +132,14 @@ class RunState:
                 self.current, self.target = None, posture.commanded
                 if posture.role == "reference":
                     self.drift.append((now, record["measured_deg"]))
-            case "unreachable":
-                self._drop(record["name"], event, record["reason"])
-            case "void":
-                for name in record["names"]:
-                    self._drop(name, "withdrawn", "recorded while an axis slipped")
+            case "unreachable" | "void":
+                lost, note = "withdrawn", "recorded while an axis slipped"
+                if event == "unreachable":
+                    lost, note = event, record["reason"]
+                for name in record.get("names") or [record["name"]]:
+                    commanded = self._posture(name).commanded
+                    self.postures[name] = Posture(name, commanded, lost, note, time=now)
+                    self.current = None if self.current == name else self.current
             case "stop":
                 self.stop = record
             case "sender_refused" | "comm_restored":
@@ -152,20 +159,6 @@ class RunState:
         if self.current is not None and self.postures[self.current].state in ACTIVE:
             self.postures[self.current].state = "waiting"
         self.current = None
-
-    def _choose(self, indices: list[int]) -> None:
-        """These candidates are to be visited; those that only waited are forgotten."""
-        for name, posture in [*self.postures.items()]:
-            if posture.role == "select" and posture.state == "waiting":
-                del self.postures[name]
-        for index in indices:
-            self._posture(f"select:{index}").commanded = self.candidates[index]
-
-    def _drop(self, name: str, state: str, note: str) -> None:
-        posture = self._posture(name)
-        posture.state, posture.note, posture.time = state, note, self.time
-        posture.measured = posture.std = None
-        self.current = None if self.current == name else self.current
 
     def _posture(self, name: str, pulses: Any = None) -> Posture:
         posture = self.postures.setdefault(name, Posture(name))

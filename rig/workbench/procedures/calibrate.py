@@ -106,7 +106,8 @@ def _visit_chosen(run: Run, device: Device, candidates: Array, choice: Choice) -
         if lost > config.session.max_unreachable:
             raise MotionFault(
                 f"{lost} postures are out of reach, more than session.max_unreachable "
-                f"({config.session.max_unreachable}). Check the ranges"
+                f"({config.session.max_unreachable}). Narrow session.*_range_deg to "
+                "what the device reaches, and begin a new run"
             )
         plan = next(plans, None)
         if plan is None:

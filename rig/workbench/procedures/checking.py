@@ -1,9 +1,8 @@
-"""collect, verify and goto: the sessions besides calibrate."""
+"""collect and verify, and the calibration that a session uses."""
 
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,17 +11,15 @@ from jaxcal.files import atomic_write
 from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.config.config import differences
-from rig.core.attitude import Array, Frame
-from rig.core.device import Device, Posture
-from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
-from rig.core.known import KeptZero, unseen
-from rig.core.motion import move
+from rig.core.device import Posture
+from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
+from rig.core.known import KeptZero
 from rig.core.session import visit
 from rig.workbench.identification.fit import held_out_errors, pairs
 from rig.workbench.outputs.words import error_text, numbers
 from rig.workbench.procedures.calibrate import END, pair_names, visit_pairs
+from rig.workbench.procedures.goto import CHARACTERISED, Play
 from rig.workbench.procedures.plan import draw, draw_held_out
-from rig.workbench.procedures.play import CHARACTERISED, Play
 from rig.workbench.run import Run
 
 _OFFERED = 10  # targets to choose each posture of a check from
@@ -119,7 +116,7 @@ def load_calibration(
     if lack := {"device", "zero_pulses", "zero_attitude"} - notes.keys():
         raise Refused(
             f"{path}: does not say with which device and zero posture it was made "
-            f"(no {', '.join(sorted(lack))}). Calibrate this device"
+            f"(no {', '.join(sorted(lack))}). Calibrate it: jaxcal-rig calibrate"
         )
     if changed := differences(notes["device"], config.device_fingerprint()):
         raise Refused(
@@ -156,7 +153,10 @@ def verify(run: Run, calibration: Any, count: int) -> int:
         "held_out", lambda: {"pairs": telling(config, calibration, count)}
     )["pairs"]
     if not held:
-        raise Refused("no target in the ranges can be reached through this calibration")
+        raise Refused(
+            "no target in session.*_range_deg can be reached through this calibration. "
+            "Widen the ranges, or calibrate again"
+        )
     if run.dry_run:
         for raw, command in held:
             run.say(f"  target {numbers(config.to_deg(raw))}  command {list(command)}")
@@ -166,7 +166,10 @@ def verify(run: Run, calibration: Any, count: int) -> int:
             run.emit("phase", phase="saving")
     records, found = held_out_errors(config, held, run.postures(), calibration)
     if not found:
-        raise Refused("no held-out posture could be reached")
+        raise Refused(
+            "no held-out posture could be reached. Narrow session.*_range_deg to what "
+            "the device reaches"
+        )
     limit = config.session.verify_limit_deg
     again = found["after"]["max"] > limit
     run.save_pairs()
@@ -175,7 +178,8 @@ def verify(run: Run, calibration: Any, count: int) -> int:
     if calibration.noise_std is not None:
         told = calibration.check(*pairs(records), tolerance=limit)
         run.say(f"a drift that moves it by {limit:g} is seen with {told.power:.0%}")
-    run.say("RECALIBRATE: over the limit" if again else "the calibration still holds")
+    over = "RECALIBRATE: over session.verify_limit_deg. Run `jaxcal-rig calibrate`"
+    run.say(over if again else "the calibration still holds")
     return EXIT_RECALIBRATE if again else EXIT_OK
 
 
@@ -188,87 +192,3 @@ def telling(
         return offered[:count]
     at = np.array([config.to_deg(command) for _, command in offered])
     return [offered[i] for i in calibration.verification(at, count)]
-
-
-def goto(run: Run, calibration: Any, desired: Array, play: Play) -> int:
-    """Move the end-effector to (3,) desired degrees through a calibration.
-
-    Args:
-        run, calibration, desired: what moves, by what, and where to.
-        play: of the axes, put back by the direction in which each arrives.
-    """
-    config = run.config
-    command = np.asarray(calibration.command_for(desired), dtype=np.float64)
-    for axis, value, most in zip(config.axes, command, play.most, strict=True):
-        if not axis.min_deg + most <= value <= axis.max_deg - most:
-            raise LimitError(
-                f"{desired.tolist()} deg needs {axis.name} commanded to {value:.3f} "
-                f"deg, outside [{axis.min_deg:g}, {axis.max_deg:g}]"
-                + f" less its play, {most:.3f} deg"
-                * bool(most)
-            )
-    if run.dry_run or not play.axes:
-        _tell(run, desired, command)
-    if run.lacks(["goto"]):
-        with run.device() as device:
-            if play.axes:
-                command = _with_play(run, device, command, play)
-                _tell(run, desired, command)
-            visit(device, Posture("goto", config.to_pulses(command)), role="goto")
-            told = [drive.axis.name for drive in device.drives if drive.origin]
-            names = unchecked(config, device.frame, told)
-        if names:
-            run.say(
-                f"NOT CHECKED: whether {', '.join(names)} was moved while without "
-                "power. The drive does not tell, and the phone does not see a turn "
-                "about the vertical"
-            )
-    record = run.postures().get("goto")
-    if record is None:
-        return EXIT_RECALIBRATE
-    reached = np.array(record["measured_deg"])
-    run.say(
-        f"reached {reached.round(4).tolist()} deg, off by "
-        f"{(reached - desired).round(4).tolist()}"
-    )
-    return EXIT_OK
-
-
-def _tell(run: Run, desired: Array, command: Array) -> None:
-    run.say(
-        f"desired {desired.tolist()} deg: command {command.round(4).tolist()} deg, "
-        f"pulses {list(run.config.to_pulses(command))}"
-    )
-
-
-def unchecked(
-    config: RigConfig, frame: Frame | None, told: Sequence[str] = ()
-) -> list[str]:
-    """Axes of which neither drive nor phone tells that they were moved when off.
-
-    A drive without homed bit and absolute encoder counts from 0 when it is switched on:
-    where it was left there, its count says nothing. That of ``told`` axes does, whose
-    home is at a count of its own.
-    """
-    seen = [] if frame is None else unseen(config, frame.zero)
-    return [
-        axis.name
-        for axis in config.axes
-        if axis.name in seen
-        and not (axis.map.homed or axis.map.absolute_encoder or axis.name in told)
-    ]
-
-
-def _with_play(run: Run, device: Device, command: Array, play: Play) -> Array:
-    """(3,) the command with the play put back, once a move from below has taken it up.
-
-    From above, where there is no room below.
-    """
-    config, direction = run.config, np.ones(3)
-    if not config.motion.approach_overshoot_deg:  # else every posture is so reached
-        low = [axis.min_deg for axis in config.axes]
-        direction = np.where(command - play.run_up < low, -1.0, 1.0)
-        begin = command - direction * play.run_up
-        move(device, Posture("goto", config.to_pulses(begin)))
-    run.say(*play.lines(command, direction))
-    return command + play.shift(direction)
