@@ -55,7 +55,7 @@ def fit_affine(
 
     free = len(u) - (n + 1)  # residual degrees of freedom of each output
     squares = w @ residuals[used] ** 2
-    known, noise_dof = noise is not None, 0
+    noise_dof = 0
     if noise is None and free:
         each = squares / free
         noise = np.sqrt(np.full(m, each.mean()) if common_noise else each)
@@ -90,9 +90,7 @@ def fit_affine(
         "distance": distance,
         "dof": float(m * free),
         "square": square,
-        "num_readings": m,
+        "num_readings": float(m),
         "noise_std": noise,
-        "noise_known": known,
         "noise_dof": float(noise_dof),
-        "num_measurements": len(u),
     }

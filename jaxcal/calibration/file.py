@@ -9,6 +9,7 @@ import copy
 import json
 import os
 import pathlib
+import typing
 from typing import Any, NoReturn
 
 import numpy as np
@@ -17,53 +18,29 @@ from jaxcal.calibration.fit import Fit
 from jaxcal.files import write_text
 from jaxcal.models import Affine, Model, SerialChain, from_dict
 
-__all__ = ["content_of", "fields", "read", "write"]
+__all__ = ["fields", "read", "save", "to_dict", "write"]
 
 FORMAT = "jaxcal-calibration"
 VERSION = 3
 
-# Axes in letters: n inputs, m outputs, P parameters, others any; "" for one number.
-_SHAPES = {
-    "estimate": "P",
-    "joint_covariance": "PP",
-    "centre": "n",
-    "unidentified": "zP",
-    "prior_mean": "P",
-    "prior_precision": "P",
-    "free": "P",
-    "commands": "Nn",
-    "estimated_commands": "Nn",
-    "residuals": "Nm",
-    "loss_weights": "N",
-    "distance": "N",
-    "noise_std": "m",
-    "noise_dof": "",
-    "dof": "",
-    "square": "",
+_NUMBERS = {
+    name: hint
+    for name, hint in typing.get_type_hints(Fit, include_extras=True).items()
+    if typing.get_origin(hint) is typing.Annotated
 }
-_MAY_BE_NULL = (
-    *("joint_covariance", "centre", "unidentified", "estimated_commands"),
-    "noise_std",
-)
-_NOT_NEGATIVE = (
-    *("prior_precision", "free", "loss_weights", "distance", "noise_std"),
-    *("noise_dof", "dof", "square"),
-)
-_COUNTS = ("num_measurements", "num_readings")
 _NAMES = {"input_names": "n", "output_names": "m"}
 _KINDS = {
     "command_unit": (str, "text"),
     "measured_unit": (str, "text"),
     "loss": (str, "text"),
-    "noise_known": (bool, "true or false"),
     "provenance": (dict, "an object"),
 }
 
 
-def content_of(fit: Fit) -> dict[str, Any]:
+def to_dict(fit: Fit) -> dict[str, Any]:
     """The content of the file: names, numbers and lists, as JSON has them."""
     content: dict[str, Any] = {"format": FORMAT, "version": VERSION}
-    for key in (*_NAMES, *_SHAPES, *_COUNTS, *_KINDS):
+    for key in (*_NAMES, *_NUMBERS, *_KINDS):
         value = copy.deepcopy(getattr(fit, key))
         array = isinstance(value, np.ndarray | tuple)
         content[key] = np.asarray(value).tolist() if array else value
@@ -78,6 +55,15 @@ def content_of(fit: Fit) -> dict[str, Any]:
         content["derived"]["matrix"] = fit.matrix.tolist()
         content["derived"]["bias"] = fit.bias.tolist()
     return content
+
+
+def save(fit: Fit, path: str | os.PathLike[str]) -> None:
+    """Write a versioned JSON file atomically; see ``docs/calibration.md``.
+
+    Raises:
+        OSError: the folder is missing, not writable or full; the old file stays.
+    """
+    write(path, to_dict(fit))
 
 
 def write(path: str | os.PathLike[str], content: dict[str, Any]) -> None:
@@ -110,7 +96,7 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
     """The arguments of a calibration from the content of its file, checked.
 
     Args:
-        content: as ``content_of`` made it.
+        content: as ``to_dict`` made it.
         model: where the file cannot hold it.
 
     Raises:
@@ -125,7 +111,7 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
             f"version {VERSION}: identify again from the measurements"
         )
     found: dict[str, Any] = {}
-    for key in (*_SHAPES, *_COUNTS, *_NAMES, *_KINDS):
+    for key in (*_NUMBERS, *_NAMES, *_KINDS):
         if key not in content:
             raise ValueError(f'key "{key}" is missing')
         found[key] = content[key]
@@ -135,16 +121,13 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
             raise ValueError(f'"{key}" must {rule}, got {content.get(key)!r}')
 
     sizes: dict[str, int] = {}
-    for key, shape in _SHAPES.items():
-        if found[key] is None and key in _MAY_BE_NULL:
+    for key, hint in _NUMBERS.items():
+        shape, least = (*hint.__metadata__, -np.inf)[:2]
+        if found[key] is None and type(None) in typing.get_args(hint.__origin__):
             continue
         array = _array(key, found[key], shape, sizes)
-        least = 0.0 if key in _NOT_NEGATIVE else -np.inf
-        require(bool((array >= least).all()), key, "not be negative")
+        require(bool((array >= least).all()), key, f"be at least {least:g}")
         found[key] = array if shape else float(array)
-    for key in _COUNTS:
-        whole = type(found[key]) is int and found[key] >= 1
-        require(whole, key, "be a whole number >= 1")
     for key, letter in _NAMES.items():
         kinds = [type(x) for x in found[key]] if isinstance(found[key], list) else None
         require(kinds == [str] * sizes[letter], key, f"hold {sizes[letter]} names")

@@ -6,7 +6,7 @@ import copy
 import dataclasses
 import functools
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,14 +27,10 @@ class Fit:
 
     ``y = f(u; theta)`` with the most probable p parameters; P of them with
     an arm's harmonics. ``identify`` fills it, in closed form where the model is affine
-    and nothing else is asked for. Arrays are copied and frozen on entry.
+    and nothing else is asked for. Arrays are copied and frozen; letters are their axes,
+    with N measurements, and numbers their least value.
     """
 
-    residuals: Array  # (N, m) measured less predicted, measured unit
-    noise_std: Array | None  # (m,) at weight 1, behind every uncertainty
-    noise_known: bool  # True: noise_std was given; False: it comes from the residuals
-    noise_dof: float  # degrees of freedom of the noise estimated, 0 where known
-    num_measurements: int  # of positive weight
     input_names: tuple[str, ...]
     output_names: tuple[str, ...]
     command_unit: str  # "" where not stated
@@ -42,20 +38,25 @@ class Fit:
     provenance: Mapping[str, Any]  # created, packages, data_sha256, notes
     model: Model
     loss: str  # "student" or "gaussian"
-    estimate: Array  # (P,)
-    joint_covariance: Array | None  # (P, P); None where the noise is unknown
-    centre: Array | None  # (n,) of the affine closed form: with b the outputs there
-    unidentified: Array | None  # (z, P) directions that nothing determines
-    prior_mean: Array  # (P,)
-    prior_precision: Array  # (P,) 0 where nothing was known
-    free: Array  # (P,) 0 where held at the prior's mean, else 1
-    commands: Array  # (N, n) as given
-    estimated_commands: Array | None  # (N, n) where command_std was given
-    loss_weights: Array  # (N,) at most 1; small for an outlier, 0 where left out
-    distance: Array  # (N,) squared, from the fit without that measurement, in noise
-    dof: float  # residual degrees of freedom of all readings, prior counted
-    square: float  # sum of the squared residuals in noise
-    num_readings: int  # of a measurement, less its unknown commands
+    estimate: Annotated[Array, "P"]
+    joint_covariance: Annotated[Array | None, "PP"]  # None where the noise is unknown
+    centre: Annotated[Array | None, "n"]  # of the closed form: with b the outputs there
+    unidentified: Annotated[Array | None, "zP"]  # directions that nothing determines
+    prior_mean: Annotated[Array, "P"]
+    prior_precision: Annotated[Array, "P", 0.0]  # 0 where nothing was known
+    free: Annotated[Array, "P", 0.0]  # 0 where held at the prior's mean, else 1
+    commands: Annotated[Array, "Nn"]  # as given
+    estimated_commands: Annotated[Array | None, "Nn"]  # where command_std was given
+    residuals: Annotated[Array, "Nm"]  # measured less predicted, measured unit
+    # At most 1; small for an outlier, 0 where left out.
+    loss_weights: Annotated[Array, "N", 0.0]
+    # Squared, from the fit without that measurement, in noise.
+    distance: Annotated[Array, "N", 0.0]
+    dof: Annotated[float, "", 0.0]  # residual degrees of freedom, prior counted
+    square: Annotated[float, "", 0.0]  # sum of the squared residuals in noise
+    num_readings: Annotated[float, "", 1.0]  # of a measurement, less unknown commands
+    noise_std: Annotated[Array | None, "m", 0.0]  # at weight 1, behind all uncertainty
+    noise_dof: Annotated[float, "", 0.0]  # of the noise estimated, 0 where given
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -77,6 +78,16 @@ class Fit:
     def num_outputs(self) -> int:
         """m."""
         return len(self.output_names)
+
+    @property
+    def num_measurements(self) -> int:
+        """Of positive weight."""
+        return int((self.loss_weights > 0.0).sum())
+
+    @property
+    def noise_known(self) -> bool:
+        """The noise was given; else it comes from the residuals."""
+        return self.noise_std is not None and not self.noise_dof
 
     @property
     def parameters(self) -> Array:

@@ -163,7 +163,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
 def parser(prog: str, typed: str, of_task: bool = False) -> Parser:
     """The parser: ``prog`` begins a message, ``typed`` an example of the help."""
     if of_task:
-        with needs("policy", prog):
+        with needs("policy", "--task"):
             return evaluate_task.parser(prog, typed)
     more = _EPILOG.format(program=typed)
     return Parser(prog=prog, description=_DESCRIPTION, epilog=more).of(_run)

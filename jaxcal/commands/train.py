@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal train") -> int:
     def alone() -> int:  # this process may be one of several
         cache.keep_compiled_programs()
         try:
-            with needs("policy", prog):
+            with needs("policy", "training"):
                 from jaxcal.commands.train_arguments import parser
             return _run(parser(prog).parse_args(given))
         except (ValueError, OSError, MissingExtraError) as error:

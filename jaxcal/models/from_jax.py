@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,8 +19,6 @@ __all__ = ["FromJax"]
 
 Array = NDArray[np.float64]
 
-_LONGER = 1000  # entries more; one in the second half is counted from the end
-
 
 class FromJax:
     """``y = f(u, theta)`` of one command; values and derivatives in float64 by JAX.
@@ -32,8 +31,7 @@ class FromJax:
             for one output; written with ``jax.numpy``, without ``if`` on their values.
         nominal: (p,) parameters of the machine as it was designed.
         names: of the parameters; t1, t2, ... when not given.
-        num_inputs: n. When not given it is what f unpacks or multiplies, else that of
-            the first commands.
+        num_inputs: n; that of the first commands when not given.
     """
 
     def __init__(
@@ -56,10 +54,7 @@ class FromJax:
             raise ValueError(f"names must differ, got {self.names}")
         self._num_inputs: int | None = None
         with needs("policy", "FromJax"):
-            import jax
-        if num_inputs is None:
-            with jax.enable_x64(True):
-                num_inputs = _inputs_needed(f, p)
+            import jax  # noqa: F401  # refused here where it is not installed
         if num_inputs is not None:
             self._trace(whole_number("num_inputs", num_inputs, 1))
 
@@ -123,14 +118,21 @@ class FromJax:
                     f"{self.nominal.shape}; write it with jax.numpy, without if on "
                     f"values: {type(error).__name__}: {str(error).splitlines()[0]}"
                 ) from error
-            sizes = (num_inputs, len(self.nominal))
-            for i, (name, size) in enumerate(zip(("u", "theta"), sizes, strict=True)):
-                read = _entries_read(self.f, sizes, i)
-                if read > size:
+            # JAX takes the last entry where an index is beyond it; numpy refuses it.
+            plain, first = inspect.unwrap(self.f), np.zeros(num_inputs)
+            for name, one, traced in (
+                ("u", lambda theta: plain(first, theta), parameters),
+                ("theta", lambda u: plain(u, self.nominal), command),
+            ):
+                try:
+                    with np.errstate(all="ignore"):
+                        jax.eval_shape(one, traced)
+                except IndexError as error:
                     raise ValueError(
-                        f"f reads {name}[{read - 1}], which {name} of {size} entries "
-                        "does not have"
-                    )
+                        f"f must read entries of {name}: {error}"
+                    ) from None
+                except Exception:  # what only JAX's arrays can do
+                    continue
         shape = getattr(result, "shape", None)
         if shape is None or len(shape) > 1 or shape == (0,):
             raise ValueError(
@@ -194,57 +196,3 @@ class FromJax:
                 f"at command {i}"
             )
         return found
-
-
-def _entries_read(
-    f: Callable[[Any, Any], Any], sizes: tuple[int, int], argument: int
-) -> int:
-    """One more than the last index read of an argument, as far as it can be seen.
-
-    JAX does not check indices: ``theta[7]`` of seven parameters is the last one.
-    Tracing f with longer arguments shows what it would read. 0 where f does not take
-    longer arguments, as when it unpacks them.
-    """
-    import jax
-
-    longer = list(sizes)
-    longer[argument] += _LONGER
-    try:
-        traced = jax.make_jaxpr(f)(*(np.zeros(size) for size in longer)).jaxpr
-    except Exception:  # whatever f raises where a size does not fit
-        return 0
-    most = sizes[argument] + _LONGER // 2
-    return _read(traced, traced.invars[argument], most)
-
-
-def _read(traced: Any, variable: Any, most: int) -> int:
-    last = 0
-    for equation in traced.eqns:
-        for i, used in enumerate(equation.invars):
-            if used is not variable:
-                continue
-            inner = equation.params.get("jaxpr")
-            inner = getattr(inner, "jaxpr", inner)
-            if equation.primitive.name == "slice":
-                end = equation.params["limit_indices"][0]
-                last = max(last, end if end <= most else 0)
-            elif inner is not None and len(inner.invars) == len(equation.invars):
-                last = max(last, _read(inner, inner.invars[i], most))
-    return last
-
-
-def _inputs_needed(f: Callable[[Any, Any], Any], num_parameters: int) -> int | None:
-    """n of f(u (n,), theta), where it takes one size alone: it unpacks or multiplies.
-
-    The last entry that f reads does not say: a column of the commands may be unused.
-    """
-    import jax
-
-    fits = []
-    for n in range(1, 33):
-        try:
-            jax.eval_shape(f, np.zeros(n), np.zeros(num_parameters))
-        except Exception:  # whatever f raises where a size does not fit
-            continue
-        fits.append(n)
-    return fits[0] if len(fits) == 1 else None

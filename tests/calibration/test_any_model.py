@@ -464,7 +464,7 @@ def test_a_file_holds_every_bit(
         ({"loss": 3}, '"loss" must be'),
         ({"estimate": [1.0]}, '"prior_mean" must have shape|"joint_covariance" must'),
         ({"model": {"kind": "odd"}}, "kind of the model"),
-        ({"noise_dof": -1.0}, '"noise_dof" must not be negative'),
+        ({"noise_dof": -1.0}, '"noise_dof" must be at least 0'),
         ({"noise_std": None}, "contradict"),
     ):
         with pytest.raises(ValueError, match=message):

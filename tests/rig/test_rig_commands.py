@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from harness import (
     HASTY,
+    QUIET,
     SESSION,
     commissioned,
     fast_config,
@@ -40,6 +41,7 @@ def test_calibrate_simulate_takes_a_device_from_the_bus_to_its_calibration(
     """Quickly with short windows; slowly without a configuration, as users do first."""
     given = ["--speedup", "5", "--rate", "250", "--out", str(tmp_path / "runs")]
     if session_table:
+        given += QUIET
         (tmp_path / "rig.toml").write_text(fast_text(session=session_table))
         given += ["--config", str(tmp_path / "rig.toml")]
     with no_figures():

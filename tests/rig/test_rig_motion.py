@@ -380,12 +380,12 @@ def test_a_lost_heartbeat_stops_the_drives():
         ):
             drive.move(pulses)
         motion.device.heartbeat.feed(moving=True)  # and then the loop falls silent
-        end = time.monotonic() + 5
+        end = time.monotonic() + 60
         while not motion.device.stopper.reason:
             assert time.monotonic() < end
             time.sleep(0.01)
         assert "this program paused for" in motion.device.stopper.reason
-        end = time.monotonic() + 5
+        end = time.monotonic() + 60
         while not motion.device.stopper.results:
             assert time.monotonic() < end
             time.sleep(0.01)

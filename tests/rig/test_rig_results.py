@@ -13,6 +13,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from harness import (
+    QUIET,
     Run,
     Simulator,
     calibrate,
@@ -245,7 +246,7 @@ def test_a_report_says_what_there_is_of_an_unfinished_run(run, finished, kept):
 @pytest.mark.slow
 def test_reports_of_collect_verify_and_goto(run, tmp_path, capsys):
     (tmp_path / "rig.toml").write_text((run / "rig.toml").read_text())
-    given = ["--config", str(tmp_path / "rig.toml"), "--simulate", "--rate", "250"]
+    given = ["--config", str(tmp_path / "rig.toml"), "--simulate", *QUIET]
     given += ["--noise", "0"]
     out = ["--out", str(tmp_path / "more")]
     assert main(["collect", *given, *out, "--count", "3"]) == 0

@@ -14,6 +14,7 @@ import warnings
 import numpy as np
 import pytest
 from harness import (
+    QUIET,
     SESSION,
     commissioned,
     fast_config,
@@ -47,7 +48,7 @@ def finished(tmp_path_factory):
     text = fast_text(session='\n[session]\nmethod = "exact"\n')
     config = parse_config(text)
     said = []
-    with simulator(config, noise_deg=0.02) as sim:
+    with simulator(config, noise_deg=0.005) as sim:
         code = session(sim.start(), folder, sim, said, figures=True)
     assert code == 0, said
     return folder, said
@@ -349,7 +350,7 @@ def test_the_wrong_euler_order_is_named(finished):
 def test_verify_and_goto_use_a_saved_calibration(finished, tmp_path, capsys):
     path = tmp_path / "rig.toml"
     path.write_text(fast_text())
-    given = [str(finished[0]), "--config", str(path), "--simulate", "--rate", "250"]
+    given = [str(finished[0]), "--config", str(path), "--simulate", *QUIET]
     assert main(["verify", *given, "--count", "2", "--out", str(tmp_path / "v")]) == 0
     assert "still holds" in capsys.readouterr().out
     assert main(["goto", *given, "--to", "2", "-3", "4",
@@ -370,7 +371,7 @@ def test_verify_says_when_it_is_time_to_recalibrate(finished, tmp_path, capsys):
     stale.save(tmp_path / "calibration.json")
     path = tmp_path / "rig.toml"
     path.write_text(fast_text())
-    given = [str(tmp_path), "--config", str(path), "--simulate", "--rate", "250"]
+    given = [str(tmp_path), "--config", str(path), "--simulate", *QUIET]
     code = main(["verify", *given, "--count", "2", "--out", str(tmp_path / "v")])
     assert code == 1
     assert "RECALIBRATE" in capsys.readouterr().out

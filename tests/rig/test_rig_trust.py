@@ -78,7 +78,7 @@ def calibrated(tmp_path_factory):
     """A calibration by drives that go to pulse 0, and its folder."""
     folder = tmp_path_factory.mktemp("trust") / "run"
     config = fast_config()
-    with simulator(config, noise_deg=0.02) as sim:
+    with simulator(config, noise_deg=0.005) as sim:
         assert session(sim.start(), folder, sim) == 0
     return folder
 
@@ -140,7 +140,7 @@ def test_a_lost_origin_is_seen_in_the_tilt_of_the_zero_posture(
     """By a record that knows nothing of where the drives were left."""
     lost = [0.0, 0.0, 0.0]
     lost[axis] = LOST
-    with simulator(fast_config(), noise_deg=0.02) as sim:
+    with simulator(fast_config(), noise_deg=0.005) as sim:
         config = sim.start()
         assert run_verify(config, calibrated, tmp_path / "before", sim)[0] == 0
         sim.power_cycle(tuple(lost))
@@ -159,7 +159,7 @@ def test_yaw_is_seen_where_the_heading_can_be_trusted(
 ):
     config = fast_config()
     config = changed(config, imu=changed(config.imu, heading=heading))
-    with simulator(config, noise_deg=0.02) as sim:
+    with simulator(config, noise_deg=0.005) as sim:
         served = sim.start()
         sim.power_cycle((0.0, LOST, 0.0))
         found, said = run_verify(served, calibrated, tmp_path / "run", sim)
@@ -171,7 +171,7 @@ def test_drives_that_are_not_where_they_were_left_have_lost_their_place(
     calibrated, tmp_path
 ):
     """Also where gravity shows nothing: yaw turns about the vertical."""
-    with simulator(fast_config(), noise_deg=0.02) as sim:
+    with simulator(fast_config(), noise_deg=0.005) as sim:
         config = sim.start()
         record = commissioned(config, tmp_path)
         code, _ = run_verify(config, calibrated, tmp_path / "a", sim, record)
@@ -188,7 +188,7 @@ def test_drives_that_are_not_where_they_were_left_have_lost_their_place(
 
 def test_with_zero_confirmed_the_pulses_tell_a_lost_origin(calibrated, tmp_path):
     """The operator has put the device into its zero posture by hand."""
-    with simulator(fast_config(), noise_deg=0.02) as sim:
+    with simulator(fast_config(), noise_deg=0.005) as sim:
         config = sim.start()
         sim.power_cycle((0.0, LOST, 0.0))
         code, said = run_verify(config, calibrated, tmp_path / "run", sim, here=True)
@@ -202,7 +202,7 @@ def test_an_absolute_encoder_keeps_its_place(calibrated, tmp_path):
         for axis in config.axes
     )
     config = changed(config, axes=axes)
-    with simulator(config, noise_deg=0.02) as sim:
+    with simulator(config, noise_deg=0.005) as sim:
         served = sim.start()
         record = commissioned(served, tmp_path)
         record.left_at((0, 0, 0))  # moved by hand since
@@ -211,7 +211,7 @@ def test_an_absolute_encoder_keeps_its_place(calibrated, tmp_path):
 
 
 def test_a_homed_bit_that_is_gone_voids_the_place(calibrated, tmp_path):
-    with simulator(fast_config(), noise_deg=0.02) as sim:
+    with simulator(fast_config(), noise_deg=0.005) as sim:
         config = sim.start()
         record = commissioned(config, tmp_path)
         for drive in sim.drives:

@@ -139,7 +139,8 @@ def test_the_search_for_pairs_ends_on_the_clock() -> None:
     begun = time.perf_counter()
     found = largest_volumes(vectors, 3, begun + 1.0)
     assert time.perf_counter() - begun < 5.0  # all pairs: 20 s
-    assert not found.complete and found.bound >= found.volumes[0] > 0.9
+    assert not found.complete and found.bound >= found.volumes[0]
+    assert found.volumes[0] > 0.9 or not found.examined  # a busy machine got no turn
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.002, 0.02])
