@@ -50,10 +50,28 @@ def check(
     calibration: Fit,
     commands: ArrayLike,
     measured: ArrayLike,
-    tolerance: float | None,
-    placed_anew: bool,
+    *,
+    tolerance: float | None = None,
+    placed_anew: bool = False,
 ) -> Check:
-    """See :meth:`jaxcal.calibration.Calibration.check`."""
+    """Does the calibration still hold, by a few new measurements.
+
+    A chi-square test (F where the noise was estimated) of the readings against the
+    predictions, with the uncertainty of both, at 5 % false alarms.
+
+    Args:
+        calibration: what is checked.
+        commands: (N, n).
+        measured: (N, m) readings there.
+        tolerance: how far, root mean square over the calibration's commands, the
+            outputs may drift; three times the noise when not given.
+        placed_anew: of an arm, what its sensor reads (sockets, planes, anchors) stands
+            elsewhere than at the calibration.
+
+    Returns:
+        "holds", "does not hold", or "cannot be told": a drift of one parameter by more
+        than the tolerance would be seen with less than 80 % probability.
+    """
     from scipy import special
 
     commands, measured = table("commands", commands), table("measured", measured)
@@ -154,12 +172,24 @@ def verification(
     calibration: Fit,
     candidates: ArrayLike,
     k: int,
-    region: ArrayLike | None,
-    tolerance: float | None,
+    *,
+    region: ArrayLike | None = None,
+    tolerance: float | None = None,
 ) -> NDArray[np.int64]:
-    """See :meth:`jaxcal.calibration.Calibration.verification`.
+    """The k of the candidates that show best that the calibration is wrong.
 
     Greedy, then swaps, for the mean power of the check that follows.
+
+    Args:
+        calibration: what is checked.
+        candidates: (M, n) commands that could be measured.
+        k: three or four see what six random ones see.
+        region: (R, n) commands where it is used, which say how much a drift of a
+            parameter matters; those of the calibration when not given.
+        tolerance: the drift to be seen, as of ``check``.
+
+    Returns:
+        (k,) indices.
     """
     points = table("candidates", candidates)
     if not 1 <= whole_number("k", k, 1) <= len(points):

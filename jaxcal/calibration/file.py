@@ -18,7 +18,7 @@ from jaxcal.calibration.fit import Fit
 from jaxcal.files import write_text
 from jaxcal.models import Affine, Model, SerialChain, from_dict
 
-__all__ = ["content_of", "fields", "read", "write"]
+__all__ = ["fields", "read", "save", "to_dict", "write"]
 
 FORMAT = "jaxcal-calibration"
 VERSION = 3
@@ -37,7 +37,7 @@ _KINDS = {
 }
 
 
-def content_of(fit: Fit) -> dict[str, Any]:
+def to_dict(fit: Fit) -> dict[str, Any]:
     """The content of the file: names, numbers and lists, as JSON has them."""
     content: dict[str, Any] = {"format": FORMAT, "version": VERSION}
     for key in (*_NAMES, *_NUMBERS, *_KINDS):
@@ -55,6 +55,15 @@ def content_of(fit: Fit) -> dict[str, Any]:
         content["derived"]["matrix"] = fit.matrix.tolist()
         content["derived"]["bias"] = fit.bias.tolist()
     return content
+
+
+def save(fit: Fit, path: str | os.PathLike[str]) -> None:
+    """Write a versioned JSON file atomically; see ``docs/calibration.md``.
+
+    Raises:
+        OSError: the folder is missing, not writable or full; the old file stays.
+    """
+    write(path, to_dict(fit))
 
 
 def write(path: str | os.PathLike[str], content: dict[str, Any]) -> None:
@@ -87,7 +96,7 @@ def fields(content: Any, model: Model | None = None) -> dict[str, Any]:
     """The arguments of a calibration from the content of its file, checked.
 
     Args:
-        content: as ``content_of`` made it.
+        content: as ``to_dict`` made it.
         model: where the file cannot hold it.
 
     Raises:

@@ -10,20 +10,115 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.calibration.fit import Fit
 from jaxcal.checks import in_words, numbers
 from jaxcal.information.excitation import direction_in_words
-from jaxcal.models import Affine, Model
+from jaxcal.models import Affine, Model, Pose, SerialChain
 from jaxcal.models.model import derivative, predict
 
-__all__ = ["Carry", "limits_of", "reach", "solve_affine"]
+__all__ = ["command_for"]
 
 Array = NDArray[np.float64]
+Carry = Callable[[Array, NDArray[np.intp]], Array]
 
 _STARTS, _STEPS, _REACHED = 6, 60, 1e-9  # of the outputs' spread over the measurements
-
-Carry = Callable[[Array, NDArray[np.intp]], Array]
 _ROUNDING = 1e-12  # a response below this share of the output is rounding
+# Greatest condition number of the derivative by the commands, in units of their spread
+# and with rows of equal size, that is inverted.
+_CONDITION = 1e6
 
 
-def limits_of(limits: ArrayLike, names: tuple[str, ...]) -> Array:
+def command_for(
+    fit: Fit,
+    desired: ArrayLike,
+    limits: ArrayLike | None = None,
+    *,
+    start: ArrayLike | None = None,
+    clip: bool = False,
+) -> Array:
+    """Commands that reach desired outputs.
+
+    Of a square affine map its inverse, else Newton's method from several starts; within
+    limits the nearest output.
+
+    Args:
+        fit: the calibration.
+        desired: (..., m) in the measured unit; m at most n. Where m is less than n the
+            command is the one that Newton's method finds near the start. Of an arm's
+            pose, position and turn from the nominal orientation at ``start``, which
+            then must be given, as ``model.rotation_vectors(start, R)``.
+        limits: (n, 2) least and greatest command of each input, if any.
+        start: (n,) or (..., n) where the search begins; the measured command whose
+            output is nearest when not given.
+        clip: where the limits leave no exact command, the one within them whose output
+            is nearest, instead of refusing.
+
+    Returns:
+        (..., n) in the command unit.
+
+    Raises:
+        ValueError: a desired output is out of reach, or needs a command beyond its
+            limits; an output does not respond there; m exceeds n.
+    """
+    n, m = fit.num_inputs, fit.num_outputs
+    points = fit.points("desired", desired, m)
+    wanted = points.reshape(-1, m)
+    if m > n:
+        raise ValueError(
+            f"command_for needs at most as many outputs as inputs, got {m} and {n}"
+        )
+    bounds = None if limits is None else _limits(limits, fit.input_names)
+    begin = None
+    if isinstance(fit.model, Affine) and m == n:
+        begin = _solve_affine(fit, wanted)
+    elif start is not None:
+        given = fit.points("start", start, n)
+        begin = np.broadcast_to(given, (*points.shape[:-1], n)).reshape(-1, n)
+    search = _Search(fit, wanted, _carry(fit.model, wanted, begin))
+    commands, reached = search.newton(search.nearest[:, 0] if begin is None else begin)
+    for k in range(search.nearest.shape[1]):
+        if reached.all():
+            break
+        again, now = search.newton(search.nearest[:, k])
+        commands = np.where((now & ~reached)[:, None], again, commands)
+        reached |= now
+    if bounds is None:
+        for i in np.flatnonzero(~reached):
+            raise ValueError(
+                f"desired {in_words(wanted[i])} is out of reach; the nearest output "
+                f"found is {in_words(search.outputs(commands)[i])}"
+            )
+    else:
+        low, high = bounds.T
+        slack = 1e-9 * search.spread
+        inside = ((commands >= low - slack) & (commands <= high + slack)).all(axis=1)
+        for i in np.flatnonzero(~(reached & inside)):
+            commands[i] = search.bounded(int(i), commands[i], reached[i], bounds, clip)
+        commands = np.clip(commands, low, high)
+    if not clip:
+        search.require_regular(commands)
+    return commands.reshape(*points.shape[:-1], n)
+
+
+def _carry(model: Model, wanted: Array, start: Array | None) -> Carry | None:
+    """What an arm would answer at commands (R, n) if points (R,) were reached there.
+
+    Its orientations are relative to the commands; other outputs are absolute.
+    """
+    if not (isinstance(model, SerialChain) and isinstance(model.sensor, Pose)):
+        return None
+    if start is None:
+        raise ValueError(
+            "start must be given for an arm's pose: the joints at whose nominal "
+            "orientation desired is a turn, as rotation_vectors(start, R) makes it"
+        )
+    arm, rotations = model, model.rotations(start, wanted[:, 3:])
+
+    def carry(commands: Array, rows: NDArray[np.intp]) -> Array:
+        turns = arm.rotation_vectors(commands, rotations[rows])
+        return np.hstack([wanted[rows, :3], turns])
+
+    return carry
+
+
+def _limits(limits: ArrayLike, names: tuple[str, ...]) -> Array:
     """(n, 2), least below greatest, with at least one finite command between them."""
     bounds = numbers("limits", limits, finite=False)
     if bounds.shape != (len(names), 2):
@@ -40,7 +135,7 @@ def limits_of(limits: ArrayLike, names: tuple[str, ...]) -> Array:
     return bounds
 
 
-def solve_affine(fit: Fit, wanted: Array, max_condition: float) -> Array:
+def _solve_affine(fit: Fit, wanted: Array) -> Array:
     """(P, n) the inverse of a square affine ``Calibration`` at outputs (P, n).
 
     Raises:
@@ -59,11 +154,11 @@ def solve_affine(fit: Fit, wanted: Array, max_condition: float) -> Array:
     left, singular, right = np.linalg.svd(effect / rows[:, None])
     unseen = direction_in_words(right[-1] * scale, fit.input_names)
     insensitive = f"no output responds to the direction {unseen} of the commands"
-    if singular[-1] * max_condition < singular[0]:
+    if singular[-1] * _CONDITION < singular[0]:
         ratio = singular[0] / singular[-1] if singular[-1] > 0 else np.inf
         raise ValueError(
             f"matrix A is near singular (condition number {ratio:.3g}, at most "
-            f"{max_condition:.3g} is inverted): {insensitive}"
+            f"{_CONDITION:.3g} is inverted): {insensitive}"
         )
     if fit.joint_covariance is not None:
         # Standard deviation of left . B right, whose value is the smallest one.
@@ -84,73 +179,12 @@ def solve_affine(fit: Fit, wanted: Array, max_condition: float) -> Array:
     return command
 
 
-def reach(
-    model: Model,
-    parameters: Array,
-    known: Array,
-    wanted: Array,
-    names: tuple[str, ...],
-    *,
-    begin: Array | None,
-    bounds: Array | None,
-    clip: bool,
-    max_condition: float,
-    carry: Carry | None = None,
-) -> Array:
-    """Commands (P, n) that reach outputs ``wanted`` (P, q), by Newton's method.
-
-    Args:
-        model, parameters: what answers, and its parameters as identified.
-        known: (N, n) commands that were measured; their outputs give the scale, and
-            the nearest are where further searches begin.
-        names: n names of the inputs, for errors.
-        begin: (P, n) where the first search begins; the nearest when None.
-        bounds: (n, 2) limits of the commands, or None.
-        clip, max_condition: as for :meth:`Calibration.command_for`.
-        carry: what the model would answer at commands (R, n) if points ``rows`` (R,)
-            were reached there; ``wanted[rows]`` where outputs are absolute.
-    """
-    search = _Search(model, parameters, known, wanted, names, carry)
-    if begin is None:
-        begin = search.nearest[:, 0]
-    commands, reached = search.newton(begin)
-    for k in range(search.nearest.shape[1]):
-        if reached.all():
-            break
-        again, now = search.newton(search.nearest[:, k])
-        commands = np.where((now & ~reached)[:, None], again, commands)
-        reached |= now
-    if bounds is None:
-        for i in np.flatnonzero(~reached):
-            raise ValueError(
-                f"desired {in_words(search.wanted[i])} is out of reach; the nearest "
-                f"output found is {in_words(search.outputs(commands)[i])}"
-            )
-    else:
-        low, high = bounds.T
-        slack = 1e-9 * search.spread
-        inside = ((commands >= low - slack) & (commands <= high + slack)).all(axis=1)
-        for i in np.flatnonzero(~(reached & inside)):
-            commands[i] = search.bounded(int(i), commands[i], reached[i], bounds, clip)
-        commands = np.clip(commands, low, high)
-    if not clip:
-        search.require_regular(commands, max_condition)
-    return commands
-
-
 class _Search:
     """Outputs and derivatives in units of their spread over the measurements."""
 
-    def __init__(
-        self,
-        model: Model,
-        theta: Array,
-        known: Array,
-        wanted: Array,
-        names: tuple[str, ...],
-        carry: Carry | None,
-    ) -> None:
-        self.model, self.theta, self.wanted, self.names = model, theta, wanted, names
+    def __init__(self, fit: Fit, wanted: Array, carry: Carry | None) -> None:
+        self.model, self.theta, self.names = fit.whole, fit.estimate, fit.input_names
+        self.wanted, known = wanted, fit.commands
         self.carry: Carry = carry or (lambda commands, rows: wanted[rows])
         outputs = predict(self.model, known, self.theta)
         self.spread = np.where(np.ptp(known, axis=0) > 0.0, known.std(axis=0), 1.0)
@@ -249,12 +283,12 @@ class _Search:
             + (f", at the limit of {', '.join(active)}" if active else "")
         )
 
-    def require_regular(self, commands: Array, max_condition: float) -> None:
+    def require_regular(self, commands: Array) -> None:
         """Refuse commands at which a direction of the outputs does not respond."""
         slopes = self.slopes(commands)
         rows = np.linalg.norm(slopes, axis=-1, keepdims=True)
         _, size, right = np.linalg.svd(slopes / np.where(rows > 0.0, rows, 1.0))
-        for i in np.flatnonzero(~(size[:, -1] * max_condition >= size[:, 0])):
+        for i in np.flatnonzero(~(size[:, -1] * _CONDITION >= size[:, 0])):
             unseen = direction_in_words(
                 right[i, size.shape[1] - 1] * self.spread, self.names
             )
