@@ -14,7 +14,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from jaxcal import compiled
 
 __all__ = [
     "Whitened",
@@ -37,74 +39,53 @@ Mask = NDArray[np.bool_]
 
 SINGULAR = 1e-10  # share of the largest; derivatives are exact to about 1e-13 of it
 _EPS = float(np.finfo(np.float64).eps)
-_TINY = float(np.finfo(np.float64).tiny)
 _SURE = 1e5  # times the tolerance: pivots above it leave no doubt of the rank
 _LOSS = 1e-9  # of orthogonality that whitened rows may have
-_MENDED = 1e-3  # loss below which a second factor restores all of it
+
+
+def _kernel() -> Any:
+    return compiled.kernel("jaxcal.information.kernel")
 
 
 def triangle(rows: Array) -> Array:
-    """(..., min(R, p), p) R of the QR factors of rows (..., R, p).
+    """(min(R, p), p) R of the QR factors of rows (R, p).
 
     Many rows go in parts: BLAS shares a large part out among threads, which for these
     sizes takes ten times as long as one thread does.
     """
-    *lead, count, p = rows.shape
+    count, p = rows.shape
     part = max(128, 2 * p)
     while count > part:
-        short = np.zeros((*lead, -count % part, p))
-        parts = np.concatenate([rows, short], axis=-2).reshape(*lead, -1, part, p)
-        rows = np.asarray(np.linalg.qr(parts, mode="r")).reshape(*lead, -1, p)
-        count = rows.shape[-2]
+        parts = np.concatenate([rows, np.zeros((-count % part, p))])
+        rows = np.asarray(np.linalg.qr(parts.reshape(-1, part, p), mode="r"))
+        rows = rows.reshape(-1, p)
+        count = len(rows)
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def rank_rule(
     columns: Array, largest: Array, count: int | None = None
-) -> tuple[NDArray[np.int64], Array]:
+) -> tuple[int, float]:
     """Rank and log det of ``columns.T @ columns``: the one rule of what is singular.
 
     Numbers are exact to half a unit in the last place of their size, not of their
     spread: a direction no wider than that is rounding, not information.
 
     Args:
-        columns: (..., R, p) stacked blocks, centred.
-        largest: (..., p) largest entry of each column before centring.
+        columns: (R, p) stacked blocks, centred.
+        largest: (p,) largest entry of each column before centring.
         count: rows that rounding errors add up over; R when not given.
 
     Returns:
-        (...,) rank, and (...,) natural log det, -inf where the rank is below p.
+        Rank, and natural log det, -inf where the rank is below p.
     """
-    num_rows, p = columns.shape[-2:]
-    norms, flat, rounding = _norms(columns, largest, count or num_rows)
-    if flat.any():
-        columns, norms = np.where(flat, 0.0, columns), np.where(flat, 1.0, norms)
-    unit, rounding = columns / norms, np.asarray(rounding)
-    if num_rows >= p:  # pivots first: they cost a third of the singular values
-        pivots = np.abs(np.diagonal(triangle(unit), axis1=-2, axis2=-1))
-        rank = np.full(rounding.shape, p)
-    else:
-        pivots, rank = np.zeros((*rounding.shape, p)), np.zeros(rounding.shape, int)
-    doubtful = np.asarray(pivots.min(axis=-1) <= _SURE * rounding)
-    sizes = np.maximum(pivots, _TINY)
-    if doubtful.any():
-        singular = np.linalg.svd(unit[doubtful], compute_uv=False)
-        rank[doubtful] = (singular > rounding[doubtful, None]).sum(axis=-1)
-    value = 2.0 * (np.log(sizes).sum(axis=-1) + np.log(norms[..., 0, :]).sum(axis=-1))
-    return rank, np.where(rank == p, value, -np.inf)
-
-
-def _norms(columns: Array, largest: Array, count: int) -> tuple[Array, Mask, Array]:
-    """Column norms (..., 1, p), which are mere rounding, and the tolerance (...,)."""
-    norms = np.sqrt(np.einsum("...ij,...ij->...j", columns, columns))
-    resolution = _EPS * max(count, 1)
-    flat = norms <= resolution * largest
-    rounding = (largest / np.where(flat, np.inf, norms)).max(axis=-1)
-    return (
-        norms[..., None, :],
-        flat[..., None, :],
-        resolution * np.maximum(8.0, rounding),
-    )
+    p, count = columns.shape[1], count or len(columns)
+    norms, rounding, least, value = _kernel().scaled(columns, largest, count)
+    rank = p
+    if least <= _SURE * rounding:  # distances of columns are cheaper
+        unit = columns / np.where(norms > 0.0, norms, np.inf)
+        rank = int((np.linalg.svd(unit, compute_uv=False) > rounding).sum())
+    return rank, value if rank == p else -np.inf
 
 
 def null_directions(columns: Array, largest: Array) -> list[Array]:
@@ -113,13 +94,13 @@ def null_directions(columns: Array, largest: Array) -> list[Array]:
     Axes that no row moves come first, then a basis of the rest of the null space.
     """
     p = columns.shape[1]
-    norms, flat, tolerance = _norms(columns, largest, len(columns))
-    norms, flat = norms[0], flat[0]
-    scaled = np.where(flat, 0.0, columns / np.where(flat, 1.0, norms))
-    scaled = np.pad(scaled, ((0, max(0, p - len(scaled))), (0, 0)))
-    _, singular, right = np.linalg.svd(scaled, full_matrices=False)
+    norms, rounding, *_ = _kernel().scaled(columns, largest, len(columns))
+    flat = norms == 0.0
+    unit = columns / np.where(flat, np.inf, norms)
+    unit = np.pad(unit, ((0, max(0, p - len(unit))), (0, 0)))
+    _, singular, right = np.linalg.svd(unit, full_matrices=False)
     null = [np.eye(p)[i] for i in np.flatnonzero(flat)]
-    free = right[singular <= tolerance][:, ~flat]
+    free = right[singular <= rounding][:, ~flat]
     if free.size:
         basis, size, _ = np.linalg.svd(free.T, full_matrices=False)
         for vector in basis.T[size > 0.5]:
@@ -175,49 +156,13 @@ def prior_root(precision: Array) -> Array:
     return np.sqrt(values[keep])[:, None] * vectors.T[keep] * scale
 
 
-def _stack(
-    blocks: Array, usable: Mask | None, root: Array
-) -> tuple[Array, Array, Array]:
-    """Centred rows (..., N q + r, p) of blocks and prior, and the largest entries.
-
-    The third is the map (..., p, p) that was subtracted: rows are ``B - B @ shift``.
-    """
-    *batch, count, q, p = blocks.shape
-    if usable is None:
-        first = blocks[..., :1, :, :]
-        same = blocks == first
-    else:
-        weight = usable[..., None, None]
-        blocks = blocks * weight
-        at = usable.argmax(axis=-1)[..., None, None, None]
-        first = np.take_along_axis(blocks, at, axis=-3)
-        same = (blocks == first) | ~weight
-    same = same.all(axis=(-3, -2))[..., None, :]
-    constant = first[..., 0, :, :] * same
-    rows = np.empty((*batch, count * q + len(root), p))
-    centred = rows[..., : count * q, :].reshape(*batch, count, q, p)  # a view
-    if constant.any() and not same.all():
-        number = count if usable is None else usable.sum(axis=-1)[..., None, None]
-        if q == 1:
-            square = (constant * constant).sum(axis=-1, keepdims=True)
-            inverse = np.matrix_transpose(constant) / np.maximum(square, _TINY)
-        else:
-            inverse = np.linalg.pinv(constant)
-        shift = inverse @ (blocks.sum(axis=-3) / number * ~same)
-        np.subtract(blocks, (constant @ shift)[..., None, :, :], out=centred)
-        if usable is not None:
-            centred *= weight
-    else:
-        shift = np.zeros((*batch, p, p))
-        centred[...] = blocks
-    largest = np.abs(blocks).max(axis=(-3, -2))
-    if len(root):
-        rows[..., count * q :, :] = root - root @ shift
-        largest = np.maximum(largest, np.abs(root).max(axis=0))
-    return rows, largest, shift
+def rank_of_blocks(blocks: Array, root: Array) -> tuple[int, float]:
+    """Rank and log det of the information of blocks (N, q, p) measured together."""
+    rows, largest, _ = _kernel().centred(blocks, None, root)
+    return rank_rule(rows, largest, len(blocks))
 
 
-def log_det_blocks(blocks: Array, root: Array) -> Array:
+def log_det_blocks(blocks: ArrayLike, root: Array) -> Array:
     """``log det(root.T @ root + sum of B_i.T @ B_i)`` of blocks measured together.
 
     Args:
@@ -227,14 +172,10 @@ def log_det_blocks(blocks: Array, root: Array) -> Array:
     Returns:
         (...,) natural log; -inf where singular.
     """
-    rows, largest, _ = _stack(blocks, None, root)
-    return rank_rule(rows, largest, blocks.shape[-3])[1]
-
-
-def rank_of_blocks(blocks: Array, root: Array) -> NDArray[np.int64]:
-    """(...,) rank of the information of blocks (..., N, q, p) measured together."""
-    rows, largest, _ = _stack(blocks, None, root)
-    return rank_rule(rows, largest, blocks.shape[-3])[0]
+    array = np.ascontiguousarray(blocks, dtype=np.float64)
+    sets = array.reshape(-1, *array.shape[-3:])
+    values = [rank_of_blocks(each, root)[1] for each in sets]
+    return np.array(values).reshape(array.shape[:-3])
 
 
 def largest_rank(blocks: Array) -> int:
@@ -250,8 +191,9 @@ def largest_rank(blocks: Array) -> int:
     if len(gram) == full and scale.all():  # cheap, and enough where it is clear
         if np.linalg.eigvalsh(gram / scale / scale[:, None])[0] > SINGULAR:
             return full
-    for some in (blocks[:1], blocks):
-        rank = int(rank_of_blocks(some[:, None], none).max(initial=0))
+    rank = 0
+    for block in blocks:
+        rank = max(rank, rank_of_blocks(block[None], none)[0])
         if rank == full:
             break
     return rank
@@ -259,7 +201,7 @@ def largest_rank(blocks: Array) -> int:
 
 def missing_directions(blocks: Array, root: Array, coarse: float = 1.0) -> list[Array]:
     """Directions (p,) that neither blocks (N, q, p) nor the prior say anything of."""
-    rows, largest, _ = _stack(blocks, None, root)
+    rows, largest, _ = _kernel().centred(blocks, None, root)
     return null_directions(rows, coarse * largest)
 
 
@@ -272,15 +214,14 @@ def coarseness(given: object) -> float:
 
 
 class Whitened(NamedTuple):
-    """S sets of blocks in coordinates where everything together has information I."""
+    """Blocks in coordinates where everything together has information I."""
 
-    blocks: Array  # (S, M, q, p), zero where not usable
-    prior: Array  # (S, p, p) precision
-    basis: Array  # (S, p, p): raw blocks times it are whitened
-    log_scale: Array  # (S,) log det of unwhitened less whitened information
-    singular: NDArray[np.int64]  # the sets whose information is; the rest is not theirs
-    triangle: Array  # (S, p, p): whitened blocks times it are the centred raw ones
-    size: Array  # (S, p) of what the centred blocks are rounded by, beside themselves
+    blocks: Array  # (M, q, p), zero where not usable
+    prior: Array  # (p, p) precision
+    basis: Array  # (p, p): raw blocks times it are whitened
+    log_scale: float  # log det of unwhitened less whitened information
+    triangle: Array  # (p, p): whitened blocks times it are the centred raw ones
+    size: Array  # (p,) of what the centred blocks are rounded by, beside themselves
 
 
 def whiten(
@@ -290,81 +231,42 @@ def whiten(
     *,
     coarse: float = 1.0,
     computed: bool = False,
-) -> Whitened:
+) -> Whitened | None:
     """Blocks in coordinates where everything measured at once has information I.
 
     With T = prior + sum of the usable ``B_i.T @ B_i`` = R.T R the whitened block is
     ``B_i R^-1``, and log det of any selection is its whitened log det plus log det T. A
-    linear map of the parameters rotates the whitened blocks and nothing else.
+    linear map of the parameters rotates the whitened blocks and nothing else. None
+    where T is singular.
 
     Args:
-        blocks: (S, M, q, p) of S sets.
-        usable: (S, M) which count.
+        blocks: (M, q, p).
+        usable: (M,) which count.
         root: (r, p) of the prior precision.
         coarse: how many times coarser than float64 the numbers are, for the rule of
             what is singular.
         computed: the blocks are rounded themselves, as a model's derivatives are.
     """
-    num_sets, count, q, p = blocks.shape
-    everything = bool(usable.all())
-    rows, largest, shift = _stack(blocks, None if everything else usable, root)
-    coarsest = coarse * largest
-    gram = np.matrix_transpose(rows) @ rows
-    norms = np.sqrt(np.diagonal(gram, axis1=1, axis2=2))
-    scale = np.where(norms == 0.0, 1.0, norms)
-    triangle, inverse = _triangle(gram, rows, scale)
-    pivots = np.abs(np.diagonal(triangle, axis1=1, axis2=2))
-    # A cheap test first: only a set that looks nearly singular pays for the rule.
-    doubtful = (norms < 1e-6 * coarsest).any(axis=1) | (pivots < 1e-6).any(axis=1)
-    at = np.flatnonzero(doubtful)
-    if at.size:
-        at = at[np.isneginf(rank_rule(rows[at], coarsest[at], count)[1])]
-        inverse[at] = np.eye(p)
-    with np.errstate(divide="ignore"):
-        log_scale = 2.0 * np.log(pivots * scale).sum(axis=1)
-    basis = inverse / scale[:, :, None]
-    white = rows @ basis
-    of_prior = white[:, count * q :]
+    rows, largest, shift, white, back, basis, log_scale, lost = _kernel().whitened(
+        blocks, usable.view(np.uint8), root, coarse
+    )
+    if not lost <= _LOSS:  # of nearly dependent columns by rotations, twice
+        if rank_rule(rows, coarse * largest, len(blocks))[0] < rows.shape[1]:
+            return None
+        scale = np.linalg.norm(rows, axis=0)
+        first = triangle(rows / scale)
+        basis = np.linalg.inv(first) / scale[:, None]
+        second = triangle(rows @ basis)
+        basis = basis @ np.linalg.inv(second)
+        back, white = second @ first * scale, rows @ basis
+        log_scale = 2.0 * float(np.log(np.abs(np.diagonal(back))).sum())
+    count, p = blocks.shape[0] * blocks.shape[1], blocks.shape[2]
+    known = white[count:]
     return Whitened(
-        white[:, : count * q].reshape(num_sets, count, q, p),
-        np.matrix_transpose(of_prior) @ of_prior,
+        white[:count].reshape(blocks.shape),
+        known.T @ known if len(root) else np.zeros((p, p)),
         basis - shift @ basis,
         log_scale,
-        at,
-        triangle * scale[:, None],
-        largest if computed else np.zeros_like(largest),
+        back,
+        largest if computed else np.zeros(p),
     )
-
-
-def _triangle(gram: Array, rows: Array, scale: Array) -> tuple[Array, Array]:
-    """R (S, p, p) with ``R.T @ R = rows.T @ rows`` in unit columns, and its inverse.
-
-    The factor of the Gram matrix is the cheapest; it leaves ``rows R^-1`` orthonormal
-    to about ``eps |R^-1|^2``. Where that is too much, the same of ``rows R^-1`` makes
-    up for it, and of nearly dependent columns the factor is by rotations.
-
-    Args:
-        gram: (S, p, p) of the rows.
-        rows: (S, R, p).
-        scale: (S, p) lengths of the columns, 1 where one is zero.
-    """
-    p = gram.shape[-1]
-    try:
-        lower = np.linalg.cholesky(gram / scale[:, :, None] / scale[:, None])
-        inverse = np.matrix_transpose(np.linalg.inv(lower))
-        lost = _EPS * float((inverse * inverse).sum(axis=(1, 2)).max())
-        if lost <= _LOSS:
-            return np.matrix_transpose(lower), inverse
-        if lost <= _MENDED:
-            near = rows @ (inverse / scale[:, :, None])
-            second = np.linalg.cholesky(np.matrix_transpose(near) @ near)
-            inverse = inverse @ np.matrix_transpose(np.linalg.inv(second))
-            return np.matrix_transpose(lower @ second), inverse
-    except np.linalg.LinAlgError:
-        pass
-    short = max(0, p - rows.shape[1])
-    padded = np.pad(rows / scale[:, None], ((0, 0), (0, short), (0, 0)))
-    factor = triangle(padded)
-    regular = (np.diagonal(factor, axis1=1, axis2=2) != 0.0).all(axis=1)
-    whole = np.where(regular[:, None, None], factor, np.eye(p))
-    return factor, np.linalg.inv(whole)

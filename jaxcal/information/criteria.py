@@ -35,7 +35,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.information.blocks import log_det_blocks, whiten
+from jaxcal.information.blocks import rank_of_blocks, whiten
 
 __all__ = ["Criteria", "criteria"]
 
@@ -69,9 +69,10 @@ def criteria(blocks: Array, root: Array, region: Array, times: int) -> Criteria:
     """
     p = blocks.shape[2]
     s = np.linalg.svd(np.concatenate([blocks.reshape(-1, p), root]), compute_uv=False)
-    white = whiten(blocks[None], np.ones((1, len(blocks)), dtype=np.bool_), root)
-    variance = ((region @ white.basis[0]) ** 2).sum(axis=-1)
-    geometric_mean = float(np.exp(log_det_blocks(blocks, root) / (2 * p)))
+    white = whiten(blocks, np.ones(len(blocks), dtype=np.bool_), root)
+    assert white is not None
+    variance = ((region @ white.basis) ** 2).sum(axis=-1)
+    geometric_mean = float(np.exp(rank_of_blocks(blocks, root)[1] / (2 * p)))
     return Criteria(
         D=geometric_mean**2,
         A=float(times * np.sum(s**-2.0)),

@@ -6,16 +6,21 @@ bool, ``required`` (B, r), ``max_replicates`` and ``num_outputs`` as ``select`` 
 
 from __future__ import annotations
 
+import os
 import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxcal.checks import whole_number
-from jaxcal.selection.problem import log_dets, make_problems
+from jaxcal.selection.exact.exact import solve_exact
+from jaxcal.selection.exchange import exchange
+from jaxcal.selection.problem import Found, Problem, make_problems
 from jaxcal.selection.result import BatchSelection
-from jaxcal.selection.solvers import SOLVERS, checked_seed
+from jaxcal.selection.solvers import checked_seed, solve_random
 
 __all__ = ["exact_batch", "exchange_batch", "greedy_batch", "random_batch"]
 
@@ -24,12 +29,15 @@ def random_batch(
     candidates: ArrayLike, k: int, *, seed: int = 0, **rules: Any
 ) -> BatchSelection:
     """A random selection per set, never singular; one seed draws the whole batch."""
-    return _solve("random", candidates, k, rules, seed=checked_seed(seed))
+    rng = np.random.default_rng(checked_seed(seed))
+    return _solve(
+        "random", lambda problem: solve_random(problem, seed=rng), candidates, k, rules
+    )
 
 
 def greedy_batch(candidates: ArrayLike, k: int, **rules: Any) -> BatchSelection:
     """Greedy from nothing, or from the partial selections in ``required``."""
-    return _solve("greedy", candidates, k, rules)
+    return _solve("greedy", exchange.solve_greedy, candidates, k, rules)
 
 
 def exchange_batch(
@@ -43,8 +51,12 @@ def exchange_batch(
     """Fedorov exchange from ``restarts`` random starts, the same seed in every set."""
     if restarts is not None:
         restarts = whole_number("restarts", restarts, 1)
-    options = {"restarts": restarts, "seed": checked_seed(seed)}
-    return _solve("exchange", candidates, k, rules, **options)
+    seed = checked_seed(seed)
+
+    def solve(problem: Problem) -> Found:
+        return exchange.solve(problem, seed=seed, restarts=restarts)
+
+    return _solve("exchange", solve, candidates, k, rules, threads=True)
 
 
 def exact_batch(
@@ -55,24 +67,42 @@ def exact_batch(
     ``time_limit`` is in seconds for the whole batch, after which the remaining sets
     return the best found with ``proven`` False; there is no limit when it is None.
     """
-    return _solve("exact", candidates, k, rules, time_limit=time_limit)
+    deadline = None if time_limit is None else time.perf_counter() + time_limit
+
+    def solve(problem: Problem) -> Found:
+        return solve_exact(problem, deadline=deadline)
+
+    return _solve("exact", solve, candidates, k, rules, threads=True)
 
 
 def _solve(
-    method: str, candidates: ArrayLike, k: int, rules: dict[str, Any], **options: Any
+    method: str,
+    solve: Callable[[Problem], Found],
+    candidates: ArrayLike,
+    k: int,
+    rules: dict[str, Any],
+    threads: bool = False,
 ) -> BatchSelection:
     start = time.perf_counter()
     problems = make_problems(candidates, k, **rules)
-    solver = SOLVERS[method]
-    if solver.solve_many is None:
-        found = [solver.solve(problem, **options) for problem in problems]
+    # Compiled solvers release the interpreter; of a simplex most is the hull, which
+    # keeps other threads waiting.
+    if (
+        threads
+        and len(problems) > 1
+        and not (method == "exact" and problems[0].simplex)
+    ):
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            found = list(pool.map(solve, problems))
     else:
-        found = solver.solve_many(problems, **options)
+        found = [solve(problem) for problem in problems]
     indices = np.stack([one.indices for one in found])
-    if found[0].value is None:
-        values = log_dets(problems, indices[:, None])[:, 0]
-    else:
-        values = np.array([one.value for one in found])
+    values = np.array(
+        [
+            problem.log_det(one.indices) if one.value is None else one.value
+            for problem, one in zip(problems, found, strict=True)
+        ]
+    )
     singular = np.flatnonzero(np.isneginf(values))
     if singular.size:
         raise ValueError(

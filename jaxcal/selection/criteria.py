@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import one_of
-from jaxcal.information.blocks import significant
+from jaxcal.information.blocks import Whitened, significant
 from jaxcal.information.criterion import Criterion
 
 __all__ = [
@@ -36,13 +36,16 @@ Array = NDArray[np.float64]
 class Coordinates(NamedTuple):
     """The coordinates of one problem, in which everything measured at once says I."""
 
-    basis: Array  # (p, p): combinations C of the caller's parameters are C @ basis here
+    white: Whitened
     names: tuple[str, ...]  # (p,) of the caller's parameters
-    prior: Array  # (p, p) information beforehand
     readings: int  # that all available candidates give together
     region: Array | None  # (R, q, p) blocks of the criterion's region, in the caller's
     times: int  # outputs that share these parameters' information
-    log_scale: float  # log det of the caller's less this information
+
+    @property
+    def basis(self) -> Array:
+        """(p, p): combinations C of the caller's parameters are ``C @ basis`` here."""
+        return self.white.basis
 
 
 class Wanted:
@@ -75,7 +78,7 @@ class D(Wanted):
 
     def criterion(self, at: Coordinates) -> Criterion:
         return Criterion(
-            self.name, self.kind, _identity(len(at.basis)), at.times, at.log_scale
+            self.name, self.kind, _identity(len(at.basis)), at.times, at.white.log_scale
         )
 
 
@@ -114,7 +117,7 @@ class I(Wanted):  # noqa: E742 - the criterion's own name in the literature
 
     def root(self, at: Coordinates) -> Array:
         if at.region is None:
-            mean = (np.eye(len(at.basis)) - at.prior) / at.readings
+            mean = (np.eye(len(at.basis)) - at.white.prior) / at.readings
         else:
             rows = (at.region @ at.basis).reshape(-1, len(at.basis))
             mean = rows.T @ rows / len(rows)

@@ -14,9 +14,9 @@ from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.exact.exact import TIME_LIMIT, solve_exact
 from jaxcal.selection.fastest.run import Travelled
 from jaxcal.selection.plan import Planned
-from jaxcal.selection.problem import Problem, values
+from jaxcal.selection.problem import Found, Problem, values
 from jaxcal.selection.result import Selection, Subset
-from jaxcal.selection.solvers import SOLVERS, Found, checked_options
+from jaxcal.selection.solvers import SOLVERS, checked_options
 
 __all__ = ["Design", "select"]
 
@@ -96,7 +96,7 @@ class Design(Planned, Travelled):
         given = checked_options(method, options)
         start = time.perf_counter()
         problem = self.problem(k, criterion, region)
-        found = SOLVERS[method].solve(problem, **given)
+        found = SOLVERS[method](problem, **given)
         return self._judged(problem, found, method, start)
 
     def score(

@@ -1,8 +1,11 @@
-"""The table of solvers, and which options each reads. A new solver is one row here."""
+"""The table of solvers, and which options each reads. A new solver is one row here.
+
+A solver is a function ``solve(problem, *, option, ...) -> Found``: its keyword
+arguments are the options it reads, checked and complete.
+"""
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import inspect
 from collections.abc import Callable, Mapping
@@ -11,28 +14,37 @@ from typing import Any
 import numpy as np
 
 from jaxcal.checks import one_of, seconds, share, whole_number
-from jaxcal.selection import random
 from jaxcal.selection.exact import exact
 from jaxcal.selection.exchange import exchange
-from jaxcal.selection.problem import Problem
-from jaxcal.selection.solver import Found
+from jaxcal.selection.problem import Found, Problem
 
-__all__ = ["METHODS", "OPTIONS", "SOLVERS", "Solver", "checked_options", "checked_seed"]
+__all__ = ["METHODS", "OPTIONS", "SOLVERS", "checked_options", "checked_seed"]
+
+_TRIES = 200  # random selections, before the greedy one, where all are singular
 
 
-@dataclasses.dataclass(frozen=True)
-class Solver:
-    """A method of ``select``; see :mod:`jaxcal.selection.solver` for the functions."""
+def solve_random(problem: Problem, *, seed: int | np.random.Generator) -> Found:
+    """The baseline of the paper: drawn uniformly, never singular, required first."""
+    rng = np.random.default_rng(seed)
+    room = problem.upper - problem.lower
+    pool = np.repeat(np.arange(len(room)), room)
+    free = problem.k - len(problem.required)
+    for _ in range(_TRIES):
+        drawn = np.concatenate([problem.required, rng.permutation(pool)[:free]])
+        value = problem.log_det(drawn)
+        if value > -np.inf:
+            break
+    else:  # a table that is nearly all duplicates
+        drawn = exchange.greedy_indices(problem)
+        value = problem.log_det(drawn)
+    return Found(drawn, value, seed=seed if isinstance(seed, int) else None)
 
-    solve: Callable[..., Found]
-    solve_many: Callable[..., list[Found]] | None = None
 
-    @functools.cached_property
-    def options(self) -> tuple[str, ...]:
-        """Names of the options it reads."""
-        kind = inspect.Parameter.KEYWORD_ONLY
-        found = inspect.signature(self.solve).parameters.values()
-        return tuple(each.name for each in found if each.kind == kind)
+@functools.cache
+def _options(solve: Callable[..., Found]) -> tuple[str, ...]:
+    """Names of the options that a solver reads."""
+    found = inspect.signature(solve).parameters.values()
+    return tuple(each.name for each in found if each.kind == each.KEYWORD_ONLY)
 
 
 def _policy(
@@ -68,13 +80,13 @@ def _policy(
     return Found(np.asarray(indices[0], dtype=np.int64), seed=seed)
 
 
-SOLVERS = {
-    "random": Solver(random.solve, random.solve_many),
-    "greedy": Solver(exchange.solve_greedy),
-    "exchange": Solver(exchange.solve, exchange.solve_many),
-    "exact": Solver(exact.solve, exact.solve_many),
-    "policy": Solver(_policy),
-    "auto": Solver(exact.solve_auto),
+SOLVERS: dict[str, Callable[..., Found]] = {
+    "random": solve_random,
+    "greedy": exchange.solve_greedy,
+    "exchange": exchange.solve,
+    "exact": exact.solve,
+    "policy": _policy,
+    "auto": exact.solve_auto,
 }
 METHODS = tuple(SOLVERS)
 
@@ -103,7 +115,7 @@ def checked_options(method: str, given: Mapping[str, Any]) -> dict[str, Any]:
         ValueError: an option is unknown, has a bad value, or belongs to other methods.
     """
     one_of("method", method, tuple(SOLVERS))
-    reads = SOLVERS[method].options
+    reads = _options(SOLVERS[method])
     checked = {name: OPTIONS[name][0] for name in reads}
     for name, value in given.items():
         one_of("the name of an option", name, tuple(OPTIONS))
@@ -112,7 +124,7 @@ def checked_options(method: str, given: Mapping[str, Any]) -> dict[str, Any]:
             continue
         value = check(value)
         if name not in reads:
-            others = [other for other in SOLVERS if name in SOLVERS[other].options]
+            others = [other for other in SOLVERS if name in _options(SOLVERS[other])]
             raise ValueError(
                 f'{name} is not an option of method "{method}" '
                 f"(it is of {', '.join(others)})"

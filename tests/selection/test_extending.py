@@ -10,9 +10,8 @@ import pytest
 import jaxcal
 from jaxcal.checks import numbers
 from jaxcal.selection.criteria import CRITERIA, Coordinates, Wanted
-from jaxcal.selection.problem import Problem
-from jaxcal.selection.solver import Found
-from jaxcal.selection.solvers import SOLVERS, Solver
+from jaxcal.selection.problem import Found, Problem
+from jaxcal.selection.solvers import SOLVERS
 
 
 class C(Wanted):
@@ -106,7 +105,7 @@ def test_the_worst_of_some_combinations(monkeypatch) -> None:
 
 
 def test_a_solver_of_ones_own_is_asked_by_its_name(monkeypatch) -> None:
-    monkeypatch.setitem(SOLVERS, "largest", Solver(largest))
+    monkeypatch.setitem(SOLVERS, "largest", largest)
     candidates = np.random.default_rng(0).random((12, 3))
     available = np.arange(12) != 3
     found = jaxcal.select(candidates, 5, "largest", available=available, seed=7)

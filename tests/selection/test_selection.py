@@ -338,7 +338,7 @@ def test_batches_name_the_set_that_is_wrong():
     candidates = np.random.default_rng(0).random((3, 9, 3))
     candidates[1, :, 0] = 2.0
     for batch in BATCHES:
-        with pytest.raises(ValueError, match=r"in set 1 lie in one plane.* u_x"):
+        with pytest.raises(ValueError, match=r"in set 1: .* lie in one plane.* u_x"):
             batch(candidates, 4)
         with pytest.raises(ValueError, match=r"candidates must have shape \(B, M, n\)"):
             batch(candidates[0], 4)

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
 from jaxcal.selection.exact.volume import largest_volumes
 from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
-from jaxcal.selection.problem import Problem, values
-from jaxcal.selection.solver import Found, in_threads
+from jaxcal.selection.problem import Found, Problem, values
 
 __all__ = ["TIME_LIMIT", "solve", "solve_auto", "solve_exact", "upper_bound"]
 
@@ -48,20 +47,6 @@ def solve(
     """The solver "exact"; 10 s where no time limit is given."""
     deadline = time.perf_counter() + (time_limit or TIME_LIMIT)
     return solve_exact(problem, best, deadline, restarts or STARTING_RESTARTS, seed)
-
-
-def solve_many(
-    problems: list[Problem], *, time_limit: float | None = None
-) -> list[Found]:
-    """One by one, in ``time_limit`` seconds for them all; no limit when None."""
-    deadline = None if time_limit is None else time.perf_counter() + time_limit
-
-    def solved(problem: Problem) -> Found:
-        return solve_exact(problem, deadline=deadline)
-
-    if problems[0].simplex:  # mostly the hull, which keeps other threads waiting
-        return [solved(problem) for problem in problems]
-    return in_threads(problems, solved)
 
 
 def solve_auto(

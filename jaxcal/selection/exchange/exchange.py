@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal import compiled
-from jaxcal.selection.problem import Problem, values
-from jaxcal.selection.solver import Found, in_threads
+from jaxcal.selection.problem import Found, Problem, values
 
 __all__ = [
     "Climbs",
@@ -29,7 +28,6 @@ __all__ = [
     "greedy_indices",
     "solve",
     "solve_greedy",
-    "solve_many",
 ]
 
 Array = NDArray[np.float64]
@@ -56,13 +54,6 @@ def solve(problem: Problem, *, seed: int, restarts: int | None) -> Found:
     restarts = restarts or default_restarts(problem)
     indices = exchange_indices(problem, restarts, seed)
     return Found(indices, seed=seed, restarts=restarts)
-
-
-def solve_many(
-    problems: list[Problem], *, seed: int, restarts: int | None
-) -> list[Found]:
-    """One by one, the same seed for each."""
-    return in_threads(problems, lambda p: solve(p, seed=seed, restarts=restarts))
 
 
 def solve_greedy(problem: Problem) -> Found:

@@ -18,14 +18,13 @@ from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model, by_name
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.criteria import wanted
-from jaxcal.selection.problem.making import Rules, whitened_problems
-from jaxcal.selection.problem.problem import Problem
-from jaxcal.selection.problem.rules import (
+from jaxcal.selection.problem.making import (
     check_available,
     filled,
-    one_array,
+    make_problem,
     usable_numbers,
 )
+from jaxcal.selection.problem.problem import Problem
 from jaxcal.selection.problem.sources import (
     Given,
     Modelled,
@@ -158,17 +157,12 @@ class Asked:
         where = asked.region
         if where is None and asked.of_region:
             where = source.predicted()
-        return whitened_problems(
-            raw[None], root,
-            Rules(
-                k, self.available[None], self._required, self.max_replicates,
-                coarse=self._coarse,
-            ),
-            asked, names=source.names, times=source.times,
+        return make_problem(
+            raw, root, asked, k, self.available, self._required, self.max_replicates,
+            coarse=self._coarse, names=source.names, times=source.times,
             region=None if where is None else source.at("region", where, False),
-            candidates=None if self.candidates is None else self.candidates[None],
-            model=self.model,
-        )[0]  # fmt: skip
+            candidates=self.candidates, model=self.model,
+        )  # fmt: skip
 
     def source(self, of_parameters: bool, of_predictions: bool = False) -> Source:
         """What makes blocks; ``of_parameters``: of all parameters by name.
@@ -204,9 +198,7 @@ class Asked:
         self.prior, self.noise = prior, noise
         # Copies: the caller's arrays may change before the next question.
         self._measured = None if measured is None else numbers("measured", measured)
-        self._required = None
-        if required is not None:
-            self._required = one_array("required", required)[None]
+        self._required = copy.deepcopy(required)
         self.max_replicates = max_replicates
 
 

@@ -1,32 +1,41 @@
-"""Problems from information blocks that were checked, one set or many at once."""
+"""Problems from information blocks: which candidates may be chosen, and how many."""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import axis_names, whole_number
-from jaxcal.information.blocks import coarseness, missing_directions, whiten
+from jaxcal.checks import (
+    array_of,
+    axis_names,
+    require_finite,
+    require_none,
+    whole_number,
+)
+from jaxcal.information.blocks import (
+    SINGULAR,
+    coarseness,
+    largest_rank,
+    missing_directions,
+    rank_of_blocks,
+    whiten,
+)
 from jaxcal.information.excitation import directions_in_words, require_excited
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model
 from jaxcal.selection.criteria import CRITERIA, Coordinates, Wanted
 from jaxcal.selection.problem.problem import Problem
-from jaxcal.selection.problem.rules import (
-    check_available,
-    check_counts,
-    check_k,
-    check_required_rank,
-    filled,
-    in_set,
-    usable_numbers,
-)
 
-__all__ = ["Rules", "make_problems", "whitened_problems"]
+__all__ = [
+    "check_available",
+    "filled",
+    "make_problem",
+    "make_problems",
+    "usable_numbers",
+]
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 # The C library keeps freed memory for the next array once an array as large as this was
@@ -34,15 +43,44 @@ Mask = NDArray[np.bool_]
 # which takes longer than what is computed in it. No page of this one is touched.
 np.empty(2**21)
 
+_FILLED = ", none of them 0"
 
-class Rules(NamedTuple):
-    """What may be chosen, over a batch of S sets."""
 
-    k: int | None
-    available: Mask  # (S, M), checked
-    required: ArrayLike | None
-    max_replicates: int
-    coarse: float = 1.0  # how many times coarser than float64 the numbers given are
+def filled(name: str, values: ArrayLike, *letters: str) -> Array:
+    """``values`` as float64 with an axis for each letter, none of them empty."""
+    array = array_of(name, values, *letters, rule=_FILLED, finite=False)
+    if 0 in array.shape:
+        raise ValueError(
+            f"{name} must have shape ({', '.join(letters)}){_FILLED}, got {array.shape}"
+        )
+    return array
+
+
+def usable_numbers(name: str, array: Array, mask: Mask) -> Array:
+    """A copy, finite where available; what is not finite elsewhere becomes zero."""
+    own = np.array(array, order="C")
+    bad = ~np.isfinite(own)
+    if bad.any():
+        hidden = bad & ~mask.reshape(*mask.shape, *[1] * (own.ndim - mask.ndim))
+        own[hidden] = 0.0
+        require_finite(name, own)
+    return own
+
+
+def check_available(available: ArrayLike | None, shape: tuple[int, ...]) -> Mask:
+    """(M,) or, of many sets, (B, M), as ``shape`` says."""
+    if available is None:
+        return np.ones(shape, dtype=np.bool_)
+    mask = _one_array("available", available)
+    if mask.shape != shape:
+        raise ValueError(f"available must have shape {shape}, got {mask.shape}")
+    if mask.dtype.kind not in "biuf" or not np.isin(mask, (0, 1)).all():
+        wrong = mask[~np.isin(mask, (0, 1))] if mask.dtype.kind in "iuf" else mask
+        raise ValueError(
+            "available must hold True or 1 where a candidate may be chosen, else False "
+            f"or 0, got {wrong.flat[0]}"
+        )
+    return mask.astype(np.bool_)
 
 
 def make_problems(
@@ -72,89 +110,196 @@ def make_problems(
     array = usable_numbers("candidates", array, mask)
     m = array.shape[2] if num_outputs is None else num_outputs
     model = Affine(array.shape[2], whole_number("num_outputs", m, 1))
-    root = np.zeros((0, model.num_inputs + 1))
-    rules = Rules(k, mask, required, max_replicates, coarseness(candidates))
-    return whitened_problems(
-        model.blocks(array), root, rules, CRITERIA["D"](), times=m, candidates=array,
-        model=model,
-    )  # fmt: skip
+    forced = None if required is None else _one_array("required", required)
+    if forced is not None and (forced.ndim != 2 or len(forced) != len(array)):
+        raise ValueError(f"required must have shape (B, r), got {forced.shape}")
+    raw, coarse = model.blocks(array), coarseness(candidates)
+    root, wanted = np.zeros((0, model.num_inputs + 1)), CRITERIA["D"]()
+    problems = []
+    for b in range(len(array)):
+        try:
+            problems.append(make_problem(
+                raw[b], root, wanted, k, mask[b], None if forced is None else forced[b],
+                max_replicates, coarse=coarse, times=m, candidates=array[b],
+                model=model,
+            ))  # fmt: skip
+        except ValueError as error:
+            raise ValueError(f"in set {b}: {error}") from None
+    return problems
 
 
-def whitened_problems(
+def make_problem(
     raw: Array,
     root: Array,
-    rules: Rules,
     wanted: Wanted,
+    k: int | None,
+    available: Mask,
+    required: ArrayLike | None,
+    max_replicates: int,
     *,
+    coarse: float = 1.0,
     names: tuple[str, ...] = (),
     times: int = 1,
     region: Array | None = None,
     candidates: Array | None = None,
     model: Model | None = None,
-) -> list[Problem]:
-    """The problems of blocks (S, M, q, p) that were checked; whitened here.
+) -> Problem:
+    """The problem of blocks (M, q, p) that were checked; whitened here.
 
     Args:
         raw: in the caller's numbers, zero where not available.
         root: (r, p) of the precision known beforehand.
-        rules: what may be chosen.
         wanted: the criterion.
+        k, required, max_replicates: what may be chosen, as asked for.
+        available: (M,), checked.
+        coarse: how many times coarser than float64 the numbers given are.
         names: (p,) of the parameters; empty where the blocks are [u, 1].
         times: how often log det and trace count.
         region: (R, q, p) blocks that the criterion is about, if it is of a region.
-        candidates: (S, M, n), where there are any.
+        candidates: (M, n), where there are any.
         model: what made blocks of them.
     """
-    k, mask, required, max_replicates, coarse = rules
-    readings = mask.sum(axis=1) * raw.shape[2]
-    if raw.shape[2] > raw.shape[3]:  # as much information in p rows, at q^3 less cost
+    readings = int(np.count_nonzero(available)) * raw.shape[1]
+    if raw.shape[1] > raw.shape[2]:  # as much information in p rows, at q^3 less cost
         raw = np.asarray(np.linalg.qr(raw, mode="r"))
-    k = check_k(k, raw, mask, root, regressors=not names)
-    cap, forced = check_counts(mask, k, required, max_replicates)
+    k = _check_k(k, raw, available, root, regressors=not names)
+    cap = whole_number("max_replicates", max_replicates, 1)
+    forced = _check_counts(available, k, required, cap)
     computed = bool(names) and model is not None
     if computed:  # a derivative is as exact as its own numbers
         coarse = 1.0
-    white = whiten(raw, mask, root, coarse=coarse, computed=computed)
-    if white.singular.size:
-        b = int(white.singular[0])
+    white = whiten(raw, available, root, coarse=coarse, computed=computed)
+    if white is None:
+        used = raw[available]
         if not names and candidates is not None:
-            names = (*axis_names("names", None, "u", candidates.shape[2]), "the bias")
+            names = (*axis_names("names", None, "u", candidates.shape[1]), "the bias")
             if not len(root):
-                which = "available ones" + in_set(b, len(raw))
-                used = candidates[b][mask[b]]
-                require_excited(used, names[:-1], "candidates", which, coarse)
-        _refuse_blind(raw[b][mask[b]], root, names, coarse)
-    owned = [raw, root, *white[:3], *white[5:], mask, forced]
-    for each in owned if candidates is None else [*owned, candidates]:
-        each.flags.writeable = False
-    problems = []
-    for b in range(len(raw)):
-        at = Coordinates(
-            white.basis[b], names, white.prior[b], int(readings[b]), region, times,
-            float(white.log_scale[b]),
-        )  # fmt: skip
-        problems.append(
-            Problem(
-                white.blocks[b], white.prior[b], k, mask[b], forced[b], cap,
-                wanted.criterion(at), times, at.log_scale, raw[b], white.basis[b], root,
-                white.triangle[b], white.size[b],
-                None if candidates is None else candidates[b], model,
-            )
-        )  # fmt: skip
-    if forced.shape[1]:
-        for b, problem in enumerate(problems):
-            check_required_rank(problem, in_set(b, len(raw)))
-    return problems
+                used, what = candidates[available], ("candidates", "available ones")
+                require_excited(used, names[:-1], *what, coarse)
+        null = missing_directions(used, root, coarse)
+        raise ValueError(
+            "blocks must inform every parameter, but the available ones"
+            + (" and what is known" if len(root) else "")
+            + directions_in_words(" say nothing of the direction{} ", null, names)
+            + "; give prior, a precision of what is known of them"
+        )
+    at = Coordinates(white, names, readings, region, times)
+    problem = Problem(
+        **white._asdict(), k=k, available=available, required=forced,
+        max_replicates=cap, criterion=wanted.criterion(at), multiplicity=times, raw=raw,
+        root=root, candidates=candidates, model=model,
+    )  # fmt: skip
+    for each in (*white, raw, root, available, forced, candidates):
+        if isinstance(each, np.ndarray):
+            each.flags.writeable = False
+    if len(forced):
+        _check_required_rank(problem)
+    return problem
 
 
-def _refuse_blind(
-    blocks: Array, root: Array, names: tuple[str, ...], coarse: float
-) -> None:
-    """Raise for the directions that neither blocks (N, q, p) nor ``root`` inform."""
-    null = missing_directions(blocks, root, coarse)
+def _one_array(name: str, values: ArrayLike) -> NDArray[np.generic]:
+    """A copy of ``values`` as an array of any kind."""
+    try:
+        return np.array(values)
+    except ValueError as error:
+        raise ValueError(
+            f"{name} must be one array, got {type(values).__name__} of mixed lengths"
+        ) from error
+
+
+def _check_counts(
+    mask: Mask, k: int, required: ArrayLike | None, cap: int
+) -> NDArray[np.int64]:
+    """The required candidates (r,); enough are available."""
+    count = int(np.count_nonzero(mask))
+    if not count:
+        raise ValueError(f"available must leave at least {k} candidates, got none")
+    if count * cap < k:
+        raise ValueError(
+            f"k must not exceed what is available: {count} candidates"
+            + (f", each at most {cap} times" if cap > 1 else "")
+            + f", got {k}"
+        )
+    given = _one_array("required", () if required is None else required)
+    if not given.size:
+        return np.zeros(0, dtype=np.int64)
+    if given.ndim != 1:
+        raise ValueError(f"required must have shape (r,), got {given.shape}")
+    if not np.issubdtype(given.dtype, np.integer):
+        raise ValueError(f"required must hold whole numbers, got dtype {given.dtype}")
+    forced = given.astype(np.int64)
+    if len(forced) > k:
+        raise ValueError(
+            f"required must name at most k = {k} candidates, got {len(forced)}"
+        )
+    outside = (forced < 0) | (forced >= len(mask))
+    require_none(outside, forced, f"required must lie in [0, {len(mask)})")
+    ordered = np.sort(forced)
+    twice = ordered[1:] == ordered[:-1]
+    require_none(twice, ordered[1:], "required must not repeat a candidate", " twice")
+    masked = ~mask[forced]
+    require_none(masked, forced, "required must be available", ", which is masked")
+    return forced
+
+
+def _check_k(
+    k: int | None, raw: Array, mask: Mask, root: Array, regressors: bool
+) -> int:
+    """k, by default the fewest candidates that identify every parameter alone.
+
+    Args:
+        k: as asked for.
+        raw, mask, root: blocks (M, q, p), available (M,), what is known (r, p).
+        regressors: the blocks are [u, 1].
+    """
+    p = raw.shape[2]
+    usable = raw if raw.shape[1] == 1 and k is not None else raw[mask]
+    most = largest_rank(usable)
+    if k is None:
+        k = p if regressors else _cover(usable)
+    k = whole_number("k", k, 1)
+    known = rank_of_blocks(root[None], root[:0])[0] if len(root) else 0
+    if k * most + known >= p:
+        return k
+    if regressors and not known:
+        raise ValueError(
+            f"k must be at least {p}, the number of regressors of {p - 1} inputs and a "
+            f"bias, got {k}"
+        )
     raise ValueError(
-        "blocks must inform every parameter, but the available ones"
-        + (" and what is known" if len(root) else "")
-        + directions_in_words(" say nothing of the direction{} ", null, names)
-        + "; give prior, a precision of what is known of them"
+        f"k must be at least {-(-(p - known) // max(most, 1))} for {p} parameters, at "
+        f"most {most} of them from a candidate"
+        + (f" and {known} known beforehand" if known else "")
+        + f", got {k}"
     )
+
+
+def _cover(blocks: Array) -> int:
+    """How many blocks (N, q, p), widest first, span what all of them span."""
+    norms = np.sqrt((blocks**2).sum(axis=(0, 1)))
+    rest = blocks / np.where(norms > 0.0, norms, 1.0)
+    count, least = 0, 0.0
+    while True:
+        size = np.linalg.svd(rest, compute_uv=False)
+        least = least or SINGULAR * float(size.max(initial=0.0))
+        rank = (size > least).sum(axis=1)
+        if not rank.any():
+            return max(count, 1)
+        volume = np.log(np.where(size > least, size, 1.0)).sum(axis=1)
+        widest = int(np.where(rank == rank.max(), volume, -np.inf).argmax())
+        basis = np.linalg.svd(rest[widest], full_matrices=False)[2][: rank.max()]
+        rest = rest - (rest @ basis.T) @ basis
+        count += 1
+
+
+def _check_required_rank(problem: Problem) -> None:
+    """Enough free choices must remain to complete the span of the required ones."""
+    r, p = len(problem.required), problem.num_regressors
+    rank = problem.held_rank
+    room = (problem.k - r) * problem.blocks.shape[1]
+    if p - rank > room:
+        raise ValueError(
+            f"required must leave room for an invertible selection: the {r} required "
+            f"candidates span {rank} of {p} regressors, so at least {p - rank} more "
+            f"are needed, got room for {room} (k = {problem.k})"
+        )

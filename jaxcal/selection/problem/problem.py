@@ -14,11 +14,11 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.information.blocks import log_det_blocks, significant
+from jaxcal.information.blocks import rank_of_blocks, significant
 from jaxcal.information.criterion import Criterion
 from jaxcal.models.model import Model
 
-__all__ = ["Problem", "log_dets", "values"]
+__all__ = ["Found", "Problem", "values"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -130,20 +130,31 @@ class Problem:
 
     def log_det(self, indices: Indices) -> float:
         """log det S of a subset, natural, in the caller's units; -inf if singular."""
-        return float(log_dets([self], np.asarray(indices)[None, None])[0, 0])
+        return (
+            self.multiplicity
+            * rank_of_blocks(self.raw[np.asarray(indices)], self.root)[1]
+        )
 
 
-def log_dets(problems: list[Problem], indices: Indices) -> Array:
-    """log det S (S, R) of subsets (S, R, k) of S problems made together."""
-    chosen = [problem.raw[of] for problem, of in zip(problems, indices, strict=True)]
-    blocks = np.stack(chosen) if len(chosen) > 1 else chosen[0][None]
-    value = log_det_blocks(blocks, problems[0].root)
-    return problems[0].multiplicity * value
+@dataclasses.dataclass(frozen=True, eq=False)
+class Found:
+    """A solver's answer; what it leaves out is judged by the caller."""
+
+    indices: Indices  # (k,) in the order picked
+    value: float | None = None  # of the criterion, as reported to the caller
+    bound: float | None = None  # no selection allowed has a better value
+    proven: bool = False  # no selection is better by more than 1e-9
+    nodes: int | None = None  # nodes of branch and bound or of the search
+    alternatives: tuple[tuple[Indices, float], ...] = ()  # best first
+    method: str | None = None  # the solver that answered, where another was asked
+    reason: str = ""  # one sentence
+    seed: int | None = None  # where it draws at random
+    restarts: int | None = None  # random starts of the exchange
 
 
 def values(problem: Problem, indices: Indices) -> tuple[Array, Array]:
     """Reported value of the criterion, and log det S, of subsets (R, k): (R,) each."""
-    log_det = log_dets([problem], indices[None])[0]
+    log_det = np.array([problem.log_det(each) for each in indices])
     criterion = problem.criterion
     if criterion.name == "D":
         return log_det, log_det
