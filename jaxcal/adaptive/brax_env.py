@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxcal.adaptive.policy.features import Seen, see
+from jaxcal.adaptive.policy.features import Seen
+from jaxcal.adaptive.policy.sessions import Exercise, Sessions, State
 from jaxcal.adaptive.rules import Scored
 from jaxcal.learning.environments.brax_env import EpisodeEnv
 
@@ -20,13 +21,7 @@ __all__ = ["SequentialEnv"]
 
 
 @struct.dataclass
-class _Episode:
-    """One session."""
-
-    truth: Any
-    belief: Any
-    session: Any
-    options: Any
+class _Episode(State):
     seen: Seen
     key: jax.Array  # of what comes next
 
@@ -43,12 +38,11 @@ class SequentialEnv(EpisodeEnv):
     metric = "gain"
 
     def __init__(self, task: Any, base: Scored, per_group: int = 8) -> None:
-        self.task, self._base, self._per_group = task, base, per_group
+        self._given, self._sessions = Exercise(task, base), Sessions(per_group)
 
     def begin(self, key: jax.Array) -> _Episode:
-        key_truth, key_begin, key = jax.random.split(key, 3)
-        belief, session = self.task.begin(key_begin)
-        return self._seen(self.task.draw(key_truth), belief, session, key)
+        key_state, key = jax.random.split(key)
+        return self._seen(self._sessions.reset(self._given, key_state), key)
 
     def observe(self, episode: _Episode) -> jax.Array:
         seen = episode.seen
@@ -56,25 +50,19 @@ class SequentialEnv(EpisodeEnv):
         return jnp.concatenate([part.astype(jnp.float32).ravel() for part in parts])
 
     def advance(self, episode: _Episode, action: jax.Array) -> tuple[Any, ...]:
-        now, task = episode, self.task
-        key_gain, key_outcome, key_update, key = jax.random.split(now.key, 4)
-        index = now.seen.index[jnp.where(now.seen.valid[action], action, 0)]
-        design = jax.tree.map(lambda leaf: leaf[index], now.options.designs)
-        # By draws of its own: those of ``seen`` chose it, so theirs is too large.
-        gain = now.belief.gain(task, design, key_gain)
-        outcome = task.measure(now.truth, design, key_outcome)
-        belief = now.belief.update(task, design, outcome, key_update)
-        session = task.spend(now.session, design, outcome)
-        done = session.over | (session.made >= task.horizon)
-        return self._seen(now.truth, belief, session, key), gain, done, gain
-
-    def _seen(self, truth: Any, belief: Any, session: Any, key: jax.Array) -> _Episode:
-        key_options, key_seen, key = jax.random.split(key, 3)
-        options = self.task.options(belief, session, key_options)
-        seen = see(
-            self.task, belief, session, options, key_seen, self._base, self._per_group
+        seen = episode.seen
+        key_step, key = jax.random.split(episode.key)
+        action = jnp.where(seen.valid[action], action, 0)
+        step = self._sessions.step(self._given, episode, seen, action, key_step)
+        now, done = jax.tree.map(
+            lambda leaf: leaf[step.happened], (step.states, step.ended)
         )
-        return _Episode(truth, belief, session, options, seen, key)
+        return self._seen(now, key), step.reward, done, step.reward
+
+    def _seen(self, state: State, key: jax.Array) -> _Episode:
+        key_seen, key = jax.random.split(key)
+        seen = self._sessions.observe(self._given, state, key_seen)
+        return _Episode(state.truth, state.belief, state.session, seen, key)
 
     @property
     def action_size(self) -> int:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.particles import ParticleBelief, ParticleTask
+from jaxcal.adaptive.particles import ParticleBelief
 from jaxcal.adaptive.session import Session, Task
 from jaxcal.checks import in_words, numbers, whole_number
 from jaxcal.checks import seconds as checked_seconds
@@ -139,7 +139,6 @@ def checked(
 
     A task with a table ``designs`` (A, e) takes a whole number as an index of it and
     anything else as coordinates; other tasks take designs as their options have them.
-    A task with ``outcome_shape`` takes outcomes of that shape alone.
 
     Raises:
         ValueError: naming the entry, the rule and the value.
@@ -167,24 +166,20 @@ def checked(
             )
         return design, jnp.int32(found)
     values = numbers(f"{where}: outcome", outcome)
-    shape = getattr(task, "outcome_shape", None)
-    if shape is not None and values.shape != shape:
-        raise ValueError(
-            f"{where}: outcome must have shape {shape}, got {values.shape}"
-        )
+    if values.shape:
+        raise ValueError(f"{where}: outcome must have shape (), got {values.shape}")
     answer = jnp.asarray(values, jnp.float32)
-    if isinstance(task, ParticleTask):
-        support = task.model.support
-        if support is not None and not (answer == support).any():
-            raise ValueError(
-                f"{where}: outcome must be one of the {len(support)} of model.support, "
-                f"from {support[0]:g} to {support[-1]:g}, got {outcome!r}"
-            )
-        if not _can_answer(belief, design, answer):
-            raise ValueError(
-                f"{where}: outcome {outcome!r} cannot follow what was measured before: "
-                "every particle gives it probability 0"
-            )
+    support = belief.model.support
+    if support is not None and not (answer == support).any():
+        raise ValueError(
+            f"{where}: outcome must be one of the {len(support)} of model.support, "
+            f"from {support[0]:g} to {support[-1]:g}, got {outcome!r}"
+        )
+    if not _can_answer(belief, design, answer):
+        raise ValueError(
+            f"{where}: outcome {outcome!r} cannot follow what was measured before: "
+            "every particle gives it probability 0"
+        )
     return design, answer
 
 

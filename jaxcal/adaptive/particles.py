@@ -322,11 +322,6 @@ class ParticleTask:
         return task
 
     @property
-    def outcome_shape(self) -> tuple[int, ...]:
-        """()."""
-        return ()
-
-    @property
     def batch(self) -> int:
         """Sessions that are played at once, for the memory that their gains take."""
         support = self.model.support

@@ -37,7 +37,7 @@ __all__ = ["Tree"]
 
 _DEPTH = cython.declare(cython.int, 4)
 # Measurements that are followed at each level.
-_WIDTHS = ((4, 1), (6, 1, 1), (6, 2, 1), (6, 2, 1, 1), (6, 3, 2, 1))
+_WIDTHS = ((6,), (4, 1), (6, 1, 1), (6, 2, 1), (6, 2, 1, 1), (6, 3, 2, 1))
 # Multiplications that take as long as the rest of a node: of each sum, and of all.
 _EACH = cython.declare(cython.double, 35.0)
 _NODE = cython.declare(cython.double, 2400.0)
