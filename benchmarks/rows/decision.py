@@ -41,7 +41,10 @@ select(rng.uniform(-90, 90, (200, 4)), 8, model=SerialChain.from_dh(rows))
 _CASES = {
     "4 of 50": ("select(sets[0], 4)", 41, 1.0, 0.4),
     "6 of 50": ("select(sets[0], 6)", 41, 1.0, 0.4),
+    "4 of 50, random": ("select(sets[0], 4, 'random')", 41, 1.0, 0.4),
     "6 of 50, exchange": ("select(sets[0], 6, 'exchange')", 41, 1.0, 0.4),
+    "8 of 50, exchange": ("select(sets[0], 8, 'exchange')", 41, 1.0, 0.4),
+    "12 of 50, exchange": ("select(sets[0], 12, 'exchange')", 41, 1.0, 0.4),
     "4 of 50, policy": ("select(sets[0], 4, 'policy')", 41, 1.0, 0.4),
     "12 of 200 with 6 inputs, policy": (
         "select(rng.random((200, 6)), 12, 'policy')", 41, 1.0, 0.5,

@@ -96,7 +96,8 @@ def run(budget: Budget) -> Row:
         calls["PyTorch"] = plain.update
         calls["PyTorch, keys folded as in jaxcal"] = folded.update
         row.notes.append(
-            f"PyTorch eager, {torch.get_num_threads()} threads, its default here"
+            f"PyTorch eager, {torch.get_num_threads()} threads, its default here; "
+            "torch.compile was not tried"
         )
     else:
         row.notes.append("torch is not installed: not measured")

@@ -28,7 +28,7 @@ __all__ = ["fit_model", "require_model"]
 Array = NDArray[np.float64]
 
 _BEYOND = 2.0  # degrees beyond a limit, or percent of a slide's stroke
-_NOMINAL = 0.5  # of its length: no arm, and no tip, is so far off before it is fitted
+_NOMINAL = 0.1  # of its length: no arm is so far off, tip included, before it is fitted
 _APART = 0.2  # of it: what two sockets may seem to be off their distance
 
 
@@ -204,16 +204,28 @@ def _require_sockets(arm: SerialChain, commands: Array, measured: Array) -> None
                 f"the arm as described scatters by {np.median(far):.2g} there: a wrong "
                 "tip, unit, sign or order of columns, or rows of another place?"
             )
+        lost = rows[far > most + 4.0 * np.median(far)]
+        if lost.size:
+            raise ValueError(
+                f"contacts of socket {i} must be at one point within {most:.2g}, but "
+                f"rows {in_words(lost)} are {far.max():.2g} from the others there: "
+                "rows of another place?"
+            )
     # Offsets that were measured, as in a simulation, are of any tip.
     for one, other, distance, _ in () if measured.any() else arm.sensor.distances:
-        if {int(one), int(other)} <= set(middles):
-            found = float(np.linalg.norm(middles[int(one)] - middles[int(other)]))
-            if abs(found - distance) > _APART * arm.length:
-                raise ValueError(
-                    f"sockets {int(one)} and {int(other)} must be {distance:g} apart, "
-                    f"but the arm as described puts them {found:.3g} apart: "
-                    "rows of another place or another unit?"
-                )
+        missing = {int(one), int(other)} - set(middles)
+        if missing:
+            raise ValueError(
+                f"commands must have contacts of socket {missing.pop()}, whose "
+                "distance from another is given"
+            )
+        found = float(np.linalg.norm(middles[int(one)] - middles[int(other)]))
+        if abs(found - distance) > _APART * arm.length:
+            raise ValueError(
+                f"sockets {int(one)} and {int(other)} must be {distance:g} apart, but "
+                f"the arm as described puts them {found:.3g} apart: rows of another "
+                "place or another unit?"
+            )
 
 
 def _noise_of(

@@ -86,7 +86,7 @@ def verdict(calibration: Fit) -> Verdict | None:
     mean = float(errors.mean())
     half = 1.96 * errors.std() / np.sqrt(max(len(errors) - 1, 1))
     explains, reasons = _scattered(calibration, usual)
-    swapped = _swapped(calibration, model)
+    swapped = _swapped(calibration, model, used, explains)
     for row, other in swapped.items():
         reasons.append(f"measurement {row} fits {model.sensor.kind} {other} instead")
     for row in calibration.outliers:
@@ -243,7 +243,9 @@ def _split(values: Array) -> tuple[float, int, float, float]:
     )
 
 
-def _swapped(calibration: Fit, model: SerialChain) -> dict[int, int]:
+def _swapped(
+    calibration: Fit, model: SerialChain, used: NDArray[np.intp], explains: bool
+) -> dict[int, int]:
     """Outliers that fit another socket or plane, as if their column were wrong."""
     sensor = model.sensor
     if not (isinstance(sensor, Placed) and sensor.zeros and sensor.count > 1):
@@ -258,4 +260,16 @@ def _swapped(calibration: Fit, model: SerialChain) -> dict[int, int]:
         off = calibration.predict(trial) / noise
         fits = at[(np.abs(off).max(axis=1) < 4.0) & ~there]
         found |= dict.fromkeys(fits.tolist(), other)
+    if isinstance(sensor, Socket) and not explains:
+        # So many that none is an outlier: by the arm as described, where that can tell.
+        joints, columns = np.split(calibration.commands[used], [model.num_joints], 1)
+        points = model.calibrated(model.nominal).predict(joints)
+        labels, which = np.unique(sensor.of_rows(columns), return_inverse=True)
+        middles = [np.median(points[which == i], axis=0) for i in range(len(labels))]
+        apart = np.linalg.norm(points[:, None] - middles, axis=-1)
+        own, nearest = apart[np.arange(len(which)), which], apart.min(axis=1)
+        if np.median(own) < 0.5 * np.median(apart.max(axis=1)):
+            wrong = np.flatnonzero(nearest < 0.5 * own)
+            fits = labels[apart[wrong].argmin(axis=1)]
+            found |= dict(zip(used[wrong].tolist(), fits.tolist(), strict=True))
     return dict(sorted(found.items()))

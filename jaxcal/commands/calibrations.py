@@ -81,9 +81,7 @@ def identify(
     outputs: Annotated[str | None, "columns of measurements", "C,D"] = None,
     model: ModelPath = None,
     of_arm: ArmOptions,
-    noise: Annotated[
-        Numbers, "standard deviation of a measurement, where it is known", "S"
-    ] = None,
+    noise: Annotated[Numbers, "std of a measurement, where it is known", "S"] = None,
     weights: Annotated[str | None, "column of relative weights", "W"] = None,
     command_unit: Annotated[str, "stored with the result", "UNIT"] = "",
     measured_unit: Annotated[str, "stored with the result", "UNIT"] = "",
@@ -92,9 +90,7 @@ def identify(
         "save the calibration (.json), or of an arm the corrected file (.urdf)",
         "FILE",
     ] = "",
-    force: Annotated[
-        bool, "write a .urdf over another one, or from a fit that is refused"
-    ] = False,
+    force: Annotated[bool, "write a .urdf over another, or from a bad fit"] = False,
     json: Annotated[bool, "print JSON"] = False,
 ) -> None:
     """Fit a model to measurements and save the calibration.
@@ -161,9 +157,7 @@ def predict(
     file: Annotated[str, "commands: .csv, .npz or -"],
     *,
     columns: Annotated[str | None, "columns of commands", "A,B"] = None,
-    std: Annotated[
-        bool, "and the standard error of each output, where the noise is known"
-    ] = False,
+    std: Annotated[bool, "and the standard error of each output"] = False,
     output: Output,
 ) -> None:
     """Where a calibrated machine goes for given commands."""

@@ -83,9 +83,7 @@ class Options:
         tuple[str, ...], "trained policies; the shipped one", "DIR"
     ] = ()
     dataset: Annotated[tuple[str, ...], "datasets; dataset2", "NAME|FILE"] = ()
-    recordings: Annotated[
-        Path | None, "of dataset4.csv and dataset5.csv, by the rig", "DIR"
-    ] = None
+    recordings: Annotated[Path | None, "dataset4.csv, dataset5.csv", "DIR"] = None
     methods: Annotated[
         list[str] | None, "comma separated; all but auto", "LIST", several(str, "names")
     ] = None

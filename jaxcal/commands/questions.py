@@ -19,6 +19,7 @@ from jaxcal.selection.criteria import CRITERIA
 __all__ = ["ModelPath", "Numbers", "plan", "read_model", "score", "select"]
 
 Numbers = Annotated[list[float] | None, several(float, "numbers")]
+Names = Annotated[list[str] | None, several(str, "names")]
 Rows = Annotated[list[int] | None, several(int, "whole numbers")]
 ModelPath = Annotated[
     str | None,
@@ -31,14 +32,12 @@ ModelPath = Annotated[
 class Asked:
     """The problem that a table of candidates and these options describe."""
 
-    columns: Annotated[
-        str | None, "commands; those that begin with u_, else all of numbers", "A,B"
-    ] = None
+    columns: Annotated[str | None, "of commands; u_..., else all of numbers", "A,B"] = (
+        None
+    )
     model: ModelPath = None
     outputs: Annotated[int | None, "of y = A u + b; as many as commands", "M"] = None
-    noise: Annotated[
-        Numbers, "std of a measurement; one number or one per output", "S"
-    ] = None
+    noise: Annotated[Numbers, "std of a measurement; or one per output", "S"] = None
     replicates: Annotated[int, "how often one row may be measured", "R"] = 1
     required: Annotated[Rows, "rows, counted from 0, that must be chosen", "I,J"] = None
 
@@ -69,15 +68,8 @@ class Asked:
 class Judged:
     """By which criterion."""
 
-    criterion: Annotated[
-        str | None, "D for y = A u + b, I for another model", [*CRITERIA]
-    ] = None
-    parameters: Annotated[
-        list[str] | None,
-        "of Ds and As: the parameters of interest",
-        "A,B",
-        several(str, "names"),
-    ] = None
+    criterion: Annotated[str | None, "D of affine models, else I", [*CRITERIA]] = None
+    parameters: Annotated[Names, "of Ds and As: those of interest", "A,B"] = None
 
     def by(self) -> Any:
         """The criterion."""
@@ -100,13 +92,11 @@ class Options:
     restarts: Annotated[int | None, "random starts of the exchange"] = None
     time_limit: Annotated[float | None, "of auto and exact; 10", "SECONDS"] = None
     best: Annotated[int | None, "the B best, of exact", "B"] = None
-    least_efficiency: Annotated[
-        float | None, "of auto: D-efficiency in (0, 1] to prove; 0.999", "E"
-    ] = None
+    least_efficiency: Annotated[float | None, "of auto: to be proven; 0.999"] = None
     checkpoint: Annotated[str | None, "a trained policy", "DIR"] = None
-    decoding: Annotated[
-        str | None, "of policy: greedy, first, samples, exchange", "NAME"
-    ] = None
+    decoding: Annotated[str | None, "of policy: greedy, first, samples, exchange"] = (
+        None
+    )
     num: Annotated[int | None, "tries of first and samples; 16"] = None
 
 
@@ -141,11 +131,9 @@ def score(
     judged: Judged,
     *,
     indices: Annotated[Rows, "rows, counted from 0", "I,J"] = None,
-    subset: Annotated[
-        str | None, "table with a column index, as select --csv writes it", "FILE"
-    ] = None,
+    subset: Annotated[str | None, "table that select --csv wrote", "FILE"] = None,
     reference: Annotated[
-        Literal["bound", "exact"], "an upper bound or the proven optimum"
+        Literal["bound", "exact"], "bound or proven optimum"
     ] = "bound",
     time_limit: Annotated[float | None, "of exact", "SECONDS"] = None,
     output: Output,
@@ -183,7 +171,7 @@ def plan(
     ],
     criterion: Annotated[
         Literal["G", "I"],
-        "G: the largest standard error over the candidates; I: the average",
+        "of the candidates G: the largest standard error; I: the mean",
     ] = "G",
     max_k: Annotated[int | None, "most measurements", "K"] = None,
     more: Annotated[int, "rows beyond the answer"] = 0,

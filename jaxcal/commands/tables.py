@@ -19,7 +19,6 @@ from jaxcal.checks import axis_letter
 from jaxcal.files import write_text
 
 __all__ = [
-    "Columns",
     "Frame",
     "Output",
     "Table",
@@ -32,7 +31,6 @@ __all__ = [
 Array = NDArray[np.float64]
 
 TablePath = Annotated[str, ".csv, .npz or - (standard input)"]
-Columns = Annotated[str | None, "columns, where their names do not tell", "A,B"]
 _NPZ_COLUMNS = {"candidates": "u", "commands": "u", "measured": "y"}
 
 

@@ -45,6 +45,7 @@ class Linear:
     ) -> None:
         self.num_outputs = whole_number("num_outputs", num_outputs, 1)
         self.features = features
+        self._analytic = isinstance(features, str)
         if isinstance(features, str):
             if terms is not None:
                 raise ValueError("terms must be left out: a formula names its own")
@@ -188,7 +189,7 @@ class Linear:
         columns = []
         for i in range(self.num_inputs):
             step = np.zeros(self.num_inputs)
-            if isinstance(self.features, str):  # a complex step is exact
+            if self._analytic:  # a complex step is exact
                 step[i] = 1e-30
                 columns.append(self._features(commands + 1j * step).imag / 1e-30)
                 continue
@@ -226,8 +227,9 @@ class Polynomial(Linear):
             for row in powers
         ]
         super().__init__(
-            self._monomials, num_outputs, inputs=names, terms=["1", *terms[1:]]
+            self._features, num_outputs, inputs=names, terms=["1", *terms[1:]]
         )
+        self._analytic = True
 
     def to_dict(self) -> dict[str, Any]:
         return {
@@ -237,16 +239,8 @@ class Polynomial(Linear):
             "num_outputs": self.num_outputs,
         }
 
-    def _monomials(self, commands: Array) -> Array:
-        return np.prod(commands[:, None, :] ** self._powers, axis=-1)
-
-    def _slopes(self, commands: Array) -> Array:
-        columns = []
-        for i in range(self.num_inputs):
-            lower = self._powers - np.eye(self.num_inputs, dtype=int)[i]
-            rest = np.prod(commands[:, None, :] ** np.maximum(lower, 0), axis=-1)
-            columns.append(self._powers[:, i] * rest)
-        return np.stack(columns, axis=-1)
+    def _features(self, commands: NDArray[Any]) -> NDArray[Any]:
+        return np.asarray(np.prod(commands[:, None, :] ** self._powers, axis=-1))
 
 
 def input_letters(count: int) -> tuple[str, ...]:

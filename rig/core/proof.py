@@ -43,8 +43,8 @@ BLIND = (
     "change, or a reduction that is far too small"
 )
 NO_UNIT = (
-    "No angle of the phone is over 6.3, so it may be in radians or degrees: turn the "
-    "base, or the phone's heading, by some degrees"
+    "No angle of the phone is over 6.3, so imu.unit, radians or degrees, is not "
+    "proved: turn the base, or the phone's heading, by some degrees"
 )
 RADIANS = 180.0 / math.pi
 LARGEST_RAD = 2.0 * math.pi + 0.1  # no larger number is an angle in radians

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import pathlib
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated
 
-from jaxcal.arguments import Parser, exit_code, number_type
+from jaxcal.arguments import Parser, exit_code, values_of
 from jaxcal.files import atomic_write, require_writable_folder
 from jaxcal.progress import Progress
 
@@ -57,39 +56,49 @@ _ORDER = (  # of the exhibits, that of the paper
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Compute, write, say where; the exit code."""
-    options = _parse(arguments)
-    progress = Progress(quiet=options.quiet)
-
-    def make() -> None:
-        try:
-            _run(options, progress)
-        finally:
-            progress.clear()
-
-    return exit_code(make, "reproduce", "nothing was written")
+    parser = Parser(
+        prog="python -m studies.paper", description=_DESCRIPTION, epilog=_EPILOG
+    )
+    given = parser.of(_make).parse_args(arguments)
+    return exit_code(
+        lambda: _make(**values_of(given)), "reproduce", "nothing was written"
+    )
 
 
-def _run(options: argparse.Namespace, progress: Progress) -> None:
-    if options.data is not None and not options.data.is_dir():
-        raise ValueError(f"--data must be a folder, got {options.data}")
-    require_writable_folder(options.out)
-    begun = time.perf_counter()
+def _make(
+    *,
+    quick: Annotated[bool, "fewer episodes, draws and devices"] = False,
+    seed: Annotated[int, "of everything random", "S", (0,)] = 0,
+    data: Annotated[
+        pathlib.Path | None, "real recordings for Datasets 4 and 5", "DIR"
+    ] = None,
+    studies: Annotated[
+        pathlib.Path | None, "kept runs; the repository's studies", "DIR"
+    ] = None,
+    out: Annotated[pathlib.Path, "of the report", "DIR"] = pathlib.Path("report"),
+    quiet: Annotated[bool, "no progress"] = False,
+) -> None:
+    if data is not None and not data.is_dir():
+        raise ValueError(f"--data must be a folder, got {data}")
+    require_writable_folder(out)
+    begun, progress = time.perf_counter(), Progress(quiet=quiet)
 
     from jaxcal.learning.runtime import cache
     from studies.paper.exhibits.claims import claims
     from studies.paper.exhibits.material import STUDIES, Settings
 
     cache.keep_compiled_programs()
-    studies = options.studies or STUDIES
-    settings = Settings(options.seed, options.quick, options.data, studies)
-    exhibits = _exhibits(settings, progress)
-    judged = claims(exhibits, settings.recorded)
-    _write(options.out, _files(settings, exhibits, judged, progress))
-    progress.clear()
+    settings = Settings(seed, quick, data, studies or STUDIES)
+    try:
+        exhibits = _exhibits(settings, progress)
+        judged = claims(exhibits, settings.recorded)
+        _write(out, _files(settings, exhibits, judged, progress))
+    finally:
+        progress.clear()
     for claim in judged:
         print(f"{claim.verdict:>15}  {claim.claim}: {claim.ours}")
     print(
-        f"saved: {options.out}/index.html, reproduction.json, "
+        f"saved: {out}/index.html, reproduction.json, "
         f"{sum(len(e.figures) for e in exhibits)} figures and "
         f"{sum(len(e.data) for e in exhibits)} tables in "
         f"{time.perf_counter() - begun:.0f} s"
@@ -148,19 +157,3 @@ def _write(out: pathlib.Path, files: dict[str, bytes]) -> None:
         for path in (out / folder).iterdir():
             if path.suffix in kinds and f"{folder}/{path.name}" not in files:
                 path.unlink()
-
-
-def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    parser = Parser(
-        prog="python -m studies.paper", description=_DESCRIPTION, epilog=_EPILOG
-    )
-    add = parser.add_argument
-    folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
-    add("--quick", action="store_true", help="fewer episodes, draws and devices")
-    seed: dict[str, Any] = {"type": number_type(int, 0), "metavar": "S"}
-    add("--seed", default=0, help="of everything random; 0", **seed)
-    add("--data", help="real recordings for Datasets 4 and 5", **folder)
-    add("--studies", help="kept runs; the repository's studies", **folder)
-    add("--out", default=pathlib.Path("report"), help="of the report; report", **folder)
-    add("--quiet", action="store_true", help="no progress")
-    return parser.parse_args(arguments)

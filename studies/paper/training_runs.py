@@ -13,12 +13,12 @@ import pathlib
 import shutil
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.arguments import Parser, exit_code
+from jaxcal.arguments import Parser, exit_code, values_of
 from jaxcal.evaluation.csv_rows import csv_text
 from jaxcal.files import require_writable_folder, write_text
 
@@ -118,25 +118,27 @@ def _summary(run: pathlib.Path) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Keep the runs; the exit code."""
-    parser = Parser(
-        prog="python -m studies.paper.training_runs", description=_DESCRIPTION
-    )
-    folder: dict[str, Any] = {"type": pathlib.Path, "metavar": "DIR"}
-    parser.add_argument("runs", nargs="+", help="folders of training runs", **folder)
-    parser.add_argument("--out", required=True, help="of the kept folders", **folder)
-    options = parser.parse_args(arguments)
+    name = "python -m studies.paper.training_runs"
+    given = Parser(prog=name, description=_DESCRIPTION).of(_keep).parse_args(arguments)
+    kept = "runs already named are kept"
+    return exit_code(lambda: _keep(**values_of(given)), "training_runs", kept)
 
-    def keep() -> None:
-        for run in options.runs:
-            if not (run / "metrics.csv").is_file():
-                raise ValueError(f"{run} holds no metrics.csv")
-        require_writable_folder(options.out)
-        for run in options.runs:
-            out = options.out / run.resolve().name
-            summary = collect(run, out)
-            print(f"saved: {out}, {summary['episodes']:,} episodes", flush=True)
 
-    return exit_code(keep, "training_runs", "runs already named are kept")
+def _keep(
+    runs: Annotated[tuple[pathlib.Path, ...], "folders of training runs", "DIR"],
+    *,
+    out: Annotated[pathlib.Path, "of the kept folders", "DIR"],
+) -> None:
+    if not runs:
+        raise ValueError("DIR must name at least one folder of a training run")
+    for run in runs:
+        if not (run / "metrics.csv").is_file():
+            raise ValueError(f"{run} holds no metrics.csv")
+    require_writable_folder(out)
+    for run in runs:
+        folder = out / run.resolve().name
+        summary = collect(run, folder)
+        print(f"saved: {folder}, {summary['episodes']:,} episodes", flush=True)
 
 
 if __name__ == "__main__":

@@ -133,10 +133,33 @@ def test_contacts_that_no_such_arm_made_are_refused():
     labels = np.repeat([0.0, 1.0], len(twice))
     with pytest.raises(ValueError, match="row 30 is row 0 with another socket"):
         _fit("panda_1", np.vstack([twice, twice]), labels)
+    with pytest.raises(ValueError, match="have contacts of socket 1, whose distance"):
+        _fit("panda_1", joints, 0.0 * sockets)
+    few = [
+        np.concatenate([each, more[:5]])
+        for each, more in zip(PLACE, other, strict=True)
+    ]
+    with pytest.raises(ValueError, match=r"62, 63, 64, 65, 66\) are .* another place"):
+        _fit("panda_1", *few)
+    turned = joints.copy()
+    turned[:, 4] *= -1.0
+    with pytest.raises(ValueError, match="a wrong tip, unit, sign or order of columns"):
+        _fit("panda_1", turned, sockets)
     beyond = joints.copy()
     beyond[7, 2] = contacts.arm("panda_1").limits[2, 1] + 2.5
     with pytest.raises(ValueError, match=r"panda_joint3 must be .* in row 7"):
         _fit("panda_1", beyond, sockets)
+
+
+def test_many_contacts_of_the_other_socket_are_named():
+    """So many that they inflate the scatter and none is an outlier."""
+    joints, sockets = PLACE
+    wrong = np.flatnonzero(sockets == 0)[::3]
+    mixed = sockets.copy()
+    mixed[wrong] = 1.0
+    reasons = _fit("panda_1", joints, mixed).verdict.reasons
+    named = {int(why.split()[1]) for why in reasons if why.endswith("socket 0 instead")}
+    assert named == set(wrong.tolist())
 
 
 def test_another_tip_within_the_prior_is_named():

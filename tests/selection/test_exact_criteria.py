@@ -12,10 +12,9 @@ from questions import make_block_problem, make_problem, of
 from scipy.linalg import hadamard
 from scipy.optimize import minimize
 
-from jaxcal.information.criterion import Criterion
 from jaxcal.models import Affine
 from jaxcal.selection import select
-from jaxcal.selection.criteria import CRITERIA
+from jaxcal.selection.criteria import CRITERIA, Criterion
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
 from jaxcal.selection.exact.exact import upper_bound
 

@@ -13,9 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from jaxcal.commands.main import main
-from jaxcal.information.criterion import Criterion
 from jaxcal.selection import select
-from jaxcal.selection.criteria import CRITERIA
+from jaxcal.selection.criteria import CRITERIA, Criterion
 from jaxcal.selection.exact.branch_and_bound import branch_and_bound
 
 Array = np.ndarray

@@ -1,15 +1,4 @@
-"""Datasets 0 to 5 of the paper's Table 3, each by seed.
-
-==========  ========  ==  ===  ========================================================
-name        episodes   M  dim  for
-==========  ========  ==  ===  ========================================================
-dataset0         200  50    6  identification, driven open loop in MuJoCo
-dataset1     200,000  50    3  training; read it in chunks
-dataset2       1,000  50    3  evaluation
-dataset3         100  50    6  independent evaluation, with measured outputs
-dataset4         100  50    6  recorded on the rig: 50-of-500 draws from a pool
-dataset5           1  50    6  recorded on the rig, in a session of its own
-==========  ========  ==  ===  ========================================================
+"""Datasets 0 to 5 of the paper's Table 3 (docs/datasets.md), each by seed.
 
 Commands are uniform within ``RANGES`` and stored normalised to [0, 1], as in the paper.
 The outputs of dataset3 are ``y = diag(scale) u + bias`` (Table 1) of the commands in
@@ -89,7 +78,7 @@ def chunks(
         episodes: the first so many; all when not given.
         recordings: folder of dataset4.csv and dataset5.csv; the shipped one when not
             given.
-        progress: told how many episodes of how many are made.
+        progress: told how much of dataset0 is simulated.
 
     Raises:
         OSError: a recording cannot be read.
@@ -107,16 +96,10 @@ def chunks(
         )
     if name in RECORDED:
         return iter([recorded_dataset(name, seed, folder=recordings).part(0, total)])
-    report = progress or (lambda *_: None)
     if name == "dataset0":
-        return iter([_simulated(seed, total, report)])
-    return _blocks(name, seed, total, report)
-
-
-def _blocks(name: str, seed: int, total: int, progress: Progress) -> Iterator[Dataset]:
-    for begin in range(0, total, BLOCK):
-        progress(f"draw {name}", begin, total)
-        yield drawn(name, seed, begin, min(begin + BLOCK, total))
+        return iter([_simulated(seed, total, progress)])
+    begins = range(0, total, BLOCK)
+    return (drawn(name, seed, begin, min(begin + BLOCK, total)) for begin in begins)
 
 
 def _joined(parts: list[Dataset]) -> Dataset:
@@ -167,7 +150,7 @@ def _streams(
     return np.random.default_rng(draw), np.random.default_rng(noise)
 
 
-def _simulated(seed: int, total: int, progress: Progress) -> Dataset:
+def _simulated(seed: int, total: int, progress: Progress | None) -> Dataset:
     """Dataset0: groups of postures driven in MuJoCo, each with a stream of its own."""
     from jaxcal.paper.twin import simulate
 

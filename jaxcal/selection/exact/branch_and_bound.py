@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from jaxcal import compiled
 from jaxcal.information.blocks import largest_rank
-from jaxcal.information.criterion import Criterion
+from jaxcal.selection.criteria import Criterion
 
 __all__ = ["branch_and_bound"]
 

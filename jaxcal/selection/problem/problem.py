@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.information.blocks import rank_of_blocks, significant
-from jaxcal.information.criterion import Criterion
 from jaxcal.models.model import Model
+from jaxcal.selection.criteria import Criterion
 
 __all__ = ["Found", "Problem", "values"]
 

@@ -111,7 +111,7 @@ def _visit_chosen(run: Run, device: Device, candidates: Array, choice: Choice) -
             )
         plan = next(plans, None)
         if plan is None:
-            choice = choose(config, degrees, available, tuple(done), replanning=True)
+            choice = choose(config, degrees, available, tuple(done))
             plan = run.emit("replan", sync=True, choice=dataclasses.asdict(choice))
         choice = Choice(**plan["choice"])
 

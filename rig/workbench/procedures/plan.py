@@ -49,30 +49,28 @@ def choose(
     candidates_deg: Array,
     available: Array | None = None,
     required: tuple[int, ...] = (),
-    replanning: bool = False,
 ) -> Choice:
     """The K postures to measure of (M, 3) candidates.
 
     Args:
         config: names K, the method and the efficiency under which exact replaces it.
         candidates_deg: (M, 3).
-        available: (M,) False where a posture cannot be reached.
+        available: (M,) False where a posture cannot be reached. The drives stand armed
+            then: it is the exact solver alone, and less time.
         required: indices measured already, which stay in the choice.
-        replanning: the drives stand armed: the exact solver alone, and less time.
     """
     import jaxcal
 
-    session = config.session
+    session, replanning = config.session, available is not None
     limit = REPLAN_LIMIT_S if replanning else EXACT_LIMIT_S
 
     def select(method: str, **more: Any) -> Any:
-        if available is not None:
-            more["available"] = available
-        if required:
-            more["required"] = list(required)
         if method != "greedy":  # which draws nothing
             more["seed"] = session.seed
-        return jaxcal.select(candidates_deg, session.k, method=method, **more)
+        return jaxcal.select(
+            candidates_deg, session.k, method=method,
+            available=available, required=list(required) or None, **more,
+        )  # fmt: skip
 
     exact = chosen = select("exact", time_limit=limit)
     note, more = "", {}

@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxcal.information.criterion import Criterion
-from jaxcal.selection.criteria import CRITERIA
+from jaxcal.selection.criteria import CRITERIA, Criterion
 
 P = 4
 PICK = np.eye(P)[[0, 2]]
