@@ -214,7 +214,7 @@ def imu(
     from rig.workbench.commission import setup, steps
 
     with _place(given) as place:
-        setup.pin(place, steps.look_at_phone(place, seconds).sender)
+        setup.pin(place, steps.look_at_phone(place, seconds))
     return EXIT_OK
 
 

@@ -105,7 +105,7 @@ class Climbs:
         self._required, self._deadline = problem.required, deadline
         self._usable: Indices | None = None  # where not all are
         blocks = problem.blocks
-        if not problem.available.all():
+        if np.count_nonzero(problem.available) < len(blocks):
             self._usable = np.flatnonzero(problem.available)
             blocks = blocks[self._usable]
         criterion, (_, q, p) = problem.criterion, blocks.shape

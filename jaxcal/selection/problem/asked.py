@@ -78,6 +78,7 @@ class Asked:
             )
         self.available = check_available(available, array.shape[:1])
         self.candidates = usable_numbers("candidates", array, self.available)
+        self.candidates.flags.writeable = False
         self._blocks: Array | None = None
         self._coarse = coarseness(candidates)
         if noise is None and hasattr(model, "default_noise"):
@@ -126,6 +127,7 @@ class Asked:
             asked.candidates = array_of(
                 "commands", commands, len(array), "n", rule=rule
             )
+            asked.candidates.flags.writeable = False
         asked._set_rules(prior, noise, measured, required, max_replicates)
         asked.names, asked.axes = _labels(array, names)
         return asked

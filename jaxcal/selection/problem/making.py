@@ -108,6 +108,7 @@ def make_problems(
     array = filled("candidates", candidates, "B", "M", "n")
     mask = check_available(available, array.shape[:2])
     array = usable_numbers("candidates", array, mask)
+    array.flags.writeable = False  # and so of every set
     m = array.shape[2] if num_outputs is None else num_outputs
     model = Affine(array.shape[2], whole_number("num_outputs", m, 1))
     forced = None if required is None else _one_array("required", required)
@@ -185,13 +186,12 @@ def make_problem(
         )
     at = Coordinates(white, names, readings, region, times)
     problem = Problem(
-        **white._asdict(), k=k, available=available, required=forced,
-        max_replicates=cap, criterion=wanted.criterion(at), multiplicity=times, raw=raw,
-        root=root, candidates=candidates, model=model,
+        white.blocks, white.prior, k, available, forced, cap, wanted.criterion(at),
+        times, white.log_scale, raw, white.basis, root, white.triangle, white.size,
+        candidates, model,
     )  # fmt: skip
-    for each in (*white, raw, root, available, forced, candidates):
-        if isinstance(each, np.ndarray):
-            each.flags.writeable = False
+    for each in (*white[:3], *white[4:], raw, root, available, forced):
+        each.flags.writeable = False
     if len(forced):
         _check_required_rank(problem)
     return problem
@@ -220,7 +220,9 @@ def _check_counts(
             + (f", each at most {cap} times" if cap > 1 else "")
             + f", got {k}"
         )
-    given = _one_array("required", () if required is None else required)
+    if required is None:
+        return np.zeros(0, dtype=np.int64)
+    given = _one_array("required", required)
     if not given.size:
         return np.zeros(0, dtype=np.int64)
     if given.ndim != 1:

@@ -6,7 +6,6 @@ import contextlib
 import socket
 import time
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
@@ -15,14 +14,8 @@ from rig.core.attitude import angle_between_deg, mean_rotation
 from rig.core.phone import Imu
 
 LOOK_S = 1.0
-
-
-class Stream(NamedTuple):
-    """A phone's stream over some seconds."""
-
-    rate_hz: float
-    longest_gap_s: float
-    sender: str  # address
+# Below these a session's settle window would hardly ever fill.
+SLOW_HZ, LONG_GAP_S = 5.0, 0.3
 
 
 def addresses_text(settings: ImuSettings, port: int) -> str:
@@ -37,9 +30,7 @@ def addresses_text(settings: ImuSettings, port: int) -> str:
     return f"type into the phone's app ({settings.format}): {each}"
 
 
-def watch(
-    imu: Imu, seconds: float, wait_s: float, say: Callable[[str], None]
-) -> Stream:
+def watch(imu: Imu, seconds: float, wait_s: float, say: Callable[[str], None]) -> None:
     """Wait for an open stream and look at it for so long, telling each second.
 
     Raises:
@@ -63,7 +54,12 @@ def watch(
             f"{scatter:.3f} deg, tilt {tilt:.1f} deg, dropped: "
             + (", ".join(dropped) or "none")
         )
-    return Stream(rate, gap, imu.sender)
+    if rate < SLOW_HZ or gap > LONG_GAP_S:
+        say(
+            f"  note: sessions want {SLOW_HZ:g} readings per s without gaps over "
+            f"{LONG_GAP_S:g} s. Raise the app's rate, keep the phone awake and near "
+            "the Wi-Fi; or raise imu.stale_s and settle.window_s"
+        )
 
 
 def serial_lines() -> list[str]:

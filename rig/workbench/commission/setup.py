@@ -157,8 +157,7 @@ def go(place: steps.Place, given: Given) -> int:
     if record.missing(place.config, IDENTIFIED):
         steps.identify(place)
     say("5 imu")
-    stream = steps.look_at_phone(place)
-    pin(place, stream.sender)
+    pin(place, steps.look_at_phone(place))
     if record.missing(place.config, HOMED):
         say("6 jog and home")
         choices = [*AXIS_NAMES, "no"]

@@ -34,7 +34,7 @@ from rig.workbench.commission.axes import check_axes
 from rig.workbench.commission.findings import Change
 from rig.workbench.commission.home import can_home, home, identity, unlimited
 from rig.workbench.commission.operator import Operator
-from rig.workbench.commission.phone import Stream, addresses_text, watch
+from rig.workbench.commission.phone import addresses_text, watch
 from rig.workbench.outputs.console import listen
 from rig.workbench.run import Run, run_safely
 from rig.workbench.toml import edit
@@ -44,8 +44,6 @@ if TYPE_CHECKING:
 
 WATCH_S = 5.0
 MOST_JOG_DEG = 10.0  # in one step
-# Below these a session's settle window would hardly ever fill.
-SLOW_HZ, LONG_GAP_S = 5.0, 0.3
 
 
 class Enough(Exception):
@@ -139,21 +137,15 @@ def identify(place: Place) -> None:
     place.say(f"IDENTIFIED: {', '.join(each)}")
 
 
-def look_at_phone(place: Place, seconds: float | None = None) -> Stream:
-    """Wait for the phone, tell what it sends, and say what of it is too little."""
+def look_at_phone(place: Place, seconds: float = WATCH_S) -> str:
+    """Wait for the phone and tell what it sends; its address."""
     settings = place.config.imu
     with Imu(settings) as imu:
         place.say(f"imu: {addresses_text(settings, imu.port)}; then start its stream")
         for listener in place.listeners:
             listener({"event": "listening", "port": imu.port})
-        stream = watch(imu, seconds or WATCH_S, session.STREAM_WAIT_S, place.say)
-    if stream.rate_hz < SLOW_HZ or stream.longest_gap_s > LONG_GAP_S:
-        place.say(
-            f"  note: sessions want {SLOW_HZ:g} readings per s without gaps over "
-            f"{LONG_GAP_S:g} s. Raise the app's rate, keep the phone awake and near "
-            "the Wi-Fi; or raise imu.stale_s and settle.window_s"
-        )
-    return stream
+        watch(imu, seconds, session.STREAM_WAIT_S, place.say)
+        return imu.sender
 
 
 def go_home(place: Place, here: bool) -> int:

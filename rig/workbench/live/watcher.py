@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import pathlib
@@ -87,14 +88,9 @@ class Watcher:
         if records or self.running != before:
             self.version += 1
             if self.state.ended is not None:
-                self.summary = self._read_summary()
-
-    def _read_summary(self) -> dict[str, Any]:
-        try:
-            text = (self.folder / "summary.json").read_text(encoding="utf-8")
-            return dict(json.loads(text))
-        except (OSError, ValueError):
-            return {}
+                with contextlib.suppress(OSError, ValueError):  # it may have none
+                    text = (self.folder / "summary.json").read_text(encoding="utf-8")
+                    self.summary = dict(json.loads(text))
 
     @property
     def report(self) -> pathlib.Path | None:
