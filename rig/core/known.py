@@ -132,11 +132,11 @@ def leave(drives: Sequence[Drive], record: DeviceRecord) -> None:
 
 
 class KeptZero(NamedTuple):
-    """The zero posture as a calibration keeps it; None where it does not."""
+    """The zero posture as a calibration keeps it."""
 
     whose: str  # of messages
-    pulses: Pulses | None = None
-    attitude: Array | None = None  # (3, 3) phone to its world
+    pulses: Pulses
+    attitude: Array  # (3, 3) phone to its world
 
     def check(self, config: RigConfig, pulses: Pulses, attitude: Array) -> str:
         """The zero posture taken now is this one; returns what was compared, in words.
@@ -144,16 +144,13 @@ class KeptZero(NamedTuple):
         Raises:
             MotionFault: it is not, by more than ``session.reference_tolerance_deg``.
         """
-        if self.pulses is not None:
-            off = config.to_deg(np.subtract(pulses, self.pulses))
-            if np.abs(off).max() > config.session.reference_tolerance_deg:
-                raise MotionFault(
-                    "in its zero posture the device counts other pulses than for "
-                    f"{self.whose}: {axes_text(off)}. Either this is not the zero "
-                    "posture, or the drives have lost their origin: home them"
-                )
-        if self.attitude is None:
-            return f"{self.whose} keeps no attitude of its zero posture: not compared"
+        off = config.to_deg(np.subtract(pulses, self.pulses))
+        if np.abs(off).max() > config.session.reference_tolerance_deg:
+            raise MotionFault(
+                "in its zero posture the device counts other pulses than for "
+                f"{self.whose}: {axes_text(off)}. Either this is not the zero "
+                "posture, or the drives have lost their origin: home them"
+            )
         return check_zero(config, self.attitude, attitude, self.whose)
 
 

@@ -192,8 +192,6 @@ class RunFolder:
                     f"{'; '.join(changed)}. What is measured now would not be "
                     "comparable. Set these keys back, or start a new run"
                 )
-            if known[0]["mode"] != mode:
-                raise ValueError(f"{self.folder} is a {known[0]['mode']} run")
             self.emit("resume", sync=True, **provenance)
             return
         config, device = self.config.described(), self.config.device_fingerprint()

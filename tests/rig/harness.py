@@ -15,6 +15,8 @@ import sys
 import time
 from unittest import mock
 
+import numpy as np
+
 from rig import simulator as simulators
 from rig.config import RigConfig, parse_config
 from rig.config.config import EXAMPLES
@@ -98,6 +100,15 @@ def commissioned(
         if record.state(name) is None:
             record.reach(name, config)
     return record
+
+
+def notes_of(config: RigConfig) -> dict:
+    """What a calibration keeps of the simulated device: it stands upright at zero."""
+    return {
+        "device": config.device_fingerprint(),
+        "zero_pulses": config.to_pulses(Truth().jig_deg),
+        "zero_attitude": np.eye(3).tolist(),
+    }
 
 
 class Simulator(simulators.Simulator):

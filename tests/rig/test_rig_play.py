@@ -2,7 +2,15 @@
 
 import numpy as np
 import pytest
-from harness import RATE_HZ, SPEEDUP, Simulator, commissioned, fast_config, make_run
+from harness import (
+    RATE_HZ,
+    SPEEDUP,
+    Simulator,
+    commissioned,
+    fast_config,
+    make_run,
+    notes_of,
+)
 
 import jaxcal
 from rig.core.faults import Refused
@@ -28,7 +36,7 @@ def saved(folder, bias, **notes):
     """A calibration of the simulated device, with another bias."""
     matrix, config = np.array(Truth().matrix), fast_config()
     u = np.vstack([np.zeros(3), 10.0 * np.eye(3), -10.0 * np.eye(3)])
-    notes |= {"device": config.device_fingerprint()}
+    notes |= notes_of(config)
     calibration = jaxcal.identify(u, u @ matrix.T + bias, noise_std=0.01, notes=notes)
     path = folder / "calibration.json"
     calibration.save(path)

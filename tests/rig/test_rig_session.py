@@ -20,6 +20,7 @@ from harness import (
     fast_config,
     fast_text,
     make_run,
+    notes_of,
     on_phase,
     session,
     simulator,
@@ -366,7 +367,7 @@ def test_verify_says_when_it_is_time_to_recalibrate(finished, tmp_path, capsys):
         np.vstack([np.zeros(3), 10 * np.eye(3)]),
         np.vstack([np.zeros(3), 10 * np.eye(3)]) @ TRUTH[:, :3].T + TRUTH[:, 3] + 1.0,
         noise_std=0.01,
-        notes={"device": fast_config().device_fingerprint()},
+        notes=notes_of(fast_config()),
     )
     stale.save(tmp_path / "calibration.json")
     path = tmp_path / "rig.toml"

@@ -266,10 +266,10 @@ def test_gravity_resolves_the_axes_it_can(rng):
         check_zero(config, tilted, tilted @ noise, "it")
 
 
-def test_a_zero_without_attitude_is_told_and_its_pulses_still_count():
+def test_the_pulses_of_the_zero_count_too():
     config = fast_config()
-    kept = KeptZero("it", (0, 0, 0))
-    assert "no attitude" in kept.check(config, (3, 0, 0), np.eye(3))
+    kept = KeptZero("it", (0, 0, 0), np.eye(3))
+    assert "zero posture stands 0.000 deg" in kept.check(config, (3, 0, 0), np.eye(3))
     far = config.to_pulses((0.0, LOST, 0.0))
     with pytest.raises(MotionFault, match=r"yaw \+1\.40 deg"):
         kept.check(config, far, np.eye(3))
@@ -347,14 +347,17 @@ def test_a_calibration_is_of_one_device(calibrated, old, new, key):
         load_calibration(calibrated, fast_config({old: new}))
     assert key in str(caught.value)
     same = fast_config({"std_deg = 0.1": "std_deg = 0.2", "port = 5020": "port = 1"})
-    assert load_calibration(calibrated, same).zero.attitude is not None
+    assert load_calibration(calibrated, same).zero.attitude.shape == (3, 3)
 
 
-def test_a_calibration_that_does_not_say_its_device_is_refused(calibrated, tmp_path):
+@pytest.mark.parametrize("key", ["device", "zero_pulses", "zero_attitude"])
+def test_a_calibration_that_does_not_say_its_device_is_refused(
+    key, calibrated, tmp_path
+):
     text = json.dumps(json.loads((calibrated / "calibration.json").read_text()))
     saved = jaxcal.Calibration.load(calibrated / "calibration.json")
     notes = dict(saved.provenance["notes"])
-    del notes["device"]
+    del notes[key]
     old = text.replace(json.dumps(saved.provenance["notes"]), json.dumps(notes))
     assert old != text
     (tmp_path / "calibration.json").write_text(old)

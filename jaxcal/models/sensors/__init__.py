@@ -6,7 +6,7 @@ from jaxcal.models.sensors.gravity import Gravity
 from jaxcal.models.sensors.plane import Plane
 from jaxcal.models.sensors.pose import Pose
 from jaxcal.models.sensors.position import Position
-from jaxcal.models.sensors.sensor import Placed, Reading, Sensor, Tip
+from jaxcal.models.sensors.sensor import Placed, Reading, Sensor, Tip, hats
 from jaxcal.models.sensors.several import Several
 from jaxcal.models.sensors.socket import Socket
 
@@ -24,6 +24,7 @@ __all__ = [
     "Several",
     "Socket",
     "Tip",
+    "hats",
 ]
 
 # By their names in files and on the command line; a sensor of one's own is added here.

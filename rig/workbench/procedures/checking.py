@@ -113,21 +113,20 @@ def load_calibration(
             f"{path}: made with a real device: what is found of a simulated one says "
             "nothing of it. Leave out --simulate, or name a simulated calibration"
         )
-    if "device" not in notes:
+    if lack := {"device", "zero_pulses", "zero_attitude"} - notes.keys():
         raise Refused(
-            f"{path}: does not say with which device it was made. Calibrate this "
-            "device: jaxcal-rig calibrate"
+            f"{path}: does not say with which device and zero posture it was made "
+            f"(no {', '.join(sorted(lack))}). Calibrate it: jaxcal-rig calibrate"
         )
     if changed := differences(notes["device"], config.device_fingerprint()):
         raise Refused(
             f"{path}: made with another device: {'; '.join(changed)}. Correct "
             "rig.toml, or calibrate this device"
         )
-    zero, attitude = notes.get("zero_pulses"), notes.get("zero_attitude")
     kept = KeptZero(
         f"calibration {notes.get('run', path)}",
-        None if zero is None else tuple(map(int, zero)),
-        None if attitude is None else np.array(attitude, dtype=np.float64),
+        tuple(map(int, notes["zero_pulses"])),
+        np.array(notes["zero_attitude"], dtype=np.float64),
     )
     return Saved(calibration, kept, Play.of(notes))
 
