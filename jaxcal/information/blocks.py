@@ -79,6 +79,7 @@ def rank_rule(
     Returns:
         Rank, and natural log det, -inf where the rank is below p.
     """
+    columns = np.ascontiguousarray(columns)
     p, count = columns.shape[1], count or len(columns)
     norms, rounding, least, value = _kernel().scaled(columns, largest, count)
     rank = p
@@ -93,7 +94,7 @@ def null_directions(columns: Array, largest: Array) -> list[Array]:
 
     Axes that no row moves come first, then a basis of the rest of the null space.
     """
-    p = columns.shape[1]
+    columns, p = np.ascontiguousarray(columns), columns.shape[1]
     norms, rounding, *_ = _kernel().scaled(columns, largest, len(columns))
     flat = norms == 0.0
     unit = columns / np.where(flat, np.inf, norms)

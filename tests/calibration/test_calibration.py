@@ -823,3 +823,10 @@ def test_importing_calibration_loads_neither_jax_nor_scipy() -> None:
         [sys.executable, "-c", script], capture_output=True, text=True, cwd=ROOT
     )
     assert out.stdout.strip() == "[]", out.stderr
+
+
+def test_the_order_of_numbers_in_memory_does_not_matter() -> None:
+    commands = np.random.default_rng(0).uniform(-20.0, 20.0, (9, 3))
+    found = identify(commands, 2.0 * commands)
+    turned = identify(np.asfortranarray(commands), np.asfortranarray(2.0 * commands))
+    np.testing.assert_array_equal(turned.parameters, found.parameters)
