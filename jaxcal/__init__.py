@@ -14,12 +14,14 @@ from typing import TYPE_CHECKING, Any
 from jaxcal import compiled
 
 if TYPE_CHECKING:
-    from jaxcal.calibration import Calibration, identify
+    from jaxcal.calibration import Calibration
+    from jaxcal.calibration.identify import identify
     from jaxcal.information.regression import (
         log_det_information,
         regression_matrix,
     )
-    from jaxcal.models import Noise, Prior, identifiability
+    from jaxcal.models import Noise, Prior
+    from jaxcal.models.identifiability import identifiability
     from jaxcal.selection import As, Design, Ds, I, Motion, Selection, select
 
 __all__ = [
