@@ -347,7 +347,7 @@ def test_methods_are_checked() -> None:
     ("change", "message"),
     [
         ({"k": 3}, "small: k must be at least 4"),
-        ({"k": 9}, "small: k must not exceed what is available"),
+        ({"k": 9}, "small: in set 0: k must not exceed what is available"),
         ({"num": 0}, "num must be at least 1, got 0"),
         ({"random_draws": 0}, "random_draws must be at least 1, got 0"),
     ],
@@ -360,7 +360,7 @@ def test_bad_arguments_are_named(change: dict[str, int], message: str) -> None:
 def test_a_flat_episode_is_named() -> None:
     dataset = small()
     dataset.candidates[4, :, 1] = 0.5
-    with pytest.raises(ValueError, match=r"small: .*set 4 lie in one plane"):
+    with pytest.raises(ValueError, match=r"small: in set 4: .* lie in one plane"):
         evaluate(dataset, 4, ["greedy"])
 
 

@@ -116,6 +116,7 @@ def make_problems(
         raise ValueError(f"required must have shape (B, r), got {forced.shape}")
     raw, coarse = model.blocks(array), coarseness(candidates)
     root, wanted = np.zeros((0, model.num_inputs + 1)), CRITERIA["D"]()
+    k = _check_k(k, raw[0], mask[0], root, regressors=True)  # of no one set
     problems = []
     for b in range(len(array)):
         try:
