@@ -539,7 +539,7 @@ def _elsewhere(
         assert not (folder / "2").exists(), "a second session was begun"
     else:
         assert done.returncode == 0, said
-        assert fault == "other_stop" or "it is ended now" in said, said
+        assert fault == "other_stop" or "it is killed now" in said, said
 
 
 def cells() -> list[tuple[str, str]]:
