@@ -161,6 +161,9 @@ def test_a_drive_that_was_not_seen_to_stand_keeps_its_watch_until_a_resume(tmp_p
         assert [here[0], here[2]] == [BEFORE[0], BEFORE[2]] and here[1] != BEFORE[1]
         assert any("yaw: its communication timeout" in line for line in said)
         assert list(timeouts_left(read_journal(tmp_path / "journal.jsonl"))) == ["yaw"]
+        # Nobody read where it stands, so it is homed before the run goes on.
+        assert session(sim.start(), tmp_path, sim, said) == 2
+        assert "not HOMED: yaw" in said[-1]
         assert session(sim.start(), tmp_path, sim, said) == 0, said[-5:]
         assert timeouts(sim) == BEFORE
 
@@ -184,8 +187,10 @@ def test_a_resumed_run_puts_back_what_a_killed_one_left(tmp_path):
         )  # fmt: skip
         assert child.returncode == -signal.SIGKILL
         assert timeouts(sim) != BEFORE
-        code = session(load_config(path), tmp_path)
-        assert code == 0 and timeouts(sim) == BEFORE
+        assert session(load_config(path), tmp_path) == 2  # home first
+        assert timeouts(sim) != BEFORE
+        assert session(load_config(path), tmp_path) == 0
+        assert timeouts(sim) == BEFORE
 
 
 def test_a_drive_that_was_set_again_since_the_kill_keeps_that():
