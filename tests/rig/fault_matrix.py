@@ -464,7 +464,7 @@ def _host_cell(
     watched = fault == "sigkill_watched"
     given = fast_config(WATCHED if watched else None)
     device = Truth(noise_deg=0.0, idle_watchdog=watched)
-    # Slow where somebody in another terminal must come in time.
+    # Slow where a command from another terminal must come in time.
     speedup = {"second_session": 0.3, "other_stop": 0.1, "suspended_stop": 0.1}.get(
         fault, 1.0
     )

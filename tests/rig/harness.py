@@ -41,7 +41,7 @@ OTHERS = (
     "second_session",
     "other_stop",
     "suspended_stop",
-)  # what somebody does in another terminal
+)  # commands from another terminal
 WATCHED = {  # drives that stop themselves when the line is silent
     'map = "leadshine_pr"': 'map = "generic"\ncomm_timeout_s = 0.8',
     "timeout_s = 0.5": "timeout_s = 0.25",

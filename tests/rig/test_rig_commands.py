@@ -109,7 +109,7 @@ def test_nothing_moves_without_confirmation(tmp_path, capsys):
         ["calibrate", "--config", "/does/not/exist.toml"],
         ["resume", "/does/not/exist"],
         ["check", "/does/not/exist.toml"],
-        ["example", "nobody"],
+        ["example", "unknown"],
         ["verify", "/does/not/exist", "--simulate"],
         ["calibrate", "--simulate", "--fault", "earthquake"],
         ["collect", "--simulate", "--count", "0"],

@@ -70,7 +70,7 @@ def test_every_fault_of_a_configuration_is_listed_at_once():
     ("old", "new", "part"),
     [
         ("max_deg = 20", "max_deg = -30", "under max_deg"),
-        ('map = "leadshine_pr"', 'map = "nobody"', "no register map"),
+        ('map = "leadshine_pr"', 'map = "unknown"', "no register map"),
         ("pulses_per_rev = 10000", "pulses_per_rev = 10", "coarser than"),
         ("min_deg = -20", "min_deg = -20\nmin_pulses = -100", "outside min_pulses"),
         ("speed_deg_s = 120", "speed_deg_s = 0", "speed_deg_s"),

@@ -161,7 +161,7 @@ def test_a_drive_that_was_not_seen_to_stand_keeps_its_watch_until_a_resume(tmp_p
         assert [here[0], here[2]] == [BEFORE[0], BEFORE[2]] and here[1] != BEFORE[1]
         assert any("yaw: its communication timeout" in line for line in said)
         assert list(timeouts_left(read_journal(tmp_path / "journal.jsonl"))) == ["yaw"]
-        # Nobody read where it stands, so it is homed before the run goes on.
+        # Its place was not read, so it is homed before the run goes on.
         assert session(sim.start(), tmp_path, sim, said) == 2
         assert "not HOMED: yaw" in said[-1]
         assert session(sim.start(), tmp_path, sim, said) == 0, said[-5:]

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 FORMATS = ["hyperimu", "sensorlogger", "lines"]
 UNITS = 16
 SAFETY = (
-    "Research software, not a medical device. No patient is attached, nobody is within "
-    "the device's reach, a hardware emergency stop is at hand."
+    "Research software, not a medical device. Confirm: no patient is attached, no "
+    "person is within reach of the device, a hardware emergency stop is at hand."
 )
 
 
