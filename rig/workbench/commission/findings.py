@@ -22,7 +22,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rig.config import AXIS_NAMES, RigConfig
-from rig.config.axis import Scale
 from rig.core.attitude import ORDERS, Array, euler_to_matrix, matrix_to_euler
 from rig.core.device import Device, Posture
 from rig.core.faults import MotionFault
@@ -381,13 +380,9 @@ def proposals(
             new = float(f"{axis.reduction / ratio:.{DIGITS}g}")
             reason = f"it turns {ratio:.3g} of what is commanded; sound is {low:g} to "
             wanted["reduction"] = axis.reduction, new, f"{reason}{high:g}"
-        wanted = {name: each for name, each in wanted.items() if each[0] != each[1]}
-        if wanted.keys() & Scale.model_fields.keys():
-            for name in ("min_pulses", "max_pulses"):
-                if (old := tables[axis.name].get(name)) is not None:
-                    wanted[name] = old, None, "pulses mean otherwise"
         for name, each in wanted.items():
-            changes.append(Change(f"axes.{axis.name}.{name}", *each))
+            if each[0] != each[1]:
+                changes.append(Change(f"axes.{axis.name}.{name}", *each))
     if found.turned_deg > MOUNTING_DEG:
         angles = matrix_to_euler(found.mounting, "ZYX").round(2) + 0.0
         before, reason = list(config.imu.mounting_deg), "the three axes put the phone"

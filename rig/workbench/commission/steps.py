@@ -168,7 +168,7 @@ def go_home(place: Place, here: bool) -> int:
         f"emergency stop; {what}",
         "home",
     )
-    return place.run("home", lambda run, dev: home(run, dev, here), limits=False)
+    return place.run("home", lambda run, dev: home(run, dev, place.config, here), limits=False)
 
 
 def jog(place: Place, axis: int, way_deg: float) -> int:
@@ -186,7 +186,7 @@ def jog(place: Place, axis: int, way_deg: float) -> int:
         each, here = run.config.axes[axis], list(device.positions())
         start, checked = here[axis], device.proof.reaches[axis].checked
         goal = min(max(each.to_deg(start) + way_deg, each.min_deg), each.max_deg)
-        here[axis] = min(max(each.to_pulses(goal), each.min_pulses), each.max_pulses)
+        here[axis] = each.to_pulses(goal)
         base = device.attitude()
         device.proof.stay_near(base, max(ALLOWED_DEG, 2.0 * abs(way_deg)))
 
