@@ -87,7 +87,7 @@ class Axis(Scale):
     @classmethod
     def unmoved(cls, name: str, unit: int, register_map: RegisterMap) -> "Axis":
         """A drive that is read or stopped and never moved: nothing else is known."""
-        return cls.model_construct(name=name, unit=unit, map=register_map)
+        return cls.model_construct(name=name, rotates="X", unit=unit, map=register_map)
 
     @property
     def min_pulses(self) -> int:
