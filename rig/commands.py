@@ -219,18 +219,13 @@ def jog(
     return _step(given, "IDENTIFIED", "jog", NAMES.index(axis), step)
 
 
-def characterise(
-    axis: Axis,
-    *,
-    into: Annotated[Path, "run whose calibration keeps what is found"] | None = None,
-    given: Step,
-) -> int:
+def characterise(axis: Axis, *, given: Step) -> int:
     """measure play, dead zone and breakaway of one axis"""
     from jaxcal.extras import needs
 
     with needs("policy", "characterise"):
         import jax  # noqa: F401  # before anything moves
-    return _step(given, "SIGN_CHECKED", "characterise", NAMES.index(axis), into)
+    return _step(given, "SIGN_CHECKED", "characterise", NAMES.index(axis))
 
 
 def home(
@@ -424,7 +419,7 @@ def _procedure(
     if mode == "verify":
         return lambda run: checking.verify(run, found, inputs["count"]), saved.zero
     to = np.array(inputs["to"], dtype=np.float64)
-    return lambda run: move_to(run, found, to, saved.play), saved.zero
+    return lambda run: move_to(run, found, to), saved.zero
 
 
 def _confirm(given: Session, session: Run) -> None:

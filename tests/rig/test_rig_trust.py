@@ -40,8 +40,6 @@ from rig.journal import (
 from rig.simulator import Truth
 from rig.simulator.faults import FaultInjector
 from rig.simulator.phone import Phone
-from rig.workbench.commission.operator import Operator
-from rig.workbench.commission.steps import Place, characterise
 from rig.workbench.identification.conclusion import check_matrix
 from rig.workbench.procedures.checking import (
     collect,
@@ -516,21 +514,6 @@ def test_the_run_of_a_real_device_is_not_resumed_as_a_simulated_one(
     assert main(given) == 2
     error = capsys.readouterr().err
     assert "was made with a real device" in error and "cannot open" not in error
-
-
-def test_what_is_found_of_a_simulated_device_stays_out_of_a_real_calibration(
-    calibrated, tmp_path
-):
-    """G, the other way: its play would have been put back on the real joints."""
-    record = DeviceRecord(tmp_path / "device.json")
-    for state in (IDENTIFIED, HOMED, SIGN_CHECKED):
-        record.reach(state, fast_config())
-    operator = Operator(yes=True, say=[].append)
-    place = Place(fast_config(), record, operator, full_speed=True)
-    before = (calibrated / "calibration.json").read_bytes()
-    with pytest.raises(Refused, match="made with a real device"):
-        characterise(place, 0, into=calibrated)
-    assert (calibrated / "calibration.json").read_bytes() == before
 
 
 @pytest.mark.parametrize("bit", [False, True])

@@ -214,19 +214,10 @@ def jog(place: Place, axis: int, way_deg: float) -> int:
     return place.run("jog", procedure, limits=homed, again=f"jog {name} {way_deg:g}")
 
 
-def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> int:
-    """Measure play, dead zone and breakaway of an axis, into a calibration."""
+def characterise(place: Place, axis: int) -> int:
+    """Measure play, dead zone and breakaway of an axis."""
     from rig.workbench.commission import characterise as measured  # loads JAX
-    from rig.workbench.procedures.checking import (
-        calibration_path,
-        keep,
-        load_calibration,
-    )
 
-    path = None if into is None else calibration_path(into)
-    if path is not None:
-        # Of this device; simulated ones alone are moved at full speed.
-        load_calibration(path, place.config, simulated=place.full_speed, into=True)
     name, most = AXIS_NAMES[axis], measured.BASE_DEG + measured.FAR_DEG
     place.operator.confirm(
         f"characterise: {name} will move up to {most:.2f} deg from where it stands, "
@@ -234,14 +225,10 @@ def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> i
         "characterise",
     )
 
-    def procedure(run: Run, device: Device) -> None:
-        found = measured.characterise(run, device, axis)
-        if path is not None:
-            keep(path, name, found | {"run": run.folder.name})
-            run.say(f"kept in {path}: `jaxcal-rig goto` puts the play back")
-
-    again = f"characterise {name}" + (f" --into {into}" if into else "")
-    return place.run("characterise", procedure, again=again)
+    return place.run(
+        "characterise", lambda run, device: measured.characterise(run, device, axis),
+        again=f"characterise {name}",
+    )  # fmt: skip
 
 
 def axes(place: Place) -> int:

@@ -18,7 +18,6 @@ from rig.core.session import visit
 from rig.workbench.identification.fit import held_out_errors, pairs
 from rig.workbench.outputs.words import error_text, numbers
 from rig.workbench.procedures.calibrate import END, pair_names, visit_pairs
-from rig.workbench.procedures.goto import CHARACTERISED, Play
 from rig.workbench.procedures.plan import draw, draw_held_out
 from rig.workbench.run import Run
 
@@ -77,11 +76,10 @@ class Saved(NamedTuple):
 
     calibration: Any
     zero: KeptZero
-    play: Play
 
 
 def load_calibration(
-    path: pathlib.Path, config: RigConfig, simulated: bool = False, into: bool = False
+    path: pathlib.Path, config: RigConfig, simulated: bool = False
 ) -> Saved:
     """A calibration that was made with a device configured as this one.
 
@@ -89,15 +87,14 @@ def load_calibration(
         path: of the file, or of its run's folder.
         config: of the device.
         simulated: so is the device that is to be moved.
-        into: what is found of that device is to be kept in the calibration.
 
     Raises:
-        Refused: not a calibration, or of another device (names the keys), or one of
-            the two is simulated and the other is not.
+        Refused: not a calibration, or of another device (names the keys), or made with
+            a simulated one, and that to be moved is real.
     """
     import jaxcal
 
-    path = calibration_path(path)
+    path = path / "calibration.json" if path.is_dir() else path
     try:
         calibration = jaxcal.Calibration.load(path)
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -107,11 +104,6 @@ def load_calibration(
         raise Refused(
             f"{path}: made with a simulated device: it says nothing of the real one. "
             "Calibrate the device, or use it with --simulate"
-        )
-    if into and simulated and not notes.get("simulated"):
-        raise Refused(
-            f"{path}: made with a real device: what is found of a simulated one says "
-            "nothing of it. Leave out --simulate, or name a simulated calibration"
         )
     if lack := {"device", "zero_pulses", "zero_attitude"} - notes.keys():
         raise Refused(
@@ -128,22 +120,7 @@ def load_calibration(
         tuple(map(int, notes["zero_pulses"])),
         np.array(notes["zero_attitude"], dtype=np.float64),
     )
-    return Saved(calibration, kept, Play.of(notes))
-
-
-def calibration_path(path: pathlib.Path) -> pathlib.Path:
-    """The file of a calibration that is given by itself or by its run's folder."""
-    return path / "calibration.json" if path.is_dir() else path
-
-
-def keep(path: pathlib.Path, axis: str, found: dict[str, Any]) -> None:
-    """Write what was found of an axis into the notes of a calibration's file."""
-    from jaxcal.calibration import file
-
-    content = file.read(path)
-    notes = content["provenance"].setdefault("notes", {})
-    notes[CHARACTERISED] = notes.get(CHARACTERISED, {}) | {axis: found}
-    file.write(path, content)
+    return Saved(calibration, kept)
 
 
 def verify(run: Run, calibration: Any, count: int) -> int:
