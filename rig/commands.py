@@ -79,7 +79,6 @@ class Target(Simulation):
 
     @property
     def simulation(self) -> dict[str, Any]:
-        """The options of the simulated device."""
         names = [field.name for field in dataclasses.fields(Simulation)]
         return {name: getattr(self, name) for name in names}
 
