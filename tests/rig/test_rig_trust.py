@@ -44,9 +44,9 @@ from rig.workbench.identification.conclusion import check_matrix
 from rig.workbench.procedures.checking import (
     collect,
     load_calibration,
+    unchecked,
     verify,
 )
-from rig.workbench.procedures.goto import unchecked
 from rig.workbench.run import run_safely
 
 LOST = 1.4  # degrees, as was seen
@@ -61,14 +61,14 @@ def run_verify(config, calibration, folder, sim, record=None, here=False):
     """One verification of two postures; its exit code and what it said."""
     folder.mkdir()
     said = []
-    saved = load_calibration(calibration, config)
+    saved, zero = load_calibration(calibration, config)
     run = make_run(
         config, folder, "verify", said.append,
         record=record or commissioned(config, folder),
-        zero_at=None if here else saved.zero.pulses, kept_zero=saved.zero,
+        zero_at=None if here else zero.pulses, kept_zero=zero,
     )  # fmt: skip
     run.listeners.append(sim.answer)
-    return run_safely(run, lambda r: verify(r, saved.calibration, 2)), said
+    return run_safely(run, lambda r: verify(r, saved, 2)), said
 
 
 @pytest.fixture(scope="module")
@@ -345,7 +345,7 @@ def test_a_calibration_is_of_one_device(calibrated, old, new, key):
         load_calibration(calibrated, fast_config({old: new}))
     assert key in str(caught.value)
     same = fast_config({"std_deg = 0.1": "std_deg = 0.2", "port = 5020": "port = 1"})
-    assert load_calibration(calibrated, same).zero.attitude.shape == (3, 3)
+    assert load_calibration(calibrated, same)[1].attitude.shape == (3, 3)
 
 
 @pytest.mark.parametrize("key", ["device", "zero_pulses", "zero_attitude"])
@@ -494,7 +494,7 @@ def test_a_simulated_calibration_moves_no_real_joint(calibrated, tmp_path, capsy
     file.write_text(json.dumps(content))
     with pytest.raises(Refused, match="made with a simulated device"):
         load_calibration(file, fast_config())
-    assert load_calibration(file, fast_config(), simulated=True).zero.pulses
+    assert load_calibration(file, fast_config(), simulated=True)[1].pulses
     path = tmp_path / "rig.toml"
     path.write_text(fast_text({"port = 5020": "port = 1"}))  # opening would say so
     for given in (["goto", str(file), "--to", "0", "0", "0"], ["verify", str(file)]):

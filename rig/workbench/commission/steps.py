@@ -8,7 +8,6 @@ import functools
 import os
 import pathlib
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
 
 from rig.config import AXIS_NAMES, RigConfig
 from rig.core import session
@@ -38,9 +37,6 @@ from rig.workbench.commission.phone import addresses_text, watch
 from rig.workbench.outputs.console import listen
 from rig.workbench.run import Run, run_safely
 from rig.workbench.toml import edit
-
-if TYPE_CHECKING:
-    from rig.simulator import Simulator
 
 WATCH_S = 5.0
 MOST_JOG_DEG = 10.0  # in one step
@@ -286,16 +282,3 @@ def commissioned(path: pathlib.Path, config: RigConfig, through: str) -> DeviceR
     for state in STATES[: STATES.index(through) + 1] if through else ():
         record.reach(state, config)
     return record
-
-
-def simulated(
-    simulator: Simulator,
-    served: RigConfig,
-    record: DeviceRecord,
-    say: Callable[[str], None],
-) -> Place:
-    """A simulated device: no operator confirms its moves, no file is corrected."""
-    return Place(
-        served, record, Operator(yes=True, say=say), full_speed=True,
-        listeners=(simulator.hear,),
-    )  # fmt: skip
