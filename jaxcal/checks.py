@@ -17,13 +17,13 @@ __all__ = [
     "levels",
     "numbers",
     "one_of",
-    "relative_weights",
+    "one_or_each",
     "require_finite",
+    "require_kind",
     "require_none",
     "seconds",
     "share",
     "table",
-    "text",
     "whole_number",
 ]
 
@@ -84,6 +84,15 @@ def require_none(bad: NDArray[np.bool_], of: Any, rule: str, more: str = "") -> 
         raise ValueError(f"{rule}, got {of[bad][0]}{more}")
 
 
+def require_kind(argument: str, value: Any, kind: type) -> None:
+    """Refuse what is neither None nor a ``Prior``, or a ``Noise``."""
+    if value is not None and not isinstance(value, kind):
+        raise ValueError(
+            f"{argument} must be a jaxcal.{kind.__name__}(std=...), got "
+            f"{type(value).__name__}"
+        )
+
+
 def table(name: str, values: ArrayLike) -> Array:
     table = numbers(name, values)
     if table.ndim != 2 or table.shape[1] < 1:
@@ -94,30 +103,22 @@ def table(name: str, values: ArrayLike) -> Array:
     return table
 
 
-def relative_weights(weights: ArrayLike | None, count: int) -> Array:
-    if weights is None:
-        return np.ones(count)
-    weight = numbers("weights", weights)
-    if weight.shape != (count,):
-        raise ValueError(f"weights must have shape ({count},), got {weight.shape}")
-    if (weight < 0.0).any():
-        where = int(np.flatnonzero(weight < 0.0)[0])
+def one_or_each(name: str, values: ArrayLike, count: int, more: str = "") -> Array:
+    """(count,) of one number for all or one each; not to be written to."""
+    given = numbers(name, values, finite=False)
+    if given.shape not in ((), (count,)):
         raise ValueError(
-            f"weights must not be negative, got {weight[where]} at {where}"
+            f"{name} must be one number or ({count},){more}, got {given.shape}"
         )
-    return weight
+    return np.broadcast_to(given, (count,))
 
 
 def levels(name: str, values: ArrayLike, count: int) -> Array:
     """(count,) positive numbers, one for all or one each; not to be written to."""
-    given = numbers(name, values)
-    if given.shape not in ((), (count,)):
-        raise ValueError(f"{name} must be one number or ({count},), got {given.shape}")
-    if (given <= 0.0).any():
-        raise ValueError(f"{name} must be positive, got {given[given <= 0.0].flat[0]}")
-    own = np.array(np.broadcast_to(given, (count,)))
-    own.flags.writeable = False
-    return own
+    given = one_or_each(name, values, count)
+    require_finite(name, given)
+    require_none(given <= 0.0, given, f"{name} must be positive")
+    return given
 
 
 def axis_names(
@@ -125,16 +126,10 @@ def axis_names(
 ) -> tuple[str, ...]:
     if names is None:
         return tuple(f"{letter}_{axis_letter(i, count)}" for i in range(count))
-    given = tuple(names)
+    given = () if isinstance(names, str) else tuple(names)
     if len(given) != count or not all(isinstance(name, str) and name for name in given):
         raise ValueError(f"{argument} must hold {count} names, got {names!r}")
     return given
-
-
-def text(argument: str, value: str) -> str:
-    if not isinstance(value, str):
-        raise ValueError(f"{argument} must be text, got {value!r}")
-    return value
 
 
 def one_of(argument: str, value: Any, choices: Sequence[str]) -> str:

@@ -116,6 +116,8 @@ def identify(
     else:
         if as_urdf:
             raise ValueError("--out FILE.urdf needs --model FILE.urdf")
+        if of_arm != ArmOptions():
+            raise ValueError("options of an arm need --model FILE.urdf")
         known, names = table.outputs(outputs), table.inputs(inputs)
         if not inputs:
             names = tuple(n for n in names if n not in (*known, weights))
@@ -154,7 +156,7 @@ CalibrationPath = Annotated[str, "made by identify", "calibration.json"]
 
 def predict(
     calibration: CalibrationPath,
-    file: Annotated[str, "commands: .csv, .npz or -"],
+    file: Annotated[str, "commands: CSV, or -"],
     *,
     columns: Annotated[str | None, "columns of commands", "A,B"] = None,
     std: Annotated[bool, "and the standard error of each output"] = False,
@@ -172,7 +174,7 @@ def predict(
 
 def command(
     calibration: CalibrationPath,
-    file: Annotated[str, "desired outputs: .csv, .npz or -"],
+    file: Annotated[str, "desired outputs: CSV, or -"],
     *,
     columns: Annotated[str | None, "columns of desired outputs", "A,B"] = None,
     limits: Annotated[

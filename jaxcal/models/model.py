@@ -21,6 +21,7 @@ __all__ = [
     "derivative",
     "facts",
     "predict",
+    "require_model",
 ]
 
 Array = NDArray[np.float64]
@@ -73,6 +74,18 @@ class Model(Protocol):
 
     def to_dict(self) -> dict[str, Any]:
         """JSON with a ``kind``; :func:`jaxcal.models.from_dict` reads it."""
+
+
+def require_model(model: Any) -> None:
+    """Refuse a class, and what has not the methods of a model."""
+    methods = ("predict", "jacobian", "command_jacobian", "default_prior")
+    missing = [name for name in methods if not callable(getattr(model, name, None))]
+    if missing or isinstance(model, type):
+        raise ValueError(
+            "model must be of jaxcal.models, or an object with the methods of "
+            f"jaxcal.models.Model, got {model!r}"
+            + (f" without {missing[0]}" if missing else "")
+        )
 
 
 def as_commands(commands: ArrayLike, num_inputs: int) -> Array:
@@ -137,12 +150,13 @@ def derivative(
         found = getattr(model, method)(commands, parameters)
     found = np.asarray(found, dtype=np.float64)
     _require_shape(method, found, (len(commands), model.num_outputs, len(names)))
-    bad = np.argwhere(~np.isfinite(found))
-    if len(bad):
-        row, _, column = (int(i) for i in bad[0])
+    bad = ~np.isfinite(found)
+    for row, output, column in np.argwhere(bad)[:1]:
+        # A forward derivative may spoil the columns beside that of the one to blame.
+        by = ", ".join(np.array(names)[bad[row, output]])
         raise ValueError(
-            f"model.{method} must be finite, got {found[tuple(bad[0])]} by "
-            f"{names[column]} for the command {in_words(commands[row])}"
+            f"model.{method} must be finite, got {found[row, output, column]} by {by} "
+            f"for the command {in_words(commands[row])}"
         )
     return found
 
