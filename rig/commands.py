@@ -45,11 +45,6 @@ Faults = Annotated[list[str], "inject KIND[@PHASE][,count=N]...; list: names the
 Postures = Annotated[int, "postures"]
 Units = Annotated[int, "ids 1 to N are asked", (1, 247)]
 BusName = Annotated[str, "rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT"]
-NamesKnown = Annotated[
-    bool,
-    "every unit was seen to turn its own joint the right way; the phone may be placed "
-    "in any way",
-]
 
 
 @dataclasses.dataclass
@@ -154,7 +149,6 @@ def setup(
     imu: Annotated[str, "APP[:PORT]: hyperimu, sensorlogger or lines"] = "",
     home: Annotated[Literal["here", "drive"], "how"] = "here",
     set: Annotated[list[str], "KEY=VALUE of the new rig.toml"] | None = None,
-    names_known: NamesKnown = False,
 ) -> int:
     """from cables to a device that may be calibrated; writes rig.toml"""
     from rig.journal import DeviceRecord
@@ -163,7 +157,7 @@ def setup(
 
     path, operator = given.config or FILE, steps.Operator(given.yes, _say)
     values = dict(map(wizard.setting, set or ()))
-    asked = wizard.Given(bus, imu, units, values, home, names_known)
+    asked = wizard.Given(bus, imu, units, values, home)
     with contextlib.ExitStack() as stack:
         if given.simulate:
             device = dataclasses.replace(given, config=None)
@@ -246,9 +240,9 @@ def home(
     return _step(given, "IDENTIFIED", "go_home", here)
 
 
-def axes(given: Step, *, names_known: NamesKnown = False) -> int:
+def axes(given: Step) -> int:
     """check what turns, which way, how far; correct rig.toml"""
-    return _step(given, "HOMED", "axes", names_known)
+    return _step(given, "HOMED", "axes")
 
 
 def zero(given: Step) -> int:

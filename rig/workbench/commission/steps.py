@@ -75,7 +75,8 @@ class Place:
     def command(self, words: str) -> str:
         """A command about this device, to be typed."""
         where = "" if self.path is None else f" --config {os.path.relpath(self.path)}"
-        return f"jaxcal-rig {words}{where}"
+        # A simulated device is gone with its command; another is made as rig.toml says.
+        return f"jaxcal-rig {words}{' --simulate' * self.full_speed}{where}"
 
     @contextlib.contextmanager
     def bus(self, what: str) -> Iterator[list[Drive]]:
@@ -168,7 +169,10 @@ def go_home(place: Place, here: bool) -> int:
         f"emergency stop; {what}",
         "home",
     )
-    return place.run("home", lambda run, dev: home(run, dev, here), limits=False)
+    return place.run(
+        "home", lambda run, dev: home(run, dev, place.config, here), limits=False,
+        again="home" + " --here" * here,
+    )  # fmt: skip
 
 
 def jog(place: Place, axis: int, way_deg: float) -> int:
@@ -186,7 +190,7 @@ def jog(place: Place, axis: int, way_deg: float) -> int:
         each, here = run.config.axes[axis], list(device.positions())
         start, checked = here[axis], device.proof.reaches[axis].checked
         goal = min(max(each.to_deg(start) + way_deg, each.min_deg), each.max_deg)
-        here[axis] = min(max(each.to_pulses(goal), each.min_pulses), each.max_pulses)
+        here[axis] = each.to_pulses(goal)
         base = device.attitude()
         device.proof.stay_near(base, max(ALLOWED_DEG, 2.0 * abs(way_deg)))
 
@@ -236,10 +240,11 @@ def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> i
             keep(path, name, found | {"run": run.folder.name})
             run.say(f"kept in {path}: `jaxcal-rig goto` puts the play back")
 
-    return place.run("characterise", procedure, again=f"characterise {name}")
+    again = f"characterise {name}" + (f" --into {into}" if into else "")
+    return place.run("characterise", procedure, again=again)
 
 
-def axes(place: Place, names_known: bool = False) -> int:
+def axes(place: Place) -> int:
     """Check each axis, correct rig.toml after a yes, and check again: SIGN_CHECKED."""
     place.operator.confirm(
         "axes: the device stands in its zero posture. Each axis in turn will move a "
@@ -248,14 +253,12 @@ def axes(place: Place, names_known: bool = False) -> int:
         "device's reach",
         "axes",
     )
-    return _check_axes(place, names_known)
+    return _check_axes(place)
 
 
-def _check_axes(place: Place, names_known: bool, again: bool = False) -> int:
+def _check_axes(place: Place, again: bool = False) -> int:
     changes: list[Change] = []
-    code = place.run(
-        "axes", lambda run, dev: changes.extend(check_axes(run, dev, names_known))
-    )
+    code = place.run("axes", lambda run, dev: changes.extend(check_axes(run, dev)))
     if code or not changes:
         return code
     place.say("rig.toml does not say what the device does:")
@@ -277,7 +280,7 @@ def _check_axes(place: Place, names_known: bool, again: bool = False) -> int:
     identify(place)
     # Which also forgets where each named axis was left: it is not what it was.
     place.record.reach(HOMED, place.config, **homed)
-    return _check_axes(place, names_known, again=True)
+    return _check_axes(place, again=True)
 
 
 def take_zero(place: Place) -> int:
