@@ -91,12 +91,10 @@ class Axis(Scale):
 
     @property
     def min_pulses(self) -> int:
-        """Soft limit."""
         return min(self.to_pulses(self.min_deg), self.to_pulses(self.max_deg))
 
     @property
     def max_pulses(self) -> int:
-        """Soft limit."""
         return max(self.to_pulses(self.min_deg), self.to_pulses(self.max_deg))
 
     def pulses_within(self, angle_deg: float) -> int:

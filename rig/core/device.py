@@ -308,7 +308,6 @@ class Device:
         return reading.matrix
 
     def positions(self) -> Pulses:
-        """Where the drives stand, in pulses."""
         return tuple(drive.status().position for drive in self.drives)
 
     def close(self) -> None:

@@ -169,7 +169,9 @@ def test_a_count_of_0_after_a_power_cycle_is_not_home(at, name, obeys, monkeypat
     with simulator(served) as sim:
         served = changed(sim.start(), output=str(at))
         record = DeviceRecord(at / "device.json")
-        place = steps.simulated(sim, served, record, told.append)
+        operator = Operator(yes=True, say=told.append)
+        place = steps.Place(served, record, operator, full_speed=True,
+                            listeners=(sim.hear,))  # fmt: skip
         steps.identify(place)
         assert steps.go_home(place, here=True) == 0
         counts = [round(drive.position) for drive in sim.drives]

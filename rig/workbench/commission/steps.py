@@ -8,7 +8,6 @@ import functools
 import os
 import pathlib
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
 
 from rig.config import AXIS_NAMES, RigConfig
 from rig.core import session
@@ -38,9 +37,6 @@ from rig.workbench.commission.phone import addresses_text, watch
 from rig.workbench.outputs.console import listen
 from rig.workbench.run import Run, run_safely
 from rig.workbench.toml import edit
-
-if TYPE_CHECKING:
-    from rig.simulator import Simulator
 
 WATCH_S = 5.0
 MOST_JOG_DEG = 10.0  # in one step
@@ -214,19 +210,10 @@ def jog(place: Place, axis: int, way_deg: float) -> int:
     return place.run("jog", procedure, limits=homed, again=f"jog {name} {way_deg:g}")
 
 
-def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> int:
-    """Measure play, dead zone and breakaway of an axis, into a calibration."""
+def characterise(place: Place, axis: int) -> int:
+    """Measure play, dead zone and breakaway of an axis."""
     from rig.workbench.commission import characterise as measured  # loads JAX
-    from rig.workbench.procedures.checking import (
-        calibration_path,
-        keep,
-        load_calibration,
-    )
 
-    path = None if into is None else calibration_path(into)
-    if path is not None:
-        # Of this device; simulated ones alone are moved at full speed.
-        load_calibration(path, place.config, simulated=place.full_speed, into=True)
     name, most = AXIS_NAMES[axis], measured.BASE_DEG + measured.FAR_DEG
     place.operator.confirm(
         f"characterise: {name} will move up to {most:.2f} deg from where it stands, "
@@ -234,14 +221,10 @@ def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> i
         "characterise",
     )
 
-    def procedure(run: Run, device: Device) -> None:
-        found = measured.characterise(run, device, axis)
-        if path is not None:
-            keep(path, name, found | {"run": run.folder.name})
-            run.say(f"kept in {path}: `jaxcal-rig goto` puts the play back")
-
-    again = f"characterise {name}" + (f" --into {into}" if into else "")
-    return place.run("characterise", procedure, again=again)
+    return place.run(
+        "characterise", lambda run, device: measured.characterise(run, device, axis),
+        again=f"characterise {name}",
+    )  # fmt: skip
 
 
 def axes(place: Place) -> int:
@@ -299,16 +282,3 @@ def commissioned(path: pathlib.Path, config: RigConfig, through: str) -> DeviceR
     for state in STATES[: STATES.index(through) + 1] if through else ():
         record.reach(state, config)
     return record
-
-
-def simulated(
-    simulator: Simulator,
-    served: RigConfig,
-    record: DeviceRecord,
-    say: Callable[[str], None],
-) -> Place:
-    """A simulated device: no operator confirms its moves, no file is corrected."""
-    return Place(
-        served, record, Operator(yes=True, say=say), full_speed=True,
-        listeners=(simulator.hear,),
-    )  # fmt: skip
