@@ -9,10 +9,10 @@ A family is a task drawn by ``jaxcal.adaptive.family`` from a held-out structure
 constants of ``shares`` and how ``ahead`` is fitted were found on other structures.
 Every method plays the same sessions of it; on other sessions ``priced`` and ``state``
 are tuned on it first, 20 generations each, and ``ahead`` is fitted. ``two_step`` and
-``rollouts`` follow ``shares`` and play fewer, as ``deep`` does: ``ahead`` not fitted, of
-trees a hundred times as large.
-Differences are in pairs with standard errors; times are of one core, a choice in a
-batch. With --keep what was played lies in DIR and is not played again.
+``rollouts`` follow ``shares`` and play fewer, as ``deep`` does: ``ahead`` not fitted,
+of trees a hundred times as large. Differences are in pairs with standard errors; times
+are of one core, a choice in a batch. With --keep what was played lies in DIR and is
+not played again.
 --optimum plays small tasks of the same structures, their answers made certain and
 their costs whole, of which dynamic programming finds the optimum; any numbers of
 --families, by the first ten of which the trees of ``ahead`` were shaped. --tune finds
