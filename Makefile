@@ -42,7 +42,10 @@ test: export XLA_FLAGS ?= --xla_backend_optimization_level=0 --xla_cpu_use_fusio
 test: export PYTHONDONTWRITEBYTECODE =
 # Half of the rig's tests wait for a device, so four share two cores, file by file in order:
 # xdist would put the files of few long tests last.
-test: lint ## set everything up, lint, and run the quick tests (the ones CI runs)
+# Each of them would compile everything that the tests import: one process does it before,
+# while mypy runs.
+test: $(READY) ## set everything up, lint, and run the quick tests (the ones CI runs)
+	$(BIN)/python -m pytest --collect-only -qq >/dev/null & $(MAKE) --no-print-directory lint && wait
 	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder -m 'not slow' $(ARGS)
 
 test-all: $(READY) lint ## every test, the slow ones too, hypothesis drawing new examples
