@@ -475,9 +475,11 @@ def _records(run: Path) -> list[Record]:
 def watch(run: RunPath) -> int:
     """show a run, also a running one, as a page in the browser"""
     from jaxcal.extras import needs
+    from rig.journal import JOURNAL
     from rig.workbench.live import listen
 
-    _records(run)
+    if not (run / JOURNAL).is_file():
+        raise Refused(f"{run} is not the folder of a run: it holds no {JOURNAL}")
     with needs("live", "the live page"):
         from rig.workbench.live.server import serve
     sock, line = listen()
