@@ -119,10 +119,10 @@ class Table:
     ) -> jax.Array:
         seconds = session.seconds - options.seconds[:, None] - task.extra
         uses = session.uses - task.uses
-        last, most = (length - 1 for length in self.values.shape)
-        at = jnp.clip(seconds / self.tick, 0, last)
-        low = jnp.minimum(at.astype(jnp.int32), last - 1)
-        kept = jnp.clip(uses, 0, most)
+        last_tick, last_use = (length - 1 for length in self.values.shape)
+        at = jnp.clip(seconds / self.tick, 0, last_tick)
+        low = jnp.minimum(at.astype(jnp.int32), last_tick - 1)
+        kept = jnp.clip(uses, 0, last_use)
         one, other = self.values[low, kept], self.values[low + 1, kept]
         value = jnp.where(
             (seconds > 0) & (uses > 0), one + (at - low) * (other - one), 0

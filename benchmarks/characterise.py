@@ -36,19 +36,19 @@ ENOUGH_DEG = 0.02
 Chooser = Callable[[int, Any, Any, Any], Any]  # number, weights, gains, keys: designs
 
 
-def tasks(sigma: float, most: int) -> dict[str, GridTask]:
+def tasks(sigma: float, measurements: int) -> dict[str, GridTask]:
     """By name; the first unknown is the one whose interval counts."""
     return {
         "play": backlash(
             1.5, 0.05, cells=150, offset_cells=5, postures=np.linspace(0.0, 2.25, 7),
-            sigma=sigma, bin_width=0.01, measurements=most,
+            sigma=sigma, bin_width=0.01, measurements=measurements,
         ),
         "dead zone": dead_zone(
             0.8, 0.2, cells=80, offset_cells=16, reach=0.8, reference=0.8,
-            num_postures=17, sigma=sigma, bin_width=0.01, measurements=most,
+            num_postures=17, sigma=sigma, bin_width=0.01, measurements=measurements,
         ),
         "breakaway": breakaway(
-            directions=1, sigma=2.0**0.5 * sigma, measurements=most
+            directions=1, sigma=2.0**0.5 * sigma, measurements=measurements
         ),
     }  # fmt: skip
 
@@ -142,13 +142,13 @@ def main() -> int:
     parser.add_argument(
         "--sigma", type=float, default=0.01, help="of a reading, degrees of commands"
     )
-    parser.add_argument("--most", type=int, default=60, help="measurements")
+    parser.add_argument("--measurements", type=int, default=60, help="measurements")
     given = parser.parse_args()
     print(
         "| unknown | decider | median | 90 % within | mean | longest step past, deg |"
     )
     print("|---|---|---|---|---|---|")
-    for name, task in tasks(given.sigma, given.most).items():
+    for name, task in tasks(given.sigma, given.measurements).items():
         choosers = {"random": [each(task, Random())], "fixed plan": [fixed]}
         if name == "breakaway":
             choosers["fixed plan"].append(planned(task, given.seed))

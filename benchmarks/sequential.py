@@ -128,10 +128,10 @@ def session(task: Any, key: jax.Array) -> tuple[Episodes, jax.Array, jax.Array]:
     (belief, end), (designs, outcomes, gains, alive) = jax.lax.scan(
         step, (prior, begun), jax.random.split(key_steps, task.horizon)
     )
-    told = prior.entropy() - belief.entropy()
+    information = prior.entropy() - belief.entropy()
     none: Any = None
     episode = Episodes(truth, none, designs, outcomes, gains, alive, none, none)
-    return episode, end.seconds, told
+    return episode, end.seconds, information
 
 
 def run(row: Row, episodes: int, seed: int) -> dict[str, Any]:
@@ -144,7 +144,7 @@ def run(row: Row, episodes: int, seed: int) -> dict[str, Any]:
         start = time.process_time()
         found.append(jax.block_until_ready(session(task, key)))
         taken.append(time.process_time() - start)
-    played, left, told = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
+    played, left, information = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
     gained = np.asarray(played.gain, np.float64)
     result = {
         "gains": [gained.mean(), gained.std(ddof=1) / np.sqrt(episodes)],
@@ -155,7 +155,7 @@ def run(row: Row, episodes: int, seed: int) -> dict[str, Any]:
         "published": row.published,
     }
     if isinstance(task, GridTask):
-        exact = np.asarray(told, np.float64)
+        exact = np.asarray(information, np.float64)
         mean, error = exact.mean(), exact.std(ddof=1) / np.sqrt(episodes)
         return result | {"nats": [mean, mean], "errors": [error, error], "exact": True}
     bounds = sace(task, played, jax.random.key(seed + 1))

@@ -17,13 +17,12 @@ __all__ = [
     "levels",
     "numbers",
     "one_of",
-    "relative_weights",
+    "one_or_each",
     "require_finite",
     "require_none",
     "seconds",
     "share",
     "table",
-    "text",
     "whole_number",
 ]
 
@@ -94,30 +93,22 @@ def table(name: str, values: ArrayLike) -> Array:
     return table
 
 
-def relative_weights(weights: ArrayLike | None, count: int) -> Array:
-    if weights is None:
-        return np.ones(count)
-    weight = numbers("weights", weights)
-    if weight.shape != (count,):
-        raise ValueError(f"weights must have shape ({count},), got {weight.shape}")
-    if (weight < 0.0).any():
-        where = int(np.flatnonzero(weight < 0.0)[0])
+def one_or_each(name: str, values: ArrayLike, count: int, more: str = "") -> Array:
+    """(count,) of one number for all or one each; not to be written to."""
+    given = numbers(name, values, finite=False)
+    if given.shape not in ((), (count,)):
         raise ValueError(
-            f"weights must not be negative, got {weight[where]} at {where}"
+            f"{name} must be one number or ({count},){more}, got {given.shape}"
         )
-    return weight
+    return np.broadcast_to(given, (count,))
 
 
 def levels(name: str, values: ArrayLike, count: int) -> Array:
     """(count,) positive numbers, one for all or one each; not to be written to."""
-    given = numbers(name, values)
-    if given.shape not in ((), (count,)):
-        raise ValueError(f"{name} must be one number or ({count},), got {given.shape}")
-    if (given <= 0.0).any():
-        raise ValueError(f"{name} must be positive, got {given[given <= 0.0].flat[0]}")
-    own = np.array(np.broadcast_to(given, (count,)))
-    own.flags.writeable = False
-    return own
+    given = one_or_each(name, values, count)
+    require_finite(name, given)
+    require_none(given <= 0.0, given, f"{name} must be positive")
+    return given
 
 
 def axis_names(
@@ -129,12 +120,6 @@ def axis_names(
     if len(given) != count or not all(isinstance(name, str) and name for name in given):
         raise ValueError(f"{argument} must hold {count} names, got {names!r}")
     return given
-
-
-def text(argument: str, value: str) -> str:
-    if not isinstance(value, str):
-        raise ValueError(f"{argument} must be text, got {value!r}")
-    return value
 
 
 def one_of(argument: str, value: Any, choices: Sequence[str]) -> str:

@@ -45,11 +45,6 @@ Faults = Annotated[list[str], "inject KIND[@PHASE][,count=N]...; list: names the
 Postures = Annotated[int, "postures"]
 Units = Annotated[int, "ids 1 to N are asked", (1, 247)]
 BusName = Annotated[str, "rtu:DEVICE,BAUD,PARITY,BITS,STOPBITS or tcp:HOST:PORT"]
-NamesKnown = Annotated[
-    bool,
-    "every unit was seen to turn its own joint the right way; the phone may be placed "
-    "in any way",
-]
 
 
 @dataclasses.dataclass
@@ -84,7 +79,6 @@ class Target(Simulation):
 
     @property
     def simulation(self) -> dict[str, Any]:
-        """The options of the simulated device."""
         names = [field.name for field in dataclasses.fields(Simulation)]
         return {name: getattr(self, name) for name in names}
 
@@ -154,7 +148,6 @@ def setup(
     imu: Annotated[str, "APP[:PORT]: hyperimu, sensorlogger or lines"] = "",
     home: Annotated[Literal["here", "drive"], "how"] = "here",
     set: Annotated[list[str], "KEY=VALUE of the new rig.toml"] | None = None,
-    names_known: NamesKnown = False,
 ) -> int:
     """from cables to a device that may be calibrated; writes rig.toml"""
     from rig.journal import DeviceRecord
@@ -163,7 +156,7 @@ def setup(
 
     path, operator = given.config or FILE, steps.Operator(given.yes, _say)
     values = dict(map(wizard.setting, set or ()))
-    asked = wizard.Given(bus, imu, units, values, home, names_known)
+    asked = wizard.Given(bus, imu, units, values, home)
     with contextlib.ExitStack() as stack:
         if given.simulate:
             device = dataclasses.replace(given, config=None)
@@ -225,18 +218,13 @@ def jog(
     return _step(given, "IDENTIFIED", "jog", NAMES.index(axis), step)
 
 
-def characterise(
-    axis: Axis,
-    *,
-    into: Annotated[Path, "run whose calibration keeps what is found"] | None = None,
-    given: Step,
-) -> int:
+def characterise(axis: Axis, *, given: Step) -> int:
     """measure play, dead zone and breakaway of one axis"""
     from jaxcal.extras import needs
 
     with needs("policy", "characterise"):
         import jax  # noqa: F401  # before anything moves
-    return _step(given, "SIGN_CHECKED", "characterise", NAMES.index(axis), into)
+    return _step(given, "SIGN_CHECKED", "characterise", NAMES.index(axis))
 
 
 def home(
@@ -246,9 +234,9 @@ def home(
     return _step(given, "IDENTIFIED", "go_home", here)
 
 
-def axes(given: Step, *, names_known: NamesKnown = False) -> int:
+def axes(given: Step) -> int:
     """check what turns, which way, how far; correct rig.toml"""
-    return _step(given, "HOMED", "axes", names_known)
+    return _step(given, "HOMED", "axes")
 
 
 def zero(given: Step) -> int:
@@ -271,20 +259,20 @@ def _place(given: Target, state: str = "") -> Iterator[Place]:
     from rig.journal import DeviceRecord
     from rig.workbench.commission import steps
 
-    config, yes = given.load(), getattr(given, "yes", False)
+    config, operator = given.load(), steps.Operator(getattr(given, "yes", False), _say)
     with contextlib.ExitStack() as stack:
         if given.simulate:
             simulator = given.simulator(config)
-            served = stack.enter_context(simulator).start()
-            path = steps.own_folder(served) / "device.json"
-            record = steps.commissioned(path, served, state)
-            place = steps.simulated(simulator, served, record, _say)
-            place.operator.yes = yes
+            config = stack.enter_context(simulator).start()
+            path = steps.own_folder(config) / "device.json"
+            record = steps.commissioned(path, config, state)
+            place = steps.Place(
+                config, record, operator, full_speed=True, listeners=(simulator.hear,)
+            )
         else:
             record = DeviceRecord.load(config.device_path)
             if state and (lack := record.missing(config, state)):
                 raise Refused(lack)
-            operator = steps.Operator(yes, _say)
             place = steps.Place(config, record, operator, given.config)
         place.reset_alarms = getattr(given, "reset_alarms", False)
         yield place
@@ -413,24 +401,19 @@ def _procedure(
     start: dict[str, Any], config: RigConfig
 ) -> tuple[Callable[[Run], int], KeptZero | None]:
     """What a session does, and the zero posture that it must find."""
-    import numpy as np
-
     from rig.workbench.procedures import calibrate, checking
-    from rig.workbench.procedures.goto import goto as move_to
 
     mode, inputs = start["mode"], start["inputs"]
     if mode == "calibrate":
         return calibrate.calibrate, None
     if mode == "collect":
         return lambda run: checking.collect(run, inputs["count"]), None
-    saved = checking.load_calibration(
+    found, kept = checking.load_calibration(
         Path(inputs["calibration"]), config, start["simulated"] is not None
     )
-    found = saved.calibration
     if mode == "verify":
-        return lambda run: checking.verify(run, found, inputs["count"]), saved.zero
-    to = np.array(inputs["to"], dtype=np.float64)
-    return lambda run: move_to(run, found, to, saved.play), saved.zero
+        return lambda run: checking.verify(run, found, inputs["count"]), kept
+    return lambda run: checking.goto(run, found, inputs["to"]), kept
 
 
 def _confirm(given: Session, session: Run) -> None:
@@ -465,22 +448,15 @@ def _recorded(run: Path, config: Path | None = None) -> tuple[RigConfig, Record]
     return parse_config(text, Path(start["maps_from"]), str(run)), start
 
 
-def _journal(run: Path) -> Path:
-    """The journal in a run's folder; Refused where there is none."""
-    from rig.journal import JOURNAL
+def _records(run: Path) -> list[Record]:
+    """The journal of a run; Refused where its folder holds none, or a damaged one."""
+    from rig.journal import JOURNAL, JournalError, read_journal
+    from rig.journal.run import SCHEMA
 
     if not (run / JOURNAL).is_file():
         raise Refused(f"{run} is not the folder of a run: it holds no {JOURNAL}")
-    return run / JOURNAL
-
-
-def _records(run: Path) -> list[Record]:
-    """The journal of a run; Refused where its folder holds none, or a damaged one."""
-    from rig.journal import JournalError, read_journal
-    from rig.journal.run import SCHEMA
-
     try:
-        records = read_journal(_journal(run))
+        records = read_journal(run / JOURNAL)
     except JournalError as error:
         raise Refused(str(error)) from None
     if not records or records[0]["event"] != "start":
@@ -501,7 +477,7 @@ def watch(run: RunPath) -> int:
     from jaxcal.extras import needs
     from rig.workbench.live import listen
 
-    _journal(run)
+    _records(run)
     with needs("live", "the live page"):
         from rig.workbench.live.server import serve
     sock, line = listen()

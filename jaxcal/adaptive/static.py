@@ -65,7 +65,7 @@ def optimise(
     count = len(task.designs)
     designs = np.arange(count)
     total = (starts * sweeps + 1) * length
-    done, best, most = 0, np.zeros(length, np.int32), -np.inf
+    done, best, best_nats = 0, np.zeros(length, np.int32), -np.inf
 
     def exchanged(sequence: Sequence, entries: slice) -> tuple[Sequence, float]:
         """The best sequence with one design in all of ``entries``."""
@@ -88,8 +88,8 @@ def optimise(
                 report(done, total, nats)
             if sweep >= 0 and (before == sequence).all():
                 break
-        if nats > most:
-            best, most = sequence, nats
+        if nats > best_nats:
+            best, best_nats = sequence, nats
     return Static(tuple(int(design) for design in best))
 
 

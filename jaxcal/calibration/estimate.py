@@ -235,13 +235,7 @@ def _noise_of(
     noise = noise or Noise()
     readings = Noise(std=noise.std, covariance=noise.covariance)
     white = readings.whitening(len(commands), q) * np.sqrt(weights)[:, None, None]
-    spread = np.asarray(0.0 if noise.command_std is None else noise.command_std)
-    n = commands.shape[1]
-    if spread.shape not in ((), (n,)):
-        raise ValueError(
-            f"command_std must be one number or ({n},), got {spread.shape}"
-        )
-    spread = np.broadcast_to(spread, (n,))
+    spread = noise.of_commands(commands.shape[1])
     if np.isinf(spread).sum() >= q:
         raise ValueError(
             f"command_std must leave fewer unknown commands than the {q} readings of a "

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from jaxcal.calibration.calibration import Calibration
 from jaxcal.calibration.closed_form import fit_affine
 from jaxcal.calibration.estimate import fit_model, require_model
-from jaxcal.checks import axis_names, levels, relative_weights, table, text
+from jaxcal.checks import array_of, axis_names, levels, require_none, table
 from jaxcal.models import Affine, Model, Noise, Prior
 from jaxcal.models.model import by_name
 
@@ -101,7 +101,10 @@ def identify(
     n, m = commands.shape[1], measured.shape[1]
     inputs = axis_names("input_names", input_names, "u", n)
     outputs = axis_names("output_names", output_names, "y", m)
-    weight = relative_weights(weights, len(commands))
+    weight = np.ones(len(commands))
+    if weights is not None:
+        weight = array_of("weights", weights, len(commands))
+        require_none(weight < 0.0, weight, "weights must not be negative")
     if noise is not None:
         if not isinstance(noise, Noise):
             raise ValueError(
@@ -119,11 +122,17 @@ def identify(
             "common_noise says how to estimate the noise and noise_std what it is: "
             "give one of them"
         )
+    for name, unit in (
+        ("command_unit", command_unit),
+        ("measured_unit", measured_unit),
+    ):
+        if not isinstance(unit, str):
+            raise ValueError(f"{name} must be text, got {unit!r}")
     about: dict[str, Any] = {
         "input_names": inputs,
         "output_names": outputs,
-        "command_unit": text("command_unit", command_unit),
-        "measured_unit": text("measured_unit", measured_unit),
+        "command_unit": command_unit,
+        "measured_unit": measured_unit,
         "provenance": _provenance(commands, measured, weight, notes),
     }
     affine = model is None

@@ -154,7 +154,7 @@ CalibrationPath = Annotated[str, "made by identify", "calibration.json"]
 
 def predict(
     calibration: CalibrationPath,
-    file: Annotated[str, "commands: .csv, .npz or -"],
+    file: Annotated[str, "commands: CSV, or -"],
     *,
     columns: Annotated[str | None, "columns of commands", "A,B"] = None,
     std: Annotated[bool, "and the standard error of each output"] = False,
@@ -172,7 +172,7 @@ def predict(
 
 def command(
     calibration: CalibrationPath,
-    file: Annotated[str, "desired outputs: .csv, .npz or -"],
+    file: Annotated[str, "desired outputs: CSV, or -"],
     *,
     columns: Annotated[str | None, "columns of desired outputs", "A,B"] = None,
     limits: Annotated[

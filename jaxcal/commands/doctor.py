@@ -4,94 +4,64 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
-import json
 import os
 import platform
 import re
 import sys
-from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import Annotated
+
+from jaxcal.commands.tables import write_json
 
 __all__ = ["doctor", "report"]
 
-_CORE = ("numpy", "scipy")
-_CACHE, _MISSING = "JAX_COMPILATION_CACHE_DIR", "not installed"
+_OTHERS = ("all", "bench", "dev", "docs")  # extras that name others, or are not used
 
 
-def doctor(*, json_: Annotated[bool, "print JSON"] = False) -> None:
+def doctor(*, json: Annotated[bool, "print JSON"] = False) -> None:
     """Print the report.
 
     Nothing is changed and no port is opened.
     """
     found = report()
-    if json_:
-        print(json.dumps(found, indent=1))
+    if json:
+        write_json("", found)
         return
-    for title, rows in found.items():
-        print(title)
-        width = max(map(len, rows), default=0)
-        for name, value in rows.items():
-            print(f"  {name:<{width}}  {value}")
+    width = max(map(len, found))
+    for name, value in found.items():
+        print(f"{name:<{width}}  {value}")
 
 
-def report() -> dict[str, dict[str, str]]:
-    """Part to name to what was found."""
-    return {
-        "system": {
-            "jaxcal": _version("jaxcal"),
-            "python": f"{platform.python_version()} ({sys.executable})",
-            "platform": platform.platform(),
-            "cores": str(os.cpu_count()),
-        },
-        "packages": {name: _version(name) for name in _CORE},
-        "extras": dict(_extras()),
-        "devices": _devices(),
-        "caches": {_CACHE: os.environ.get(_CACHE, "not set")},
-        "ports": _ports(),
+def report() -> dict[str, str]:
+    """Thing to what was found of it."""
+    python = f"{platform.python_version()} ({sys.executable})"
+    found = {
+        "python": python,
+        "platform": platform.platform(),
+        "cores": str(os.cpu_count()),
+        "jaxcal": _version("jaxcal", "a checkout that is not installed"),
     }
+    for line in importlib.metadata.requires("jaxcal") or []:
+        asked = re.match(r"([\w.-]+)(?:.*extra == ['\"](\w+)['\"])?", line)
+        if asked and asked[2] not in _OTHERS:
+            extra = f": pip install 'jaxcal[{asked[2]}]'" if asked[2] else ""
+            found.setdefault(asked[1], _version(asked[1], f"not installed{extra}"))
+    cache = "JAX_COMPILATION_CACHE_DIR"
+    return found | {"devices": _devices(), cache: os.environ.get(cache, "not set")}
 
 
-def _version(package: str) -> str:
+def _version(package: str, missing: str) -> str:
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
-        return _MISSING
+        return missing
 
 
-def _extras() -> Iterator[tuple[str, str]]:
-    """Each extra with the versions of its packages, or what installs it."""
-    try:
-        about = importlib.metadata.metadata("jaxcal")
-        lines = importlib.metadata.requires("jaxcal") or []
-    except importlib.metadata.PackageNotFoundError:
-        return
-    for extra in about.get_all("Provides-Extra") or []:
-        ours = re.compile(rf"([\w.-]+).*;.*extra == ['\"]{extra}['\"]")
-        named = [found[1] for line in lines if (found := ours.match(line))]
-        versions = {name: _version(name) for name in named if name != "jaxcal"}
-        missing = [name for name, found in versions.items() if found == _MISSING]
-        text = ", ".join(f"{name} {found}" for name, found in versions.items())
-        if missing:
-            text = f"no {', '.join(missing)}: pip install 'jaxcal[{extra}]'"
-        if versions:
-            yield extra, text
-
-
-def _devices() -> dict[str, str]:
+def _devices() -> str:
     if importlib.util.find_spec("jax") is None:
-        return {"jax": _MISSING}
+        return "none: JAX is not installed"
     import jax
 
     try:
-        return {str(d.id): f"{d.platform} {d.device_kind}" for d in jax.devices()}
+        return ", ".join(f"{d.id} {d.platform} {d.device_kind}" for d in jax.devices())
     except RuntimeError as error:
-        return {"jax": " ".join(str(error).split())}
-
-
-def _ports() -> dict[str, str]:
-    if importlib.util.find_spec("serial") is None:
-        return {"serial": "pyserial is not installed"}
-    from serial.tools import list_ports  # type: ignore[import-untyped]  # no stubs
-
-    found: list[Any] = sorted(list_ports.comports())
-    return {p.device: p.description for p in found} or {"serial": "none"}
+        return " ".join(str(error).split())

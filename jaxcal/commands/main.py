@@ -26,7 +26,7 @@ _HERE = {  # command: one line of help, and the module with its flags and functi
     "predict": ("where a calibrated machine goes for given commands", "calibrations"),
     "command": ("what to command to reach given outputs", "calibrations"),
     "doctor": (
-        "versions, devices, caches, extras and ports, for a bug report",
+        "versions and devices, for a bug report",
         "doctor",
     ),
 }
@@ -45,7 +45,7 @@ examples:
   jaxcal command calibration.json targets.csv --limits=-20,20
   jaxcal COMMAND --help                             options of one command
 
-Tables are CSV (with or without a header) or .npz; - is standard input."""
+Tables are CSV, with or without a header; - is standard input."""
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""Tables in and out of the commands: CSV, .npz, JSON, ``-`` for standard input."""
+"""Tables in and out of the commands: CSV, JSON, ``-`` for standard input."""
 
 from __future__ import annotations
 
@@ -30,8 +30,7 @@ __all__ = [
 
 Array = NDArray[np.float64]
 
-TablePath = Annotated[str, ".csv, .npz or - (standard input)"]
-_NPZ_COLUMNS = {"candidates": "u", "commands": "u", "measured": "y"}
+TablePath = Annotated[str, "CSV, or - (standard input)"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +62,7 @@ class Table:
     names: tuple[str, ...]  # of the numeric columns
     values: Array  # (N, len(names)), NaN where a cell is empty
     labels: dict[str, list[str]]  # columns that hold text, each of length N
-    lines: tuple[int, ...] = ()  # of the file, one for each row; of .npz none
+    lines: tuple[int, ...]  # of the file, one for each row
 
     def __len__(self) -> int:
         return len(self.values)
@@ -93,11 +92,10 @@ class Table:
         mask = self.available()
         bad = ~np.isfinite(values)
         for row, place in np.argwhere(bad if mask is None else bad & mask[:, None]):
-            line = f"line {self.lines[row]}" if self.lines else f"row {row}"
             raise ValueError(
-                f"{self.source}: {line}, column {wanted[place]!r} must hold a number, "
-                f"got {values[row, place]} or an empty cell; fill it or leave the row "
-                "out"
+                f"{self.source}: line {self.lines[row]}, column {wanted[place]!r} must "
+                f"hold a number, got {values[row, place]} or an empty cell; fill it or "
+                "leave the row out"
             )
         return Frame(values, tuple(wanted), tuple(rows))
 
@@ -140,10 +138,7 @@ def _split(text: str) -> tuple[str, ...]:
 
 
 def read_table(path: str) -> Table:
-    """Read a .csv (comma, semicolon or tab; header optional) or .npz; ``-`` is stdin.
-
-    A .npz holds one array (N, n), or ``candidates`` or ``commands`` (N, n) and
-    optionally ``measured`` (N, m) and ``available`` (N,).
+    """Read a CSV file (comma, semicolon or tab; header optional); ``-`` is stdin.
 
     Raises:
         OSError: the file cannot be read.
@@ -152,10 +147,8 @@ def read_table(path: str) -> Table:
     if path == "-":
         return _from_csv("standard input", sys.stdin.read())
     data = pathlib.Path(path).read_bytes()
-    if data.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")) and path[-4:] != ".npz":
-        raise ValueError(f"{path}: a table must be CSV or .npz; save this one as CSV")
-    if path.lower().endswith(".npz"):
-        return _from_npz(path, data)
+    if data.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")):
+        raise ValueError(f"{path}: a table must be CSV; save this one as CSV")
     try:
         return _from_csv(path, data.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
@@ -172,7 +165,7 @@ def _from_csv(source: str, text: str) -> Table:
         raise ValueError(f"{source}: the table is empty")
     header = rows[0][1]
     if all(map(_is_number, header)):
-        header = _letters("u", len(header))
+        header = [f"u_{axis_letter(i, len(header))}" for i in range(len(header))]
     elif not (rows := rows[1:]):
         raise ValueError(f"{source}: there are no rows below the header")
     for name in header:
@@ -213,45 +206,6 @@ def _require_text(
                 f"{source}: line {line}, column {name!r} must hold a number, got "
                 f"{cell!r}" + (": write a decimal point" if comma else "")
             )
-
-
-def _letters(letter: str, count: int) -> list[str]:
-    return [f"{letter}_{axis_letter(i, count)}" for i in range(count)]
-
-
-def _from_npz(source: str, data: bytes) -> Table:
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-    except Exception as error:  # zipfile, zlib and numpy each raise their own
-        raise ValueError(f"{source}: not a readable .npz file ({error})") from None
-    if len(arrays) == 1:
-        arrays = {"candidates": next(iter(arrays.values()))}
-    names: list[str] = []
-    columns: list[Array] = []
-    for key, array in arrays.items():
-        if key in ("low", "high"):
-            continue
-        if key != "available" and key not in _NPZ_COLUMNS:
-            known = ", ".join((*_NPZ_COLUMNS, "available"))
-            raise ValueError(f"{source}: unknown key {key!r}; keys: {known}")
-        if array.dtype.kind not in "biuf":
-            raise ValueError(f"{source}: {key} must hold numbers, got {array.dtype}")
-        flat = array.reshape(-1, 1) if key == "available" else array
-        if flat.ndim == 3 and len(flat) == 1:
-            flat = flat[0]
-        if flat.ndim != 2 or 0 in flat.shape:
-            raise ValueError(
-                f"{source}: {key} must have shape (N, axes), got {array.shape}"
-                + ("; evaluate takes many sets" if array.ndim == 3 else "")
-            )
-        columns.append(flat.astype(np.float64))
-        letter = _NPZ_COLUMNS.get(key)
-        names += _letters(letter, flat.shape[1]) if letter else ["available"]
-    lengths = {len(table) for table in columns}
-    if len(lengths) != 1:
-        raise ValueError(f"{source}: the arrays must have equal lengths, got {lengths}")
-    return Table(source, tuple(names), np.concatenate(columns, axis=1), {})
 
 
 def _is_number(cell: str) -> bool:

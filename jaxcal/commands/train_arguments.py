@@ -10,11 +10,10 @@ from typing import Annotated, Any, Literal
 from jaxcal.adaptive.policy.config import PPO, PolicyConfig
 from jaxcal.adaptive.tasks import registry
 from jaxcal.arguments import Parser, number_type
-from jaxcal.learning.config import PPOConfig, StreamsConfig
+from jaxcal.learning.config import StreamsConfig
 from jaxcal.learning.runtime import processes
-from jaxcal.learning.settings import Setting, settings_of
+from jaxcal.learning.settings import settings_of
 from jaxcal.learning.training import presets
-from jaxcal.learning.training.config import TrainConfig
 
 __all__ = ["TASK_PARTS", "flag_of", "parser", "values_of"]
 
@@ -50,7 +49,6 @@ Ctrl-C saves and stops; --resume then continues bit for bit (on the same CPU).
 All devices of all processes share each update: docs/scaling.md."""
 
 TASK_PARTS: dict[str, type] = {"ppo": StreamsConfig, "policy": PolicyConfig}
-_FIRST = ("num_episodes", "num_updates", "seed", "num_seeds")
 _NAMES = {"num_episodes": "episodes", "num_updates": "updates", "num_seeds": "seeds"}
 
 
@@ -65,8 +63,8 @@ class Options:
     resume: Annotated[bool, "go on from the run folder's checkpoint"] = False
     candidates: Annotated[
         str | None,
-        "train on your own postures, .csv or .npz: one table is a pool that every "
-        "episode draws --num-candidates from; several episodes are candidate sets",
+        "train on your own postures: one table, .csv, is a pool that every episode "
+        "draws --num-candidates from; a dataset, .csv or .npz, holds candidate sets",
         "FILE",
     ] = None
     trainer: Annotated[
@@ -89,42 +87,25 @@ def flag_of(name: str) -> str:
 def parser(prog: str) -> Parser:
     """All flags; ``prog`` is what was typed, "train.py" or "jaxcal train"."""
     program = f"python {prog}" if prog.endswith(".py") else prog
-    known = {name: presets.load(name) for name in presets.names()}
     out = Parser(
         prog=prog,
         usage="%(prog)s [--preset NAME | --task NAME] [--out DIR] [flags below]",
         description="Train a policy, and save it with all it needs: one that selects "
         "postures, or with --task one that picks the next measurement.",
-        epilog=_EPILOG.format(program=program, presets=_abouts(known), tasks=_tasks()),
+        epilog=_EPILOG.format(program=program, presets=_abouts(), tasks=_tasks()),
     ).of(Options)
     processes.add_arguments(out)
-    common = {field.name for field in settings_of(PPOConfig)} | {"width"}
-    parts = presets.PARTS
-
-    def of(*kinds: type, shared: bool = False) -> list[Setting]:
-        found = [field for kind in kinds for field in settings_of(kind)]
-        return [
-            f for f in found if (f.name in common) == shared and f.name not in _FIRST
-        ]
-
-    first = {f.name: f for part in (*parts.values(), *TASK_PARTS.values())
-             for f in settings_of(part)}  # fmt: skip
+    postures = {f.name: f for part in presets.PARTS.values() for f in settings_of(part)}
+    tasks = {f.name: f for part in TASK_PARTS.values() for f in settings_of(part)}
     groups = (
-        ("budget", "--episodes of postures, --updates of a task",
-         [first[name] for name in _FIRST]),
-        ("optimisation and size",
-         "in brackets the value of compact, and of others that differ",
-         of(PPOConfig, parts["network"], shared=True)),
-        ("postures",
-         "what an episode is, in presets of one task; --kind paper reads --width "
-         "alone of the network",
-         of(*(parts[part] for part in ("ppo", "run", "environment", "network")))),
-        ("tasks", "with --task", of(*TASK_PARTS.values())),
-    )  # fmt: skip
-    for title, description, fields in groups:
-        group = out.add_argument_group(title, description)
-        for field in fields:
-            line = (field.help + _held(field.name, known)).replace("%", "%%")
+        ("of postures and tasks", postures.keys() & tasks.keys()),
+        ("of postures, in presets of one task", postures.keys() - tasks.keys()),
+        ("of tasks", tasks.keys() - postures.keys()),
+    )
+    for title, names in groups:
+        group = out.add_argument_group(title, "in brackets the value of compact")
+        for field in (f for name, f in (tasks | postures).items() if name in names):
+            line = f"{field.help} [{_held(field.name)}]".replace("%", "%%")
             flag = flag_of(field.name)
             if field.kind is bool:
                 yes_no = argparse.BooleanOptionalAction
@@ -165,10 +146,10 @@ def values_of(arguments: argparse.Namespace, task: bool) -> dict[str, Any]:
     return given
 
 
-def _abouts(known: dict[str, TrainConfig]) -> str:
+def _abouts() -> str:
     lines = []
-    for name, config in known.items():
-        about = f"  {name:9} {config.about}"
+    for name in presets.names():
+        about = f"  {name:9} {presets.load(name).about}"
         lines += textwrap.wrap(about, 86, subsequent_indent=" " * 12)
     return "\n".join(lines)
 
@@ -179,24 +160,12 @@ def _tasks() -> str:
     )
 
 
-def _held(name: str, known: dict[str, TrainConfig]) -> str:
-    """The value of compact, and of what differs: ``" [2; paper 10; tasks 4]"``."""
-    values: dict[str, str] = {}
-    for preset, config in known.items():
-        for part in (config, config.ppo, config.network, config.tasks[0].environment):
-            if name in part.__dataclass_fields__:
-                values[preset] = _shown(getattr(part, name))
-    sizes = {f.name: f.default for f in PolicyConfig.__dataclass_fields__.values()}
-    if name in PPO.__dataclass_fields__:
-        values["tasks"] = _shown(getattr(PPO, name))
-    elif name in ("width", "per_group"):
-        values["tasks"] = _shown(sizes[name])
-    first = values.pop("compact", None) or values.pop("tasks")
-    others = [f"{p} {v}" for p, v in values.items() if v != first]
-    return " [" + "; ".join([first, *others]) + "]"
-
-
-def _shown(value: Any) -> str:
-    if isinstance(value, bool):
-        return "on" if value else "off"
-    return f"{value:,}" if isinstance(value, int) else str(value)
+def _held(name: str) -> Any:
+    """The value of compact, or of tasks."""
+    config = presets.load("compact")
+    parts = (config, config.ppo, config.network, config.tasks[0].environment, PPO)
+    return next(
+        getattr(part, name)
+        for part in (*parts, PolicyConfig)
+        if name in part.__dataclass_fields__
+    )

@@ -43,9 +43,9 @@ class Dataset:
             mask = array_of("available", self.available, *u.shape[:2])
             require_none(~np.isin(mask, (0, 1)), mask, "available must be 1 or 0")
             object.__setattr__(self, "available", mask == 1)
-        if self.ranges is not None and self.ranges.num_inputs != u.shape[2]:
+        if self.ranges is not None and len(self.ranges.low) != u.shape[2]:
             raise ValueError(
-                f"ranges must hold {u.shape[2]} numbers, got {self.ranges.num_inputs}"
+                f"ranges must hold {u.shape[2]} numbers, got {len(self.ranges.low)}"
             )
 
     @property

@@ -14,7 +14,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from jaxcal import compiled
 
@@ -22,7 +22,6 @@ __all__ = [
     "Whitened",
     "coarseness",
     "largest_rank",
-    "log_det_blocks",
     "missing_directions",
     "null_directions",
     "prior_root",
@@ -65,28 +64,29 @@ def triangle(rows: Array) -> Array:
 
 def rank_rule(
     columns: Array, largest: Array, count: int | None = None
-) -> tuple[int, float]:
+) -> tuple[list[int], Array]:
     """Rank and log det of ``columns.T @ columns``: the one rule of what is singular.
 
     Numbers are exact to half a unit in the last place of their size, not of their
     spread: a direction no wider than that is rounding, not information.
 
     Args:
-        columns: (R, p) stacked blocks, centred.
-        largest: (p,) largest entry of each column before centring.
+        columns: (S, R, p) stacked blocks of S sets, centred.
+        largest: (S, p) largest entry of each column before centring.
         count: rows that rounding errors add up over; R when not given.
 
     Returns:
-        Rank, and natural log det, -inf where the rank is below p.
+        (S,) ranks, and (S,) natural log det, -inf where the rank is below p.
     """
-    columns = np.ascontiguousarray(columns)
-    p, count = columns.shape[1], count or len(columns)
+    p, count = columns.shape[2], count or columns.shape[1]
     norms, rounding, least, value = _kernel().scaled(columns, largest, count)
-    rank = p
-    if least <= _SURE * rounding:  # distances of columns are cheaper
-        unit = columns / np.where(norms > 0.0, norms, np.inf)
-        rank = int((np.linalg.svd(unit, compute_uv=False) > rounding).sum())
-    return rank, value if rank == p else -np.inf
+    ranks = [p] * len(columns)
+    for n, share in enumerate(rounding):
+        if least[n] <= _SURE * share:  # distances of columns are cheaper
+            unit = columns[n] / np.where(norms[n] > 0.0, norms[n], np.inf)
+            ranks[n] = int((np.linalg.svd(unit, compute_uv=False) > share).sum())
+            value[n] = value[n] if ranks[n] == p else -np.inf
+    return ranks, value
 
 
 def null_directions(columns: Array, largest: Array) -> list[Array]:
@@ -95,7 +95,8 @@ def null_directions(columns: Array, largest: Array) -> list[Array]:
     Axes that no row moves come first, then a basis of the rest of the null space.
     """
     columns, p = np.ascontiguousarray(columns), columns.shape[1]
-    norms, rounding, *_ = _kernel().scaled(columns, largest, len(columns))
+    found = _kernel().scaled(columns[None], largest[None], len(columns))
+    norms, rounding = found[0][0], found[1][0]
     flat = norms == 0.0
     unit = columns / np.where(flat, np.inf, norms)
     unit = np.pad(unit, ((0, max(0, p - len(unit))), (0, 0)))
@@ -157,26 +158,18 @@ def prior_root(precision: Array) -> Array:
     return np.sqrt(values[keep])[:, None] * vectors.T[keep] * scale
 
 
-def rank_of_blocks(blocks: Array, root: Array) -> tuple[int, float]:
-    """Rank and log det of the information of blocks (N, q, p) measured together."""
-    rows, largest, _ = _kernel().centred(blocks, None, root)
-    return rank_rule(rows, largest, len(blocks))
-
-
-def log_det_blocks(blocks: ArrayLike, root: Array) -> Array:
-    """``log det(root.T @ root + sum of B_i.T @ B_i)`` of blocks measured together.
+def rank_of_blocks(blocks: Array, root: Array) -> tuple[list[int], Array]:
+    """Rank and natural log det, -inf where singular, of information blocks.
 
     Args:
-        blocks: (..., N, q, p).
+        blocks: (S, N, q, p), the N of each of S sets measured together.
         root: (r, p) of the prior precision, r = 0 without one.
 
     Returns:
-        (...,) natural log; -inf where singular.
+        (S,) of both.
     """
-    array = np.ascontiguousarray(blocks, dtype=np.float64)
-    sets = array.reshape(-1, *array.shape[-3:])
-    values = [rank_of_blocks(each, root)[1] for each in sets]
-    return np.array(values).reshape(array.shape[:-3])
+    rows, largest, _ = _kernel().centred(blocks, None, root)
+    return rank_rule(rows, largest, blocks.shape[1])
 
 
 def largest_rank(blocks: Array) -> int:
@@ -194,7 +187,7 @@ def largest_rank(blocks: Array) -> int:
             return full
     rank = 0
     for block in blocks:
-        rank = max(rank, rank_of_blocks(block[None], none)[0])
+        rank = max(rank, rank_of_blocks(block[None, None], none)[0][0])
         if rank == full:
             break
     return rank
@@ -202,8 +195,8 @@ def largest_rank(blocks: Array) -> int:
 
 def missing_directions(blocks: Array, root: Array, coarse: float = 1.0) -> list[Array]:
     """Directions (p,) that neither blocks (N, q, p) nor the prior say anything of."""
-    rows, largest, _ = _kernel().centred(blocks, None, root)
-    return null_directions(rows, coarse * largest)
+    rows, largest, _ = _kernel().centred(blocks[None], None, root)
+    return null_directions(rows[0], coarse * largest[0])
 
 
 def coarseness(given: object) -> float:
@@ -220,9 +213,9 @@ class Whitened(NamedTuple):
     blocks: Array  # (M, q, p), zero where not usable
     prior: Array  # (p, p) precision
     basis: Array  # (p, p): raw blocks times it are whitened
-    log_scale: float  # log det of unwhitened less whitened information
     triangle: Array  # (p, p): whitened blocks times it are the centred raw ones
     size: Array  # (p,) of what the centred blocks are rounded by, beside themselves
+    log_scale: float  # log det of unwhitened less whitened information
 
 
 def whiten(
@@ -232,42 +225,50 @@ def whiten(
     *,
     coarse: float = 1.0,
     computed: bool = False,
-) -> Whitened | None:
+) -> list[Whitened | None]:
     """Blocks in coordinates where everything measured at once has information I.
 
     With T = prior + sum of the usable ``B_i.T @ B_i`` = R.T R the whitened block is
     ``B_i R^-1``, and log det of any selection is its whitened log det plus log det T. A
-    linear map of the parameters rotates the whitened blocks and nothing else. None
-    where T is singular.
+    linear map of the parameters rotates the whitened blocks and nothing else.
 
     Args:
-        blocks: (M, q, p).
-        usable: (M,) which count.
+        blocks: (S, M, q, p) of S sets.
+        usable: (S, M) which count.
         root: (r, p) of the prior precision.
         coarse: how many times coarser than float64 the numbers are, for the rule of
             what is singular.
         computed: the blocks are rounded themselves, as a model's derivatives are.
+
+    Returns:
+        One of every set, read-only; None where T is singular.
     """
     rows, largest, shift, white, back, basis, log_scale, lost = _kernel().whitened(
         blocks, usable.view(np.uint8), root, coarse
     )
-    if not lost <= _LOSS:  # of nearly dependent columns by rotations, twice
-        if rank_rule(rows, coarse * largest, len(blocks))[0] < rows.shape[1]:
-            return None
-        scale = np.linalg.norm(rows, axis=0)
-        first = triangle(rows / scale)
-        basis = np.linalg.inv(first) / scale[:, None]
-        second = triangle(rows @ basis)
-        basis = basis @ np.linalg.inv(second)
-        back, white = second @ first * scale, rows @ basis
-        log_scale = 2.0 * float(np.log(np.abs(np.diagonal(back))).sum())
-    count, p = blocks.shape[0] * blocks.shape[1], blocks.shape[2]
-    known = white[count:]
-    return Whitened(
-        white[:count].reshape(blocks.shape),
-        known.T @ known if len(root) else np.zeros((p, p)),
-        basis - shift @ basis,
-        log_scale,
-        back,
-        largest if computed else np.zeros(p),
-    )
+    sets, num, q, p = blocks.shape
+    for n in range(sets):
+        if lost[n] <= _LOSS:
+            continue
+        # Columns are nearly dependent: by rotations, twice.
+        if rank_rule(rows[n : n + 1], coarse * largest[n : n + 1], num)[0][0] < p:
+            continue
+        scale = np.linalg.norm(rows[n], axis=0)
+        first = triangle(rows[n] / scale)
+        once = np.linalg.inv(first) / scale[:, None]
+        second = triangle(rows[n] @ once)
+        once = once @ np.linalg.inv(second)
+        back[n], white[n] = second @ first * scale, rows[n] @ once
+        basis[n] = once - shift[n] @ once
+        log_scale[n] = 2.0 * float(np.log(np.abs(np.diagonal(back[n]))).sum())
+        lost[n] = 0.0
+    prior = np.zeros((sets, p, p))
+    if len(root):
+        known, white = white[:, num * q :], white[:, : num * q]
+        prior = known.transpose(0, 2, 1) @ known
+    size = largest if computed else np.zeros((sets, p))
+    parts = (white.reshape(blocks.shape), prior, basis, back, size)
+    for part in parts:
+        part.flags.writeable = False
+    found = map(Whitened, *parts, log_scale)
+    return [one if lost[n] <= _LOSS else None for n, one in enumerate(found)]

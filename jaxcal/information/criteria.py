@@ -69,10 +69,10 @@ def criteria(blocks: Array, root: Array, region: Array, times: int) -> Criteria:
     """
     p = blocks.shape[2]
     s = np.linalg.svd(np.concatenate([blocks.reshape(-1, p), root]), compute_uv=False)
-    white = whiten(blocks, np.ones(len(blocks), dtype=np.bool_), root)
+    white = whiten(blocks[None], np.ones((1, len(blocks)), dtype=np.bool_), root)[0]
     assert white is not None
     variance = ((region @ white.basis) ** 2).sum(axis=-1)
-    geometric_mean = float(np.exp(rank_of_blocks(blocks, root)[1] / (2 * p)))
+    geometric_mean = float(np.exp(rank_of_blocks(blocks[None], root)[1][0] / (2 * p)))
     return Criteria(
         D=geometric_mean**2,
         A=float(times * np.sum(s**-2.0)),

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers, require_finite, whole_number
-from jaxcal.information.blocks import log_det_blocks
+from jaxcal.information.blocks import rank_of_blocks
 
 __all__ = [
     "log_det_gram",
@@ -93,7 +93,9 @@ def log_det_gram(commands: ArrayLike) -> Array:
         (...,) natural log; ``-inf`` where the postures span fewer than n dimensions.
     """
     z = regressors(commands)
-    return log_det_blocks(z[..., None, :], np.zeros((0, z.shape[-1])))
+    *batch, count, p = z.shape
+    sets = z.reshape(-1, count, 1, p)
+    return rank_of_blocks(sets, np.zeros((0, p)))[1].reshape(batch)
 
 
 def log_det_information(

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import table
+from jaxcal.checks import one_of, table
 from jaxcal.information.blocks import SINGULAR, significant, triangle
-from jaxcal.models.model import Model
+from jaxcal.models.model import Model, derivative, facts
 from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["Direction", "Identifiability", "identifiability"]
@@ -91,11 +91,11 @@ def identifiability(
         raise ValueError("candidates must hold at least one row, got none")
     known = None if prior is None else prior.resolve(model)
     mean = model.nominal if known is None else known.mean
-    jacobian = model.jacobian(commands, mean)
+    jacobian = derivative(model, commands, mean)
     if noise is not None:
         slopes = None
         if noise.command_std is not None:
-            slopes = model.command_jacobian(commands, mean)
+            slopes = np.asarray(model.command_jacobian(commands, mean))
         jacobian = noise.whitening(len(commands), model.num_outputs, slopes) @ jacobian
     rows = jacobian.reshape(-1, model.num_parameters)
     asked = np.ones(model.num_parameters, dtype=np.bool_)
@@ -106,14 +106,10 @@ def identifiability(
     elif parameters is None:
         held = model.default_prior().fixed
         asked &= ~np.isin(model.names, list(held))
-    if hasattr(model, "facts"):
-        rows = np.vstack([rows, model.facts(mean)[1]])
+    rows = np.vstack([rows, facts(model, mean)[1]])
     if parameters is not None:
-        unknown = [name for name in parameters if name not in model.names]
-        if unknown:
-            raise ValueError(
-                f"parameters must be among {', '.join(model.names)}, got {unknown[0]!r}"
-            )
+        for name in parameters:
+            one_of("parameters", name, model.names)
         asked &= np.isin(model.names, list(parameters))
     at = np.flatnonzero(asked)
     names = tuple(model.names[i] for i in at)
@@ -123,26 +119,24 @@ def identifiability(
     columns = triangle(rows[:, at] * scale)
     norms = np.linalg.norm(columns, axis=0)
     seen = norms > _FLAT * norms.max(initial=0.0)
-    unit = columns / np.where(seen, norms, 1.0) * seen
-    groups = [[int(i)] for i in np.flatnonzero(~seen)]
-    classes = _parallel(unit, np.flatnonzero(seen))
-    groups += [group for group in classes if len(group) > 1]
-    vectors = [_of_class(unit, group, norms) for group in groups]
-    first = [group[0] for group in classes]
+    norms = np.where(seen, norms, 1.0)
+    unit = columns / norms * seen
+    found = [np.eye(len(at))[[i]] for i in np.flatnonzero(~seen)]
+    first, classes = _parallel(unit, np.flatnonzero(seen))
+    found += [each / norms for each in classes]
     for vector in _sparse_null(unit[:, first]):
         full = np.zeros((1, len(at)))
         full[0, first] = vector / norms[first]
-        groups.append([int(i) for i in np.flatnonzero(full[0])])
-        vectors.append(full)
+        found.append(full)
     directions = []
-    for group, local in zip(groups, vectors, strict=True):
+    for local in found:
         full = np.zeros((len(local), model.num_parameters))
         full[:, at] = local * scale
         full /= np.linalg.norm(full, axis=1, keepdims=True)
-        told = tuple(names[i] for i in group)
+        told = tuple(names[i] for i in np.flatnonzero(local.any(axis=0)))
         same = np.allclose(np.abs(full[np.abs(full) > 0.0]), np.sqrt(0.5))
         directions.append(Direction(told, _in_words(told, same), full))
-    rank = len(at) - sum(len(vector) for vector in vectors)
+    rank = len(at) - sum(len(vectors) for vectors in found)
     size = np.linalg.svd(unit, compute_uv=False)
     condition = float(size[0] / size[rank - 1]) if rank else np.inf
     order = {name: i for i, name in enumerate(names)}
@@ -162,39 +156,31 @@ def _in_words(names: tuple[str, ...], same: bool) -> str:
     return f"{names[0]} with {rest}" if rest else names[0]
 
 
-def _parallel(unit: Array, at: NDArray[np.int64]) -> list[list[int]]:
-    """Columns ``at`` in classes of those that are multiples of each other."""
-    classes: list[list[int]] = []
+def _parallel(unit: Array, at: NDArray[np.intp]) -> tuple[list[int], list[Array]]:
+    """Of columns ``at`` that are multiples of each other the first, and vectors (k, p)
+    of each of the others against it."""
+    first: list[int] = []
+    classes: list[list[Array]] = []
     for i in at:
-        for group in classes:
-            first = unit[:, group[0]]
-            apart = unit[:, i] - (first @ unit[:, i]) * first
-            if np.linalg.norm(apart) < SINGULAR:
-                group.append(int(i))
-                break
+        along = unit[:, first].T @ unit[:, i]
+        apart = unit[:, [i]] - unit[:, first] * along
+        same = np.flatnonzero(np.linalg.norm(apart, axis=0) < SINGULAR)
+        if same.size:
+            j = int(same[0])
+            vector = np.zeros(unit.shape[1])
+            vector[[first[j], i]] = 1.0, -np.sign(along[j])
+            classes[j].append(vector)
         else:
-            classes.append([int(i)])
-    return classes
-
-
-def _of_class(unit: Array, group: list[int], norms: Array) -> Array:
-    """(k, p) each member against the first; a column of zeros by itself."""
-    first, *others = group
-    vectors = np.zeros((max(len(others), 1), unit.shape[1]))
-    vectors[:, first] = 1.0
-    for row, i in enumerate(others):
-        sign = np.sign(unit[:, first] @ unit[:, i])
-        vectors[row, i] = -sign * norms[first] / norms[i]
-    return vectors
+            first.append(int(i))
+            classes.append([])
+    return first, [np.array(each) for each in classes if each]
 
 
 def _sparse_null(columns: Array) -> Array:
     """(k, m) a basis of the null space of columns (R, m) with few entries each."""
     _, size, right = np.linalg.svd(columns)
     null = right[int(significant(size).sum()) :].copy()
-    for row in range(
-        len(null) if null.size else 0
-    ):  # reduced echelon form: a pivot of its own for each
+    for row in range(len(null)):  # reduced echelon form: a pivot of its own for each
         pivot = int(np.abs(null[row]).argmax())
         null[row] /= null[row, pivot]
         others = np.arange(len(null)) != row

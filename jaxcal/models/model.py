@@ -137,12 +137,13 @@ def derivative(
         found = getattr(model, method)(commands, parameters)
     found = np.asarray(found, dtype=np.float64)
     _require_shape(method, found, (len(commands), model.num_outputs, len(names)))
-    bad = np.argwhere(~np.isfinite(found))
-    if len(bad):
-        row, _, column = (int(i) for i in bad[0])
+    bad = ~np.isfinite(found)
+    for row, output, column in np.argwhere(bad)[:1]:
+        # A forward derivative may spoil the columns beside that of the one to blame.
+        by = ", ".join(np.array(names)[bad[row, output]])
         raise ValueError(
-            f"model.{method} must be finite, got {found[tuple(bad[0])]} by "
-            f"{names[column]} for the command {in_words(commands[row])}"
+            f"model.{method} must be finite, got {found[row, output, column]} by {by} "
+            f"for the command {in_words(commands[row])}"
         )
     return found
 

@@ -4,30 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import in_words, numbers, whole_number
+from jaxcal.checks import (
+    array_of,
+    in_words,
+    numbers,
+    one_or_each,
+    require_finite,
+    require_none,
+)
 from jaxcal.information.blocks import significant
 
 __all__ = ["Noise", "Prior", "ResolvedPrior"]
 
 Array = NDArray[np.float64]
 Named = ArrayLike | Mapping[str, float]
-
-
-class Parametric(Protocol):
-    """What a prior is about: any model, by its parameters."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """p names."""
-
-    @property
-    def nominal(self) -> Array:
-        """(p,) values of the machine as it was designed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,10 +57,9 @@ class Prior:
             raise ValueError(
                 f"fixed must be a sequence of names, got the text {self.fixed!r}"
             )
-        std = np.asarray(
-            list(self.std.values()) if isinstance(self.std, Mapping) else self.std
-        )
-        std = numbers("std of the prior", std, finite=False)
+        given = self.std
+        given = [*given.values()] if isinstance(given, Mapping) else given
+        std = numbers("std of the prior", given, finite=False)
         if not (std > 0.0).all():
             raise ValueError(
                 "std of the prior must be positive (inf: nothing is known; "
@@ -82,49 +76,34 @@ class Prior:
         """
         return dataclasses.replace(self, by_data=True)
 
-    def resolve(self, model: Parametric) -> ResolvedPrior:
+    def resolve(self, model: Any) -> ResolvedPrior:
         """The prior of ``model``'s parameters, checked against its names."""
         names = model.names
-        for name in self.fixed:
-            _require_name("fixed", name, names)
-        std = _by_name("std of the prior", self.std, names, np.full(len(names), np.inf))
-        mean = np.array(model.nominal, dtype=np.float64)
-        if self.mean is not None:
-            mean = _by_name("mean of the prior", self.mean, names, mean)
-            if not np.isfinite(mean).all():
-                raise ValueError(
-                    "mean of the prior must be finite, got "
-                    f"{in_words(mean[~np.isfinite(mean)])}"
-                )
-        free = np.array([name not in self.fixed for name in names], dtype=np.bool_)
+        unknown = np.full(len(names), np.inf)
+        std = _by_name("std of the prior", self.std, names, unknown)
+        nominal = np.array(model.nominal, dtype=np.float64)
+        mean = _by_name("mean of the prior", self.mean, names, nominal)
+        require_finite("mean of the prior", mean)
+        _by_name("fixed", dict.fromkeys(self.fixed, 0.0), names, unknown)
+        free = ~np.isin(names, list(self.fixed))
         return ResolvedPrior(mean, np.diag(std**-2.0), free)
 
 
-def _require_name(argument: str, name: str, names: tuple[str, ...]) -> None:
-    if name not in names:
-        raise ValueError(
-            f"{argument} must name parameters of the model ({', '.join(names)}), "
-            f"got {name!r}"
-        )
-
-
 def _by_name(
-    argument: str, values: Named, names: tuple[str, ...], default: Array
+    argument: str, values: Named | None, names: tuple[str, ...], default: Array
 ) -> Array:
     """(p,) ``values`` in the order of ``names``; ``default`` where they are silent."""
-    if isinstance(values, Mapping):
+    if values is None or isinstance(values, Mapping):
         result = default.copy()
-        for name, value in values.items():
-            _require_name(argument, name, names)
+        for name, value in (values or {}).items():
+            if name not in names:
+                raise ValueError(
+                    f"{argument} must name parameters of the model "
+                    f"({', '.join(names)}), got {name!r}"
+                )
             result[names.index(name)] = value
         return result
-    array = numbers(argument, values, finite=False)
-    if array.shape not in ((), (len(names),)):
-        raise ValueError(
-            f"{argument} must be one number, ({len(names)},) or a mapping from names, "
-            f"got {array.shape}"
-        )
-    return np.broadcast_to(array, (len(names),)).copy()
+    return one_or_each(argument, values, len(names), " or a mapping from names").copy()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,25 +128,20 @@ class Noise:
             raise ValueError("give std or covariance of the noise, not both")
         if self.std is not None:
             std = numbers("std of the noise", self.std)
-            if not (std > 0.0).all():
-                raise ValueError(
-                    f"std of the noise must be positive, got {in_words(std.min())}"
-                )
+            require_none(~(std > 0.0), std, "std of the noise must be positive")
         if self.covariance is not None:
             numbers("covariance of the noise", self.covariance)
-        if self.command_std is not None:
-            spread = numbers("command_std", self.command_std, finite=False)
-            if not (spread >= 0.0).all():
-                raise ValueError(
-                    "command_std must not be negative (inf: unknown in every "
-                    f"measurement), got {in_words(spread[~(spread >= 0.0)])}"
-                )
-            given = self.std is not None or self.covariance is not None
-            if not given and (np.isfinite(spread) & (spread > 0.0)).any():
-                raise ValueError(
-                    "command_std needs std or covariance of the readings beside it: "
-                    "the two are added in the readings' units"
-                )
+        if self.command_std is None:
+            return
+        spread = numbers("command_std", self.command_std, finite=False)
+        rule = "command_std must not be negative (inf: unknown in every measurement)"
+        require_none(~(spread >= 0.0), spread, rule)
+        known = np.isfinite(spread) & (spread > 0.0)
+        if self.std is None and self.covariance is None and known.any():
+            raise ValueError(
+                "command_std needs std or covariance of the readings beside it: "
+                "the two are added in the readings' units"
+            )
 
     def of(self, rows: NDArray[np.bool_]) -> Noise:
         """The noise of some of the N candidates, ``rows`` (N,) True at each of them."""
@@ -190,12 +164,17 @@ class Noise:
             num_outputs: q readings in each.
             command_jacobian: (N, q, n) of the model; needed with ``command_std``.
         """
-        whole_number("count", count, 0)
         shape = (count, num_outputs, num_outputs)
-        covariance = self._of_readings(*shape[:2])
+        covariance = self._of_readings(count, num_outputs)
         unknown = np.zeros((count, num_outputs, 0))
         if self.command_std is not None:
-            derivative, spread = self._of_commands(shape[:2], command_jacobian)
+            if command_jacobian is None:
+                raise ValueError(
+                    "command_std needs the derivative by the commands: give a model, "
+                    "or command_jacobian (N, q, n)"
+                )
+            derivative = array_of("command_jacobian", command_jacobian, *shape[:2], "n")
+            spread = self.of_commands(derivative.shape[-1])
             known = derivative * np.where(np.isinf(spread), 0.0, spread)
             covariance = covariance + known @ np.matrix_transpose(known)
             unknown = derivative[..., np.isinf(spread)]
@@ -235,25 +214,7 @@ class Noise:
             )
         return covariance
 
-    def _of_commands(
-        self, leading: tuple[int, int], command_jacobian: ArrayLike | None
-    ) -> tuple[Array, Array]:
-        """Derivative (N, q, n) and command_std (n,)."""
-        if command_jacobian is None:
-            raise ValueError(
-                "command_std needs the derivative by the commands: give a model, or "
-                "command_jacobian (N, q, n)"
-            )
-        derivative = numbers("command_jacobian", command_jacobian)
-        if derivative.ndim != 3 or derivative.shape[:2] != leading:
-            raise ValueError(
-                f"command_jacobian must have shape ({leading[0]}, {leading[1]}, n), "
-                f"got {derivative.shape}"
-            )
-        spread = np.asarray(self.command_std, dtype=np.float64)
-        n = derivative.shape[-1]
-        if spread.shape not in ((), (n,)):
-            raise ValueError(
-                f"command_std must be one number or ({n},), got {spread.shape}"
-            )
-        return derivative, np.broadcast_to(spread, (n,))
+    def of_commands(self, n: int) -> Array:
+        """(n,) command_std, zero where it is not given."""
+        given = 0.0 if self.command_std is None else self.command_std
+        return one_or_each("command_std", given, n)

@@ -24,7 +24,7 @@ AXES = ("pitch", "yaw", "roll")
 SCALE = np.array([0.43, 0.71, 0.87])  # pitch, yaw, roll; Table 1 lists roll before yaw
 BIAS_DEG = np.array([3.1, -5.8, 2.41])
 NOISE_STD_DEG = 0.1  # ours; the paper gives none
-RANGES = JointRanges([-20.0] * 3, [20.0] * 3, AXES)  # degrees, ours as well
+RANGES = JointRanges([-20.0] * 3, [20.0] * 3)  # degrees, ours as well
 
 EPISODES = {
     "dataset0": 200,

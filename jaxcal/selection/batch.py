@@ -18,9 +18,9 @@ from numpy.typing import ArrayLike
 from jaxcal.checks import whole_number
 from jaxcal.selection.exact.exact import solve_exact
 from jaxcal.selection.exchange import exchange
-from jaxcal.selection.problem import Found, Problem, make_problems
+from jaxcal.selection.problem import Found, Problem, log_dets, make_problems
 from jaxcal.selection.result import BatchSelection
-from jaxcal.selection.solvers import checked_seed, solve_random
+from jaxcal.selection.solvers import checked_seed, random_indices
 
 __all__ = ["exact_batch", "exchange_batch", "greedy_batch", "random_batch"]
 
@@ -30,14 +30,20 @@ def random_batch(
 ) -> BatchSelection:
     """A random selection per set, never singular; one seed draws the whole batch."""
     rng = np.random.default_rng(checked_seed(seed))
-    return _solve(
-        "random", lambda problem: solve_random(problem, seed=rng), candidates, k, rules
-    )
+
+    def solve(problems: list[Problem]) -> list[Found]:
+        return [Found(drawn) for drawn in random_indices(problems, rng)[0]]
+
+    return _solve("random", solve, candidates, k, rules)
 
 
 def greedy_batch(candidates: ArrayLike, k: int, **rules: Any) -> BatchSelection:
     """Greedy from nothing, or from the partial selections in ``required``."""
-    return _solve("greedy", exchange.solve_greedy, candidates, k, rules)
+
+    def solve(problems: list[Problem]) -> list[Found]:
+        return list(map(exchange.solve_greedy, problems))
+
+    return _solve("greedy", solve, candidates, k, rules)
 
 
 def exchange_batch(
@@ -53,10 +59,12 @@ def exchange_batch(
         restarts = whole_number("restarts", restarts, 1)
     seed = checked_seed(seed)
 
-    def solve(problem: Problem) -> Found:
-        return exchange.solve(problem, seed=seed, restarts=restarts)
+    def solve(problems: list[Problem]) -> list[Found]:
+        return _in_threads(
+            lambda one: exchange.solve(one, seed=seed, restarts=restarts), problems
+        )
 
-    return _solve("exchange", solve, candidates, k, rules, threads=True)
+    return _solve("exchange", solve, candidates, k, rules)
 
 
 def exact_batch(
@@ -69,40 +77,34 @@ def exact_batch(
     """
     deadline = None if time_limit is None else time.perf_counter() + time_limit
 
-    def solve(problem: Problem) -> Found:
-        return solve_exact(problem, deadline=deadline)
+    def solve(problems: list[Problem]) -> list[Found]:
+        # Of a simplex most is the hull, which keeps other threads waiting.
+        each = map if problems[0].simplex else _in_threads
+        return list(each(lambda one: solve_exact(one, deadline=deadline), problems))
 
-    return _solve("exact", solve, candidates, k, rules, threads=True)
+    return _solve("exact", solve, candidates, k, rules)
+
+
+def _in_threads(
+    solve: Callable[[Problem], Found], problems: list[Problem]
+) -> list[Found]:
+    """On every core: compiled solvers release the interpreter."""
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, len(problems))) as pool:
+        return list(pool.map(solve, problems))
 
 
 def _solve(
     method: str,
-    solve: Callable[[Problem], Found],
+    solve: Callable[[list[Problem]], list[Found]],
     candidates: ArrayLike,
     k: int,
     rules: dict[str, Any],
-    threads: bool = False,
 ) -> BatchSelection:
     start = time.perf_counter()
     problems = make_problems(candidates, k, **rules)
-    # Compiled solvers release the interpreter; of a simplex most is the hull, which
-    # keeps other threads waiting.
-    if (
-        threads
-        and len(problems) > 1
-        and not (method == "exact" and problems[0].simplex)
-    ):
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            found = list(pool.map(solve, problems))
-    else:
-        found = [solve(problem) for problem in problems]
+    found = solve(problems)
     indices = np.stack([one.indices for one in found])
-    values = np.array(
-        [
-            problem.log_det(one.indices) if one.value is None else one.value
-            for problem, one in zip(problems, found, strict=True)
-        ]
-    )
+    values = log_dets(problems, indices)
     singular = np.flatnonzero(np.isneginf(values))
     if singular.size:
         raise ValueError(

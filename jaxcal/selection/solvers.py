@@ -8,36 +8,59 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from jaxcal.checks import one_of, seconds, share, whole_number
 from jaxcal.selection.exact import exact
 from jaxcal.selection.exchange import exchange
-from jaxcal.selection.problem import Found, Problem
+from jaxcal.selection.problem import Found, Problem, log_dets
 
-__all__ = ["METHODS", "OPTIONS", "SOLVERS", "checked_options", "checked_seed"]
+__all__ = [
+    "METHODS",
+    "OPTIONS",
+    "SOLVERS",
+    "checked_options",
+    "checked_seed",
+    "random_indices",
+]
 
 _TRIES = 200  # random selections, before the greedy one, where all are singular
 
 
 def solve_random(problem: Problem, *, seed: int | np.random.Generator) -> Found:
     """The baseline of the paper: drawn uniformly, never singular, required first."""
-    rng = np.random.default_rng(seed)
-    room = problem.upper - problem.lower
-    pool = np.repeat(np.arange(len(room)), room)
-    free = problem.k - len(problem.required)
+    indices, values = random_indices([problem], np.random.default_rng(seed))
+    return Found(
+        indices[0], float(values[0]), seed=seed if isinstance(seed, int) else None
+    )
+
+
+def random_indices(
+    problems: Sequence[Problem], rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """(B, k) drawn until none is singular, of problems of one shape, and log det S."""
+    k, cap = problems[0].k, min(problems[0].max_replicates, problems[0].k)
+    required, count = np.array([each.required for each in problems]), len(problems)
+    taken = ~np.array([each.available for each in problems]).repeat(cap, axis=1)
+    indices, values = np.empty((count, k), np.int64), np.empty(count)
+    forced, left = required.shape[1], np.arange(count)
+    indices[:, :forced] = required
+    if forced:
+        taken[left[:, None], required * cap] = True
     for _ in range(_TRIES):
-        drawn = np.concatenate([problem.required, rng.permutation(pool)[:free]])
-        value = problem.log_det(drawn)
-        if value > -np.inf:
-            break
-    else:  # a table that is nearly all duplicates
-        drawn = exchange.greedy_indices(problem)
-        value = problem.log_det(drawn)
-    return Found(drawn, value, seed=seed if isinstance(seed, int) else None)
+        order = (rng.random((len(left), taken.shape[1])) + taken[left]).argsort(axis=1)
+        indices[left, forced:] = order[:, : k - forced] // cap
+        values[left] = log_dets([problems[b] for b in left.tolist()], indices[left])
+        left = left[np.isneginf(values[left])]
+        if not left.size:
+            return indices, values
+    for b in left.tolist():  # tables that are nearly all duplicates
+        indices[b] = exchange.greedy_indices(problems[b])
+    return indices, log_dets(problems, indices)
 
 
 @functools.cache

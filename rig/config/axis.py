@@ -1,7 +1,7 @@
 """One ``[[axes]]`` table: a joint, its drive, and pulses against degrees."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
@@ -56,14 +56,6 @@ class Scale(Section):
         return pulses / self.pulses_per_deg
 
 
-def _limit(pick: Callable[..., int]) -> Callable[[dict[str, Any]], int]:
-    def pulses(made: dict[str, Any]) -> int:
-        scale = Scale.of(made)
-        return pick(scale.to_pulses(made["min_deg"]), scale.to_pulses(made["max_deg"]))
-
-    return pulses
-
-
 def _map(name: Any, info: ValidationInfo) -> RegisterMap:
     if not isinstance(name, str) or not name:
         raise ValueError(f"must be the name of a map or of a file, got {name!r}")
@@ -85,12 +77,6 @@ class Axis(Scale):
     ] = key("register map: a name, or a .toml file relative to this one")
     min_deg: float = key("soft limit", ..., -180, 180)
     max_deg: float = key("soft limit", ..., -180, 180)
-    min_pulses: int = advanced(
-        "soft limit", "of the limits", LOWEST, HIGHEST, by=_limit(min)
-    )
-    max_pulses: int = advanced(
-        "soft limit", "of the limits", LOWEST, HIGHEST, by=_limit(max)
-    )
     speed_deg_s: float = key("of every move", ..., 1e-3, 5000)
     accel_deg_s2: float = key("of every move, also to brake", ..., 1e-3, 1e5)
     comm_timeout_s: float | None = advanced(
@@ -101,10 +87,15 @@ class Axis(Scale):
     @classmethod
     def unmoved(cls, name: str, unit: int, register_map: RegisterMap) -> "Axis":
         """A drive that is read or stopped and never moved: nothing else is known."""
-        return cls.model_construct(
-            name=name, unit=unit, map=register_map,
-            rotates="X", min_pulses=0, max_pulses=0,
-        )  # fmt: skip
+        return cls.model_construct(name=name, rotates="X", unit=unit, map=register_map)
+
+    @property
+    def min_pulses(self) -> int:
+        return min(self.to_pulses(self.min_deg), self.to_pulses(self.max_deg))
+
+    @property
+    def max_pulses(self) -> int:
+        return max(self.to_pulses(self.min_deg), self.to_pulses(self.max_deg))
 
     def pulses_within(self, angle_deg: float) -> int:
         """A tolerance in degrees as whole pulses, at least one."""
@@ -164,16 +155,11 @@ class Axis(Scale):
         return counts["speed"] / per_speed, accel
 
     def broken_rules(self) -> Iterator[str]:
-        for unit in ("deg", "pulses"):
-            low, high = getattr(self, f"min_{unit}"), getattr(self, f"max_{unit}")
-            if low >= high:
-                yield f"min_{unit}: must be under max_{unit}, got {low} and {high}"
-                return
-        allowed = f"min_pulses..max_pulses ({self.min_pulses}..{self.max_pulses})"
-        for name in ("min_deg", "max_deg"):
-            pulses = self.to_pulses(getattr(self, name))
-            if not self.min_pulses <= pulses <= self.max_pulses:
-                yield f"{name}: {pulses} pulses are outside {allowed}"
+        if self.min_deg >= self.max_deg:
+            yield (
+                f"min_deg: must be under max_deg, got {self.min_deg} and {self.max_deg}"
+            )
+            return
         try:
             self.motion_counts()
         except ValueError as error:

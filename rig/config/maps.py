@@ -314,7 +314,6 @@ class RegisterMap(Section):
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the parsed file."""
         known = tomllib.loads(self.text)
         data = json.dumps(known, sort_keys=True, default=str)
         return hashlib.sha256(data.encode()).hexdigest()
@@ -327,7 +326,6 @@ class RegisterMap(Section):
 
 
 def available_maps() -> list[str]:
-    """Names of the maps that ship."""
     return sorted(path.stem for path in MAP_FOLDER.glob("*.toml"))
 
 

@@ -38,7 +38,6 @@ class BusSettings(Section):
 
     @property
     def where(self) -> str:
-        """The bus in words."""
         if self.transport == "rtu":
             return f"{self.device} at {self.baudrate} baud"
         return f"{self.host}:{self.port} ({self.transport})"

@@ -78,13 +78,6 @@ class Frame:
         sequence = matrix_to_euler(self.mounting @ turned @ self.mounting.T, order)
         return sequence[..., [order.index(letter) for letter in self.letters]]
 
-    def matrix(self, angles_deg: ArrayLike) -> Array:
-        """(..., 3, 3) attitudes of the phone at (..., 3) pitch, yaw and roll."""
-        places = [self.letters.index(letter) for letter in self.order]
-        sequence = np.asarray(angles_deg, dtype=np.float64)[..., places]
-        turned = euler_to_matrix(sequence, self.order)
-        return self.zero @ self.mounting.T @ turned @ self.mounting
-
 
 def raw_fields(readings: Sequence[Reading]) -> dict[str, Any]:
     """``quaternions`` (samples, 4), x y z w, and ``stamps`` (samples,), Unix time."""

@@ -50,19 +50,15 @@ def approach(config: RigConfig, target: Pulses) -> list[Pulses]:
 
 def check_plan(config: RigConfig, targets: Iterable[Pulses]) -> None:
     """LimitError lists each target, or point it is approached from, that is outside."""
-    faults = []
-    for point in (point for target in targets for point in approach(config, target)):
-        for axis, pulses in zip(config.axes, point, strict=True):
-            angle, rounding = axis.to_deg(pulses), 0.51 / abs(axis.pulses_per_deg)
-            if not (
-                axis.min_pulses <= pulses <= axis.max_pulses
-                and axis.min_deg - rounding <= angle <= axis.max_deg + rounding
-            ):
-                faults.append(
-                    f"{axis.name} to {pulses} pulses ({angle:.3f} deg), limits "
-                    f"{axis.min_pulses}..{axis.max_pulses} pulses and "
-                    f"{axis.min_deg:g}..{axis.max_deg:g} deg"
-                )
+    faults = [
+        f"{axis.name} to {pulses} pulses ({axis.to_deg(pulses):.3f} deg), limits "
+        f"{axis.min_pulses}..{axis.max_pulses} pulses and "
+        f"{axis.min_deg:g}..{axis.max_deg:g} deg"
+        for target in targets
+        for point in approach(config, target)
+        for axis, pulses in zip(config.axes, point, strict=True)
+        if not axis.min_pulses <= pulses <= axis.max_pulses
+    ]
     if faults:
         raise LimitError("outside the limits, nothing was sent: " + "; ".join(faults))
 
@@ -312,7 +308,6 @@ class Device:
         return reading.matrix
 
     def positions(self) -> Pulses:
-        """Where the drives stand, in pulses."""
         return tuple(drive.status().position for drive in self.drives)
 
     def close(self) -> None:

@@ -117,7 +117,6 @@ class Requests:
         return str(self._stop) if late else ""
 
     def check_stop(self) -> None:
-        """Raise StopRequested where one has been asked for."""
         if self._stop is not None:
             raise self._stop
 

@@ -79,7 +79,6 @@ class Receiver:
         self._thread.start()
 
     def close(self) -> None:
-        """Close every socket and end the thread."""
         self._closing.set()
         self._thread.join(2.0)
 
@@ -240,13 +239,11 @@ class Imu:
         return self
 
     def close(self) -> None:
-        """Close every socket."""
         if self._receiver is not None:
             self._receiver.close()
 
     @property
     def port(self) -> int:
-        """That is listened on."""
         return self._receiver.port if self._receiver else self.settings.port
 
     @property

@@ -127,7 +127,6 @@ class Journal:
             return record
 
     def events(self, event: str) -> list[Record]:
-        """Records of one kind."""
         return [record for record in self.records if record["event"] == event]
 
     def close(self) -> None:
@@ -237,5 +236,4 @@ class RunFolder:
         write_text(self.folder / "pairs.csv", text)
 
     def save_summary(self, summary: dict[str, Any]) -> None:
-        """Write summary.json."""
         write_text(self.folder / "summary.json", json.dumps(summary, indent=1))

@@ -126,18 +126,15 @@ class ModbusServer:
                     reply = bytes([body[1] | 0x80, TARGET_SILENT])
                 sent = body[:1] + reply
                 if rtu:
-                    sent = self._mangled(sent + crc16(sent), spoilt)
+                    sent += crc16(sent)
+                    if spoilt:
+                        place = self._random.randrange(len(sent))
+                        wrong = sent[place] ^ self._random.randrange(1, 256)
+                        sent = sent[:place] + bytes([wrong]) + sent[place + 1 :]
                 else:
                     sent = frame[:4] + struct.pack(">H", len(sent)) + sent
                 os.write(fd, noise + sent)
         return buffer
-
-    def _mangled(self, frame: bytes, spoilt: bool) -> bytes:
-        changed = bytearray(frame)
-        if spoilt:
-            place = self._random.randrange(len(changed))
-            changed[place] ^= self._random.randrange(1, 256)
-        return bytes(changed)
 
     def _spoils(self, axis: int) -> bool:
         fault = self.faults.take("spoilt_frames", axis)

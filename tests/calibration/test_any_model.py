@@ -521,7 +521,7 @@ def broken(method: str, answer: Any) -> Any:
         ),
         (
             {"model": broken("jacobian", lambda n: np.full((n, 2, 6), np.inf))},
-            "model.jacobian must be finite, got inf by a for the command",
+            "model.jacobian must be finite, got inf by a, b.* for the command",
         ),
         ({"prior": 1.0}, "prior must be a jaxcal.Prior, got float"),
         ({"prior": Prior({"zz": 1.0})}, "must name parameters of the model"),

@@ -567,7 +567,7 @@ good = np.vstack([np.zeros(3), np.eye(3), np.ones(3)])
         ({"commands": [["1"] * 3] * 5}, "commands must be an array of numbers"),
         ({"commands": [[None] * 3] * 5}, r"commands must be (an array of|finite)"),
         ({"weights": [1, 1, 1, 1]}, r"weights must have shape \(5,\), got \(4,\)"),
-        ({"weights": [1, 1, 1, 1, -2]}, "not be negative, got -2.0 at 4"),
+        ({"weights": [1, 1, 1, 1, -2]}, "not be negative, got -2.0"),
         ({"weights": [0, 0, 1, 1, 1]}, "at least 4 postures of positive weight"),
         ({"weights": np.zeros(5)}, "at least 4 postures of positive weight"),
         ({"noise_std": 0.0}, "noise_std must be positive, got 0"),

@@ -12,13 +12,10 @@ from jaxcal.commands import doctor, main
 def test_it_names_versions_extras_and_devices(capsys):
     assert main(["doctor", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["system"]["jaxcal"] == jaxcal.__version__
-    assert found["packages"]["numpy"] == importlib.metadata.version("numpy")
-    assert found["extras"]["models"] == (
-        f"formulaic {importlib.metadata.version('formulaic')}"
-    )
-    assert "cpu" in " ".join(found["devices"].values())
-    assert found["ports"]
+    assert found["jaxcal"] == jaxcal.__version__
+    assert found["numpy"] == importlib.metadata.version("numpy")
+    assert found["formulaic"] == importlib.metadata.version("formulaic")
+    assert "cpu" in found["devices"]
 
 
 def test_a_missing_package_is_named_with_what_installs_it(monkeypatch, capsys):
@@ -30,8 +27,7 @@ def test_a_missing_package_is_named_with_what_installs_it(monkeypatch, capsys):
         return real(name)
 
     monkeypatch.setattr(importlib.metadata, "version", version)
-    assert doctor.report()["extras"]["models"] == (
-        "no formulaic: pip install 'jaxcal[models]'"
-    )
+    told = "not installed: pip install 'jaxcal[models]'"
+    assert doctor.report()["formulaic"] == told
     assert main(["doctor"]) == 0
-    assert "  models" in capsys.readouterr().out
+    assert told in capsys.readouterr().out

@@ -48,16 +48,6 @@ def test_standard_input(monkeypatch):
     assert len(read_table("-")) == 2
 
 
-def test_npz(tmp_path):
-    path = tmp_path / "t.npz"
-    commands, measured = np.arange(6.0).reshape(3, 2), np.ones((3, 1))
-    np.savez(path, commands=commands, measured=measured, available=[True, False, True])
-    table = read_table(str(path))
-    assert table.names == ("u_1", "u_2", "y_1", "available")
-    np.testing.assert_array_equal(table.columns(["u_1", "u_2"]), commands)
-    np.testing.assert_array_equal(table.available(), [True, False, True])
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -82,11 +72,8 @@ def test_refusals_name_the_column(tmp_path):
         table.outputs(None)
 
 
-def test_a_damaged_npz_is_refused(tmp_path):
-    path = tmp_path / "t.npz"
+def test_a_file_of_a_spreadsheet_is_refused(tmp_path):
+    path = tmp_path / "t.xlsx"
     path.write_bytes(b"PK\x03\x04 nothing")
-    with pytest.raises(ValueError, match="not a readable"):
-        read_table(str(path))
-    np.savez(path, candidates=np.ones((2, 3, 4)))
-    with pytest.raises(ValueError, match="evaluate takes many sets"):
+    with pytest.raises(ValueError, match="a table must be CSV; save this one as CSV"):
         read_table(str(path))

@@ -33,7 +33,7 @@ def test_whitened_information_is_the_identity(digits, with_root):
     root = blocks[0] * 2.0 if with_root else np.zeros((0, p))
     usable = np.ones(count, dtype=bool)
     usable[3] = with_root
-    white = whiten(blocks, usable, root)
+    white = whiten(blocks[None], usable[None], root)[0]
     chosen = white.blocks[usable].reshape(-1, p)
     total = chosen.T @ chosen + white.prior
     rounding = 3e-9 + 1e-16 * 10**digits  # a factor by rotations keeps its condition

@@ -441,7 +441,7 @@ def test_help_says_what_every_number_is(capsys):
     for name in presets.field_names() - {"num_episodes", "num_seeds"}:
         assert f"--{name.replace('_', '-')}" in text
     assert "what to try first" in text
-    assert "[2; paper 10; tasks 4]" in " ".join(text.split())
+    assert "passes over what an update has played [2]" in " ".join(text.split())
     for name in presets.names():
         assert f"\n  {name} " in text
 

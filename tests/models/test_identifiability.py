@@ -93,7 +93,7 @@ def test_some_parameters_taking_the_others_as_known():
     assert report.names == ("a2", "d2", "d3", "theta6")
     assert [each.words for each in report.directions] == ["d2 = d3", "theta6"]
     assert report.identifiable == ("a2",)
-    with pytest.raises(ValueError, match=r"parameters must be among .* got 'd9'"):
+    with pytest.raises(ValueError, match=r"parameters must be one of .* got 'd9'"):
         identifiability(ur5(), ur5_data()[0][:50], parameters=["d9"])
 
 

@@ -39,7 +39,7 @@ def test_one_number_and_a_row_of_them():
         ({"std": 1.0, "mean": np.nan}, "mean of the prior must be finite"),
         ({"std": 1.0, "fixed": ["x"]}, "fixed must name parameters .* got 'x'"),
         ({"std": 1.0, "fixed": "b1"}, "fixed must be a sequence of names"),
-        ({"std": [1.0, 2.0]}, r"one number, \(4,\) or a mapping"),
+        ({"std": [1.0, 2.0]}, r"one number or \(4,\) or a mapping"),
         ({"std": 0.0}, r"std of the prior must be positive .*, got \(0\)"),
         ({"std": {"a11": np.nan}}, r"must be positive .*, got \(nan\)"),
     ],

@@ -44,7 +44,7 @@ from rig.core.drive import Drive
 from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord, read_journal
 from rig.simulator import Truth, parse_fault
 from rig.workbench.commission.operator import Operator
-from rig.workbench.commission.steps import Place, go_home, identify, simulated
+from rig.workbench.commission.steps import Place, go_home, identify
 from rig.workbench.commission.steps import axes as check_the_axes
 from rig.workbench.run import Run
 
@@ -312,7 +312,8 @@ def _unknown_cell(fault: str, folder: pathlib.Path) -> Outcome:
     with simulator(fast_config(generic)) as sim:
         served = changed(sim.start(), output=str(folder))
         record = DeviceRecord(folder / "device.json")
-        place = simulated(sim, served, record, said.append)
+        operator = Operator(yes=True, say=said.append)
+        place = Place(served, record, operator, full_speed=True, listeners=(sim.hear,))
         identify(place)
         assert go_home(place, here=True) == 0, said
         record.reach(SIGN_CHECKED, served)

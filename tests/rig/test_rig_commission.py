@@ -83,6 +83,19 @@ def test_a_step_is_cut_at_the_limit(commissioned):
     assert pitch.position == config.axes[0].to_pulses(limit)
 
 
+def test_a_step_before_homing_goes_from_where_the_drive_counts(at):
+    """A count beyond a limit means no place yet: the step went back to the limit."""
+    with device() as (sim, bus, port):
+        (at / "rig.toml").write_text(quick_text(bus, port))
+        assert main(["scan", "--units", "3"]) == 0
+        roll = sim.drives[2]
+        roll.power_cycle(90.0)
+        before = roll.position
+        assert main(["jog", "roll", "1", "--yes"]) == 0
+        way = load_config("rig.toml").axes[2].to_pulses(1.0)
+        assert before < roll.position <= before + abs(way)
+
+
 def test_sigterm_in_the_axis_check_stops_the_drives(commissioned, at, monkeypatch):
     emit = steps.Run.emit
 
@@ -156,7 +169,9 @@ def test_a_count_of_0_after_a_power_cycle_is_not_home(at, name, obeys, monkeypat
     with simulator(served) as sim:
         served = changed(sim.start(), output=str(at))
         record = DeviceRecord(at / "device.json")
-        place = steps.simulated(sim, served, record, told.append)
+        operator = Operator(yes=True, say=told.append)
+        place = steps.Place(served, record, operator, full_speed=True,
+                            listeners=(sim.hear,))  # fmt: skip
         steps.identify(place)
         assert steps.go_home(place, here=True) == 0
         counts = [round(drive.position) for drive in sim.drives]

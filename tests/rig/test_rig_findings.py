@@ -112,32 +112,15 @@ def test_a_device_as_configured_needs_no_correction():
     assert proposals(CONFIG, find(CONFIG, Chain().stands()), [None] * 3) == []
 
 
-def test_play_is_the_difference_of_the_two_ways_to_one_place():
+def test_play_does_not_enter_the_gains():
     chain = Chain()
     chain.play = np.array([0.5, 0.1, 0.0])
     found = find(CONFIG, chain.stands())
-    np.testing.assert_allclose(found.backlash_deg, chain.play, atol=0.01)
     own = [
         abs(r * a.pulses_per_deg)
         for r, a in zip(found.deg_per_pulse, CONFIG.axes, strict=True)
     ]
-    np.testing.assert_allclose(own, 1.0, atol=0.01)  # play does not enter the gain
-
-
-@pytest.mark.parametrize("turned", [(90, 0, 0), (0, 180, 0), (30, 80, -60)])
-def test_with_names_known_the_phone_may_lie_in_any_way(turned):
-    mounting = euler_to_matrix(turned, "ZYX")
-    chain = Chain(turned=mounting)
-    found = find(CONFIG, chain.stands(), names_known=True)
-    assert found.joints == (0, 1, 2)
-    assert angle_between_deg(found.mounting, mounting) < 0.3
-
-
-def test_with_names_known_a_mirrored_axis_is_refused_not_put_on_the_phone():
-    rates = [1.0 / axis.pulses_per_deg for axis in CONFIG.axes]
-    rates[2] = -rates[2]
-    with pytest.raises(MotionFault, match="mirrored"):
-        find(CONFIG, Chain(deg_per_pulse=rates).stands(), names_known=True)
+    np.testing.assert_allclose(own, 1.0, atol=0.01)
 
 
 def test_a_phone_placed_quite_otherwise_is_refused_not_explained_by_exchanged_axes():
@@ -156,7 +139,9 @@ def test_mirrored_readings_are_not_taken_for_a_reversed_axis(changes):
         matrix = euler_to_matrix(sent * read.signs, read.order)
         stands[name] = Stand(stand.pulses, matrix, 0.0, 25)
     config = CONFIG.model_copy(update={"imu": read})
-    with pytest.raises(MotionFault, match=r"imu.signs = \[-1, -1, -1\]"):
+    with pytest.raises(
+        MotionFault, match=r"imu.order, imu.columns or imu.signs is wrong"
+    ):
         find(config, stands)
 
 

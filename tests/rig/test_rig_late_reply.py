@@ -95,3 +95,55 @@ def test_a_drive_that_refuses_a_pair_by_halves_is_told_apart_too(line):
         assert position_after_a_late_status(line, late_s) == PLACE_WORDS
     found = drive.status()
     assert (found.word, found.position) == (word, PLACE)
+
+
+class Talking:
+    """A serial port on which bytes still come in until it was emptied so often."""
+
+    def __init__(self, port, emptied):
+        self.port, self.emptied, self.sent_into = port, emptied, []
+
+    def __getattr__(self, name):
+        return getattr(self.port, name)
+
+    @property
+    def in_waiting(self):
+        return 1 if self.emptied else self.port.in_waiting
+
+    def reset_input_buffer(self):
+        self.emptied = max(0, self.emptied - 1)
+
+    def read(self, size=1):
+        return b"" if self.emptied else self.port.read(size)
+
+    def write(self, data):
+        self.sent_into.append(self.emptied)
+        return self.port.write(data)
+
+
+def test_nothing_is_sent_while_a_serial_line_is_not_quiet():
+    """A frame sent into a late reply would meet it on the wire."""
+    pytest.importorskip("serial", reason="serial ports need pyserial")
+    config = fast_config(PAIRS)
+    with simulator(config, transport="rtu") as sim:
+        sim.drives[0].position = PLACE
+        with Bus(changed(sim.start().bus, timeout_s=5.0, read_retries=1)) as bus:
+            assert bus.read_words(1, PLACE_AT, 2) == PLACE_WORDS
+            port = bus._client.socket = Talking(bus._client.socket, 3)
+            assert bus.read_words(1, PLACE_AT, 2) == PLACE_WORDS
+    first, *others = port.sent_into
+    assert first == 3 and others and not any(others)
+
+
+@pytest.mark.parametrize("transport", ["tcp", "rtu_tcp"])
+def test_what_comes_late_over_a_network_comes_over_a_connection_given_up(transport):
+    config = fast_config(PAIRS)
+    with simulator(config, transport=transport) as sim:
+        sim.faults.add(parse_fault("lost_reply,count=1,axis=pitch"))
+        settings = changed(sim.start().bus, timeout_s=TIMEOUT_S, read_retries=0)
+        with Bus(settings) as bus:
+            first = bus._client.socket
+            with pytest.raises(BusError):
+                bus.read_words(1, PLACE_AT, 2)
+            assert first.fileno() < 0
+            bus.read_words(1, PLACE_AT, 2, retries=9)

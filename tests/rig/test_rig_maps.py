@@ -103,7 +103,7 @@ def test_leadshine_registers_are_those_of_a_recorded_session(spoken):
     # reduction 10: 600 rpm are 360 deg/s; 1000 rpm in 50 ms are 12000 deg/s^2
     sent, _ = spoken(
         "leadshine_pr", 1, lambda d: d.move(200000), speed_deg_s=360.0,
-        accel_deg_s2=12000.0, max_pulses=300000,
+        accel_deg_s2=12000.0, max_deg=2e4,
     )  # fmt: skip
     assert sent[:7] == bytes.fromhex("01 10 62 00 00 08 10")
     assert sent[7:19] == b"".join(single[4:6] for single in recorded)
@@ -156,7 +156,7 @@ def test_oriental_move_is_the_direct_data_operation_of_the_manual(spoken):
     absolute = printed[:13] + b"\x00\x01" + printed[15:-2]
     sent, _ = spoken(
         "oriental_az", 1, lambda d: d.move(8500), pulses_per_rev=1000, reduction=1.0,
-        speed_deg_s=720.0, accel_deg_s2=540.0, max_pulses=9000,
+        speed_deg_s=720.0, accel_deg_s2=540.0, max_deg=2e4,
     )  # fmt: skip
     assert sent == absolute + check_bytes(absolute)
 
@@ -209,7 +209,7 @@ def test_applied_motion_move_is_what_a_running_machine_sends(spoken):
     sent, _ = spoken(
         "applied_motion", 5, lambda d: d.move(228580),
         lambda sent: replies.get(sent) or echo(sent), speed_deg_s=252.0,
-        accel_deg_s2=21600.0, max_pulses=300000,
+        accel_deg_s2=21600.0, max_deg=2e4,
     )  # fmt: skip
     assert sent == b"".join(replies) + recorded
 

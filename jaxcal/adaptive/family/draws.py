@@ -26,7 +26,7 @@ BUDGETS = (
     "time+uses+number",
 )  # fmt: skip
 _PASSES = 8  # sessions by which budgets are set
-_MOST = 0.8  # of what such a session tells
+_ENOUGH = 0.8  # of the information such a session gains
 _SHARES = (0.25, 1.2)  # of what such a session takes: a budget
 _UNKNOWN = 1.5  # nats at the start, at least
 _LEAST = 3  # measurements that a budget is meant for
@@ -59,7 +59,7 @@ def draw(
     if budget is not None and budget not in BUDGETS:
         raise ValueError(f"budget must be of {', '.join(BUDGETS)}, got {budget!r}")
     counted = (budget or str(drawn)).split("+")
-    asked = _with_nothing_told(rng, known[structure or own](rng, limits))
+    asked = _with_uninformative(rng, known[structure or own](rng, limits))
     count, num_outcomes = asked.likelihood.shape[:2]
 
     base, travel = _travel(rng, asked)
@@ -88,9 +88,9 @@ def draw(
         seconds = (low, low * rng.choice([1.0, rng.uniform(1.0, 3.0)]))
     ends = [1]
     if "uses" in counted:
-        most = int(np.clip(np.rint(need["uses"]), 1, limits.uses))
-        first = int(rng.integers(1, most + 1))
-        ends = list(range(first, int(rng.integers(first, most + 1)) + 1))
+        max_uses = int(np.clip(np.rint(need["uses"]), 1, limits.uses))
+        first = int(rng.integers(1, max_uses + 1))
+        ends = list(range(first, int(rng.integers(first, max_uses + 1)) + 1))
     return GridTask.make(
         asked.theta,
         asked.designs,
@@ -115,7 +115,7 @@ def _needed(
     extra: Array,
     uses: Array,
     after: NDArray[Any],
-    most: int,
+    horizon: int,
 ) -> dict[str, float]:
     """What the largest gain a second takes to tell most of what it tells in the end."""
     count, num_outcomes, num_states = table.shape
@@ -124,28 +124,28 @@ def _needed(
     truth = rng.choice(num_states, _PASSES, p=prior)
     belief = np.repeat(prior[:, None], _PASSES, axis=1)
     place = np.full(_PASSES, len(travel) - 1)
-    told, spent = np.zeros(most), np.zeros((most, 2))
+    gained, spent = np.zeros(horizon), np.zeros((horizon, 2))
     each = np.arange(_PASSES)
-    for number in range(most):
+    for number in range(horizon):
         p = (flat @ belief).reshape(count, num_outcomes, _PASSES)
         gains = special.entr(p).sum(axis=1) - noise @ belief
         seconds = travel[place].T + (p * extra[..., None]).sum(axis=1)
         chosen = (gains / seconds).argmax(axis=0)
         below = table[chosen, :, truth].cumsum(axis=1)[:, :-1]
         outcome = (rng.random((_PASSES, 1)) >= below).sum(axis=1)
-        told[number] = gains[chosen, each].mean()
+        gained[number] = gains[chosen, each].mean()
         took = travel[place, chosen] + extra[chosen, outcome]
         spent[number] = took.mean(), uses[chosen, outcome].mean()
         belief = belief * table[chosen, outcome].T
         belief /= belief.sum(axis=0)
         place = after[chosen, outcome]
-    told = told.cumsum()
-    enough = int(np.argmax(told >= _MOST * told[-1])) + 1
+    gained = gained.cumsum()
+    enough = int(np.argmax(gained >= _ENOUGH * gained[-1])) + 1
     seconds, used = spent[:enough].sum(axis=0)
     return {"number": enough, "seconds": float(seconds), "uses": float(used)}
 
 
-def _with_nothing_told(rng: np.random.Generator, asked: Questions) -> Questions:
+def _with_uninformative(rng: np.random.Generator, asked: Questions) -> Questions:
     """Sometimes a few designs tell nothing: their outcomes do not depend on theta."""
     count, num_outcomes = asked.likelihood.shape[:2]
     if rng.random() > 0.2:

@@ -78,8 +78,8 @@ def pad(task: GridTask, limits: Limits) -> Padded:
         out[tuple(slice(n) for n in array.shape)] = array
         return out
 
-    most, wide = limits.designs, limits.outcomes
-    table = larger(task.likelihood, most, wide, limits.states)
+    designs, outcomes = limits.designs, limits.outcomes
+    table = larger(task.likelihood, designs, outcomes, limits.states)
     table[count:, 0] = 1.0
     table[:count, 0, num_states:] = 1.0
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -87,33 +87,35 @@ def pad(task: GridTask, limits: Limits) -> Padded:
     start = np.asarray(task.place)
     # The start goes where it is in every padded task: after all designs.
     roads = np.asarray(task.travel)
-    travel = larger(roads[:count], most + 1, most)
+    travel = larger(roads[:count], designs + 1, designs)
     travel[-1, :count] = roads[-1]
     after = np.asarray(task.place_after)
-    after = np.where(after == count, most, after) if len(task.travel) > count else after
+    after = (
+        np.where(after == count, designs, after) if len(task.travel) > count else after
+    )
     if len(task.travel) > count:
-        start = np.where(start == count, most, start)
+        start = np.where(start == count, designs, start)
     fields: dict[str, Any] = dict(
         theta=np.zeros((limits.states, 1), np.float32),  # nothing reads it
         prior=larger(task.prior, limits.states),
-        designs=np.zeros((most, 1), np.float32),
+        designs=np.zeros((designs, 1), np.float32),
         likelihood=table,
         parts=(Part(table, p_log_p, (0,)),),
-        order=np.arange(most, dtype=np.int32),
+        order=np.arange(designs, dtype=np.int32),
         travel=travel,
-        place_after=larger(after.astype(np.int32), most, wide),
-        extra=larger(task.extra, most, wide),
-        uses=larger(task.uses, most, wide),
+        place_after=larger(after.astype(np.int32), designs, outcomes),
+        extra=larger(task.extra, designs, outcomes),
+        uses=larger(task.uses, designs, outcomes),
         seconds=np.asarray(task.seconds),
         num_uses=np.resize(ends, 60).astype(np.int32),
         place=start.astype(np.int32),
-        groups=larger(task.groups, most),
+        groups=larger(task.groups, designs),
         num_groups=limits.groups,
         shape=(limits.states,),
         horizon=limits.measurements,
         theta_names=(),
         design_names=(),
-        allowed=np.arange(most) < count,
+        allowed=np.arange(designs) < count,
         first=np.int32(limits.measurements - task.horizon),
     )
     return Padded(**fields)

@@ -55,9 +55,9 @@ def _grid(*axes: Array) -> Array:
 
 def _side(rng: np.random.Generator, dim: int, limits: Limits, least: int = 4) -> int:
     """Cells on each of ``dim`` axes; large grids are as likely as small ones."""
-    most = int(min(48 if dim > 1 else 128, limits.states ** (1.0 / dim) + 1e-9))
-    least = min(least, most)
-    return int(np.rint(np.exp(rng.uniform(np.log(least), np.log(most)))))
+    max_side = int(min(48 if dim > 1 else 128, limits.states ** (1.0 / dim) + 1e-9))
+    least = min(least, max_side)
+    return int(np.rint(np.exp(rng.uniform(np.log(least), np.log(max_side)))))
 
 
 def _below(rng: np.random.Generator, distance: Array) -> Array:
@@ -106,8 +106,8 @@ def _per_joint(
     rng: np.random.Generator, joints: int, limits: Limits
 ) -> tuple[NDArray[np.int64], Array]:
     """(A,) joint and (A,) level of tests that go along each of several joints."""
-    most = limits.designs // joints
-    count = int(rng.integers(min(5, most), min(most, 40) + 1))
+    max_levels = limits.designs // joints
+    count = int(rng.integers(min(5, max_levels), min(max_levels, 40) + 1))
     levels = np.linspace(0.0, 1.0, count + 2)[1:-1]
     return np.repeat(np.arange(joints), count), np.tile(levels, joints)
 
@@ -197,8 +197,8 @@ def curves(rng: np.random.Generator, limits: Limits) -> Questions:
     """Which of many smooth random functions; readings of it on a line or a plane."""
     count = int(np.exp(rng.uniform(np.log(12), np.log(limits.states))))
     dim = int(rng.integers(1, 3))
-    most = int(min(limits.designs, 64) ** (1.0 / dim) + 1e-9)
-    at = _grid(*[_cells(int(rng.integers(min(4, most), most + 1)))] * dim)
+    max_side = int(min(limits.designs, 64) ** (1.0 / dim) + 1e-9)
+    at = _grid(*[_cells(int(rng.integers(min(4, max_side), max_side + 1)))] * dim)
     lengths = np.exp(rng.uniform(np.log(1.0), np.log(8.0)))
     rate = lengths * rng.standard_normal((dim, 24))
     basis = np.cos(at @ rate + rng.uniform(0.0, 2.0 * np.pi, 24))
@@ -245,8 +245,8 @@ def two_ways(rng: np.random.Generator, limits: Limits) -> Questions:
 
 def ranking(rng: np.random.Generator, limits: Limits) -> Questions:
     """An order of up to six things; two of them are compared at a time."""
-    most = max(n for n in (3, 4, 5, 6) if special.factorial(n) <= limits.states)
-    count = int(rng.integers(min(4, most), most + 1))
+    max_things = max(n for n in (3, 4, 5, 6) if special.factorial(n) <= limits.states)
+    count = int(rng.integers(min(4, max_things), max_things + 1))
     orders = np.array(list(itertools.permutations(range(count))), float)
     pairs = np.array(list(itertools.combinations(range(count), 2)))[: limits.designs]
     ahead = (orders[:, pairs[:, 0]] - orders[:, pairs[:, 1]]).T / count
@@ -270,8 +270,8 @@ def stops(rng: np.random.Generator, limits: Limits) -> Questions:
 
 def pools(rng: np.random.Generator, limits: Limits) -> Questions:
     """Which of several parts are faulty; some of them are tested together."""
-    most = min(10, int(np.log2(limits.states)))
-    parts = int(rng.integers(min(6, most), most + 1))
+    max_parts = min(10, int(np.log2(limits.states)))
+    parts = int(rng.integers(min(6, max_parts), max_parts + 1))
     theta = _grid(*[np.arange(2.0)] * parts)
     number = int(rng.integers(parts, min(limits.designs, 40) + 1))
     pool = rng.random((number, parts)) < rng.uniform(0.15, 0.5, number)[:, None]

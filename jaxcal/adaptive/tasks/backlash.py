@@ -139,8 +139,8 @@ def dead_zone_bins(
         max_width, reach, bin_width: as of the task.
         relative: to the reading at a reference, and less the command.
     """
-    most = max_width + bin_width if relative else reach + max_width / 2.0 + bin_width
-    count = int(np.ceil(2.0 * most / bin_width))
+    highest = max_width + bin_width if relative else reach + max_width / 2.0 + bin_width
+    count = int(np.ceil(2.0 * highest / bin_width))
     return Bins(-count * bin_width / 2.0, count * bin_width / 2.0, count)
 
 

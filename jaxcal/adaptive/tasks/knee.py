@@ -45,7 +45,7 @@ def knee(
         rho: correlation of the thresholds' Gaussian copula.
         sigma: width of the step from no trip to trip; 0 is a sharp one.
         slip: probability that a test answers wrongly far from the threshold.
-        seconds: budget of a session, or (least, most) to draw it from.
+        seconds: budget of a session, or (low, high) to draw it from.
         trips: that end a session, or the list it is drawn from.
         test_s: seconds of one test.
         travel_s: over the full range.

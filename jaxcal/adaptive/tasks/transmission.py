@@ -61,12 +61,12 @@ def transmission_error(
     at = np.linspace(0.0, 1.0, num_postures)
     frequency, amplitude, phase = theta.T[:, None]
     mean = amplitude * np.sin(2.0 * np.pi * frequency * at[:, None] + phase)
-    most = float(np.max(amplitudes)) + 2.0 * sigma
+    highest = float(np.max(amplitudes)) + 2.0 * sigma
     here = np.append(at, 0.0)
     return GridTask.make(
         theta,
         at,
-        Bins(-most, most, num_bins).likelihood(mean, sigma),
+        Bins(-highest, highest, num_bins).likelihood(mean, sigma),
         travel=measure_s + travel_s * np.abs(here[:, None] - at),
         uses=1,
         num_uses=measurements,

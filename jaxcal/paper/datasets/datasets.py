@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxcal.candidates import uniform_candidates
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.paper.constants import (
     BIAS_DEG,
@@ -132,7 +131,7 @@ def drawn(name: str, seed: int, begin: int, end: int) -> Dataset:
     for first in range(begin, end, BLOCK):
         draw, noise = _streams(name, seed, first // BLOCK)
         count = min(BLOCK, end - first)
-        candidates = uniform_candidates(draw, count, NUM_CANDIDATES, 3)
+        candidates = draw.random((count, NUM_CANDIDATES, 3))
         measured = None
         if name == "dataset3":
             measured = RANGES.denormalise(candidates) * SCALE + BIAS_DEG
@@ -156,7 +155,7 @@ def _simulated(seed: int, total: int, progress: Progress | None) -> Dataset:
 
     shape = (NUM_CANDIDATES, 3)
     streams = [_streams("dataset0", seed, group) for group in range(total)]
-    unit = np.stack([uniform_candidates(draw, 1, *shape)[0] for draw, _ in streams])
+    unit = np.stack([draw.random(shape) for draw, _ in streams])
     noise = np.stack([rng.normal(0.0, NOISE_STD_DEG, shape) for _, rng in streams])
     read = simulate(dataset0_robot(), RANGES.denormalise(unit), progress=progress)
     return Dataset("dataset0", unit, read + noise, ranges=RANGES, seed=seed)

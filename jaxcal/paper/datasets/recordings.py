@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.candidates import JointRanges, draw_from_pool
+from jaxcal.candidates import JointRanges
 from jaxcal.evaluation.csv_rows import read_columns
 from jaxcal.evaluation.dataset import Dataset
 from jaxcal.paper.constants import AXES, EPISODES, NUM_CANDIDATES, RANGES
@@ -64,7 +64,9 @@ def recorded_dataset(
         rows = np.arange(episodes * NUM_CANDIDATES).reshape(episodes, -1)
     else:
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(4,)))
-        rows = draw_from_pool(rng, have, episodes, NUM_CANDIDATES)
+        rows = np.stack(
+            [rng.choice(have, NUM_CANDIDATES, replace=False) for _ in range(episodes)]
+        )
     unit = ranges.normalise(commands)[rows]
     return Dataset(name, unit, measured[rows], None, ranges, seed, digest)
 
@@ -89,9 +91,8 @@ def read_pool(
         _, lines, values = read_columns(data, _wanted, _is_posture)
         if not lines:
             raise ValueError("no postures below the header")
-        outside = ~ranges.contains(values[:, :3])
-        if np.any(outside):
-            row = int(np.flatnonzero(outside)[0])
+        unit = ranges.normalise(values[:, :3])
+        for row in np.flatnonzero(((unit < 0.0) | (unit > 1.0)).any(axis=1)):
             low, high = ranges.low.tolist(), ranges.high.tolist()
             raise ValueError(
                 f"posture {row + 1} is commanded {values[row, :3].tolist()} deg, "
@@ -129,7 +130,7 @@ def _ranges_beside(recording: pathlib.Path) -> JointRanges:
         if named is None:
             return RANGES
         low, high = zip(*(named[axis] for axis in AXES), strict=True)
-        return JointRanges(low, high, AXES)
+        return JointRanges(low, high)
     except FileNotFoundError:
         return RANGES
     except (ValueError, TypeError, KeyError, AttributeError) as error:

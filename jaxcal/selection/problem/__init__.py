@@ -2,6 +2,6 @@
 
 from jaxcal.selection.problem.asked import Asked
 from jaxcal.selection.problem.making import make_problems
-from jaxcal.selection.problem.problem import Found, Problem, values
+from jaxcal.selection.problem.problem import Found, Problem, log_dets, values
 
-__all__ = ["Asked", "Found", "Problem", "make_problems", "values"]
+__all__ = ["Asked", "Found", "Problem", "log_dets", "make_problems", "values"]

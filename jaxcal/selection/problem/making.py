@@ -14,6 +14,7 @@ from jaxcal.checks import (
 )
 from jaxcal.information.blocks import (
     SINGULAR,
+    Whitened,
     coarseness,
     largest_rank,
     missing_directions,
@@ -115,15 +116,17 @@ def make_problems(
     if forced is not None and (forced.ndim != 2 or len(forced) != len(array)):
         raise ValueError(f"required must have shape (B, r), got {forced.shape}")
     raw, coarse = model.blocks(array), coarseness(candidates)
+    raw.flags.writeable = mask.flags.writeable = False
     root, wanted = np.zeros((0, model.num_inputs + 1)), CRITERIA["D"]()
+    white = whiten(raw, mask, root, coarse=coarse)
     k = _check_k(k, raw[0], mask[0], root, regressors=True)  # of no one set
     problems = []
     for b in range(len(array)):
         try:
             problems.append(make_problem(
                 raw[b], root, wanted, k, mask[b], None if forced is None else forced[b],
-                max_replicates, coarse=coarse, times=m, candidates=array[b],
-                model=model,
+                max_replicates, white=white[b], coarse=coarse, times=m,
+                candidates=array[b], model=model,
             ))  # fmt: skip
         except ValueError as error:
             raise ValueError(f"in set {b}: {error}") from None
@@ -139,6 +142,7 @@ def make_problem(
     required: ArrayLike | None,
     max_replicates: int,
     *,
+    white: Whitened | None = None,
     coarse: float = 1.0,
     names: tuple[str, ...] = (),
     times: int = 1,
@@ -154,6 +158,7 @@ def make_problem(
         wanted: the criterion.
         k, required, max_replicates: what may be chosen, as asked for.
         available: (M,), checked.
+        white: the blocks whitened, where they are already.
         coarse: how many times coarser than float64 the numbers given are.
         names: (p,) of the parameters; empty where the blocks are [u, 1].
         times: how often log det and trace count.
@@ -170,7 +175,9 @@ def make_problem(
     computed = bool(names) and model is not None
     if computed:  # a derivative is as exact as its own numbers
         coarse = 1.0
-    white = whiten(raw, available, root, coarse=coarse, computed=computed)
+    if white is None:
+        sets = raw[None], available[None]
+        white = whiten(*sets, root, coarse=coarse, computed=computed)[0]
     if white is None:
         used = raw[available]
         if not names and candidates is not None:
@@ -191,7 +198,7 @@ def make_problem(
         times, white.log_scale, raw, white.basis, root, white.triangle, white.size,
         candidates, model,
     )  # fmt: skip
-    for each in (*white[:3], *white[4:], raw, root, available, forced):
+    for each in (raw, root, available, forced):
         each.flags.writeable = False
     if len(forced):
         _check_required_rank(problem)
@@ -261,7 +268,9 @@ def _check_k(
     if k is None:
         k = p if regressors else _cover(usable)
     k = whole_number("k", k, 1)
-    known = rank_of_blocks(root[None], root[:0])[0] if len(root) else 0
+    known = 0
+    if len(root):
+        known = rank_of_blocks(root[None, None], root[:0])[0][0]
     if k * most + known >= p:
         return k
     if regressors and not known:

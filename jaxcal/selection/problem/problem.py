@@ -10,6 +10,7 @@ coordinates. Postures of the affine model are blocks [u, 1] that count once per 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from jaxcal.information.blocks import rank_of_blocks, significant
 from jaxcal.models.model import Model
 from jaxcal.selection.criteria import Criterion
 
-__all__ = ["Found", "Problem", "values"]
+__all__ = ["Found", "Problem", "log_dets", "values"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -130,10 +131,8 @@ class Problem:
 
     def log_det(self, indices: Indices) -> float:
         """log det S of a subset, natural, in the caller's units; -inf if singular."""
-        return (
-            self.multiplicity
-            * rank_of_blocks(self.raw[np.asarray(indices)], self.root)[1]
-        )
+        blocks = self.raw[np.asarray(indices)[None]]
+        return self.multiplicity * float(rank_of_blocks(blocks, self.root)[1][0])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -152,9 +151,16 @@ class Found:
     restarts: int | None = None  # random starts of the exchange
 
 
+def log_dets(problems: Sequence[Problem], indices: Indices) -> Array:
+    """(R,) log det S of a subset (R, k) of each, of one model; -inf if singular."""
+    raw = np.array([one.raw[i] for one, i in zip(problems, indices, strict=True)])
+    return problems[0].multiplicity * rank_of_blocks(raw, problems[0].root)[1]
+
+
 def values(problem: Problem, indices: Indices) -> tuple[Array, Array]:
     """Reported value of the criterion, and log det S, of subsets (R, k): (R,) each."""
-    log_det = np.array([problem.log_det(each) for each in indices])
+    log_det = rank_of_blocks(problem.raw[indices], problem.root)[1]
+    log_det *= problem.multiplicity
     criterion = problem.criterion
     if criterion.name == "D":
         return log_det, log_det

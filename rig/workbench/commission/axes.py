@@ -38,13 +38,13 @@ SEEN_DEG = 0.03  # the phone must turn at least this much in a whole move
 SEEN_SIGMA = 6.0
 
 
-def check_axes(run: Run, device: Device, names_known: bool) -> list[Change]:
+def check_axes(run: Run, device: Device) -> list[Change]:
     """Move, measure and say what is found; the corrections that follow from it.
 
     Where nothing is to be corrected the device is SIGN_CHECKED.
     """
     stands = measure_axes(run, device)
-    found = find(run.config, stands, names_known)
+    found = find(run.config, stands)
     told = [drive.pulses_per_rev() for drive in device.drives]
     ratios = ratios_of(run.config, found)
     if run.config.imu.unit == "rad":
@@ -53,7 +53,6 @@ def check_axes(run: Run, device: Device, names_known: bool) -> list[Change]:
     changes = proposals(run.config, found, told)
     evidence = {
         "ratio": dict(zip(AXIS_NAMES, np.round(ratios, 4).tolist(), strict=True)),
-        "backlash_deg": found.backlash_deg.round(4).tolist(),
         "phone_turned_deg": round(found.turned_deg, 2),
         "run": run.folder.name,
     }
@@ -93,7 +92,7 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
         return stands[name]
 
     run.say(
-        f"axes: about {25 + len(CORNERS)} places; each axis first by "
+        f"axes: about {22 + len(CORNERS)} places; each axis first by "
         f"{FIRST_MOTOR_DEG:g} deg of its motor, then as far as the phone's turn "
         f"allows, {REACH_DEG:g} deg at most either way"
     )
@@ -152,7 +151,7 @@ def measure_axes(run: Run, device: Device) -> dict[str, Stand]:
         visit(f"{name}:plus", {j: far})
         visit(f"{name}:back", {j: 0})
         visit(f"{name}:minus", {j: -far})
-        visit(f"{name}:up", {j: 0})
+        move(device, Posture(name, start))
         most = min(CORNER_DEG, room[j])
         corner[j] = round(far * min(REACH_DEG / way, most / abs(axis.to_deg(far))))
         run.say(

@@ -17,7 +17,7 @@ import math
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from scipy import special
@@ -34,7 +34,6 @@ from rig.core.motion import move
 from rig.core.proof import ALLOWED_DEG
 from rig.workbench.commission.axes import ROOM_DEG, SEEN_DEG
 from rig.workbench.commission.findings import Stand, stand_at, turn
-from rig.workbench.procedures.goto import CENTRE_DEG
 from rig.workbench.run import Run
 
 LEVEL = 0.95
@@ -42,6 +41,7 @@ PAIRS = 8  # of readings, of the play and of the dead zone
 MOST_DEG = 1.5  # of play
 FAR_DEG = 1.5 * MOST_DEG  # of a move after which play and friction are taken up
 ZONE_DEG = 0.8  # of the dead zone at most
+CENTRE_DEG = 0.2  # of it from where the axis stood, at most
 REACH_DEG = 0.5 * ZONE_DEG + CENTRE_DEG + 0.2  # either way, to be past the zone
 BASE_DEG = FAR_DEG + REACH_DEG + MOST_DEG / 2.0  # where the play is measured
 STEPS = 64  # of a breakaway; its threshold is looked for under so many
@@ -192,8 +192,8 @@ class Probe:
         )
 
 
-def characterise(run: Run, device: Device, axis: int) -> dict[str, Any]:
-    """Measure an axis; what a calibration keeps of it, in degrees of its commands.
+def characterise(run: Run, device: Device, axis: int) -> None:
+    """Measure an axis, say what is found and journal it, in degrees of its commands.
 
     Raises:
         Refused: the axis stands too near to a limit; nothing was moved.
@@ -213,18 +213,16 @@ def characterise(run: Run, device: Device, axis: int) -> dict[str, Any]:
             f"{probe.name}: {name} {each.mean:.4f} deg of its commands, {LEVEL:.0%} in "
             f"{each.low:.4f}..{each.high:.4f}"
         )
-    run.say(f"from {probe.count} measurements")
-    result = {
-        "axis": probe.name,
-        "level": LEVEL,
-        "backlash_deg": _kept(play),
-        "dead_zone_deg": _kept(zone),
-        "dead_zone_at_deg": round(probe.here_deg, 5),  # give or take CENTRE_DEG
-        "breakaway_deg": [_kept(up), _kept(down)],
-        "measurements": probe.count,
-    }
-    run.emit("characterised", sync=True, **result)
-    return result
+    run.say(
+        f"from {probe.count} measurements. Where the play is over the accuracy you "
+        "need, set motion.approach_overshoot_deg to more than it, and calibrate"
+    )
+    run.emit(
+        "characterised", sync=True, axis=probe.name, level=LEVEL,
+        backlash_deg=_kept(play), dead_zone_deg=_kept(zone),
+        dead_zone_at_deg=round(probe.here_deg, 5),  # give or take CENTRE_DEG
+        breakaway_deg=[_kept(up), _kept(down)], measurements=probe.count,
+    )  # fmt: skip
 
 
 def _kept(found: Estimate) -> dict[str, float]:

@@ -6,8 +6,8 @@ is (3,) degrees in the phone's own frame at the start.
 
 A drive's axis there, with its sign, is the direction of its rotation vector for
 positive pulses. With the three axes alone, a phone that is placed differently cannot be
-told from drives whose names and signs are exchanged, so one of the two is taken as
-known: the configured placement (as good as ``NEAREST``), or names and signs.
+told from drives whose names and signs are exchanged, so the configured placement is
+taken as known, as good as ``NEAREST``.
 """
 
 from __future__ import annotations
@@ -15,15 +15,14 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rig.config import AXIS_NAMES, RigConfig
-from rig.config.axis import Scale
-from rig.core.attitude import ORDERS, Array, euler_to_matrix, matrix_to_euler
+from rig.core.attitude import Array, euler_to_matrix, matrix_to_euler
 from rig.core.device import Device, Posture
 from rig.core.faults import MotionFault
 from rig.core.measure import measure
@@ -89,21 +88,19 @@ def turn(base: Array, attitude: Array) -> Array:
     return Rotation.from_matrix(base.T @ attitude).as_rotvec(degrees=True)
 
 
-def rates_of(stands: Mapping[str, Stand]) -> tuple[Array, Array]:
-    """(3, 3) columns: rotation vector for one pulse of each drive; (3,) play."""
-    base, rates, backlash = stands["start"].attitude, np.empty((3, 3)), np.empty(3)
+def rates_of(stands: Mapping[str, Stand]) -> Array:
+    """(3, 3) columns: rotation vector for one pulse of each drive."""
+    base, rates = stands["start"].attitude, np.empty((3, 3))
     for j, name in enumerate(AXIS_NAMES):
-        parts = ("look", "plus", "back", "minus", "up")
+        parts = ("look", "plus", "back", "minus")
         places = [stands[f"{name}:{part}"] for part in parts]
-        look, plus, back, minus, up = (turn(base, each.attitude) for each in places)
+        look, plus, back, minus = (turn(base, each.attitude) for each in places)
         at = [each.pulses[j] for each in places]
         # On the way up and on the way down the play is taken up: no reversal between.
         moved = np.array([at[1] - at[0], at[3] - at[2]])
         each = np.array([plus - look, minus - back]) / moved[:, None]
         rates[:, j] = np.average(each, axis=0, weights=abs(moved))
-        direction = rates[:, j] / np.linalg.norm(rates[:, j])
-        backlash[j] = (back - up) @ direction * np.sign(moved[0])
-    return rates, backlash
+    return rates
 
 
 def _inner(stands: Mapping[str, Stand], rates: Array) -> list[int] | None:
@@ -136,34 +133,12 @@ def _inner(stands: Mapping[str, Stand], rates: Array) -> list[int] | None:
     return inner if sorted(inner) == [0, 1, 2] else []
 
 
-def _combining(config: RigConfig, stands: Mapping[str, Stand]) -> Iterator[str]:
-    """Other orders or signs of the phone's angles under which the readings combine."""
-    told, signs = config.imu.order, np.array(config.imu.signs)
-    if told is None or config.imu.format == "sensorlogger":
-        return
-    sent = {
-        name: matrix_to_euler(stand.attitude, told) * signs
-        for name, stand in stands.items()
-    }
-    tries = [(f'imu.order = "{order}"', order, signs) for order in ORDERS]
-    for other in itertools.product((-1, 1), repeat=3):
-        tries.append((f"imu.signs = {list(other)}", told, np.array(other)))
-    for text, order, signed in tries:
-        sequence, read = [told.index(letter) for letter in order], {}
-        for name, stand in stands.items():
-            attitude = euler_to_matrix((sent[name] * signed)[sequence], order)
-            read[name] = dataclasses.replace(stand, attitude=attitude)
-        if _inner(read, rates_of(read)[0]):
-            yield text
-
-
 @dataclasses.dataclass(frozen=True)
 class Findings:
     """Of the drives in the order of the configuration's axes, unless said otherwise."""
 
     joints: tuple[int, ...]  # for each drive: the axis that it turns
     deg_per_pulse: Array  # (3,) of the phone, > 0 where pulses turn the joint positive
-    backlash_deg: Array  # (3,) at the phone
     mounting: Array  # (3, 3) phone to end-effector, nearest to the three axes
     turned_deg: float  # that from the configured one
     order: str | None  # axes of the mechanism from the base outwards; None: not clear
@@ -172,37 +147,32 @@ class Findings:
 def find(
     config: RigConfig,
     stands: Mapping[str, Stand],
-    names_known: bool = False,
 ) -> Findings:
     """Read the findings from the places that ``axes.measure`` went to.
 
     Args:
         config: as the moves were made.
         stands: ``start``; of each axis NAME ``NAME:look``, ``:plus``, ``:back``,
-            ``:minus``, ``:up``; of each of CORNERS its ``corner_name``.
-        names_known: units and directions are as configured, and the phone may be placed
-            in any way; otherwise the phone is placed about as configured.
+            ``:minus``; of each of CORNERS its ``corner_name``.
 
     Raises:
         MotionFault: the axes fit no three joints, or the readings are no rotations.
     """
-    rates, backlash = rates_of(stands)
+    rates = rates_of(stands)
     size = np.linalg.norm(rates, axis=0)
     axes = rates / size
-    joints, signs, mounting = _placed(config, axes, names_known)
+    joints, signs, mounting = _placed(config, axes)
     order, inner = None, _inner(stands, rates)
     if inner is not None:
         if not inner:
-            others = ", ".join(_combining(config, stands))
             raise MotionFault(
                 "the phone's readings do not combine as rotations of three joints do: "
                 "imu.order, imu.columns or imu.signs is wrong, or the phone is loose. "
                 "Nothing was corrected"
-                + (others and f". They would combine with {others}")
             )
         order = "".join(config.letters[joints[i]] for i in np.argsort(inner)[::-1])
     mirrored = np.linalg.det(axes * _directions(config) @ _expected(config)) < 0
-    if mirrored and order is None and not names_known:
+    if mirrored and order is None:
         raise MotionFault(
             "the axes are mirrored, and the phone is too noisy to tell whether a "
             "direction is wrong or imu.signs. Raise settle.samples, then run "
@@ -210,7 +180,7 @@ def find(
         )
     told = euler_to_matrix(config.imu.mounting_deg, "ZYX")
     turned = float(np.linalg.norm(turn(told, mounting)))
-    return Findings(joints, signs * size, backlash, mounting, turned, order)
+    return Findings(joints, signs * size, mounting, turned, order)
 
 
 def _expected(config: RigConfig) -> Array:
@@ -223,37 +193,24 @@ def _directions(config: RigConfig) -> Array:
     return np.array([float(axis.direction) for axis in config.axes])
 
 
-def _placed(
-    config: RigConfig, axes: Array, names_known: bool
-) -> tuple[tuple[int, ...], Array, Array]:
+def _placed(config: RigConfig, axes: Array) -> tuple[tuple[int, ...], Array, Array]:
     """Joint and sign of each drive, and the mounting that fits them best."""
     expected = _expected(config)
-    joints: tuple[int, ...] = (0, 1, 2)
-    signs = _directions(config)
-    if names_known:
-        if np.linalg.det(axes * signs) * np.linalg.det(expected) < 0:
-            raise MotionFault(
-                "the three axes are mirrored: one direction is wrong, or all three. "
-                "Move each with `jaxcal-rig jog`, and set axes.*.direction of the one "
-                "that turns the negative way"
-            )
-    else:
-        told = euler_to_matrix(config.imu.mounting_deg, "ZYX")
-        cosines = expected.T @ told @ axes  # rows: joints
-        joints = max(
-            itertools.permutations(range(3)),
-            key=lambda order: np.abs(cosines[order, range(3)]).sum(),
+    told = euler_to_matrix(config.imu.mounting_deg, "ZYX")
+    cosines = expected.T @ told @ axes  # rows: joints
+    joints: tuple[int, ...] = max(
+        itertools.permutations(range(3)),
+        key=lambda order: np.abs(cosines[order, range(3)]).sum(),
+    )
+    own = cosines[joints, range(3)]
+    signs = np.sign(own)
+    if np.abs(own).min() < NEAREST:
+        unit = config.axes[int(np.abs(own).argmin())].unit
+        raise MotionFault(
+            f"unit {unit} turns the phone about an axis more than 45 deg from every "
+            "joint's, so the phone is not placed as imu.mounting_deg says. Correct "
+            "that roughly, then run `jaxcal-rig axes` again"
         )
-        own = cosines[joints, range(3)]
-        signs = np.sign(own)
-        if np.abs(own).min() < NEAREST:
-            unit = config.axes[int(np.abs(own).argmin())].unit
-            raise MotionFault(
-                f"unit {unit} turns the phone about an axis more than 45 deg from "
-                "every joint's, so the phone is not placed as imu.mounting_deg says. "
-                "Correct that roughly; or, where you have seen that every unit turns "
-                "its own joint the right way, use --names-known"
-            )
     fitted, _ = Rotation.align_vectors((expected[:, joints] * signs).T, axes.T)
     return joints, signs, fitted.as_matrix()
 
@@ -381,13 +338,9 @@ def proposals(
             new = float(f"{axis.reduction / ratio:.{DIGITS}g}")
             reason = f"it turns {ratio:.3g} of what is commanded; sound is {low:g} to "
             wanted["reduction"] = axis.reduction, new, f"{reason}{high:g}"
-        wanted = {name: each for name, each in wanted.items() if each[0] != each[1]}
-        if wanted.keys() & Scale.model_fields.keys():
-            for name in ("min_pulses", "max_pulses"):
-                if (old := tables[axis.name].get(name)) is not None:
-                    wanted[name] = old, None, "pulses mean otherwise"
         for name, each in wanted.items():
-            changes.append(Change(f"axes.{axis.name}.{name}", *each))
+            if each[0] != each[1]:
+                changes.append(Change(f"axes.{axis.name}.{name}", *each))
     if found.turned_deg > MOUNTING_DEG:
         angles = matrix_to_euler(found.mounting, "ZYX").round(2) + 0.0
         before, reason = list(config.imu.mounting_deg), "the three axes put the phone"
@@ -407,12 +360,12 @@ def _way(rate: float) -> str:
 def lines(config: RigConfig, found: Findings) -> list[str]:
     """The findings in words, a line for each drive and each thing found."""
     ratios = ratios_of(config, found)
-    text = ["  unit  turns   sense     measured/commanded  play"]
+    text = ["  unit  turns   sense     measured/commanded"]
     for drive, joint in enumerate(found.joints):
         axis, unit = config.axes[joint], config.axes[drive].unit
         text.append(
             f"  {unit:>4}  {axis.name:<6}  {_way(found.deg_per_pulse[drive]):<8}  "
-            f"{ratios[drive]:18.3f}  {max(0.0, found.backlash_deg[drive]):.3f}"
+            f"{ratios[drive]:18.3f}"
         )
     angles = matrix_to_euler(found.mounting, "ZYX")
     text.append(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 
 from rig.config import RigConfig
-from rig.config.axis import HIGHEST, LOWEST
 from rig.core.attitude import Array, Reading, angle_between_deg
 from rig.core.bus import BusError
 from rig.core.device import Device
@@ -15,6 +14,7 @@ from rig.core.proof import NOISE_DEG
 from rig.journal import HOMED
 from rig.workbench.run import Run
 
+NO_LIMIT_DEG = 1e9
 HOME_S = 120.0  # for one axis on its own way home
 SET_S, SET_TRIES = 1.0, 3  # until a drive counts from its new zero
 ANSWER_S = 0.5  # until a drive that was sent home moves
@@ -27,7 +27,7 @@ POLL_S = 0.05
 def unlimited(config: RigConfig) -> RigConfig:
     """The same without soft limits, for drives whose counts mean nothing yet."""
     axes = tuple(
-        axis.model_copy(update={"min_pulses": LOWEST, "max_pulses": HIGHEST})
+        axis.model_copy(update={"min_deg": -NO_LIMIT_DEG, "max_deg": NO_LIMIT_DEG})
         for axis in config.axes
     )
     return config.model_copy(update={"axes": axes})
@@ -38,19 +38,20 @@ def can_home(config: RigConfig) -> bool:
     return all(axis.map.home is not None for axis in config.axes)
 
 
-def home(run: Run, device: Device, here: bool) -> None:
+def home(run: Run, device: Device, config: RigConfig, here: bool) -> None:
     """Make the drives' counts mean a place; the device is HOMED.
 
     Args:
         run, device: with ``unlimited`` axes.
+        config: with the limits, by which a homing is watched.
         here: where the device stands is home: each drive is told so, and its count is
             noted where it cannot be told. Otherwise each drive homes itself.
     """
-    for drive in device.drives:
+    for drive, axis in zip(device.drives, config.axes, strict=True):
         if here:
             _set_zero(run, device, drive)
         else:
-            _go_home(run, device, drive)
+            _go_home(run, device, drive, axis.max_deg - axis.min_deg)
     positions = list(device.positions())
     how = "here" if here else "drive"
     run.emit("homed", sync=True, how=how, pulses=positions)
@@ -102,7 +103,7 @@ def _counts_from(device: Device, drive: Drive, origin: int) -> str | None:
     )
 
 
-def _go_home(run: Run, device: Device, drive: Drive) -> None:
+def _go_home(run: Run, device: Device, drive: Drive, range_deg: float) -> None:
     """Let a drive home itself, as far and as fast as it is set to, under the phone.
 
     Raises:
@@ -113,8 +114,7 @@ def _go_home(run: Run, device: Device, drive: Drive) -> None:
     run.say(f"  {axis.name} goes home")
     run.emit("command", label="home", axis=axis.name, pulses=None)
     base, begun, gone = device.attitude(), time.monotonic(), 0
-    most = axis.max_deg - axis.min_deg + motion.envelope_margin_deg
-    device.proof.stay_near(base, most)
+    device.proof.stay_near(base, range_deg + motion.envelope_margin_deg)
     last = drive.status().position
     drive.write(axis.map.home)
     while True:

@@ -22,12 +22,10 @@ def addresses_text(settings: ImuSettings, port: int) -> str:
     """What to type into the phone's app."""
     if settings.transport == "connect":
         return f"connecting to the phone at {settings.host}:{port}"
-    if settings.host in ("0.0.0.0", "::"):
-        hosts = own_addresses() or ["(this computer has no network address)"]
-    else:
-        hosts = [settings.host]
-    each = " or ".join(f"{host} port {port}" for host in hosts)
-    return f"type into the phone's app ({settings.format}): {each}"
+    host = settings.host
+    if host in ("0.0.0.0", "::"):
+        host = own_address() or "(this computer has no network address)"
+    return f"type into the phone's app ({settings.format}): {host} port {port}"
 
 
 def watch(imu: Imu, seconds: float, wait_s: float, say: Callable[[str], None]) -> None:
@@ -74,17 +72,13 @@ def serial_lines() -> list[str]:
     return lines
 
 
-def own_addresses() -> list[str]:
-    """IPv4 addresses under which a phone can reach this computer."""
-    found: dict[str, None] = {}
+def own_address() -> str:
+    """IPv4 address under which a phone can reach this computer; empty without one."""
     # Connecting UDP sends nothing; it tells the address packets leave from.
     with (
         contextlib.suppress(OSError),
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe,
     ):
         probe.connect(("192.0.2.1", 9))
-        found[str(probe.getsockname()[0])] = None
-    with contextlib.suppress(OSError):
-        for *_, address in socket.getaddrinfo(socket.gethostname(), None):
-            found[str(address[0])] = None
-    return [a for a in found if ":" not in a and not a.startswith(("127.", "0."))]
+        return str(probe.getsockname()[0])
+    return ""

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import json
 import re
-import time
 from collections.abc import Callable
 
 from rig.config.axis import Axis
@@ -88,15 +87,12 @@ def scan(
     found: list[Found] = []
     silence_s = max(each.inter_frame_s for each in known)
     with BusLock(settings).acquire("scan"), Bus(short, silence_s) as bus:
-        begun = time.monotonic()
         for unit in range(1, units + 1):
             if answer := _ask(bus, unit, known):
                 found.append(answer)
                 say(str(answer))
             if unit % 10 == 0 or unit == units:
-                spent = time.monotonic() - begun
-                left = spent / unit * (units - unit)
-                say(f"  {unit} of {units} units asked, about {left:.0f} s left")
+                say(f"  {unit} of {units} units asked")
     if not found:
         say(
             "no unit answers. Check power, wiring, termination, the line format (baud "

@@ -40,7 +40,6 @@ class Given:
     units: int = UNITS
     values: dict[str, Any] = dataclasses.field(default_factory=dict)  # of rig.toml
     home: str = "here"
-    names_known: bool = False
 
 
 def setting(text: str) -> tuple[str, Any]:
@@ -180,16 +179,14 @@ def go(place: steps.Place, given: Given) -> int:
         _ask_limits(place)
     if record.missing(place.config, SIGN_CHECKED):
         say("8 axes")
-        if code := steps.axes(place, given.names_known):
+        if code := steps.axes(place):
             return code
     if record.missing(place.config, ZEROED):
         say("9 zero")
         if code := steps.take_zero(place):
             return code
     say(f"the device is commissioned: {record.path}")
-    # A simulated device is gone with this command; another is made as rig.toml says.
-    again = " --simulate" * place.full_speed
-    say(f"next: {place.command(f'calibrate{again}')}")
+    say(f"next: {place.command('calibrate')}")
     return EXIT_OK
 
 

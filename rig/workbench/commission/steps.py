@@ -8,7 +8,6 @@ import functools
 import os
 import pathlib
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING
 
 from rig.config import AXIS_NAMES, RigConfig
 from rig.core import session
@@ -38,9 +37,6 @@ from rig.workbench.commission.phone import addresses_text, watch
 from rig.workbench.outputs.console import listen
 from rig.workbench.run import Run, run_safely
 from rig.workbench.toml import edit
-
-if TYPE_CHECKING:
-    from rig.simulator import Simulator
 
 WATCH_S = 5.0
 MOST_JOG_DEG = 10.0  # in one step
@@ -75,7 +71,8 @@ class Place:
     def command(self, words: str) -> str:
         """A command about this device, to be typed."""
         where = "" if self.path is None else f" --config {os.path.relpath(self.path)}"
-        return f"jaxcal-rig {words}{where}"
+        # A simulated device is gone with its command; another is made as rig.toml says.
+        return f"jaxcal-rig {words}{' --simulate' * self.full_speed}{where}"
 
     @contextlib.contextmanager
     def bus(self, what: str) -> Iterator[list[Drive]]:
@@ -168,7 +165,10 @@ def go_home(place: Place, here: bool) -> int:
         f"emergency stop; {what}",
         "home",
     )
-    return place.run("home", lambda run, dev: home(run, dev, here), limits=False)
+    return place.run(
+        "home", lambda run, dev: home(run, dev, place.config, here), limits=False,
+        again="home" + " --here" * here,
+    )  # fmt: skip
 
 
 def jog(place: Place, axis: int, way_deg: float) -> int:
@@ -186,7 +186,7 @@ def jog(place: Place, axis: int, way_deg: float) -> int:
         each, here = run.config.axes[axis], list(device.positions())
         start, checked = here[axis], device.proof.reaches[axis].checked
         goal = min(max(each.to_deg(start) + way_deg, each.min_deg), each.max_deg)
-        here[axis] = min(max(each.to_pulses(goal), each.min_pulses), each.max_pulses)
+        here[axis] = each.to_pulses(goal)
         base = device.attitude()
         device.proof.stay_near(base, max(ALLOWED_DEG, 2.0 * abs(way_deg)))
 
@@ -210,19 +210,10 @@ def jog(place: Place, axis: int, way_deg: float) -> int:
     return place.run("jog", procedure, limits=homed, again=f"jog {name} {way_deg:g}")
 
 
-def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> int:
-    """Measure play, dead zone and breakaway of an axis, into a calibration."""
+def characterise(place: Place, axis: int) -> int:
+    """Measure play, dead zone and breakaway of an axis."""
     from rig.workbench.commission import characterise as measured  # loads JAX
-    from rig.workbench.procedures.checking import (
-        calibration_path,
-        keep,
-        load_calibration,
-    )
 
-    path = None if into is None else calibration_path(into)
-    if path is not None:
-        # Of this device; simulated ones alone are moved at full speed.
-        load_calibration(path, place.config, simulated=place.full_speed, into=True)
     name, most = AXIS_NAMES[axis], measured.BASE_DEG + measured.FAR_DEG
     place.operator.confirm(
         f"characterise: {name} will move up to {most:.2f} deg from where it stands, "
@@ -230,16 +221,13 @@ def characterise(place: Place, axis: int, into: pathlib.Path | None = None) -> i
         "characterise",
     )
 
-    def procedure(run: Run, device: Device) -> None:
-        found = measured.characterise(run, device, axis)
-        if path is not None:
-            keep(path, name, found | {"run": run.folder.name})
-            run.say(f"kept in {path}: `jaxcal-rig goto` puts the play back")
-
-    return place.run("characterise", procedure, again=f"characterise {name}")
+    return place.run(
+        "characterise", lambda run, device: measured.characterise(run, device, axis),
+        again=f"characterise {name}",
+    )  # fmt: skip
 
 
-def axes(place: Place, names_known: bool = False) -> int:
+def axes(place: Place) -> int:
     """Check each axis, correct rig.toml after a yes, and check again: SIGN_CHECKED."""
     place.operator.confirm(
         "axes: the device stands in its zero posture. Each axis in turn will move a "
@@ -248,14 +236,12 @@ def axes(place: Place, names_known: bool = False) -> int:
         "device's reach",
         "axes",
     )
-    return _check_axes(place, names_known)
+    return _check_axes(place)
 
 
-def _check_axes(place: Place, names_known: bool, again: bool = False) -> int:
+def _check_axes(place: Place, again: bool = False) -> int:
     changes: list[Change] = []
-    code = place.run(
-        "axes", lambda run, dev: changes.extend(check_axes(run, dev, names_known))
-    )
+    code = place.run("axes", lambda run, dev: changes.extend(check_axes(run, dev)))
     if code or not changes:
         return code
     place.say("rig.toml does not say what the device does:")
@@ -277,7 +263,7 @@ def _check_axes(place: Place, names_known: bool, again: bool = False) -> int:
     identify(place)
     # Which also forgets where each named axis was left: it is not what it was.
     place.record.reach(HOMED, place.config, **homed)
-    return _check_axes(place, names_known, again=True)
+    return _check_axes(place, again=True)
 
 
 def take_zero(place: Place) -> int:
@@ -296,16 +282,3 @@ def commissioned(path: pathlib.Path, config: RigConfig, through: str) -> DeviceR
     for state in STATES[: STATES.index(through) + 1] if through else ():
         record.reach(state, config)
     return record
-
-
-def simulated(
-    simulator: Simulator,
-    served: RigConfig,
-    record: DeviceRecord,
-    say: Callable[[str], None],
-) -> Place:
-    """A simulated device: no operator confirms its moves, no file is corrected."""
-    return Place(
-        served, record, Operator(yes=True, say=say), full_speed=True,
-        listeners=(simulator.hear,),
-    )  # fmt: skip

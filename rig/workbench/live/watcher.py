@@ -94,7 +94,6 @@ class Watcher:
 
     @property
     def report(self) -> pathlib.Path | None:
-        """report.html, where the run has one."""
         path = self.folder / "report.html"
         return path if path.is_file() else None
 

@@ -55,6 +55,11 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
     config = records[0]["config"]  # of the run, also where it was refitted
     of_name = {axis["name"]: axis for axis in config["axes"]}
     axes = [of_name[name] for name in AXIS_NAMES]
+    scales = [Scale.of(axis) for axis in axes]
+    limits = [
+        sorted(scale.to_pulses(axis[end]) for end in ("min_deg", "max_deg"))
+        for scale, axis in zip(scales, axes, strict=True)
+    ]
     warnings = recalibrate(summary, config["session"]["verify_limit_deg"])
     if summary.get("simulated"):
         warnings.append("made on a simulated rig")
@@ -63,9 +68,9 @@ def load_inverse(folder: pathlib.Path, records: list[Record]) -> dict[str, Any]:
         "offset_deg": at_zero.tolist(),
         "min_deg": [float(axis["min_deg"]) for axis in axes],
         "max_deg": [float(axis["max_deg"]) for axis in axes],
-        "pulses_per_deg": [Scale.of(axis).pulses_per_deg for axis in axes],
-        "min_pulses": [axis["min_pulses"] for axis in axes],
-        "max_pulses": [axis["max_pulses"] for axis in axes],
+        "pulses_per_deg": [scale.pulses_per_deg for scale in scales],
+        "min_pulses": [low for low, _ in limits],
+        "max_pulses": [high for _, high in limits],
         "forward": np.column_stack([calibration.matrix, calibration.bias]).tolist(),
         "half_widths": summary["ci95"],
         "run": folder.resolve().name,

@@ -187,7 +187,6 @@ class RunState:
         return str(self.start.get("mode", ""))
 
     def setting(self, table: str, key: str, default: Any) -> Any:
-        """A value of the run's configuration."""
         return self.start.get("config", {}).get(table, {}).get(key, default)
 
     @property

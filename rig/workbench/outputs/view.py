@@ -86,14 +86,7 @@ def trouble(state: RunState, running: bool, folder: str) -> list[str]:
         lines += [go_on] if ended["event"] != "refused" else []
     elif ended is None and stop is not None and stop["reason"]:
         lines.append(f"Stopped: {stop['reason']}")
-    lines += state.warnings
-    verbs = {"unreachable": "is out of reach", "withdrawn": "was withdrawn"}
-    lines += [
-        f"{posture.title} {verbs[posture.state]}: {posture.note}"
-        for posture in state.postures.values()
-        if posture.state in verbs
-    ]
-    return [line for line in lines if line]
+    return [line for line in [*lines, *state.warnings] if line]
 
 
 def numbers(now: dict[str, Any]) -> list[tuple[str, ...]]:

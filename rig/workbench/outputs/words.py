@@ -89,7 +89,11 @@ def summary_lines(summary: dict[str, Any], limit_deg: float) -> list[str]:
         a, b, wide = summary["A"][row], summary["b"][row], summary["ci95"][row]
         values = "  ".join(f"{a[i]:8.5f} +- {wide[i]:.5f}" for i in range(3))
         lines.append(f"  {name:<5} [{values}]   {b:8.4f} +- {wide[3]:.4f}")
-    lines.append(f"  {noise_text(summary)}")
+    std = zip(AXIS_NAMES, summary["noise_std_deg"], strict=True)
+    lines.append(
+        f"  noise of one posture {', '.join(f'{n} {v:.4f}' for n, v in std)} deg, from "
+        f"{summary['basis']} ({summary['dof']} degrees of freedom each)"
+    )
     if "after" in summary:
         lines.append(f"held-out {error_text(summary)}")
     elif found := summary.get("prediction"):  # a refit: nothing was compensated by it
@@ -149,15 +153,6 @@ def drift_text(drift: dict[str, Any]) -> str:
             "motors"
         )
     return text
-
-
-def noise_text(summary: dict[str, Any]) -> str:
-    """How large the noise is, axis by axis, and where it was taken from."""
-    std = zip(AXIS_NAMES, summary["noise_std_deg"], strict=True)
-    return (
-        f"noise of one posture {', '.join(f'{name} {v:.4f}' for name, v in std)} deg, "
-        f"from {summary['basis']} ({summary['dof']} degrees of freedom each)"
-    )
 
 
 def choice_text(choice: dict[str, Any]) -> str:

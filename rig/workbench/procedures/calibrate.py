@@ -11,7 +11,7 @@ from rig.core.attitude import Array
 from rig.core.device import Device, Posture, check_plan
 from rig.core.faults import MotionFault
 from rig.core.session import visit
-from rig.journal import SIGN_CHECKED, Record
+from rig.journal import SIGN_CHECKED
 from rig.workbench.identification.conclusion import check_matrix, conclude
 from rig.workbench.identification.fit import identify
 from rig.workbench.outputs.console import plan_lines
@@ -36,9 +36,9 @@ def calibrate(run: Run) -> int:
         with run.device() as device:
             _visit_chosen(run, device, candidates, choice)
             run.emit("phase", phase="saving")
-            first = identify(_chosen(run))
+            chosen = [r for r in run.postures().values() if r["role"] == "select"]
+            first = identify(chosen)
             _check_gains(run, first.matrix)
-            first.save(run.folder / "calibration.partial.json")
             held = _held_out(run, first)
             if held:
                 visit(device, Posture(MIDDLE, run.zero_pulses), role="reference")
@@ -75,11 +75,6 @@ def _plan(run: Run) -> tuple[Array, Choice]:
     shown = dataclasses.replace(choice, indices=tuple(order.tolist()))
     run.say(*plan_lines(config, shown, candidates, start))
     return candidates, choice
-
-
-def _chosen(run: Run) -> list[Record]:
-    """Records of the postures measured to identify from."""
-    return [record for record in run.postures().values() if record["role"] == "select"]
 
 
 def _visit_chosen(run: Run, device: Device, candidates: Array, choice: Choice) -> None:
@@ -179,6 +174,4 @@ def _identify(run: Run) -> int:
     calibration, summary = conclude(run.config, run.journal.records, notes)
     choice = [*run.journal.events("plan"), *run.journal.events("replan")][-1]["choice"]
     told = {"mode": "calibrate", "simulated": simulated, "choice": choice}
-    code = save_result(run, calibration, summary | told, run.say)
-    (run.folder / "calibration.partial.json").unlink(missing_ok=True)
-    return code
+    return save_result(run, calibration, summary | told, run.say)

@@ -1,9 +1,10 @@
-"""collect and verify, and the calibration that a session uses."""
+"""collect; and what uses a calibration: verify, goto."""
 
 from __future__ import annotations
 
 import pathlib
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -11,14 +12,14 @@ from jaxcal.files import atomic_write
 from rig.config import RigConfig
 from rig.config.axis import Pulses
 from rig.config.config import differences
+from rig.core.attitude import Frame
 from rig.core.device import Posture
-from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, Refused
-from rig.core.known import KeptZero
+from rig.core.faults import EXIT_OK, EXIT_RECALIBRATE, LimitError, Refused
+from rig.core.known import KeptZero, unseen
 from rig.core.session import visit
 from rig.workbench.identification.fit import held_out_errors, pairs
 from rig.workbench.outputs.words import error_text, numbers
 from rig.workbench.procedures.calibrate import END, pair_names, visit_pairs
-from rig.workbench.procedures.goto import CHARACTERISED, Play
 from rig.workbench.procedures.plan import draw, draw_held_out
 from rig.workbench.run import Run
 
@@ -72,32 +73,23 @@ def collect(run: Run, count: int) -> int:
     return EXIT_OK
 
 
-class Saved(NamedTuple):
-    """A calibration that this device can use, and what is known of its zero posture."""
-
-    calibration: Any
-    zero: KeptZero
-    play: Play
-
-
 def load_calibration(
-    path: pathlib.Path, config: RigConfig, simulated: bool = False, into: bool = False
-) -> Saved:
-    """A calibration that was made with a device configured as this one.
+    path: pathlib.Path, config: RigConfig, simulated: bool = False
+) -> tuple[Any, KeptZero]:
+    """A calibration made with a device configured as this one, and its zero posture.
 
     Args:
         path: of the file, or of its run's folder.
         config: of the device.
         simulated: so is the device that is to be moved.
-        into: what is found of that device is to be kept in the calibration.
 
     Raises:
-        Refused: not a calibration, or of another device (names the keys), or one of
-            the two is simulated and the other is not.
+        Refused: not a calibration, or of another device (names the keys), or made with
+            a simulated one, and that to be moved is real.
     """
     import jaxcal
 
-    path = calibration_path(path)
+    path = path / "calibration.json" if path.is_dir() else path
     try:
         calibration = jaxcal.Calibration.load(path)
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -107,11 +99,6 @@ def load_calibration(
         raise Refused(
             f"{path}: made with a simulated device: it says nothing of the real one. "
             "Calibrate the device, or use it with --simulate"
-        )
-    if into and simulated and not notes.get("simulated"):
-        raise Refused(
-            f"{path}: made with a real device: what is found of a simulated one says "
-            "nothing of it. Leave out --simulate, or name a simulated calibration"
         )
     if lack := {"device", "zero_pulses", "zero_attitude"} - notes.keys():
         raise Refused(
@@ -128,22 +115,7 @@ def load_calibration(
         tuple(map(int, notes["zero_pulses"])),
         np.array(notes["zero_attitude"], dtype=np.float64),
     )
-    return Saved(calibration, kept, Play.of(notes))
-
-
-def calibration_path(path: pathlib.Path) -> pathlib.Path:
-    """The file of a calibration that is given by itself or by its run's folder."""
-    return path / "calibration.json" if path.is_dir() else path
-
-
-def keep(path: pathlib.Path, axis: str, found: dict[str, Any]) -> None:
-    """Write what was found of an axis into the notes of a calibration's file."""
-    from jaxcal.calibration import file
-
-    content = file.read(path)
-    notes = content["provenance"].setdefault("notes", {})
-    notes[CHARACTERISED] = notes.get(CHARACTERISED, {}) | {axis: found}
-    file.write(path, content)
+    return calibration, kept
 
 
 def verify(run: Run, calibration: Any, count: int) -> int:
@@ -192,3 +164,59 @@ def telling(
         return offered[:count]
     at = np.array([config.to_deg(command) for _, command in offered])
     return [offered[i] for i in calibration.verification(at, count)]
+
+
+def goto(run: Run, calibration: Any, to: Sequence[float]) -> int:
+    """Move the end-effector to (3,) desired degrees through a calibration."""
+    config, desired = run.config, np.array(to, dtype=np.float64)
+    command = np.asarray(calibration.command_for(desired), dtype=np.float64)
+    for axis, value in zip(config.axes, command, strict=True):
+        if not axis.min_deg <= value <= axis.max_deg:
+            raise LimitError(
+                f"{desired.tolist()} deg needs {axis.name} commanded to {value:.3f} "
+                f"deg, outside [{axis.min_deg:g}, {axis.max_deg:g}]. Choose a target "
+                "further inside"
+            )
+    pulses = config.to_pulses(command)
+    run.say(
+        f"desired {desired.tolist()} deg: command {command.round(4).tolist()} deg, "
+        f"pulses {list(pulses)}"
+    )
+    if run.lacks(["goto"]):
+        with run.device() as device:
+            visit(device, Posture("goto", pulses), role="goto")
+            counted = [drive.axis.name for drive in device.drives if drive.origin]
+            names = unchecked(config, device.frame, counted)
+        if names:
+            run.say(
+                f"NOT CHECKED: whether {', '.join(names)} was moved while without "
+                "power. The drive does not tell, and the phone does not see a turn "
+                "about the vertical. If in doubt: jaxcal-rig home"
+            )
+    record = run.postures().get("goto")
+    if record is None:
+        return EXIT_RECALIBRATE
+    reached = np.array(record["measured_deg"])
+    run.say(
+        f"reached {reached.round(4).tolist()} deg, off by "
+        f"{(reached - desired).round(4).tolist()}"
+    )
+    return EXIT_OK
+
+
+def unchecked(
+    config: RigConfig, frame: Frame | None, told: Sequence[str] = ()
+) -> list[str]:
+    """Axes of which neither drive nor phone tells that they were moved when off.
+
+    A drive without homed bit and absolute encoder counts from 0 when it is switched on:
+    where it was left there, its count says nothing. That of ``told`` axes does, whose
+    home is at a count of its own.
+    """
+    seen = [] if frame is None else unseen(config, frame.zero)
+    return [
+        axis.name
+        for axis in config.axes
+        if axis.name in seen
+        and not (axis.map.homed or axis.map.absolute_encoder or axis.name in told)
+    ]

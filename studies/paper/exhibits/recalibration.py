@@ -15,7 +15,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from jaxcal.candidates import uniform_candidates
 from jaxcal.evaluation.parameters import least_squares, predict
 from jaxcal.paper.constants import AXES, NOISE_STD_DEG, RANGES
 from jaxcal.plots.style import (
@@ -66,7 +65,7 @@ def _drifting(material: Material) -> Exhibit:
     settings = material.settings
     count = min(settings.size("repeats"), 250)
     rng = settings.rng(20)
-    unit = uniform_candidates(rng, count * SESSIONS, 50, 3)
+    unit = rng.random((count * SESSIONS, 50, 3))
     commands = RANGES.denormalise(unit).reshape(count, SESSIONS, 50, 3)
     unit = unit.reshape(commands.shape)
     steps = rng.normal(0.0, DRIFT_DEG, (count, SESSIONS, 3))

@@ -121,7 +121,7 @@ def _reward(material: Material) -> Exhibit:
     words = {"count": len(reward), "bound": bound / 10, "side": side}
     return Exhibit.from_texts(
         "reward_range",
-        words | {"constant": RANGES.log_det_scale / 10},
+        words | {"constant": 6.0 * np.log(RANGES.span).sum() / 10},
         verdict=judge(bound / 10 >= 3.0),
         numbers={
             "largest_log_det_s_in_unit_cube": bound,
