@@ -19,6 +19,7 @@ __all__ = [
     "one_of",
     "one_or_each",
     "require_finite",
+    "require_kind",
     "require_none",
     "seconds",
     "share",
@@ -83,6 +84,15 @@ def require_none(bad: NDArray[np.bool_], of: Any, rule: str, more: str = "") -> 
         raise ValueError(f"{rule}, got {of[bad][0]}{more}")
 
 
+def require_kind(argument: str, value: Any, kind: type) -> None:
+    """Refuse what is neither None nor a ``Prior``, or a ``Noise``."""
+    if value is not None and not isinstance(value, kind):
+        raise ValueError(
+            f"{argument} must be a jaxcal.{kind.__name__}(std=...), got "
+            f"{type(value).__name__}"
+        )
+
+
 def table(name: str, values: ArrayLike) -> Array:
     table = numbers(name, values)
     if table.ndim != 2 or table.shape[1] < 1:
@@ -116,7 +126,7 @@ def axis_names(
 ) -> tuple[str, ...]:
     if names is None:
         return tuple(f"{letter}_{axis_letter(i, count)}" for i in range(count))
-    given = tuple(names)
+    given = () if isinstance(names, str) else tuple(names)
     if len(given) != count or not all(isinstance(name, str) and name for name in given):
         raise ValueError(f"{argument} must hold {count} names, got {names!r}")
     return given

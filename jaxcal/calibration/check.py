@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.fit import Fit
-from jaxcal.checks import table, whole_number
+from jaxcal.checks import numbers, table, whole_number
 from jaxcal.information.blocks import without
 from jaxcal.models import SerialChain
 
@@ -143,7 +143,7 @@ def check(
 
 def _tolerance(given: float | None, noise: Array) -> float:
     matters = float(3.0 * np.sqrt(np.mean(noise**2))) if given is None else given
-    if not matters > 0.0:
+    if not numbers("tolerance", matters) > 0.0:
         raise ValueError(f"tolerance must be positive, got {given}")
     return matters
 

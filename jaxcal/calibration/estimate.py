@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from jaxcal.calibration.sizes import Sizes, group_sizes, of_sizes
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
-from jaxcal.checks import in_words, one_of
+from jaxcal.checks import in_words, one_of, require_kind
 from jaxcal.information.blocks import significant, triangle
 from jaxcal.models import (
     Model,
@@ -21,9 +21,9 @@ from jaxcal.models import (
     SerialChain,
     Socket,
 )
-from jaxcal.models.model import facts
+from jaxcal.models.model import facts, require_model
 
-__all__ = ["fit_model", "require_model"]
+__all__ = ["fit_model", "require_fitting"]
 
 Array = NDArray[np.float64]
 
@@ -32,14 +32,9 @@ _NOMINAL = 0.1  # of its length: no arm is so far off, tip included, before it i
 _APART = 0.2  # of it: what two sockets may seem to be off their distance
 
 
-def require_model(model: Any, commands: Array, measured: Array) -> None:
+def require_fitting(model: Any, commands: Array, measured: Array) -> None:
     """Refuse what is no model, and a model of other commands or outputs."""
-    for method in ("predict", "jacobian", "default_prior"):
-        if not callable(getattr(model, method, None)):
-            raise ValueError(
-                f"model must have a method {method} (see jaxcal.models.Model), got "
-                f"{model!r}"
-            )
+    require_model(model)
     if not len(commands):
         raise ValueError("commands must hold at least one row, got none")
     model.predict(commands, None)  # tells some models their number of inputs
@@ -66,8 +61,7 @@ def fit_model(
 ) -> dict[str, Any]:
     """The fields of a ``Calibration`` but names, units and provenance."""
     one_of("loss", loss, ("student", "gaussian"))
-    if prior is not None and not isinstance(prior, Prior):
-        raise ValueError(f"prior must be a jaxcal.Prior, got {type(prior).__name__}")
+    require_kind("prior", prior, Prior)
     used = weights > 0.0
     if not used.any():
         raise ValueError("weights must be positive for one measurement at least")

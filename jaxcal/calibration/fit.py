@@ -285,7 +285,7 @@ class Fit:
 
     def _quantile(self, confidence: float) -> float:
         """Half-width of an interval in standard errors."""
-        if not 0.0 < confidence < 1.0:
+        if not 0.0 < numbers("confidence", confidence) < 1.0:
             raise ValueError(f"confidence must be in (0, 1), got {confidence}")
         from scipy import special  # loads in half the time of scipy.stats
 

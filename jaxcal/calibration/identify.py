@@ -20,8 +20,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.calibration import Calibration
 from jaxcal.calibration.closed_form import fit_affine
-from jaxcal.calibration.estimate import fit_model, require_model
-from jaxcal.checks import array_of, axis_names, levels, require_none, table
+from jaxcal.calibration.estimate import fit_model, require_fitting
+from jaxcal.checks import (
+    array_of,
+    axis_names,
+    levels,
+    require_kind,
+    require_none,
+    table,
+)
 from jaxcal.models import Affine, Model, Noise, Prior
 from jaxcal.models.model import by_name
 
@@ -105,12 +112,10 @@ def identify(
     if weights is not None:
         weight = array_of("weights", weights, len(commands))
         require_none(weight < 0.0, weight, "weights must not be negative")
+    require_kind("noise", noise, Noise)
+    if not (common_noise is None or isinstance(common_noise, bool)):
+        raise ValueError(f"common_noise must be True or False, got {common_noise!r}")
     if noise is not None:
-        if not isinstance(noise, Noise):
-            raise ValueError(
-                f"noise must be a jaxcal.Noise, got {type(noise).__name__}; a number "
-                "goes into noise_std"
-            )
         if noise_std is not None:
             raise ValueError("noise_std is short for noise: give one of them")
         plain = noise.covariance is None and noise.command_std is None
@@ -137,7 +142,7 @@ def identify(
     }
     affine = model is None
     if model is not None:
-        require_model(model, commands, measured)
+        require_fitting(model, commands, measured)
         affine = isinstance(model, Affine)
     if affine and loss in (None, "gaussian"):
         if prior is None and noise is None:

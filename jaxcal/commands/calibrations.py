@@ -116,6 +116,8 @@ def identify(
     else:
         if as_urdf:
             raise ValueError("--out FILE.urdf needs --model FILE.urdf")
+        if of_arm != ArmOptions():
+            raise ValueError("options of an arm need --model FILE.urdf")
         known, names = table.outputs(outputs), table.inputs(inputs)
         if not inputs:
             names = tuple(n for n in names if n not in (*known, weights))

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import one_of, table
+from jaxcal.checks import one_of, require_kind, table
 from jaxcal.information.blocks import SINGULAR, significant, triangle
-from jaxcal.models.model import Model, derivative, facts
+from jaxcal.models.model import Model, derivative, facts, require_model
 from jaxcal.models.uncertainty import Noise, Prior
 
 __all__ = ["Direction", "Identifiability", "identifiability"]
@@ -89,6 +89,9 @@ def identifiability(
     commands = table("candidates", candidates)
     if not len(commands):
         raise ValueError("candidates must hold at least one row, got none")
+    require_model(model)
+    require_kind("noise", noise, Noise)
+    require_kind("prior", prior, Prior)
     known = None if prior is None else prior.resolve(model)
     mean = model.nominal if known is None else known.mean
     jacobian = derivative(model, commands, mean)
@@ -108,6 +111,7 @@ def identifiability(
         asked &= ~np.isin(model.names, list(held))
     rows = np.vstack([rows, facts(model, mean)[1]])
     if parameters is not None:
+        parameters = [parameters] if isinstance(parameters, str) else parameters
         for name in parameters:
             one_of("parameters", name, model.names)
         asked &= np.isin(model.names, list(parameters))

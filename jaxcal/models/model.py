@@ -21,6 +21,7 @@ __all__ = [
     "derivative",
     "facts",
     "predict",
+    "require_model",
 ]
 
 Array = NDArray[np.float64]
@@ -73,6 +74,18 @@ class Model(Protocol):
 
     def to_dict(self) -> dict[str, Any]:
         """JSON with a ``kind``; :func:`jaxcal.models.from_dict` reads it."""
+
+
+def require_model(model: Any) -> None:
+    """Refuse a class, and what has not the methods of a model."""
+    methods = ("predict", "jacobian", "command_jacobian", "default_prior")
+    missing = [name for name in methods if not callable(getattr(model, name, None))]
+    if missing or isinstance(model, type):
+        raise ValueError(
+            "model must be of jaxcal.models, or an object with the methods of "
+            f"jaxcal.models.Model, got {model!r}"
+            + (f" without {missing[0]}" if missing else "")
+        )
 
 
 def as_commands(commands: ArrayLike, num_inputs: int) -> Array:

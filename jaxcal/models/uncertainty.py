@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -53,10 +53,8 @@ class Prior:
     by_data: bool = False
 
     def __post_init__(self) -> None:
-        if isinstance(self.fixed, str):
-            raise ValueError(
-                f"fixed must be a sequence of names, got the text {self.fixed!r}"
-            )
+        if isinstance(self.fixed, str) or not isinstance(self.fixed, Collection):
+            raise ValueError(f"fixed must be a sequence of names, got {self.fixed!r}")
         given = self.std
         given = [*given.values()] if isinstance(given, Mapping) else given
         std = numbers("std of the prior", given, finite=False)

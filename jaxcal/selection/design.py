@@ -161,10 +161,10 @@ class Design(Planned, Travelled):
         Raises:
             RuntimeError: it is no selection of this problem: the solver is wrong.
         """
-        indices, value = found.indices, found.value
+        indices, value = np.asarray(found.indices), found.value
         counts = np.bincount(indices, minlength=len(problem.blocks))
-        allowed = (problem.lower <= counts) & (counts <= problem.upper)
-        if len(indices) != problem.k or not allowed.all():
+        right = len(indices) == problem.k and len(counts) == len(problem.blocks)
+        if not right or ((counts < problem.lower) | (counts > problem.upper)).any():
             raise RuntimeError(
                 f"method {method!r} must return {problem.k} candidates within lower "
                 f"and upper of its problem, got {indices.tolist()}"

@@ -139,7 +139,7 @@ def checked_options(method: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """
     one_of("method", method, tuple(SOLVERS))
     reads = _options(SOLVERS[method])
-    checked = {name: OPTIONS[name][0] for name in reads}
+    checked = {name: OPTIONS[name][0] for name in reads if name in OPTIONS}
     for name, value in given.items():
         one_of("the name of an option", name, tuple(OPTIONS))
         default, check = OPTIONS[name]

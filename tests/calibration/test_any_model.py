@@ -501,7 +501,7 @@ def broken(method: str, answer: Any) -> Any:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"model": 3}, "model must have a method predict"),
+        ({"model": 3}, "model must be of jaxcal.models, .* got 3 without predict"),
         (
             {"model": Affine(3, 2), "loss": "student"},
             r"commands must have shape \(N, 3\) for this mo",
@@ -523,14 +523,16 @@ def broken(method: str, answer: Any) -> Any:
             {"model": broken("jacobian", lambda n: np.full((n, 2, 6), np.inf))},
             "model.jacobian must be finite, got inf by a, b.* for the command",
         ),
-        ({"prior": 1.0}, "prior must be a jaxcal.Prior, got float"),
+        ({"prior": 1.0}, r"prior must be a jaxcal.Prior\(std=...\), got float"),
         ({"prior": Prior({"zz": 1.0})}, "must name parameters of the model"),
         ({"noise": Noise(1.0), "noise_std": 1.0}, "give one of them"),
         ({"noise": Noise(np.ones((3, 2)))}, r"std of the noise must be .* \(3, 2\)"),
         ({"noise": Noise(1.0, command_std=[1, 2, 3])}, "command_std must be one"),
         ({"noise": Noise(1.0, command_std=np.inf)}, "must leave fewer unknown"),
         ({"noise_std": 1.0, "common_noise": True}, "give one of them"),
-        ({"noise": 0.1}, "noise must be a jaxcal.Noise, got float; a number goes"),
+        ({"noise": 0.1}, r"noise must be a jaxcal.Noise\(std=...\), got float"),
+        ({"common_noise": "no"}, "common_noise must be True or False, got 'no'"),
+        ({"input_names": "ab"}, "input_names must hold 2 names, got 'ab'"),
         ({"loss": "huber"}, "loss must be one of student, gaussian"),
         ({"weights": np.zeros(12)}, "weights must be positive for one"),
     ],

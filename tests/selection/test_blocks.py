@@ -277,7 +277,7 @@ def test_bad_blocks_are_one_clear_error():
     refused("prior must be a symmetric", prior=np.triu(np.ones((4, 4))))
     refused("prior must be a positive semidefinite", prior=-np.eye(4))
     bare = {"blocks": None, "candidates": np.ones((8, 3))}
-    refused("prior must be a jaxcal.Prior where candidates are given", **bare, prior=1)
+    refused(r"prior must be a jaxcal.Prior\(std=...\), got int", **bare, prior=1)
     refused('blocks cannot be used with method "policy"', method="policy")
     blind = blocks * [1, 1, 0, 1]
     refused("say nothing of the direction theta3", blocks=blind)

@@ -80,6 +80,8 @@ def joint_numbers(argument: str, given: Sequence[int], n: int) -> tuple[int, ...
 def load(
     given: tuple[int, float, ArrayLike], n: int
 ) -> tuple[int, float, tuple[float, float, float]]:
+    if len(given) != 3:
+        raise ValueError(f"loads must be (link, weight, centre) each, got {given!r}")
     link, weight, centre = given
     if whole_number("link of a load", link, 1) > n:
         raise ValueError(f"link of a load must be at most {n}, got {link}")

@@ -651,7 +651,7 @@ def _limits(given: ArrayLike | None, columns: int) -> Array:
     open_ended = np.tile([-np.inf, np.inf], (columns, 1))
     if given is None:
         return open_ended
-    limits = np.array(given, dtype=np.float64)  # None becomes NaN
+    limits = numbers("limits", given, finite=False)  # None becomes NaN
     if limits.shape != (columns, 2):
         raise ValueError(f"limits must have shape ({columns}, 2), got {limits.shape}")
     limits = np.where(np.isnan(limits), open_ended, limits)

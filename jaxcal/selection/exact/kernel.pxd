@@ -38,6 +38,7 @@ cdef class Search:
     cdef double* lapack
     cdef int[::1] whole
     cdef int size
+    cdef int now  # the kind of the bound where the relaxation ended
     cdef int places  # t
     cdef double tail_weight
     cdef double smoothing  # b of E
@@ -92,4 +93,5 @@ cdef class Search:
     cdef double _relax(self, int kind, double* low, double* high, double* c, double goal, double share) except? -1.0 nogil
     cdef void _offer(self, const double* counts) noexcept nogil
     cdef bint _balance(self, const double* low, const double* high, double* c) noexcept nogil
+    cdef void _stiffen(self, const double* c) noexcept nogil
     cdef Py_ssize_t _process(self, double* low, double* high, double* c, double slack, double share, double* bound) except -2 nogil

@@ -57,6 +57,7 @@ from cython.cimports.jaxcal.information.linear_algebra import (
     dot,
     eigen,
     factor,
+    invert_lower,
     multiply,
     take,
 )
@@ -673,6 +674,7 @@ class Search:
         after: cython.double = value
         tunes = _TUNES
         for step in range(_MAX_STEPS):
+            self.now = kind
             self._leverages()
             gain = self._linear_gain(low, high, c)
             bound = self.base + gain
@@ -797,6 +799,43 @@ class Search:
             total += c[best] - before
         return True
 
+    def _stiffen(self, c):
+        """Let ``wish`` be how much the bound bends as a fractional count is forced.
+
+        A count that moves by d, the others following, costs ``d^2 / 2`` over its entry
+        in the inverse of the curvature among counts of one sum.
+        """
+        m: cython.int = 0
+        largest: cython.double = 1e-300
+        total: cython.double = 0.0
+        lower = self.curvature
+        for o in range(self.opened):
+            i = self.open[o]
+            self.wish[i] = 0.0
+            if fabs(c[i] - floor(c[i] + 0.5)) > _WHOLE and m < self.most_moved:
+                self.which[m] = i
+                m += 1
+        self._hessian(self.now, m)
+        for f in range(m):
+            largest = max(largest, lower[f * m + f])
+            self.ends[f] = self.move[f] = 0.0
+        for f in range(m):
+            lower[f * m + f] += _RIDGE * largest
+        cholesky(lower, lower, m, _RIDGE * largest)
+        invert_lower(lower, m)
+        for r in range(m):
+            row = lower + r * m
+            across: cython.double = 0.0
+            for f in range(r + 1):
+                across += row[f]
+            for f in range(r + 1):
+                self.ends[f] += row[f] * row[f]
+                self.move[f] += row[f] * across
+            total += across * across
+        for f in range(m):
+            free = self.ends[f] - self.move[f] * self.move[f] / total
+            self.wish[self.which[f]] = 1.0 / (largest * max(free, 1e-300))
+
     def _process(self, low, high, c, slack, share, bound):
         """Solve, tighten and, where settled, close one node.
 
@@ -838,6 +877,8 @@ class Search:
         whole: cython.bint = True
         branch: cython.Py_ssize_t = -1
         score: cython.double = -1.0
+        if not settled:
+            self._stiffen(c)
         total: cython.double = 0.0
         for i in range(self.count):
             away = fabs(c[i] - floor(c[i] + 0.5))
@@ -845,12 +886,15 @@ class Search:
                 whole = False
             total += floor(c[i] + 0.5)
             if low[i] < high[i]:
-                # The nearest below a whole number: with it chosen the bound is sharper.
+                # What both branches cost the bound, one times the other. With few
+                # readings left a count that is nearly chosen, which sharpens the bound.
                 # Among whole ones the one nearest to changing.
                 this = _WHOLE / (1.0 + fabs(self.leverage[i] - self.cut))
                 if away > _WHOLE:
-                    this = c[i] - floor(c[i])
-                if this > score:
+                    part = c[i] - floor(c[i])
+                    weight = part if self.now == _RANK else 1.0 - part
+                    this = 1.0 + part * weight * self.wish[i]
+                if branch < 0 or this > score:
                     score, branch = this, i
         if whole and total == self.k:
             for i in range(self.count):

@@ -12,10 +12,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import array_of, numbers
+from jaxcal.checks import array_of, numbers, require_kind
 from jaxcal.information.blocks import coarseness
 from jaxcal.models.affine import Affine
-from jaxcal.models.model import Model, by_name
+from jaxcal.models.model import Model, by_name, require_model
 from jaxcal.models.uncertainty import Noise, Prior
 from jaxcal.selection.criteria import wanted
 from jaxcal.selection.problem.making import (
@@ -60,14 +60,9 @@ class Asked:
         *,
         names: Sequence[str] | None = None,
     ) -> None:
-        if model is not None and (
-            isinstance(model, type) or not hasattr(model, "default_prior")
-        ):
-            raise ValueError(
-                "model must be of jaxcal.models, or an object with the methods of "
-                f"jaxcal.models.Model, got {model!r}"
-            )
-        _require_kind("prior", prior, Prior)
+        if model is not None:
+            require_model(model)
+        require_kind("prior", prior, Prior)
         candidates = by_name(model, candidates)
         array = filled("candidates", candidates, "M", "n")
         self.model = Affine(array.shape[1], array.shape[1]) if model is None else model
@@ -196,20 +191,12 @@ class Asked:
         required: ArrayLike | None,
         max_replicates: int,
     ) -> None:
-        _require_kind("noise", noise, Noise)
+        require_kind("noise", noise, Noise)
         self.prior, self.noise = prior, noise
         # Copies: the caller's arrays may change before the next question.
         self._measured = None if measured is None else numbers("measured", measured)
         self._required = copy.deepcopy(required)
         self.max_replicates = max_replicates
-
-
-def _require_kind(argument: str, value: Any, kind: type) -> None:
-    if value is not None and not isinstance(value, kind):
-        raise ValueError(
-            f"{argument} must be a jaxcal.{kind.__name__} where candidates are given, "
-            f"got {type(value).__name__}"
-        )
 
 
 def _with_measured(root: Array, blocks: Array) -> Array:
