@@ -1,12 +1,13 @@
-# Everything runs in .venv, made on first use from constraints.txt. Python compiles what it
-# imports; pip compiling everything takes as long again as installing it.
+# Everything runs in .venv, made on first use: jaxcal, whose kernels compile meanwhile, and
+# every line of constraints.txt. Python compiles what it imports; pip compiling everything
+# takes as long again as installing it.
 PYTHON ?= $(shell for p in python3 python3.13 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
 VENV ?= .venv
 BENCH ?= .venv-bench
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
-DOCS := $(VENV)/.docs
+INSTALL := $(BIN)/python -m pip install --quiet --no-compile --no-deps
 KERNELS := hatch_build.py $(shell find jaxcal -name '*kernel.py' -o -name '*.pxd')
 
 .DEFAULT_GOAL := help
@@ -18,11 +19,8 @@ help: ## this list
 $(READY): pyproject.toml constraints.txt $(KERNELS)
 	@test -n "$(PYTHON)" || { echo "jaxcal needs Python 3.11 or newer: make PYTHON=/path/to/python3.11"; exit 2; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[all,dev]'
-	@touch $@
-
-$(DOCS): $(READY)
-	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[all,dev,docs]'
+	$(INSTALL) -e . & jaxcal=$$!; $(INSTALL) -r constraints.txt && wait $$jaxcal
+	$(BIN)/python -m pip check
 	@touch $@
 
 train: $(READY) ## set everything up and train the compact policy on this machine (a few minutes)
@@ -44,10 +42,13 @@ test: export XLA_FLAGS ?= --xla_backend_optimization_level=0 --xla_cpu_use_fusio
 test: export PYTHONDONTWRITEBYTECODE =
 # Half of the rig's tests wait for a device, so four share two cores, file by file in order:
 # xdist would put the files of few long tests last.
-test: lint ## set everything up, lint, and run the quick tests (the ones CI runs)
+# Each of them would compile everything that the tests import: one process does it before,
+# while mypy runs.
+test: $(READY) ## set everything up, lint, and run the quick tests (the ones CI runs)
+	$(BIN)/python -m pytest --collect-only -qq >/dev/null & $(MAKE) --no-print-directory lint && wait
 	$(BIN)/python -m pytest -n 4 --dist loadfile --no-loadscope-reorder -m 'not slow' $(ARGS)
 
-test-all: $(DOCS) lint ## every test, the slow ones too, hypothesis drawing new examples
+test-all: $(READY) lint ## every test, the slow ones too, hypothesis drawing new examples
 	$(BIN)/python -m pytest --hypothesis-profile=new $(ARGS)
 
 lint: $(READY) ## ruff (lint and format), mypy and the import contracts
@@ -69,10 +70,10 @@ $(BENCH)/.ready: pyproject.toml constraints.txt constraints-bench.txt
 benchmark: $(BENCH)/.ready ## every benchmark with its peers: table, JSON, figures (26 to 40 minutes; ARGS="--only steps", "--quick")
 	$(BENCH)/bin/python -m benchmarks $(ARGS)
 
-docs: $(DOCS) ## the documentation site in site/, strictly and without a network
+docs: $(READY) ## the documentation site in site/, strictly and without a network
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet $(ARGS)
 
-docs-serve: $(DOCS) ## the site at http://127.0.0.1:8000, built again at each change
+docs-serve: $(READY) ## the site at http://127.0.0.1:8000, built again at each change
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs serve $(ARGS)
 
 release-check: $(READY) ## wheel and sdist in fresh environments of Python 3.11, 3.12, 3.13 (or ARGS="INTERPRETER...")

@@ -1,4 +1,4 @@
-"""``ahead``, which is not tuned, and other deciders on twenty families of tasks.
+"""``ahead`` and other deciders on twenty families of tasks.
 
     python benchmarks/families.py [--episodes 4096] [--seed 0] [--families 0 1 ...]
         [--methods NAME ...] [--keep DIR] [--json FILE]
@@ -6,11 +6,13 @@
     python benchmarks/families.py --tune
 
 A family is a task drawn by ``jaxcal.adaptive.family`` from a held-out structure: the
-constants of ``shares`` and ``ahead`` were found on other structures. Every method plays
-the same sessions of it; ``priced`` and ``state`` are tuned on it first, 20 generations
-each, on other sessions. ``two_step`` and ``rollouts`` follow ``shares`` and play fewer.
-Differences are in pairs with standard errors; times are of one core, a choice in a
-batch. With --keep what was played lies in DIR and is not played again.
+constants of ``shares`` and how ``ahead`` is fitted were found on other structures.
+Every method plays the same sessions of it; on other sessions ``priced`` and ``state``
+are tuned on it first, 20 generations each, and ``ahead`` is fitted. ``two_step`` and
+``rollouts`` follow ``shares`` and play fewer, as ``deep`` does: ``ahead`` not fitted,
+of trees a hundred times as large. Differences are in pairs with standard errors; times
+are of one core, a choice in a batch. With --keep what was played lies in DIR and is
+not played again.
 --optimum plays small tasks of the same structures, their answers made certain and
 their costs whole, of which dynamic programming finds the optimum; any numbers of
 --families, by the first ten of which the trees of ``ahead`` were shaped. --tune finds
@@ -40,8 +42,9 @@ from jaxcal.adaptive.episodes import compare, play
 from jaxcal.adaptive.family.draws import draw
 from jaxcal.adaptive.family.padded import batch
 from jaxcal.adaptive.family.structures import HELD_OUT, Limits
+from jaxcal.adaptive.fitting import fit
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.lookahead import AHEAD, Rollouts, TwoStep
+from jaxcal.adaptive.lookahead import AHEAD, Ahead, Rollouts, TwoStep
 from jaxcal.adaptive.rules import (
     SHARES,
     Gain,
@@ -58,14 +61,15 @@ from jaxcal.learning.runtime import cache
 
 METHODS = (
     "random", "gain", "rate", "shares", "ahead", "priced", "state", "two_step",
-    "rollouts16", "rollouts64",
+    "rollouts16", "rollouts64", "deep",
 )  # fmt: skip
 TUNED = ("priced", "state")
 RULES = ("gain", "rate", *TUNED)
 BUDGETS = ("time+uses", "time", "uses", "time+uses+number", "uses+number", "time+uses",
            "time+number")  # fmt: skip
 STATES = (256, 512, 1024)
-FEWER = {"two_step": 256, "rollouts16": 64, "rollouts64": 32}  # sessions at most
+# Sessions at most.
+FEWER = {"two_step": 256, "rollouts16": 64, "rollouts64": 32, "deep": 256}
 BATCH = {"two_step": 64, "rollouts16": 16, "rollouts64": 16}
 _FIRST = 10**7  # seed
 
@@ -160,7 +164,8 @@ def decider_of(method: str, task: GridTask, seed: int, found: dict[str, Any]) ->
         )
     return {
         "random": Random, "gain": Gain, "rate": GainRate, "shares": lambda: SHARES,
-        "ahead": lambda: AHEAD,
+        "ahead": lambda: fit(task, seed=seed + 1).decider,
+        "deep": lambda: Ahead(effort=100.0 * AHEAD.effort),
         "priced": lambda: found["priced"], "state": lambda: found["state"],
         "two_step": lambda: TwoStep(SHARES),
         "rollouts16": lambda: Rollouts(SHARES, rollouts=16),

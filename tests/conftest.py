@@ -29,6 +29,16 @@ hypothesis.settings.register_profile("new", deadline=None)
 hypothesis.settings.load_profile("same")
 
 
+@pytest.fixture(autouse=True, scope="module")
+def few_programs():
+    """Compiled programs hold memory maps, of which Linux allows 65,530 a process: one
+    that runs every slow test would abort."""
+    yield
+    maps = pathlib.Path("/proc/self/maps")
+    if maps.exists() and len(maps.read_text().splitlines()) > 20_000:
+        jax.clear_caches()
+
+
 @pytest.fixture
 def key() -> jax.Array:
     return jax.random.key(0)

@@ -97,12 +97,13 @@ def brax(sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:
     network = build(config.network)
     validation = training.Validation(sets, best, 3)
 
-    def watch(step: int, params: Any) -> None:
-        if clock.say(validation.measure(network, params, 4)[0]):
+    def watch(step: int, make_policy: Any, params: Any) -> None:
+        if clock.say(validation.measure(network, params[1], 4)[0]):
             raise Done
 
     with tempfile.TemporaryDirectory() as folder:
-        brax_ppo.train(config, folder, lambda line: None, num_evals=500, watch=watch)
+        options = {"num_evals": 500, "policy_params_fn": watch}
+        brax_ppo.train(config, folder, lambda line: None, **options)
 
 
 def sb3(sets: np.ndarray, best: np.ndarray, clock: Clock) -> None:

@@ -15,7 +15,7 @@ from jaxcal.adaptive.rules import SHARES, Rule, Shares, best, log_score, shortli
 from jaxcal.adaptive.search_kernel import Tree
 from jaxcal.adaptive.session import Options, Session
 
-__all__ = ["AHEAD", "Ahead", "Rollouts", "TwoStep"]
+__all__ = ["AHEAD", "Ahead", "Rollouts", "TwoStep", "tree"]
 
 
 @struct.dataclass
@@ -29,6 +29,8 @@ class Ahead:
     """
 
     base: Shares = SHARES
+    doubt: Any = 0.3  # of what is estimated: by so much another must beat ``shares``
+    hints: Any = None  # (N, A) multiples of the scores of the first N measurements
     effort: float = struct.field(pytree_node=False, default=7e5)
 
     def __call__(
@@ -36,23 +38,28 @@ class Ahead:
     ) -> jax.Array:
         if not isinstance(task, GridTask):
             return self.base(task, belief, session, options, key)
-        rule = self.base
-        constants = jnp.stack([rule.time, rule.use, rule.a, rule.b])
+        constants, hints = self.constants()
         chosen: jax.Array = jax.pure_callback(
             functools.partial(_chosen, task.horizon, self.effort),
             jax.ShapeDtypeStruct((), jnp.int32),
             *(task.likelihood, task.travel, task.extra, task.uses, task.place_after),
-            *(options.allowed, constants, belief.weights),
+            *(options.allowed, jnp.stack(constants), hints, belief.weights),
             *(session.place, session.seconds, session.uses, session.made),
             vmap_method="expand_dims",
         )
         return chosen
 
+    def constants(self) -> tuple[list[Any], Any]:
+        """Those of ``shares`` and the doubt, and (N, A) or (1, 1) hints."""
+        rule = self.base
+        numbers = [rule.time, rule.use, rule.a, rule.b, rule.haste, self.doubt]
+        return numbers, np.ones((1, 1)) if self.hints is None else self.hints
+
 
 AHEAD = Ahead()
 
-_TABLES = 7  # arrays of the task come first, then those of the session
-_DIMENSIONS = (3, 2, 2, 2, 2, 1, 1, 1, 0, 0, 0, 0)
+_TABLES = 8  # arrays of the task come first, then those of the session
+_DIMENSIONS = (3, 2, 2, 2, 2, 1, 1, 2, 1, 0, 0, 0, 0)
 
 
 def _chosen(horizon: int, effort: float, *arrays: Any) -> Any:
@@ -68,28 +75,39 @@ def _chosen(horizon: int, effort: float, *arrays: Any) -> Any:
     ]
     chosen = np.empty(batch, np.int32)
     for index in np.ndindex(tasks):  # one, where there is one task
-        table, travel, extra, uses, after, allowed, constants = (
+        table, travel, extra, uses, after, allowed, constants, hints = (
             array[
                 tuple(min(i, n - 1) for i, n in zip(index, array.shape, strict=False))
             ]
             for array in given[:_TABLES]
         )
-        tree = Tree(
-            _single(table), _single(travel), _single(extra.T),
-            _single(uses.T), np.array(after, np.int32), _single(allowed),
-            horizon, constants, effort,
+        searched = tree(
+            table, travel, extra, uses, after, allowed, constants, hints, horizon,
+            effort,
         )  # fmt: skip
         at = tuple(
             slice(None) if n == 1 else i for i, n in zip(index, tasks, strict=True)
         )
         belief, place, seconds, left, made = (state[at] for state in states)
         found = np.empty(place.size, np.int32)
-        tree.choose(
+        searched.choose(
             _single(belief).reshape(found.size, -1), _whole(place),
             _single(seconds).ravel(), _whole(left), _whole(made), found,
         )  # fmt: skip
         chosen[at] = found.reshape(place.shape)
     return chosen
+
+
+def tree(
+    likelihood: Any, travel: Any, extra: Any, uses: Any, place_after: Any,
+    allowed: Any, constants: Any, hints: Any, horizon: int, effort: float,
+) -> Tree:  # fmt: skip
+    """The kernel's object from tables as ``GridTask`` has them."""
+    return Tree(
+        _single(likelihood), _single(travel), _single(np.transpose(extra)),
+        _single(np.transpose(uses)), np.array(place_after, np.int32),
+        _single(allowed), horizon, constants, _single(hints), effort,
+    )  # fmt: skip
 
 
 def _single(array: Any) -> Any:

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxcal.adaptive.fitting import fit, outside
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.history import (
     History,
@@ -42,6 +43,7 @@ class Proposal:
     number: int  # measurements made before it
     belief: Any
     session: Session  # what is left
+    outside: tuple[str, ...]  # see ``fitting.outside``; empty where a decider was given
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,7 +71,8 @@ def next_measurement(
         history: (design, outcome) of each measurement in order. A design is an index of
             ``task.designs`` (a whole number) or its coordinates.
         decider: when not given, the largest expected gain, and where time or uses count
-            ``lookahead.AHEAD``.
+            what ``fitting.fit`` finds for the task and this budget: the first call
+            simulates some seconds.
         seconds: budget of the whole session; the task's when not given.
         uses: likewise of what is countable.
         seed: of deciders and beliefs that draw. The same arguments, the same proposal.
@@ -78,9 +81,10 @@ def next_measurement(
         ValueError: an entry of the history that cannot be, by its number.
     """
     belief, session = begin(task, seconds, uses, seed)
+    beyond = outside(task) if decider is None else ()
     decider = _default(task, session) if decider is None else decider
     belief, session, _ = replay(task, history, belief, session, seed)
-    return _proposal(task, decider, belief, session, seed)
+    return _proposal(task, decider, belief, session, seed, beyond)
 
 
 def run(
@@ -109,7 +113,6 @@ def run(
             none, or cannot follow what was measured before.
     """
     belief, session = begin(task, seconds, uses, seed)
-    decider = _default(task, session) if decider is None else decider
     header = {
         "task": fingerprint(task),
         "decider": fingerprint(decider),
@@ -117,6 +120,8 @@ def run(
         "uses": int(session.uses),
         "seed": seed,
     }
+    beyond = outside(task) if decider is None else ()
+    decider = _default(task, session) if decider is None else decider
     file = None if journal is None else Journal(journal, header)
     try:
         kept = [] if file is None else file.entries
@@ -126,7 +131,7 @@ def run(
         ]
         belief, session, entries = replay(task, made, belief, session, seed)
         while True:
-            proposal = _proposal(task, decider, belief, session, seed)
+            proposal = _proposal(task, decider, belief, session, seed, beyond)
             if proposal.design is None or enough(proposal):
                 return Finished(entries, belief, session)
             outcome = measure(proposal)
@@ -144,27 +149,36 @@ def run(
 
 def _default(task: Task, session: Session) -> Decider:
     counted = isinstance(task, GridTask) and bool((task.uses > 0).any())
-    return AHEAD if math.isfinite(session.seconds) or counted else Gain()
+    if not (math.isfinite(session.seconds) or counted):
+        return Gain()
+    if type(task) is not GridTask:  # a kind of its own may not allow every design
+        return AHEAD
+    return fit(task, float(session.seconds), int(session.uses)).decider
 
 
 def _proposal(
-    task: Task, decider: Decider, belief: Any, session: Session, seed: int
+    task: Task,
+    decider: Decider,
+    belief: Any,
+    session: Session,
+    seed: int,
+    beyond: tuple[str, ...],
 ) -> Proposal:
     number = int(session.made)
     if bool(session.over) or number >= task.horizon:
-        return Proposal(None, None, 0.0, 0.0, 0.0, number, belief, session)
+        return Proposal(None, None, 0.0, 0.0, 0.0, number, belief, session, beyond)
     keys = step_keys(seed, number)
     design, gain, took, uses, any_left = _choose(task, decider, belief, session, keys)
     if not took >= 0.0:
         raise ValueError(f"a measurement must cost at least 0 s, got {float(took):g}")
     if not any_left:
-        return Proposal(None, None, 0.0, 0.0, 0.0, number, belief, session)
+        return Proposal(None, None, 0.0, 0.0, 0.0, number, belief, session, beyond)
     table = getattr(task, "designs", None)
     design = jax.tree.map(np.asarray, design)
     coordinates = design if table is None else np.asarray(table[int(design)])
     return Proposal(
         design if table is None else int(design), coordinates,
-        float(gain), float(took), float(uses), number, belief, session,
+        float(gain), float(took), float(uses), number, belief, session, beyond,
     )  # fmt: skip
 
 

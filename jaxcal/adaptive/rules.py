@@ -132,19 +132,21 @@ class Shares(Rule):
 
     ``1 / n + time s / t + use (u / e) N^a e^b``: a measurement takes s of the t seconds
     and u of the e uses left (no share counts as more than 1), n measurements may still
-    be made, and N of those that gain most a second. No unit of time matters.
+    be made, and N of those that gain most a second. No unit of time matters. Where time
+    is not limited the time of these N stands for t, and ``haste`` for ``time``.
     """
 
     time: Any = 1.0
     use: Any = 1.0
     a: Any = 0.0
     b: Any = 0.0
+    haste: Any = 0.0
     num_free: ClassVar[int] = 4
 
     def moved(self, by: Any) -> Shares:
         return Shares(
             self.time * np.exp(by[0]), self.use * np.exp(by[1]),
-            self.a + by[2], self.b + by[3],
+            self.a + by[2], self.b + by[3], self.haste * np.exp(by[0]),
         )  # fmt: skip
 
     def judged(
@@ -157,12 +159,13 @@ class Shares(Rule):
         always = jnp.where(options.allowed, u, jnp.inf).min()
         n = jnp.maximum(task.horizon - session.made, 1).astype(gains.dtype)
         n = jnp.minimum(n, jnp.maximum(e / jnp.maximum(always, 1e-6), 1.0))
-        t = jnp.maximum(session.seconds, 1e-9)
         each = jnp.maximum(s[best(log_score(gains, s), options)], 1e-9)
+        limited = jnp.isfinite(session.seconds)
+        t = jnp.where(limited, jnp.maximum(session.seconds, 1e-9), n * each)
         number = jnp.minimum(n, jnp.maximum(t / each, 0.1))
         price = (
             1.0 / n
-            + self.time * jnp.minimum(s / t, 1.0)
+            + jnp.where(limited, self.time, self.haste) * jnp.minimum(s / t, 1.0)
             + self.use * jnp.clip((u - always) / e, 0.0, 1.0)
             * number**self.a * e**self.b
         )  # fmt: skip

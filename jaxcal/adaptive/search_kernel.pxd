@@ -16,8 +16,9 @@ cdef class Tree:
     cdef int[:, ::1] place_after  # (A, Y)
     cdef float[::1] allowed  # (D,) 1 or 0
     cdef float[::1] closed  # (D,) 0 or 1e9
+    cdef float[:, ::1] hints  # (N, D) multiples of scores
     cdef int horizon
-    cdef double time, a, effort
+    cdef double time, a, haste, doubt, effort
     cdef double[::1] use_of  # constant of a use, where 1 to _USES are left
     cdef float cut  # least weight that is followed, of that of its node
     cdef int designs  # D
@@ -37,6 +38,7 @@ cdef class Tree:
     cdef float[:, ::1] seconds
     cdef float[:, ::1] needs
     cdef double[::1] guess
+    cdef float[::1] belief  # of the session that is played
     cdef int _best(self, float* belief, State now) noexcept nogil
     cdef double _size(self, int number) noexcept nogil
     cdef void _sum(self, int level) noexcept nogil

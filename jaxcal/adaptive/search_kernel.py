@@ -15,7 +15,7 @@ a node at the end of the tree may still gain is an estimate, g (1 - exp(-k m)) /
 (1 - exp(-k)): g of the proposed measurement, m of them fit into what is left, and each
 tells less than the one before since what is unknown ends; fitted to sessions of
 ``shares`` on tasks of the family. The first proposal is kept unless another is better
-by ``_DOUBT`` of what is estimated, so a tree that reaches every session's end is exact.
+by ``doubt`` of what is estimated, so a tree that reaches every session's end is exact.
 
 Trees are tried from the smallest, as long as ``effort`` multiplications suffice.
 
@@ -33,18 +33,21 @@ from cython.cimports.jaxcal.watch import Watch, begin, late
 from cython.cimports.libc.math import INFINITY, expf, fmax, fmin
 from cython.cimports.libc.string import memcpy
 
-__all__ = ["Tree"]
+__all__ = ["NODE", "SUM", "Tree"]
 
 _DEPTH = cython.declare(cython.int, 4)
 # Measurements that are followed at each level.
-_WIDTHS = ((6,), (4, 1), (6, 1, 1), (6, 2, 1), (6, 2, 1, 1), (6, 3, 2, 1))
+_WIDTHS = (
+    (6,), (4, 1), (6, 1, 1), (6, 2, 1), (6, 2, 1, 1), (6, 3, 2, 1), (12, 4, 2, 1),
+    (24, 8, 3, 2), (48, 12, 6, 4),
+)  # fmt: skip
 # Multiplications that take as long as the rest of a node: of each sum, and of all.
 _EACH = cython.declare(cython.double, 35.0)
 _NODE = cython.declare(cython.double, 2400.0)
+SUM, NODE = _EACH, _NODE
 _LIKELY = cython.declare(cython.float, 1e-4)  # of 1 / S: less weight is left out
 _NO_CHANCE = cython.declare(cython.double, 1e-6)  # of an outcome that is not followed
 _USES = cython.declare(cython.int, 64)  # from which on a use costs the same
-_DOUBT = cython.declare(cython.double, 0.3)
 # m is _FIT price^-_BEND; k is _FALL g / entropy + _FLAT.
 _FIT = cython.declare(cython.double, 2.4)
 _BEND = cython.declare(cython.double, 0.9)
@@ -103,24 +106,25 @@ def _argmax(values, count):
 
 
 class Tree:
-    """A task, the constants of ``shares`` and the work space of one path."""
+    """A task, the constants of ``Ahead`` and the work space of one path."""
 
     def __init__(
-        self, likelihood, travel, extra, uses, place_after, allowed, horizon, shares,
-        effort,
+        self, likelihood, travel, extra, uses, place_after, allowed, horizon,
+        constants, hints, effort,
     ):  # fmt: skip
-        # As in GridTask, but for extra and uses, (Y, A).
+        # As in GridTask, but for extra and uses, (Y, A). Hints are (N, A), the last for
+        # the Nth measurement and all that follow.
         designs, outcomes, states = likelihood.shape
         more = -designs % 8
         self.designs, self.outcomes = designs + more, outcomes
         self.likelihood, self.place_after = likelihood, place_after
         self.horizon, self.effort, self.cut = horizon, effort, _LIKELY / states
-        self.time, use, self.a, b = shares
+        self.time, use, self.a, b, self.haste, self.doubt = constants
         e = np.arange(1.0, _USES + 1)
         self.use_of = use * e ** (b - 1.0)
-        self.travel, self.extra, self.uses, self.allowed = (
+        self.travel, self.extra, self.uses, self.allowed, self.hints = (
             np.pad(table, [(0, 0)] * (table.ndim - 1) + [(0, more)])
-            for table in (travel, extra, uses, allowed)
+            for table in (travel, extra, uses, allowed, hints * allowed)
         )
         self.closed = np.float32(1e9) * (1 - np.pad(allowed, (0, more)))
         # Of each state L of all outcomes but the first, then the sum of L log L.
@@ -141,6 +145,7 @@ class Tree:
         four = np.zeros((4, levels, self.designs), np.float32)
         self.gains, self.scores, self.seconds, self.needs = four
         self.guess = np.zeros(levels)
+        self.belief = np.zeros(states, np.float32)
 
     def choose(
         self,
@@ -160,6 +165,54 @@ class Tree:
                 now.place, now.seconds = place[i], seconds[i]
                 now.uses, now.made = uses[i], made[i]
                 chosen[i] = self._best(cython.address(beliefs[i, 0]), now)
+
+    def play(
+        self,
+        prior: cython.float[::1],
+        place: cython.int,
+        seconds: cython.float[::1],
+        uses: cython.int[::1],
+        truth: cython.int[::1],
+        draws: cython.float[:, ::1],
+        gains: cython.float[:, ::1],
+        chosen: cython.int[:, ::1],
+    ):
+        """Whole sessions (B,) of at most T measurements.
+
+        What is chosen and its expected gain are written; after a session's end nothing
+        is. ``draws`` (B, T) in [0, 1) decide the outcomes.
+        """
+        now = cython.declare(State)
+        states = self.likelihood.shape[2]
+        belief = cython.address(self.belief[0])
+        watch: Watch = begin(INFINITY)
+        with cython.nogil:
+            for i in range(truth.shape[0]):
+                now.place, now.seconds = place, seconds[i]
+                now.uses, now.made = uses[i], 0
+                for s in range(states):
+                    belief[s] = prior[s]
+                while now.seconds > 0.0 and now.uses > 0 and now.made < self.horizon:
+                    late(cython.address(watch))
+                    a = self._best(belief, now)
+                    chosen[i, now.made] = a
+                    gains[i, now.made] = self.gains[0, a]
+                    y: cython.int = 0
+                    below: cython.float = self.likelihood[a, 0, truth[i]]
+                    while y < self.outcomes - 1 and draws[i, now.made] >= below:
+                        y += 1
+                        below += self.likelihood[a, y, truth[i]]
+                    mass: cython.float = 0.0
+                    for s in range(states):
+                        belief[s] *= self.likelihood[a, y, s]
+                        mass += belief[s]
+                    mass = 1.0 / mass
+                    for s in range(states):
+                        belief[s] *= mass
+                    now.seconds -= self.travel[now.place, a] + self.extra[y, a]
+                    now.uses -= cython.cast(cython.int, self.uses[y, a])
+                    now.place = self.place_after[a, y]
+                    now.made += 1
 
     def _best(self, belief, now):
         """Of the largest tree that ``effort`` suffices for."""
@@ -272,7 +325,7 @@ class Tree:
             if number == 0:
                 value = kept = total
                 guess = own = mine
-            elif total > value and total > kept + _DOUBT * fmax(own, mine):
+            elif total > value and total > kept + self.doubt * fmax(own, mine):
                 value = total
                 guess = mine
                 best[0] = first
@@ -291,6 +344,7 @@ class Tree:
         travel = cython.address(self.travel[now.place, 0])
         allowed = cython.address(self.allowed[0])
         closed = cython.address(self.closed[0])
+        hints = cython.address(self.hints[min(now.made, self.hints.shape[0] - 1), 0])
         share: cython.float = 1.0 / p
         tiny: cython.float = 1e-12
         nothing: cython.float = 1e-9
@@ -330,21 +384,23 @@ class Tree:
             needs[a] = needs[a] * share + closed[a]
         always = -_largest(needs, designs, -1.0)
         e: cython.int = max(now.uses, 1)
-        t: cython.double = fmax(now.seconds, 1e-9)
         n: cython.double = fmax(self.horizon - now.made, 1.0)
         n = fmin(n, fmax(now.uses / fmax(always, 1e-6), 1.0))
-        number = fmin(n, fmax(t / seconds[_argmax(scores, designs)], 0.1))
+        each: cython.double = seconds[_argmax(scores, designs)]
+        limited: cython.bint = now.seconds < 1e30
+        t: cython.double = fmax(now.seconds, 1e-9) if limited else n * each
+        number = fmin(n, fmax(t / each, 0.1))
         use: cython.float = self.use_of[min(e, _USES) - 1] * expf(self.a * _log(number))
         last: cython.float = e
-        time: cython.float = self.time / t
-        end: cython.float = fmin(t, 1e30)
+        time: cython.float = (self.time if limited else self.haste) / t
+        end: cython.float = t
         fixed: cython.float = 1.0 / n
         least: cython.float = nothing * p
         for a in range(designs):
             s = seconds[a] if seconds[a] < end else end
             u = needs[a] - always
             u = u if u < last else last
-            scores[a] = allowed[a] * (gains[a] + least) / (fixed + time * s + use * u)
+            scores[a] = hints[a] * (gains[a] + least) / (fixed + time * s + use * u)
         self.work += _EACH * self.wide + _NODE
         best[0] = _argmax(scores, designs)
         return (gains[best[0]] + least) / fmax(scores[best[0]], 1e-30)

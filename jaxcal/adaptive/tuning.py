@@ -14,7 +14,7 @@ from jaxcal.adaptive.rules import Rule
 from jaxcal.adaptive.session import Task
 from jaxcal.checks import whole_number
 
-__all__ = ["tune"]
+__all__ = ["search", "tune"]
 
 R = TypeVar("R", bound=Rule)
 
@@ -56,19 +56,40 @@ def tune(
         raise ValueError(
             f"elite must be between 1 and population = {population}, got {elite}"
         )
-    rng = np.random.default_rng(seed)
-    centre = np.zeros(rule.num_free)
-    spread = np.full(rule.num_free, _SPREAD)
-    for number in range(generations):
+
+    def nats(rule: R, number: int) -> float:
         keys = jax.random.split(
             jax.random.fold_in(jax.random.key(seed), number), episodes
         )
-        tried = centre + spread * rng.standard_normal((population, rule.num_free))
+        return (nats_of or _nats)(task, rule, keys)
+
+    return search(
+        rule, generations, population, elite, seed, nats_of=nats, report=report
+    )
+
+
+def search(
+    rule: R,
+    generations: int,
+    population: int,
+    elite: int,
+    seed: int,
+    *,
+    nats_of: Callable[[R, int], float],
+    spread: float = _SPREAD,
+    report: Callable[[int, float, R], None] = lambda number, nats, rule: None,
+) -> R:
+    """The search itself; ``nats_of`` is asked for a rule and a generation's number."""
+    rng = np.random.default_rng(seed)
+    centre = np.zeros(rule.num_free)
+    spreads = np.full(rule.num_free, spread)
+    for number in range(generations):
+        tried = centre + spreads * rng.standard_normal((population, rule.num_free))
         tried[0] = centre
-        nats = np.array([(nats_of or _nats)(task, rule.moved(x), keys) for x in tried])
+        nats = np.array([nats_of(rule.moved(x), number) for x in tried])
         best = np.argsort(-nats)[:elite]
         centre = (1 - _SMOOTH) * centre + _SMOOTH * tried[best].mean(axis=0)
-        spread = (1 - _SMOOTH) * spread + _SMOOTH * tried[best].std(axis=0)
+        spreads = (1 - _SMOOTH) * spreads + _SMOOTH * tried[best].std(axis=0)
         report(number + 1, float(nats[best].mean()), rule.moved(centre))
     return rule.moved(centre)
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from jaxcal.adaptive import static
 from jaxcal.adaptive.episodes import Comparison, compare
+from jaxcal.adaptive.fitting import fit, outside
 from jaxcal.adaptive.grid import GridTask
 from jaxcal.adaptive.lookahead import AHEAD, Rollouts, TwoStep
 from jaxcal.adaptive.policy import run as policies
@@ -38,7 +39,7 @@ METHODS = {
     "gain": "the largest expected information gain (EIG)",
     "rate": "the largest EIG a second",
     "shares": "EIG per share of time, uses and number left; its constants are fixed",
-    "ahead": "shares, over a tree of the next measurements and their outcomes",
+    "ahead": "shares, over a tree of the next measurements, fitted to the task first",
     "priced": "EIG per price of time and uses, its constants tuned",
     "state": "the same with prices that follow what is left, tuned",
     "two_step": "state, or shares where that is not tuned, over two measurements",
@@ -65,6 +66,7 @@ class Result:
     seconds: NDArray[np.float64]  # (D,) of one core, a choice
     rules: Mapping[str, Scored]
     checkpoint: Mapping[str, Any] | None  # meta of the policy
+    outside: tuple[str, ...]  # sizes beyond those that ``ahead`` was measured on
 
 
 def evaluate(
@@ -123,6 +125,9 @@ def evaluate(
         elif method == "policy":
             assert trained is not None  # loaded above
             decider = trained.decider
+        elif method == "ahead" and isinstance(task, GridTask):
+            progress("fitting ahead", 0, 1)
+            decider = fit(task, seed=seed + 1).decider  # other sessions than judge it
         else:
             decider = _decider(method, rules, rollouts)
         decider = jax.tree.map(jnp.asarray, decider)
@@ -157,6 +162,7 @@ def evaluate(
         seconds=np.array(seconds),
         rules=rules,
         checkpoint=None if trained is None else trained.meta,
+        outside=outside(task) if "ahead" in methods else (),
     )
 
 

@@ -51,9 +51,11 @@ def _rows(result: Result) -> list[tuple[str, ...]]:
 
 def _heading(result: Result) -> str:
     shown = ", ".join(f"{name} = {value}" for name, value in result.options.items())
+    beyond = "; ".join(result.outside)
     return (
         f"{result.task}{f' ({shown})' if shown else ''}, seed {result.seed}: "
         f"{result.found.gain.shape[1]:,} sessions, information gained in nats"
+        f"{f'; ahead is used beyond its tests: {beyond}' if beyond else ''}"
     )
 
 

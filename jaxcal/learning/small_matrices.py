@@ -127,7 +127,7 @@ def picked(candidates: jax.Array, chosen: jax.Array) -> jax.Array:
         candidates: (..., M, n).
         chosen: (..., K) int, -1 where nothing is chosen.
     """
-    # Everybody gathers alike, so that a program that needs them twice gathers once.
+    # One form of gather for all callers: XLA merges those that are equal.
     index = jnp.maximum(chosen, 0)[..., None]
     return jnp.take_along_axis(candidates, index, axis=-2, mode="clip")
 

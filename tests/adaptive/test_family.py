@@ -13,8 +13,8 @@ from jaxcal.adaptive import next_measurement, play
 from jaxcal.adaptive.family.draws import BUDGETS, draw
 from jaxcal.adaptive.family.padded import SHAPE, batch, pad, stack
 from jaxcal.adaptive.family.structures import HELD_OUT, TRAINED_ON, Limits
+from jaxcal.adaptive.fitting import fit
 from jaxcal.adaptive.grid import GridTask
-from jaxcal.adaptive.lookahead import AHEAD
 from jaxcal.adaptive.rules import SHARES, Gain, Random
 from jaxcal.adaptive.tasks.knee import knee
 
@@ -189,10 +189,11 @@ def test_the_default_looks_ahead_where_time_or_uses_count():
     counted, free = knee(8, sigma=0.05), draw(3, "band", "number", SHAPE)
     made = [(5, 0)]
     mine = next_measurement(counted, made, **budget)
+    fitted = fit(counted, **budget).decider
     assert (
-        mine.design == next_measurement(counted, made, AHEAD, **budget, seed=3).design
+        mine.design == next_measurement(counted, made, fitted, **budget, seed=3).design
     )
-    assert mine.design != next_measurement(counted, made, SHARES, **budget).design
+    assert mine.design != next_measurement(counted, made, Gain(), **budget).design
     mine = next_measurement(free, [])
     assert mine.design == next_measurement(free, [], Gain()).design
 

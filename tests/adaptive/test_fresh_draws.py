@@ -161,10 +161,15 @@ def test_two_steps_draw_candidates_and_judge_them_by_different_draws(task):
             return self.belief.draws(count, key)
 
     long = task.replace(horizon=3)
-    belief, session = long.begin(jax.random.key(0))
-    options = long.options(belief, session, jax.random.key(1))
-    decider = TwoStep(Priced(1.0, 0.0, 0.0), per_group=2)
-    decider(long, Watched(belief), session, options, jax.random.key(2))
+
+    @jax.jit
+    def keys():
+        belief, session = long.begin(jax.random.key(0))
+        options = long.options(belief, session, jax.random.key(1))
+        decider = TwoStep(Priced(1.0, 0.0, 0.0), per_group=2)
+        decider(long, Watched(belief), session, options, jax.random.key(2))
+        return [jax.random.key_data(key) for _, key in spent]
+
+    data = [np.asarray(key).tobytes() for key in keys()]
     assert {name for name, _ in spent} == {"gains", "outcomes", "update", "options"}
-    data = [np.asarray(jax.random.key_data(key)).tobytes() for _, key in spent]
     assert len(set(data)) == len(data)

@@ -6,13 +6,12 @@ randomness of outcomes, most of the variance, is left out, and the expectation o
 advantages is the same.
 
 The environment is given its task as arrays, never closed over: another task of the same
-shapes compiles nothing, and each stream may have a task of its own.
+shapes compiles nothing.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import Any, Protocol, cast
 
 import flax.linen as nn
@@ -54,25 +53,20 @@ class Environment(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class Streams:
-    """The learner of sessions; it is given one task, or a task for every stream."""
+    """The learner of sessions of the task it is given."""
 
     config: StreamsConfig
     environment: Environment
     network: nn.Module  # of what is observed: masked logits (..., A), values (...)
-    task_per_stream: bool = False  # the task's leaves have a leading axis of streams
 
     def init(self, key: jax.Array, task: Any) -> Any:
         """Parameters before training."""
-        if self.task_per_stream:
-            task = jax.tree.map(lambda leaf: leaf[0], task)
-
         state = self.environment.reset(task, key)
         return self.network.init(key, self.environment.observe(task, state, key))
 
     def gather(self, params: Any, keys: jax.Array, task: Any) -> tuple[Batch, Metrics]:
         """Play a stream with each of the keys (B,)."""
-        axis = 0 if self.task_per_stream else None
-        play = jax.vmap(self._play, in_axes=(None, 0, axis))
+        play = jax.vmap(self._play, in_axes=(None, 0, None))
         batch, reward, ended = play(params, keys, task)  # (B, T + 1)
         metrics = {
             "reward_mean": reward.sum() / jnp.maximum(ended.sum(), 1.0),
@@ -93,25 +87,24 @@ class Streams:
         """Sessions one after another: a row of T decisions; and of T + 1, of which the
         last closes the row, the rewards and where a session ended."""
         environment = self.environment
-        score: Any = functools.partial(self.network.apply, params)
+
+        def score(state: Any, key: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
+            seen = environment.observe(task, state, key)
+            return seen, *cast(Any, self.network.apply(params, seen))
 
         def decide(state: Any, key: jax.Array) -> tuple[Any, dict[str, Any]]:
             key_seen, key_action, key_step, key_next = jax.random.split(key, 4)
-            seen = environment.observe(task, state, key_seen)
-            logits, value = score(seen)
+            seen, logits, value = score(state, key_seen)
             action = jax.random.categorical(key_action, logits).astype(jnp.int32)
             step = environment.step(task, state, seen, action, key_step)
             happened, number = step.happened, len(step.chance)
-
-            def value_of(state: Any) -> Any:
-                return score(environment.observe(task, state, key_seen))[1]
 
             # The value of what happened is the next decision's.
             others = jnp.zeros(())
             if number > 1:
                 elsewhere = (happened + jnp.arange(1, number)) % number
                 states = jax.tree.map(lambda leaf: leaf[elsewhere], step.states)
-                values = jax.vmap(value_of)(states)
+                values = jax.vmap(score, (0, None))(states, key_seen)[2]
                 values = jnp.where(step.ended[elsewhere], 0.0, values)
                 others = step.chance[elsewhere] @ values
             ended = step.ended[happened]

@@ -168,7 +168,7 @@ class CompactNetwork(Network):
         for layer in self.decoder:
             g = layer(g, vectors)
         g = self.final_norm(g)
-        # How far to believe the greedy look ahead is learned.
+        # The weight of the greedy look-ahead is learned.
         rule = 20.0 * vectors.to_the_end
         if self.config.close_up:
             rule = rule + close_up_of(vectors.to_the_end).sum(-1)

@@ -131,7 +131,7 @@ def run_job(
         code = work()
         if code == 0 and jax.distributed.is_initialized():
             sys.stdout.flush()
-            jax.distributed.shutdown()  # whoever does not wait counts as lost
+            jax.distributed.shutdown()  # to leave earlier counts as lost
             return code
     except ValueError as error:
         print(f"{program}: {error}", file=sys.stderr)
@@ -143,7 +143,7 @@ def run_job(
     if jax.distributed.is_initialized():
         sys.stdout.flush()
         sys.stderr.flush()
-        os._exit(code)  # without the farewell, which would wait for who is lost
+        os._exit(code)  # JAX's exit handler would wait for the lost process
     return code
 
 

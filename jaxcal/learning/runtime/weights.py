@@ -101,7 +101,7 @@ def flat(tree: Mapping[str, Any], above: str = "") -> Arrays:
 
 
 def nested(arrays: Mapping[str, Any]) -> dict[str, Any]:
-    """What ``flat`` was given."""
+    """The inverse of ``flat``."""
     tree: dict[str, Any] = {}
     for name, array in arrays.items():
         *above, last = name.split(".")

@@ -43,7 +43,7 @@ _READ = {  # fields of the optimisation that brax is given, and its names of the
 }
 _FIXED = dict(
     num_envs=256, num_eval_envs=256, batch_size=64, num_minibatches=16,
-    num_updates_per_batch=4, normalize_observations=False,
+    num_updates_per_batch=4, normalize_observations=False, num_evals=10,
 )  # fmt: skip
 
 
@@ -116,8 +116,7 @@ def train(
     config: TrainConfig,
     folder: str | pathlib.Path,
     say: Callable[[str], None],
-    num_evals: int = 10,
-    watch: Callable[[int, Any], None] = lambda step, params: None,
+    **more: Any,
 ) -> None:
     """Train with ``brax.training.agents.ppo.train`` and save a checkpoint.
 
@@ -127,15 +126,14 @@ def train(
         config: from ``adapted``.
         folder: of the run.
         say: takes a line of progress.
-        num_evals: how often brax reports.
-        watch: called with the step and the policy's parameters at every report.
+        more: other arguments of ``ppo.train``, such as ``num_evals``.
     """
     task, episodes = config.tasks[0], config.ppo.num_episodes
     env, length = task.environment, task.environment.num_selected
     read = {name: getattr(config.ppo, name) for name in _READ}
     given = _FIXED | {_READ[name]: value for name, value in read.items()}
-    given |= {"num_timesteps": episodes * length, "num_evals": num_evals}
-    given |= {"episode_length": length, "unroll_length": length, "seed": config.seed}
+    given |= {"num_timesteps": episodes * length, "seed": config.seed}
+    given |= {"episode_length": length, "unroll_length": length, **more}
     begun = time.perf_counter()
 
     def progress(steps: int, metrics: dict[str, Any]) -> None:
@@ -150,13 +148,13 @@ def train(
             wrap_env_fn=wrap_fresh,
             network_factory=lambda *_, **__: _networks(env, config.network),
             progress_fn=progress,
-            policy_params_fn=lambda step, _, params: watch(step, params[1]),
             **given,
         )
     meta = config.as_meta() | {
         "network": {"kind": config.network.kind, "width": config.network.width},
         "ppo": read | {"num_episodes": episodes},
-        **{"trainer": "brax", "brax": given},
+        "trainer": "brax",
+        "brax": {name: value for name, value in given.items() if not callable(value)},
         "progress": {
             "episodes": episodes,
             "seconds": time.perf_counter() - begun,

@@ -122,7 +122,7 @@ class Imitation:
     def gather(
         self, params: Any, keys: jax.Array, lesson: Lesson
     ) -> tuple[Attempt, Metrics]:
-        """Follow the lesson, each time choosing what the policy likes of the wanted."""
+        """Follow the lesson: each choice is the policy's likeliest wanted posture."""
         task, network = self.postures.task, self.postures.network
         features = network.candidate_features(lesson.candidates, lesson.available)
         memory = encode(network, params, features)
@@ -167,7 +167,7 @@ class Imitation:
         of_each = jax.vmap(decide, in_axes=1, out_axes=1)
         logits, value = of_each(attempt.decisions)  # (B, T, M), (B, T)
         log_probs = jax.nn.log_softmax(logits)
-        hopes = mask_logits(log_probs, attempt.wanted)
+        wanted_log_probs = mask_logits(log_probs, attempt.wanted)
 
         def mean(array: jax.Array) -> jax.Array:
             return (array * attempt.weight).mean()
@@ -175,7 +175,7 @@ class Imitation:
         error = self.postures.task.value_scale * (value - attempt.best[:, None])
         square = 2.0 * optax.losses.huber_loss(error, delta=config.value_error_limit)
         metrics = {
-            "policy_loss": -mean(jax.nn.logsumexp(hopes, axis=-1)),
+            "policy_loss": -mean(jax.nn.logsumexp(wanted_log_probs, axis=-1)),
             "value_loss": mean(square),
             "entropy": mean(-(jnp.exp(log_probs) * log_probs).sum(-1)),
         }

@@ -120,7 +120,11 @@ def updates(
         def update(state: TrainState) -> tuple[TrainState, ppo.Metrics]:
             return one(state, *given)
 
-        each = jax.vmap(update) if seeds else update
+        each: Any = update
+        if seeds:
+            # On a CPU one after another: several at once do not fit a core's cache.
+            at_once = None if jax.default_backend() == "cpu" else seeds
+            each = functools.partial(jax.lax.map, update, batch_size=at_once)
 
         def step(number: jax.Array, carry: Any) -> Any:
             state, kept = carry

@@ -21,7 +21,7 @@ from jaxcal.selection.exact.volume import largest_volumes
 from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
 from jaxcal.selection.problem import Found, Problem, values
 
-__all__ = ["TIME_LIMIT", "solve", "solve_auto", "solve_exact", "upper_bound"]
+__all__ = ["TIME_LIMIT", "relaxed", "solve", "solve_auto", "solve_exact", "upper_bound"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -117,8 +117,7 @@ def solve_exact(
         if best == 1 or cheap:
             if enough and not cheap:  # the relaxation may do without
                 start = np.sort(exchange_indices(problem, restarts, seed, deadline))
-                relaxed = _relaxed(problem, start)
-                found = _found(problem, [start], best, relaxed, 1)
+                found = _found(problem, [start], best, relaxed(problem, start), 1)
                 assert found.value is not None and found.bound is not None
                 if problem.criterion.efficiency(found.value, found.bound) >= enough:
                     return dataclasses.replace(found, seed=seed, restarts=restarts)
@@ -160,11 +159,11 @@ def upper_bound(problem: Problem) -> float:
             found = _enumerate(problem, pool, 1, None)
             assert found.bound is not None
             return found.bound
-    relaxed = _relaxed(problem, greedy_indices(problem))
-    return float(problem.criterion.reported(relaxed))
+    bound = relaxed(problem, greedy_indices(problem))
+    return float(problem.criterion.reported(bound))
 
 
-def _relaxed(problem: Problem, start: Indices) -> float:
+def relaxed(problem: Problem, start: Indices) -> float:
     """Upper bound on phi of the criterion, from a selection (k,) to climb from."""
     keep = np.flatnonzero(problem.available)
     counts = np.bincount(start, minlength=len(problem.blocks))
@@ -224,7 +223,7 @@ def _enumerate(
     greedy = np.sort(greedy_indices(problem))
     # log det(X_s.T X_s) is twice the log of the volume, beside that of ``required``.
     fixed = np.linalg.slogdet(required @ required.T)[1] if len(required) else 0.0
-    bound = min(_relaxed(problem, greedy), fixed + 2.0 * float(np.log(found.bound)))
+    bound = min(relaxed(problem, greedy), fixed + 2.0 * float(np.log(found.bound)))
     return _found(problem, [*subsets, greedy], best, bound, found.examined)
 
 
@@ -232,12 +231,12 @@ def _found(
     problem: Problem,
     subsets: list[Indices],
     best: int,
-    relaxed: float | None,
+    phi: float | None,
     nodes: int,
 ) -> Found:
     """Values in the caller's unit, singular subsets left out, best first.
 
-    ``relaxed`` bounds phi from above; None where the first is proven.
+    ``phi`` is a bound on it from above; None where the first is proven.
     """
     chosen, criterion = np.stack(subsets), problem.criterion
     value, log_det = values(problem, chosen)
@@ -250,9 +249,9 @@ def _found(
             f"{chosen[0].tolist()}, is singular"
         )
     subsets, worth = list(chosen[order]), value[order].tolist()
-    bound, proven, reason = worth[0], relaxed is None, ""
-    if relaxed is not None:
-        bound = better(bound, float(criterion.reported(relaxed)))
+    bound, proven, reason = worth[0], phi is None, ""
+    if phi is not None:
+        bound = better(bound, float(criterion.reported(phi)))
     unsure = problem.uncertainty(subsets[0])
     if unsure > TOLERATED:
         bound = criterion.bettered(bound, unsure)

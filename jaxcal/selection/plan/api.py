@@ -10,8 +10,8 @@ information in units of the noise. Two summaries over the region of interest:
 
 The standard errors of the parameters are those of a region of unit vectors.
 
-For each K ``designs`` looks for a good design and ``bound`` says what no design of K
-measurements beats. The K returned is proven the smallest where the bound of K - 1 lies
+For each K ``designs`` looks for a good design and says what no design of K measurements
+beats. The K returned is proven the smallest where the bound of K - 1 lies
 above the target. Source: Atkinson, Donev and Tobias, Optimum Experimental Designs.
 """
 
@@ -30,8 +30,13 @@ from jaxcal.information.blocks import largest_rank
 from jaxcal.models.uncertainty import Noise
 from jaxcal.selection.criteria import positions
 from jaxcal.selection.exchange.exchange import greedy_indices
-from jaxcal.selection.plan.bound import lower_bound, region_weighting
-from jaxcal.selection.plan.designs import Found, best_design, variances_of
+from jaxcal.selection.plan.designs import (
+    Found,
+    best_design,
+    lower_bound,
+    region_root,
+    variances_of,
+)
 from jaxcal.selection.problem import Asked, Problem
 from jaxcal.selection.problem.sources import shares_regressor
 from jaxcal.selection.solvers import checked_seed
@@ -186,14 +191,14 @@ class Planned(Asked):
             raise ValueError(
                 f"max_k must not exceed the {total} measurements allowed, got {max_k}"
             )
-        weighting = region_weighting(points, how)
+        root = region_root(points, how)
 
         @functools.cache
         def bound_of(k: int) -> float:
             if k == total:  # there is one design only
                 every = np.repeat(np.arange(len(problem.blocks)), problem.upper)
                 return float(variances_of(problem, every, points, how).max())
-            return lower_bound(problem, weighting, k)
+            return lower_bound(problem, root, k)
 
         def best(k: int, kind: str, previous: Found | None) -> Found:
             one = dataclasses.replace(problem, k=k)

@@ -1,8 +1,14 @@
-"""The best design of one size for a region: exchange on the criterion itself.
+"""The best design of one size for a region, and what no design of that size beats.
 
-It starts from the D-optimal selection (exact where time allows), the greedy one, the
-design of one measurement less plus its best addition, and random ones. It proves
-nothing; ``bound`` says what no design beats.
+The best: exchange on the criterion itself, which proves nothing. It starts from the
+D-optimal selection (exact where time allows), the greedy one, the design of one
+measurement less plus its best addition, and random ones.
+
+The bound: with weights w over the region and W = sum of w z z.T, the largest variance
+is at least the weighted mean trace(W M^-1), and that at least what the relaxation of
+branch and bound proves. For G the weights are those of the D-optimal measure of the
+region, which make the bound p / K where the region is the candidates and replicates are
+free (Kiefer and Wolfowitz 1960). Source: Pukelsheim, Optimal Design of Experiments.
 """
 
 from __future__ import annotations
@@ -16,11 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.information.blocks import significant
-from jaxcal.selection.exact.exact import solve_exact
+from jaxcal.selection.criteria import Criterion
+from jaxcal.selection.exact.exact import relaxed, solve_exact
 from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
 from jaxcal.selection.problem import Problem
 
-__all__ = ["Found", "best_design", "variances_of"]
+__all__ = ["Found", "best_design", "lower_bound", "region_root", "variances_of"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -30,6 +37,7 @@ _MEANS: dict[str, Callable[..., Any]] = {"G": np.max, "I": np.mean}
 
 _RANDOM_STARTS = 4  # where a candidate gives one reading: swaps of more take longer
 _D_RESTARTS = 50  # of the exchange that looks for the D-optimal selection
+_ITERATIONS = 300  # of the weights of G: any count gives a true bound
 
 
 @dataclasses.dataclass(frozen=True)
@@ -182,3 +190,28 @@ def _room(problem: Problem, indices: Indices) -> Indices:
     """Candidates that may be chosen once more."""
     counts = np.bincount(indices, minlength=len(problem.blocks))
     return np.flatnonzero(counts < problem.upper)
+
+
+def region_root(points: Array, how: str) -> Array:
+    """(r, p) root of W, the sum of w z z.T over the region, of weights that sum to 1.
+
+    Args:
+        points: (R, s, p) whitened rows of the region.
+        how: "I", equal weights, or "G", those of the D-optimal measure of the region by
+            Titterington's steps w <- w (z.T W^-1 z) / p.
+    """
+    rows = points.reshape(-1, points.shape[-1])
+    weight = np.full(len(rows), 1.0 / len(rows))
+    for _ in range(_ITERATIONS if how == "G" else 0):
+        inverse = np.linalg.pinv((rows * weight[:, None]).T @ rows, hermitian=True)
+        weight *= np.einsum("ra,ab,rb->r", rows, inverse, rows)
+        weight /= weight.sum()
+    size, vectors = np.linalg.eigh((rows * weight[:, None]).T @ rows)
+    keep = significant(size, squares=True)
+    return np.asarray(np.sqrt(size[keep])[:, None] * vectors.T[keep])
+
+
+def lower_bound(problem: Problem, root: Array, k: int) -> float:
+    """No design of k within the counts has a smaller ``trace(root M^-1 root.T)``."""
+    one = dataclasses.replace(problem, k=k, criterion=Criterion("I", "trace", root))
+    return -relaxed(one, greedy_indices(one))

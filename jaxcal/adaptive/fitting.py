@@ -1,0 +1,189 @@
+"""The constants of ``ahead`` for one task, from simulated sessions of that task.
+
+Three things are found, in about a second on one core:
+
+1. the constants of ``shares``, by the cross-entropy method;
+2. hints: how often a tree of ``_DEEP`` multiplications a choice, too slow to decide,
+   makes each measurement first, second and so on;
+3. which of these, and which ``doubt``, serve ``ahead``: every combination plays the
+   same sessions, others than before, and one is taken if it beats ``AHEAD`` by a
+   standard error. Where the tree then loses against ``SHARES`` the rule decides.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import itertools
+from typing import Any
+
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal.adaptive.family.structures import Limits
+from jaxcal.adaptive.grid import GridTask
+from jaxcal.adaptive.journal import fingerprint
+from jaxcal.adaptive.lookahead import AHEAD, Ahead, tree
+from jaxcal.adaptive.rules import SHARES, Shares
+from jaxcal.adaptive.search_kernel import NODE, SUM
+from jaxcal.adaptive.tuning import search
+
+__all__ = ["Fitted", "fit", "outside"]
+
+Array = NDArray[np.float32]
+
+# Multiplications: of each set of constants of a generation, of the deep tree's
+# sessions, of each combination's.
+_TUNE, _PLAY, _TRY = 6e7, 1e10, 2e9
+_DEEP = 2e7
+_MOST, _LEAST = 512, 16  # sessions; fewer tell nothing
+_OF_ALL, _POWER = 8.0, 0.25  # counts that weigh as all of them; of a share, to a hint
+_HASTE = 0.3  # from where it is searched for
+
+_SHOWN = Limits(states=1024, designs=48, outcomes=4, measurements=32)
+
+
+@dataclasses.dataclass(frozen=True)
+class Fitted:
+    """A decider for one task, and what it is worth there."""
+
+    decider: Ahead | Shares
+    nats: float  # a session
+    more: float  # nats a session than ``SHARES``
+    error: float  # standard error of ``more``
+
+
+def outside(task: Any) -> tuple[str, ...]:
+    """In which sizes a task lies beyond those that ``ahead`` was measured on."""
+    if not isinstance(task, GridTask):
+        return ("its unknowns are continuous: ahead decides as shares",)
+    designs, outcomes, states = task.likelihood.shape
+    sizes = {
+        "states": states, "designs": designs, "outcomes": outcomes,
+        "uses": int(np.max(task.num_uses)) * bool((np.asarray(task.uses) > 0).any()),
+        "measurements": task.horizon, "groups": task.num_groups,
+    }  # fmt: skip
+    return tuple(
+        f"{size:,} {name}: measured up to {getattr(_SHOWN, name):,}"
+        for name, size in sizes.items()
+        if size > getattr(_SHOWN, name)
+    )
+
+
+def fit(
+    task: GridTask,
+    seconds: float | None = None,
+    uses: int | None = None,
+    seed: int = 0,
+) -> Fitted:
+    """``ahead`` with the constants that gain most on a task's own sessions.
+
+    Args:
+        task: what is measured; every design allowed.
+        seconds, uses: budget of its sessions; the task's when not given.
+        seed: of what is simulated. The same arguments, the same constants.
+    """
+    task = jax.device_get(task)
+    budget = np.asarray(task.seconds if seconds is None else (seconds, seconds))
+    ends = np.atleast_1d(task.num_uses if uses is None else uses)
+    return _fit(_Task(fingerprint((task, budget, ends)), task, budget, ends), seed)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Task:
+    """What is simulated; equal where the hash is."""
+
+    key: str
+    task: GridTask = dataclasses.field(compare=False)
+    seconds: Any = dataclasses.field(compare=False)  # (2,)
+    uses: Any = dataclasses.field(compare=False)  # (E,)
+
+    def play(self, decider: Ahead, count: int, seed: int) -> tuple[Array, Any]:
+        """(B, T) gains and choices, -1 after the end; the same truths for a seed."""
+        task, horizon = self.task, self.task.horizon
+        rng = np.random.default_rng(seed)
+        at = (np.arange(count) + 0.5) / count  # every part of the prior in its share
+        below = np.cumsum(task.prior, dtype=np.float64)
+        truth = np.searchsorted(below, rng.permutation(at) * below[-1])
+        low, high = self.seconds
+        spread = high - low if np.isfinite(high) else 0.0
+        gains = np.zeros((count, horizon), np.float32)
+        chosen = np.full((count, horizon), -1, np.int32)
+        tree(
+            task.likelihood, task.travel, task.extra, task.uses, task.place_after,
+            np.ones(len(task.likelihood)), *decider.constants(), horizon,
+            decider.effort,
+        ).play(
+            np.array(task.prior, np.float32), int(task.place),
+            (low + spread * rng.permutation(at)).astype(np.float32),
+            rng.permutation(np.resize(self.uses, count)).astype(np.int32),
+            np.minimum(truth, len(below) - 1).astype(np.int32),
+            rng.random((count, horizon), np.float32), gains, chosen,
+        )  # fmt: skip
+        return gains, chosen
+
+
+@functools.lru_cache(maxsize=16)
+def _fit(of: _Task, seed: int) -> Fitted:
+    seeds = np.random.SeedSequence(seed).generate_state(4)
+    chosen = of.play(_plain(SHARES), _LEAST, seeds[0])[1]
+    length = max(float((chosen >= 0).sum()) / _LEAST, 1.0)
+    designs, outcomes, states = of.task.likelihood.shape
+    each = designs * outcomes * (states + SUM) + NODE  # of a choice of ``shares``
+
+    def sessions(work: float, choice: float) -> int:
+        return int(min(work / (length * choice), _MOST))
+
+    bases = [SHARES]
+    limited = bool(np.isfinite(of.seconds[1]))
+    if (count := sessions(_TUNE, each)) >= _LEAST:
+        start = SHARES if limited else SHARES.replace(haste=_HASTE)  # type: ignore[attr-defined]  # flax
+        bases.append(
+            search(
+                start, 8, 12, 4, seeds[1], spread=0.5,
+                nats_of=lambda rule, number: float(
+                    of.play(_plain(rule), count, seeds[1] + number)[0].sum()
+                ),
+            )
+        )  # fmt: skip
+    tried = [Ahead(base) for base in bases]
+    if (count := sessions(_PLAY, max(_DEEP, each))) >= _LEAST // 2:
+        tried += [
+            Ahead(base, hints=_hints(of.play(deep, count, seeds[2])[1], designs))
+            for base in bases
+            if (deep := Ahead(base, effort=_DEEP))
+        ]
+    tried = [
+        one.replace(doubt=doubt)  # type: ignore[attr-defined]  # flax
+        for one, doubt in itertools.product(tried, (AHEAD.doubt, 1.0))
+    ]
+    count = max(sessions(_TRY, max(AHEAD.effort, each)), _LEAST)
+    nats = np.array([of.play(one, count, seeds[3])[0].sum(axis=1) for one in tried])
+    mean, error = _paired(nats - nats[0])
+    best = int((mean - error).argmax())
+    rule = of.play(_plain(SHARES), count, seeds[3])[0].sum(axis=1)
+    more, error = _paired(nats[best] - rule)
+    if more < -2.0 * error:
+        return Fitted(SHARES, float(rule.mean()), 0.0, 0.0)
+    return Fitted(tried[best], float(nats[best].mean()), float(more), float(error))
+
+
+def _plain(rule: Shares) -> Ahead:
+    """The rule without a tree."""
+    return Ahead(rule, effort=0.0)
+
+
+def _hints(chosen: Any, designs: int) -> Array:
+    """(N, A) multiples of scores from choices (B, N): what is often chosen is more."""
+    every = [np.bincount(a[a >= 0], minlength=designs) for a in chosen.T]
+    counts = np.array([row for row in every if row.any()], np.float64)
+    whole = counts.sum(axis=0)
+    whole = 0.5 * (whole / whole.sum() + 1.0 / designs)
+    total = counts.sum(axis=1, keepdims=True)
+    share = (counts + _OF_ALL * whole) / (total + _OF_ALL)
+    return ((share * designs) ** _POWER).astype(np.float32)
+
+
+def _paired(less: Any) -> tuple[Any, Any]:
+    return less.mean(axis=-1), less.std(axis=-1) / np.sqrt(less.shape[-1])
