@@ -12,11 +12,13 @@ error elsewhere with and without harmonics of the joints. ``checks``: what a few
 postures and random ones can tell of a drift. ``contacts``: of real arms, trained on one
 place and judged at the others: 12 and 16 contacts that are random, chosen, or chosen
 for the very postures they are judged at; measured, and as expected of a model without
-any error, with the noise and the sizes that all contacts of the place show.
+any error, with the noise and the sizes that all contacts of the place show; and with
+stiff joints, stated tolerances and noise (of the choice and the fit).
 """
 
 from __future__ import annotations
 
+import dataclasses
 import pathlib
 import sys
 import warnings
@@ -41,6 +43,7 @@ from jaxcal.models import (
 
 Array = NDArray[np.float64]
 
+PLAY = 2e-4  # m, of a ball in its socket
 EXAMPLES = pathlib.Path(__file__).parents[1] / "examples"
 READINGS = 60  # of each sensor: 20 postures of three readings
 NEAR = {  # where sockets, planes and anchors stand, in metres
@@ -303,37 +306,61 @@ def contacts(draws: int) -> None:
     import contacts as example
 
     print(
-        "| arm, trained on | K | over random: measured, expected, at best | over all |"
+        "| arm, trained on | K | over random: measured, expected, at best | over all "
+        "| stiff: over random, all | mm: default, stiff |"
     )
-    print("| --- | --- | --- | --- |")
+    print("| --- | --- | --- | --- | --- | --- |")
     for name in ("panda_1", "kuka_14"):
-        places = example.load(name)
+        places, arm = example.load(name), example.arm(name)
+        stiff = dataclasses.replace(arm, compliance=(), yields=np.zeros(0))
+        stated = dataclasses.replace(stiff.default_prior(), by_data=False)
         for trained, place in places.items():
             others = [each for at, each in places.items() if at != trained]
             table = np.column_stack(place)
             every = np.arange(len(table))
 
-            def measured(rows: Array) -> float:
+            def by_default(rows: Array) -> float:
                 found = example.identify(name, place, rows).arm  # noqa: B023 - called here
                 return np.mean([example.consistency(found, each) for each in others])  # noqa: B023
 
-            expected, best = _expected(example.arm(name), table, others)
+            def as_stated(rows: Array) -> float:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", UserWarning)
+                    found = jaxcal.identify(
+                        table[rows],  # noqa: B023
+                        np.zeros((len(rows), 3)),
+                        model=stiff,  # noqa: B023
+                        prior=stated,  # noqa: B023
+                        noise_std=PLAY,
+                        loss="gaussian",
+                    ).arm
+                return np.mean([example.consistency(found, each) for each in others])  # noqa: B023
+
+            expected, best = _expected(arm, table, others)
             for k in (12, 16):
                 rng = np.random.default_rng(0)
                 random = [rng.choice(every, k, replace=False) for _ in range(draws)]
+                plain = jaxcal.select(
+                    table, k, "exchange", model=stiff, prior=stated,
+                    noise=jaxcal.Noise(std=PLAY),
+                ).indices  # fmt: skip
                 chosen = example.choose("I", name, place, k, rng)
                 rows = {"chosen": [chosen], "random": random, "best": [best(k)]}
                 real, theory = (
                     {at: np.mean([error(each) for each in rows[at]]) for at in rows}
-                    for error in (measured, expected)
+                    for error in (by_default, expected)
                 )
+                tried = as_stated(plain)
                 cells = (
                     f"{real['chosen'] / real['random']:.2f}, "
                     f"{theory['chosen'] / theory['random']:.2f}, "
                     f"{theory['best'] / theory['random']:.2f} | "
-                    f"{real['chosen'] / measured(every):.2f}, "
+                    f"{real['chosen'] / by_default(every):.2f}, "
                     f"{theory['chosen'] / expected(every):.2f}, "
-                    f"{theory['best'] / expected(every):.2f}"
+                    f"{theory['best'] / expected(every):.2f} | "
+                    f"{tried / np.mean([as_stated(each) for each in random]):.2f}, "
+                    f"{tried / as_stated(every):.2f} | "
+                    f"{real['chosen']:.2f}, {tried:.2f}"
                 )
                 print(f"| {name}, {trained} | {k} | {cells} |", flush=True)
 

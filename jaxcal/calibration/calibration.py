@@ -54,18 +54,21 @@ class Calibration(Fit):
         return self.whole.calibrated(self.estimate)  # type: ignore[attr-defined]  # a chain
 
     def to_urdf(self, path: str | os.PathLike[str], *, force: bool = False) -> str:
-        """See :meth:`jaxcal.models.SerialChain.to_urdf`; returns the tip link."""
-        return self._chain().to_urdf(path, self.parameters, force=force)
+        """The arm's own file, corrected; see :meth:`jaxcal.models.SerialChain.write`.
+
+        Returns the tip link.
+        """
+        return self._chain().write("urdf", path, self.parameters, force=force)
 
     def to_dh(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
-        """See :meth:`jaxcal.models.SerialChain.to_dh`; fitted without harmonics."""
-        self._chain().to_dh(path, self._of_table(), force=force)
+        """The DH table as CSV, fitted without harmonics."""
+        self._chain().write("dh", path, self._of_table(), force=force)
 
     def to_ur_kinematics(
         self, path: str | os.PathLike[str], *, force: bool = False
     ) -> None:
-        """See :meth:`jaxcal.models.SerialChain.to_ur_kinematics`."""
-        self._chain().to_ur_kinematics(path, self._of_table(), force=force)
+        """Universal Robots' kinematics file, likewise."""
+        self._chain().write("ur", path, self._of_table(), force=force)
 
     def _of_table(self) -> Array:
         """(p,) for a file, which holds no harmonics: fitted without them."""

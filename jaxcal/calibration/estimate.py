@@ -186,7 +186,9 @@ def _require_sockets(arm: SerialChain, commands: Array, measured: Array) -> None
             f"a posture must have the ball in one socket, but row {row} is row "
             f"{first[groups.ravel()[row]]} with another socket: rows of the other file?"
         )
-    points = arm.calibrated(arm.nominal).predict(joints) - measured
+    if measured.any():  # offsets that were measured, as in a simulation, are of any tip
+        return
+    points = arm.calibrated(arm.nominal).predict(joints)
     most, middles = _NOMINAL * arm.length, {}
     for i in np.unique(which):
         rows = np.flatnonzero(which == i)
@@ -205,8 +207,7 @@ def _require_sockets(arm: SerialChain, commands: Array, measured: Array) -> None
                 f"rows {in_words(lost)} are {far.max():.2g} from the others there: "
                 "rows of another place?"
             )
-    # Offsets that were measured, as in a simulation, are of any tip.
-    for one, other, distance, _ in () if measured.any() else arm.sensor.distances:
+    for one, other, distance, _ in arm.sensor.distances:
         missing = {int(one), int(other)} - set(middles)
         if missing:
             raise ValueError(

@@ -18,7 +18,7 @@ from jaxcal.calibration.fit import Fit
 from jaxcal.files import write_text
 from jaxcal.models import Affine, Model, SerialChain, from_dict
 
-__all__ = ["fields", "read", "save", "to_dict", "write"]
+__all__ = ["fields", "read", "save", "to_dict"]
 
 FORMAT = "jaxcal-calibration"
 VERSION = 3
@@ -63,12 +63,7 @@ def save(fit: Fit, path: str | os.PathLike[str]) -> None:
     Raises:
         OSError: the folder is missing, not writable or full; the old file stays.
     """
-    write(path, to_dict(fit))
-
-
-def write(path: str | os.PathLike[str], content: dict[str, Any]) -> None:
-    """Write the content atomically."""
-    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    write_text(path, json.dumps(to_dict(fit), indent=1, allow_nan=False) + "\n")
 
 
 def read(path: str | os.PathLike[str]) -> Any:

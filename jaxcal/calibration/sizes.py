@@ -4,7 +4,7 @@ The prior says how errors of lengths compare with each other, and those of angle
 large they are altogether is seldom known. Here a factor for all lengths, one for the
 turns of the axes (alpha, beta), one for the zeros of the joints (theta), one for their
 compliance and the level of the noise make the readings most probable (marginal
-likelihood, the model linear about the fit), with a factor of three either way (ten of
+likelihood, the model linear about the fit), with a factor of six either way (ten of
 the harmonics) as what is thought of each beforehand.
 
 Sources: MacKay, 1992; Bishop, Pattern Recognition and Machine Learning, 3.5.
@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 # Beforehand, of the factors of the groups and of the level: median, and the factor of
 # one standard deviation. Most arms have little misfit and some have much.
 _MIDDLE = np.log([1.0, 1.0, 1.0, 1.0, 0.3, 1.0])
-_SPREAD = np.log([3.0, 3.0, 3.0, 3.0, 10.0, 3.0])
+_SPREAD = np.log([6.0, 6.0, 6.0, 6.0, 10.0, 3.0])
 _MOST = 5.0  # of a logarithm
 _SCORES = 100  # steps of Fisher's scoring, at most
 _GROUPS = 5  # lengths, turns of the axes, zeros of the joints, compliance, harmonics
@@ -106,7 +106,7 @@ def group_sizes(
             trial = np.clip(best - step, -_MOST, _MOST)
         gain, best = least - after[0], trial
         least, slope, curve = after
-        if gain < 1e-6:
+        if gain < 1e-4:
             break
     factors = np.ones(p)
     factors[groups >= 0] = np.exp(best[groups[groups >= 0]])

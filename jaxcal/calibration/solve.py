@@ -99,7 +99,8 @@ def solve(
 ) -> Solution:
     """The most probable parameters, from the prior's mean or from ``start``.
 
-    ``rough`` is to .03 standard deviations, for what another fit begins at.
+    ``rough`` is to .1 standard deviations, the weights of the loss to .03, for what
+    another fit begins at.
 
     Raises:
         ValueError: the model fails at the start, a derivative is not finite, or the
@@ -120,7 +121,7 @@ def solve(
             gain = evidence[-_PATIENCE] - search.evidence
             asked = max(1e-3, 0.1 * (len(evidence) // 60))
             creeps = gain < max(asked, 1e-3 * search.cost)
-        slack = 300.0 if rough else 100.0 if creeps else 1.0
+        slack = 100.0 if creeps else 1.0
         if search.settle(slack) and (done or creeps):
             return search.solution()
     raise ValueError(
@@ -140,7 +141,9 @@ class _Search:
     def __init__(self, task: Task, start: Solution | None, rough: bool) -> None:
         self.task = task
         # 1e-6 standard deviations; 1e-5 where convergence is linear.
-        self.least = 1e-3 if rough else 1e-10 if task.student else 1e-12
+        self.least = 1e-2 if rough else 1e-10 if task.student else 1e-12
+        self.change = (3e-2, 3e-2) if rough else (1e-5, 1e-4)  # of weights and levels
+        self.rough = rough
         self.linear = 0.0  # length of a step that did what its derivatives said
         self.solved: tuple[Array, Array] | None = None  # hardly damped, in a step
         count, q = task.measured.shape
@@ -270,7 +273,7 @@ class _Search:
             theta = self.theta.copy()
             theta[task.free] += step / scale
             if gain <= self.least + 1e-13 * cost:
-                if not self.stale:
+                if self.rough or not self.stale:
                     return True
                 self.theta = theta
                 self._refresh()
@@ -322,7 +325,7 @@ class _Search:
     def settle(self, slack: float) -> bool:
         """Weights and levels that follow from the residuals; True where they stay.
 
-        ``slack`` times 1e-6 of a weight and 1e-4 of a level are no change.
+        Changes of ``slack`` times ``self.change`` are none.
         """
         task = self.task
         before = self.weights, np.log(self.level)
@@ -334,7 +337,7 @@ class _Search:
         after = self.weights, np.log(self.level)
         return all(
             np.abs(new - old).max() < slack * limit
-            for new, old, limit in zip(after, before, (1e-6, 1e-4), strict=True)
+            for new, old, limit in zip(after, before, self.change, strict=True)
         )
 
     def _estimate_level(self, distance: Array) -> None:

@@ -25,8 +25,8 @@ _FAR = 4.0  # standard deviations of the prior
 _MOVED = 3.0  # times the scatter of a socket's contacts: it was moved
 _SHUFFLES = 400
 _FEW = 4  # contacts: fewer that lie apart are outliers, not a socket that was moved
-_LOOSE = 10.0  # standard deviations: no scatter, a reading of something else
-_TIP = 0.015  # of the arm's length between the tip as found and as described
+_LOOSE = 7.0  # standard deviations: no scatter, a reading of something else
+_TIP = 0.01  # of the arm's length between the tip as found and as described
 
 
 @dataclasses.dataclass(frozen=True)
@@ -253,13 +253,15 @@ def _swapped(
     noise = np.asarray(calibration.noise_std)
     at = np.array(list(calibration.outliers), dtype=np.intp)
     found: dict[int, int] = {}
-    for other in range(sensor.count):
-        trial = calibration.commands[at]
-        there = trial[:, model.num_joints] == other
-        trial[:, model.num_joints] = other
-        off = calibration.predict(trial) / noise
-        fits = at[(np.abs(off).max(axis=1) < 4.0) & ~there]
-        found |= dict.fromkeys(fits.tolist(), other)
+    if at.size:
+        trial = np.repeat(calibration.commands[None, at], sensor.count, axis=0)
+        own = trial[..., model.num_joints].copy()
+        trial[..., model.num_joints] = np.arange(sensor.count)[:, None]
+        off = np.abs(calibration.predict(trial) / noise).max(axis=-1)
+        for other, row in np.argwhere(
+            (off < 4.0) & (own != trial[..., model.num_joints])
+        ):
+            found[int(at[row])] = int(other)
     if isinstance(sensor, Socket) and not explains:
         # So many that none is an outlier: by the arm as described, where that can tell.
         joints, columns = np.split(calibration.commands[used], [model.num_joints], 1)

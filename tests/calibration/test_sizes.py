@@ -62,7 +62,7 @@ def test_the_factors_maximise_the_marginal_likelihood():
         factors[:30] = np.exp(logs)[GROUPS]
         spread = (slopes * (factors * STD) ** 2) @ slopes.T + 0.01 * np.eye(len(off))
         value = np.linalg.slogdet(spread)[1] + off @ np.linalg.solve(spread, off)
-        return value + (np.square(logs) / np.log(3.0) ** 2).sum()
+        return value + (np.square(logs) / np.log(6.0) ** 2).sum()
 
     sized = np.log(found.prior_precision[:30] ** -0.5 / STD[:30])
     here = np.array([sized[GROUPS == group][0] for group in range(3)])

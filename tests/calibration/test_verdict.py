@@ -162,16 +162,17 @@ def test_many_contacts_of_the_other_socket_are_named():
     assert named == set(wrong.tolist())
 
 
-def test_another_tip_within_the_prior_is_named():
-    arm = contacts.arm("panda_1")
+@pytest.mark.parametrize(("name", "off"), [("panda_1", 0.05), ("kuka_14", 0.02)])
+def test_another_tip_within_the_prior_is_named(name, off):
+    arm, place = contacts.arm(name), contacts.load(name)["front"]
     tool = arm.tool.copy()
-    tool[0, 3] += 0.05
+    tool[0, 3] += off
     arm = dataclasses.replace(arm, tool=tool)
-    commands = np.column_stack(PLACE)
+    commands = np.column_stack(place)
     found = jaxcal.identify(commands, np.zeros((62, 3)), model=arm)
     said = [why for why in found.verdict.reasons if "is it another tip?" in why]
-    assert len(said) == 1 and said[0].startswith("the tip is 0.05 from where")
-    clean = _fit("panda_1", *PLACE).verdict
+    assert len(said) == 1 and said[0].startswith(f"the tip is {off:g}")
+    clean = _fit(name, *place).verdict
     assert not [why for why in clean.reasons if "another tip" in why]
     assert clean.good and not found.verdict.clean
 

@@ -46,7 +46,7 @@ def _round_trip(tmp_path, text, size=1.0, **ends):
     rng = np.random.default_rng(0)
     off = np.where(np.array(model.units) == "length", 0.01, 1.0) * size
     parameters = model.nominal + off * rng.normal(size=model.num_parameters)
-    tip = model.to_urdf(out, parameters)
+    tip = model.write("urdf", out, parameters)
     again = SerialChain.from_urdf(out, sensor=Pose(), **{**ends, "tip": tip})
     return model, parameters, out.read_text(encoding="utf-8"), again
 
@@ -85,7 +85,7 @@ def test_all_but_the_origins_is_kept(tmp_path):
     assert '<mesh filename="a.stl"/>' in text
     assert text.count("<origin") == ARM.count("<origin") + 1  # the wrist had none
     unchanged = tmp_path / "same.urdf"
-    model.to_urdf(unchanged, model.nominal)
+    model.write("urdf", unchanged, model.nominal)
     assert unchanged.read_text(encoding="utf-8") == ARM
 
 
@@ -93,9 +93,9 @@ def test_nothing_is_written_over_a_file_without_force(tmp_path):
     model, _parameters, text, _ = _round_trip(tmp_path, ARM)
     out = tmp_path / "calibrated.urdf"
     with pytest.raises(FileExistsError, match="is there already; force=True"):
-        model.to_urdf(out, model.nominal)
+        model.write("urdf", out, model.nominal)
     assert out.read_text(encoding="utf-8") == text
-    model.to_urdf(out, model.nominal, force=True)
+    model.write("urdf", out, model.nominal, force=True)
     assert out.read_text(encoding="utf-8") == ARM
 
 
@@ -105,19 +105,19 @@ def test_what_no_file_can_hold_is_refused(tmp_path):
     model = SerialChain.from_urdf(path, gears=[2])
     parameters = model.nominal.copy()
     parameters[model.names.index("gear2")] = 1.01
-    with pytest.raises(ValueError, match=r"gear2 is 1\.01, which a URDF file cannot"):
-        model.to_urdf(tmp_path / "out.urdf", parameters)
+    with pytest.raises(ValueError, match=r"gear2 is 1\.01, which such a file cannot"):
+        model.write("urdf", tmp_path / "out.urdf", parameters)
     model = SerialChain.from_urdf(path, compliance=[2])
     parameters = model.nominal.copy()
     parameters[model.names.index("compliance2")] = 0.1
     with pytest.warns(UserWarning, match="compliance2 left out of the file"):
-        model.to_urdf(tmp_path / "stiff.urdf", parameters)
+        model.write("urdf", tmp_path / "stiff.urdf", parameters)
     assert (tmp_path / "stiff.urdf").read_text(encoding="utf-8") == ARM
     with pytest.raises(ValueError, match="must come from a URDF file"):
-        ur5().to_urdf(tmp_path / "out.urdf", ur5().nominal)
+        ur5().write("urdf", tmp_path / "out.urdf", ur5().nominal)
     model = SerialChain.from_urdf(path, base="hand", tip="upper")
     with pytest.raises(ValueError, match="base 'hand' moves with its joint"):
-        model.to_urdf(tmp_path / "out.urdf", model.nominal + 0.01)
+        model.write("urdf", tmp_path / "out.urdf", model.nominal + 0.01)
     assert not (tmp_path / "out.urdf").exists()
 
 
@@ -180,7 +180,7 @@ def test_the_kinematics_file_of_universal_robots(tmp_path):
     parameters = arm.nominal + off * rng.normal(size=arm.num_parameters)
     parameters[30:] = 0.0  # base and tool are not in the file
     path = tmp_path / "kinematics.yaml"
-    arm.to_ur_kinematics(path, parameters)
+    arm.write("ur", path, parameters)
     last = parameters[25:30].copy()
     wrist = _matrix(Rotation.from_euler("x", last[1], degrees=True), [last[0], 0, 0])
     wrist = wrist @ _matrix(Rotation.from_euler("y", last[4], degrees=True))
@@ -189,18 +189,18 @@ def test_the_kinematics_file_of_universal_robots(tmp_path):
         expected = arm.predict(command[None], parameters)[0]
         np.testing.assert_allclose(frame[:3, 3], expected[:3], atol=1e-9)
     # The nominal file is that of the ROS description.
-    arm.to_ur_kinematics(path, arm.nominal, force=True)
+    arm.write("ur", path, arm.nominal, force=True)
     frames = _ur_frames(path.read_text())
     np.testing.assert_allclose(frames[2][:3, 3], [-0.425, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(frames[4][:3, 3], [0.0, -0.09456, 0.0], atol=2e-4)
     with pytest.raises(ValueError, match="must be in metres"):
-        ur5().to_ur_kinematics(path, ur5().nominal)
+        ur5().write("ur", path, ur5().nominal)
 
 
 def test_the_table_as_csv(tmp_path):
     path = tmp_path / "dh.csv"
     parameters = ur5().nominal + 0.1
-    ur5().to_dh(path, parameters)
+    ur5().write("dh", path, parameters)
     rows = np.genfromtxt(path, delimiter=",", names=True)
     np.testing.assert_array_equal(rows["theta"], parameters[3:30:5])
     np.testing.assert_array_equal(rows["beta"], 0.1)

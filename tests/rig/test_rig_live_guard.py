@@ -15,6 +15,7 @@ import pytest
 
 from rig.core.faults import Refused
 from rig.journal import Journal
+from rig.journal.run import SCHEMA
 from rig.signals import PAUSE
 from rig.workbench import live
 from rig.workbench.live.watcher import Watcher
@@ -107,9 +108,8 @@ def test_other_sites_may_link_to_the_page_but_not_frame_it():
 
 def _journal(tmp_path, pid, **more):
     journal = Journal(tmp_path / "journal.jsonl")
-    journal.write(
-        "start", mode="goto", config={}, pid=pid, **{"host": platform.node()} | more
-    )
+    start = {"schema": SCHEMA, "mode": "goto", "config": {}, "host": platform.node()}
+    journal.write("start", pid=pid, **start | more)
     journal.write("phase", phase="moving")
     return journal
 

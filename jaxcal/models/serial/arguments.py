@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import in_words, numbers, whole_number
+from jaxcal.checks import array_of, in_words, numbers, whole_number
+from jaxcal.models.serial.torque import Load
 
 __all__ = [
     "joint_numbers",
@@ -15,7 +16,6 @@ __all__ = [
     "pose_matrix",
     "require_degrees",
     "transform",
-    "triple",
 ]
 
 Array = NDArray[np.float64]
@@ -35,9 +35,7 @@ def require_degrees(rows: Array) -> None:
 def transform(argument: str, given: ArrayLike | None) -> Array:
     """(4, 4) of a translation (3,) or a transform (4, 4)."""
     matrix = np.eye(4)
-    if given is None:
-        return matrix
-    array = numbers(argument, given)
+    array = numbers(argument, matrix if given is None else given)
     if array.shape == (3,):
         matrix[:3, 3] = array
         return matrix
@@ -62,14 +60,6 @@ def pose_matrix(pose: Array) -> Array:
     return matrix
 
 
-def triple(argument: str, given: ArrayLike) -> tuple[float, float, float]:
-    array = numbers(argument, given)
-    if array.shape != (3,):
-        raise ValueError(f"{argument} must have shape (3,), got {array.shape}")
-    x, y, z = array.tolist()
-    return x, y, z
-
-
 def joint_numbers(argument: str, given: Sequence[int], n: int) -> tuple[int, ...]:
     result = tuple(whole_number(argument, joint, 1) for joint in given)
     if len(set(result)) < len(result) or max(result, default=1) > n:
@@ -77,13 +67,11 @@ def joint_numbers(argument: str, given: Sequence[int], n: int) -> tuple[int, ...
     return result
 
 
-def load(
-    given: tuple[int, float, ArrayLike], n: int
-) -> tuple[int, float, tuple[float, float, float]]:
+def load(given: tuple[int, float, ArrayLike], n: int) -> Load:
     if len(given) != 3:
         raise ValueError(f"loads must be (link, weight, centre) each, got {given!r}")
     link, weight, centre = given
     if whole_number("link of a load", link, 1) > n:
         raise ValueError(f"link of a load must be at most {n}, got {link}")
     weight = float(numbers("weight of a load", weight))
-    return int(link), weight, triple("centre of a load", centre)
+    return int(link), weight, tuple(array_of("centre of a load", centre, 3).tolist())

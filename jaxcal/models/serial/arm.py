@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 # row of the table; the tool's three shifts, nominal rotation, three turns. A step is
 # 0, 1, 2, a shift along x, y, z, or 3, 4, 5, a turn about it, or 6 and on, a constant.
 _BASE, _ROW, _TOOL = (0, 1, 2, 3, 4, 5, 6), (0, 3, 2, 5, 4), (0, 1, 2, 7, 3, 4, 5)
+_MANY = 1000  # postures: what is found of so many is not kept
 # Where a, alpha, d, theta and beta act among the five steps of a row.
 _ORDER = {"standard": (2, 3, 1, 0, 4), "modified": (0, 1, 4, 3, 2)}
 
@@ -209,10 +210,30 @@ class Arm:
         """(N, n) how far each joint moves, before its gear."""
         return commands[:, : self.num_joints] @ self.drive.T + self.offset
 
-    def _chain(
+    def _kept(
+        self, name: str, key: tuple[Array, ...], find: Callable[[], tuple[Array, ...]]
+    ) -> tuple[Array, ...]:
+        """What ``find`` gives; the last answer, which a fit asks for again, is kept."""
+        kept = self.__dict__.get(name)
+        if kept is None or not all(map(np.array_equal, kept[0], key)):
+            kept = tuple(map(np.copy, key)), find()
+            if len(key[0]) < _MANY:
+                self.__dict__[name] = kept
+        found: tuple[Array, ...] = kept[1]
+        return found
+
+    def _chain(self, commands: Array, parameters: Array) -> tuple[Array, ...]:
+        """The tool's frame (4, 3, N), axis and origin (S, 3, N) of each step."""
+        return self._kept(
+            "_last_chain",
+            (commands, parameters),
+            lambda: self._after(commands, parameters),
+        )
+
+    def _after(
         self, commands: Array, parameters: Array, links: int | None = None
-    ) -> tuple[Array, Array, Array]:
-        """The tool's frame, or that after some links, axis and origin of each step."""
+    ) -> tuple[Array, ...]:
+        """The same up to the tool, or only to the end of some links."""
         n = len(self.joints)
         gears, compliance, waves = self._drives(parameters)
         moves = gears[:, None] * self._moves(commands).T
@@ -232,7 +253,7 @@ class Arm:
         values[self._steps_of_joints] += moves
         kinds, fixed = self._steps
         end = None if links is None else len(_BASE) + len(_ROW) * links
-        found: tuple[Array, Array, Array] = forward(kinds[:end], values[:end], fixed)
+        found: tuple[Array, ...] = forward(kinds[:end], values[:end], fixed)
         return found
 
     def _tip_at(self, commands: Array, frame: Array) -> Tip:
@@ -256,25 +277,22 @@ class Arm:
         found = self.sensor.read(tip, inputs, self._split(parameters)[2])
         return found.by_tip @ motion.transpose(2, 1, 0), found.by_own
 
-    def _torque(self, commands: Array) -> tuple[Array, Array]:
-        """Of the compliant joints of the nominal arm (C, N), and its rate (C, n, N).
+    def _torque(self, commands: Array) -> tuple[Array, ...]:
+        """Of the compliant joints of the nominal arm (C, N), and its rate (C, n, N)."""
+        first = self.table.size + len(self.gears)
+        stiff = self.nominal
+        stiff[first : first + len(self.compliance)] = 0.0
 
-        A fit asks for the same commands in every step, so the last answer is kept.
-        """
-        kept = self.__dict__.get("_kept_torque")
-        if kept is None or not np.array_equal(kept[0], commands):
-            first = self.table.size + len(self.gears)
-            stiff = self.nominal
-            stiff[first : first + len(self.compliance)] = 0.0
-            _, axes, origins = self._chain(commands, stiff)
-            found = torque(
+        def find() -> tuple[Array, ...]:
+            _, axes, origins = self._after(commands, stiff)
+            return torque(
                 axes[self._steps_of_joints],
                 origins[self._steps_of_joints],
                 np.array([kind == "R" for kind in self.joints]),
                 np.array(self.compliance) - 1,
                 self.loads,
-                lambda link: self._chain(commands, stiff, link)[0],
+                lambda link: self._after(commands, stiff, link)[0],
                 np.array(self.gravity),
             )
-            kept = self.__dict__["_kept_torque"] = (commands.copy(), found)
-        return kept[1]
+
+        return self._kept("_last_torque", (commands,), find)

@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import in_words, numbers, one_of
+from jaxcal.checks import array_of, in_words, numbers, one_of
 from jaxcal.files import write_text
 from jaxcal.models.model import as_commands, as_parameters
 from jaxcal.models.sensors import SENSORS, Position, Sensor, Several
@@ -22,7 +22,6 @@ from jaxcal.models.serial.arguments import (
     pose_matrix,
     require_degrees,
     transform,
-    triple,
 )
 from jaxcal.models.serial.arm import Arm
 from jaxcal.models.uncertainty import Noise, Prior
@@ -187,7 +186,7 @@ class SerialChain(Arm):
             bent,
             swings.reshape(-1, 4),
             tuple(load(each, n) for each in given),
-            triple("gravity", gravity),
+            tuple(array_of("gravity", gravity, 3).tolist()),
             tuple(joint_names) or _numbered(columns),
             moves,
             at_zero,
@@ -347,93 +346,62 @@ class SerialChain(Arm):
             sensor=sensor or Position(),
         )
 
-    def _stiff(self, parameters: ArrayLike) -> Self:
-        """The calibrated arm without what no file of others holds, which is said."""
-        _, yields, waves = self._drives(as_parameters(self, parameters))
-        lost = [f"compliance{i}" for i, one in zip(self.compliance, yields, strict=True)
-                if one]  # fmt: skip
-        lost += [f"harmonics of joint {i}" for i, one in
-                 zip(self.harmonics, waves, strict=True) if one.any()]  # fmt: skip
-        if lost:
-            warnings.warn(
-                f"{', '.join(lost)} left out of the file: its joints are stiff and "
-                "their gears round",
-                stacklevel=3,
-            )
-        return dataclasses.replace(
-            self.calibrated(parameters),
-            compliance=(),
-            yields=np.zeros(0),
-            harmonics=(),
-            waves=np.zeros((0, 4)),
-        )
-
-    def to_urdf(
+    def write(
         self,
+        form: str,
         path: str | os.PathLike[str],
         parameters: ArrayLike,
         *,
         force: bool = False,
     ) -> str:
-        """Write the URDF file that the arm came from, its origins corrected.
+        """Write the arm with ``parameters`` as a file that robots read.
 
-        Meshes, comments and all else stay as they are; the tip goes where ``predict``
-        of positions puts it, the base in the measuring frame included. Such a file has
-        stiff joints: compliance is left out.
+        Such files have stiff joints and round gears: what was found of compliance and
+        harmonics is left out, with a warning.
 
         Args:
+            form: "urdf" is the file that the arm came from, its origins corrected:
+                meshes, comments and all else stay as they are, and the tip goes where
+                ``predict`` of positions puts it, the base in the measuring frame
+                included. "dh" is the table as CSV: joint, a, alpha, d, theta (with the
+                joint's offset), beta. "ur" is the YAML file of Universal Robots' ROS
+                description, for its six joints, without base and tool.
             path: the file to write.
             parameters: (p,) as ``identify`` found them.
             force: write over a file that is there.
 
         Returns:
-            The tip link, a new one where no fixed joint before it could hold the tool.
+            Of "urdf" the tip link, a new one where no fixed joint before it could hold
+            the tool; else "".
 
         Raises:
-            ValueError: the arm is of no URDF file; a gear ratio was found, which such
-                a file cannot hold.
+            ValueError: the arm is not of the form; a gear ratio was found, which none
+                can hold.
             FileExistsError: there is a file and ``force`` is not given.
         """
-        from jaxcal.models.serial.written import urdf_text
+        from jaxcal.models.serial.written import written
 
-        ratios = self._drives(as_parameters(self, parameters))[0]
+        ratios, yields, waves = self._drives(as_parameters(self, parameters))
         for i in np.flatnonzero(ratios != 1.0):
             raise ValueError(
-                f"gear{i + 1} is {ratios[i]:.6g}, which a URDF file cannot hold"
+                f"gear{i + 1} is {ratios[i]:.6g}, which such a file cannot hold"
             )
-        text, tip = urdf_text(self, self._stiff(parameters))
-        _write_new(path, text, force)
+        lost = [f"compliance{self.compliance[i]}" for i in np.flatnonzero(yields)]
+        bent = np.flatnonzero(waves.any(axis=1))
+        lost += [f"harmonics of joint {self.harmonics[i]}" for i in bent]
+        if lost:
+            warnings.warn(
+                f"{', '.join(lost)} left out of the file: its joints are stiff and "
+                "their gears round",
+                stacklevel=2,
+            )
+        text, tip = written(form, self, self.calibrated(parameters))
+        if not force and os.path.exists(path):
+            raise FileExistsError(
+                f"{os.fspath(path)} is there already; force=True writes over it"
+            )
+        write_text(path, text)
         return tip
-
-    def to_dh(
-        self,
-        path: str | os.PathLike[str],
-        parameters: ArrayLike,
-        *,
-        force: bool = False,
-    ) -> None:
-        """Write the calibrated DH table as CSV: joint, a, alpha, d, theta, beta.
-
-        theta has the joint's offset. Arguments and errors as of :meth:`to_urdf`.
-        """
-        from jaxcal.models.serial.written import dh_text
-
-        _write_new(path, dh_text(self._stiff(parameters)), force)
-
-    def to_ur_kinematics(
-        self,
-        path: str | os.PathLike[str],
-        parameters: ArrayLike,
-        *,
-        force: bool = False,
-    ) -> None:
-        """Write the YAML file of Universal Robots' ROS description, for its six joints.
-
-        Base and tool are not in it. Arguments and errors as of :meth:`to_urdf`.
-        """
-        from jaxcal.models.serial.written import ur_text
-
-        _write_new(path, ur_text(self, self._stiff(parameters)), force)
 
     def together(
         self, *tables: tuple[ArrayLike, ArrayLike | None]
@@ -631,14 +599,6 @@ class SerialChain(Arm):
         ]
         sensor = self.sensor.to_dict()
         return {"kind": "serial_chain", **data, "limits": ends, "sensor": sensor}
-
-
-def _write_new(path: str | os.PathLike[str], text: str, force: bool) -> None:
-    if not force and os.path.exists(path):
-        raise FileExistsError(
-            f"{os.fspath(path)} is there already; force=True writes over it"
-        )
-    write_text(path, text)
 
 
 def _numbered(columns: int) -> tuple[str, ...]:

@@ -14,12 +14,13 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.checks import one_of
 from jaxcal.models.serial.urdf import Joint, joints_of, led, moved, row_matrix, walk
 
 if TYPE_CHECKING:
     from jaxcal.models.serial.arm import Arm
 
-__all__ = ["dh_text", "ur_text", "urdf_text"]
+__all__ = ["written"]
 
 Array = NDArray[np.float64]
 
@@ -46,7 +47,15 @@ class _Part(NamedTuple):
         return np.asarray(whole @ np.linalg.inv(self.stands))
 
 
-def urdf_text(nominal: Arm, calibrated: Arm) -> tuple[str, str]:
+def written(form: str, nominal: Arm, calibrated: Arm) -> tuple[str, str]:
+    """The text of a form of :meth:`SerialChain.write`, and the tip link, if any."""
+    one_of("form", form, ("urdf", "dh", "ur"))
+    if form == "urdf":
+        return _urdf_text(nominal, calibrated)
+    return _dh_text(calibrated) if form == "dh" else _ur_text(nominal, calibrated), ""
+
+
+def _urdf_text(nominal: Arm, calibrated: Arm) -> tuple[str, str]:
     """The file of ``nominal`` with the origins of ``calibrated``, and its tip link.
 
     The tip is a new link where the file has no fixed joint that could hold the tool.
@@ -73,7 +82,7 @@ def urdf_text(nominal: Arm, calibrated: Arm) -> tuple[str, str]:
     return written[:at] + more + written[at:], name
 
 
-def dh_text(calibrated: Arm) -> str:
+def _dh_text(calibrated: Arm) -> str:
     """The table as CSV: joint, a, alpha, d, theta (with the offset), beta."""
     lines = ["joint,a,alpha,d,theta,beta"]
     numbers = [f"joint {i + 1}" for i in range(len(calibrated.table))]
@@ -85,7 +94,7 @@ def dh_text(calibrated: Arm) -> str:
     return "\n".join(lines) + "\n"
 
 
-def ur_text(nominal: Arm, calibrated: Arm) -> str:
+def _ur_text(nominal: Arm, calibrated: Arm) -> str:
     """The kinematics file of Universal Robots' ROS description, in metres.
 
     Raises:
