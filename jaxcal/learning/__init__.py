@@ -1,4 +1,4 @@
-"""Training: ``core`` is the whole of it, pure; the other packages stand around it."""
+"""Training: the pure algorithm in ``core``, environments, policies and runs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["make_train"]
 def make_train(config: Any) -> Any:
     """A whole training as one pure function; see ``core.ppo.make_train``.
 
-    Inference without JAX imports this package too, so JAX is loaded here and no sooner.
+    JAX is imported here, because inference without JAX imports this package too.
     """
     from jaxcal.learning.core import ppo
 

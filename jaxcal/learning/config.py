@@ -1,4 +1,4 @@
-"""Every number of a training: of PPO, and of what an update plays."""
+"""Hyperparameters of a training: of PPO, and how much an update plays."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["EpisodesConfig", "PPOConfig", "StreamsConfig"]
 
 @dataclasses.dataclass(frozen=True)
 class PPOConfig(abc.ABC):
-    """Every number of the optimisation; what is played adds its sizes."""
+    """Hyperparameters of the optimisation; subclasses add how much is played."""
 
     unit: ClassVar[str]  # of what is played: "episodes" or "decisions"
     num_epochs: int = setting(2, "passes over what an update has played")
@@ -21,7 +21,7 @@ class PPOConfig(abc.ABC):
     learning_rate: float = setting(2e-3, "of Adam, after the warm-up")
     final_learning_rate: float = setting(3e-5, "at the end; a cosine leads there")
     warmup_updates: int = setting(5, "updates in which the learning rate rises")
-    clip_range: float = setting(0.2, "most that a probability ratio counts beyond 1")
+    clip_range: float = setting(0.2, "probability ratios are clipped to 1 +- this")
     value_coefficient: float = setting(0.5, "weight of the value's error")
     value_error_limit: float = setting(
         3.0, "reward units; beyond, the value's error counts linearly (Huber)"
@@ -29,17 +29,17 @@ class PPOConfig(abc.ABC):
     entropy_start: float = setting(0.02, "entropy bonus at the beginning")
     entropy_end: float = setting(0.0, "entropy bonus at the end; linear between")
     discount: float = setting(1.0, "of a reward one decision later")
-    gae_lambda: float = setting(1.0, "of the advantages; 1 is return less value")
+    gae_lambda: float = setting(1.0, "lambda of GAE; 1 is return minus value")
     normalise_per_decision: bool = False
     advantage_limit: float = setting(
         6.0, "standard deviations; a larger advantage (a singular pick) is clipped"
     )
     max_grad_norm: float = setting(0.5, "global norm at which gradients are clipped")
     average_decay: float = setting(
-        0.99, "for each gradient step, of the averaged weights, which are what is kept"
+        0.99, "decay per gradient step of the averaged weights, which are the policy"
     )
     slice_rows: int = setting(
-        8, "rows of a minibatch whose gradient is computed at once on a CPU: its cache"
+        8, "rows of a minibatch per gradient slice on a CPU, so that it fits the cache"
     )
 
     def __post_init__(self) -> None:
@@ -51,7 +51,7 @@ class PPOConfig(abc.ABC):
         require(self, "in [0, 1)", lambda v: 0.0 <= v < 1.0, "average_decay")
 
     def require_whole(self, total: str, each: str) -> None:
-        """Refuse a ``total`` that is no whole number of minibatches of ``each``."""
+        """Refuse a ``total`` that is not a multiple of ``each`` x num_minibatches."""
         whole = getattr(self, each) * self.num_minibatches
         rule = f"a multiple of {each} x num_minibatches = {whole}"
         require(self, rule, lambda v: v % whole == 0, total)
@@ -68,7 +68,7 @@ class PPOConfig(abc.ABC):
 
     @property
     def played_per_update(self) -> int:
-        """Episodes or decisions."""
+        """Episodes or decisions (``unit``) of an update."""
         return int(getattr(self, f"{self.unit}_per_update"))
 
     @property
@@ -78,7 +78,7 @@ class PPOConfig(abc.ABC):
 
     @property
     def rows_per_minibatch(self) -> int:
-        """What devices share among them."""
+        """Rows of a minibatch, which the devices divide among them."""
         return self.rows_per_update // self.num_minibatches
 
 
@@ -115,7 +115,7 @@ class EpisodesConfig(PPOConfig):
 
 @dataclasses.dataclass(frozen=True)
 class StreamsConfig(PPOConfig):
-    """How much is played, in decisions: sessions differ in length."""
+    """How much is played, in decisions, because sessions differ in length."""
 
     unit: ClassVar[str] = "decisions"
     num_updates: int = setting(300, "training budget")

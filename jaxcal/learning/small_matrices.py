@@ -21,8 +21,8 @@ __all__ = [
     "solve_lower",
 ]
 
-_TINY = 1e-12  # below any squared length that float32 commands in [0, 1] can show
-_UNROLLED_ROWS = 16  # rows up to which sums over them are written out
+_TINY = 1e-12  # least squared pivot; float32 commands in [0, 1] resolve no smaller one
+_UNROLLED_ROWS = 16  # sums over at most so many rows are written out
 
 
 def cholesky(matrix: jax.Array) -> jax.Array:
@@ -66,11 +66,11 @@ def _factored(rows: list[list[jax.Array]]) -> list[list[jax.Array]]:
 
 
 def solve_lower(lower: jax.Array, rows: jax.Array) -> jax.Array:
-    """Rows ``r`` of the solution of ``lower @ r = row``, by forward substitution.
+    """Solutions ``r`` of ``lower @ r = row`` for each row, by forward substitution.
 
     Args:
         lower: (..., p, p) lower triangular.
-        rows: (..., M, p) right-hand sides, one a row.
+        rows: (..., M, p) right-hand sides, one per row.
 
     Returns:
         (..., M, p).
@@ -93,8 +93,8 @@ def log_det_gram(
         postures: (..., K, n) commands, K > n.
         present: (..., K) bool, the rows that count; all of them by default. At least
             one must.
-        floor: least squared column length, relative to its share before projection;
-            it keeps the value finite where the postures lie in one plane.
+        floor: least squared length of a column after projection; it keeps the value
+            finite where the postures lie in one plane.
 
     Returns:
         (...,) natural log.
@@ -121,22 +121,22 @@ def log_det_gram(
 
 
 def picked(candidates: jax.Array, chosen: jax.Array) -> jax.Array:
-    """(..., K, n) postures that were chosen; the first one where nothing is yet.
+    """(..., K, n) chosen postures; the first candidate where nothing is chosen yet.
 
     Args:
         candidates: (..., M, n).
         chosen: (..., K) int, -1 where nothing is chosen.
     """
-    # One form of gather for all callers: XLA merges those that are equal.
+    # All callers use this same gather, so XLA merges equal ones.
     index = jnp.maximum(chosen, 0)[..., None]
     return jnp.take_along_axis(candidates, index, axis=-2, mode="clip")
 
 
 def row_parts(column: jax.Array) -> list[jax.Array]:
-    """A column (..., K) as K arrays (..., 1) where K is small, else as it is.
+    """A column (..., K) as K arrays (..., 1) where K <= 16, else as one array.
 
-    A compiled loop runs over the last axis that is long: one over the batch is several
-    times faster than one over four rows, and long columns would be long programs.
+    XLA's inner loop then runs over the batch, several times faster than over four rows.
+    Long columns are not split, because the program would grow with K.
     """
     k = column.shape[-1]
     size = 1 if k <= _UNROLLED_ROWS else k

@@ -181,7 +181,7 @@ def _truncate(step: pathlib.Path) -> None:
 def test_results_that_arrive_after_a_failed_read_are_ignored():
     # Orbax closes its event loop while tensorstore still reads; without this, users
     # see "Event loop is closed" below the message about a damaged checkpoint.
-    loop = checkpoint._PatientPolicy().new_event_loop()
+    loop = checkpoint._TolerantPolicy().new_event_loop()
     loop.close()
     assert loop.call_soon_threadsafe(print) is None
     plain = asyncio.new_event_loop()

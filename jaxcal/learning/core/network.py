@@ -1,7 +1,7 @@
-"""What a network that chooses postures is.
+"""Interface of a network that chooses postures.
 
-What needs no parameters is kept apart from what does, so that training computes it once
-for a decision and not in every epoch:
+Features, which need no parameters, are separate from ``encode`` and ``decode``, so that
+training computes them once for a decision and not in every epoch:
 
     features      = candidate_features(candidates, usable)        of a set
     decision      = decision_features(features, chosen, available, count)
@@ -35,7 +35,7 @@ class Network(nn.Module):
         return 0
 
     def candidate_features(self, candidates: jax.Array, usable: jax.Array) -> Any:
-        """Of sets (..., M, n) of which (..., M) are usable: available or chosen."""
+        """Features of sets (..., M, n); (..., M) bool usable: available or chosen."""
         raise NotImplementedError(_OWN)
 
     def decision_features(
@@ -45,7 +45,7 @@ class Network(nn.Module):
         available: jax.Array,
         count: int,
     ) -> Any:
-        """Of the decision after ``count`` choices.
+        """Features of the decision after ``count`` choices.
 
         Args:
             features: from ``candidate_features``.
@@ -64,13 +64,13 @@ class Network(nn.Module):
         raise NotImplementedError(_OWN)
 
     def lookahead_logits(self, decision: Any) -> tuple[jax.Array, jax.Array]:
-        """As ``decode``, of one of the last ``num_unlearned`` choices."""
+        """As ``decode``, for one of the last ``num_unlearned`` choices."""
         raise NotImplementedError(_LAST)
 
     def __call__(
         self, candidates: jax.Array, available: jax.Array, chosen: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """The first decision; flax makes the parameters with it."""
+        """Logits and value of the first decision; flax initialises with this call."""
         features = self.candidate_features(candidates, available)
         decision = self.decision_features(features, chosen, available, 0)
         return self.decode(self.encode(features), decision)
@@ -78,7 +78,7 @@ class Network(nn.Module):
 
 def initial(network: Network, key: jax.Array, m: int, n: int, k: int) -> Any:
     """Fresh parameters for M candidates of n inputs and K choices."""
-    init = jax.jit(network.init)  # op by op it would be two hundred small programs
+    init = jax.jit(network.init)  # eager, it would compile two hundred small programs
     blank = jnp.zeros((1, m, n)), jnp.ones((1, m), bool), jnp.full((1, k), -1)
     return init(key, *blank)["params"]
 

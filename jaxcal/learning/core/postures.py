@@ -1,9 +1,8 @@
 """Postures: episodes of K choices among M candidates, as PPO plays and scores them.
 
-A row is a fresh candidate set and several whole episodes on it: they share its
-geometry, its encoding and its first decision, and are each other's baseline. All are
-equally long, so they are played step by step; the network's last, unlearned choices are
-made by its look-ahead. G episodes on a set, T decisions of them learned.
+A row is a fresh candidate set and G episodes on it. They share its features, its
+encoding and the first decision, whose baseline is the mean return of the others. Of the
+K choices the network learns the first T; its look-ahead makes the rest.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ class Episode(Protocol):
 
     @property
     def value_scale(self) -> float:
-        """Reward for a unit of the network's value."""
+        """Reward per unit of the network's value."""
 
     def reset(self, key: jax.Array) -> Any:
         """The state of a new episode."""
@@ -45,17 +44,17 @@ class Episode(Protocol):
         """The next state, () reward, () bool done."""
 
     def paid(self, state: Any) -> jax.Array:
-        """() reward received already of what the network's value predicts."""
+        """() part of the total that the network's value predicts, received so far."""
 
     def outcome(self, state: Any) -> jax.Array:
-        """() what a finished episode is judged by."""
+        """() score of a finished episode, for the metric ``log_det_mean``."""
 
 
 @struct.dataclass
 class Seen:
-    """What the network is shown of a set: T learned decisions of G episodes."""
+    """Inputs of the network for one set: T learned decisions of G episodes."""
 
-    features: Any  # leaves (...): of the candidate set
+    features: Any  # leaves (...): candidate features of the set
     first: Any  # leaves (...): of the first decision, which the episodes share
     later: Any  # leaves (T - 1, G, ...): of the others; None where T is 1
 
@@ -93,7 +92,7 @@ class Postures:
     def loss(
         self, params: Any, experience: Batch, done: jax.Array
     ) -> tuple[jax.Array, Metrics]:
-        """PPO's, of whole episodes."""
+        """PPO loss of whole episodes."""
         score = jax.vmap(functools.partial(self._score, params))
         return surrogate(self.config, *score(experience.seen), experience, done)
 
@@ -157,7 +156,7 @@ class Postures:
         stack = functools.partial(jax.tree.map, lambda *leaves: jnp.stack(leaves))
         played = stack(*records)  # leaves (K, G)
         advantage, target = self._advantages_and_targets(played)
-        # The last choices, made by the look-ahead alone, are not learned from.
+        # The last choices, which the look-ahead makes, are not trained on.
         later = stack(*decisions[1:learned]) if learned > 1 else None
         batch = Batch(
             seen=Seen(features, decisions[0], later),
@@ -173,7 +172,7 @@ class Postures:
 
         ``played`` holds (K, G) values, rewards, and what was paid before.
         """
-        # What was paid already is not to come: the baseline is the value of the rest.
+        # The baseline is the predicted total minus what was received before.
         rest = played["value"] - played["paid"]
         following = jnp.concatenate([rest[1:], jnp.zeros_like(rest[:1])])
         goes_on = jnp.ones_like(rest).at[-1].set(0.0)
@@ -181,7 +180,7 @@ class Postures:
         target = advantage + played["value"]
         others = self.config.episodes_per_set - 1
         if others:
-            # On the first decision the other episodes are the better baseline.
+            # The first decision is the same in all: the others' mean is a better one.
             baseline = (target[0].sum() - target[0]) / others
             advantage = advantage.at[0].set(target[0] - baseline)
         return advantage, target

@@ -4,8 +4,8 @@
     weights, metrics = jax.jit(train)(jax.random.key(0))
     jax.vmap(train)(jax.random.split(jax.random.key(0), 8))  # eight runs, one program
 
-A ``Learner`` plays and scores: ``postures`` does it for episodes of a fixed number of
-choices, ``streams`` for sessions that end when they end. Everything here is pure;
+A ``Learner`` plays and scores: ``postures`` has that of episodes of a fixed number of
+choices, ``streams`` that of sessions of any length. Everything here is pure;
 ``training.run`` adds files, progress and a host.
 
 Sources: Schulman et al. 2017 (clipped surrogate), 2016 (advantages).
@@ -52,18 +52,18 @@ class Learner(Protocol):
     """
 
     def __hash__(self) -> int:
-        """It is static to ``jit``."""
+        """Hashable, as a static argument of ``jit``."""
 
     def init(self, key: jax.Array, *given: Any) -> Any:
         """Parameters before training."""
 
     def gather(self, params: Any, keys: jax.Array, *given: Any) -> tuple[Any, Metrics]:
-        """Play a row of experience, (B, ...) leaves, with each of the keys (B,)."""
+        """Play one row of experience per key (B,): leaves (B, ...), and metrics."""
 
     def loss(
         self, params: Any, experience: Any, done: jax.Array
     ) -> tuple[jax.Array, Metrics]:
-        """Mean loss and metrics of some rows of experience, after ``done`` updates."""
+        """Mean loss and metrics of rows of experience, after ``done`` updates."""
 
 
 @struct.dataclass
@@ -108,7 +108,8 @@ def advantages(
 
 
 def normalised(config: PPOConfig, batch: Batch) -> Batch:
-    """Advantages with mean 0 and scale 1 over the batch, then clipped."""
+    """Advantages with mean 0 and scale 1, over the batch or for each of the T decisions
+    (``normalise_per_decision``), then clipped."""
     axes = 0, *range(2, batch.advantage.ndim)
     over = axes if config.normalise_per_decision else None
     centred = batch.advantage - batch.advantage.mean(over, keepdims=True)
@@ -140,7 +141,7 @@ def surrogate(
     ratio = jnp.exp(log_ratio)
     clipped = jnp.clip(ratio, 1.0 - config.clip_range, 1.0 + config.clip_range)
     gain = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
-    # Beyond the limit a line: it has a gradient however wrong a value is.
+    # Squared up to the limit, linear beyond, where a clipped error has no gradient.
     limit = config.value_error_limit
     error = 2.0 * optax.losses.huber_loss(value, batch.target, delta=limit)
     metrics = {
@@ -157,10 +158,10 @@ def surrogate(
 
 @struct.dataclass
 class TrainState:
-    """All that an uninterrupted run would need to go on, bit for bit."""
+    """All that a resumed run needs to go on as if uninterrupted, bit for bit."""
 
     params: Any  # network parameters
-    average: Any  # exponential average of the parameters, what a checkpoint offers
+    average: Any  # exponential average of the parameters: the policy
     opt_state: Any  # of Adam
     key: jax.Array  # (2,) uint32, data of the PRNG key of the next update
     num_updates: jax.Array  # () int32, updates made
@@ -182,7 +183,7 @@ def begin(
 
 
 def schedule(config: PPOConfig) -> optax.Schedule:
-    """The learning rate after so many gradient steps: a rise, then a cosine."""
+    """Learning rate by gradient step: linear warm-up, then cosine decay."""
     steps = config.steps_per_update
     return optax.warmup_cosine_decay_schedule(
         init_value=config.learning_rate / 10,
@@ -200,15 +201,15 @@ def optimiser(config: PPOConfig) -> optax.GradientTransformation:
 
 def descend(config: PPOConfig, state: TrainState, grads: Any) -> TrainState:
     """One gradient step: clipped by the global norm, Adam, averaged weights."""
-    # By one factor: optax divides every gradient by the norm, which XLA fuses into
-    # neither of Adam's moments (7 to 14 % of an update of the paper's network).
+    # One factor: optax divides each gradient by the norm, which XLA does not fuse with
+    # Adam's moments (that takes 7 to 14 % of an update of the paper's network).
     norm = jnp.sqrt(sum(jnp.vdot(grad, grad) for grad in jax.tree.leaves(grads)))
     factor = jnp.minimum(1.0, config.max_grad_norm / jnp.maximum(norm, 1e-30))
     grads = jax.tree.map(lambda grad: grad * factor, grads)
     changes, opt_state = optimiser(config).update(grads, state.opt_state)
     params = optax.apply_updates(state.params, changes)
-    # The share of the newest weights in a mean whose weights decay and add up to one:
-    # 1 at the first step, so that nothing of the initial weights stays.
+    # Exponential average with bias correction: the share of the newest weights is 1 at
+    # the first step, so the initial weights do not enter.
     decay, count = config.average_decay, opt_state[0].count
     share = (1.0 - decay) / (1.0 - decay**count)
     average = optax.incremental_update(params, state.average, share)
@@ -216,7 +217,7 @@ def descend(config: PPOConfig, state: TrainState, grads: Any) -> TrainState:
 
 
 def placed(tree: Any, mesh: Mesh | None, *axes: str) -> Any:
-    """The same values, each leaf's leading axes spread over those of the mesh."""
+    """The tree, leading axes of leaves sharded over the mesh ``axes``; none: copies."""
     if mesh is None:
         return tree
     sharding = NamedSharding(mesh, PartitionSpec(*axes))
@@ -226,16 +227,16 @@ def placed(tree: Any, mesh: Mesh | None, *axes: str) -> Any:
 def make_update(
     config: PPOConfig, learner: Learner, mesh: Mesh | None = None
 ) -> Callable[..., tuple[TrainState, Metrics]]:
-    """One update: play, then epochs of minibatches over it; pure, not compiled.
+    """One update: play, then epochs of minibatches; pure, not compiled.
 
-    On a mesh the rows are spread over its devices while they are played, what was
-    played is then whole on every device, and each minibatch is spread again: it is any
-    of the rows, as on a single device, and is cut without further communication.
+    On a mesh every device plays some of the rows; all rows are then copied to every
+    device, so that a minibatch can hold any of them, as on a single device. A device
+    computes the gradient of its part of each minibatch.
 
     Args:
         config: the optimisation.
         learner: what is trained.
-        mesh: with the one axis ``sets``; None for one device, which places nothing.
+        mesh: with the one axis ``sets``; None for one device.
 
     Returns:
         (state, *given) -> the next state and metrics.
@@ -251,9 +252,9 @@ def make_update(
 
         def step(state: TrainState, index: jax.Array) -> tuple[TrainState, Metrics]:
             def gradient(part: jax.Array) -> tuple[Any, Metrics]:
-                some = placed(jax.tree.map(lambda leaf: leaf[part], rows), mesh, "sets")
+                cut = placed(jax.tree.map(lambda leaf: leaf[part], rows), mesh, "sets")
                 of_loss = jax.grad(learner.loss, has_aux=True)
-                return of_loss(state.params, some, state.num_updates)
+                return of_loss(state.params, cut, state.num_updates)
 
             # A slice's arrays stay in a core's cache: faster than all rows at once.
             size = len(index) if whole else math.gcd(len(index), config.slice_rows)
@@ -282,9 +283,9 @@ def make_train(config: Any) -> Callable[..., tuple[Any, Metrics]]:
             it reads ``ppo`` and ``learners``: update u trains number u modulo theirs.
 
     Returns:
-        (key; *given, what the learners are given: nothing for postures, the arrays of a
-        task for streams) -> the averaged weights, and metrics with a leading axis of
-        ``config.ppo.num_updates``.
+        ``train(key, *given)`` -> the averaged weights, and metrics with a leading axis
+        of ``config.ppo.num_updates``. ``given``: none for postures, the arrays of a
+        task for streams.
     """
     learners = config.learners
     each = [make_update(config.ppo, learner) for learner in learners]

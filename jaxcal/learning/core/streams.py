@@ -1,12 +1,12 @@
-"""Streams: sessions of any length, one beginning where another ends, as PPO plays them.
+"""Streams: sessions of any length played one after another, as experience for PPO.
 
-B streams of T decisions are an update, however long the sessions in them are. What
-follows a decision counts in expectation over what may happen, not as it happened: the
-randomness of outcomes, most of the variance, is left out, and the expectation of the
-advantages is the same.
+An update plays B streams of T decisions, however long the sessions in them are. The
+value after a decision is the expectation over its possible outcomes, not the value of
+the outcome that was drawn: the advantages have the same expectation without the
+randomness of outcomes, which is most of their variance.
 
-The environment is given its task as arrays, never closed over: another task of the same
-shapes compiles nothing.
+The task is an argument of the environment's functions, as arrays: another task of the
+same shapes compiles nothing.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ __all__ = ["Environment", "Step", "Streams"]
 
 @struct.dataclass
 class Step:
-    """What a decision leads to: Y states that may follow, one of which happened."""
+    """Result of a decision: Y states that may follow, one of which was drawn."""
 
     reward: jax.Array  # () expected of the decision
     states: Any  # leaves (Y, ...)
-    ended: jax.Array  # (Y,) bool, the session is over then
-    chance: jax.Array  # (Y,) probabilities; [1.0] where only what happened is known
-    happened: jax.Array  # () int32, which of them
+    ended: jax.Array  # (Y,) bool, whether the session ends in that state
+    chance: jax.Array  # (Y,) probabilities; [1.0] if only the drawn state is known
+    happened: jax.Array  # () int32, index of the state that was drawn
 
 
 class Environment(Protocol):
@@ -43,12 +43,12 @@ class Environment(Protocol):
         """The state of a new session."""
 
     def observe(self, task: Any, state: Any, key: jax.Array) -> Any:
-        """What the network sees: a tree of arrays, options among it."""
+        """Inputs of the network: a tree of arrays, which includes the options."""
 
     def step(
         self, task: Any, state: Any, seen: Any, action: jax.Array, key: jax.Array
     ) -> Step:
-        """Take an option: ``action`` () int32 of those in ``seen``."""
+        """Take the option with index ``action``, () int32, of those in ``seen``."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Streams:
     def gather(self, params: Any, keys: jax.Array, task: Any) -> tuple[Batch, Metrics]:
         """Play a stream with each of the keys (B,)."""
         play = jax.vmap(self._play, in_axes=(None, 0, None))
-        batch, reward, ended = play(params, keys, task)  # (B, T + 1)
+        batch, reward, ended = play(params, keys, task)  # the last two (B, T + 1)
         metrics = {
             "reward_mean": reward.sum() / jnp.maximum(ended.sum(), 1.0),
             "choices": 1.0 / jnp.maximum(ended.mean(), 1e-6),
@@ -77,15 +77,15 @@ class Streams:
     def loss(
         self, params: Any, experience: Batch, done: jax.Array
     ) -> tuple[jax.Array, Metrics]:
-        """PPO's."""
+        """PPO loss of some streams."""
         logits, value = cast(Any, self.network.apply(params, experience.seen))
         return surrogate(self.config, logits, value, experience, done)
 
     def _play(
         self, params: Any, key: jax.Array, task: Any
     ) -> tuple[Batch, jax.Array, jax.Array]:
-        """Sessions one after another: a row of T decisions; and of T + 1, of which the
-        last closes the row, the rewards and where a session ended."""
+        """A row of T decisions; (T + 1,) rewards; (T + 1,) 1.0 where a session ended.
+        Decision T + 1 is played for the value that follows decision T."""
         environment = self.environment
 
         def score(state: Any, key: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
@@ -99,7 +99,7 @@ class Streams:
             step = environment.step(task, state, seen, action, key_step)
             happened, number = step.happened, len(step.chance)
 
-            # The value of what happened is the next decision's.
+            # The drawn state is valued at the next decision, only the others here.
             others = jnp.zeros(())
             if number > 1:
                 elsewhere = (happened + jnp.arange(1, number)) % number

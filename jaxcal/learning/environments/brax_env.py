@@ -1,8 +1,8 @@
 """Episodes as ``brax.envs.base.Env``; importing this loads brax.
 
 ``done`` is 1 on the last step: an episode ends, it is never cut off, so brax's
-``truncation`` stays 0. brax's own ``AutoResetWrapper`` replays the first episode for
-ever; ``wrap_fresh`` draws a new one every time.
+``truncation`` stays 0. brax's own ``AutoResetWrapper`` replays the first episode;
+``wrap_fresh`` draws a new one every time.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ __all__ = ["EpisodeEnv", "SelectionEnv", "wrap_fresh"]
 
 
 class EpisodeEnv(Env, abc.ABC):
-    """One episode of what jaxcal plays; brax's wrappers make the batch."""
+    """One episode as a brax environment; brax's wrappers make the batch."""
 
-    metric: ClassVar[str]  # what ``advance`` reports beside the reward
+    metric: ClassVar[str]  # name of the number that ``advance`` returns last
     backend = "jaxcal"
 
     @abc.abstractmethod
@@ -37,7 +37,7 @@ class EpisodeEnv(Env, abc.ABC):
 
     @abc.abstractmethod
     def advance(self, episode: Any, action: jax.Array) -> tuple[Any, ...]:
-        """The next episode, reward, () bool whether it was the last step, metric."""
+        """The episode after the step, () reward, () bool done, () metric."""
 
     def reset(self, rng: jax.Array) -> State:
         """A new episode; ``rng`` is a legacy uint32 key, which brax's wrappers need."""
@@ -64,7 +64,7 @@ class EpisodeEnv(Env, abc.ABC):
 
     @property
     def observation_size(self) -> int:
-        key = jax.random.PRNGKey(0)  # brax's own kind
+        key = jax.random.PRNGKey(0)  # legacy uint32, as brax uses
         return int(jax.eval_shape(self.reset, key).obs.shape[-1])
 
 
@@ -73,7 +73,7 @@ class SelectionEnv(EpisodeEnv):
 
     Observation: (n M + M + 2 n + 4,) of ``environment.observe``, the paper's 210.
     Action: () int32, an available candidate. Reward and end: as
-    ``jaxcal.learning.environments.selection``; ``log_det`` is paid with the reward.
+    ``jaxcal.learning.environments.selection``. Metric ``log_det``: the unscaled reward.
     """
 
     metric = "log_det"
@@ -118,7 +118,7 @@ class _FreshReset(Wrapper):
             episode, obs = jax.tree.map(where_done, new, old)
             return state.replace(pipeline_state=episode, obs=obs)
 
-        # All environments of a batch end together, so three steps of four skip this.
+        # Episodes of one length end together, so all steps but their last skip this.
         return jax.lax.cond(jnp.any(state.done > 0), renewed, lambda s: s, state)
 
 
@@ -128,7 +128,7 @@ def wrap_fresh(
     action_repeat: int = 1,
     randomization_fn: Any = None,
 ) -> Wrapper:
-    """What to pass to brax's trainers as ``wrap_env_fn``.
+    """The ``wrap_env_fn`` for brax's trainers: a new episode after every ``done``.
 
     Args:
         env: one episode.

@@ -1,8 +1,8 @@
-"""Keys and uniform numbers: those of ``jax.random``, several times faster on a CPU.
+"""PRNG keys and uniform numbers of ``jax.random``, several times faster on a CPU.
 
-jax computes its Threefry hash on the CPU as a loop whose every round goes through
-memory, to compile sooner. Written out, the twenty rounds fuse into one pass: the same
-bits in about a quarter of the time, and quicker to compile beside everything else.
+On a CPU jax runs its Threefry hash as a loop that writes every round to memory, to
+compile sooner. Unrolled, the twenty rounds fuse into one pass: the same bits in about a
+quarter of the time, and it compiles sooner within a larger program.
 Source of the hash: Salmon, Moraes, Dror and Shaw, Parallel Random Numbers: As Easy as
 1, 2, 3, SC 2011.
 """
@@ -59,7 +59,7 @@ def split(key: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def _is_plain_threefry(key: jax.Array) -> bool:
-    """Whether the key is Threefry's and jax numbers its draws by position."""
+    """Whether it is a Threefry key and ``jax_threefry_partitionable`` is on."""
     typed = jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key)
     default = getattr(jax.config, "jax_default_prng_impl", "")
     name = str(jax.random.key_impl(key)) if typed else default

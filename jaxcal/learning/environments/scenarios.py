@@ -1,8 +1,8 @@
 """Where training candidates come from: shapes and masks, a pool, given sets.
 
 Each function returns a ``Candidates``: key -> (M, n) candidates and (M,) available. The
-compact network is blind to affine maps, so ranges, shear and correlation need no shape
-of their own in ``mixture``; what is left is the shape of the cloud and what is masked.
+compact network is invariant to affine maps, so ``mixture`` varies no ranges, shear or
+correlation, only the shape of the cloud and what is masked.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SHAPES = ("uniform", "gaussian", "sphere", "clustered", "grid", "cluster_uniform
 def given(
     config: SelectionConfig, sets: ArrayLike, available: ArrayLike | None = None
 ) -> Candidates:
-    """One of the given sets for every episode; of a single one, a pool, some rows.
+    """A given set, drawn for every episode; of a single set (a pool), M of its rows.
 
     Args:
         config: sizes.
@@ -60,7 +60,7 @@ def given(
 
 
 def _shape(name: str, key: jax.Array, m: int, n: int) -> jax.Array:
-    """(M, n) candidates of one shape, about the size of the unit cube."""
+    """(M, n) candidates of one shape, of order one in size."""
     key_a, key_b, key_c = jax.random.split(key, 3)
     if name == "uniform":
         return randomness.uniform(key_a, (m, n))
@@ -76,7 +76,7 @@ def _shape(name: str, key: jax.Array, m: int, n: int) -> jax.Array:
         key_width, key_noise = jax.random.split(key_c)
         width = jax.random.uniform(key_width, (), minval=0.02, maxval=0.15)
         return centres[which] + width * jax.random.normal(key_noise, (m, n))
-    # "grid": distinct nodes of one fine enough for M, of a size that varies a little.
+    # "grid": M distinct nodes of a grid with ``least`` to ``least + 2`` nodes per axis.
     least = next(side for side in itertools.count(2) if side**n >= m)
     side = jax.random.randint(key_a, (), least, least + 3)
     nodes = jax.random.permutation(key_b, (least + 2) ** n)

@@ -4,13 +4,14 @@
 |---|---|
 | state | the candidate set, what was chosen, what is still available |
 | action | the index of one available candidate |
-| reward | 0, and after every (n + 1)-th choice ``reward_scale * log det S`` |
+| reward | ``reward_scale * log det S`` at each (n + 1)-th and the last choice, else 0 |
 | end | after ``num_selected`` choices; a pure termination, nothing is truncated |
 | version | 1 |
 
-Write for one episode, ``jax.vmap`` for thousands. The key lives in the state, so that
-``reset_from`` draws fresh candidates for every episode. Source: paper, Section 2.3 and
-Table 2; the reward's range is discussed in docs/environment.md.
+With ``reward_gain`` the reward is the increase of log det S since the last payment.
+Functions take one episode; ``jax.vmap`` makes a batch. ``reset_from`` draws the next
+episode's candidates from the key in the state. Source: paper, Section 2.3 and Table 2;
+docs/environment.md discusses the reward's range.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ Candidates = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
 
 @dataclasses.dataclass(frozen=True)
 class SelectionConfig:
-    """What an episode is."""
+    """Sizes and reward of an episode."""
 
     num_candidates: int = setting(50, "postures offered per episode")
     num_selected: int = setting(4, "postures chosen; num_inputs + 1 identify the model")
@@ -80,7 +81,7 @@ class SelectionConfig:
 class SelectionState:
     """One calibration episode."""
 
-    candidates: jax.Array  # (M, n) float32, commands, normalised by convention
+    candidates: jax.Array  # (M, n) float32 commands, usually in [0, 1]
     chosen: jax.Array  # (K,) int32, -1 where nothing is chosen yet
     available: jax.Array  # (M,) bool, True = may be chosen
     count: jax.Array  # () int32, postures chosen so far

@@ -1,7 +1,7 @@
-"""What is trained on: an episode of selection and where its candidates come from.
+"""Task of a training: the selection environment and where its candidates come from.
 
-A ``Task`` is all that the trainer knows of an environment; ``core.postures.Episode``
-says what it needs. Another environment is another class with these methods.
+``Task`` implements ``core.postures.Episode``, which PPO plays. Another environment is
+another class with these methods.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["GivenCandidates", "Task"]
 
 @dataclasses.dataclass(frozen=True)
 class GivenCandidates:
-    """The user's own candidates, known by their digest; a checkpoint holds no copy."""
+    """The user's own candidates; a checkpoint holds their digest, not the values."""
 
     name: str = field(compare=False)  # of the file, for messages
     sha256: str  # of the file
@@ -35,7 +35,7 @@ class GivenCandidates:
     available: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     def source(self, config: SelectionConfig) -> Candidates:
-        """Draws candidates for an episode."""
+        """key -> the candidates of an episode, from the file's values."""
         if self.values is None:
             raise ValueError(
                 f"this run was trained on {self.name}: give the file again with "
@@ -51,7 +51,7 @@ class Task:
     environment: SelectionConfig = field(default_factory=SelectionConfig)
     shapes: tuple[str, ...] = ("uniform",)  # see scenarios.SHAPES
     masked: float = 0.0  # greatest share of candidates masked
-    random_starts: float = 0.0  # share of episodes begun with random choices
+    random_starts: float = 0.0  # share of imitated episodes begun with random choices
     given: GivenCandidates | None = None  # instead of shapes and masked
 
     @property
@@ -68,7 +68,7 @@ class Task:
 
     @property
     def value_scale(self) -> float:
-        """Reward for a unit of the log det(Z.T Z) that a network predicts."""
+        """Reward per unit of the log det(Z.T Z) that a network predicts."""
         return self.environment.reward_scale * self.environment.num_outputs
 
     def reset(self, key: jax.Array) -> SelectionState:
@@ -82,7 +82,7 @@ class Task:
         return selection.step(state, action, self.environment)
 
     def paid(self, state: SelectionState) -> jax.Array:
-        """() reward received already of the final value; 0 if each payment is whole."""
+        """() reward received so far of the final value; 0 without ``reward_gain``."""
         config = self.environment
         return config.reward_scale * state.paid * float(config.reward_gain)
 

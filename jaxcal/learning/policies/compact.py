@@ -27,10 +27,10 @@ _SHARP = 60.0  # inverse temperature of the choices that need no learning
 
 
 class _Dense(nn.Module):
-    """A dense layer over inputs side by side, each multiplied by its own rows alone.
+    """A dense layer on concatenated inputs, as a product of each with its kernel rows.
 
-    What all candidates share, or all decisions of a set, is then multiplied once and
-    not for each of them.
+    An input that all candidates of a set share, or all decisions on it, is then
+    multiplied once and not for each of them.
     """
 
     width: int
@@ -71,7 +71,7 @@ class _Round(nn.Module):
         total = jnp.einsum("...mf,...mw->...fw", vectors.moments, v)
         number = jnp.maximum(active.sum(-2, keepdims=True), 1.0)
         mean = (u * active).sum(-2, keepdims=True) / number
-        # The layer over messages is applied to their few totals instead.
+        # The layer is linear: it is applied to p (p + 1) / 2 totals, not M messages.
         own, sent = _Dense(2 * width, name="mix")(u, total)
         inner = own + jnp.einsum("...mf,...fw->...mw", vectors.moments, sent)
         pooled = nn.Dense(2 * width, use_bias=False, name="pool")(mean)
@@ -82,13 +82,13 @@ class _Round(nn.Module):
 class CompactNetwork(Network):
     """Permutation-equivariant, affine-invariant, for any M, K and n.
 
-    It sees the candidates only through inner products of whitened regressors, so no
-    affine map of the commands and no order of the candidates can change the pick.
+    Its inputs are functions of inner products of whitened regressors, so no affine map
+    of the commands and no order of the candidates changes the pick.
 
-    The last two choices are the look-ahead's (``num_unlearned``): the best pair given
-    what was chosen before, then the largest gain. At K = n + 2 the choices before the
-    pair do not span the space and it is rated with the ridge of ``features`` beside
-    them: it may be second best where those choices nearly coincide (docs/policy.md).
+    The look-ahead makes the last two choices (``num_unlearned``): the best pair given
+    the choices before, then the largest gain. At K = n + 2 the choices before the pair
+    do not span the space, so pairs are compared with the ridge of ``features`` added:
+    the pair may be second best where those choices nearly coincide (docs/policy.md).
     """
 
     config: NetworkConfig

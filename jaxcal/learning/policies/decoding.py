@@ -34,7 +34,7 @@ def complete(
     first: int,
     key: jax.Array | None,
 ) -> jax.Array:
-    """Choose from position ``first`` to the end; by sampling where a key is given."""
+    """Choose from position ``first`` to the end: sampled with a key, else greedy."""
     m = available.shape[-1]
     for position in range(first, chosen.shape[-1]):
         logits, _ = logits_at(
@@ -61,7 +61,7 @@ def logits_at(
 ) -> tuple[jax.Array, jax.Array]:
     """(B, M) logits and (B,) value of the decision after ``count`` choices.
 
-    The last ``network.num_unlearned`` choices are the look-ahead's.
+    The look-ahead makes the last ``network.num_unlearned`` choices.
     """
     decision = network.decision_features(features, chosen, available, count)
     if chosen.shape[-1] - count <= network.num_unlearned:
@@ -122,8 +122,8 @@ def choose(
             network, params, features, memory, chosen, free, num_required
         )
         _, firsts = jax.lax.top_k(logits, min(num, m))
-        # With fewer than num candidates left the list ends in masked ones: repeat the
-        # best instead of choosing what is not available.
+        # With fewer than ``num`` candidates available, ``firsts`` ends in masked ones:
+        # replace these by the best.
         valid = jnp.take_along_axis(free, firsts, axis=-1)
         firsts = jnp.where(valid, firsts, firsts[:, :1]).astype(jnp.int32)
 

@@ -1,4 +1,4 @@
-"""What a compact policy is shown: geometry of a candidate set and of a decision.
+"""Inputs of the compact network: geometry of a candidate set and of a decision.
 
 Nothing here has parameters, so training computes it once for a decision and not in
 every epoch. Shapes: M candidates, n inputs, p = n + 1, K choices; leading axes ``...``.
@@ -35,14 +35,14 @@ FEATURES = (
     *(f"exp of {name}" for name in AHEAD),
     *(f"exp of 4 x {name}" for name in AHEAD),
     "half of the squared length's log, less the mean's",
-    *(f"exp of {scale:g} x {AHEAD[-1]}" for scale in _CLOSE),  # where asked for
+    *(f"exp of {scale:g} x {AHEAD[-1]}" for scale in _CLOSE),  # with ``close_up``
 )
-"""Columns of a candidate; the log-volumes ahead are relative to the best candidate's.
-``selection/policy/kernel.py`` writes the same."""
+"""Columns of a candidate; log-volumes ahead are relative to the best candidate's.
+``selection/policy/kernel.py`` computes the same."""
 
 
 class VectorFeatures(NamedTuple):
-    """What the network reads of one vector a candidate, and of all of them together."""
+    """Inputs of the network from vectors y, one per candidate."""
 
     columns: jax.Array  # (..., M, F) FEATURES, without close-ups all but the last three
     moments: jax.Array  # (..., M, p (p + 1) / 2) products of coordinates, scaled so
@@ -63,7 +63,7 @@ class CandidateFeatures(NamedTuple):
 
     vectors: VectorFeatures  # of the whitened regressors
     whitened: jax.Array  # (..., M, p) regressors with mean x x.T = I
-    offset: jax.Array  # (...,) log det(Z_s.T Z_s) less that of the whitened subset
+    offset: jax.Array  # (...,) log det(Z_s.T Z_s) of any subset less log det(X_s.T X_s)
 
 
 class DecisionFeatures(NamedTuple):
@@ -72,8 +72,8 @@ class DecisionFeatures(NamedTuple):
     vectors: VectorFeatures  # of what is left of the regressors
     chosen: jax.Array  # (..., M) 1 / count where chosen already, else 0
     reached: jax.Array  # (...,) log det(Z.T Z) of the best look-ahead to the end
-    progress: jax.Array  # (..., 7) one of the last three choices, 1 / left, count / p,
-    # left / p, whether K > p
+    progress: jax.Array  # (..., 7) left == 1, == 2, == 3, then 1 / left, count / p,
+    # left / p (3 at most), K > p; left = K - count
 
 
 def decision_features(
@@ -84,7 +84,7 @@ def decision_features(
     lookahead: int,
     close_up: bool,
 ) -> DecisionFeatures:
-    """What is left of a set after ``count`` choices, the same for the whole batch.
+    """Features of the decision after ``count`` choices, one count for the whole batch.
 
     Args:
         features: of the set.
@@ -123,7 +123,7 @@ def decision_features(
 
 
 def close_up_of(ahead: jax.Array) -> jax.Array:
-    """(..., 3) of (...,) log-volumes behind the best: 1 for the best, each sharper."""
+    """(..., 3) ``exp(scale * ahead)`` of (...,) log-volumes relative to the best."""
     return jnp.stack([jnp.exp(scale * ahead) for scale in _CLOSE], axis=-1)
 
 

@@ -2,9 +2,9 @@
 
 The best subset does not change under an affine map of the commands, so the policy
 works on whitened regressors ``x_i`` (mean over the candidates of ``x x.T`` is the
-identity; ``x_i . x_j / M`` is the hat matrix). What a choice does to the remaining
-candidates is a projection: the chosen direction leaves every ``x_i``, and the squared
-length of what is left is the gain. All functions broadcast over leading axes.
+identity; ``x_i . x_j / M`` is the hat matrix). A choice is a projection: its
+direction is removed from every remaining ``x_i``, whose squared length is then the gain
+of choosing it. All functions broadcast over leading axes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = [
 ]
 
 _LOWEST = -30.0  # log-volume of a candidate that is not active
-_LEAST_GAIN = 1e-5  # of a whitened vector: below it float32 shows the rounding of zero
+_LEAST_GAIN = 1e-5  # of whitened vectors; smaller gains are float32 rounding errors
 
 
 def whiten(candidates: jax.Array, usable: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -51,9 +51,9 @@ def whiten(candidates: jax.Array, usable: jax.Array) -> tuple[jax.Array, jax.Arr
 
 
 def projected(x: jax.Array, chosen: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """What is left of every vector once the chosen ones are projected out.
+    """Components of every vector orthogonal to the chosen ones.
 
-    A chosen vector in the span of those before it is left out.
+    A chosen vector in the span of those before it is not projected out again.
 
     Args:
         x: (..., M, p).
@@ -119,7 +119,7 @@ def normalised_by(
 def lookahead(
     y: jax.Array, spanned: bool, active: jax.Array, depth: int
 ) -> list[jax.Array]:
-    """How far each candidate leads when the choices after it are greedy.
+    """Log gain of the determinant from each candidate and greedy choices after it.
 
     Args:
         y: (..., M, p) conditional vectors (``projected`` or ``normalised_by``), zero
@@ -152,7 +152,7 @@ def lookahead(
     for _ in range(1, depth):
         size = jnp.maximum((picked * picked).sum(-1), _LEAST_GAIN)
         unit = picked * jax.lax.rsqrt(size)[..., None]
-        # A spanning choice removes its direction; later ones shorten it.
+        # A choice removes its direction; where the chosen span all, it shortens it.
         keep = jax.lax.rsqrt(1.0 + size) if spanned else jnp.zeros_like(size)
         along.append((unit, 1.0 - keep))
         # The direction in y's own coordinates, through the earlier ones, newest first.

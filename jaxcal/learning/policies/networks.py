@@ -1,6 +1,6 @@
-"""Which network of postures, its size, and how one is found by its kind.
+"""Configuration of a network of postures, and the kinds of network there are.
 
-``compact`` stands in this package; an installed package adds a kind by an entry point,
+``compact`` is part of this package; an installed package adds a kind by an entry point,
 as jaxcal's own pyproject.toml adds ``paper``:
 
     [project.entry-points."jaxcal.networks"]
@@ -31,7 +31,7 @@ class NetworkConfig:
     lookahead: int = setting(12, "most greedy choices ahead that a feature shows")
     close_up: bool = setting(False, "features that tell near-equal look-aheads apart")
     initial_trust: float = setting(
-        0.0, "weight of the look-ahead before learning; 4 begins as the rule"
+        0.0, "initial weight of the look-ahead; at 4 training begins at its rule"
     )
     initial_actor: float = setting(0.1, "scale of the learned score before learning")
 

@@ -13,10 +13,10 @@ __all__ = ["keep_compiled_programs"]
 
 
 def keep_compiled_programs() -> None:
-    """Have JAX keep compiled code, in the user's folder for it if one is chosen, else
+    """Have JAX cache compiled code on disk: in the folder that the user has set, else
     in ``jaxcal/jax`` under ``XDG_CACHE_HOME`` or ``~/.cache``. Does not load JAX."""
     # jaxlib 0.10.1 logs an error for each program that it takes from the cache if the
-    # processor has hints that XLA does not list as features; the programs are right.
+    # processor has hints that XLA does not list as features; the results are correct.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # read when JAX is loaded
     home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
     settings = {

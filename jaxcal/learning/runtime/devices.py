@@ -1,11 +1,10 @@
-"""One update over many devices: candidate sets are spread, everything else is the same.
+"""One update over many devices: each plays some candidate sets and has all weights.
 
 The mesh has one axis, ``sets``. Keys are split for every set of the whole job before
 anything is placed, so an update draws the same numbers on one device and on many; only
-the order of sums differs. The weights are on every device. Of several seeds each device
-trains some instead: the axis is ``seeds``. With one device there is no mesh and nothing
-here does anything. Process 0 alone reads and writes files: what it read goes to the
-others through ``on_first``.
+the order of sums differs. With several seeds the axis is ``seeds`` instead, and each
+device trains some of them. With one device there is no mesh and nothing is placed.
+Process 0 alone reads and writes files; ``on_first`` sends what it read to the others.
 """
 
 from __future__ import annotations
@@ -41,16 +40,16 @@ T = TypeVar("T")
 def make_mesh(
     rows: int, num_devices: int | None = None, num_seeds: int = 1
 ) -> Mesh | None:
-    """All devices of the job along the axis ``sets``, of several seeds along ``seeds``;
-    None for a single one.
+    """All devices of the job on the axis ``sets``, or ``seeds`` if several are trained;
+    None for one device.
 
     Args:
         rows: sets or streams of a minibatch.
-        num_devices: as many of each process; all when None.
+        num_devices: devices of each process; all when None.
         num_seeds: runs side by side.
 
     Raises:
-        ValueError: a process has fewer, or they cannot share what there is.
+        ValueError: a process has fewer, or they do not divide the rows or seeds evenly.
     """
     have = jax.local_device_count()
     number = have if num_devices is None else num_devices
@@ -78,10 +77,10 @@ def make_mesh(
 
 
 def a_device_for_each_core(num_seeds: int) -> None:
-    """Have JAX see the cores of a CPU as devices, as many as can share so many seeds.
+    """Make CPU cores devices of JAX: the largest number that divides ``num_seeds``.
 
-    Each trains its seeds by itself and waits for no other. It does nothing in a program
-    that has used JAX already, or that chose its devices.
+    Each core then trains its seeds independently. Does nothing where JAX is initialised
+    or ``XLA_FLAGS`` sets the number of devices.
     """
     if "xla_force_host_platform_device_count" in os.environ.get("XLA_FLAGS", ""):
         return
@@ -143,9 +142,9 @@ def any_process(flag: bool) -> bool:
 
 
 def replicate(tree: Any, mesh: Mesh | None, *axes: str) -> Any:
-    """Put arrays that every process holds alike on every device of the mesh.
+    """Copy arrays that are the same in every process to every device of the mesh.
 
-    Leading axes that are named are spread over those of the mesh instead.
+    With ``axes``, leading axes of the arrays are spread over these axes of the mesh.
     """
     if mesh is None:
         return tree
@@ -161,7 +160,7 @@ def replicate(tree: Any, mesh: Mesh | None, *axes: str) -> Any:
 
 
 def spread(tree: Any, mesh: Mesh | None) -> Any:
-    """Put rows that every process holds alike on the devices that share them."""
+    """Spread rows that are the same in every process over the axis ``sets``, if any."""
     sets = mesh is not None and "sets" in mesh.axis_names
     return replicate(tree, mesh, *(["sets"] if sets else []))
 

@@ -1,9 +1,9 @@
-"""A job of several processes: who takes part, and how one joins and leaves.
+"""A job of several processes: its members, and how a process joins and leaves.
 
 Every process runs the same command. It learns of the others from ``--coordinator``,
 ``--num-processes`` and ``--process-id``, or from what JAX finds under SLURM, Open MPI,
-Kubernetes and on Cloud TPU. When a process dies JAX ends the others, after a heartbeat
-was missing long enough; what was saved stays, and the next start resumes.
+Kubernetes and on Cloud TPU. When a process dies, JAX ends the others after
+``HEARTBEAT_SECONDS``; checkpoints stay, and the next start resumes from the newest.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = [
 EXIT_LOST = 3  # another process of the job is gone
 HEARTBEAT_SECONDS = 20  # silence after which a process counts as lost
 _CONNECT_SECONDS = 300  # for all processes to come together
-_LEAVE_SECONDS = 3600  # for the first to write, when the others are done
+_LEAVE_SECONDS = 3600  # for process 0 to write its files when the others are done
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -70,7 +70,7 @@ def expected(job: argparse.Namespace, environ: Mapping[str, str] = os.environ) -
 def _cluster(environ: Mapping[str, str]) -> bool:
     """Whether a launcher that JAX knows started several of these processes."""
     if environ.get("SLURM_NTASKS", "1") != "1":
-        # A batch script has this, too, but is no task of its own job step.
+        # A batch script has SLURM_NTASKS too, but runs outside any job step.
         return "SLURM_STEP_NODELIST" in environ
     if environ.get("OMPI_COMM_WORLD_SIZE", "1") != "1":
         return True
@@ -79,7 +79,7 @@ def _cluster(environ: Mapping[str, str]) -> bool:
     several = ("JAX_COORDINATOR_ADDRESS", "MEGASCALE_COORDINATOR_ADDRESS")
     if any(name in environ for name in (*several, "JOB_COMPLETION_INDEX")):
         return True
-    # A Cloud TPU machine keeps its slice in its metadata, which only JAX reads.
+    # The slice of a Cloud TPU machine is in its metadata, which only JAX reads.
     return any(map(os.path.exists, ("/dev/accel0", "/dev/vfio/0")))
 
 
@@ -131,7 +131,7 @@ def run_job(
         code = work()
         if code == 0 and jax.distributed.is_initialized():
             sys.stdout.flush()
-            jax.distributed.shutdown()  # to leave earlier counts as lost
+            jax.distributed.shutdown()  # without it the process counts as lost
             return code
     except ValueError as error:
         print(f"{program}: {error}", file=sys.stderr)
@@ -149,9 +149,9 @@ def run_job(
 
 @contextlib.contextmanager
 def collective() -> Iterator[None]:
-    """What a collective raises where another process is gone becomes RuntimeError.
+    """Raise RuntimeError where a collective fails because another process is gone.
 
-    JAX's transport raises ValueError, which would read as an argument that is wrong.
+    JAX's transport raises ValueError, which commands report as a wrong argument.
     """
     import jax
 
@@ -164,7 +164,7 @@ def collective() -> Iterator[None]:
 
 
 def _connect(job: argparse.Namespace) -> None:
-    """Join the job, before anything else of JAX is used.
+    """Join the job; must be called before JAX is initialised.
 
     Raises:
         ValueError: the job is not described completely.

@@ -1,4 +1,4 @@
-"""Where a checkpoint lies, and a policy in one plain file: no JAX, no orbax.
+"""Paths of checkpoints, and a policy as one plain file; needs no JAX and no orbax.
 
 A weights file (``.npz``) holds the weights by flat name (``encoder_0.mix.kernel``) and
 ``header``: JSON with the format, its version, the fields of the ``NetworkConfig``, the
@@ -42,14 +42,14 @@ class CheckpointError(ValueError):
 
 
 def shipped(name: str = "default") -> pathlib.Path:
-    """A policy that ships: in the installed package, or in the repository."""
+    """Path of a policy that ships, in the installed package or in the repository."""
     package = pathlib.Path(__file__).resolve().parents[2]
     inside = package / "checkpoints" / f"{name}.npz"
     return inside if inside.is_file() else package.parent / "checkpoints" / inside.name
 
 
 def locate(checkpoint: str | pathlib.Path | None) -> pathlib.Path:
-    """The weights file that is named, or the newest complete step of a run.
+    """Path of a weights file, or of the newest complete step of a run.
 
     Args:
         checkpoint: a weights file, a training run's folder or its checkpoint folder;
@@ -81,7 +81,7 @@ class Weights:
 
     @property
     def fingerprint(self) -> str:
-        """SHA-256 of network and weights, the same wherever they lie."""
+        """SHA-256 of network and weights."""
         digest = hashlib.sha256(json.dumps(self.network, sort_keys=True).encode())
         for name, array in sorted(self.arrays.items()):
             digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
@@ -113,7 +113,7 @@ def nested(arrays: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write(path: str | pathlib.Path, weights: Weights) -> None:
-    """Write a weights file, NAME.npz, atomically; one that is there is replaced."""
+    """Write a weights file, NAME.npz, atomically; an existing one is replaced."""
     if not str(path).endswith(".npz"):
         raise ValueError(f"the policy is exported to one file NAME.npz, got {path}")
     pathlib.Path(path).parent.mkdir(parents=True, exist_ok=True)
@@ -134,7 +134,7 @@ def read(path: str | pathlib.Path) -> Weights:
     """Read a weights file.
 
     Raises:
-        CheckpointError: it is damaged, or no weights file of this version.
+        CheckpointError: it is damaged, or not a weights file of this version.
         OSError: it cannot be read.
     """
     data = pathlib.Path(path).read_bytes()

@@ -33,7 +33,7 @@ from jaxcal.learning.training.config import TrainConfig
 
 __all__ = ["adapted", "require_read", "train"]
 
-_READ = {  # fields of the optimisation that brax is given, and its names of them
+_READ = {  # fields of PPOConfig that brax is given: brax's names
     "learning_rate": "learning_rate",
     "entropy_start": "entropy_cost",
     "discount": "discounting",
@@ -48,7 +48,7 @@ _FIXED = dict(
 
 
 def adapted(config: TrainConfig) -> TrainConfig:
-    """A preset as brax trains it: another architecture, a learning rate it bears."""
+    """A preset for brax: the paper's network, a learning rate of at most 1e-3."""
     width = config.network.width if config.network.kind == "paper" else 64
     rate = min(config.ppo.learning_rate, 1e-3)  # brax's updates diverge at 2e-3
     ppo = dataclasses.replace(config.ppo, learning_rate=rate)
@@ -105,9 +105,9 @@ def _networks(env: SelectionConfig, config: NetworkConfig) -> PPONetworks:
 
 
 def _replicated(tree: Any, devices: list[Any]) -> Any:
-    """``jax.device_put_replicated``, which jax 0.10 has no more and brax 0.14.2 calls.
+    """``jax.device_put_replicated``, which brax 0.14.2 calls and jax 0.10 removed.
 
-    google/brax issue 671: its main branch is mended, its newest release is not.
+    google/brax issue 671: fixed on its main branch, not in its newest release.
     """
     return jax.tree.map(lambda leaf: jnp.stack([leaf] * len(devices)), tree)
 
@@ -120,13 +120,13 @@ def train(
 ) -> None:
     """Train with ``brax.training.agents.ppo.train`` and save a checkpoint.
 
-    The checkpoint's configuration holds what brax was given and nothing else.
+    Of network and optimisation, the checkpoint's meta holds only what brax was given.
 
     Args:
         config: from ``adapted``.
         folder: of the run.
-        say: takes a line of progress.
-        more: other arguments of ``ppo.train``, such as ``num_evals``.
+        say: called with each line of progress.
+        more: further arguments of brax's ``train``, such as ``num_evals``.
     """
     task, episodes = config.tasks[0], config.ppo.num_episodes
     env, length = task.environment, task.environment.num_selected

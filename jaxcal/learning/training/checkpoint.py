@@ -1,10 +1,10 @@
-"""Checkpoints: of a run by orbax, of a policy that is finished as one plain file.
+"""Checkpoints: of a run by orbax, of a finished policy as one plain file.
 
-A run's folder ``checkpoint`` holds one numbered folder a save. Each has ``policy`` (the
-averaged weights), ``state`` (what else an uninterrupted run would need) and ``meta``
-(JSON: schema, configuration, package versions, progress). Orbax writes a step beside
-the others and renames it, so a kill during a save leaves the previous one. A policy
-alone is one weights file (``runtime.weights``): what ships, and what a rig reads.
+A run's folder ``checkpoint`` holds one numbered folder per save. Each has ``policy``
+(the averaged weights), ``state`` (what else a resumed run needs) and ``meta`` (JSON:
+schema, configuration, package versions, progress). Orbax writes a step beside the
+others and renames it, so a kill during a save leaves the previous one. A policy alone
+is one weights file (``runtime.weights``): what ships, and what a rig reads.
 
 orbax calls this interface legacy and its successor is still experimental; it is used
 here alone, so that changing it touches one file.
@@ -65,7 +65,7 @@ class Policy:
 
 
 def _alone() -> Any:
-    """In a job of several processes, the one that asks works without the others."""
+    """Options by which the calling process works alone, without the job's others."""
     own = jax.process_index()
     return ocp.options.MultiprocessingOptions(
         primary_host=own, active_processes={own}, barrier_sync_key_prefix=str(own)
@@ -86,10 +86,10 @@ def save(
         folder: made where missing.
         step: number of the step; a step that exists is left as it is.
         policy: the averaged weights.
-        meta: JSON values: ``schema``, and a configuration as that one says.
-        state: of the run, with that policy in it; None where there is nothing to go on
-            with.
-        keep: older steps beyond these are deleted.
+        meta: JSON values: a configuration, and its ``schema`` if not ``SCHEMA``.
+        state: of the run, whose averaged weights are ``policy``; None for a policy that
+            cannot be resumed.
+        keep: newest steps to keep; older ones are deleted.
     """
     root = pathlib.Path(folder)
     root.mkdir(parents=True, exist_ok=True)
@@ -97,7 +97,7 @@ def save(
     own: dict[str, Any] = {"schema": SCHEMA, "version": VERSION}
     meta = own | {"created": now, "versions": versions()} | meta
     trees = {"policy": policy} | ({} if state is None else {"state": _rest(state)})
-    # Arrays of the host, which know no device; nothing is written twice.
+    # Arrays of the host, so that no device is recorded.
     items = {
         name: ocp.args.StandardSave(jax.tree.map(np.asarray, tree))
         for name, tree in trees.items()
@@ -118,12 +118,12 @@ def save(
 
 
 def _rest(state: TrainState) -> dict[str, Any]:
-    """What a state holds beside the averaged weights."""
+    """Leaves of a state other than the averaged weights."""
     names = ("params", "opt_state", "key", "num_updates")
     return {name: getattr(state, name) for name in names}
 
 
-class _PatientLoop(asyncio.SelectorEventLoop):
+class _TolerantLoop(asyncio.SelectorEventLoop):
     """An event loop that ignores results which arrive after it is closed."""
 
     def call_soon_threadsafe(  # type: ignore[override]  # generic in its arguments
@@ -135,9 +135,9 @@ class _PatientLoop(asyncio.SelectorEventLoop):
         return super().call_soon_threadsafe(*arguments, **options)
 
 
-class _PatientPolicy(asyncio.DefaultEventLoopPolicy):
+class _TolerantPolicy(asyncio.DefaultEventLoopPolicy):
     def new_event_loop(self) -> asyncio.AbstractEventLoop:
-        return _PatientLoop()
+        return _TolerantLoop()
 
 
 def _read(path: pathlib.Path, like: Any, what: str) -> Any:
@@ -147,10 +147,10 @@ def _read(path: pathlib.Path, like: Any, what: str) -> Any:
         CheckpointError: it cannot be read, or has another shape.
     """
     like = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), like)
-    # Where a read fails, orbax leaves the others to end: in a thread of tensorstore,
-    # after its event loop is closed. asyncio would print that.
+    # After one failed read, orbax's other reads end in a thread of tensorstore when
+    # their event loop is closed already; asyncio would print an error for each.
     before = asyncio.get_event_loop_policy()
-    asyncio.set_event_loop_policy(_PatientPolicy())
+    asyncio.set_event_loop_policy(_TolerantPolicy())
     try:
         with ocp.StandardCheckpointer(multiprocessing_options=_alone()) as reader:
             found = reader.restore(path.absolute(), like)
@@ -177,7 +177,7 @@ def read_meta(
     Args:
         checkpoint: a weights file, a training run's folder or its checkpoint folder;
             the policy that ships when None.
-        schema: what it must hold.
+        schema: the schema that it must have.
 
     Raises:
         CheckpointError: there is none, it is damaged, or holds something else.
@@ -205,7 +205,7 @@ def read_meta(
 
 
 def load(checkpoint: str | pathlib.Path | None = None) -> Policy:
-    """A policy of postures; of several seeds the best by validation.
+    """A policy of postures; with several seeds the best by validation.
 
     Args:
         checkpoint: as for ``read_meta``.
@@ -231,7 +231,7 @@ def read(path: pathlib.Path, meta: dict[str, Any], like: Any) -> Any:
 
     Args:
         path, meta: from ``read_meta``.
-        like: weights of one policy; of several seeds the best is taken.
+        like: weights of one policy; with several seeds the best is read.
 
     Raises:
         CheckpointError: they are damaged, of other shapes or not finite.

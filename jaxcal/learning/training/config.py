@@ -1,4 +1,4 @@
-"""A whole run of postures: what, with what, and how often to look."""
+"""Configuration of a training run of postures."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _PLAIN = ("preset", "imitation", "seed", "num_seeds")  # fields that JSON holds 
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """A whole run: what, with what, and how often to look."""
+    """Network, optimisation and tasks of a run; how often it validates and saves."""
 
     preset: str = "compact"
     network: NetworkConfig = field(default_factory=NetworkConfig)
     ppo: EpisodesConfig = field(default_factory=EpisodesConfig)
     tasks: tuple[Task, ...] = field(default=(Task(),))  # update u: tasks[u % len]
     imitation: float = setting(
-        0.0, "share of the updates, the first, that imitate the solvers"
+        0.0, "share of the updates, from the first on, that imitate the solvers"
     )
     seed: int = setting(0, "of everything random")
     num_seeds: int = setting(1, "runs side by side: seed, seed + 1, ...")
-    validate_every: float = 15.0  # seconds between looks at the validation set
+    validate_every: float = 15.0  # seconds between validations
     save_every: float = 60.0  # seconds between checkpoints
     about: str = ""  # one line for --help, of a preset
 
@@ -47,7 +47,7 @@ class TrainConfig:
 
     @property
     def learners(self) -> tuple[Postures, ...]:
-        """What update u trains on: number u modulo their number."""
+        """Learners of the tasks; update u trains number u modulo theirs."""
         network = build(self.network)
         return tuple(Postures(self.ppo, task, network) for task in self.tasks)
 

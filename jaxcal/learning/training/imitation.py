@@ -1,9 +1,9 @@
-"""Learning from a teacher that knows the best postures: the warm start before PPO.
+"""Imitation of a teacher that knows the best postures: the warm start before PPO.
 
 A lesson is a batch of candidate sets with the postures that a teacher, such as the
 exact solver, would choose. The loss of a decision is minus the log of the probability
 that the policy gives to *any* posture of the wanted ones that is not chosen yet: their
-order does not matter, and the policy's own favourite among them is chosen next.
+order does not matter. The wanted one with the largest logit is then chosen.
 Episodes that begin with given postures want the best completion of those.
 """
 
@@ -40,14 +40,14 @@ class Lesson:
 
     candidates: jax.Array  # (B, M, n) float32
     available: jax.Array  # (B, M) bool, given postures included
-    given: jax.Array  # (B, T) int32, postures chosen beforehand, the first `length`
+    given: jax.Array  # (B, T) int32; the first `length` are chosen beforehand
     length: jax.Array  # (B,) int32, how many are given
     wanted: jax.Array  # (B, M) bool, the given and the teacher's
     best: jax.Array  # (B,) float32 log det(Z.T Z) of the wanted
 
 
 def draw(learner: Postures, teacher: Teacher, key: jax.Array) -> Lesson:
-    """The lesson of an update: the same whenever it is asked for with the same key."""
+    """A lesson of ``episodes_per_update`` sets, determined by the key."""
     task: Any = learner.task  # an ``environments.Task``
     num_sets = learner.config.episodes_per_update
     key_sets, key_share, key_length, key_given = jax.random.split(key, 4)
@@ -79,7 +79,7 @@ def _drawn(key: jax.Array, num_sets: int, task: Any) -> tuple[jax.Array, jax.Arr
 
 
 class Lessons:
-    """Lessons ``0`` to ``last - 1``, the next prepared while this one is learned."""
+    """Lessons ``0`` to ``last - 1``; a thread prepares the next during an update."""
 
     def __init__(self, prepare: Callable[[int], Lesson], last: int) -> None:
         self._prepare, self._last = prepare, last
@@ -94,18 +94,18 @@ class Lessons:
         return self._asked.pop(index).result()
 
     def close(self) -> None:
-        """Forget what was being prepared."""
+        """Cancel lessons not begun, without waiting for one in preparation."""
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 
 @struct.dataclass
 class Attempt:
-    """Lessons followed by the policy: B sets, T learned decisions."""
+    """A lesson as played by the policy: B sets, T learned decisions."""
 
     features: Any  # leaves (B, ...): of the candidate sets
     decisions: Any  # leaves (B, T, ...): of the decisions
-    wanted: jax.Array  # (B, T, M) bool, what would be right
-    weight: jax.Array  # (B, T) 0 where the choice is given; 1 on average
+    wanted: jax.Array  # (B, T, M) bool, the wanted that are not chosen yet
+    weight: jax.Array  # (B, T) 0 where the choice is given; mean 1
     best: jax.Array  # (B,) log det(Z.T Z) of what is wanted
 
 
@@ -122,7 +122,7 @@ class Imitation:
     def gather(
         self, params: Any, keys: jax.Array, lesson: Lesson
     ) -> tuple[Attempt, Metrics]:
-        """Follow the lesson: each choice is the policy's likeliest wanted posture."""
+        """Play the lesson: each choice is the policy's likeliest wanted posture."""
         task, network = self.postures.task, self.postures.network
         features = network.candidate_features(lesson.candidates, lesson.available)
         memory = encode(network, params, features)
@@ -135,8 +135,8 @@ class Imitation:
             decisions.append(seen)
             wants.append(wanted)
             counts.append(count >= lesson.length)
-            favourite = jnp.argmax(mask_logits(logits, wanted), axis=-1)
-            action = jnp.where(count < lesson.length, lesson.given[:, count], favourite)
+            likeliest = jnp.argmax(mask_logits(logits, wanted), axis=-1)
+            action = jnp.where(count < lesson.length, lesson.given[:, count], likeliest)
             chosen = chosen.at[:, count].set(action.astype(jnp.int32))
             taken = jax.nn.one_hot(action, free.shape[-1], dtype=bool)
             free, wanted = free & ~taken, wanted & ~taken

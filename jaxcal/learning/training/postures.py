@@ -1,4 +1,4 @@
-"""The run that trains a policy of postures: its recipe, and what it is measured on."""
+"""The run that trains a policy of postures: its recipe and its validation."""
 
 from __future__ import annotations
 
@@ -71,19 +71,19 @@ def train(
         config: the run.
         folder: of the run; made where missing.
         validation: fixed sets to measure the averaged weights on.
-        teacher: whom the first ``config.num_imitated`` updates imitate.
+        teacher: imitated by the first ``config.num_imitated`` updates.
         num_updates: stop after this update instead of at the end of the budget.
-        num_devices: use so many of each process; all when None.
+        num_devices: devices of each process; all when None.
         rest: ``resume``, ``report`` and ``should_stop`` of ``training.run.run``.
 
     Returns:
-        The last state; each leaf has a leading axis of ``config.num_seeds`` where they
-        are several.
+        The last state; with several seeds each leaf has a leading axis of
+        ``config.num_seeds``.
 
     Raises:
         CheckpointError: nothing to resume from, or damaged.
-        ValueError: the devices cannot share a minibatch evenly, no teacher is given
-            where one is imitated, or nothing is left to learn.
+        ValueError: the devices do not divide a minibatch or the seeds evenly, the
+            teacher is missing, or the look-ahead makes every choice.
         OSError: the folder cannot be written.
     """
     rows = config.ppo.rows_per_minibatch
@@ -106,7 +106,7 @@ def train(
 
     def lesson(index: int) -> imitation.Lesson:
         assert teacher is not None  # checked above
-        # The first two are the run's own: weights and updates.
+        # The third key; ``ppo.begin`` uses the first two, for weights and updates.
         key = jax.random.split(jax.random.key(config.seed), 3)[2]
         learner = learners[index % len(learners)]
         return imitation.draw(learner, teacher, jax.random.fold_in(key, index))

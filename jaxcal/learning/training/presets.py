@@ -33,8 +33,8 @@ def _task(k: int = 4, m: int = 50, n: int = 3, **drawn: Any) -> Task:
     return Task(SelectionConfig(m, k, n, n, reward_gain=k > n + 1), **drawn)
 
 
-# It begins as the look-ahead rule and imitates the solvers, which is what adds most to
-# the rule in a given time (docs/policy.md): the paper's task, other shapes of
+# It begins as the look-ahead rule and imitates the solvers, which improves on the rule
+# most for a given time (docs/policy.md). Tasks: the paper's, other shapes of
 # candidates, masks, given postures, other numbers of postures and of inputs.
 _GENERAL = TrainConfig(
     preset="general",
@@ -94,9 +94,9 @@ def field_names() -> set[str]:
 
 
 def with_values(config: TrainConfig, values: dict[str, Any]) -> TrainConfig:
-    """A configuration with single fields changed, wherever they live.
+    """A configuration with single fields changed, in whichever part they are.
 
-    Environment fields change every task; where the tasks differ in one it is refused.
+    An environment field is changed in every task, and refused where tasks differ in it.
     Where more than n + 1 postures are asked for, the reward becomes the increase of
     log det S (``reward_gain``), so that an episode is paid what it is judged by.
 

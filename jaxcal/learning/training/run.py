@@ -1,10 +1,10 @@
-"""The one caller of the trainer: files, resume, validation, progress, devices.
+"""The loop of a training run: files, resume, validation, progress, devices.
 
-A run folder holds ``metrics.csv`` (a row for each update; means where several seeds run
-side by side), ``seeds.csv`` (then: what each measured at every look),
-``last_rewards.npy`` (the rewards of the last 1,000 episodes) and ``checkpoint/``. The
-loop is on the host, over calls of several updates each, so that progress is printed
-while it runs and a signal stops it between two calls.
+A run folder holds ``metrics.csv`` (a row per update; means over seeds), ``seeds.csv``
+(with several seeds: every validation of each), ``last_rewards.npy`` (the rewards of the
+last 1,000 episodes of the first task) and ``checkpoint/``. The loop is on the host,
+over calls of several updates each, so that progress is printed while it runs and a
+signal stops it between two calls.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ class Recipe:
     """What one kind of run trains, and how."""
 
     config: Any  # a ``TrainConfig`` or a ``PolicyConfig``
-    given: tuple[tuple[Any, ...], ...]  # arrays that each learner is given
+    given: tuple[tuple[Any, ...], ...]  # arguments of update u: number u modulo theirs
     schema: str  # of the checkpoints
-    columns: tuple[str, ...]  # its own of metrics.csv, for every update
-    measured: tuple[str, ...]  # its columns of looks; the first says which seed is best
+    columns: tuple[str, ...]  # further ones of metrics.csv, in every update
+    measured: tuple[str, ...]  # columns of validations; the first ranks the seeds
     validate: Callable[[Any], dict[str, float]] | None  # averaged weights -> measured
-    # The first updates of imitation: their number, and the update and what it is shown.
+    # The first updates imitate: their number; update -> its learner and argument.
     num_imitated: int = 0
     imitate: Callable[[int], tuple[Learner, Any]] | None = None
 
     @functools.cached_property
     def learners(self) -> tuple[Learner, ...]:
-        """Update u trains number u modulo theirs."""
+        """Learners of the run; update u trains number u modulo theirs."""
         return tuple(self.config.learners)
 
     def init(self) -> TrainState:
@@ -72,7 +72,7 @@ class Recipe:
         return begin(keys[0]) if number == 1 else jax.vmap(begin)(jnp.stack(keys))
 
 
-# One program, the same for every seed: op by op it would be two hundred.
+# One program for every seed; eager, it would compile two hundred small ones.
 _begun = jax.jit(ppo.begin, static_argnums=(0, 1))
 
 
@@ -82,11 +82,11 @@ class Report:
 
     update: int
     played: int  # episodes or decisions
-    seconds: float  # of training so far, earlier sittings included
-    per_second: float  # played
+    seconds: float  # of training so far, before a resume included
+    per_second: float  # episodes or decisions
     eta: float  # seconds left
     metrics: dict[str, float]  # of the last update, validation included; means of seeds
-    spread: dict[str, float]  # standard deviation over several seeds, of validation
+    spread: dict[str, float]  # of validation: standard deviation over seeds, 0 for one
 
 
 @functools.lru_cache(maxsize=32)
@@ -101,17 +101,17 @@ def updates(
 
     Args:
         config, learner: as for ``ppo.make_update``.
-        mesh: of the axis ``sets``, which an update shares, or of ``seeds``: every
-            device trains some of them by itself.
+        mesh: axis ``sets``: the devices share every update; axis ``seeds``: each device
+            trains some of the seeds by itself.
         at_most: updates of a call.
         seeds: runs side by side, each leaf of the state with a leading axis of so many;
             0 for one run without that axis.
 
     Returns:
-        (state, given up; () number of updates to make, up to ``at_most``; *given) ->
-        the next state, and metrics with a leading axis ``at_most``, zero from that
-        number on. An update is the same program whatever the number, so cutting a run
-        into calls in another way changes no bit of it.
+        (state, count, *given) -> the state after ``count <= at_most`` updates, and
+        metrics with a leading axis ``at_most``, zero from ``count`` on. ``state`` is
+        donated. The program does not depend on ``count``, so dividing a run into calls
+        in another way changes no bit of it.
     """
     spread = mesh is not None and mesh.axis_names == ("seeds",)
     one = ppo.make_update(config, learner, None if spread else mesh)
@@ -169,7 +169,7 @@ def run(
         folder: of the run; made where missing.
         mesh: the devices that share an update; None for one.
         resume: go on from the newest checkpoint in ``folder``.
-        report: called after every look.
+        report: called after the first and last update and every ``validate_every``.
         should_stop: asked between calls.
         num_updates: stop after this update instead of at the end of the budget.
 
@@ -186,10 +186,10 @@ def run(
     seeds = recipe.config.num_seeds if recipe.config.num_seeds > 1 else 0
     count, timed = 1, False
     with contextlib.ExitStack() as stack:
-        diary = None
+        recorder = None
         if devices.is_first():
-            diary = _Diary(root, recipe, report, last, before, done, recent)
-            stack.enter_context(contextlib.closing(diary))
+            recorder = _Recorder(root, recipe, report, last, before, done, recent)
+            stack.enter_context(contextlib.closing(recorder))
         while done < last and not devices.any_process(should_stop()):
             begun = time.perf_counter()
             at_most, given = _UPDATES, recipe.given[done % len(recipe.given)]
@@ -199,7 +199,7 @@ def run(
                 learner, shown = recipe.imitate(done)
                 at_most, given = 1, (devices.spread(shown, mesh),)
             elif len(recipe.learners) > 1 or len(recipe.given) > 1:
-                at_most = 1  # the next update is of another program, or of other arrays
+                at_most = 1  # the next update has another program or other arrays
             count = min(count, at_most, last - done)
             update = updates(recipe.config.ppo, learner, mesh, at_most, seeds)
             with collective():
@@ -207,28 +207,28 @@ def run(
                 # One transfer for all that these updates measured.
                 rows = jax.device_get(devices.local(found))
             first, done = done, done + count
-            if diary is not None:
-                diary.note(state, first, count, rows)
+            if recorder is not None:
+                recorder.note(state, first, count, rows)
             each = (time.perf_counter() - begun) / count
             # The first call also compiled, so the second is of one update too.
             fit = int(_CALL_SECONDS / each) if timed else 1
             count, timed = devices.on_first(functools.partial(max, fit, 1)), True
-    if diary is not None:
-        diary.save(state, done)
+    if recorder is not None:
+        recorder.save(state, done)
     return state
 
 
 @dataclasses.dataclass
-class _Diary:
-    """What the first process writes and says of a run: rows, reports, checkpoints."""
+class _Recorder:
+    """Output of a run, on the first process only: rows, reports, checkpoints."""
 
     root: pathlib.Path
     recipe: Recipe
     report: Callable[[Report], None]
     last: int  # update at which the run ends
-    before: float  # seconds of earlier sittings
+    before: float  # seconds of training before a resume
     reported: int  # update of the last report; at first the updates made before
-    recent: np.ndarray  # the last rewards
+    recent: np.ndarray  # last rewards of the first task
 
     def __post_init__(self) -> None:
         recipe = self.recipe
@@ -240,21 +240,21 @@ class _Diary:
         if recipe.config.num_seeds > 1:
             path = self.root / "seeds.csv"
             self._seeds = _table(path, self.reported, self._seed_columns)
-        self._begun = self._looked = self._saved = time.perf_counter()
+        self._begun = self._validated = self._saved = time.perf_counter()
         self._noted = self._begun
-        self._each: list[dict[str, float]] = []  # of every seed, at the last look
+        self._each: list[dict[str, float]] = []  # of every seed, at the last validation
 
     def note(
         self, state: TrainState, first: int, count: int, found: Mapping[str, Any]
     ) -> None:
-        """Keep the metrics of ``count`` updates; look and save where it is time to."""
+        """Record the metrics of ``count`` updates; validate and save when due."""
         recipe, config, now = self.recipe, self.recipe.config, time.perf_counter()
         schedule = ppo.schedule(config.ppo)
         for number in range(count):
             rewards = found["rewards"][number] if "rewards" in found else ()
             if (first + number) % len(recipe.learners) == 0:
                 self.recent = np.concatenate([self.recent, np.ravel(rewards)])[-_LAST:]
-            # Only the end of a call is seen by the clock.
+            # Only the end of a call is timed: interpolate.
             at = self._noted + (now - self._noted) * (number + 1) / count
             done = first + number + 1
             row: dict[str, float] = {
@@ -267,18 +267,18 @@ class _Diary:
                 "learning_rate": float(schedule(done * config.ppo.steps_per_update)),
             }
             if number == count - 1:
-                self._look(state, row)
+                self._validate(state, row)
             _add(self._rows, self._columns, row)
         self._noted = now
         if now - self._saved > config.save_every:
             self._saved = now
             self.save(state, first + count)
 
-    def _look(self, state: TrainState, row: dict[str, float]) -> None:
-        """Validate and report where it is time to."""
+    def _validate(self, state: TrainState, row: dict[str, float]) -> None:
+        """Validate and report when due, and at the first and last update."""
         recipe, config = self.recipe, self.recipe.config
         done, now = int(row["update"]), time.perf_counter()
-        due = now - self._looked > config.validate_every
+        due = now - self._validated > config.validate_every
         if not due and done not in (1, self.last):
             return
         spread: dict[str, float] = {}
@@ -293,8 +293,8 @@ class _Diary:
                 for number, each in enumerate(self._each):
                     own = {"update": done, "seed": config.seed + number} | each
                     _add(self._seeds, self._seed_columns, own)
-        rate = (done - self.reported) / max(now - self._looked, 1e-9)
-        self._looked, self.reported = time.perf_counter(), done
+        rate = (done - self.reported) / max(now - self._validated, 1e-9)
+        self._validated, self.reported = time.perf_counter(), done
         self.report(
             Report(
                 update=done,
@@ -330,7 +330,7 @@ class _Diary:
         checkpoint.save(self.root / "checkpoint", done, state.average, meta, state)
 
     def close(self) -> None:
-        """Bring the metrics to the disk."""
+        """Sync the metrics to disk and close their files."""
         for file in filter(None, (self._rows, self._seeds)):
             file.flush()
             os.fsync(file.fileno())
@@ -361,7 +361,7 @@ def _of_each_seed(tree: Any, num_seeds: int) -> list[Any]:
 
 
 def _table(path: pathlib.Path, done: int, columns: Sequence[str]) -> TextIO:
-    """A CSV file to go on with after update ``done``: later rows were never saved."""
+    """A CSV file opened to append, without rows of updates after ``done``."""
     lines = path.read_text().splitlines()[1:] if path.exists() else []
     kept = [
         line
