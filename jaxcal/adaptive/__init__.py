@@ -1,8 +1,8 @@
-"""The next measurement from the last: where information depends on what is measured.
+"""Sequential measurement: the next one is chosen from the outcomes so far.
 
 A task (``GridTask``, ``ParticleTask``) says what is unknown, what may be measured and
 what it costs; a belief is what is known; a decider picks what comes next.
-``next_measurement`` answers at the bench, ``run`` closes the loop, ``play`` and
+``next_measurement`` proposes one design, ``run`` is the closed loop, ``play`` and
 ``compare`` try deciders on thousands of sessions.
 """
 

@@ -27,8 +27,8 @@ from jaxcal.checks import whole_number
 __all__ = ["Bounds", "sace", "spce"]
 
 _CHUNK = 4096  # contrasts at a time
-_PRIOR = 0.05  # share of the proposal: bounds the ratio of posterior to proposal
-_NEAREST = 32  # particles that shape each kernel
+_PRIOR = 0.05  # prior's share of the proposal; it bounds posterior / proposal
+_NEAREST = 32  # particles from which each kernel's covariance is estimated
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,8 +93,8 @@ def sace(
         episodes: B sessions.
         key: of particles and contrasts.
         contrasts: L for each session.
-        particles: that the posterior is fitted to: anew, whatever the task's belief.
-        moves: of the particles.
+        particles: of the fit of the posterior, in place of the task's number.
+        moves: Metropolis steps of the particles at each resampling, likewise.
     """
     finer = dataclasses.replace(task, num_particles=particles, num_moves=moves)
     return _bounds(_sace(finer, episodes, key, contrasts), np.inf)
@@ -106,7 +106,7 @@ def _bounds(found: tuple[jax.Array, jax.Array], cap: float) -> Bounds:
 
 
 def _observed(task: ParticleTask, episode: Episodes) -> ParticleBelief:
-    """A belief of no particles with the history of one session."""
+    """A belief with the history of one session; its particles are void (zeros)."""
     belief, _ = jax.eval_shape(task.begin, jax.random.key(0))
     empty = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), belief)
     return dataclasses.replace(

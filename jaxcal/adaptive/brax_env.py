@@ -30,8 +30,8 @@ class SequentialEnv(EpisodeEnv):
     """Sessions of a task.
 
     Observation: (C (F + 2),) features, log score and validity of the shortlist. Action:
-    () int32, a place in the shortlist; an invalid one counts as the first. Reward: nats
-    that the measurement is expected to tell. End: time or uses are spent, or
+    () int32, a place in the shortlist; an invalid one counts as the first. Reward:
+    expected information gain of the measurement, nats. End: time or uses are spent, or
     ``task.horizon`` measurements are made.
     """
 
@@ -66,5 +66,5 @@ class SequentialEnv(EpisodeEnv):
 
     @property
     def action_size(self) -> int:
-        key = jax.random.PRNGKey(0)  # brax's own kind
+        key = jax.random.PRNGKey(0)  # legacy uint32, as brax uses
         return len(jax.eval_shape(self.begin, key).seen.index)

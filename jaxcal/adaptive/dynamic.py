@@ -1,9 +1,9 @@
 """The optimum of a small task, and its decider, by dynamic programming.
 
-Where outcomes are certain once theta is known, a belief is the prior restricted to the
-values that every answer allows: a set. The sets that can be reached are few, and with
-the place, the time left in ticks and the uses left they are the states of a finite
-problem, solved backwards in time. Every other decider is measured against its value.
+Where theta determines the outcomes, a belief is the prior restricted to the set of
+values that all outcomes allow. The sets that can be reached are few, and with the
+place, the time left in ticks and the uses left they are the states of a finite problem,
+solved backwards in time. No decider gains more than its value.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def _ticks(name: str, values: Array, tick: float) -> NDArray[np.int64]:
 def _beliefs(
     answers: NDArray[np.bool_], prior: Array
 ) -> tuple[NDArray[np.bool_], NDArray[np.int64], Array]:
-    """All sets (B, S) that answers can leave; the next set, its chance, (B, A, Y)."""
+    """All reachable sets (B, S); the next set and its probability, (B, A, Y) each."""
     number: dict[bytes, int] = {}
     sets: list[NDArray[np.bool_]] = []
 

@@ -18,7 +18,7 @@ __all__ = ["Comparison", "Episodes", "compare", "play"]
 
 @struct.dataclass
 class Episodes:
-    """B sessions of at most T measurements; what follows a session's end is void."""
+    """B sessions of at most T measurements; entries where not ``alive`` are void."""
 
     truth: Any  # leaves (B, ...)
     begun: Any  # Session, leaves (B, ...): the budget
@@ -26,17 +26,17 @@ class Episodes:
     outcomes: Any  # leaves (B, T, ...)
     gains: jax.Array  # (B, T) nats expected of each measurement when it was chosen
     alive: jax.Array  # (B, T) bool
-    entropy_drop: jax.Array  # (B,) nats: of the prior, less the posterior's
+    entropy_drop: jax.Array  # (B,) nats: entropy of the prior less the posterior's
     log_ratio: jax.Array  # (B,) log posterior less log prior, at the truth
 
     @property
     def gain(self) -> jax.Array:
-        """(B,) nats: the sum of expected gains; its mean is the entropy's drop."""
+        """(B,) nats: sum of expected gains; its mean is that of ``entropy_drop``."""
         return (self.gains * self.alive).sum(axis=-1)
 
 
 def play(task: Task, decider: Decider, keys: jax.Array) -> Episodes:
-    """Play a session a key (B,); no more at once than ``task.batch``, where it has one.
+    """Play one session per key (B,), at most ``task.batch`` at once if it is defined.
 
     The truth, the budget and the noise of every measurement depend on the key alone, so
     deciders that are given the same keys can be compared in pairs.
@@ -135,7 +135,7 @@ class Comparison:
         return _mean(self.gain[self.names.index(name)])
 
     def paired(self, name: str, base: str) -> tuple[float, float]:
-        """Nats that one decider has more than another on the same sessions."""
+        """Mean difference ``name`` less ``base``, nats, and its standard error."""
         a, b = (self.gain[self.names.index(n)] for n in (name, base))
         return _mean(a - b)
 
@@ -155,7 +155,7 @@ def compare(
         episodes: at least two.
         seed: of the sessions.
         batch: sessions played at once; the result does not depend on it.
-        progress: told how many sessions of a decider are played, from 0.
+        progress: called with the sessions of a decider played so far, from 0.
     """
     keys = jax.random.split(jax.random.key(seed), episodes)
     found = []

@@ -1,4 +1,4 @@
-"""What a belief on a grid says of each unknown: mean and interval."""
+"""Mean and credible interval of each unknown, from a belief on a grid."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def estimates(
 ) -> dict[str, Estimate]:
     """Mean and equal-tailed interval of each unknown, by name.
 
-    The values of theta stand for cells that meet half way between them; within a cell
-    every value is as likely.
+    Each value of theta stands for a cell that ends half way to the next value, with a
+    uniform density.
 
     Args:
         task: whose theta it is about.
@@ -54,7 +54,7 @@ def estimates(
         )
         edges = np.concatenate([[first], middle, [last]])
         below = np.concatenate([[0.0], np.cumsum(mass)])
-        # The smallest value that has so much below it: flat parts hold no mass.
+        # Quantiles of the piecewise linear distribution function.
         low = float(np.interp(tails[0], below, edges))
         high = float(np.interp(tails[1], below, edges))
         found[name] = Estimate(float(mass @ cells), low, high)

@@ -3,7 +3,7 @@
 Three things are found, in about a second on one core:
 
 1. the constants of ``shares``, by the cross-entropy method;
-2. hints: how often a tree of ``_DEEP`` multiplications a choice, too slow to decide,
+2. hints: how often a tree of ``_DEEP`` multiplications per choice, too slow for use,
    makes each measurement first, second and so on;
 3. which of these, and which ``doubt``, serve ``ahead``: every combination plays the
    same sessions, others than before, and one is taken if it beats ``AHEAD`` by a
@@ -33,29 +33,29 @@ __all__ = ["Fitted", "fit", "outside"]
 
 Array = NDArray[np.float32]
 
-# Multiplications: of each set of constants of a generation, of the deep tree's
-# sessions, of each combination's.
+# Multiplications to simulate: each set of constants in a generation, the deep tree,
+# each combination.
 _TUNE, _PLAY, _TRY = 6e7, 1e10, 2e9
 _DEEP = 2e7
-_MOST, _LEAST = 512, 16  # sessions; fewer tell nothing
-_OF_ALL, _POWER = 8.0, 0.25  # counts that weigh as all of them; of a share, to a hint
-_HASTE = 0.3  # from where it is searched for
+_MOST, _LEAST = 512, 16  # sessions of one estimate
+_OF_ALL, _POWER = 8.0, 0.25  # pseudo-counts of the mean share; hint = (A share)^.25
+_HASTE = 0.3  # start of its search where time is not limited
 
 _SHOWN = Limits(states=1024, designs=48, outcomes=4, measurements=32)
 
 
 @dataclasses.dataclass(frozen=True)
 class Fitted:
-    """A decider for one task, and what it is worth there."""
+    """A decider for one task, and its information gain there."""
 
     decider: Ahead | Shares
-    nats: float  # a session
-    more: float  # nats a session than ``SHARES``
+    nats: float  # per session
+    more: float  # nats per session above ``SHARES``
     error: float  # standard error of ``more``
 
 
 def outside(task: Any) -> tuple[str, ...]:
-    """In which sizes a task lies beyond those that ``ahead`` was measured on."""
+    """Sizes of a task that exceed those on which ``ahead`` was measured, in words."""
     if not isinstance(task, GridTask):
         return ("its unknowns are continuous: ahead decides as shares",)
     designs, outcomes, states = task.likelihood.shape
@@ -82,7 +82,7 @@ def fit(
     Args:
         task: what is measured; every design allowed.
         seconds, uses: budget of its sessions; the task's when not given.
-        seed: of what is simulated. The same arguments, the same constants.
+        seed: of the simulation; the same arguments give the same constants.
     """
     task = jax.device_get(task)
     budget = np.asarray(task.seconds if seconds is None else (seconds, seconds))
@@ -92,7 +92,7 @@ def fit(
 
 @dataclasses.dataclass(frozen=True)
 class _Task:
-    """What is simulated; equal where the hash is."""
+    """A task and a budget to simulate; compared by ``key``, their hash."""
 
     key: str
     task: GridTask = dataclasses.field(compare=False)
@@ -103,7 +103,7 @@ class _Task:
         """(B, T) gains and choices, -1 after the end; the same truths for a seed."""
         task, horizon = self.task, self.task.horizon
         rng = np.random.default_rng(seed)
-        at = (np.arange(count) + 0.5) / count  # every part of the prior in its share
+        at = (np.arange(count) + 0.5) / count  # stratified over the prior
         below = np.cumsum(task.prior, dtype=np.float64)
         truth = np.searchsorted(below, rng.permutation(at) * below[-1])
         low, high = self.seconds
@@ -175,7 +175,7 @@ def _plain(rule: Shares) -> Ahead:
 
 
 def _hints(chosen: Any, designs: int) -> Array:
-    """(N, A) multiples of scores from choices (B, N): what is often chosen is more."""
+    """(N, A) multiples of scores from choices (B, N), larger for frequent choices."""
     every = [np.bincount(a[a >= 0], minlength=designs) for a in chosen.T]
     counts = np.array([row for row in every if row.any()], np.float64)
     whole = counts.sum(axis=0)
@@ -185,5 +185,6 @@ def _hints(chosen: Any, designs: int) -> Array:
     return ((share * designs) ** _POWER).astype(np.float32)
 
 
-def _paired(less: Any) -> tuple[Any, Any]:
-    return less.mean(axis=-1), less.std(axis=-1) / np.sqrt(less.shape[-1])
+def _paired(more: Any) -> tuple[Any, Any]:
+    """Mean and standard error of differences (..., B) on the same sessions."""
+    return more.mean(axis=-1), more.std(axis=-1) / np.sqrt(more.shape[-1])

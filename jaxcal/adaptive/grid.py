@@ -55,11 +55,11 @@ class GridBelief:
     def gain(
         self, task: GridTask, design: jax.Array, key: jax.Array | None = None
     ) -> jax.Array:
-        """() nats of one design: exact, so it is that of ``gains``."""
+        """() nats of one design, that of ``gains``, which are exact."""
         return self.gains(task)[design]
 
     def entropies_after(self, task: GridTask) -> jax.Array:
-        """(A, Y) nats after each outcome, of what its design depends on alone."""
+        """(A, Y) nats: posterior entropy of the coordinates a design depends on."""
 
         def of(part: Part, w: jax.Array) -> jax.Array:
             p = part.likelihood @ w + _SMALL
@@ -107,7 +107,7 @@ class Part:
     """Designs whose outcomes depend on the same coordinates of theta, and on no other.
 
     Their gains follow from the marginal over those coordinates, which is far shorter
-    than the belief: of KNEE, 32 values in place of 1,024.
+    than the belief: 32 values in place of 1,024 in ``tasks.knee``.
     """
 
     likelihood: jax.Array  # (A', Y, K)
@@ -124,18 +124,18 @@ class GridTask:
 
     theta: jax.Array  # (S, d)
     prior: jax.Array  # (S,) sums to one
-    designs: jax.Array  # (A, e) for the reader and for features
+    designs: jax.Array  # (A, e) coordinates, for users and features
     likelihood: jax.Array  # (A, Y, S)
     parts: tuple[Part, ...]  # the same likelihood, by what designs depend on
     order: jax.Array  # (A,) int32 where each design is among those of the parts
     travel: jax.Array  # (P, A) seconds from a place until a design is measured
     place_after: jax.Array  # (A, Y) int32
     extra: jax.Array  # (A, Y) seconds that an outcome costs
-    uses: jax.Array  # (A, Y) int32 of what is countable that an outcome takes
+    uses: jax.Array  # (A, Y) int32 that an outcome takes of a countable resource
     seconds: jax.Array  # (2,) budget of a session, uniform between the two
-    num_uses: jax.Array  # (E,) int32 budgets, each as likely
+    num_uses: jax.Array  # (E,) int32 equally likely budgets
     place: jax.Array  # () int32 at the start
-    groups: jax.Array  # (A,) int32 of alike designs, such as those of one joint
+    groups: jax.Array  # (A,) int32 group of each design, such as its joint
     num_groups: int = struct.field(pytree_node=False)
     shape: tuple[int, ...] = struct.field(pytree_node=False)  # of theta as a grid
     horizon: int = struct.field(pytree_node=False)
@@ -170,12 +170,12 @@ class GridTask:
                 ``designs`` (A, e) and ``theta`` (S, d) that returns it.
             prior: (S,) weights; equal when not given.
             travel: seconds from a place to a measured design: a number, (A,) or
-                (P, A). Places 0 to A - 1 are the designs, others are the task's own;
-                without more, the last, A, is where a session starts.
+                (P, A). Places 0 to A - 1 are the designs, others are the task's own.
+                Where it is not (P, A), a place A is added, where a session starts.
             place_after: (A, Y) place after an outcome; the design itself by default.
             place: at the start; the last place by default.
-            groups: (A,) numbers from 0 of alike designs, such as the joint they are
-                of; what is shortlisted holds the best of each. One by default.
+            groups: (A,) group of each design from 0, such as its joint; a shortlist
+                holds the best of each group. One group by default.
             extra: (A, Y), or what broadcasts to it, seconds that an outcome costs.
             uses: (A, Y), or what broadcasts to it, of a countable resource.
             seconds: budget of a session, or (least, most) to draw it from.
@@ -210,32 +210,32 @@ class GridTask:
                 f"prior must hold {size} weights, none below 0 and one above, "
                 f"got shape {weights.shape}, least {weights.min():g}"
             )
-        roads = numbers("travel", travel)
-        if roads.ndim < 2:
-            roads = np.broadcast_to(roads, (count + 1, count))
-        if roads.ndim != 2 or roads.shape[1] != count or len(roads) < count:
+        times = numbers("travel", travel)
+        if times.ndim < 2:
+            times = np.broadcast_to(times, (count + 1, count))
+        if times.ndim != 2 or times.shape[1] != count or len(times) < count:
             raise ValueError(
                 f"travel must be a number, ({count},) or (P, {count}) with at least "
-                f"{count} places, got shape {roads.shape}"
+                f"{count} places, got shape {times.shape}"
             )
         shape = (count, table.shape[1])
         more, used = _table("extra", extra, shape), _table("uses", uses, shape)
-        for name, values in (("travel", roads), ("extra", more), ("uses", used)):
+        for name, values in (("travel", times), ("extra", more), ("uses", used)):
             if (values < 0.0).any():
                 raise ValueError(f"{name} must be at least 0, got {values.min():g}")
         itself = np.arange(count)[:, None]
         after = _table(
             "place_after", itself if place_after is None else place_after, shape
         )
-        first = len(roads) - 1 if place is None else place
+        first = len(times) - 1 if place is None else place
         for name, values in (("place_after", after), ("place", np.asarray(first))):
             if (
                 (values % 1 != 0).any()
                 or values.min() < 0
-                or values.max() >= len(roads)
+                or values.max() >= len(times)
             ):
                 raise ValueError(
-                    f"{name} must hold places in [0, {len(roads)}), "
+                    f"{name} must hold places in [0, {len(times)}), "
                     f"got {values.min():g} to {values.max():g}"
                 )
         budget = numbers("seconds", seconds, finite=False)
@@ -263,7 +263,7 @@ class GridTask:
             likelihood=_single(table),
             parts=parts,
             order=_whole(order),
-            travel=_single(roads),
+            travel=_single(times),
             place_after=_whole(after),
             extra=_single(more),
             uses=_whole(used),
@@ -279,7 +279,7 @@ class GridTask:
         )
 
     def by_design(self, of_parts: Sequence[jax.Array]) -> jax.Array:
-        """What was computed for the designs of each part, (A', ...), as (A, ...)."""
+        """(A, ...) values in the order of designs, from those of parts (A', ...)."""
         if len(of_parts) == 1:
             return of_parts[0]
         return jnp.concatenate(of_parts)[self.order]
@@ -289,7 +289,7 @@ class GridTask:
         return GridBelief(self.prior).draw(key)
 
     def begin(self, key: jax.Array) -> tuple[GridBelief, Session]:
-        """The prior, and a session with a budget that is drawn."""
+        """The prior, and a session with a random budget."""
         key_seconds, key_uses = jax.random.split(key)
         low, high = self.seconds
         spread = jnp.where(jnp.isfinite(high), high - low, 0.0)

@@ -30,7 +30,7 @@ __all__ = [
 
 History = Iterable[tuple[Any, Any]]  # (design, outcome) of each measurement, in order
 
-_NEAR = 1e-5  # of a design's range: coordinates this near to a design are that design
+_NEAR = 1e-5  # of a coordinate's range: tolerance for coordinates of a design
 
 
 def begin(
@@ -71,18 +71,18 @@ def begin(
 
 
 class StepKeys(NamedTuple):
-    """What one measurement draws with."""
+    """PRNG keys of one measurement."""
 
     options: jax.Array
     choice: jax.Array
     update: jax.Array  # of the belief
-    gain: jax.Array  # of the design chosen: other draws than those that chose it
+    gain: jax.Array  # of the gain of the chosen design, independent of ``choice``
 
 
 def step_keys(seed: int, number: int) -> StepKeys:
     """Keys of measurement ``number``, from 0.
 
-    They depend on the number alone, so that a resumed session goes on as it would have.
+    They depend on seed and number alone: a resumed session goes on as uninterrupted.
     """
     key = jax.random.fold_in(jax.random.key(seed), number)
     return StepKeys(*jax.random.split(key, 4))
@@ -94,9 +94,9 @@ def replay(
     """Belief and session after a history, and its entries as the task has them.
 
     Raises:
-        ValueError: naming the entry, from 0: a design that is not there, an outcome
-            that is none, one that cannot follow what was measured before, or an entry
-            after the budget was spent.
+        ValueError: naming the entry, from 0: a design or an outcome that the task does
+            not have, an outcome that cannot follow what was measured before, or an
+            entry after the budget was spent.
     """
     entries = []
     for number, entry in enumerate(history):

@@ -1,4 +1,4 @@
-"""Measurements on disk, one a line, for a closed loop that may be killed.
+"""Measurements on disk, one per line, for a closed loop that may be killed.
 
 The first line says what is measured and how; each further one is a measurement and is
 on the disk (fsync) before the next begins. One process writes it at a time. A torn
@@ -38,7 +38,7 @@ class Journal:
     """An append-only file of a header and measurements.
 
     Args:
-        path: of the file; it is made where it is not there, in a folder that is.
+        path: of the file; made where missing, in an existing folder.
         header: of this session. A file of another session is refused.
 
     Raises:
@@ -58,7 +58,7 @@ class Journal:
                 raise ValueError(f"{path}: a running session is writing it") from None
             lines, self._size = _whole_lines(self.path.read_bytes(), self.path)
             self.entries = lines[1:]
-            """What is there already: dicts with ``design`` and ``outcome``."""
+            """Measurements so far: dicts with ``design`` and ``outcome``."""
             if lines:
                 _require_same(self.path, lines[0], header)
             self._file.truncate(self._size)
@@ -108,7 +108,7 @@ def _whole_lines(data: bytes, path: pathlib.Path) -> tuple[list[Any], int]:
                 raise ValueError
         except ValueError:
             if number == len(lines) - 1 and not torn:
-                break  # the last line, whole but spoilt: torn as well
+                break  # a damaged last line counts as torn, also with its newline
             raise ValueError(
                 f"{path}: line {number + 1} is damaged; the session cannot be resumed"
             ) from None

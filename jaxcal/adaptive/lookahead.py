@@ -1,4 +1,4 @@
-"""Deciders that think past the next measurement: a tree, two steps, rollouts."""
+"""Deciders that look past the next measurement: a tree, two steps, rollouts."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ class Ahead:
     """``shares`` on a tree of the next measurements and all of their outcomes.
 
     The measurement of the largest expected total of nats: exact where the session ends
-    within the tree, with an estimate of what follows elsewhere. It draws nothing. On a
-    task that is not a ``GridTask`` it is ``shares``, as where even a small tree takes
-    more than ``effort``: multiplications of a choice, 7e5 about .04 ms of one core.
+    within the tree, with an estimate of what follows elsewhere; deterministic. It is
+    ``shares`` on a task that is not a ``GridTask``, and where even a small tree takes
+    more than ``effort`` multiplications per choice (7e5: about .04 ms of one core).
     """
 
     base: Shares = SHARES
-    doubt: Any = 0.3  # of what is estimated: by so much another must beat ``shares``
+    doubt: Any = 0.3  # share of the estimated nats by which to beat ``shares``
     hints: Any = None  # (N, A) multiples of the scores of the first N measurements
     effort: float = struct.field(pytree_node=False, default=7e5)
 
@@ -50,7 +50,7 @@ class Ahead:
         return chosen
 
     def constants(self) -> tuple[list[Any], Any]:
-        """Those of ``shares`` and the doubt, and (N, A) or (1, 1) hints."""
+        """Constants of ``shares`` and ``doubt``; (N, A) hints, (1, 1) without any."""
         rule = self.base
         numbers = [rule.time, rule.use, rule.a, rule.b, rule.haste, self.doubt]
         return numbers, np.ones((1, 1)) if self.hints is None else self.hints
@@ -63,7 +63,7 @@ _DIMENSIONS = (3, 2, 2, 2, 2, 1, 1, 2, 1, 0, 0, 0, 0)
 
 
 def _chosen(horizon: int, effort: float, *arrays: Any) -> Any:
-    """(...) int32; each array has axes of batches in front, of length 1 or its own."""
+    """(...) int32 choices; arrays have leading batch axes that broadcast."""
     given = [np.asarray(array) for array in arrays]
     each = list(zip(given, _DIMENSIONS, strict=True))
     batches = [array.shape[: array.ndim - dims] for array, dims in each]
@@ -74,7 +74,7 @@ def _chosen(horizon: int, effort: float, *arrays: Any) -> Any:
         for array, dims in each[_TABLES:]
     ]
     chosen = np.empty(batch, np.int32)
-    for index in np.ndindex(tasks):  # one, where there is one task
+    for index in np.ndindex(tasks):  # one iteration per task
         table, travel, extra, uses, after, allowed, constants, hints = (
             array[
                 tuple(min(i, n - 1) for i, n in zip(index, array.shape, strict=False))
@@ -138,7 +138,7 @@ class TwoStep:
         score = log_score(gains, prices)
         index, valid = shortlist(task, score, options, self.per_group)
 
-        # The same of every candidate and outcome, so that these are compared in pairs.
+        # Common random numbers for all candidates and outcomes.
         keys = jax.random.split(key_next, 4)
 
         def follow(index: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -153,7 +153,7 @@ class TwoStep:
                 gains, prices = self.base.judged(task, then, left, follow, keys[3])
                 chosen = best(log_score(gains, prices), follow)
                 going = ~(left.over | (left.made >= task.horizon))
-                # The price counts also where the session ends: an end is not cheap.
+                # The price counts also where the session is over: no bonus for ending.
                 return going * gains[chosen], prices[chosen]
 
             gain, price = jax.vmap(after)(outcomes)
@@ -171,8 +171,8 @@ class Rollouts:
     Each shortlisted measurement is followed by the base rule, ``rollouts`` times, for
     at most ``depth`` measurements in all. Every candidate meets the same truths and
     the same random numbers. The base rule's choice is kept unless another gains more
-    by ``doubt`` standard errors of the difference: the largest of
-    some noisy means is mostly the noisiest, and taking it is worse than the base rule.
+    by ``doubt`` standard errors of the difference: the largest of some noisy means is
+    mostly the noisiest, and taking it is worse than the base rule.
     """
 
     base: Rule

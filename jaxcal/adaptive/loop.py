@@ -1,4 +1,4 @@
-"""The next measurement for a user at the bench, and the closed loop that makes it."""
+"""The next measurement for a user who makes it, and the closed loop."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ __all__ = ["Finished", "Proposal", "next_measurement", "run"]
 
 @dataclasses.dataclass(frozen=True)
 class Proposal:
-    """What to measure next, what it is expected to bring, and what is known now."""
+    """What to measure next, its expected gain and cost, and the present belief."""
 
     design: Any  # an index where the task has a table of designs; None: session is over
     coordinates: Any  # the design itself, (e,); None: session is over
-    gain: float  # nats it is expected to tell
-    seconds: float  # it is expected to take
-    uses: float  # it is expected to take
+    gain: float  # expected information gain, nats
+    seconds: float  # expected
+    uses: float  # expected
     number: int  # measurements made before it
     belief: Any
     session: Session  # what is left
@@ -70,12 +70,12 @@ def next_measurement(
         task: what is unknown and what may be measured.
         history: (design, outcome) of each measurement in order. A design is an index of
             ``task.designs`` (a whole number) or its coordinates.
-        decider: when not given, the largest expected gain, and where time or uses count
-            what ``fitting.fit`` finds for the task and this budget: the first call
-            simulates some seconds.
+        decider: when not given, the largest expected gain; where time or uses count,
+            what ``fitting.fit`` finds for the task and this budget, in some seconds at
+            the first call.
         seconds: budget of the whole session; the task's when not given.
-        uses: likewise of what is countable.
-        seed: of deciders and beliefs that draw. The same arguments, the same proposal.
+        uses: budget of the countable resource, likewise.
+        seed: of random draws; the same arguments give the same proposal.
 
     Raises:
         ValueError: an entry of the history that cannot be, by its number.
@@ -109,8 +109,8 @@ def run(
         enough: asked before each measurement; True ends the session.
 
     Raises:
-        ValueError: the journal is of another task, decider or budget; an outcome is
-            none, or cannot follow what was measured before.
+        ValueError: the journal is of another task, decider or budget; an outcome is not
+            one of the task's, or cannot follow what was measured before.
     """
     belief, session = begin(task, seconds, uses, seed)
     header = {

@@ -20,11 +20,11 @@ from jaxcal.checks import in_words, numbers, whole_number
 
 __all__ = ["Model", "ParticleBelief", "ParticleTask", "log_mean", "systematic"]
 
-_FLOOR = -1e6  # log likelihood of what is next to impossible
+_FLOOR = -1e6  # least log likelihood, of impossible outcomes
 _ENOUGH = 0.5  # effective share of the particles below which they are moved
 _HALVINGS = 10  # bisections for a temperature
 _STEPS = 40  # temperatures that one outcome may take
-_FEW = 8  # outcomes that a look past the next measurement follows
+_FEW = 8  # outcomes per design that a two-step look-ahead follows
 _AT_ONCE = 2**25  # log probabilities that sessions played at once may hold
 
 
@@ -54,13 +54,13 @@ class Model(Protocol):
     def propose(
         self, unknowns: Any, session: Session, key: jax.Array, count: int
     ) -> Any:
-        """``count`` designs worth a look, given draws of the unknowns, leaves (N, ..).
+        """``count`` candidate designs, given draws of the unknowns, leaves (N, ...).
 
-        Designs that cost more than ``session.seconds`` are not taken: one must not.
+        At least one must cost at most ``session.seconds``; others are not chosen.
         """
 
     def cost(self, session: Session, design: Any) -> jax.Array:
-        """() what a design costs, in the terms of ``session.seconds``."""
+        """() cost of a design, in the unit of ``session.seconds``."""
 
 
 @struct.dataclass
@@ -68,7 +68,7 @@ class ParticleBelief:
     """N weighted draws of the coordinates, and the T measurements they follow from."""
 
     z: jax.Array  # (N, d)
-    log_weight: jax.Array  # (N,) sum to one
+    log_weight: jax.Array  # (N,) logs of weights that sum to one
     log_likelihood: jax.Array  # (N,) of the measurements made
     designs: Any  # leaves (T, ...)
     answers: jax.Array  # (T,) their outcomes
@@ -77,7 +77,7 @@ class ParticleBelief:
     model: Model
 
     def entropy(self) -> jax.Array:
-        """() nats of z: the estimated evidence less what the particles have of it."""
+        """() nats, of z: log evidence less the particles' mean log joint density."""
         joint = _log_prior(self.z) + self.log_likelihood
         return self.log_evidence - (jnp.exp(self.log_weight) * joint).sum()
 
@@ -99,7 +99,7 @@ class ParticleBelief:
     ) -> tuple[jax.Array, jax.Array]:
         """(Y,) outcomes of a design and (Y,) their probabilities.
 
-        All there are, up to eight; of more, or of continuous ones, eight drawn.
+        All outcomes where they are at most eight; otherwise eight draws.
         """
         model, support = self.model, self.model.support
         if support is not None and len(support) <= _FEW:
@@ -119,7 +119,7 @@ class ParticleBelief:
         return support, weight @ jnp.exp(log_p)
 
     def can_answer(self, design: Any, outcome: jax.Array) -> jax.Array:
-        """() bool: some particle gives an outcome more than no probability."""
+        """() bool: some particle gives the outcome a probability above 0."""
         unknowns = jax.vmap(self.model.unknowns)(self.z)
         return jax.vmap(
             lambda u: _log_likelihood(self.model, u, design, outcome) > _FLOOR
@@ -128,7 +128,7 @@ class ParticleBelief:
     def gains(self, task: ParticleTask, options: Options, key: jax.Array) -> jax.Array:
         """(A,) nats, from ``task.num_contrasts`` particles.
 
-        Few outcomes are summed over. Of continuous ones, one is drawn for each
+        Discrete outcomes are summed over. Of continuous ones, one is drawn for each
         particle, with common random numbers for all designs, and contrasted with all
         other particles.
         """
@@ -151,8 +151,8 @@ class ParticleBelief:
     ) -> ParticleBelief:
         """The belief after a measurement.
 
-        The outcome's likelihood comes in by powers of 0 to 1, each as large as leaves
-        half of the particles effective; between them particles are resampled and moved.
+        The likelihood is tempered: its power rises from 0 to 1 in steps that keep half
+        of the particles effective; between steps they are resampled and moved.
         """
         at = self.made
         observed = dataclasses.replace(
@@ -444,7 +444,7 @@ def _tried(task: ParticleTask) -> tuple[jax.Array, ...]:
 
 
 def systematic(log_weight: jax.Array, count: int, key: jax.Array) -> jax.Array:
-    """(count,) int32 indices, each as often as its weight says, to within one."""
+    """(count,) int32 indices, each ``count`` times its weight often, to within one."""
     below = jnp.cumsum(jnp.exp(log_weight))
     ticks = (jnp.arange(count) + jax.random.uniform(key)) / count * below[-1]
     index = jnp.searchsorted(below, ticks, side="right")
@@ -464,7 +464,7 @@ def _gain(model: Model, unknowns: Any, design: Any, keys: jax.Array) -> jax.Arra
         all_of = jax.vmap(
             lambda y: jax.vmap(lambda p: model.log_prob(p, y))(predictions)
         )(outcomes)
-        # What is drawn is likely where it is drawn from: no overflow, so no maximum.
+        # Outcomes are likely under their own particle: clipping prevents overflow.
         ratio = jnp.exp(jnp.minimum(all_of - own[:, None], 80.0))
         found = -jnp.log(ratio.mean(axis=-1)).mean()
     else:

@@ -1,4 +1,4 @@
-"""Rules that look one measurement ahead: gain, gain a second, gain a price."""
+"""Rules that look one measurement ahead: gain, gain per second, gain per price."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = [
 
 
 def best(score: jax.Array, options: Options) -> jax.Array:
-    """() int32 the allowed option of the largest score (A,)."""
+    """() int32 index of the allowed option of the largest score (A,)."""
     return jnp.argmax(jnp.where(options.allowed, score, -jnp.inf)).astype(jnp.int32)
 
 
@@ -70,7 +70,7 @@ def shortlist(
 
 @struct.dataclass
 class Random:
-    """Any option that is allowed."""
+    """An allowed option, uniformly at random."""
 
     def __call__(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array
@@ -91,7 +91,7 @@ class Gain:
 
 @struct.dataclass
 class GainRate:
-    """The largest expected gain a second."""
+    """The largest expected gain per second."""
 
     def __call__(
         self, task: Any, belief: Any, session: Session, options: Options, key: jax.Array

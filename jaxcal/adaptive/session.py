@@ -19,7 +19,7 @@ __all__ = ["Belief", "Decider", "Options", "Session", "Task"]
 
 @struct.dataclass
 class Session:
-    """Where one session stands, besides its belief."""
+    """State of one session, besides its belief."""
 
     place: Any  # where the machine is, in the task's own terms
     seconds: jax.Array  # () left; inf where time does not count
@@ -37,7 +37,7 @@ class Options:
     """The A measurements that may come next."""
 
     designs: Any  # leaves (A, ...), in the task's own terms; a decider returns an index
-    seconds: jax.Array  # (A,) until each is measured, whatever it answers
+    seconds: jax.Array  # (A,) until each is measured, whatever the outcome
     allowed: jax.Array  # (A,) bool
 
 
@@ -45,10 +45,10 @@ class Belief(Protocol):
     """What is known of the unknown."""
 
     def gains(self, task: Any, options: Options, key: jax.Array) -> jax.Array:
-        """(A,) nats that each measurement is expected to tell; at least 0."""
+        """(A,) expected information gain of each measurement, nats; at least 0."""
 
     def gain(self, task: Any, design: Any, key: jax.Array) -> jax.Array:
-        """() nats that one measurement is expected to tell.
+        """() expected information gain of one measurement, nats.
 
         With a key of its own it is unbiased for a design that was chosen by ``gains``:
         the largest of some noisy estimates is on average too large.

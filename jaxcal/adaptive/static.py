@@ -53,7 +53,7 @@ def optimise(
         task: of finitely many designs.
         length: entries; ``task.horizon`` by default.
         episodes: sessions that judge a sequence.
-        starts, sweeps: so many, at most so many.
+        starts, sweeps: number of starts; most sweeps of each.
         seed: of the sessions and starts.
         report: called after each entry with how many are done, of how many, and nats.
     """

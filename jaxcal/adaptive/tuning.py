@@ -18,8 +18,8 @@ __all__ = ["search", "tune"]
 
 R = TypeVar("R", bound=Rule)
 
-_SPREAD = 0.7  # of the first generation, in units of ``Scored.moved``
-_SMOOTH = 0.7  # share of the elite's mean in the next one
+_SPREAD = 0.7  # of the first generation, in units of ``Rule.moved``
+_SMOOTH = 0.7  # weight of the elite in the next mean and spread
 
 
 def tune(
@@ -43,7 +43,7 @@ def tune(
     Args:
         task: whose sessions are played.
         rule: where to start.
-        episodes: sessions a generation.
+        episodes: sessions of a generation.
         generations, population, elite: of the cross-entropy method.
         seed: of the sessions and of the search.
         nats_of: what is maximised, of task, rule and keys; the mean of nats when None.
@@ -79,7 +79,7 @@ def search(
     spread: float = _SPREAD,
     report: Callable[[int, float, R], None] = lambda number, nats, rule: None,
 ) -> R:
-    """The search itself; ``nats_of`` is asked for a rule and a generation's number."""
+    """Cross-entropy search that maximises ``nats_of(rule, generation)``."""
     rng = np.random.default_rng(seed)
     centre = np.zeros(rule.num_free)
     spreads = np.full(rule.num_free, spread)

@@ -1,4 +1,4 @@
-"""Every number of a run that trains a policy of sequential measurement."""
+"""Configuration of a run that trains a policy of sequential measurement."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ PPO = StreamsConfig(
     gae_lambda=1.0,
     average_decay=0.998,
 )
-"""The numbers that ship."""
+"""The defaults."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PolicyConfig:
-    """What is trained, from which rule on, and how."""
+    """Task, base rule, network and optimisation of a run."""
 
     task: str  # as registered
-    base: Scored  # the rule that the network corrects, its constants numbers
+    base: Scored  # the rule that the network corrects; its constants are floats
     options: tuple[Mapping[str, Any], ...] = ({},)  # update u trains on u modulo n
     per_group: int = setting(6, "options of a group that the network sees")
     width: int = setting(64, "of the network's layers")
@@ -58,7 +58,7 @@ class PolicyConfig:
 
     @property
     def learners(self) -> tuple[Streams, ...]:
-        """One: other options are other arrays of the same program."""
+        """One learner: other options are other arrays of the same program."""
         return (Streams(self.ppo, Sessions(self.per_group), Network(self.width)),)
 
     def as_meta(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What a policy sees of a session: a shortlist of options, each by features."""
+"""Inputs of a policy: a shortlist of options with their features."""
 
 from __future__ import annotations
 
@@ -115,9 +115,9 @@ def _along(task: Any, count: int) -> jax.Array:
 
 
 def _left_after(task: Any, belief: Any, count: int) -> tuple[jax.Array, jax.Array]:
-    """(A,) entropy expected after an outcome that takes uses, and after one that not.
+    """(A,) expected entropy after outcomes that take uses, and after those that do not.
 
-    0 where a belief does not tell it, or no outcome is such.
+    0 where the belief has no ``entropies_after`` or there are no such outcomes.
     """
     if not hasattr(belief, "entropies_after"):
         return jnp.zeros(count), jnp.zeros(count)

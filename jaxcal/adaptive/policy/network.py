@@ -1,4 +1,4 @@
-"""The policy: a correction, learned, of a rule's score."""
+"""The policy: a learned correction of a rule's score."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from jaxcal.adaptive.session import Options, Session
 
 __all__ = ["Network", "Policy"]
 
-# Of the rule's log score at first: an option whose score is a fifth below the best
-# one's is then tried a third as often (0.8^5).
+# Initial factor of the rule's log score: an option whose score is a fifth below the
+# best one's is sampled a third as often (0.8^5).
 _SHARPNESS = 5.0
-_STEP = 3.0  # logits for a unit of the network, which learns corrections faster so
+_STEP = 3.0  # logits per unit of the network's output, so that it learns faster
 
 
 class Network(nn.Module):
@@ -35,7 +35,7 @@ class Network(nn.Module):
         hidden = nn.tanh(nn.Dense(self.width)(seen.features))
         valid = seen.valid[..., None]
         pool = jnp.where(valid, hidden, -1.0).max(axis=-2)
-        # Two layers in place of one over both: the pool's is computed once.
+        # A layer over both as two: the pool's product is computed once.
         beside = nn.Dense(self.width, use_bias=False)(pool)[..., None, :]
         late = nn.tanh(nn.Dense(self.width)(hidden) + beside)
         change = nn.Dense(1, kernel_init=nn.initializers.zeros)(late)[..., 0]

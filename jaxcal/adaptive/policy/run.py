@@ -1,4 +1,4 @@
-"""The run that trains a policy, and what it leaves."""
+"""The run that trains a policy, and the policy in its checkpoint."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ __all__ = ["MEASURED", "Trained", "exercises", "load", "train"]
 
 SCHEMA = "jaxcal-sequential-policy"
 MEASURED = ("nats", "nats_over_base")
-_VALIDATED = 1024  # sessions
+_VALIDATED = 1024  # sessions of a validation
 _FRESH = 2**31 - 1  # their seed
 
 
 @dataclasses.dataclass(frozen=True)
 class Trained:
-    """A policy as it lies in a checkpoint."""
+    """A policy from a checkpoint."""
 
     params: Any
     config: PolicyConfig
@@ -80,7 +80,7 @@ def train(
     Args:
         config: the run.
         folder: of the run; made where missing.
-        num_devices: use so many of each process; all when None.
+        num_devices: devices of each process; all when None.
         rest: ``resume``, ``report``, ``should_stop`` and ``num_updates`` of
             ``training.run.run``.
 
@@ -116,7 +116,7 @@ def train(
 
 
 def load(path: str | pathlib.Path | None = None) -> Trained:
-    """A policy; of several seeds the best by validation.
+    """A policy; with several seeds the best by validation.
 
     Args:
         path: a weights file or a training run's folder; the policy of KNEE that ships

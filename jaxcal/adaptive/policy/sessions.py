@@ -20,7 +20,7 @@ __all__ = ["Exercise", "Sessions", "State"]
 
 @struct.dataclass
 class Exercise:
-    """What a stream is given, as arrays: a task, and the rule to be corrected."""
+    """Arrays that a stream takes: a task, and the rule that the policy corrects."""
 
     task: Any
     base: Scored
@@ -65,8 +65,8 @@ class Sessions:
     ) -> Step:
         """Make a measurement; its reward is the information it is expected to give.
 
-        The gain is estimated by draws of its own: those of the shortlist chose it, so
-        theirs is too large.
+        The gain is estimated from independent draws: the design was chosen by those of
+        the shortlist, so their estimate is too large.
         """
         made, belief = task.task, state.belief
         key_outcome, key_update, key_gain = jax.random.split(key, 3)
