@@ -26,10 +26,10 @@ BUDGETS = (
     "time+uses+number",
 )  # fmt: skip
 _PASSES = 8  # sessions by which budgets are set
-_ENOUGH = 0.8  # of the information such a session gains
-_SHARES = (0.25, 1.2)  # of what such a session takes: a budget
-_UNKNOWN = 1.5  # nats at the start, at least
-_LEAST = 3  # measurements that a budget is meant for
+_ENOUGH = 0.8  # share of the information that such a session gains in all
+_SHARES = (0.25, 1.2)  # least and largest budget, over what that share takes
+_UNKNOWN = 1.5  # least entropy of the prior, nats
+_LEAST = 3  # least number of measurements for which a budget is drawn
 
 
 def draw(
@@ -38,13 +38,13 @@ def draw(
     budget: str | None = None,
     limits: Limits = Limits(),  # noqa: B008  # frozen
 ) -> GridTask:
-    """One task of the family. The same arguments, the same task.
+    """One task of the family; the same arguments give the same task.
 
     Args:
         seed: of everything that is drawn.
         structure: of ``TRAINED_ON`` or ``HELD_OUT``; one of ``TRAINED_ON`` when None.
         budget: of ``BUDGETS``; drawn when None, time and uses together most often.
-        limits: no size of the task is larger.
+        limits: largest sizes of the task.
 
     Raises:
         ValueError: no such structure or budget.
@@ -117,7 +117,8 @@ def _needed(
     after: NDArray[Any],
     horizon: int,
 ) -> dict[str, float]:
-    """What the largest gain a second takes to tell most of what it tells in the end."""
+    """Measurements, seconds and uses until the rule of the largest gain per second has
+    ``_ENOUGH`` of the information that it gains in ``horizon`` measurements."""
     count, num_outcomes, num_states = table.shape
     flat = table.reshape(-1, num_states)
     noise = special.entr(table).sum(axis=1)
@@ -146,7 +147,7 @@ def _needed(
 
 
 def _with_uninformative(rng: np.random.Generator, asked: Questions) -> Questions:
-    """Sometimes a few designs tell nothing: their outcomes do not depend on theta."""
+    """In a fifth of tasks, outcomes of a few designs are made independent of theta."""
     count, num_outcomes = asked.likelihood.shape[:2]
     if rng.random() > 0.2:
         return asked
@@ -158,7 +159,7 @@ def _with_uninformative(rng: np.random.Generator, asked: Questions) -> Questions
 
 
 def _prior(rng: np.random.Generator, asked: Questions) -> Array:
-    """Smooth hills, lumps, coordinates that go together; often none of them."""
+    """(S,) prior: smooth hills, lumps and correlated coordinates, each at random."""
     theta = asked.theta
     count, dim = theta.shape
     log = np.zeros(count)
@@ -186,7 +187,7 @@ def _prior(rng: np.random.Generator, asked: Questions) -> Array:
 def _travel(rng: np.random.Generator, asked: Questions) -> tuple[float, Array]:
     """Seconds of a measurement, and (A + 1, A) of going there; the last is the start.
 
-    The unit is drawn too: nothing may depend on it.
+    The unit of time is drawn too, because no decider may depend on it.
     """
     at = np.concatenate([asked.designs, asked.designs[:1] * 0.0])
     group = np.append(asked.groups, 0)
@@ -213,7 +214,7 @@ def _uses(rng: np.random.Generator, asked: Questions) -> Array:
         uses[:, -number:] = 1.0
         if rng.random() < 0.3:
             uses = uses[:, ::-1]
-    elif kind < 0.9:  # some designs, whatever they answer
+    elif kind < 0.9:  # some designs, whatever the outcome
         uses[rng.random(count) < rng.uniform(0.2, 0.7)] = 1.0
     else:  # outcomes of some designs alone
         uses[rng.random(count) < rng.uniform(0.3, 0.8), -1] = 1.0

@@ -18,19 +18,19 @@ from jaxcal.adaptive.session import Options, Session
 __all__ = ["SHAPE", "Padded", "batch", "pad", "stack"]
 
 SHAPE = Limits(states=256, designs=48, outcomes=4, measurements=32)
-"""Of ``batch``: what a CPU plays thousands of sessions of in seconds."""
+"""Sizes of ``batch``: a CPU plays thousands of such sessions in seconds."""
 
 
 @struct.dataclass
 class Padded(GridTask):
     """A grid task in the shapes of ``Limits``.
 
-    States beyond the task's have no weight, its designs beyond are not allowed, and
-    outcomes beyond are never given.
+    States added have no weight, designs added are not allowed, and outcomes added have
+    probability 0.
     """
 
     allowed: jax.Array  # (A,) bool
-    first: jax.Array  # () int32 measurements that a session is not given
+    first: jax.Array  # () int32 initial ``Session.made``: padded less own horizon
 
     def options(
         self, belief: GridBelief, session: Session, key: jax.Array | None = None
@@ -40,7 +40,7 @@ class Padded(GridTask):
         return every.replace(allowed=self.allowed)  # type: ignore[attr-defined]  # flax
 
     def session(self, seconds: object, uses: object) -> Session:
-        """A session with this budget; counts from ``first``, to end at ``horizon``."""
+        """A session with this budget; ``made`` counts from ``first`` to ``horizon``."""
         begun = super().session(seconds, uses)
         return begun.replace(made=self.first)  # type: ignore[attr-defined]  # flax
 
@@ -85,10 +85,10 @@ def pad(task: GridTask, limits: Limits) -> Padded:
     with np.errstate(divide="ignore", invalid="ignore"):
         p_log_p: Any = np.where(table > 0.0, table * np.log(table), 0.0)
     start = np.asarray(task.place)
-    # The start goes where it is in every padded task: after all designs.
-    roads = np.asarray(task.travel)
-    travel = larger(roads[:count], designs + 1, designs)
-    travel[-1, :count] = roads[-1]
+    # In every padded task the start is the place after all designs.
+    times = np.asarray(task.travel)
+    travel = larger(times[:count], designs + 1, designs)
+    travel[-1, :count] = times[-1]
     after = np.asarray(task.place_after)
     after = (
         np.where(after == count, designs, after) if len(task.travel) > count else after
@@ -96,7 +96,7 @@ def pad(task: GridTask, limits: Limits) -> Padded:
     if len(task.travel) > count:
         start = np.where(start == count, designs, start)
     fields: dict[str, Any] = dict(
-        theta=np.zeros((limits.states, 1), np.float32),  # nothing reads it
+        theta=np.zeros((limits.states, 1), np.float32),  # not used
         prior=larger(task.prior, limits.states),
         designs=np.zeros((designs, 1), np.float32),
         likelihood=table,
@@ -128,6 +128,6 @@ def stack(tasks: Sequence[Padded]) -> Padded:
 
 
 def batch(number: int = 0, tasks: int = 128) -> Padded:
-    """Tasks of one shape, a leading axis of them; other numbers, other tasks."""
+    """Tasks of one shape on a leading axis; each ``number`` gives other tasks."""
     seeds = range(number * tasks, (number + 1) * tasks)
     return stack([pad(draw(seed, limits=SHAPE), SHAPE) for seed in seeds])

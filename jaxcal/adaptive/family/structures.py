@@ -1,4 +1,4 @@
-"""What may be unknown, and what may be asked of it: the structures of the family.
+"""Structures of the family: the unknown, the designs and the law of the outcomes.
 
 Each structure is a function of a random generator and of sizes that returns
 ``Questions``. Those of ``HELD_OUT`` are never trained on: the benchmark is drawn from
@@ -61,7 +61,7 @@ def _side(rng: np.random.Generator, dim: int, limits: Limits, least: int = 4) ->
 
 
 def _below(rng: np.random.Generator, distance: Array) -> Array:
-    """Probability of a yes: 1 far above distance 0, 0 far below, with slips."""
+    """Probability of a yes: a step from 0 to 1 at distance 0, with wrong answers."""
     sigma = rng.choice([0.0, np.exp(rng.uniform(np.log(0.005), np.log(0.15)))])
     wrong = rng.choice([0.0, rng.uniform(0.0, 0.12)], size=2)
     if rng.random() < 0.6:
@@ -91,7 +91,7 @@ def _bins(rng: np.random.Generator, mean: Array, limits: Limits) -> Array:
 
 
 def _answers(rng: np.random.Generator, mean: Array, limits: Limits) -> Array:
-    """Readings in bins, or whether the mean lies above its middle."""
+    """(A, Y, S) of readings in bins, or of whether ``mean`` exceeds a quantile."""
     if limits.outcomes > 2 and rng.random() < 0.6:
         return _bins(rng, mean, limits)
     middle = np.quantile(mean, rng.uniform(0.3, 0.7))
@@ -304,7 +304,7 @@ def corner(rng: np.random.Generator, limits: Limits) -> Questions:
 
 
 def dead_zone(rng: np.random.Generator, limits: Limits) -> Questions:
-    """Width and centre of a zone that gives nothing; a command gives a reading."""
+    """Width and centre of a zone without output; a command gives a reading."""
     side = _side(rng, 2, limits)
     theta = _grid(_cells(side), 0.6 * _cells(side))
     at = np.linspace(0.0, 1.0, int(rng.integers(8, min(limits.designs, 40) + 1)))

@@ -1,4 +1,4 @@
-"""Tasks, one a file, and the registry that finds them by name."""
+"""Tasks, one per file, and the registry that finds them by name."""
 
 from jaxcal.adaptive.tasks.registry import Entry, load, names
 

@@ -1,14 +1,14 @@
-"""Backlash and dead zone: what a joint does when its drive turns back.
+"""Backlash and dead zone of a joint behind its drive.
 
 With play of some width between drive and joint, the joint stays behind the drive by
 half the width, on the side it comes from, and a move the other way first takes up the
 play. A measurement is a posture and the direction in which it is reached: the axis
 comes to zero against that direction, from far enough, and then goes on to the posture.
-Postures within the play leave the joint where it was; which ones those are is unknown,
-so what a posture tells depends on the width.
+Postures within the play leave the joint where it was. Which ones these are depends on
+the unknown width, and so does the information of a posture.
 
-A dead zone gives nothing while the command is within half its width of a centre, and
-the command less that half outside; no direction matters.
+The output of a dead zone is 0 while the command is within half its width of a centre,
+else the signed distance of the command from the zone, whatever the direction.
 """
 
 from __future__ import annotations
@@ -86,9 +86,9 @@ def backlash(
             when not given.
         sigma: noise of a reading.
         bin_width: of the outcomes.
-        outliers: share of readings that say nothing.
+        outliers: share of readings that carry no information.
         measure_s: seconds of a reading.
-        speed: of the axis, a second. Each measurement runs up from 1.5 of ``max_width``
+        speed: of the axis, per second. A measurement runs up from 1.5 of ``max_width``
             on the other side.
         measurements: that end a session.
     """
@@ -106,7 +106,7 @@ def backlash(
     mean = residual(
         designs[:, :1], designs[:, 1:], theta[None, :, 0], theta[None, :, 1]
     )
-    # From where it stands to far on the other side, and back to the posture.
+    # From the present posture to ``far`` on the other side, then to the posture.
     stands = np.append(designs[:, 0] * designs[:, 1], 0.0)
     turn = -designs[:, 1] * far
     way = np.abs(stands[:, None] - turn) + far + designs[:, 0]
@@ -125,7 +125,7 @@ def backlash(
 
 
 def past_zone(command: ArrayLike, width: ArrayLike, centre: ArrayLike) -> Array:
-    """What a dead zone lets through of a command."""
+    """Output of a dead zone for a command."""
     off = np.asarray(command) - np.asarray(centre)
     return np.asarray(np.sign(off) * np.maximum(np.abs(off) - np.divide(width, 2), 0.0))
 
@@ -166,13 +166,12 @@ def dead_zone(
         cells: of the width.
         offset_cells: of the centre.
         reach: largest command either way.
-        reference: command whose reading, less itself, is taken off every reading, less
-            its command: for an instrument that does not know where the zone's output
-            is. Readings as they are when not given.
+        reference: a command; outcomes are then reading less command, minus the same at
+            the reference, for an instrument of unknown zero. Plain readings when None.
         num_postures: commands, evenly spaced.
         sigma: noise of a reading.
         bin_width: of the outcomes, of :func:`dead_zone_bins`.
-        outliers: share of readings that say nothing.
+        outliers: share of readings that carry no information.
         measurements: that end a session.
     """
     relative = reference is not None

@@ -1,9 +1,9 @@
-"""Breakaway: how small a step a joint at rest does not answer.
+"""Breakaway: the largest step from rest at which a joint does not move.
 
 Friction holds a joint at rest until its drive is so far away that it yields; then it
 follows. A test is a step from rest in a direction, and tells whether the joint moved.
-One that moves has gone further than it had to: how far that may be is a limit, so the
-threshold is climbed up to from below and halved only where a step is known to move.
+A joint that moves goes past the threshold, and ``Cautious`` limits by how far: it
+raises the steps from below, and bisects only where that keeps within the limit.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def breakaway(
         directions: 2, or 1 for up alone.
         sigma: noise of the difference of the readings before and after a step.
         spread: standard deviation of the threshold from one test to the next.
-        outliers: share of tests that say nothing.
+        outliers: share of tests that carry no information.
         measurements: that end a session.
     """
     if directions not in (1, 2):
@@ -74,10 +74,10 @@ def breakaway(
 
 @struct.dataclass
 class Cautious:
-    """The largest expected gain of the steps that hardly go too far past a threshold.
+    """The largest expected gain among steps unlikely to go far past a threshold.
 
-    With a probability of ``risk`` at most is a step by more than ``limit`` past the
-    threshold; where every step is riskier, the least risky ones are left.
+    The probability that the step exceeds the threshold by more than ``limit`` is at
+    most ``risk``; where every step is riskier, it is the least risky ones.
     """
 
     limit: Any = 0.1

@@ -44,13 +44,13 @@ def knee(
         joints: thresholds.
         rho: correlation of the thresholds' Gaussian copula.
         sigma: width of the step from no trip to trip; 0 is a sharp one.
-        slip: probability that a test answers wrongly far from the threshold.
+        slip: probability of the wrong outcome far from the threshold.
         seconds: budget of a session, or (low, high) to draw it from.
         trips: that end a session, or the list it is drawn from.
         test_s: seconds of one test.
-        travel_s: over the full range.
-        change_s: to go on with another joint, from u = 0.
-        reset_s: after a trip.
+        travel_s: seconds over the full range.
+        change_s: seconds to change to another joint, at its u = 0.
+        reset_s: seconds after a trip.
     """
     tau = (np.arange(cells) + 0.5) / cells
     theta = np.stack(np.meshgrid(*[tau] * joints, indexing="ij"), axis=-1)

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 @dataclasses.dataclass(frozen=True)
 class Bins:
-    """``count`` equal bins from ``low`` to ``high``; the outer two have no end."""
+    """``count`` equal bins from ``low`` to ``high``; the outer two are unbounded."""
 
     low: float
     high: float
@@ -45,7 +45,7 @@ class Bins:
         Args:
             mean: (A, S) readings without noise.
             sigma: standard deviation of the normal noise.
-            outliers: share of readings that fall into any bin.
+            outliers: share of readings that fall into every bin with equal probability.
         """
         if not sigma > 0.0:
             raise ValueError(f"sigma must be above 0, got {sigma:g}")

@@ -45,9 +45,9 @@ class Entry:
     train_on: tuple[Mapping[str, Any], ...] = ({},)
     """Options of the tasks that a policy is trained on: update u takes u modulo n."""
     methods: tuple[str, ...] = ()
-    """What ``evaluate.py`` compares unless told; all quick methods when empty."""
+    """What ``evaluate.py`` compares by default; all quick methods when empty."""
     episodes: int = 4096
-    """Sessions that ``evaluate.py`` plays unless told."""
+    """Sessions that ``evaluate.py`` plays by default."""
 
 
 def names() -> list[str]:
@@ -86,7 +86,7 @@ def _of_file(path: pathlib.Path) -> Any:
     spec = importlib.util.spec_from_file_location(f"{_GROUP} {path}", path)
     assert spec is not None and spec.loader is not None  # it is a Python file
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses of the file look themselves up there
+    sys.modules[spec.name] = module  # its dataclasses look up the module there
     spec.loader.exec_module(module)
     if not hasattr(module, "ENTRY"):
         raise ValueError(f"task file {path} must define ENTRY = Entry(...)")

@@ -1,9 +1,9 @@
 """Transmission error of unknown frequency: ``amplitude sin(2 pi frequency u + phase)``.
 
-A gear's error repeats with a period that is known only where the teeth are; a bent
-shaft or a loose belt brings one that is not. What a posture tells about the frequency
-depends on what is known of it: postures far apart tell it finely, and only once it is
-known so well that the turns between them can be counted.
+The period of a gear's error is known only if the numbers of teeth are; that of a bent
+shaft or a loose belt is not. Postures far apart determine the frequency finely, but
+only once it is known well enough to count the periods between them: the information of
+a posture depends on the belief.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ def transmission_error(
         frequencies: lowest and highest, in periods over the range of the axis; cells
             are equal between them.
         cells: of the frequency.
-        amplitudes: that there may be, in the reading's unit.
+        amplitudes: the possible ones, in the reading's unit.
         phases: evenly spaced over a turn.
         sigma: noise of a reading.
         num_postures: evenly spaced over the range.
         num_bins: outcomes, from below the lowest to above the highest reading.
         measure_s: seconds of a reading.
-        travel_s: over the full range.
+        travel_s: seconds over the full range.
         measurements: that end a session.
     """
     low, high = frequencies
