@@ -169,7 +169,7 @@ class Rollouts:
     """The measurement after which a base rule gains most, by simulation.
 
     Each shortlisted measurement is followed by the base rule, ``rollouts`` times, for
-    at most ``depth`` measurements in all. Every candidate meets the same truths and
+    at most ``depth`` measurements in all. Every candidate is given the same truths and
     the same random numbers. The base rule's choice is kept unless another gains more
     by ``doubt`` standard errors of the difference: the largest of some noisy means is
     mostly the noisiest, and taking it is worse than the base rule.

@@ -270,7 +270,7 @@ class ParticleBelief:
 
 @struct.dataclass
 class ParticleTask:
-    """A model, how long a session lasts, and how much is computed; see :func:`make`."""
+    """A model, the length of a session, and the effort of its belief; see ``make``."""
 
     model: Model
     seconds: jax.Array  # () budget of a session; inf where nothing costs

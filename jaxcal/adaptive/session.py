@@ -1,7 +1,7 @@
 """A session of sequential measurement: what is left, what may come next, the protocols.
 
-A *task* says what is unknown, what may be measured, what a measurement answers and what
-it costs. A *belief* is what is known of the unknown. A *decider* picks the next
+A *task* says what is unknown, what may be measured, with what outcomes and at what
+cost. A *belief* is what is known of the unknown. A *decider* picks the next
 measurement. All three are pytrees, so they are arguments of compiled functions (tables
 closed over by a jitted function have given wrong results on the CPU) and ``jax.vmap``
 plays thousands of sessions at once.

@@ -33,7 +33,7 @@ class EpisodeEnv(Env, abc.ABC):
 
     @abc.abstractmethod
     def observe(self, episode: Any) -> jax.Array:
-        """(observation_size,) what a policy sees."""
+        """(observation_size,) input of a policy."""
 
     @abc.abstractmethod
     def advance(self, episode: Any, action: jax.Array) -> tuple[Any, ...]:

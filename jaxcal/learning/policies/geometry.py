@@ -1,4 +1,4 @@
-"""The geometry a policy sees, in JAX: whitening, projection, volumes, log-determinants.
+"""Geometry of a policy's inputs: whitening, projection, volumes, log-determinants.
 
 The best subset does not change under an affine map of the commands, so the policy
 works on whitened regressors ``x_i`` (mean over the candidates of ``x x.T`` is the
@@ -127,7 +127,7 @@ def lookahead(
         spanned: True where choosing i multiplies the determinant by ``1 + |y_i|^2``,
             False where by ``|y_i|^2``.
         active: (..., M) bool.
-        depth: choices to look at, that candidate included; at least 1.
+        depth: number of choices, that candidate included; at least 1.
 
     Returns:
         ``depth`` arrays (..., M): the log of the factor by which the determinant grows

@@ -4,7 +4,7 @@ A lesson is a batch of candidate sets with the postures that a teacher, such as 
 exact solver, would choose. The loss of a decision is minus the log of the probability
 that the policy gives to *any* posture of the wanted ones that is not chosen yet: their
 order does not matter. The wanted one with the largest logit is then chosen.
-Episodes that begin with given postures want the best completion of those.
+Where postures are given, the wanted are those and their best completion.
 """
 
 from __future__ import annotations

@@ -78,7 +78,7 @@ _begun = jax.jit(ppo.begin, static_argnums=(0, 1))
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """What a line of progress says."""
+    """Values of a line of progress."""
 
     update: int
     played: int  # episodes or decisions
