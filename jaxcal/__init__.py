@@ -41,7 +41,7 @@ __all__ = [
     "select",
 ]
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _PACKAGE = pathlib.Path(__file__).parent
 if (_PACKAGE.parent / "pyproject.toml").exists():
