@@ -42,6 +42,7 @@ from rig.config import RigConfig, parse_config
 from rig.core.bus import Bus
 from rig.core.drive import Drive
 from rig.journal import HOMED, IDENTIFIED, SIGN_CHECKED, DeviceRecord, read_journal
+from rig.journal.errors import Refused
 from rig.simulator import Truth, parse_fault
 from rig.workbench.commission.operator import Operator
 from rig.workbench.commission.steps import Place, go_home, identify
@@ -107,12 +108,15 @@ MISTAKES: dict[str, dict[str, Any]] = {
 # degrees by which the counters, or the joints, are elsewhere.
 OVERNIGHT = {"lost_origin": (1.4, 0.0), "moved_while_off": (0.0, 1.4)}
 # What is wrong in the file when the axes are checked, or with the phone: the factor on
-# every reduction, and the fault of the phone.
+# every reduction, and the fault of the phone; or the operator presses Enter, and types
+# no word.
+ENTER = "enter_for_the_word"
 UNPROVED = {
     "reduction_times_10": (10.0, ""),
     "reduction_times_100": (100.0, ""),
     "imu_radians": (1.0, "imu_radians"),
     "imu_radians_reduction_times_25": (25.0, "imu_radians"),
+    ENTER: (1.0, ""),
 }
 # Refused before anything moves: what is no proof of this device.
 UNKNOWN = ("pushed_while_off", "simulated_calibration")
@@ -381,7 +385,7 @@ def _axes_cell(fault: str, folder: pathlib.Path) -> Outcome:
         record = DeviceRecord(folder / "device.json")
         for state in (IDENTIFIED, HOMED):
             record.reach(state, wrong)
-        operator = Operator(yes=True, say=said.append)
+        operator = Operator(yes=fault != ENTER, read=lambda _: "", say=said.append)
         place = Place(wrong, record, operator, listeners=(sim.answer,))
         start, far = sim.plant.joints(), np.zeros(3)
         attitude = sim.plant.attitude
@@ -391,8 +395,12 @@ def _axes_cell(fault: str, folder: pathlib.Path) -> Outcome:
             return attitude()
 
         sim.plant.attitude = watched  # type: ignore[method-assign]
-        code = check_the_axes(place)
-    assert code in (1, 3), (code, said[-12:])
+        try:
+            code = check_the_axes(place)
+        except Refused as error:
+            code, said = 2, [f"fault: {error}"]
+            assert sim.executions() == [[], [], []], "refused, but something moved"
+    assert (code == 2) == (fault == ENTER) and code in (1, 2, 3), (code, said[-12:])
     assert far.max() < MOST_DEG, f"a joint went {far.max():.1f} deg"
     assert record.state(SIGN_CHECKED) is None
     reason = next((s for s in said if s.startswith("fault:")), "")
@@ -593,7 +601,8 @@ def table(outcomes: list[Outcome]) -> str:
         "saved, and with exit code 2 nothing moved. *axes*: the check of the axes with "
         "a file whose gearing is wrong, or a phone that sends radians: it is said, no "
         f"joint is moved by {MOST_DEG:g} degrees, and the device is not sign-checked. "
-        "*overnight*: between a stopped "
+        f"`{ENTER}`: asked for the word `axes`, the operator presses Enter; nothing "
+        "moves. *overnight*: between a stopped "
         "session and its resumption the drives were without power and count from "
         "elsewhere, or the joints were moved; the resumption is refused and measures "
         "nothing until the origin is found again. `second_session` and `other_stop` "
@@ -633,7 +642,8 @@ def table(outcomes: list[Outcome]) -> str:
             if o.fault == fault
         } - {""}
         if reasons:
-            lines.append(f"- `{fault}`: {sorted(reasons, key=len)[0]}")
+            shortest = min(reasons, key=lambda reason: (len(reason), reason))
+            lines.append(f"- `{fault}`: {shortest}")
     return "\n".join(lines) + "\n"
 
 
