@@ -18,7 +18,6 @@ from jaxcal.adaptive.tasks.knee import STATE_RULE, knee
 from jaxcal.commands import evaluate as evaluate_command
 from jaxcal.commands import train as train_command
 from jaxcal.learning.core.ppo import make_train
-from jaxcal.learning.core.streams import Streams
 from jaxcal.learning.runtime import weights
 from jaxcal.learning.runtime.weights import CheckpointError
 from jaxcal.learning.training import checkpoint
@@ -83,31 +82,6 @@ def test_the_run_trains_what_the_pure_function_does_and_tasks_are_arguments(tmp_
     assert metrics["reward_mean"].shape == (4,)
     train(jax.random.key(1), run.exercises(CONFIG)[1])
     assert train._cache_size() == 1
-
-
-@pytest.mark.slow
-def test_every_stream_may_have_a_task_of_its_own():
-    (learner,) = CONFIG.learners
-    one, other = run.exercises(CONFIG)
-    both = jax.tree.map(lambda *leaves: np.stack([*leaves] * 2), one, other)
-    own = Streams(learner.config, learner.environment, learner.network, True)
-    key = jax.random.key(2)
-    keys = jax.random.split(key, learner.config.rows_per_update)
-    params = learner.init(key, one)
-    for a, b in zip(leaves(params), leaves(own.init(key, both)), strict=True):
-        np.testing.assert_array_equal(a, b)
-    play = jax.jit(
-        lambda learner, task: learner.gather(params, keys, task), static_argnums=0
-    )
-    mixed, _ = play(own, both)
-    for task, streams in ((one, slice(0, None, 2)), (other, slice(1, None, 2))):
-        alone, _ = play(learner, task)
-        for name in ("action", "log_prob", "target"):
-            np.testing.assert_allclose(
-                getattr(mixed, name)[streams],
-                getattr(alone, name)[streams],
-                atol=1e-5,
-            )
 
 
 def test_a_checkpoint_gives_back_the_policy_and_its_configuration(finished, tmp_path):
