@@ -162,7 +162,7 @@ def test_asking_who_holds_it_never_keeps_anyone_out():
     assert held == ["verify"] * 20
 
 
-def test_a_lock_folder_of_somebody_else_is_refused(folder, monkeypatch):
+def test_a_lock_folder_of_another_user_is_refused(folder, monkeypatch):
     folder.mkdir()
     monkeypatch.setattr(os, "getuid", lambda: folder.stat().st_uid + 1)
     with pytest.raises(Refused, match="belongs to user"):

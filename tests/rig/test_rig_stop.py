@@ -401,7 +401,7 @@ def test_stop_says_so_when_it_cannot_open_the_port_of_a_holder(tmp_path, capsys)
 
 
 def test_what_a_dead_holder_left_is_not_believed(rig, capsys):
-    """Its pid may be somebody else's by now."""
+    """Its pid may belong to another process by now."""
     innocent = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     try:
         held = BusLock(load_config(rig.path).bus)

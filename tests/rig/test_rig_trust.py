@@ -396,7 +396,7 @@ def test_sessions_need_the_states_and_say_which_command_reaches_them(
     path = tmp_path / "rig.toml"
     path.write_text(fast_text({"port = 5020": "port = 1", "port = 2055": "port = 1"}))
     config = parse_config(path.read_text())
-    commissioned(config, tmp_path).void(lost, "somebody cut the cable")
+    commissioned(config, tmp_path).void(lost, "the cable was cut")
     sessions = (
         ["calibrate"], ["collect"], ["verify", str(calibrated)],
         ["goto", str(calibrated), "--to", "1", "1", "1"],
@@ -406,7 +406,7 @@ def test_sessions_need_the_states_and_say_which_command_reaches_them(
                      "--out", str(tmp_path / "runs")])  # fmt: skip
         assert code == 2
         error = capsys.readouterr().err
-        assert f"not {lost}: somebody cut the cable" in error
+        assert f"not {lost}: the cable was cut" in error
         assert "`jaxcal-rig axes`" in error and "cannot open" not in error
     assert not (tmp_path / "runs").exists()
 
@@ -517,8 +517,8 @@ def test_the_run_of_a_real_device_is_not_resumed_as_a_simulated_one(
 
 
 @pytest.mark.parametrize("bit", [False, True])
-def test_a_place_that_nobody_read_is_no_home(bit, tmp_path):
-    """D: a killed session, a joint that was pushed: nothing was noticed."""
+def test_a_position_not_read_after_a_session_voids_home(bit, tmp_path):
+    """D: after a killed session a pushed joint was not noticed."""
     with simulator(fast_config()) as sim:
         served = sim.start()
         record = commissioned(served, tmp_path, sim)

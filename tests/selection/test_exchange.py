@@ -38,7 +38,7 @@ def test_no_single_swap_improves_the_result(k, cap):
 @pytest.mark.parametrize("q", [1, 2, 5])
 @pytest.mark.parametrize("name", CRITERIA)
 def test_no_single_swap_of_blocks_improves_the_result(name, q):
-    """14 parameters: leverages are updated for 1 or 2 readings, made anew for 5."""
+    """14 parameters: leverages are updated for q = 1 and 2, recomputed for q = 5."""
     rng = np.random.default_rng(q)
     blocks = rng.normal(size=(150, q, 14)) * 10.0 ** rng.uniform(-1, 1, size=14)
     design = jaxcal.Design.from_blocks(blocks, prior=0.1 * np.eye(14))
