@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.information.excitation import require_excited
+from jaxcal.information.singular import require_excited
 from jaxcal.models import Affine
 
 __all__ = ["fit_affine"]
