@@ -28,7 +28,7 @@ from jaxcal.checks import (
     require_none,
     table,
 )
-from jaxcal.information.excitation import require_excited
+from jaxcal.information.singular import require_excited
 from jaxcal.models import Affine, Model, Noise, Prior
 from jaxcal.models.model import by_name
 

@@ -18,6 +18,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.information.singular import flat
 from jaxcal.models import Model
 from jaxcal.models.model import derivative, facts, predict
 
@@ -28,8 +29,7 @@ Array = NDArray[np.float64]
 NU = 4.0  # degrees of freedom of Student's loss
 _LIMIT = 300  # iterations
 _PATIENCE = 20  # iterations whose gain together decides whether the search creeps
-_FLAT = 64.0 * float(np.finfo(np.float64).eps)  # of the largest derivative: rounding
-_WELL = 1e-6  # of the largest pivot: Cholesky's rounding is that of reflections
+_CHOLESKY = 1e-6  # least pivot, of the largest, at which it is as exact as reflections
 _LEAST_DAMPING = 1e-14  # keeps directions that nothing determines where they are
 
 
@@ -171,9 +171,9 @@ class _Search:
         rows = derivative(task.model, self.commands, self.theta)
         rows = rows[..., task.free]
         largest = np.abs(rows).max(axis=(0, 1))
-        flat = largest <= _FLAT * largest.max(initial=0.0)
+        still = flat(largest, largest.max(initial=0.0))
         self.known, self.more = facts(task.model, self.theta)
-        self.by_theta = task.white @ np.where(flat, 0.0, rows)
+        self.by_theta = task.white @ np.where(still, 0.0, rows)
         if self.uncertain.any():
             inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
             rows = derivative(task.model, self.commands, self.theta, inputs)
@@ -385,7 +385,7 @@ def _factor(rows: Array, right: Array, damping: float) -> tuple[Array, Array]:
             turned = whole @ inverse
             root = np.linalg.cholesky(turned.T @ turned).T
             size = np.diagonal(root)
-            if size.min(initial=np.inf) < _WELL * size.max(initial=0.0):
+            if size.min(initial=np.inf) < _CHOLESKY * size.max(initial=0.0):
                 raise np.linalg.LinAlgError
             inverse = inverse @ dtrtri(root)[0]
         return inverse, inverse.T @ (rows.T @ right)

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxcal.arguments import several
 from jaxcal.commands.tables import Output, Table, TablePath, read_table
-from jaxcal.information.excitation import require_excited
+from jaxcal.information.singular import require_excited
 from jaxcal.models import Affine, Model, Noise, SerialChain, from_dict
 from jaxcal.selection import Design, Selection
 from jaxcal.selection.criteria import CRITERIA

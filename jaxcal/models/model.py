@@ -153,7 +153,7 @@ def derivative(
     found = np.asarray(found, dtype=np.float64)
     _require_shape(method, found, (len(commands), model.num_outputs, len(names)))
     bad = ~np.isfinite(found)
-    for row, output, column in np.argwhere(bad)[:1]:
+    for row, output, column in np.argwhere(bad)[:1] if bad.any() else ():
         # A forward derivative may spoil the columns beside that of the one to blame.
         by = ", ".join(np.array(names)[bad[row, output]])
         raise ValueError(

@@ -431,6 +431,8 @@ class SerialChain(Arm):
         frame = self._chain(commands, self.nominal)[0]
         inputs = commands[:, self.num_joints :]
         sensor, new = self.sensor.located(self._tip_at(commands, frame), inputs, read)
+        if sensor is self.sensor and new is None:
+            return self
         tool = self.tool if new is None else self.tool @ new
         return dataclasses.replace(self, sensor=sensor, tool=tool)
 

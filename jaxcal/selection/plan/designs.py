@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.information.blocks import significant
+from jaxcal.information.singular import significant
 from jaxcal.selection.criteria import Criterion
 from jaxcal.selection.exact.exact import relaxed, solve_exact
 from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
