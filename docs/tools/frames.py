@@ -75,7 +75,9 @@ def main() -> None:
                 found[scheme].append(frame(page))
                 page.quit()
     if (number := min(map(len, found.values()))) < FEWEST:
-        sys.exit(f"{number} frames, at least {FEWEST} wanted: run it on an idle machine")
+        sys.exit(
+            f"{number} frames, at least {FEWEST} wanted: run it on an idle machine"
+        )
     for scheme, (first, *rest) in found.items():
         rest = rest[:: max(1, len(rest) // MOST)] + rest[-1:]
         times = [350] * len(rest) + [4000]  # ms; the last stays

@@ -42,7 +42,9 @@ def before_after(
         at = np.arange(count) + places[i] + spread
         rms = np.sqrt(np.mean(each**2))
         shown = f"{rms:.3g}{unit}" if unit == "°" else f"{rms:.3g} {unit}".rstrip()
-        axes.plot(at.ravel(), each.ravel(), label=f"{label}: {shown} rms", **points(i) | look)
+        axes.plot(
+            at.ravel(), each.ravel(), label=f"{label}: {shown} rms", **points(i) | look
+        )
     axes.set_xticks(range(count), names or [str(i + 1) for i in range(count)])
     axes.set_ylabel(f"error ({unit})" if unit else "error")
     above = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0)}  # clear of the points
