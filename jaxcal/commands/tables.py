@@ -19,7 +19,6 @@ from jaxcal.checks import axis_letter
 from jaxcal.files import write_text
 
 __all__ = [
-    "Frame",
     "Output",
     "Table",
     "TablePath",
@@ -31,27 +30,6 @@ __all__ = [
 Array = NDArray[np.float64]
 
 TablePath = Annotated[str, "CSV, or - (standard input)"]
-
-
-@dataclasses.dataclass(frozen=True)
-class Frame:
-    """As much of a data frame as ``select`` reads: numbers with their names."""
-
-    values: Array  # (N, n)
-    columns: tuple[str, ...]
-    index: tuple[str, ...]  # names of the rows; empty where there are none
-
-    def to_numpy(self) -> Array:
-        """(N, n)."""
-        return self.values
-
-    def __getitem__(self, names: Sequence[str]) -> Frame:
-        """These columns, in this order."""
-        places = [self.columns.index(name) for name in names]
-        return Frame(self.values[:, places], tuple(names), self.index)
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
-        return np.array(self.values, dtype=dtype)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,14 +60,13 @@ class Table:
                 )
         return self.values[:, [self.names.index(name) for name in wanted]]
 
-    def frame(self, wanted: Sequence[str]) -> Frame:
-        """The named columns, with the first column of text as the rows' names.
+    def candidates(self, wanted: Sequence[str]) -> Array:
+        """(N, len(wanted)) the named columns.
 
         Raises:
             ValueError: a cell that may be chosen is empty, NaN or infinite.
         """
-        rows, values = next(iter(self.labels.values()), []), self.columns(wanted)
-        mask = self.available()
+        values, mask = self.columns(wanted), self.available()
         bad = ~np.isfinite(values)
         for row, place in np.argwhere(bad if mask is None else bad & mask[:, None]):
             raise ValueError(
@@ -97,7 +74,7 @@ class Table:
                 f"hold a number, got {values[row, place]} or an empty cell; fill it or "
                 "leave the row out"
             )
-        return Frame(values, tuple(wanted), tuple(rows))
+        return values
 
     def inputs(self, chosen: str | None) -> tuple[str, ...]:
         """Columns of commands: those chosen, else ``u_...``, else all but outputs."""

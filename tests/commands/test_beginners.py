@@ -73,7 +73,7 @@ CASES = [  # what was typed, what the line must hold
     ("select table.csv -k 13", "12 candidates, got 13"),
     ("select table.csv --columns pitch,jaw", "no column 'jaw'; columns: pitch, yaw"),
     ("select table.csv --method best", "method must be one of", "got 'best'"),
-    ("select table.csv --model arm.urdf", "'turn' is missing"),
+    ("select table.csv --model arm.urdf", "there is no column 'turn'"),
     ("select table.csv --model calibration.json", "a model is needed, this is a cal"),
     ("select table.csv --model table.csv", "a model must be a JSON file"),
     ("score table.csv --subset 1,2,3,4", "--indices 1,2,3,4"),

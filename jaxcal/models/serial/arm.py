@@ -101,7 +101,7 @@ class Arm:
         """
         from scipy.spatial.transform import Rotation
 
-        commands = as_commands(commands, self.num_inputs)
+        commands = as_commands(self, commands)
         rotations = numbers("rotations", rotations)
         if rotations.shape != (len(commands), 3, 3):
             raise ValueError(
@@ -119,7 +119,7 @@ class Arm:
         """
         from scipy.spatial.transform import Rotation
 
-        commands = as_commands(commands, self.num_inputs)
+        commands = as_commands(self, commands)
         turn = Rotation.from_rotvec(numbers("vectors", vectors), degrees=True)
         return np.asarray(turn.as_matrix() @ self._nominal_rotations(commands))
 
