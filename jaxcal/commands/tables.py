@@ -45,8 +45,13 @@ class Table:
     def __len__(self) -> int:
         return len(self.values)
 
-    def columns(self, wanted: Sequence[str]) -> Array:
-        """(N, len(wanted)) the named columns, in that order."""
+    def columns(self, wanted: Sequence[str], available: Any = True) -> Array:
+        """(N, len(wanted)) the named columns, in that order.
+
+        Raises:
+            ValueError: there is none of that name, or a cell of a row that is
+                ``available``, (N,), is no finite number.
+        """
         for name in wanted:
             if name in self.labels:
                 cell = next(c for c in self.labels[name] if not _is_number(c))
@@ -58,23 +63,20 @@ class Table:
                 raise ValueError(
                     f"{self.source}: there is no column {name!r}; columns: {known}"
                 )
-        return self.values[:, [self.names.index(name) for name in wanted]]
-
-    def candidates(self, wanted: Sequence[str]) -> Array:
-        """(N, len(wanted)) the named columns.
-
-        Raises:
-            ValueError: a cell that may be chosen is empty, NaN or infinite.
-        """
-        values, mask = self.columns(wanted), self.available()
-        bad = ~np.isfinite(values)
-        for row, place in np.argwhere(bad if mask is None else bad & mask[:, None]):
+        values = self.values[:, [self.names.index(name) for name in wanted]]
+        bad = ~np.isfinite(values) & np.reshape(available, (-1, 1))
+        for row, place in np.argwhere(bad):
             raise ValueError(
                 f"{self.source}: line {self.lines[row]}, column {wanted[place]!r} must "
                 f"hold a number, got {values[row, place]} or an empty cell; fill it or "
                 "leave the row out"
             )
         return values
+
+    def candidates(self, wanted: Sequence[str]) -> Array:
+        """(N, len(wanted)) the named columns; rows not available may have gaps."""
+        mask = self.available()
+        return self.columns(wanted, True if mask is None else mask)
 
     def inputs(self, chosen: str | None) -> tuple[str, ...]:
         """Columns of commands: those chosen, else ``u_...``, else all but outputs."""
@@ -130,7 +132,9 @@ def read_table(path: str) -> Table:
         return _from_csv(path, data.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise ValueError(f"{path}: line {line} is not UTF-8 text") from None
+        raise ValueError(
+            f"{path}: line {line} is not UTF-8 text; save it as UTF-8"
+        ) from None
 
 
 def _from_csv(source: str, text: str) -> Table:
