@@ -129,7 +129,9 @@ def read_table(path: str) -> Table:
         return _from_csv(path, data.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise ValueError(f"{path}: line {line} is not UTF-8 text") from None
+        raise ValueError(
+            f"{path}: line {line} is not UTF-8 text; save it as UTF-8"
+        ) from None
 
 
 def _from_csv(source: str, text: str) -> Table:

@@ -123,7 +123,7 @@ def _train(
     else:
         from jaxcal.learning.training import checkpoint
         from jaxcal.learning.training import postures as trainer
-        from jaxcal.selection.teacher import fixed_validation, teacher
+        from jaxcal.selection.batch import fixed_validation, teacher
 
         rows = config.ppo.rows_per_minibatch
         mesh = devices.make_mesh(rows, arguments.devices, config.num_seeds)
