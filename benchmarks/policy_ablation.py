@@ -54,8 +54,8 @@ from jaxcal.learning.runtime import cache
 from jaxcal.learning.training import postures as training
 from jaxcal.learning.training import presets
 from jaxcal.selection import exact_batch, greedy_batch, select
+from jaxcal.selection.batch import teacher
 from jaxcal.selection.policy import select_batch
-from jaxcal.selection.teacher import teacher
 
 HIT = 1e-9
 PARTS = ("unlearned", "shipped", "tasks", "time", "trained")

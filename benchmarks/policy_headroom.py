@@ -120,7 +120,7 @@ def cpu_seconds(call: Callable[[], Any], least: float = 0.004) -> float:
 
 def policy_time() -> list[dict[str, float]]:
     """CPU time of the shipped policy and of greedy on the same affine problems."""
-    choose = load_policy().choose
+    choose = load_policy()
     rows = []
     for count, k in ((20, 4), (50, 4), (50, 8), (200, 8), (200, 20), (1000, 8)):
         candidates = np.random.default_rng(count).uniform(size=(count, 3))

@@ -39,7 +39,9 @@ def four_of_fifty() -> Figure:
     axes.scatter(*rest.T, color=GREY, s=9, depthshade=False)
     axes.scatter(*points.T, color=COLOURS[0], s=60, marker="D", depthshade=False)
     axes.set(xlabel="pitch (°)", ylabel="yaw (°)", zlabel="roll (°)")
-    axes.set_title("50 candidates: measure 4", fontsize=12)
+    ticks = [-20, -10, 0, 10, 20]
+    axes.set(xticks=ticks, yticks=ticks, zticks=ticks)
+    axes.set_title("50 candidates: the 4 of largest volume", fontsize=12)
     return figure
 
 
@@ -57,7 +59,7 @@ def before_and_after() -> Figure:
     }
     figure, axes = panels((4.8, 4.4))
     plots.before_after(axes, errors, ("pitch", "yaw", "roll"), "°")
-    axes.set_title("Error at the other 46", fontsize=12, pad=42)
+    axes.set_title("Error at the other 46, from these 4", fontsize=12, pad=42)
     return figure
 
 

@@ -1,4 +1,4 @@
-"""``Calibration``: a fit with its inverse, its judges, what it prints and its file."""
+"""``Calibration``: a fit with its inverse, its judges, its summary and its file."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from jaxcal.calibration.estimate import fit_model
 from jaxcal.calibration.file import save, to_dict
 from jaxcal.calibration.fit import Fit
 from jaxcal.calibration.inverse import command_for
-from jaxcal.calibration.summary import summary
 from jaxcal.calibration.verdict import verdict
-from jaxcal.models import Model, Noise, SerialChain
+from jaxcal.checks import in_words
+from jaxcal.models import Affine, Model, Noise, SerialChain
 
 __all__ = ["Calibration"]
 
@@ -43,7 +43,69 @@ class Calibration(Fit):
 
     def summary(self) -> str:
         """The parameters with their 95 % intervals, the noise and the fit, as text."""
-        return summary(self, self.verdict)
+        affine = isinstance(self.model, Affine)
+        what = "y = A u + b" if affine else f"of {type(self.model).__name__}"
+        fixed = int((self.free[: len(self.parameters)] == 0).sum())
+        lines = [
+            f"Calibration {what}: {self.num_inputs} inputs "
+            f"({', '.join(self.input_names)}), {self.num_outputs} outputs "
+            f"({', '.join(self.output_names)}), {self.num_measurements} measurements, "
+            f"{len(self.parameters)} parameters"
+            + (f" ({fixed} fixed)" if fixed else "")
+            + f", {self.loss} loss"
+        ]
+        cells = {"": list(self.names)}
+        if affine:
+            cells["meaning"] = [
+                *(f"{y} per {u}" for y in self.output_names for u in self.input_names),
+                *(f"{y} at u = 0" for y in self.output_names),
+            ]
+        cells["value"] = [f"{value: .6g}" for value in self.parameters]
+        errors, shares = self.standard_errors, self.from_data
+        if errors is not None and shares is not None:
+            cells["std error"] = [f"{error:.3g}" for error in errors]
+            ends = self.confidence_intervals()
+            cells["95 % interval"] = [
+                f"[{low: .6g}, {high: .6g}]" for low, high in ends
+            ]
+            if self.prior_precision.any() or self.unidentified is not None:
+                cells["from data"] = [f"{share:.0%}" for share in shares]
+        if any(units := _units(self)):
+            cells["unit"] = units
+        lines += _in_lines(cells)
+        unit = f" {self.measured_unit}" if self.measured_unit else ""
+        size = np.sqrt(np.mean(self.residuals**2, axis=0))
+        lack = self.lack_of_fit()
+        lines.append(
+            f"residuals {in_words(size)}{unit} root mean square, {self.dof:.4g} "
+            "degrees of freedom"
+            + ("" if lack is None else f"; lack-of-fit p = {lack:.3g}")
+        )
+        if self.noise_std is None:
+            lines.append(self.no_noise("intervals"))
+        else:
+            source = "as given" if self.noise_known else "from the residuals"
+            lines.append(f"noise std {in_words(self.noise_std)}{unit}, {source}")
+            if self.dof < 0.5:
+                lines.append("no residual degree of freedom: the noise is not checked")
+        if self.verdict is not None:
+            lines += str(self.verdict).splitlines()
+        if self.unidentified is not None:
+            named = [
+                name
+                for name, lost in zip(self.names, self.undetermined, strict=True)
+                if lost
+            ]
+            lines.append(
+                f"not determined, held near the prior's mean: {', '.join(named)}; "
+                "see identifiability()"
+            )
+        for row, weight in self.outliers.items():
+            lines.append(
+                f"outlier: measurement {row}, {self.distance[row] ** 0.5:.3g} standard "
+                f"deviations from the fit of the others, weight {weight:.2g}"
+            )
+        return "\n".join(lines)
 
     # -- an arm, written back ----------------------------------------------------------
 
@@ -124,3 +186,23 @@ class Calibration(Fit):
                 message names the key.
         """
         return cls(**file.fields(content, model))
+
+
+def _units(fit: Fit) -> list[str]:
+    """p units of the parameters, "" where not known."""
+    if not isinstance(fit.model, Affine):
+        return list(getattr(fit.model, "units", [""] * len(fit.names)))
+    per = f"/{fit.command_unit}" if fit.command_unit else ""
+    slope = (fit.measured_unit or "1") + per if per else fit.measured_unit
+    m = fit.num_outputs
+    return [slope] * (m * fit.num_inputs) + [fit.measured_unit] * m
+
+
+def _in_lines(columns: dict[str, list[str]]) -> list[str]:
+    """A header and a line for each row, columns padded to the same width."""
+    widths = [max(map(len, [name, *column])) for name, column in columns.items()]
+    lines = []
+    for row in [list(columns), *zip(*columns.values(), strict=True)]:
+        padded = [f"{cell:<{w}}" for cell, w in zip(row, widths, strict=True)]
+        lines.append(("  " + "  ".join(padded)).rstrip())
+    return lines

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from jaxcal.calibration.sizes import Sizes, group_sizes, of_sizes
 from jaxcal.calibration.solve import Solution, Task, solve, student_constants
 from jaxcal.checks import in_words, one_of, require_kind
-from jaxcal.information.blocks import significant, triangle
+from jaxcal.information.blocks import triangle
+from jaxcal.information.singular import exact_zeros, significant
 from jaxcal.models import (
     Model,
     Noise,
@@ -21,6 +22,7 @@ from jaxcal.models import (
     SerialChain,
     Socket,
 )
+from jaxcal.models.identifiability import unknown
 from jaxcal.models.model import facts, require_model
 
 __all__ = ["fit_model", "require_fitting"]
@@ -269,7 +271,7 @@ def _fields(
     rows = rows.reshape(-1, rows.shape[-1])
     known = facts(task.model, found.parameters)[1][:, task.free]
     rows = np.concatenate([rows, known])
-    covariance, null = _covariance(task, rows, task.precision[task.free], found.left)
+    covariance, null = _covariance(task, found, rows)
     freedom = float(found.freedom.sum())
     noise_std: Array | None = _noise(task, found, weights[used])
     noise_dof = 0.0
@@ -315,34 +317,35 @@ def _noise(task: Task, found: Solution, weights: Array) -> Array:
     return np.asarray(std * found.level)
 
 
-def _covariance(
-    task: Task, rows: Array, precision: Array, left: int
-) -> tuple[Array, Array | None]:
+def _covariance(task: Task, found: Solution, rows: Array) -> tuple[Array, Array | None]:
     """(P, P) of what is determined, and directions (z, P) of what is not.
 
     Raises:
         ValueError: every reading is used up and parameters are still undetermined.
     """
     size, free = len(task.mean), np.flatnonzero(task.free)
+    precision = task.precision[free]
     scale = np.sqrt((rows**2).sum(axis=0) + precision)
     scale = np.where(scale > 0.0, scale, 1.0)
     whole = np.concatenate([rows, np.diag(np.sqrt(precision))]) / scale
     _, singular, right = np.linalg.svd(triangle(whole))
     known = significant(singular)
-    readings = left * len(task.commands)
+    readings = found.left * len(task.commands)
     of_rows = 0
     if not known.all():
         of_rows = significant(np.linalg.svd(rows / scale, compute_uv=False)).sum()
     if of_rows >= readings:
+        prior = found.parameters, task.precision, task.free
+        left = unknown(task.model, task.commands, *prior)
         raise ValueError(
             f"measured holds {readings} independent readings, too few for "
             f"{len(free)} free parameters: {int((~known).sum())} combinations of them "
-            "stay unknown; measure more, or give a prior or fixed parameters"
+            f"stay unknown ({'; '.join(each.words for each in left)}); measure "
+            "more, or give a prior or fixed parameters"
         )
     root = right[known] / singular[known, None] / scale
     covariance = np.zeros((size, size))
     covariance[np.ix_(free, free)] = root.T @ root
     null = np.zeros((int((~known).sum()), size))
-    exact = np.where(np.abs(right[~known]) < 1e-7, 0.0, right[~known])  # no rounding
-    null[:, free] = exact / scale
+    null[:, free] = exact_zeros(right[~known]) / scale
     return covariance, null if len(null) else None

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import numbers
+from jaxcal.information.singular import depends
 from jaxcal.models import Affine, Model, Prior, SerialChain, identifiability
 from jaxcal.models.identifiability import Identifiability
 from jaxcal.models.model import derivative, predict
@@ -139,7 +140,8 @@ class Fit:
     def identifiability(self) -> Identifiability:
         """What the measurements alone say of the parameters, at the estimate."""
         here = Prior(np.inf, mean=self.parameters)
-        return identifiability(self.model, self.commands, prior=here)
+        used = self.commands[self.loss_weights > 0.0]
+        return identifiability(self.model, used, prior=here)
 
     @property
     def matrix(self) -> Array:
@@ -236,9 +238,7 @@ class Fit:
         variance = ((slopes @ covariance) * slopes).sum(axis=-1)
         std = np.sqrt(np.maximum(variance, 0.0) + float(new_measurement) * noise**2)
         if self.unidentified is not None:
-            moved = slopes @ self.unidentified.T
-            size = np.abs(slopes) @ np.abs(self.unidentified).T
-            std = np.where((np.abs(moved) > 1e-7 * size).any(axis=-1), np.inf, std)
+            std = np.where(depends(slopes, self.unidentified), np.inf, std)
         return std.reshape(*points.shape[:-1], self.num_outputs)
 
     # -- inside ------------------------------------------------------------------------
@@ -266,9 +266,7 @@ class Fit:
         """(p,) parameters in directions that nothing determines."""
         if self.unidentified is None:
             return np.zeros(len(self.parameters), dtype=np.bool_)
-        share = np.abs(self.unidentified)
-        share = share > 1e-7 * share.max(axis=1, keepdims=True)
-        return np.asarray(share.any(axis=0)[: len(self.parameters)])
+        return np.asarray(self.unidentified[:, : len(self.parameters)].any(axis=0))
 
     def points(self, name: str, values: ArrayLike, width: int) -> Array:
         points = numbers(name, values)

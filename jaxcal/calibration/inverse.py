@@ -7,8 +7,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.calibration.fit import Fit
 from jaxcal.checks import in_words, numbers
-from jaxcal.information.excitation import direction_in_words
+from jaxcal.information.singular import (
+    depends,
+    direction_in_words,
+    exact_zeros,
+    flat,
+    significant,
+)
 from jaxcal.models import Affine, Pose, SerialChain
+from jaxcal.models.identifiability import unknown
 from jaxcal.models.model import derivative, predict
 
 __all__ = ["command_for"]
@@ -16,10 +23,6 @@ __all__ = ["command_for"]
 Array = NDArray[np.float64]
 
 _STARTS, _STEPS, _REACHED = 6, 60, 1e-9  # of the outputs' spread over the measurements
-_ROUNDING = 1e-12  # a response below this share of the output is rounding
-# Greatest condition number of the derivative by the commands, in units of their spread
-# and with rows of equal size, that is inverted.
-_CONDITION = 1e6
 
 
 def command_for(
@@ -52,7 +55,8 @@ def command_for(
 
     Raises:
         ValueError: a desired output is out of reach, or needs a command beyond its
-            limits; an output does not respond there; m exceeds n.
+            limits; an output does not respond there, or depends there on what nothing
+            determines; m exceeds n.
     """
     n, m = fit.num_inputs, fit.num_outputs
     points = fit.points("desired", desired, m)
@@ -77,6 +81,7 @@ def command_for(
     commands = np.clip(commands, low, high)
     if not (clip or search.affine):
         search.require_regular(commands)
+    search.require_determined(commands)
     return commands.reshape(*points.shape[:-1], n)
 
 
@@ -184,22 +189,42 @@ class _Search:
         """
         effect = self.slopes(commands) * self.size[:, None]
         rows = np.linalg.norm(effect, axis=-1)
-        for i, j in np.argwhere(rows <= _ROUNDING * np.abs(self.outputs(commands)))[:1]:
+        for i, j in np.argwhere(flat(rows, np.abs(self.outputs(commands))))[:1]:
             raise ValueError(
                 f"the model is singular at the command {in_words(commands[i])}: "
                 f"{self.fit.output_names[j]} does not respond to any input"
             )
         left, size, right = np.linalg.svd(effect / rows[..., None])
-        for i in np.flatnonzero(~(size[:, -1] * _CONDITION >= size[:, 0]))[:1]:
+        for i in np.flatnonzero(~significant(size)[:, -1])[:1]:
             raise ValueError(
-                f"the model is near singular at the command {in_words(commands[i])} "
-                f"(its condition number is above {_CONDITION:.3g}): "
+                f"the model is singular at the command {in_words(commands[i])}: "
                 + self._insensitive(right[i, size.shape[1] - 1])
             )
         return left[-1], size[-1], right[-1], rows[-1]
 
+    def require_determined(self, commands: Array) -> None:
+        """Refuse commands whose outputs depend on what nothing determines."""
+        fit = self.fit
+        if fit.unidentified is None:
+            return
+        slopes = fit.linear(commands)[0]
+        for i, j in np.argwhere(depends(slopes, fit.unidentified))[:1]:
+            used = fit.commands[fit.loss_weights > 0.0]
+            known = fit.estimate, fit.prior_precision, fit.free > 0.0
+            words = [
+                each.words
+                for each in unknown(self.model, used, *known)
+                if depends(slopes[i, j], each.vectors)
+            ]
+            raise ValueError(
+                f"{fit.output_names[j]} at the command {in_words(commands[i])} depends "
+                f"on what no measurement shows: {'; '.join(words)}; measure there, or "
+                "give a prior"
+            )
+
     def _insensitive(self, direction: Array) -> str:
-        unseen = direction_in_words(direction * self.spread, self.fit.input_names)
+        direction = exact_zeros(direction) * self.spread
+        unseen = direction_in_words(direction, self.fit.input_names)
         return f"the outputs do not respond to the direction {unseen} of the commands"
 
     def newton(self, begin: Array) -> tuple[Array, NDArray[np.bool_]]:

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal.calibration.solve import Solution, Task
-from jaxcal.information.blocks import significant, triangle, without
+from jaxcal.information.blocks import triangle, without
+from jaxcal.information.singular import significant
 from jaxcal.models import SerialChain
 from jaxcal.models.model import derivative, facts
 

@@ -18,6 +18,7 @@ import functools
 import numpy as np
 from numpy.typing import NDArray
 
+from jaxcal.information.singular import flat
 from jaxcal.models import Model
 from jaxcal.models.model import derivative, facts, predict
 
@@ -28,9 +29,7 @@ Array = NDArray[np.float64]
 NU = 4.0  # degrees of freedom of Student's loss
 _LIMIT = 300  # iterations
 _PATIENCE = 20  # iterations whose gain together decides whether the search creeps
-_FLAT = 64.0 * float(np.finfo(np.float64).eps)  # of the largest derivative: rounding
-_WELL = 1e-6  # of the largest pivot: Cholesky's rounding is that of reflections
-_SHORT = 0.01  # gain of a step of a tenth of a standard deviation
+_CHOLESKY = 1e-6  # least pivot, of the largest, at which it is as exact as reflections
 _LEAST_DAMPING = 1e-14  # keeps directions that nothing determines where they are
 
 
@@ -143,8 +142,6 @@ class _Search:
         # 1e-6 standard deviations; 1e-5 where convergence is linear.
         self.least = 1e-2 if rough else 1e-10 if task.student else 1e-12
         self.change = (3e-2, 3e-2) if rough else (1e-5, 1e-4)  # of weights and levels
-        self.rough = rough
-        self.linear = 0.0  # length of a step that did what its derivatives said
         self.solved: tuple[Array, Array] | None = None  # hardly damped, in a step
         count, q = task.measured.shape
         self.uncertain = task.command_std > 0.0
@@ -173,12 +170,10 @@ class _Search:
         task = self.task
         rows = derivative(task.model, self.commands, self.theta)
         rows = rows[..., task.free]
-        self.stale = False  # the residuals are those of the model at ``theta``
         largest = np.abs(rows).max(axis=(0, 1))
-        flat = largest <= _FLAT * largest.max(initial=0.0)
+        still = flat(largest, largest.max(initial=0.0))
         self.known, self.more = facts(task.model, self.theta)
-        self.slopes = np.where(flat, 0.0, rows)
-        self.by_theta = task.white @ self.slopes
+        self.by_theta = task.white @ np.where(still, 0.0, rows)
         if self.uncertain.any():
             inputs = tuple(f"command {i + 1}" for i in range(len(self.uncertain)))
             rows = derivative(task.model, self.commands, self.theta, inputs)
@@ -254,40 +249,20 @@ class _Search:
         )
 
     def step(self) -> bool:
-        """Move the parameters to a lower cost; True where they need not move.
-
-        A short step reuses the last derivatives if they predicted the step before it;
-        they are recomputed before the search ends.
-        """
+        """Move the parameters to a lower cost; True where they need not move."""
         task = self.task
         cost = self.cost
         while True:
             rows, right, scale = self._system(self.damping)
-            inverse, target = _factor(
-                rows, right, self.damping, 1 if self.linear else 2
-            )
+            inverse, target = _factor(rows, right, self.damping)
             self.solved = (rows, inverse) if self.damping < 1e-9 else None
             step = inverse @ target
             rest = rows @ step - right
             gain = float(right @ right - rest @ rest)
+            if gain <= self.least + 1e-13 * cost:
+                return True
             theta = self.theta.copy()
             theta[task.free] += step / scale
-            if gain <= self.least + 1e-13 * cost:
-                if self.rough or not self.stale:
-                    return True
-                self.theta = theta
-                self._refresh()
-                return False
-            if gain < _SHORT and np.linalg.norm(step) < self.linear:
-                self.residuals = self.residuals - self.slopes @ (step / scale)
-                self.known = self.known - self.more @ (theta - self.theta)
-                self.theta, self.stale = theta, True
-                self.damping = max(0.1 * self.damping, _LEAST_DAMPING)
-                return False
-            if self.stale:
-                self._refresh()
-                cost = self.cost
-                continue
             commands = self._moved(step / scale)
             residuals = task.measured - predict(
                 task.model, commands, theta, finite=False
@@ -295,8 +270,6 @@ class _Search:
             known, _ = facts(task.model, theta)
             after = self._cost(residuals, theta, commands, known)
             ratio = (cost - after) / gain if np.isfinite(after) else -1.0
-            held = abs(ratio - 1.0) < 0.1 and not self.uncertain.any()
-            self.linear = held * float(np.linalg.norm(step))
             if ratio > 1e-4:
                 self.theta, self.commands, self.residuals = theta, commands, residuals
                 shrunk = self.damping * max(0.1, 1.0 - (2.0 * ratio - 1.0) ** 3)
@@ -313,14 +286,6 @@ class _Search:
                 return True
             self.damping *= self.grow
             self.grow *= 2.0
-
-    def _refresh(self) -> None:
-        """Residuals and derivatives of the model at the parameters reached."""
-        told = self.cost
-        predicted = predict(self.task.model, self.commands, self.theta)
-        self.residuals = self.task.measured - predicted
-        self.linear *= self.cost < told + _SHORT
-        self._linearise()
 
     def settle(self, slack: float) -> bool:
         """Weights and levels that follow from the residuals; True where they stay.
@@ -366,7 +331,7 @@ class _Search:
         """(N, R, F) roots of the hat matrix, of the readings."""
         if solved is None:
             rows, right, _ = self._system(0.0)
-            solved = rows, _factor(rows, right, _LEAST_DAMPING, 2)[0]
+            solved = rows, _factor(rows, right, _LEAST_DAMPING)[0]
         rows, inverse = solved
         root = rows @ inverse
         width, count = rows.shape[1], len(self.weights)
@@ -404,26 +369,23 @@ class _Search:
         )
 
 
-def _factor(
-    rows: Array, right: Array, damping: float, passes: int
-) -> tuple[Array, Array]:
+def _factor(rows: Array, right: Array, damping: float) -> tuple[Array, Array]:
     """The inverse of R and ``Q.T right`` of the damped rows (R, F).
 
     Cholesky twice (Yamamoto et al., 2015) is as exact as Householder's reflections
-    where it succeeds, and does not wait for BLAS's threads in every column. Once is
-    enough where the next step makes good what rounding left.
+    where it succeeds, and does not wait for BLAS's threads in every column.
     """
     from scipy.linalg.lapack import dtrtri
 
     width = rows.shape[1]
     whole = np.concatenate([rows, np.sqrt(damping) * np.eye(width)])
-    inverse, turned = np.eye(width), whole
+    inverse = np.eye(width)
     try:
-        for i in range(passes):
-            turned = whole @ inverse if i else whole
+        for _ in range(2):
+            turned = whole @ inverse
             root = np.linalg.cholesky(turned.T @ turned).T
             size = np.diagonal(root)
-            if size.min(initial=np.inf) < _WELL * size.max(initial=0.0):
+            if size.min(initial=np.inf) < _CHOLESKY * size.max(initial=0.0):
                 raise np.linalg.LinAlgError
             inverse = inverse @ dtrtri(root)[0]
         return inverse, inverse.T @ (rows.T @ right)

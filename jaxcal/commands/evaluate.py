@@ -1,19 +1,22 @@
-"""``python evaluate.py`` and ``jaxcal evaluate``: parse, evaluate, print, write."""
+"""``python evaluate.py`` and ``jaxcal evaluate``: parse, evaluate, print, write.
+
+Methods that select postures, or with ``--task`` deciders of sequential measurement.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import importlib
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 from jaxcal.arguments import Parser, refused, several, values_of
-from jaxcal.commands import evaluate_task
 from jaxcal.extras import MissingExtraError, needs
-from jaxcal.files import require_writable_folder
+from jaxcal.files import require_writable_folder, write_text
 
 if TYPE_CHECKING:
     from jaxcal.evaluation.dataset import Dataset
@@ -75,9 +78,85 @@ examples:
 """
 
 
-@dataclasses.dataclass
-class Options:
-    """What is evaluated, and where it is written."""
+_DECIDERS = "random,gain,rate,shares,ahead,two_step,policy"
+_TUNED = "priced,state"  # where the task brings their constants
+
+_TASK_DESCRIPTION = """\
+Let deciders play the same sessions of a task: what they learn in nats, each less the
+best rule in pairs, and the time of a choice.
+"""
+
+_TASK_EPILOG = """\
+methods:
+{methods}
+
+tasks:
+{tasks}
+  FILE.py    your own: a file that defines ENTRY (docs/adaptive.md)
+
+examples:
+  {program} --task knee
+  {program} --task knee --methods state,rollouts,policy --episodes 512
+  {program} --task knee --with sigma=0.05 cells=16 --retune --json out.json
+"""
+
+
+@dataclasses.dataclass(kw_only=True)
+class Outputs:
+    """What is written."""
+
+    json: Annotated[Path | None, "write every number"] = None
+    report: Annotated[Path | None, "write figures and index.html", "DIR"] = None
+    quiet: Annotated[bool, "no progress"] = False
+    command: list[str] = dataclasses.field(init=False)
+
+    def require_writable(self) -> None:
+        """Refuse what cannot be written, before anything is computed."""
+        if self.json is not None:
+            if self.json.is_dir():
+                raise ValueError(f"--json must be a file, {self.json} is a folder")
+            require_writable_folder(self.json.parent)
+        if self.report is not None:
+            with needs("study", "--report"):
+                importlib.import_module("jinja2")
+                importlib.import_module("matplotlib")
+            require_writable_folder(self.report)
+
+    def write_json(self, document: str) -> None:
+        """Where it was asked for."""
+        if self.json is not None:
+            self.json.parent.mkdir(parents=True, exist_ok=True)
+            write_text(self.json, document)
+            print(f"saved: {self.json}")
+
+
+@dataclasses.dataclass(kw_only=True)
+class TaskOptions(Outputs):
+    """What is played."""
+
+    task: Annotated[str, "see below"]
+    with_: Annotated[tuple[str, ...], "options of the task", "OPTION=VALUE"] = ()
+    methods: Annotated[
+        list[str] | None,
+        f"comma separated; {_DECIDERS}, with {_TUNED} where the task has their "
+        "constants, or the task's own",
+        "LIST",
+        several(str, "names"),
+    ] = None
+    checkpoint: Annotated[str | None, "of the policy; the shipped one", "DIR"] = None
+    episodes: Annotated[
+        int | None, "sessions; 4096, fewer where a task takes long", (2,)
+    ] = None
+    seed: Annotated[int, "of the sessions", "S", (0,)] = 0
+    rollouts: Annotated[
+        int, "simulations of each candidate of the method rollouts", (1,)
+    ] = 16
+    retune: Annotated[bool, "tune the rules on this task; else as they ship"] = False
+
+
+@dataclasses.dataclass(kw_only=True)
+class Options(Outputs):
+    """What is evaluated."""
 
     checkpoint: Annotated[
         tuple[str, ...], "trained policies; the shipped one", "DIR"
@@ -98,9 +177,7 @@ class Options:
         "SECONDS",
         (1e-3,),
     ] = None
-    json: Annotated[Path | None, "write every number"] = None
     indices: Annotated[bool, "and the postures chosen, in the JSON"] = False
-    report: Annotated[Path | None, "write figures and index.html", "DIR"] = None
     run: Annotated[
         tuple[Path, ...],
         "training runs to draw curves of; those of --checkpoint are found",
@@ -111,8 +188,6 @@ class Options:
         "evaluate in parts kept in DIR: any number of --episodes, resumable",
         "DIR",
     ] = None
-    quiet: Annotated[bool, "no progress"] = False
-    command: list[str] = dataclasses.field(init=False)
 
     @property
     def checkpoints(self) -> list[str | None]:
@@ -160,11 +235,22 @@ def main(argv: Sequence[str] | None = None, prog: str = "jaxcal evaluate") -> in
 
 def parser(prog: str, typed: str, of_task: bool = False) -> Parser:
     """The parser: ``prog`` begins a message, ``typed`` an example of the help."""
-    if of_task:
-        with needs("policy", "--task"):
-            return evaluate_task.parser(prog, typed)
-    more = _EPILOG.format(program=typed)
-    return Parser(prog=prog, description=_DESCRIPTION, epilog=more).of(_run)
+    if not of_task:
+        more = _EPILOG.format(program=typed)
+        return Parser(prog=prog, description=_DESCRIPTION, epilog=more).of(_run)
+    with needs("policy", "--task"):
+        from jaxcal.adaptive.tasks import registry
+        from jaxcal.evaluation.sequential import METHODS
+
+    tasks = {name: registry.load(name).about for name in registry.names()}
+    more = _TASK_EPILOG.format(
+        methods=_listed(METHODS), tasks=_listed(tasks), program=typed
+    )
+    return Parser(prog=prog, description=_TASK_DESCRIPTION, epilog=more).of(_run_task)
+
+
+def _listed(abouts: Mapping[str, str]) -> str:
+    return "\n".join(f"  {name:10} {about}" for name, about in abouts.items())
 
 
 class _Terminated(KeyboardInterrupt):
@@ -180,7 +266,6 @@ def _run(options: Options) -> None:
         from jaxcal.progress import Progress
     from jaxcal.evaluation.methods import DEFAULT_METHODS, POLICIES, check_methods
     from jaxcal.evaluation.report import json_document, text_table, write_report
-    from jaxcal.files import write_text
 
     asked = DEFAULT_METHODS if options.methods is None else options.methods
     methods = check_methods(asked)
@@ -215,10 +300,7 @@ def _run(options: Options) -> None:
             options.report, whole, runs, command=options.command, many=many
         )
         print(f"saved: {options.report}/index.html and {number} figures")
-    if options.json is not None and summaries:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        write_text(options.json, json_document(summaries, command=options.command))
-        print(f"saved: {options.json}")
+    options.write_json(json_document(summaries, command=options.command))
 
 
 def _whole(
@@ -305,7 +387,7 @@ def _streamed(
 
 def _check_outputs(options: Options) -> None:
     """Refuse outputs that cannot be written before anything is computed."""
-    evaluate_task.require_outputs(options)
+    options.require_writable()
     if options.stream is not None:
         require_writable_folder(options.stream)
     for folder in options.run:
@@ -323,3 +405,45 @@ def _run_folders(given: Sequence[Path], checkpoints: list[str | None]) -> list[P
         near = [folder, *folder.resolve().parents[:2]]
         found += [place for place in near if (place / "metrics.csv").is_file()][:1]
     return list({place.resolve(): place for place in found}.values())
+
+
+def _run_task(options: TaskOptions) -> None:
+    from jaxcal.adaptive.tasks import registry
+    from jaxcal.evaluation import sequential, sequential_report
+    from jaxcal.learning.runtime import cache
+    from jaxcal.progress import Progress
+
+    options.require_writable()
+    entry = registry.load(options.task)
+    methods = options.methods or list(entry.methods)
+    if not methods:
+        known = [m for m in _TUNED.split(",") if m in entry.rules or options.retune]
+        methods = _DECIDERS.split(",")
+        methods[5:5] = known
+    if options.checkpoint is not None and "policy" not in methods:
+        if options.methods:
+            raise ValueError("--checkpoint is given, but policy is not among --methods")
+        methods.append("policy")
+    chosen = registry.options_from(entry, options.with_)
+    cache.keep_compiled_programs()
+    progress = Progress(quiet=options.quiet)
+    try:
+        result = sequential.evaluate(
+            options.task,
+            entry,
+            chosen,
+            methods,
+            checkpoint=options.checkpoint,
+            episodes=options.episodes or entry.episodes,
+            seed=options.seed,
+            rollouts=options.rollouts,
+            retune=options.retune,
+            progress=progress,
+        )
+    finally:
+        progress.clear()
+    print(sequential_report.text_table(result))
+    if options.report is not None:
+        sequential_report.write_report(options.report, result, command=options.command)
+        print(f"saved: {options.report}/index.html and 1 figure")
+    options.write_json(sequential_report.json_document(result, command=options.command))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.metadata
 import inspect
 import logging
 import os
+import platform
+import re
 import sys
 import warnings
+from typing import Annotated
 
 from jaxcal.arguments import Parser, refused, values_of
 from jaxcal.extras import MissingExtraError
@@ -25,16 +28,14 @@ _HERE = {  # command: one line of help, and the module with its flags and functi
     ),
     "predict": ("where a calibrated machine goes for given commands", "calibrations"),
     "command": ("what to command to reach given outputs", "calibrations"),
-    "doctor": (
-        "versions and devices, for a bug report",
-        "doctor",
-    ),
+    "doctor": ("versions and devices, for a bug report", "main"),
 }
 _WHOLE = {  # commands that parse their own arguments
     "train": ("train a policy (train.py)", "train"),
     "evaluate": ("compare methods with the proven optimum (evaluate.py)", "evaluate"),
 }
 COMMANDS = (*_HERE, *_WHOLE)
+_OTHERS = ("all", "bench", "dev", "docs")  # extras that name others, or are not used
 _EPILOG = """\
 examples:
   jaxcal select candidates.csv -k 4                 the four rows to measure
@@ -100,3 +101,47 @@ def _parser(given: list[str]) -> Parser:
             told = inspect.getdoc(function) or ""
             command.of(function).epilog = told.partition("\n\n")[2]
     return parser
+
+
+def doctor(*, json: Annotated[bool, "print JSON"] = False) -> None:
+    """Print versions and devices; nothing is changed and no port is opened."""
+    from jaxcal.commands.tables import write_json
+
+    found = {
+        "python": f"{platform.python_version()} ({sys.executable})",
+        "platform": platform.platform(),
+        "cores": str(os.cpu_count()),
+        "jaxcal": _version("jaxcal", "a checkout that is not installed"),
+    }
+    for line in importlib.metadata.requires("jaxcal") or []:
+        asked = re.match(r"([\w.-]+)(?:.*extra == ['\"](\w+)['\"])?", line)
+        if asked and asked[2] not in _OTHERS:
+            extra = f": pip install 'jaxcal[{asked[2]}]'" if asked[2] else ""
+            found.setdefault(asked[1], _version(asked[1], f"not installed{extra}"))
+    found["devices"] = _devices()
+    cache = "JAX_COMPILATION_CACHE_DIR"
+    found[cache] = os.environ.get(cache, "not set")
+    if json:
+        write_json("", found)
+        return
+    width = max(map(len, found))
+    for name, value in found.items():
+        print(f"{name:<{width}}  {value}")
+
+
+def _version(package: str, missing: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return missing
+
+
+def _devices() -> str:
+    try:
+        import jax
+    except ImportError:
+        return "none: JAX is not installed"
+    try:
+        return ", ".join(f"{d.id} {d.platform} {d.device_kind}" for d in jax.devices())
+    except RuntimeError as error:
+        return " ".join(str(error).split())

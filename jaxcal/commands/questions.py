@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxcal.arguments import several
 from jaxcal.commands.tables import Output, Table, TablePath, read_table
-from jaxcal.information.excitation import require_excited
+from jaxcal.information.singular import require_excited
 from jaxcal.models import Affine, Model, Noise, SerialChain, from_dict
 from jaxcal.selection import Design, Selection
 from jaxcal.selection.criteria import CRITERIA
@@ -43,25 +43,30 @@ class Asked:
 
     def design(self, table: Table) -> Design:
         """Of these candidates."""
-        candidates, mask = table.frame(table.inputs(self.columns)), table.available()
-        model = read_model(self.model)
+        model, mask = read_model(self.model), table.available()
+        names = getattr(model, "inputs", ()) if self.columns is None else ()
+        names = tuple(names) or table.inputs(self.columns)
+        candidates = table.candidates(names)
         if self.outputs is not None:
             if model is not None:
                 rule = "must be left out with --model, which has them"
                 raise ValueError(f"--outputs {rule}")
-            model = Affine(len(candidates.columns), self.outputs)
+            model = Affine(len(names), self.outputs)
         if self.model is None:  # said here in the names of the columns
-            used = candidates.values if mask is None else candidates.values[mask]
+            used = candidates if mask is None else candidates[mask]
             distinct = f"rows ({len(np.unique(used, axis=0))} of them distinct)"
-            require_excited(used, candidates.columns, table.source, distinct)
-        return Design(
+            require_excited(used, names, table.source, distinct)
+        design = Design(
             candidates,
             model,
             noise=None if self.noise is None else Noise(_one_or_all(self.noise)),
             available=mask,
             required=self.required,
             max_replicates=self.replicates,
+            names=next(iter(table.labels.values()), None),
         )
+        design.axes = names
+        return design
 
 
 @dataclasses.dataclass

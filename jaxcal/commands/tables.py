@@ -19,7 +19,6 @@ from jaxcal.checks import axis_letter
 from jaxcal.files import write_text
 
 __all__ = [
-    "Frame",
     "Output",
     "Table",
     "TablePath",
@@ -31,27 +30,6 @@ __all__ = [
 Array = NDArray[np.float64]
 
 TablePath = Annotated[str, "CSV, or - (standard input)"]
-
-
-@dataclasses.dataclass(frozen=True)
-class Frame:
-    """As much of a data frame as ``select`` reads: numbers with their names."""
-
-    values: Array  # (N, n)
-    columns: tuple[str, ...]
-    index: tuple[str, ...]  # names of the rows; empty where there are none
-
-    def to_numpy(self) -> Array:
-        """(N, n)."""
-        return self.values
-
-    def __getitem__(self, names: Sequence[str]) -> Frame:
-        """These columns, in this order."""
-        places = [self.columns.index(name) for name in names]
-        return Frame(self.values[:, places], tuple(names), self.index)
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
-        return np.array(self.values, dtype=dtype)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,8 +45,13 @@ class Table:
     def __len__(self) -> int:
         return len(self.values)
 
-    def columns(self, wanted: Sequence[str]) -> Array:
-        """(N, len(wanted)) the named columns, in that order."""
+    def columns(self, wanted: Sequence[str], available: Any = True) -> Array:
+        """(N, len(wanted)) the named columns, in that order.
+
+        Raises:
+            ValueError: there is none of that name, or a cell of a row that is
+                ``available``, (N,), is no finite number.
+        """
         for name in wanted:
             if name in self.labels:
                 cell = next(c for c in self.labels[name] if not _is_number(c))
@@ -80,24 +63,20 @@ class Table:
                 raise ValueError(
                     f"{self.source}: there is no column {name!r}; columns: {known}"
                 )
-        return self.values[:, [self.names.index(name) for name in wanted]]
-
-    def frame(self, wanted: Sequence[str]) -> Frame:
-        """The named columns, with the first column of text as the rows' names.
-
-        Raises:
-            ValueError: a cell that may be chosen is empty, NaN or infinite.
-        """
-        rows, values = next(iter(self.labels.values()), []), self.columns(wanted)
-        mask = self.available()
-        bad = ~np.isfinite(values)
-        for row, place in np.argwhere(bad if mask is None else bad & mask[:, None]):
+        values = self.values[:, [self.names.index(name) for name in wanted]]
+        bad = ~np.isfinite(values) & np.reshape(available, (-1, 1))
+        for row, place in np.argwhere(bad):
             raise ValueError(
                 f"{self.source}: line {self.lines[row]}, column {wanted[place]!r} must "
                 f"hold a number, got {values[row, place]} or an empty cell; fill it or "
                 "leave the row out"
             )
-        return Frame(values, tuple(wanted), tuple(rows))
+        return values
+
+    def candidates(self, wanted: Sequence[str]) -> Array:
+        """(N, len(wanted)) the named columns; rows not available may have gaps."""
+        mask = self.available()
+        return self.columns(wanted, True if mask is None else mask)
 
     def inputs(self, chosen: str | None) -> tuple[str, ...]:
         """Columns of commands: those chosen, else ``u_...``, else all but outputs."""
@@ -153,7 +132,9 @@ def read_table(path: str) -> Table:
         return _from_csv(path, data.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise ValueError(f"{path}: line {line} is not UTF-8 text") from None
+        raise ValueError(
+            f"{path}: line {line} is not UTF-8 text; save it as UTF-8"
+        ) from None
 
 
 def _from_csv(source: str, text: str) -> Table:

@@ -123,7 +123,7 @@ def _train(
     else:
         from jaxcal.learning.training import checkpoint
         from jaxcal.learning.training import postures as trainer
-        from jaxcal.selection.teacher import fixed_validation, teacher
+        from jaxcal.selection.batch import fixed_validation, teacher
 
         rows = config.ppo.rows_per_minibatch
         mesh = devices.make_mesh(rows, arguments.devices, config.num_seeds)
@@ -167,8 +167,7 @@ def _num_seeds(arguments: argparse.Namespace, out: pathlib.Path) -> int:
 
 def _configuration(arguments: argparse.Namespace, out: pathlib.Path) -> TrainConfig:
     """Of postures: from the flags, or from the run to go on with."""
-    from jaxcal.commands.train_arguments import values_of
-    from jaxcal.commands.train_candidates import candidates_of, trained_on
+    from jaxcal.commands.train_arguments import candidates_of, trained_on, values_of
     from jaxcal.learning.training import checkpoint, presets
     from jaxcal.learning.training.config import TrainConfig
 

@@ -1,4 +1,4 @@
-"""Information blocks: their log det, the rule of singularity, and whitening.
+"""Information blocks: their log det, rank and whitening.
 
 Measuring candidate i adds ``B_i.T @ B_i`` to the information, B_i a block (q, p): q
 readings, p parameters. A prior of precision P comes as a root (r, p) with
@@ -17,17 +17,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jaxcal import compiled
+from jaxcal.information.singular import (
+    SINGULAR,
+    null_directions,
+    rank_rule,
+    significant,
+)
 
 __all__ = [
     "Whitened",
     "coarseness",
     "largest_rank",
     "missing_directions",
-    "null_directions",
     "prior_root",
     "rank_of_blocks",
-    "rank_rule",
-    "significant",
     "triangle",
     "whiten",
     "without",
@@ -36,9 +39,7 @@ __all__ = [
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-SINGULAR = 1e-10  # share of the largest; derivatives are exact to about 1e-13 of it
 _EPS = float(np.finfo(np.float64).eps)
-_SURE = 1e5  # times the tolerance: pivots above it leave no doubt of the rank
 _LOSS = 1e-9  # of orthogonality that whitened rows may have
 
 
@@ -60,69 +61,6 @@ def triangle(rows: Array) -> Array:
         rows = rows.reshape(-1, p)
         count = len(rows)
     return np.asarray(np.linalg.qr(rows, mode="r"))
-
-
-def rank_rule(
-    columns: Array, largest: Array, count: int | None = None
-) -> tuple[list[int], Array]:
-    """Rank and log det of ``columns.T @ columns``: the one rule of what is singular.
-
-    Numbers are exact to half a unit in the last place of their size, not of their
-    spread: a direction no wider than that is rounding, not information.
-
-    Args:
-        columns: (S, R, p) stacked blocks of S sets, centred.
-        largest: (S, p) largest entry of each column before centring.
-        count: rows that rounding errors add up over; R when not given.
-
-    Returns:
-        (S,) ranks, and (S,) natural log det, -inf where the rank is below p.
-    """
-    p, count = columns.shape[2], count or columns.shape[1]
-    norms, rounding, least, value = _kernel().scaled(columns, largest, count)
-    ranks = [p] * len(columns)
-    for n, share in enumerate(rounding):
-        if least[n] <= _SURE * share:  # distances of columns are cheaper
-            unit = columns[n] / np.where(norms[n] > 0.0, norms[n], np.inf)
-            ranks[n] = int((np.linalg.svd(unit, compute_uv=False) > share).sum())
-            value[n] = value[n] if ranks[n] == p else -np.inf
-    return ranks, value
-
-
-def null_directions(columns: Array, largest: Array) -> list[Array]:
-    """Directions (p,) of which ``columns`` (R, p) say nothing by the rule above.
-
-    Axes that no row moves come first, then a basis of the rest of the null space.
-    """
-    columns, p = np.ascontiguousarray(columns), columns.shape[1]
-    found = _kernel().scaled(columns[None], largest[None], len(columns))
-    norms, rounding = found[0][0], found[1][0]
-    flat = norms == 0.0
-    unit = columns / np.where(flat, np.inf, norms)
-    unit = np.pad(unit, ((0, max(0, p - len(unit))), (0, 0)))
-    _, singular, right = np.linalg.svd(unit, full_matrices=False)
-    null = [np.eye(p)[i] for i in np.flatnonzero(flat)]
-    free = right[singular <= rounding][:, ~flat]
-    if free.size:
-        basis, size, _ = np.linalg.svd(free.T, full_matrices=False)
-        for vector in basis.T[size > 0.5]:
-            direction = np.zeros(p)
-            direction[~flat] = vector / norms[~flat]
-            null.append(direction)
-    return null
-
-
-def significant(size: NDArray[Any], squares: bool = False) -> Mask:
-    """Which singular values (..., r) of columns in comparable units are no rounding.
-
-    The rule above is for the caller's own numbers, this one for what follows from them.
-
-    Args:
-        size: singular values, or eigenvalues.
-        squares: they are eigenvalues of a product of these columns with themselves.
-    """
-    share = 8.0 * _EPS * size.shape[-1] if squares else SINGULAR
-    return size > share * size.max(axis=-1, initial=0.0, keepdims=True)
 
 
 def without(nuisance: Array, *others: Array) -> list[Array]:
@@ -158,18 +96,25 @@ def prior_root(precision: Array) -> Array:
     return np.sqrt(values[keep])[:, None] * vectors.T[keep] * scale
 
 
-def rank_of_blocks(blocks: Array, root: Array) -> tuple[list[int], Array]:
+def rank_of_blocks(
+    blocks: Array, root: Array, size: Array | None = None
+) -> tuple[list[int], Array]:
     """Rank and natural log det, -inf where singular, of information blocks.
 
     Args:
         blocks: (S, N, q, p), the N of each of S sets measured together.
         root: (r, p) of the prior precision, r = 0 without one.
+        size: (p,) of what the blocks were computed beside, the largest of a model's
+            derivatives; zero or None: they are the caller's own numbers.
 
     Returns:
         (S,) of both.
     """
     rows, largest, _ = _kernel().centred(blocks, None, root)
-    return rank_rule(rows, largest, blocks.shape[1])
+    if size is None or not size.any():
+        return rank_rule(rows, largest, blocks.shape[1])
+    largest = np.maximum(largest, size)
+    return rank_rule(rows, largest, blocks.shape[1], computed=True)
 
 
 def largest_rank(blocks: Array) -> int:
@@ -193,10 +138,12 @@ def largest_rank(blocks: Array) -> int:
     return rank
 
 
-def missing_directions(blocks: Array, root: Array, coarse: float = 1.0) -> list[Array]:
+def missing_directions(
+    blocks: Array, root: Array, coarse: float = 1.0, computed: bool = False
+) -> list[Array]:
     """Directions (p,) that neither blocks (N, q, p) nor the prior say anything of."""
     rows, largest, _ = _kernel().centred(blocks[None], None, root)
-    return null_directions(rows[0], coarse * largest[0])
+    return null_directions(rows[0], coarse * largest[0], computed)
 
 
 def coarseness(given: object) -> float:
@@ -251,7 +198,8 @@ def whiten(
         if lost[n] <= _LOSS:
             continue
         # Columns are nearly dependent: by rotations, twice.
-        if rank_rule(rows[n : n + 1], coarse * largest[n : n + 1], num)[0][0] < p:
+        one, size = rows[n : n + 1], coarse * largest[n : n + 1]
+        if rank_rule(one, size, num, computed)[0][0] < p:
             continue
         scale = np.linalg.norm(rows[n], axis=0)
         first = triangle(rows[n] / scale)

@@ -67,7 +67,7 @@ class Affine:
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
         """(N, m, m (n + 1)) derivative of the outputs; ``parameters`` do not matter."""
-        commands = as_commands(commands, self.num_inputs)
+        commands = as_commands(self, commands)
         matrix = regression_matrix(commands, self.num_outputs)
         return matrix.reshape(-1, self.num_outputs, self.num_parameters)
 
@@ -75,7 +75,7 @@ class Affine:
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
         """(N, m, n): the matrix A for every command."""
-        count = len(as_commands(commands, self.num_inputs))
+        count = len(as_commands(self, commands))
         slopes = as_parameters(self, parameters)[: self.num_outputs * self.num_inputs]
         shape = (self.num_outputs, self.num_inputs)
         return np.broadcast_to(slopes.reshape(shape), (count, *shape))

@@ -160,7 +160,7 @@ class FromJax:
     ) -> Array:
         if self._num_inputs is None:
             self._trace(table("commands", commands).shape[1])
-        commands = as_commands(commands, self.num_inputs)
+        commands = as_commands(self, commands)
         parameters = as_parameters(self, parameters)
         import jax
 

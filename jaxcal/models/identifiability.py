@@ -10,16 +10,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import one_of, require_kind, table
-from jaxcal.information.blocks import SINGULAR, significant, triangle
+from jaxcal.information.blocks import triangle
+from jaxcal.information.singular import SINGULAR, exact_zeros, flat, significant
 from jaxcal.models.model import Model, derivative, facts, require_model
 from jaxcal.models.uncertainty import Noise, Prior
 
-__all__ = ["Direction", "Identifiability", "identifiability"]
+__all__ = ["Direction", "Identifiability", "identifiability", "unknown"]
 
 Array = NDArray[np.float64]
-
-# Of columns of length one.
-_ZERO, _FLAT = 1e-6, 16.0 * np.finfo(np.float64).eps
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -122,7 +120,7 @@ def identifiability(
     # A triangle of p rows holds all that is needed of the N q.
     columns = triangle(rows[:, at] * scale)
     norms = np.linalg.norm(columns, axis=0)
-    seen = norms > _FLAT * norms.max(initial=0.0)
+    seen = ~flat(norms, norms.max(initial=0.0))
     norms = np.where(seen, norms, 1.0)
     unit = columns / norms * seen
     found = [np.eye(len(at))[[i]] for i in np.flatnonzero(~seen)]
@@ -148,6 +146,25 @@ def identifiability(
     return Identifiability(
         names, rank, tuple(directions), condition, len(commands), tuple(held)
     )
+
+
+def unknown(
+    model: Model,
+    commands: Array,
+    mean: Array,
+    precision: Array,
+    free: NDArray[np.bool_],
+) -> tuple[Direction, ...]:
+    """Directions that neither commands (N, n) nor a prior's precision (p,) determine.
+
+    Args:
+        mean: (p,) where the model is looked at.
+        free: (p,) False: held.
+    """
+    flat_prior = precision == 0.0
+    std = np.where(flat_prior, np.inf, 1.0 / np.sqrt(precision + flat_prior))
+    held = [name for name, one in zip(model.names, free, strict=True) if not one]
+    return identifiability(model, commands, prior=Prior(std, mean, held)).directions
 
 
 def _in_words(names: tuple[str, ...], same: bool) -> str:
@@ -189,8 +206,7 @@ def _sparse_null(columns: Array) -> Array:
         null[row] /= null[row, pivot]
         others = np.arange(len(null)) != row
         null[others] -= np.outer(null[others, pivot], null[row])
-    largest = np.abs(null).max(axis=1, keepdims=True, initial=0.0)
-    null[np.abs(null) < _ZERO * largest] = 0.0
+    null = exact_zeros(null)
     shorter = True
     while shorter:  # combine two where that leaves fewer entries
         shorter = False
@@ -198,8 +214,7 @@ def _sparse_null(columns: Array) -> Array:
             for k in np.flatnonzero((null[i] != 0.0) & (null[j] != 0.0)):
                 if i == j:
                     continue
-                trial = null[i] - null[i, k] / null[j, k] * null[j]
-                trial[np.abs(trial) < _ZERO * np.abs(trial).max()] = 0.0
+                trial = exact_zeros(null[i] - null[i, k] / null[j, k] * null[j])
                 if np.count_nonzero(trial) < np.count_nonzero(null[i]):
                     null[i] = trial / np.abs(trial).max()
                     shorter = True

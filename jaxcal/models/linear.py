@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import axis_names, numbers, whole_number
 from jaxcal.models.formula import input_names, parse
-from jaxcal.models.model import as_commands, as_parameters, by_name
+from jaxcal.models.model import as_commands, as_parameters
 from jaxcal.models.uncertainty import Prior
 
 __all__ = ["Linear", "Polynomial"]
@@ -101,14 +101,14 @@ class Linear:
     ) -> Array:
         """Outputs (N, m) at commands (N, n), or at a data frame with their names."""
         coefficients = as_parameters(self, parameters)
-        features = self._evaluate(self._commands(commands))
+        features = self._evaluate(as_commands(self, commands))
         return features @ coefficients.reshape(self.num_outputs, -1).T
 
     def jacobian(
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
         """(N, m, m r): the features; ``parameters`` do not matter."""
-        features = self._evaluate(self._commands(commands))
+        features = self._evaluate(as_commands(self, commands))
         whole = np.einsum("ab,nr->nabr", np.eye(self.num_outputs), features)
         return whole.reshape(-1, self.num_outputs, self.num_parameters)
 
@@ -117,7 +117,7 @@ class Linear:
     ) -> Array:
         """(N, m, n); of a function by differences, exact to about 1e-9."""
         coefficients = as_parameters(self, parameters).reshape(self.num_outputs, -1)
-        slopes = self._slopes(self._commands(commands))
+        slopes = self._slopes(as_commands(self, commands))
         return np.einsum("mr,nri->nmi", coefficients, slopes)
 
     def default_prior(self) -> Prior:
@@ -133,12 +133,6 @@ class Linear:
             "inputs": list(self.inputs),
             "terms": list(self.terms),
         }
-
-    def _commands(self, commands: Any) -> Array:
-        commands = by_name(self, commands)
-        if hasattr(commands, "to_numpy"):
-            commands = commands.to_numpy()
-        return as_commands(commands, self.num_inputs)
 
     def _evaluate(self, commands: Array) -> Array:
         """(N, r), finite."""

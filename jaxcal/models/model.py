@@ -88,9 +88,11 @@ def require_model(model: Any) -> None:
         )
 
 
-def as_commands(commands: ArrayLike, num_inputs: int) -> Array:
-    """``commands`` as finite float64 (N, n)."""
-    return array_of("commands", commands, "N", num_inputs, rule=" for this model")
+def as_commands(model: Any, commands: ArrayLike) -> Array:
+    """``commands`` as finite float64 (N, n); of a data frame the model's columns."""
+    commands = by_name(model, commands)
+    rule = " for this model"
+    return array_of("commands", commands, "N", model.num_inputs, rule=rule)
 
 
 def as_parameters(model: Model, parameters: ArrayLike | None) -> Array:
@@ -103,8 +105,8 @@ def as_parameters(model: Model, parameters: ArrayLike | None) -> Array:
 
 def by_name(model: Any, commands: Any) -> Any:
     """Of a data frame the columns that the model names, in its order; else as given."""
-    inputs = getattr(model, "inputs", None)
-    if not inputs or not hasattr(commands, "columns"):
+    inputs = getattr(model, "inputs", ()) if hasattr(commands, "columns") else ()
+    if not inputs:
         return commands
     missing = [name for name in inputs if name not in commands.columns]
     if missing:
@@ -151,7 +153,7 @@ def derivative(
     found = np.asarray(found, dtype=np.float64)
     _require_shape(method, found, (len(commands), model.num_outputs, len(names)))
     bad = ~np.isfinite(found)
-    for row, output, column in np.argwhere(bad)[:1]:
+    for row, output, column in np.argwhere(bad)[:1] if bad.any() else ():
         # A forward derivative may spoil the columns beside that of the one to blame.
         by = ", ".join(np.array(names)[bad[row, output]])
         raise ValueError(

@@ -17,7 +17,7 @@ from jaxcal.checks import (
     require_finite,
     require_none,
 )
-from jaxcal.information.blocks import significant
+from jaxcal.information.singular import significant
 
 __all__ = ["Noise", "Prior", "ResolvedPrior"]
 

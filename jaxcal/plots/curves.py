@@ -78,7 +78,6 @@ def plan(axes: Any, plan: Any) -> Any:
     """
     series = (
         ("standard_error", "design found", MARKERS[0], "-", COLOURS[0]),
-        ("d_optimal_error", "D-optimal selection", MARKERS[1], "--", COLOURS[1]),
         ("least_error", "no design below", "", ":", GREY),
     )
     ks = [row.k for row in plan.rows]

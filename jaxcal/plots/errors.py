@@ -41,8 +41,10 @@ def before_after(
         spread = np.linspace(-0.07, 0.07, len(each))[:, None]
         at = np.arange(count) + places[i] + spread
         rms = np.sqrt(np.mean(each**2))
-        text = " ".join(f"{label}: {rms:.3g} {unit} rms".split())
-        axes.plot(at.ravel(), each.ravel(), label=text, **points(i) | look)
+        shown = f"{rms:.3g}{unit}" if unit == "°" else f"{rms:.3g} {unit}".rstrip()
+        axes.plot(
+            at.ravel(), each.ravel(), label=f"{label}: {shown} rms", **points(i) | look
+        )
     axes.set_xticks(range(count), names or [str(i + 1) for i in range(count)])
     axes.set_ylabel(f"error ({unit})" if unit else "error")
     above = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0)}  # clear of the points

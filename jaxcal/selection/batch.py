@@ -1,16 +1,17 @@
-"""The solvers over many candidate sets at once, for labels and evaluation.
+"""The solvers over many candidate sets at once, for evaluation and training.
 
-Each function takes candidates (B, M, n) and k, and by keyword ``available`` (B, M)
-bool, ``required`` (B, r), ``max_replicates`` and ``num_outputs`` as ``select`` does.
+The solvers take candidates (B, M, n) and k, and by keyword ``available`` (B, M) bool,
+``required`` (B, r), ``max_replicates`` and ``num_outputs`` as ``select`` does.
 """
 
 from __future__ import annotations
 
+import functools
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,7 +23,20 @@ from jaxcal.selection.problem import Found, Problem, log_dets, make_problems
 from jaxcal.selection.result import BatchSelection
 from jaxcal.selection.solvers import checked_seed, random_indices
 
-__all__ = ["exact_batch", "exchange_batch", "greedy_batch", "random_batch"]
+if TYPE_CHECKING:
+    from jaxcal.learning.training.config import TrainConfig
+    from jaxcal.learning.training.postures import Validation
+
+__all__ = [
+    "exact_batch",
+    "exchange_batch",
+    "fixed_validation",
+    "greedy_batch",
+    "random_batch",
+    "teacher",
+]
+
+_VALIDATED = 500  # sets that a training run is measured on
 
 
 def random_batch(
@@ -32,18 +46,15 @@ def random_batch(
     rng = np.random.default_rng(checked_seed(seed))
 
     def solve(problems: list[Problem]) -> list[Found]:
-        return [Found(drawn) for drawn in random_indices(problems, rng)[0]]
+        return list(map(Found, random_indices(problems, rng)[0]))
 
-    return _solve("random", solve, candidates, k, rules)
+    return _solved("random", solve, candidates, k, rules)
 
 
 def greedy_batch(candidates: ArrayLike, k: int, **rules: Any) -> BatchSelection:
     """Greedy from nothing, or from the partial selections in ``required``."""
-
-    def solve(problems: list[Problem]) -> list[Found]:
-        return list(map(exchange.solve_greedy, problems))
-
-    return _solve("greedy", solve, candidates, k, rules)
+    solve = functools.partial(map, exchange.solve_greedy)
+    return _solved("greedy", solve, candidates, k, rules)
 
 
 def exchange_batch(
@@ -57,14 +68,9 @@ def exchange_batch(
     """Fedorov exchange from ``restarts`` random starts, the same seed in every set."""
     if restarts is not None:
         restarts = whole_number("restarts", restarts, 1)
-    seed = checked_seed(seed)
-
-    def solve(problems: list[Problem]) -> list[Found]:
-        return _in_threads(
-            lambda one: exchange.solve(one, seed=seed, restarts=restarts), problems
-        )
-
-    return _solve("exchange", solve, candidates, k, rules)
+    one = functools.partial(exchange.solve, seed=checked_seed(seed), restarts=restarts)
+    solve = functools.partial(_in_threads, one)
+    return _solved("exchange", solve, candidates, k, rules)
 
 
 def exact_batch(
@@ -76,33 +82,33 @@ def exact_batch(
     return the best found with ``proven`` False; there is no limit when it is None.
     """
     deadline = None if time_limit is None else time.perf_counter() + time_limit
+    one = functools.partial(solve_exact, deadline=deadline)
 
-    def solve(problems: list[Problem]) -> list[Found]:
+    def solve(problems: list[Problem]) -> Iterable[Found]:
         # Of a simplex most is the hull, which keeps other threads waiting.
-        each = map if problems[0].simplex else _in_threads
-        return list(each(lambda one: solve_exact(one, deadline=deadline), problems))
+        return (map if problems[0].simplex else _in_threads)(one, problems)
 
-    return _solve("exact", solve, candidates, k, rules)
+    return _solved("exact", solve, candidates, k, rules)
 
 
 def _in_threads(
     solve: Callable[[Problem], Found], problems: list[Problem]
-) -> list[Found]:
+) -> Iterable[Found]:
     """On every core: compiled solvers release the interpreter."""
     with ThreadPoolExecutor(min(os.cpu_count() or 1, len(problems))) as pool:
         return list(pool.map(solve, problems))
 
 
-def _solve(
+def _solved(
     method: str,
-    solve: Callable[[list[Problem]], list[Found]],
+    solve: Callable[[list[Problem]], Iterable[Found]],
     candidates: ArrayLike,
     k: int,
     rules: dict[str, Any],
 ) -> BatchSelection:
     start = time.perf_counter()
     problems = make_problems(candidates, k, **rules)
-    found = solve(problems)
+    found = list(solve(problems))
     indices = np.stack([one.indices for one in found])
     values = log_dets(problems, indices)
     singular = np.flatnonzero(np.isneginf(values))
@@ -120,3 +126,45 @@ def _solve(
         method=method,
         seconds=time.perf_counter() - start,
     )
+
+
+def fixed_validation(config: TrainConfig) -> Validation:
+    """500 sets as the first task has them, and their optima.
+
+    Uniform ones, never trained on, that depend on M and n only, so runs with other
+    seeds or networks are measured on the same ones. Where the user gave candidates, 500
+    draws of those.
+    """
+    from jaxcal.learning.training.postures import Validation
+
+    task = config.tasks[0]
+    env = task.environment
+    if task.given is not None:
+        import jax
+
+        states = jax.vmap(task.reset)(
+            jax.random.split(jax.random.key(20261121), _VALIDATED)
+        )
+        given = np.asarray(states.candidates, np.float64)
+        free = np.asarray(states.available)
+        found = exact_batch(given, env.num_selected, available=free, num_outputs=1)
+        return Validation(given, np.asarray(found.log_det), env.num_outputs, free)
+    rng = np.random.default_rng([20261121, env.num_candidates, env.num_inputs])
+    sets = rng.uniform(size=(_VALIDATED, env.num_candidates, env.num_inputs))
+    best = exact_batch(sets, env.num_selected, num_outputs=1).log_det
+    return Validation(sets, np.asarray(best), env.num_outputs)
+
+
+def teacher(
+    candidates: np.ndarray, available: np.ndarray, given: np.ndarray, k: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """The best postures of every set, as ``imitation.Teacher`` wants them.
+
+    The proven optimum where k is the number of regressors. Above it, what Fedorov
+    exchange finds from its default restarts: almost always optimal, and in a time that
+    does not depend on the shape of the candidates, as that of a proof does.
+    """
+    required = given if given.shape[1] else None
+    solve = exact_batch if k == candidates.shape[2] + 1 else exchange_batch
+    found = solve(candidates, k, available=available, required=required, num_outputs=1)
+    return found.indices, found.log_det

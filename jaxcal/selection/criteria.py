@@ -31,7 +31,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import one_of
-from jaxcal.information.blocks import Whitened, significant
+from jaxcal.information.blocks import Whitened
+from jaxcal.information.singular import significant
 
 __all__ = [
     "CRITERIA",

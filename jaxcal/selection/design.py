@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import one_of, require_none, seconds
 from jaxcal.models.model import Model
@@ -178,7 +179,7 @@ class Design(Planned, Travelled):
             what = "" if method == "score" else f", which {method!r} returned"
             raise ValueError(
                 f"{name} must give an invertible information matrix, but that of "
-                f"{indices.tolist()}{what} is singular"
+                f"{indices.tolist()}{what} is singular{self._why_singular(indices)}"
             )
         subsets = [Subset(indices, value, log_det)]
         if len(found.alternatives) > 1:
@@ -202,6 +203,17 @@ class Design(Planned, Travelled):
             names=self.names,
             axes=self.axes,
         )
+
+    def _why_singular(self, indices: NDArray[np.int64]) -> str:
+        """What choosing among these candidates alone would be refused for."""
+        alone = copy.copy(self)
+        alone.available = np.isin(np.arange(len(self.available)), indices)
+        alone._required, alone.max_replicates = None, len(indices)
+        try:
+            alone.problem(len(indices))
+        except ValueError as error:
+            return f": {error}"
+        return ""
 
 
 def select(

@@ -73,7 +73,7 @@ def _options(solve: Callable[..., Found]) -> tuple[str, ...]:
 def _policy(
     problem: Problem, *, seed: int, checkpoint: Any, decoding: str, num: int
 ) -> Found:
-    from jaxcal.selection.policy import select_batch
+    from jaxcal.selection.policy import choose
 
     if problem.candidates is None or problem.model is None:
         raise ValueError(
@@ -90,17 +90,8 @@ def _policy(
             'max_replicates must be 1 with method "policy", which picks distinct '
             f"postures, got {problem.max_replicates}"
         )
-    indices = select_batch(
-        problem.candidates[None],
-        problem.k,
-        available=problem.available[None],
-        required=problem.required[None] if len(problem.required) else None,
-        decoding=decoding,
-        num=num,
-        seed=seed,
-        checkpoint=checkpoint,
-    )
-    return Found(np.asarray(indices[0], dtype=np.int64), seed=seed)
+    indices = choose([problem], decoding, num, seed, checkpoint)[0]
+    return Found(np.asarray(indices, dtype=np.int64), seed=seed)
 
 
 SOLVERS: dict[str, Callable[..., Found]] = {

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -47,6 +50,7 @@ FILES = {
     "pairs.csv": csv(
         "u_pitch,u_yaw,u_roll,y_pitch,y_yaw,y_roll", np.hstack([POINTS, REACHED])
     ),
+    "unread.csv": csv("u_a,y_a", np.array([[1, 1], [2, np.nan], [3, 3]])),
     "three.csv": csv("u_a,u_b,u_c,y_a,y_b,y_c", np.hstack([POINTS, REACHED])[:3]),
     "target.csv": "2,-4,3",
     "far.csv": "200,-4,3",
@@ -73,12 +77,13 @@ CASES = [  # what was typed, what the line must hold
     ("select table.csv -k 13", "12 candidates, got 13"),
     ("select table.csv --columns pitch,jaw", "no column 'jaw'; columns: pitch, yaw"),
     ("select table.csv --method best", "method must be one of", "got 'best'"),
-    ("select table.csv --model arm.urdf", "'turn' is missing"),
+    ("select table.csv --model arm.urdf", "there is no column 'turn'"),
     ("select table.csv --model calibration.json", "a model is needed, this is a cal"),
     ("select table.csv --model table.csv", "a model must be a JSON file"),
     ("score table.csv --subset 1,2,3,4", "--indices 1,2,3,4"),
     ("plan table.csv --accuracy 0.001 --noise 0.1", "best design found has a largest"),
     ("identify table.csv", "no column begins with y_", "--outputs"),
+    ("identify unread.csv", "unread.csv: line 3, column 'y_a' must hold a number"),
     ("identify three.csv", "at least 4 postures", "got 3"),
     ("command calibration.json far.csv --limits=-20,20", "u_pitch = 457.9", "[-20, 20"),
     ("command calibration.json two.csv", "3 columns are needed", "got 2"),
@@ -115,6 +120,19 @@ def test_a_negative_value_after_a_blank(folder, monkeypatch, capsys):
     with pytest.raises(SystemExit):
         main("command calibration.json target.csv --limits -20,20".split())
     assert "write --limits=VALUE" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("imported", "missing", "extra"),
+    [("jaxcal.plots", "matplotlib", "study"), ("jaxcal.adaptive", "jax", "policy")],
+)
+def test_an_import_names_its_extra(imported, missing, extra):
+    code = f"import sys; sys.modules[{missing!r}] = None; import {imported}"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    wanted = f"{imported} needs {missing}, which is not installed: "
+    assert f"{wanted}pip install 'jaxcal[{extra}]'" in done.stderr
 
 
 def test_radians_are_named(folder, monkeypatch, capsys):

@@ -6,7 +6,7 @@ import importlib.metadata
 import json
 
 import jaxcal
-from jaxcal.commands import doctor, main
+from jaxcal.commands import main
 
 
 def test_it_names_versions_extras_and_devices(capsys):
@@ -28,6 +28,6 @@ def test_a_missing_package_is_named_with_what_installs_it(monkeypatch, capsys):
 
     monkeypatch.setattr(importlib.metadata, "version", version)
     told = "not installed: pip install 'jaxcal[models]'"
-    assert doctor.report()["formulaic"] == told
     assert main(["doctor"]) == 0
-    assert told in capsys.readouterr().out
+    (line,) = [x for x in capsys.readouterr().out.splitlines() if "formulaic" in x]
+    assert line.split(maxsplit=1) == ["formulaic", told]

@@ -42,6 +42,13 @@ def test_a_public_name_without_a_docstring_is_found(hooks, monkeypatch):
     assert hooks.undocumented("bare") == ["bare.Told.method", "bare.function"]
 
 
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_picture_of_the_live_page_moves(scheme):
+    image = pytest.importorskip("PIL.Image")
+    with image.open(ROOT / "docs" / "assets" / f"live_{scheme}.webp") as picture:
+        assert picture.n_frames >= 12
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
     pytest.importorskip("mkdocs")

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from jaxcal.commands import train as command
-from jaxcal.commands import train_candidates
+from jaxcal.commands import train_arguments
 from jaxcal.learning.config import EpisodesConfig
 from jaxcal.learning.environments.selection import SelectionConfig
 from jaxcal.learning.environments.task import Task
@@ -472,10 +472,10 @@ def test_ones_own_sets_are_drawn_as_they_are(tmp_path, rng, key):
     sets, free = rng.uniform(-30, 30, size=(5, 7, 2)), rng.random((5, 7)) < 0.8
     free[:, :4] = True
     np.savez(tmp_path / "sets.npz", candidates=sets, available=free)
-    given = train_candidates.candidates_of(str(tmp_path / "sets.npz"))
+    given = train_arguments.candidates_of(str(tmp_path / "sets.npz"))
     low, high = sets[free].min(0), sets[free].max(0)
     np.testing.assert_allclose(given.values, (sets - low) / (high - low), rtol=1e-5)
-    config = train_candidates.trained_on(presets.load("compact"), given, {})
+    config = train_arguments.trained_on(presets.load("compact"), given, {})
     task = config.tasks[0]
     assert (task.environment.num_candidates, task.num_decisions) == (7, 3)
     states = jax.vmap(task.reset)(jax.random.split(key, 40))
@@ -487,11 +487,11 @@ def test_ones_own_sets_are_drawn_as_they_are(tmp_path, rng, key):
         seen.add(which)
     assert len(seen) == 5
     with pytest.raises(ValueError, match="--num-candidates must be 7, as in"):
-        train_candidates.trained_on(
+        train_arguments.trained_on(
             presets.load("compact"), given, {"num_candidates": 9}
         )
     with pytest.raises(ValueError, match="one task"):
-        train_candidates.trained_on(presets.load("general"), given, {})
+        train_arguments.trained_on(presets.load("general"), given, {})
 
 
 def test_ctrl_c_saves_and_resume_goes_on(tmp_path, capsys, monkeypatch):

@@ -103,7 +103,8 @@ def test_a_data_frame_is_read_by_its_columns():
         columns = ("load", "time", "angle")
 
         def __getitem__(self, names):
-            return type("Part", (), {"to_numpy": lambda _: np.array([[30.0, 2.0]])})()
+            assert names == ["angle", "load"]
+            return np.array([[30.0, 2.0]])
 
     model = Linear("angle + load", inputs=["angle", "load"])
     np.testing.assert_array_equal(model.predict(Frame(), [1.0, 1.0, 10.0]), [[51.0]])
@@ -178,10 +179,10 @@ def test_a_model_that_a_file_cannot_hold_is_refused():
         from_dict(model.to_dict())
     with pytest.raises(ValueError, match="kind of the model must be one of affine"):
         from_dict({"kind": "cubic"})
-    with pytest.raises(ValueError, match="kind polynomial must hold 'degree'"):
+    with pytest.raises(ValueError, match=r"kind polynomial .* missing .* 'degree'"):
         from_dict({"kind": "polynomial"})
     chain = SerialChain.from_dh([(1.0, 90, 0, 0), (2.0, 0, 0, 0)]).to_dict()
-    with pytest.raises(ValueError, match=r"serial_chain must hold no other .* 'tabel'"):
+    with pytest.raises(ValueError, match=r"kind serial_chain .* unexpected .* 'tabel'"):
         from_dict({**chain, "tabel": []})
     with pytest.raises(ValueError, match="kind serial_chain must hold values as"):
         from_dict({**chain, "joints": 5})

@@ -60,7 +60,6 @@ def test_the_smallest_k_and_the_bounds_hold_against_brute_force(criterion, repea
             assert row.least_error[0] <= truth * (1 + 1e-9)
             assert row.standard_error[0] >= truth * (1 - 1e-9)
             assert row.standard_error[0] <= truth * 1.02
-            assert row.standard_error[0] <= row.d_optimal_error[0] * (1 + 1e-9)
         if found.smallest_proven:
             assert 0.5 * np.sqrt(best[4]) > target
 
@@ -78,7 +77,6 @@ def test_laws_of_a_plan(seed, criterion, cap, with_region):
         "criterion": criterion,
         "region": region,
         "max_replicates": cap,
-        "design": "exchange",
     }
     everything = np.repeat(np.arange(14), cap)
     if np.sqrt(value_of(candidates, everything, criterion, region)) > 1.2:
@@ -102,10 +100,7 @@ def test_laws_of_a_plan(seed, criterion, cap, with_region):
 def test_an_affine_map_changes_no_k_and_no_error(rng):
     candidates = rng.random((15, 3))
     mapped = candidates @ (rng.normal(size=(3, 3)) + 2 * np.eye(3)) * 1e4 + 3e4
-    first, second = (
-        plan(c, accuracy=0.9, noise_std=1.0, design="exchange")
-        for c in (candidates, mapped)
-    )
+    first, second = (plan(c, accuracy=0.9, noise_std=1.0) for c in (candidates, mapped))
     assert first.k == second.k
     np.testing.assert_allclose(
         first.rows[0].least_error, second.rows[0].least_error, rtol=1e-6
@@ -146,7 +141,7 @@ def test_simulated_calibrations_err_as_planned(rng, criterion):
 
 def test_replicates_need_no_more_measurements(rng):
     candidates = rng.random((12, 3))
-    wanted = {"accuracy": 0.8, "noise_std": 1.0, "design": "exchange"}
+    wanted = {"accuracy": 0.8, "noise_std": 1.0}
     single = plan(candidates, **wanted)
     several = plan(candidates, max_replicates=4, **wanted)
     assert several.k <= single.k
@@ -183,9 +178,8 @@ def test_required_postures_in_a_plane_raise_the_least_k(rng):
 
 def test_each_output_has_its_own_target(rng):
     candidates = rng.random((15, 3))
-    quick = {"design": "exchange"}
-    strict = plan(candidates, accuracy=[9, 9, 0.9], noise_std=1.0, **quick)
-    loose = plan(candidates, accuracy=0.9, noise_std=[0.1, 0.1, 1.0], **quick)
+    strict = plan(candidates, accuracy=[9, 9, 0.9], noise_std=1.0)
+    loose = plan(candidates, accuracy=0.9, noise_std=[0.1, 0.1, 1.0])
     assert strict.k == loose.k
     assert strict.standard_error.shape == (3,)
 
@@ -205,12 +199,10 @@ def test_out_of_reach_names_the_best_achievable(rng):
     ("change", "message"),
     [
         ({"criterion": "D"}, "criterion must be one of G, I, parameters, got 'D'"),
-        ({"design": "policy"}, "design must be one of exact, exchange, got 'policy'"),
         ({"noise_std": 0.0}, "noise_std must be positive, got 0"),
         ({"noise_std": [1.0, 2.0]}, "noise_std must be one number"),
         ({"accuracy": -1.0}, "accuracy must be positive, got -1"),
         ({"accuracy": np.nan}, "accuracy must be finite"),
-        ({"time_limit": 0}, "time_limit must be a number above 0 in seconds"),
         ({"max_k": 3}, "max_k must be at least 4, got 3"),
         ({"max_k": 13}, "max_k must not exceed the 12 measurements allowed, got 13"),
         ({"more": -1}, "more must be at least 0, got -1"),
@@ -243,7 +235,7 @@ def test_the_table_and_the_figure_show_every_row(rng):
 
 def test_a_masked_candidate_may_hold_anything(rng):
     candidates = rng.random((15, 3))
-    wanted = {"accuracy": 0.9, "noise_std": 1.0, "design": "exchange"}
+    wanted = {"accuracy": 0.9, "noise_std": 1.0}
     available = np.arange(15) != 4
     plain = plan(candidates, available=available, **wanted)
     candidates[4] = np.nan

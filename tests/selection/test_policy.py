@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 import jaxcal
 from jaxcal.information.regression import log_det_gram
+from jaxcal.learning.runtime import weights
 from jaxcal.selection import exact_batch
-from jaxcal.selection.policy import DECODINGS, load_policy, select_batch
+from jaxcal.selection.policy import DECODINGS, select_batch
 
 
 def values(sets, indices):
@@ -128,10 +129,10 @@ def test_bad_requests_are_named(rng, tmp_path):
 
 
 def test_the_shipped_checkpoint_says_how_it_was_made():
-    policy = load_policy()
-    assert policy.meta["preset"] == "general"
-    assert policy.meta["progress"]["episodes"] >= 200_000
-    assert policy.kind == "compact"
+    found = weights.read(weights.locate(None))
+    assert found.meta["preset"] == "general"
+    assert found.meta["progress"]["episodes"] >= 200_000
+    assert found.network["kind"] == "compact"
 
 
 def test_importing_jaxcal_loads_nothing_heavy():

@@ -24,7 +24,7 @@ Load = tuple[int, float, tuple[float, float, float]]  # link from 1, weight, its
 # row of the table; the tool's three shifts, nominal rotation, three turns. A step is
 # 0, 1, 2, a shift along x, y, z, or 3, 4, 5, a turn about it, or 6 and on, a constant.
 _BASE, _ROW, _TOOL = (0, 1, 2, 3, 4, 5, 6), (0, 3, 2, 5, 4), (0, 1, 2, 7, 3, 4, 5)
-_MANY = 1000  # postures: what is found of so many is not kept
+_MANY = 2_000  # postures: what is found of so many is not kept
 # Where a, alpha, d, theta and beta act among the five steps of a row.
 _ORDER = {"standard": (2, 3, 1, 0, 4), "modified": (0, 1, 4, 3, 2)}
 
@@ -101,7 +101,7 @@ class Arm:
         """
         from scipy.spatial.transform import Rotation
 
-        commands = as_commands(commands, self.num_inputs)
+        commands = as_commands(self, commands)
         rotations = numbers("rotations", rotations)
         if rotations.shape != (len(commands), 3, 3):
             raise ValueError(
@@ -119,7 +119,7 @@ class Arm:
         """
         from scipy.spatial.transform import Rotation
 
-        commands = as_commands(commands, self.num_inputs)
+        commands = as_commands(self, commands)
         turn = Rotation.from_rotvec(numbers("vectors", vectors), degrees=True)
         return np.asarray(turn.as_matrix() @ self._nominal_rotations(commands))
 

@@ -315,11 +315,11 @@ class SerialChain(Arm):
         """(N,) the commands' rows in an order of little travel, socket after socket."""
         from jaxcal.models.serial.postures import in_turn
 
-        return in_turn(as_commands(commands, self.num_inputs), self.num_joints)
+        return in_turn(as_commands(self, commands), self.num_joints)
 
     def skeleton(self, commands: ArrayLike) -> Array:
         """(N, n + 2, 3) the base, each joint's origin and the tip, to be drawn."""
-        commands = as_commands(commands, self.num_inputs)
+        commands = as_commands(self, commands)
         frame, _, origins = self._chain(commands, self.nominal)
         at = np.concatenate([[0], self._steps_of_joints])
         points = np.concatenate([origins[at], frame[None, 3]])
@@ -431,11 +431,13 @@ class SerialChain(Arm):
         Nothing is changed that was given: sockets, planes, anchors, boards and their
         cameras have no place of their own until the first readings.
         """
-        commands = as_commands(commands, self.num_inputs)
+        commands = as_commands(self, commands)
         read = None if measured is None else numbers("measured", measured)
         frame = self._chain(commands, self.nominal)[0]
         inputs = commands[:, self.num_joints :]
         sensor, new = self.sensor.located(self._tip_at(commands, frame), inputs, read)
+        if sensor is self.sensor and new is None:
+            return self
         tool = self.tool if new is None else self.tool @ new
         return dataclasses.replace(self, sensor=sensor, tool=tool)
 
@@ -498,7 +500,7 @@ class SerialChain(Arm):
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
         """Readings (N, q)."""
-        commands = as_commands(commands, self.num_inputs)
+        commands = as_commands(self, commands)
         parameters = as_parameters(self, parameters)
         frame = self._chain(commands, parameters)[0]
         tip, inputs = self._tip_at(commands, frame), commands[:, self.num_joints :]
@@ -508,7 +510,7 @@ class SerialChain(Arm):
         self, commands: ArrayLike, parameters: ArrayLike | None = None
     ) -> Array:
         """(N, q, p)."""
-        commands = as_commands(commands, self.num_inputs)
+        commands = as_commands(self, commands)
         parameters = as_parameters(self, parameters)
         columns, own = self._motion(commands, parameters, self._steps_of_parameters)
         first = 5 * len(self.joints)
@@ -536,7 +538,7 @@ class SerialChain(Arm):
 
         Of a pose, with the orientation that it is compared with held.
         """
-        commands = as_commands(commands, self.num_inputs)
+        commands = as_commands(self, commands)
         parameters = as_parameters(self, parameters)
         columns, _ = self._motion(commands, parameters, self._steps_of_joints)
         gears, compliance, _ = self._drives(parameters)

@@ -25,13 +25,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import array_of, levels, one_of, seconds, whole_number
+from jaxcal.checks import array_of, levels, one_of, whole_number
 from jaxcal.information.blocks import largest_rank
 from jaxcal.models.uncertainty import Noise
 from jaxcal.selection.criteria import positions
 from jaxcal.selection.exchange.exchange import greedy_indices
 from jaxcal.selection.plan.designs import (
-    Found,
     best_design,
     lower_bound,
     region_root,
@@ -46,8 +45,6 @@ __all__ = ["Plan", "PlanRow", "Planned"]
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-DESIGNS = ("exact", "exchange")
-
 _SUMMARIES = {"G": "largest", "I": "average", "parameters": "largest"}
 _LARGEST_K = 200  # looked for where max_k is not given
 _ENOUGH = 1.0 + 1e-12  # variance that is accurate enough
@@ -61,9 +58,6 @@ class PlanRow:
     indices: Indices  # (k,) sorted; a posture measured r times appears r times
     standard_error: Array  # (m,) predicted, by the criterion, measured unit
     least_error: Array  # (m,) lower bound of any design of k, measured unit
-    method: str  # "exact" or "exchange": the D-optimal selection, or one from exchange
-    proven: bool  # the design is a proven D-optimum; never: proven best by G or I
-    d_optimal_error: Array  # (m,) standard error of the D-optimal selection of k
 
     @property
     def num_distinct(self) -> int:
@@ -117,16 +111,14 @@ class Plan:
             what += f", noise {self.noise_std[worst]:g}"
         lines = [
             f"{what}, target {self.accuracy[worst]:g}",
-            "   K  distinct  standard error  no design below  D-optimal     design",
+            "   K  distinct  standard error  no design below",
         ]
         for row in self.rows:
-            kind = row.method + (", proven D-optimal" if row.proven else "")
             mark = " <-" if row.k == self.k else ""
             lines.append(
                 f"{row.k:4d} {row.num_distinct:9d} "
                 f"{self.worst(row.standard_error):15.6g} "
-                f"{self.worst(row.least_error):16.6g} "
-                f"{self.worst(row.d_optimal_error):10.6g}   {kind}{mark}"
+                f"{self.worst(row.least_error):16.6g}{mark}"
             )
         proof = "proven" if self.smallest_proven else "not proven to be"
         return "\n".join([*lines, f"K = {self.k} is {proof} the smallest"])
@@ -145,8 +137,6 @@ class Planned(Asked):
         region: ArrayLike | None = None,
         max_k: int | None = None,
         more: int = 0,
-        design: str = "exact",
-        time_limit: float = 1.0,
         seed: int | np.random.Generator = 0,
     ) -> Plan:
         """The smallest number of measurements that predicts accurately enough.
@@ -167,8 +157,6 @@ class Planned(Asked):
                 not given.
             max_k: largest K allowed; what is available, up to 200, when not given.
             more: rows of the table beyond the K that suffices.
-            design: the D-optimal selection to start from, "exact" or "exchange".
-            time_limit: seconds for the exact selection of each K.
             seed: of the exchange.
 
         Raises:
@@ -177,8 +165,6 @@ class Planned(Asked):
         """
         begun = time.perf_counter()
         one_of("criterion", criterion, tuple(_SUMMARIES))
-        one_of("design", design, DESIGNS)
-        limit = seconds("time_limit", time_limit)
         more, start = whole_number("more", more, 0), checked_seed(seed)
         how = "I" if criterion == "I" else "G"
         asked = _request(self, criterion, accuracy, noise_std, parameters, region)
@@ -200,35 +186,33 @@ class Planned(Asked):
                 return float(variances_of(problem, every, points, how).max())
             return lower_bound(problem, root, k)
 
-        def best(k: int, kind: str, previous: Found | None) -> Found:
+        def best(k: int, previous: Indices | None) -> tuple[Indices, Array]:
             one = dataclasses.replace(problem, k=k)
-            before = None if previous is None else previous.indices
-            return best_design(one, points, how, kind, limit, before, start)
+            found = best_design(one, points, how, previous, start)
+            return found, variances_of(one, found, points, how)
 
         rows: list[PlanRow] = []
         chosen: PlanRow | None = None
-        last: Found | None = None
+        last: Indices | None = None
         ks = range(least_k, max_k + 1) if bound_of(max_k) <= _ENOUGH else ()
         for k in ks:  # none where no K allowed is enough
-            last = best(k, design, last)
+            last, variance = best(k, last)
             row = PlanRow(
                 k=k,
-                indices=last.indices,
-                standard_error=unit * np.sqrt(last.variance),
-                least_error=unit * np.sqrt(min(bound_of(k), last.variance.max())),
-                method=last.method,
-                proven=last.proven,
-                d_optimal_error=unit * np.sqrt(last.d_optimal),
+                indices=last,
+                standard_error=unit * np.sqrt(variance),
+                least_error=unit * np.sqrt(min(bound_of(k), variance.max())),
             )
             rows.append(row)
-            if chosen is None and last.variance.max() <= _ENOUGH:
+            if chosen is None and variance.max() <= _ENOUGH:
                 chosen = row
             if chosen is not None and k >= chosen.k + more:
                 break
         if chosen is None:
-            last = last or best(max_k, "exchange", None)
-            one = int((unit * np.sqrt(last.variance) / asked.target).argmax())
-            found, least = unit[one] * np.sqrt([last.variance.max(), bound_of(max_k)])
+            if last is None:
+                variance = best(max_k, None)[1]
+            one = int((unit * np.sqrt(variance) / asked.target).argmax())
+            found, least = unit[one] * np.sqrt([variance.max(), bound_of(max_k)])
             every = " (all that are allowed)" if max_k == total else ""
             raise ValueError(
                 f"accuracy must be reachable with max_k = {max_k} measurements{every}: "

@@ -1,8 +1,8 @@
 """The best design of one size for a region, and what no design of that size beats.
 
 The best: exchange on the criterion itself, which proves nothing. It starts from the
-D-optimal selection (exact where time allows), the greedy one, the design of one
-measurement less plus its best addition, and random ones.
+selection that exchange finds for D, the greedy one, the design of one measurement less
+plus its best addition, and random ones.
 
 The bound: with weights w over the region and W = sum of w z z.T, the largest variance
 is at least the weighted mean trace(W M^-1), and that at least what the relaxation of
@@ -14,20 +14,19 @@ free (Kiefer and Wolfowitz 1960). Source: Pukelsheim, Optimal Design of Experime
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.information.blocks import significant
+from jaxcal.information.singular import significant
 from jaxcal.selection.criteria import Criterion
-from jaxcal.selection.exact.exact import relaxed, solve_exact
+from jaxcal.selection.exact.exact import relaxed
 from jaxcal.selection.exchange.exchange import exchange_indices, greedy_indices
 from jaxcal.selection.problem import Problem
 
-__all__ = ["Found", "best_design", "lower_bound", "region_root", "variances_of"]
+__all__ = ["best_design", "lower_bound", "region_root", "variances_of"]
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -38,17 +37,6 @@ _MEANS: dict[str, Callable[..., Any]] = {"G": np.max, "I": np.mean}
 _RANDOM_STARTS = 4  # where a candidate gives one reading: swaps of more take longer
 _D_RESTARTS = 50  # of the exchange that looks for the D-optimal selection
 _ITERATIONS = 300  # of the weights of G: any count gives a true bound
-
-
-@dataclasses.dataclass(frozen=True)
-class Found:
-    """The best design of one K that was found."""
-
-    indices: Indices  # (k,) sorted
-    variance: Array  # (s,) the criterion of each output for unit noise
-    d_optimal: Array  # (s,) that of the D-optimal selection
-    method: str  # "exact": a D-optimal selection of exact; else "exchange"
-    proven: bool  # the design is a proven D-optimum
 
 
 def variances_of(problem: Problem, indices: Indices, points: Array, how: str) -> Array:
@@ -74,29 +62,21 @@ def best_design(
     problem: Problem,
     points: Array,
     how: str,
-    design: str,
-    time_limit: float,
     previous: Indices | None,
     seed: int,
-) -> Found:
-    """The best design of ``problem.k`` found.
+) -> Indices:
+    """(k,) the best design of ``problem.k`` found, sorted.
 
     Args:
         problem: candidates, limits and k.
         points: (R, s, p) whitened rows of the region.
         how: the criterion, "G" or "I".
-        design: of the D-optimal selection: "exact" or "exchange".
-        time_limit: seconds of exact.
         previous: (k - 1,) the design of one measurement less.
         seed: of exchange and of the random starts.
     """
-    proven = False
-    if design == "exact":
-        found = solve_exact(problem, deadline=time.perf_counter() + time_limit)
-        optimal, proven = found.indices, found.proven
-    else:
-        optimal = exchange_indices(problem, _D_RESTARTS, seed)
-    starts = [optimal, greedy_indices(problem)]
+    best = exchange_indices(problem, _D_RESTARTS, seed)
+    value = variances_of(problem, best, points, how).max()
+    starts = [best, greedy_indices(problem)]
     if previous is not None:
         more = _room(problem, previous)
         values = _after(problem, previous, [None], more, points, how)[0]
@@ -106,20 +86,11 @@ def best_design(
     for _ in range(_RANDOM_STARTS if problem.blocks.shape[1] == 1 else 0):
         some = rng.permutation(room)[: problem.k - len(problem.required)]
         starts.append(np.concatenate([problem.required, some]))
-    best, value = optimal, variances_of(problem, optimal, points, how).max()
     for start in starts:
         indices, reached = _exchange(problem, start, points, how)
         if reached < value * (1.0 - 1e-12):
             best, value = indices, reached
-    best = np.sort(best)
-    same = np.array_equal(best, np.sort(optimal))
-    return Found(
-        best,
-        variances_of(problem, best, points, how),
-        variances_of(problem, optimal, points, how),
-        "exact" if same and design == "exact" else "exchange",
-        same and proven,
-    )
+    return np.sort(best)
 
 
 def _exchange(

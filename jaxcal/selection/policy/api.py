@@ -7,22 +7,19 @@ rescaled candidates, so pulses and degrees give the same pick.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import pathlib
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from jaxcal.checks import whole_number
+from jaxcal.checks import one_of, whole_number
 from jaxcal.extras import needs
 from jaxcal.learning.runtime import weights
-from jaxcal.learning.runtime.weights import Weights
 from jaxcal.selection.problem import Problem, make_problems
 
-__all__ = ["DECODINGS", "Policy", "load_policy", "select_batch"]
+__all__ = ["DECODINGS", "choose", "load_policy", "select_batch"]
 
 DECODINGS = ("greedy", "samples", "first", "exchange")
 
@@ -34,16 +31,7 @@ Indices = NDArray[np.int64]
 Network = Callable[[Sequence[Problem], str, int, int], Indices]
 
 
-@dataclasses.dataclass(frozen=True)
-class Policy:
-    """A trained policy, ready to choose."""
-
-    kind: str  # of its network
-    meta: dict[str, Any]  # as saved with the checkpoint
-    choose: Network
-
-
-def load_policy(checkpoint: str | pathlib.Path | None = None) -> Policy:
+def load_policy(checkpoint: str | pathlib.Path | None = None) -> Network:
     """The newest policy of a checkpoint; read again only where its files have changed.
 
     Args:
@@ -60,7 +48,7 @@ def load_policy(checkpoint: str | pathlib.Path | None = None) -> Policy:
 
 
 @functools.lru_cache(maxsize=8)
-def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Policy:
+def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Network:
     """Args: a weights file or a run's step, and what changes when it is replaced."""
     if path.is_file():
         found = weights.read(path)
@@ -68,10 +56,6 @@ def _loaded(path: pathlib.Path, state: tuple[int, ...]) -> Policy:
         with needs("policy", f"checkpoint {path}, the folder of a training run,"):
             from jaxcal.learning.training import checkpoint
         found = checkpoint.load(path.parent).weights
-    return Policy(found.network["kind"], found.meta, _network(found, path))
-
-
-def _network(found: Weights, path: pathlib.Path) -> Network:
     if found.network["kind"] == "compact":
         from jaxcal.selection.policy.compact import CompactNetwork
 
@@ -118,18 +102,25 @@ def select_batch(
         ValueError: naming the argument, the rule and the value; or what is wrong with
             the checkpoint.
     """
-    if decoding not in DECODINGS:
-        raise ValueError(
-            f"decoding must be one of {', '.join(DECODINGS)}, got {decoding!r}"
-        )
-    num, seed = whole_number("num", num, 1), whole_number("seed", seed, 0)
     problems = make_problems(candidates, k, available=available, required=required)
+    return choose(problems, decoding, num, seed, checkpoint)
+
+
+def choose(
+    problems: Sequence[Problem],
+    decoding: str,
+    num: int,
+    seed: int,
+    checkpoint: str | pathlib.Path | None,
+) -> Indices:
+    """(B, k) for problems of one shape, of the affine model; see ``select_batch``."""
+    one_of("decoding", decoding, DECODINGS)
+    num, seed = whole_number("num", num, 1), whole_number("seed", seed, 0)
     climbs = decoding == "exchange"
-    choose = load_policy(checkpoint).choose
-    indices = choose(problems, "greedy" if climbs else decoding, num, seed)
+    policy = load_policy(checkpoint)
+    found = policy(problems, "greedy" if climbs else decoding, num, seed)
     if climbs:
         from jaxcal.selection.exchange.exchange import exchange_from
 
-        found = zip(problems, indices, strict=True)
-        indices = np.stack([exchange_from(problem, start) for problem, start in found])
-    return indices
+        found = np.stack(list(map(exchange_from, problems, found)))
+    return found

@@ -13,7 +13,6 @@ from jaxcal.checks import (
     whole_number,
 )
 from jaxcal.information.blocks import (
-    SINGULAR,
     Whitened,
     coarseness,
     largest_rank,
@@ -21,7 +20,11 @@ from jaxcal.information.blocks import (
     rank_of_blocks,
     whiten,
 )
-from jaxcal.information.excitation import directions_in_words, require_excited
+from jaxcal.information.singular import (
+    SINGULAR,
+    directions_in_words,
+    require_excited,
+)
 from jaxcal.models.affine import Affine
 from jaxcal.models.model import Model
 from jaxcal.selection.criteria import CRITERIA, Coordinates, Wanted
@@ -185,7 +188,7 @@ def make_problem(
             if not len(root):
                 used, what = candidates[available], ("candidates", "available ones")
                 require_excited(used, names[:-1], *what, coarse)
-        null = missing_directions(used, root, coarse)
+        null = missing_directions(used, root, coarse, computed)
         raise ValueError(
             "blocks must inform every parameter, but the available ones"
             + (" and what is known" if len(root) else "")

@@ -15,7 +15,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from jaxcal.information.blocks import rank_of_blocks, significant
+from jaxcal.information.blocks import rank_of_blocks
+from jaxcal.information.singular import significant
 from jaxcal.models.model import Model
 from jaxcal.selection.criteria import Criterion
 
@@ -132,7 +133,8 @@ class Problem:
     def log_det(self, indices: Indices) -> float:
         """log det S of a subset, natural, in the caller's units; -inf if singular."""
         blocks = self.raw[np.asarray(indices)[None]]
-        return self.multiplicity * float(rank_of_blocks(blocks, self.root)[1][0])
+        found = rank_of_blocks(blocks, self.root, self.size)[1][0]
+        return self.multiplicity * float(found)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -154,12 +156,13 @@ class Found:
 def log_dets(problems: Sequence[Problem], indices: Indices) -> Array:
     """(R,) log det S of a subset (R, k) of each, of one model; -inf if singular."""
     raw = np.array([one.raw[i] for one, i in zip(problems, indices, strict=True)])
-    return problems[0].multiplicity * rank_of_blocks(raw, problems[0].root)[1]
+    first = problems[0]
+    return first.multiplicity * rank_of_blocks(raw, first.root, first.size)[1]
 
 
 def values(problem: Problem, indices: Indices) -> tuple[Array, Array]:
     """Reported value of the criterion, and log det S, of subsets (R, k): (R,) each."""
-    log_det = rank_of_blocks(problem.raw[indices], problem.root)[1]
+    log_det = rank_of_blocks(problem.raw[indices], problem.root, problem.size)[1]
     log_det *= problem.multiplicity
     criterion = problem.criterion
     if criterion.name == "D":

@@ -1,0 +1,191 @@
+"""What is not determined: the one rule, and such a direction in words.
+
+Every judgement of what is singular is made here. It is of columns in comparable units,
+and in one of two ways, by how exact the numbers are:
+
+- the caller's own numbers (commands, blocks) are exact to half a unit in the last place
+  of their size, so a direction no wider than that says nothing (``rank_rule``,
+  ``null_directions``);
+- what was computed from them (derivatives, factors) is exact to about 1e-13, so what is
+  below ``SINGULAR`` of the largest singular value says nothing (``significant``).
+
+Limits elsewhere choose an algorithm or end an iteration; none decides what is known.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from jaxcal import compiled
+
+__all__ = [
+    "SINGULAR",
+    "depends",
+    "direction_in_words",
+    "directions_in_words",
+    "exact_zeros",
+    "flat",
+    "null_directions",
+    "rank_rule",
+    "require_excited",
+    "significant",
+]
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+SINGULAR = 1e-10  # share of the largest singular value
+_EPS = float(np.finfo(np.float64).eps)
+_FLAT = 64.0 * _EPS  # of the size of what a number was computed from
+_NONE = 1e-7  # of the largest entry of a direction: its rounding where it nearly exists
+_SURE = 1e5  # times the tolerance: pivots above it leave no doubt of the rank
+
+
+def _scaled(
+    columns: Array, largest: Array, count: int, computed: bool
+) -> tuple[Array, list[float], list[float], Array]:
+    kernel = compiled.kernel("jaxcal.information.kernel")
+    norms, rounding, least, value = kernel.scaled(columns, largest, count)
+    if computed:
+        rounding = [max(share, SINGULAR) for share in rounding]
+    return norms, rounding, least, value
+
+
+def rank_rule(
+    columns: Array,
+    largest: Array,
+    count: int | None = None,
+    computed: bool = False,
+) -> tuple[list[int], Array]:
+    """Rank and log det of ``columns.T @ columns``.
+
+    Args:
+        columns: (S, R, p) stacked blocks of S sets, centred.
+        largest: (S, p) largest entry of each column before centring.
+        count: rows that rounding errors add up over; R when not given.
+        computed: the columns are rounded themselves, as a model's derivatives are.
+
+    Returns:
+        (S,) ranks, and (S,) natural log det, -inf where the rank is below p.
+    """
+    p, count = columns.shape[2], count or columns.shape[1]
+    norms, rounding, least, value = _scaled(columns, largest, count, computed)
+    ranks = [p] * len(columns)
+    for n, share in enumerate(rounding):
+        if least[n] <= _SURE * share:  # distances of columns are cheaper
+            unit = columns[n] / np.where(norms[n] > 0.0, norms[n], np.inf)
+            ranks[n] = int((np.linalg.svd(unit, compute_uv=False) > share).sum())
+            value[n] = value[n] if ranks[n] == p else -np.inf
+    return ranks, value
+
+
+def null_directions(
+    columns: Array, largest: Array, computed: bool = False
+) -> list[Array]:
+    """Directions (p,) of which ``columns`` (R, p) say nothing by ``rank_rule``.
+
+    Axes that no row moves come first, then a basis of the rest of the null space.
+    """
+    columns, p = np.ascontiguousarray(columns), columns.shape[1]
+    found = _scaled(columns[None], largest[None], len(columns), computed)
+    norms, rounding = found[0][0], found[1][0]
+    still = norms == 0.0
+    unit = columns / np.where(still, np.inf, norms)
+    unit = np.pad(unit, ((0, max(0, p - len(unit))), (0, 0)))
+    _, singular, right = np.linalg.svd(unit, full_matrices=False)
+    null = [np.eye(p)[i] for i in np.flatnonzero(still)]
+    free = right[singular <= rounding][:, ~still]
+    if free.size:
+        basis, size, _ = np.linalg.svd(free.T, full_matrices=False)
+        for vector in exact_zeros(basis.T[size > 0.5]):
+            direction = np.zeros(p)
+            direction[~still] = vector / norms[~still]
+            null.append(direction)
+    return null
+
+
+def significant(size: NDArray[Any], squares: bool = False) -> Mask:
+    """Which singular values (..., r) of columns in comparable units are no rounding.
+
+    Args:
+        size: singular values, or eigenvalues.
+        squares: they are eigenvalues of a product of these columns with themselves.
+    """
+    share = 8.0 * _EPS * size.shape[-1] if squares else SINGULAR
+    return size > share * size.max(axis=-1, initial=0.0, keepdims=True)
+
+
+def flat(size: NDArray[Any], beside: Any) -> Mask:
+    """Which columns of ``size`` are rounding of what they were computed ``beside``."""
+    return np.asarray(size <= _FLAT * beside)
+
+
+def exact_zeros(directions: Array) -> Array:
+    """Directions (..., p) in comparable units; an entry that is rounding becomes 0."""
+    size = np.abs(directions)
+    least = _NONE * size.max(axis=-1, initial=0.0, keepdims=True)
+    return np.where(size > least, directions, 0.0)
+
+
+def depends(slopes: Array, directions: Array) -> Mask:
+    """Which outputs of ``slopes`` (..., p) one of ``directions`` (z, p) changes."""
+    moved = np.abs(slopes @ directions.T)
+    return np.asarray((moved > _NONE * (np.abs(slopes) @ np.abs(directions.T))).any(-1))
+
+
+def require_excited(
+    commands: Array,
+    names: tuple[str, ...],
+    argument: str = "commands",
+    which: str = "postures",
+    coarse: float = 1.0,
+) -> None:
+    """Refuse commands (N, n) that leave a direction unexcited, and name it.
+
+    Args:
+        commands: (N, n).
+        names: n names of the axes.
+        argument, which: what the message calls the commands: "candidates must vary in
+            every direction, but the 5 available ones lie in one plane ...".
+        coarse: how many times coarser than float64 the numbers are.
+    """
+    count, n = commands.shape
+    offset = commands - commands.mean(axis=0) if count else commands
+    largest = np.abs(commands).max(axis=0, initial=0.0)
+    null = null_directions(offset, coarse * largest)
+    if count >= n + 1 and not null:
+        return
+    never = directions_in_words("the direction{} never excited: ", null, names)
+    if count < n + 1:
+        raise ValueError(
+            f"{argument} must hold at least {n + 1} postures of positive weight for "
+            f"{n} inputs and a bias, got {count}" + (f"; {never}" if never else "")
+        )
+    place = {1: "at one point", 2: "on one line"}.get(n, "in one plane")
+    raise ValueError(
+        f"{argument} must vary in every direction, but the {count} {which} lie "
+        f"{place}; {never}"
+    )
+
+
+def directions_in_words(text: str, null: list[Array], names: tuple[str, ...]) -> str:
+    """``text`` with its plural at {}, then every direction; empty if there is none."""
+    if not null:
+        return ""
+    named = "; ".join(direction_in_words(vector, names) for vector in null)
+    return text.format("s" if len(null) > 1 else "") + named
+
+
+def direction_in_words(vector: Array, names: tuple[str, ...]) -> str:
+    """A direction in the named axes, largest component positive, unit length."""
+    vector = vector / np.linalg.norm(vector)
+    size = np.abs(vector)
+    vector = vector * np.sign(vector[(size > (1.0 - 1e-9) * size.max()).argmax()])
+    present = np.flatnonzero(vector)
+    if present.size == 1:
+        return names[present[0]]
+    parts = [f"{vector[i]:+.4g} {names[i]}" for i in present]
+    return "(" + " ".join(parts) + ")"
