@@ -151,6 +151,15 @@ class Noise:
             covariance = np.asarray(covariance)[rows]
         return Noise(std, covariance, self.command_std)
 
+    def beside(self, std: float) -> Noise:
+        """This noise and, independent of it, one of ``std`` in every reading."""
+        if self.covariance is None:
+            known = 1.0 if self.std is None else self.std
+            return dataclasses.replace(self, std=np.hypot(known, std))
+        covariance = np.asarray(self.covariance)
+        more = std**2 * np.eye(covariance.shape[-1])
+        return dataclasses.replace(self, covariance=covariance + more)
+
     def whitening(
         self, count: int, num_outputs: int, command_jacobian: ArrayLike | None = None
     ) -> Array:
