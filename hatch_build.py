@@ -166,7 +166,8 @@ class _Build:
         names = (f"PyInit_{name}", "__pyx_module_is_main_" + "__".join(dotted))
         objects = [self._object(choice, "", flags)]
         avx2 = "-mcpu=x86_64_v3" if self.zig else "-march=x86-64-v3"
-        for kind, more in (("any", []), ("avx2", [avx2])):
+        # Processors older than AVX2, of 2013, are not worth the seconds of -O3.
+        for kind, more in (("any", ["-O1"]), ("avx2", [avx2])):
             renamed = [f"-D{name}={name}_{kind}" for name in names]
             objects.append(self._object(code, kind, [*flags, *renamed, *more]))
         return objects

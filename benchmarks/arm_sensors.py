@@ -202,43 +202,39 @@ def tracked(draw: int) -> tuple[Array, Array]:
     return joints[rows], np.stack(places, axis=1)[rows]
 
 
+MISFIT: dict[str, tuple[int, Callable[[int], tuple[Array, Array]]]] = {
+    "UR5, real": (6, tracked),
+    "UR5, no misfit": (6, lambda draw: cable_driven(6, 0.0, draw)),
+    "UR5, cables": (6, lambda draw: cable_driven(6, 1.0, draw)),
+    "WAM, cables": (7, lambda draw: cable_driven(7, 1.0, draw)),
+    "WAM, half of it": (7, lambda draw: cable_driven(7, 0.4, draw)),
+}
+
+
 def misfit(draws: int) -> None:
     """Chosen of 150 poses and judged at 250, without and with harmonics."""
-    print("| arm | K | without: chosen, random, better | with them |")
-    print("| --- | --- | --- | --- |")
-    arms = {
-        "UR5, real": (6, tracked),
-        "UR5, no misfit": (6, lambda draw: cable_driven(6, 0.0, draw)),
-        "UR5, cables": (6, lambda draw: cable_driven(6, 1.0, draw)),
-        "WAM, cables": (7, lambda draw: cable_driven(7, 1.0, draw)),
-        "WAM, half of it": (7, lambda draw: cable_driven(7, 0.4, draw)),
-    }
-    for name, (joints, make) in arms.items():
+    print("| arm | K | without | with harmonics | gain | random ones that are better |")
+    print("| --- | --- | --- | --- | --- | --- |")
+    for name, (joints, make) in MISFIT.items():
         model = table_of(joints)
         for count in (8, 20):
-            # With a prior that is given there are no harmonics.
-            cells = []
-            for prior in (model.default_prior(), None):
-                lines = [
-                    _against_random(model, prior, count, *make(draw), draw)
-                    for draw in range(draws)
-                ]
-                one, other, share = np.mean(lines, axis=0)
-                cells.append(f"{one:.3g}, {other:.3g}, {share:.0%}")
-            print(f"| {name} | {count} | {cells[0]} | {cells[1]} |", flush=True)
+            lines = [_misfit(model, count, *make(draw), draw) for draw in range(draws)]
+            gain = np.log([one / other for one, other, _ in lines])
+            spread = gain.std() / np.sqrt(draws)
+            without, with_them, better = np.mean(lines, axis=0)
+            print(
+                f"| {name} | {count} | {without:.3g} | {with_them:.3g} | "
+                f"{gain.mean():.0%} +- {spread:.0%} | {better:.0%} |",
+                flush=True,
+            )
 
 
-def _against_random(
-    model: SerialChain,
-    prior: jaxcal.Prior | None,
-    count: int,
-    joints: Array,
-    reached: Array,
-    seed: int,
+def _misfit(
+    model: SerialChain, count: int, joints: Array, reached: Array, seed: int
 ) -> tuple[float, float, float]:
-    """Error of the choice, mean of six random ones, share of these that is better."""
+    """Errors without and with harmonics; share of random choices that beat these."""
 
-    def error(rows: Array) -> float:
+    def error(rows: Array, prior: jaxcal.Prior | None) -> float:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)
             found = jaxcal.identify(
@@ -247,12 +243,18 @@ def _against_random(
         off = found.predict(joints[150:]) - reached[150:]
         return float(np.linalg.norm(off, axis=1).mean())
 
-    chosen = error(
-        jaxcal.select(joints[:150], count, "exchange", model=model, prior=prior).indices
+    without, with_them = (
+        error(
+            jaxcal.select(
+                joints[:150], count, "exchange", model=model, prior=prior
+            ).indices,
+            prior,
+        )
+        for prior in (model.default_prior(), None)  # a prior that is given has none
     )
     rng = np.random.default_rng(seed)
-    random = [error(rng.choice(150, count, replace=False)) for _ in range(6)]
-    return chosen, float(np.mean(random)), float(np.mean(np.array(random) < chosen))
+    random = [error(rng.choice(150, count, replace=False), None) for _ in range(6)]
+    return without, with_them, float(np.mean(np.array(random) < with_them))
 
 
 def checks(draws: int) -> None:

@@ -96,7 +96,8 @@ class Target(Simulation):
                 return parse_config(example_text("simulate"))
             if not FILE.exists():
                 lack = "there is no rig.toml here: give --config FILE or --simulate"
-                raise ConfigError("configuration", [lack])
+                setup = "`jaxcal-rig setup` writes one"
+                raise ConfigError("configuration", [f"{lack}; {setup}"])
             self.config = FILE
         return load_config(self.config)
 

@@ -6,10 +6,13 @@ what it costs; a belief is what is known; a decider picks what comes next.
 ``compare`` try deciders on thousands of sessions.
 """
 
-from jaxcal.adaptive.episodes import compare, play
-from jaxcal.adaptive.grid import GridBelief, GridTask
-from jaxcal.adaptive.loop import next_measurement, run
-from jaxcal.adaptive.particles import ParticleBelief, ParticleTask
+from jaxcal.extras import needs
+
+with needs("policy", "jaxcal.adaptive"):
+    from jaxcal.adaptive.episodes import compare, play
+    from jaxcal.adaptive.grid import GridBelief, GridTask
+    from jaxcal.adaptive.loop import next_measurement, run
+    from jaxcal.adaptive.particles import ParticleBelief, ParticleTask
 
 __all__ = [
     "GridBelief",

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 
 # Beforehand, of the factors of the groups and of the level: median, and the factor of
 # one standard deviation. Most arms have little misfit and some have much.
-_MIDDLE = np.log([1.0, 1.0, 1.0, 1.0, 0.3, 1.0])
+_MIDDLE = np.log([1.0, 1.0, 1.0, 1.0, 0.1, 1.0])
 _SPREAD = np.log([6.0, 6.0, 6.0, 6.0, 10.0, 3.0])
 _MOST = 5.0  # of a logarithm
 _SCORES = 100  # steps of Fisher's scoring, at most

@@ -45,8 +45,15 @@ class Table:
     def __len__(self) -> int:
         return len(self.values)
 
-    def columns(self, wanted: Sequence[str]) -> Array:
-        """(N, len(wanted)) the named columns, in that order."""
+    def columns(
+        self, wanted: Sequence[str], used: NDArray[np.bool_] | None = None
+    ) -> Array:
+        """(N, len(wanted)) the named columns, in that order.
+
+        Raises:
+            ValueError: there is no such column, or a cell of a row that is ``used``
+                (N,), all when not given, is empty, NaN or infinite.
+        """
         for name in wanted:
             if name in self.labels:
                 cell = next(c for c in self.labels[name] if not _is_number(c))
@@ -58,17 +65,9 @@ class Table:
                 raise ValueError(
                     f"{self.source}: there is no column {name!r}; columns: {known}"
                 )
-        return self.values[:, [self.names.index(name) for name in wanted]]
-
-    def candidates(self, wanted: Sequence[str]) -> Array:
-        """(N, len(wanted)) the named columns.
-
-        Raises:
-            ValueError: a cell that may be chosen is empty, NaN or infinite.
-        """
-        values, mask = self.columns(wanted), self.available()
+        values = self.values[:, [self.names.index(name) for name in wanted]]
         bad = ~np.isfinite(values)
-        for row, place in np.argwhere(bad if mask is None else bad & mask[:, None]):
+        for row, place in np.argwhere(bad if used is None else bad & used[:, None]):
             raise ValueError(
                 f"{self.source}: line {self.lines[row]}, column {wanted[place]!r} must "
                 f"hold a number, got {values[row, place]} or an empty cell; fill it or "
@@ -130,7 +129,9 @@ def read_table(path: str) -> Table:
         return _from_csv(path, data.decode("utf-8-sig"))
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
-        raise ValueError(f"{path}: line {line} is not UTF-8 text") from None
+        raise ValueError(
+            f"{path}: line {line} is not UTF-8 text; save it as UTF-8"
+        ) from None
 
 
 def _from_csv(source: str, text: str) -> Table:

@@ -99,7 +99,8 @@ def _by_name(
                     f"{argument} must name parameters of the model "
                     f"({', '.join(names)}), got {name!r}"
                 )
-            result[names.index(name)] = value
+            number = array_of(f"{argument} of {name}", value, finite=False)
+            result[names.index(name)] = number
         return result
     return one_or_each(argument, values, len(names), " or a mapping from names").copy()
 
@@ -149,6 +150,15 @@ class Noise:
         if covariance is not None and np.ndim(covariance) == 3:
             covariance = np.asarray(covariance)[rows]
         return Noise(std, covariance, self.command_std)
+
+    def beside(self, std: float) -> Noise:
+        """This noise and, independent of it, one of ``std`` in every reading."""
+        if self.covariance is None:
+            known = 1.0 if self.std is None else self.std
+            return dataclasses.replace(self, std=np.hypot(known, std))
+        covariance = np.asarray(self.covariance)
+        more = std**2 * np.eye(covariance.shape[-1])
+        return dataclasses.replace(self, covariance=covariance + more)
 
     def whitening(
         self, count: int, num_outputs: int, command_jacobian: ArrayLike | None = None

@@ -3,11 +3,14 @@
 ``figure, axes = matplotlib.pyplot.subplots()``, then ``plots.selection(axes, ...)``.
 """
 
-from jaxcal.plots.arm import postures
-from jaxcal.plots.curves import against_count, pareto, plan
-from jaxcal.plots.errors import before_after, residuals
-from jaxcal.plots.scatter import ellipsoid, selection
-from jaxcal.plots.style import as_bytes
+from jaxcal.extras import needs
+
+with needs("study", "jaxcal.plots"):
+    from jaxcal.plots.arm import postures
+    from jaxcal.plots.curves import against_count, pareto, plan
+    from jaxcal.plots.errors import before_after, residuals
+    from jaxcal.plots.scatter import ellipsoid, selection
+    from jaxcal.plots.style import as_bytes
 
 __all__ = [
     "against_count",

@@ -235,7 +235,10 @@ class Imu:
         except OSError as error:
             where = f"{self.settings.host}:{self.settings.port}"
             reason = error.strerror or error
-            raise ImuError(f"cannot open the IMU port {where}: {reason}") from None
+            raise ImuError(
+                f"cannot open the IMU port {where}: {reason}. End the program that "
+                "uses it, or change imu.host and imu.port"
+            ) from None
         return self
 
     def close(self) -> None:

@@ -74,14 +74,22 @@ def test_the_choice_has_them_too_unless_a_prior_is_given():
     again = jaxcal.select(candidates, model=ARM, **given, **options)
     assert of_table.value == pytest.approx(again.value)
     plain = jaxcal.select(candidates, model=ARM, prior=ARM.default_prior(), **options)
-    slopes = ARM.jacobian(candidates) / 0.1
-    used = slopes[plain.indices].reshape(-1, 39)
-    noise = np.asarray(ARM.default_noise().std)[0] / 0.1
-    prior = np.diag(np.asarray(ARM.default_prior().std) ** -2.0)
-    inverse = np.linalg.inv(used.T @ used / noise**2 + prior)
-    rows = slopes.reshape(-1, 39) / noise
-    expected = np.einsum("ri,ij,rj->", rows, inverse, rows) / len(rows)
-    assert plain.value == pytest.approx(expected, rel=1e-6)
+    noise = np.asarray(ARM.default_noise().std)[0]
+    assert plain.value == pytest.approx(_variance(ARM, candidates, plain, noise), 1e-6)
+    # Readings scatter by what harmonics leave, too; of predictions that is no error.
+    misfit = np.hypot(noise, 3e-4 * ARM.length)
+    expected = _variance(WHOLE, candidates, chosen, misfit) * (misfit / noise) ** 2
+    assert chosen.value == pytest.approx(expected, rel=1e-6)
+
+
+def _variance(arm, candidates, chosen, noise):
+    """Mean variance of a prediction, in that of the noise, by definition."""
+    slopes = arm.jacobian(candidates) / noise
+    used = slopes[chosen.indices].reshape(-1, len(arm.names))
+    prior = np.diag(np.asarray(arm.default_prior().std) ** -2.0)
+    inverse = np.linalg.inv(used.T @ used + prior)
+    rows = slopes.reshape(-1, len(arm.names))
+    return np.einsum("ri,ij,rj->", rows, inverse, rows) / len(rows)
 
 
 def test_what_is_written_to_a_urdf_file_is_what_is_predicted(tmp_path):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -47,6 +50,7 @@ FILES = {
     "pairs.csv": csv(
         "u_pitch,u_yaw,u_roll,y_pitch,y_yaw,y_roll", np.hstack([POINTS, REACHED])
     ),
+    "unread.csv": csv("u_a,y_a", np.array([[1, 1], [2, np.nan], [3, 3]])),
     "three.csv": csv("u_a,u_b,u_c,y_a,y_b,y_c", np.hstack([POINTS, REACHED])[:3]),
     "target.csv": "2,-4,3",
     "far.csv": "200,-4,3",
@@ -79,6 +83,8 @@ CASES = [  # what was typed, what the line must hold
     ("score table.csv --subset 1,2,3,4", "--indices 1,2,3,4"),
     ("plan table.csv --accuracy 0.001 --noise 0.1", "best design found has a largest"),
     ("identify table.csv", "no column begins with y_", "--outputs"),
+    ("identify pairs.csv --inputs u_yaw,y_yaw", "must differ, both hold y_yaw"),
+    ("identify unread.csv", "unread.csv: line 3, column 'y_a' must hold a number"),
     ("identify three.csv", "at least 4 postures", "got 3"),
     ("command calibration.json far.csv --limits=-20,20", "u_pitch = 457.9", "[-20, 20"),
     ("command calibration.json two.csv", "3 columns are needed", "got 2"),
@@ -117,10 +123,32 @@ def test_a_negative_value_after_a_blank(folder, monkeypatch, capsys):
     assert "write --limits=VALUE" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("imported", "missing", "extra"),
+    [("jaxcal.plots", "matplotlib", "study"), ("jaxcal.adaptive", "jax", "policy")],
+)
+def test_an_import_names_its_extra(imported, missing, extra):
+    code = f"import sys; sys.modules[{missing!r}] = None; import {imported}"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
+    wanted = f"{imported} needs {missing}, which is not installed: "
+    assert f"{wanted}pip install 'jaxcal[{extra}]'" in done.stderr
+
+
 def test_radians_are_named(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     assert main("select radians.csv -k 4 --model arm.urdf".split()) == 0
     assert "joints are in degrees" in capsys.readouterr().err
+
+
+def test_ctrl_c_is_told_in_one_line(monkeypatch, capsys):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("jaxcal.commands.questions.read_table", interrupt)
+    assert main(["select", "table.csv"]) == 130
+    assert capsys.readouterr().err == "jaxcal select: interrupted\n"
 
 
 def test_the_columns_of_an_arm_in_any_company(folder, monkeypatch, capsys):

@@ -90,6 +90,16 @@ def test_an_unknown_command_is_the_limit_of_a_large_one(seed, n, q):
     )
 
 
+@pytest.mark.parametrize("noise", [
+    Noise(), Noise(std=2.0), Noise(std=[1.0, 2.0]), Noise(std=np.full((3, 2), 0.5)),
+    Noise(covariance=[[2.0, 1.0], [1.0, 2.0]]),
+])  # fmt: skip
+def test_noise_beside_another_adds_its_variance(noise):
+    one, both = (each.whitening(3, 2) for each in (noise, noise.beside(0.7)))
+    total = np.linalg.inv(np.matrix_transpose(one) @ one) + 0.49 * np.eye(2)
+    np.testing.assert_allclose(np.matrix_transpose(both) @ both, np.linalg.inv(total))
+
+
 def test_a_level_of_noise_for_everything_each_output_or_each_candidate():
     def first_rows(noise):
         return np.diagonal(noise.whitening(2, 3), axis1=1, axis2=2)

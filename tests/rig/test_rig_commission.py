@@ -153,8 +153,15 @@ def test_imu_pins_the_sender_and_tells_what_to_type(commissioned, capsys):
     assert load_config("rig.toml").imu.allow == ("127.0.0.1",)
 
 
-@pytest.mark.parametrize("name", ["generic", "applied_motion"])
-@pytest.mark.parametrize("obeys", [True, False])
+@pytest.mark.parametrize(
+    ("name", "obeys"),
+    [
+        ("generic", True),
+        ("applied_motion", True),
+        ("generic", False),
+        pytest.param("applied_motion", False, marks=pytest.mark.slow),
+    ],
+)
 def test_a_count_of_0_after_a_power_cycle_is_not_home(at, name, obeys, monkeypatch):
     """D: homed at 0, switched off and pushed, such a drive said that it is at home."""
     if not obeys:  # a drive that can be set to 0 only

@@ -63,8 +63,13 @@ def angles(records):
 @pytest.mark.parametrize(
     ("phase", "changes"),
     [
-        *((p, None) for p in ("moving", "settling", "measuring", "saving")),
-        ("measuring", PUSHING),  # another session of the app, on any connection
+        ("measuring", None),
+        *(
+            pytest.param(phase, None, marks=pytest.mark.slow)
+            for phase in ("moving", "settling", "saving")
+        ),
+        # Another session of the app, on any connection.
+        pytest.param("measuring", PUSHING, marks=pytest.mark.slow),
     ],
 )
 def test_postures_after_it_are_as_right_as_those_before(phase, changes, tmp_path):

@@ -131,7 +131,7 @@ def test_a_refused_fit_saves_nothing_and_voids_the_sign_check(tmp_path, monkeypa
 # A lost origin
 
 
-@pytest.mark.parametrize("axis", [0, 2])
+@pytest.mark.parametrize("axis", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_lost_origin_is_seen_in_the_tilt_of_the_zero_posture(
     axis, calibrated, tmp_path
 ):

@@ -20,7 +20,7 @@ class Position(Sensor):
 
     kind = "position"
     sizes_prior = True
-    harmonic = True
+    misfit = 3e-4
 
     @property
     def outputs(self) -> tuple[str, ...]:

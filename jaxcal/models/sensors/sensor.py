@@ -90,7 +90,8 @@ class Sensor(abc.ABC):
     zeros: ClassVar[bool] = False  # what is measured is always zero
     sizes_prior: ClassVar[bool] = False  # shown to be better with Prior.sized()
     compliant: ClassVar[bool] = False  # shown to be better with joints that yield
-    harmonic: ClassVar[bool] = False  # and with their harmonics, as misfit
+    # And with their harmonics, as misfit; what it leaves, by the arm's length.
+    misfit: ClassVar[float] = 0.0
 
     @property
     def inputs(self) -> tuple[str, ...]:

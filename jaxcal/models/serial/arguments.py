@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from jaxcal.checks import array_of, in_words, numbers, whole_number
-from jaxcal.models.serial.torque import Load
+from jaxcal.models.serial.arm import Load
 
 __all__ = [
     "joint_numbers",

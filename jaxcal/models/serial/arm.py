@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,11 +14,11 @@ from jaxcal.checks import numbers
 from jaxcal.models.model import as_commands
 from jaxcal.models.sensors import Sensor, Tip
 from jaxcal.models.serial.kernel import forward
-from jaxcal.models.serial.torque import Load, cross, torque
 
-__all__ = ["Arm"]
+__all__ = ["Arm", "Load"]
 
 Array = NDArray[np.float64]
+Load = tuple[int, float, tuple[float, float, float]]  # link from 1, weight, its centre
 
 # The steps of the base: three shifts, three turns, its nominal rotation; five of each
 # row of the table; the tool's three shifts, nominal rotation, three turns. A step is
@@ -270,7 +270,7 @@ class Arm:
         motion = np.zeros((len(at), 6, len(commands)))  # shift and turn of the tip
         turns = self._steps[0][at] > 2
         about = np.radians(axes[at[turns]])
-        motion[turns, :3] = cross(about, frame[3] - origins[at[turns]])
+        motion[turns, :3] = _cross(about, frame[3] - origins[at[turns]])
         motion[turns, 3:] = about
         motion[~turns, :3] = axes[at[~turns]]
         tip, inputs = self._tip_at(commands, frame), commands[:, self.num_joints :]
@@ -285,7 +285,7 @@ class Arm:
 
         def find() -> tuple[Array, ...]:
             _, axes, origins = self._after(commands, stiff)
-            return torque(
+            return _torques(
                 axes[self._steps_of_joints],
                 origins[self._steps_of_joints],
                 np.array([kind == "R" for kind in self.joints]),
@@ -296,3 +296,54 @@ class Arm:
             )
 
         return self._kept("_last_torque", (commands,), find)
+
+
+def _torques(
+    axes: Array,
+    origins: Array,
+    revolute: NDArray[np.bool_],
+    at: NDArray[np.int64],
+    loads: Sequence[Load],
+    frame: Callable[[int], Array],
+    gravity: Array,
+) -> tuple[Array, Array]:
+    """Torque of the loads on some joints, and its derivative by the commands.
+
+    A joint's torque is the work of the loads per radian, so its derivative by another
+    joint is a second derivative of their positions: ``w_i x J_j``, i before j.
+
+    Args:
+        axes: (n, 3, N) of the joints.
+        origins: (n, 3, N) of these axes.
+        revolute: (n,) else prismatic.
+        at: (C,) joints, from 0, whose torque is asked for.
+        loads: each in the frame after its link's row.
+        frame: of a link, its axes and origin (4, 3, N).
+        gravity: (3,) direction.
+
+    Returns:
+        (C, N) and (C, n, N), the latter per degree or unit of length.
+    """
+    n, count = len(axes), axes.shape[-1]
+    turns = revolute[:, None, None]
+    first = np.minimum(at[:, None], np.arange(n))
+    second = np.maximum(at[:, None], np.arange(n))
+    result, rate = np.zeros((len(at), count)), np.zeros((len(at), n, count))
+    for link, weight, centre in loads:
+        reached = frame(link)
+        point = reached[3] + np.einsum("k,kcn->cn", centre, reached[:3])
+        motion = np.where(turns, _cross(axes, point - origins), axes)
+        motion[link:] = 0.0
+        force = weight * gravity
+        result += np.einsum("c,jcn->jn", force, motion[at])
+        bent = _cross((axes * turns)[first], motion[second])
+        rate += np.einsum("c,ijcn->ijn", force, bent)
+    rate[:, revolute] = np.radians(rate[:, revolute])
+    return result, rate
+
+
+def _cross(left: Array, right: Array) -> Array:
+    """Cross products of (..., 3, N): over the axis before the last."""
+    x, y, z = (left[..., k, :] for k in range(3))
+    u, v, w = (right[..., k, :] for k in range(3))
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-2)

@@ -36,7 +36,7 @@ _COLUMNS = ("a", "alpha", "d", "theta", "beta")
 # 1.7 degrees of the base and the tool.
 _LENGTH, _TWIST, _ZERO = 1.5e-3, 0.3, 0.5  # share of the links' length; degrees
 _GEAR, _SAG = 5e-3, 0.5  # ratio; degrees under the largest torque
-_WAVES, _WAVE = ("sin", "cos", "sin2", "cos2"), 0.015  # of gears; degrees
+_WAVES, _WAVE = ("sin", "cos", "sin2", "cos2"), 0.045  # of gears; degrees
 _MOUNTING, _MOUNTING_ANGLE = 0.1, 1.7
 
 
@@ -244,11 +244,16 @@ class SerialChain(Arm):
         They are no parameters of the arm: ``identify``, and ``select`` for predictions,
         add them where no prior is given, as what the parameters do not explain.
         """
-        if self.harmonics or not self.sensor.harmonic:
+        if self.harmonics or not self.sensor.misfit:
             return self
         bent = tuple(i + 1 for i, kind in enumerate(self.joints) if kind == "R")
         waves = np.zeros((len(bent), 4))
         return dataclasses.replace(self, harmonics=bent, waves=waves)
+
+    @property
+    def misfit_std(self) -> float:
+        """What harmonics leave of the misfit, which a choice counts as noise."""
+        return self.sensor.misfit * self.length
 
     def postures(
         self,

@@ -158,7 +158,7 @@ def _origins(nominal: Arm, calibrated: Arm) -> tuple[dict[str, Array], Array | N
         if not gap:
             raise ValueError(
                 f"base {nominal.source['base']!r} moves with its joint and cannot hold "
-                "a correction: name the link before it as base"
+                "a correction: give as base a link fixed to it, one you add if need be"
             )
         driving = [k for k, part in enumerate(gap) if part.drives]
         at = driving[-1] if driving else len(gap) - 1

@@ -173,9 +173,10 @@ class Asked:
         if not of_parameters and isinstance(model, Affine):
             if shares_regressor(model, prior, self.noise):
                 return Shared(model, candidates, self.noise)
+        misfit = 0.0
         if of_predictions and prior is None and hasattr(model, "with_misfit"):
-            model = model.with_misfit()
-        return Modelled(model, candidates, self.available, prior, self.noise)
+            model, misfit = model.with_misfit(), model.misfit_std
+        return Modelled(model, candidates, self.available, prior, self.noise, misfit)
 
     def with_noise(self, noise: Noise | None) -> Self:
         """The same with other noise."""

@@ -127,12 +127,15 @@ class Modelled(Source):
         available: Mask,
         prior: Prior | None,
         noise: Noise | None,
+        misfit: float = 0.0,
     ) -> None:
         if hasattr(model, "located"):  # an arm whose sensor stands somewhere
             model = model.located(candidates[available])
             _warn_of_radians(model, candidates[available])
         self._model, self._candidates, self._available = model, candidates, available
         self._noise = Noise() if noise is None else noise
+        # Readings are off by what no parameter explains; a prediction is no reading.
+        self._read = self._noise.beside(misfit) if misfit else self._noise
         self._prior = model.default_prior() if prior is None else prior
         known = self._prior.resolve(model)
         if not known.free.any():
@@ -157,7 +160,7 @@ class Modelled(Source):
         if self._noise.command_std is not None:
             slopes = np.zeros((count, q, self._candidates.shape[1]))
             slopes[mask] = self._model.command_jacobian(self.used, self._mean)
-        white = self._noise.whitening(count, q, slopes)
+        white = self._read.whitening(count, q, slopes)
         if mask.all():
             return _weighted(white, jacobian)
         blocks = np.zeros((count, q, len(self.names)))
@@ -165,7 +168,7 @@ class Modelled(Source):
         return blocks
 
     def at(self, argument: str, values: ArrayLike, readings: bool) -> Array:
-        noise = self._noise
+        noise = self._read if readings else self._noise
         for name, axes in (("std", 1), ("covariance", 2)):
             given = getattr(noise, name)
             if given is not None and np.ndim(given) > axes:
@@ -184,7 +187,8 @@ class Modelled(Source):
         return _weighted(white, jacobian)
 
     def predicted(self) -> Array | None:
-        return None if self._noise.command_std is None else self.used
+        same = self._read is self._noise and self._noise.command_std is None
+        return None if same else self.used
 
     def require_identified(self, measured: ArrayLike | None) -> None:
         if np.diagonal(self._precision).all():

@@ -138,7 +138,10 @@ def look_at_phone(place: Place, seconds: float = WATCH_S) -> str:
     """Wait for the phone and tell what it sends; its address."""
     settings = place.config.imu
     with Imu(settings) as imu:
-        place.say(f"imu: {addresses_text(settings, imu.port)}; then start its stream")
+        place.say(
+            f"imu: {addresses_text(settings, imu.port)}; then start its stream "
+            f"(waiting for it up to {session.STREAM_WAIT_S:g} s)"
+        )
         for listener in place.listeners:
             listener({"event": "listening", "port": imu.port})
         watch(imu, seconds, session.STREAM_WAIT_S, place.say)
